@@ -1,0 +1,1 @@
+"""3D visual EKF-SLAM that builds small, locally referenced submaps."""

@@ -1,0 +1,1 @@
+"""NDT and ICP registration of point clouds, and scan odometry."""

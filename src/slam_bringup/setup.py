@@ -1,0 +1,34 @@
+"""Build of slam_bringup (ament_python)."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+PACKAGE = "slam_bringup"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(),
+    package_data={"": ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/launch", glob("launch/*")),
+        (f"share/{PACKAGE}/config", glob("config/*")),
+        (f"share/{PACKAGE}/rviz", glob("rviz/*")),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="Indoor SLAM maintainers",
+    maintainer_email="maintainers@indoor-slam.org",
+    description="Launch files, configuration, the offline pipeline, bag tools and the slam command line.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "slam = slam_bringup.cli:main",
+            "bag_player = slam_bringup.bag_player_node:main",
+            "recorder = slam_bringup.recorder_node:main",
+        ]
+    },
+)

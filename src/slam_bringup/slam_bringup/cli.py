@@ -1,0 +1,61 @@
+"""The ``slam`` command line: a table of names, each command loaded when it is called so that ``slam --help`` is instant."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+COMMANDS = {
+    "run": "offline pipeline: a bag to a map and a trajectory",
+    "nodes": "the same through the real ROS nodes: starts them, plays the bag, records",
+    "simulate": "render a scenario to a bag with ground truth",
+    "convert": "a public data set (EuRoC, KITTI, RGB-D) to a bag",
+    "play": "publish a bag's topics over ROS",
+    "record": "record ROS topics to a bag",
+    "register": "align two point clouds (pcd, ply, vtk)",
+    "join": "join text submaps of the Linear SLAM format",
+    "evaluate": "ATE, RPE and NEES of a trajectory against ground truth",
+    "calibrate": "camera_info with uncertainties from pictures of a board",
+}
+
+
+class SlamError(click.ClickException):
+    """Bad input or configuration: one clear line for the user, exit code 2."""
+
+    exit_code = 2
+
+
+class _LazyGroup(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"slam_bringup.commands.{cmd_name}")
+        command: click.Command = module.command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+def slam() -> None:
+    """Map indoor areas with a stereo camera and a time-of-flight camera."""
+
+
+def main() -> None:
+    """Entry point: a ``ValueError`` or ``OSError`` of any command becomes one clear line and exit code 2."""
+    try:
+        slam(prog_name="slam")
+    except (ValueError, OSError) as error:
+        click.echo(f"slam: {error}", err=True)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

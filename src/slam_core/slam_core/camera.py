@@ -1,0 +1,142 @@
+"""Camera models: pinhole with the ROS distortion models, and the rectified stereo rig.
+
+Pixels are (u, v), u to the right, v down, the centre of the top-left pixel at (0, 0). The optical frame is REP-103's:
+x right, y down, z forward. ``depth`` is along z (REP-118), ``range`` along the ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_core.geometry import FloatArray
+
+DISTORTION_MODELS = ("none", "plumb_bob", "rational_polynomial", "equidistant")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics and distortion of one camera.
+
+    ``distortion``: plumb_bob (k1 k2 p1 p2 k3), rational_polynomial (k1 k2 p1 p2 k3 k4 k5 k6), equidistant (k1 k2 k3 k4;
+    Kannala and Brandt 2006). A rectified camera has the model "none".
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion_model: str = "none"
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.width <= 0 or self.height <= 0:
+            raise ValueError(f"image size must be positive, got {self.width} x {self.height} px")
+        if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0 and self.fy > 0):
+            raise ValueError(f"focal lengths must be positive and finite, got {self.fx}, {self.fy} px: is the camera calibrated?")
+        if self.distortion_model not in DISTORTION_MODELS:
+            raise ValueError(f"unknown distortion model '{self.distortion_model}', known: {', '.join(DISTORTION_MODELS)}")
+        if not np.isfinite(self.distortion).all():
+            raise ValueError(f"distortion coefficients must be finite, got {self.distortion}")
+
+    @property
+    def K(self) -> FloatArray:
+        """Camera matrix, shape (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether straight lines stay straight: no distortion left."""
+        return self.distortion_model == "none" or not np.any(self.distortion)
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """Pixels (n, 2) of points (n, 3) in the optical frame; NaN for points at or behind the camera."""
+        points = np.asarray(points, dtype=np.float64)
+        z = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
+        return self.pixels_from_normalised(points[:, :2] / z[:, None])
+
+    def unproject(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
+        """Points (n, 3) in the optical frame of pixels (n, 2) at depth (n,) m along z."""
+        xy = self.normalised_from_pixels(pixels)
+        depth = np.asarray(depth, dtype=np.float64)
+        return np.column_stack([xy * depth[:, None], depth])
+
+    def pixels_from_normalised(self, xy: FloatArray) -> FloatArray:
+        """Distorted pixels (n, 2) of ideal image-plane coordinates x/z, y/z, shape (n, 2)."""
+        return self.distort(xy) * [self.fx, self.fy] + [self.cx, self.cy]
+
+    def normalised_from_pixels(self, pixels: FloatArray) -> FloatArray:
+        """Ideal image-plane coordinates x/z, y/z of distorted pixels, shape (n, 2): the exact inverse, by Newton."""
+        distorted = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        if self.is_rectified:
+            return np.asarray(distorted)
+        return self._undistort(distorted)
+
+    def distort(self, xy: FloatArray) -> FloatArray:
+        """Apply the distortion model to ideal image-plane coordinates, shape (n, 2)."""
+        xy = np.asarray(xy, dtype=np.float64)
+        if self.is_rectified:
+            return xy
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        if self.distortion_model == "equidistant":
+            k = np.zeros(4)
+            k[: len(self.distortion)] = self.distortion
+            r = np.sqrt(r2)
+            theta = np.arctan(r)
+            t2 = theta * theta
+            theta_d = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+            scale = np.where(r > 1e-12, theta_d / np.where(r > 1e-12, r, 1.0), 1.0)
+            return np.asarray(xy * scale[:, None])
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *([0.0] * 8))[:8]
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.column_stack([x * radial + dx, y * radial + dy])
+
+    def _undistort(self, distorted: FloatArray) -> FloatArray:
+        xy = distorted.copy()
+        if self.distortion_model == "equidistant":
+            theta_d = np.linalg.norm(distorted, axis=1)
+            theta = np.minimum(theta_d, 1.5)
+            xy = distorted * np.where(theta_d > 1e-12, np.tan(theta) / np.maximum(theta_d, 1e-12), 1.0)[:, None]
+        step = 1e-6
+        for _ in range(20):
+            residual = self.distort(xy) - distorted
+            if np.nanmax(np.abs(residual), initial=0.0) < 1e-11:
+                break
+            jx = (self.distort(xy + [step, 0]) - self.distort(xy - [step, 0])) / (2 * step)
+            jy = (self.distort(xy + [0, step]) - self.distort(xy - [0, step])) / (2 * step)
+            determinant = jx[:, 0] * jy[:, 1] - jx[:, 1] * jy[:, 0]
+            determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+            xy = xy - np.column_stack(
+                [
+                    (jy[:, 1] * residual[:, 0] - jy[:, 0] * residual[:, 1]) / determinant,
+                    (jx[:, 0] * residual[:, 1] - jx[:, 1] * residual[:, 0]) / determinant,
+                ]
+            )
+        return xy
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """A rectified stereo pair: one camera model for both images and the baseline (m, positive)."""
+
+    camera: Camera
+    baseline: float
+
+    def __post_init__(self) -> None:
+        if not self.camera.is_rectified:
+            raise ValueError("a StereoCamera is rectified: its camera must have no distortion")
+        if not self.baseline > 0.0:
+            raise ValueError(
+                f"stereo baseline must be positive, got {self.baseline} m: are left and right swapped? "
+                "The right camera_info must have P[0, 3] = -fx * baseline < 0"
+            )
+
+    def depth_from_disparity(self, disparity: FloatArray) -> FloatArray:
+        """Depth (m) of disparities (px), ``d = f b / (u_left - u_right)`` (Eq. 4.4)."""
+        return np.asarray(self.camera.fx * self.baseline / np.asarray(disparity))

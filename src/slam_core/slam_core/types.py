@@ -1,0 +1,178 @@
+"""The data that crosses package borders. Every array's shape, unit and frame stands here and nowhere else.
+
+All objects are immutable by convention: arrays are handed over, never changed afterwards. Times are header stamps in integer
+nanoseconds, the only time an estimator knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.camera import Camera, StereoCamera
+from slam_core.geometry import FloatArray
+
+Float32Array = npt.NDArray[np.float32]
+ByteArray = npt.NDArray[np.uint8]
+AnyArray = npt.NDArray[Any]
+
+
+class FeatureSource(IntEnum):
+    """Where a feature's depth came from; the values of the ``source`` field of the ``features`` topic."""
+
+    STEREO = 0
+    TOF = 1
+    FUSED = 2
+
+
+@dataclass(frozen=True, eq=False)
+class StereoImages:
+    """A rectified pair: ``left`` and ``right`` uint8, shape (height, width), of ``stereo``."""
+
+    stamp_ns: int
+    left: ByteArray
+    right: ByteArray
+    stereo: StereoCamera
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """A rectified depth image with its uncertainty.
+
+    depth: float32 (height, width), m along z, NaN where there is none. sigma: float32, standard deviation of depth, m, NaN
+    likewise. amplitude, intensity: float32 or None.
+    """
+
+    stamp_ns: int
+    depth: Float32Array
+    sigma: Float32Array
+    camera: Camera
+    amplitude: Float32Array | None = None
+    intensity: Float32Array | None = None
+
+    def points(self) -> Float32Array:
+        """Points (height, width, 3) float32 in the optical frame, NaN where there is no depth."""
+        c = self.camera
+        u = (np.arange(c.width, dtype=np.float32) - np.float32(c.cx)) / np.float32(c.fx)
+        v = (np.arange(c.height, dtype=np.float32) - np.float32(c.cy)) / np.float32(c.fy)
+        return np.stack([self.depth * u[None, :], self.depth * v[:, None], self.depth], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Features of one instant in one optical frame, as on the ``features`` topic; float32 so that a topic loses nothing.
+
+    xyz (n, 3) m in the optical frame ``frame_id``; uv (n, 2) px in the rectified image of ``camera``; depth (n,) m along z;
+    sigma_uv (n, 2) px; sigma_depth (n,) m; response (n,); source (n,) uint8, see :class:`FeatureSource`; descriptors
+    (n, d), unit norm, d = 128 for SURF-128 and SIFT.
+    """
+
+    stamp_ns: int
+    xyz: Float32Array
+    uv: Float32Array
+    depth: Float32Array
+    sigma_uv: Float32Array
+    sigma_depth: Float32Array
+    response: Float32Array
+    source: ByteArray
+    descriptors: Float32Array
+    camera: Camera
+    frame_id: str = "stereo_left_optical_frame"
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    def select(self, index: AnyArray) -> Features:
+        """The features at ``index`` (mask or indices)."""
+        return Features(
+            self.stamp_ns, self.xyz[index], self.uv[index], self.depth[index], self.sigma_uv[index],
+            self.sigma_depth[index], self.response[index], self.source[index], self.descriptors[index],
+            self.camera, self.frame_id,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """A pose ``T`` = T_parent_child (4, 4) at a stamp with covariance (6, 6), tangent order of ``slam_core.geometry``."""
+
+    stamp_ns: int
+    T: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeMotion:
+    """Motion of the rig between two stamps: ``T`` = T_rig(start)_rig(end), with covariance (6, 6)."""
+
+    start_stamp_ns: int
+    end_stamp_ns: int
+    T: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSample:
+    """One reading of an IMU: angular_velocity (3,) rad/s and linear_acceleration (3,) m/s2 (gravity included), rig frame."""
+
+    stamp_ns: int
+    angular_velocity: FloatArray
+    linear_acceleration: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """A local map as one joint Gaussian, in the frame of its own first rig pose, ``<agent>/submap_<index>``.
+
+    end_pose: T_start_end (4, 4), the rig pose at which the submap was closed. landmarks: (n, 3) m, in the start frame.
+    covariance: (6 + 3n, 6 + 3n) of (end pose error, landmarks), positive definite. landmark_ids: (n,) int64, unique within
+    the agent and kept when a landmark is carried into the next submap, so that equal ids of neighbours are a known
+    association (a hint, not proof). sightings: (n,) int32. descriptors: (n, d) float32, unit norm. path: the rig poses inside,
+    T_start_rig, each with the marginal covariance (6, 6) at that time; the first is identity, the last is ``end_pose``.
+    follows_previous: the start pose is the end pose of submap ``index - 1`` of the agent (odometry chains); False after the
+    rig was lost.
+    """
+
+    agent: str
+    index: int
+    start_stamp_ns: int
+    end_stamp_ns: int
+    end_pose: FloatArray
+    landmarks: FloatArray
+    covariance: FloatArray
+    landmark_ids: npt.NDArray[np.int64]
+    sightings: npt.NDArray[np.int32]
+    descriptors: Float32Array
+    path: tuple[PoseEstimate, ...]
+    follows_previous: bool = True
+
+    def __post_init__(self) -> None:
+        n = len(self.landmarks)
+        expected = {
+            "end_pose": (4, 4), "landmarks": (n, 3), "covariance": (6 + 3 * n, 6 + 3 * n), "landmark_ids": (n,),
+            "sightings": (n,),
+        }  # fmt: skip
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"submap {name} must have shape {shape}, got {getattr(self, name).shape}")
+        if len(self.descriptors) != n:
+            raise ValueError(f"submap has {n} landmarks but {len(self.descriptors)} descriptors")
+
+    @property
+    def frame_id(self) -> str:
+        """Name of the submap's frame."""
+        return f"{self.agent}/submap_{self.index}" if self.agent else f"submap_{self.index}"
+
+
+@dataclass
+class Counters:
+    """Named counts of what was accepted and rejected; a rejection is counted, never silent."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def add(self, name: str, amount: int = 1) -> None:
+        """Count ``amount`` more of ``name``."""
+        self.counts[name] = self.counts.get(name, 0) + amount

@@ -1,0 +1,28 @@
+"""Build of stereo_frontend (ament_python)."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "stereo_frontend"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(),
+    package_data={"": ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="Indoor SLAM maintainers",
+    maintainer_email="maintainers@indoor-slam.org",
+    description="Stereo camera driver, feature extraction (SURF-128, SIFT and others), stereo matching and depth fusion.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "stereo_driver = stereo_frontend.driver_node:main",
+            "feature_extractor = stereo_frontend.node:main",
+        ]
+    },
+)

@@ -1,0 +1,1 @@
+"""Stereo camera driver, feature extraction (SURF-128, SIFT and others), stereo matching and depth fusion."""

@@ -1,0 +1,1 @@
+"""Time-of-flight camera driver: range images to rectified depth with per-pixel uncertainty."""

@@ -1,0 +1,25 @@
+"""Shared fixtures: the public data sets (skipped with a reason where absent) and seeded random numbers."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder of the public data sets: $INDOOR_SLAM_DATA or ../shared/data beside the checkout."""
+    path = Path(os.environ.get("INDOOR_SLAM_DATA", ROOT.parent / "shared" / "data"))
+    if not path.is_dir():
+        pytest.skip(f"no public data sets at {path} (set INDOOR_SLAM_DATA)")
+    return path
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(12345)
