@@ -6,7 +6,7 @@ x right, y down, z forward. ``depth`` is along z (REP-118), ``range`` along the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -119,6 +119,50 @@ class Camera:
                 ]
             )
         return xy
+
+
+@dataclass(frozen=True, eq=False)
+class CameraInfo:
+    """What a sensor_msgs/CameraInfo says of one camera, without ROS.
+
+    camera: intrinsics K and distortion D of the *raw* image. R: (3, 3) rotation from the raw to the rectified optical
+    frame. P: (3, 4) projection of the rectified image; ``P[0, 3] = -fx * baseline`` for the right camera of a pair, zero
+    for the left one. A P of zeros (drivers that never rectify) means the raw K.
+    """
+
+    camera: Camera
+    R: FloatArray = field(default_factory=lambda: np.eye(3))
+    P: FloatArray = field(default_factory=lambda: np.zeros((3, 4)))
+
+    def __post_init__(self) -> None:
+        R, P = np.asarray(self.R, dtype=np.float64), np.asarray(self.P, dtype=np.float64)
+        if R.shape != (3, 3) or P.shape != (3, 4) or not (np.isfinite(R).all() and np.isfinite(P).all()):
+            raise ValueError(f"camera info needs a finite R (3, 3) and P (3, 4), got shapes {R.shape} and {P.shape}")
+        if not P[:, :3].any():
+            P = np.column_stack([self.camera.K, P[:, 3]])
+        if not R.any():
+            R = np.eye(3)
+        if np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
+            raise ValueError(f"camera info has an R that is no rotation: {R.tolist()}")
+        object.__setattr__(self, "R", R)
+        object.__setattr__(self, "P", P)
+
+    @property
+    def rectified(self) -> Camera:
+        """The camera of the rectified image: P without distortion, same size."""
+        P, c = self.P, self.camera
+        return Camera(c.width, c.height, float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]))
+
+    @property
+    def baseline(self) -> float:
+        """Distance (m) to the left camera of the pair, ``-P[0, 3] / P[0, 0]``: zero for the left camera itself."""
+        return float(-self.P[0, 3] / self.P[0, 0])
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether the raw image already is the rectified one: no distortion, no rotation, K equal to P."""
+        same = np.allclose(self.P[:, :3], self.camera.K, atol=1e-6) and np.allclose(self.R, np.eye(3), atol=1e-9)
+        return bool(self.camera.is_rectified and same)
 
 
 @dataclass(frozen=True)
