@@ -41,7 +41,7 @@ def so3_exp(phi: FloatArray) -> FloatArray:
     a = np.where(small, 1.0 - angle**2 / 6.0, np.sin(safe) / safe)
     b = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
     K = skew(phi)
-    return np.eye(3) + a * K + b * (K @ K)
+    return np.asarray(np.eye(3) + a * K + b * (K @ K))
 
 
 def so3_log(rotation: FloatArray) -> FloatArray:
@@ -63,7 +63,7 @@ def so3_left_jacobian(phi: FloatArray) -> FloatArray:
     a = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
     b = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
     K = skew(phi)
-    return np.eye(3) + a * K + b * (K @ K)
+    return np.asarray(np.eye(3) + a * K + b * (K @ K))
 
 
 def so3_left_jacobian_inverse(phi: FloatArray) -> FloatArray:
@@ -75,7 +75,7 @@ def so3_left_jacobian_inverse(phi: FloatArray) -> FloatArray:
     half = 0.5 * safe
     b = np.where(small, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - half / np.tan(half)) / safe**2)
     K = skew(phi)
-    return np.eye(3) - 0.5 * K + b * (K @ K)
+    return np.asarray(np.eye(3) - 0.5 * K + b * (K @ K))
 
 
 def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:

@@ -1,0 +1,83 @@
+"""``slam evaluate``: ATE, RPE and NEES of a trajectory against ground truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from slam_core.evaluation import ALIGNMENTS, ErrorStatistics, Evaluation, evaluate
+from slam_core.files import atomic_text
+from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajectory
+
+
+@click.command()
+@click.argument("estimate", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("ground_truth", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option(
+    "--align", "alignment", type=click.Choice(ALIGNMENTS), default="se3", show_default=True, help="frame alignment"
+)
+@click.option(
+    "--delta", type=click.IntRange(1), default=1, show_default=True, help="frames between the poses of the RPE"
+)
+@click.option("--max-difference", default=0.01, show_default=True, help="largest difference of stamps [s]")
+@click.option("--interpolate", is_flag=True, help="interpolate ground truth between its poses")
+@click.option(
+    "--covariance",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="covariances of the estimate; found by itself beside a trajectory.tum",
+)
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="write the figures as JSON")
+def command(
+    estimate: Path, ground_truth: Path, alignment: str, delta: int, max_difference: float, interpolate: bool,
+    covariance: Path | None, output: Path | None,
+) -> None:  # fmt: skip
+    """ATE, RPE and NEES of the trajectory ESTIMATE against GROUND_TRUTH (TUM, KITTI or EuRoC files)."""
+    result = evaluate(
+        _with_covariances(
+            read_trajectory(estimate), covariance or estimate.with_name(f"{estimate.stem}_covariance.csv")
+        ),
+        read_trajectory(ground_truth),
+        alignment=alignment,
+        delta=delta,
+        max_difference_s=max_difference,
+        interpolate=interpolate,
+    )
+    Console().print(evaluation_table(result))
+    if output is not None:
+        atomic_text(output, json.dumps(asdict(result), indent=2) + "\n")
+
+
+def _with_covariances(trajectory: Trajectory, path: Path) -> Trajectory:
+    if not path.is_file():
+        return trajectory
+    stamps, covariances = read_covariance_csv(path)
+    if not np.array_equal(stamps, trajectory.stamps_ns):
+        raise ValueError(f"{path} does not have the stamps of the trajectory")
+    return Trajectory(trajectory.stamps_ns, trajectory.poses, covariances)
+
+
+def evaluation_table(result: Evaluation) -> Table:
+    """The figures as a table for the console."""
+    table = Table(title=f"{result.ate.count} poses over {result.truth_length_m:.2f} m")
+    for heading in ("error", "rmse", "mean", "median", "max"):
+        table.add_column(heading, justify="left" if heading == "error" else "right")
+    rows: list[tuple[str, ErrorStatistics]] = [
+        ("ATE m", result.ate),
+        ("ATE deg", result.ate_rotation_deg),
+        ("RPE m", result.rpe),
+        ("RPE deg", result.rpe_rotation_deg),
+    ]
+    for name, s in rows:
+        table.add_row(name, *(f"{v:.5f}" for v in (s.rmse, s.mean, s.median, s.max)))
+    table.add_row("end error m", f"{result.end_error_m:.5f}", "", "", f"{result.drift_percent:.2f} %")
+    if result.anees is not None:
+        table.add_row(
+            "ANEES", f"{result.anees:.2f}", "", "", f"95 % in {result.anees_low:.2f}..{result.anees_high:.2f}"
+        )
+    return table

@@ -1,0 +1,193 @@
+"""How good is a trajectory, and does its covariance tell the truth: ATE, RPE, drift and NEES.
+
+ATE and RPE follow Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), as evo computes
+them; NEES and its chi-square bounds follow Bar-Shalom, Li and Kirubarajan (2001), section 5.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from slam_core.geometry import FloatArray, boxminus, invert_transform, so3_log
+from slam_core.rigid_alignment import umeyama
+from slam_core.trajectory import Trajectory
+
+ALIGNMENTS = ("se3", "origin", "none")
+
+
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Root mean square, mean, median, standard deviation, smallest and largest of a set of errors, and how many."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+    count: int
+
+    @classmethod
+    def of(cls, errors: FloatArray) -> ErrorStatistics:
+        """Statistics of errors (n,), n >= 1."""
+        if len(errors) == 0:
+            raise ValueError("no errors to summarise: estimate and ground truth share no stamps")
+        return cls(
+            float(np.sqrt(np.mean(np.square(errors)))), float(np.mean(errors)), float(np.median(errors)),
+            float(np.std(errors)), float(np.min(errors)), float(np.max(errors)), len(errors),
+        )  # fmt: skip
+
+
+def associate(
+    estimate: Trajectory, truth: Trajectory, max_difference_s: float = 0.01, interpolate: bool = False
+) -> tuple[Trajectory, FloatArray]:
+    """The estimates that ground truth covers, and the true poses (n, 4, 4) that belong to them.
+
+    A pose belongs to the nearest true one in time, at most ``max_difference_s`` away; with ``interpolate`` the truth is
+    interpolated between its two neighbours where these are that far apart at most.
+
+    Raises
+    ------
+    ValueError
+        If fewer than two poses can be compared; the message gives both time spans.
+    """
+    stamps, limit = estimate.stamps_ns, int(max_difference_s * 1e9)
+    after = np.clip(np.searchsorted(truth.stamps_ns, stamps), 1, max(len(truth) - 1, 1)) if len(truth) > 1 else None
+    if after is None:
+        nearest = np.zeros(len(stamps), dtype=np.intp)
+    else:
+        closer = np.abs(truth.stamps_ns[after] - stamps) < np.abs(truth.stamps_ns[after - 1] - stamps)
+        nearest = np.where(closer, after, after - 1)
+    supported = np.abs(truth.stamps_ns[nearest] - stamps) <= limit
+    if interpolate and after is not None:
+        inside = (stamps >= truth.stamps_ns[after - 1]) & (stamps <= truth.stamps_ns[after])
+        supported |= inside & (truth.stamps_ns[after] - truth.stamps_ns[after - 1] <= limit)
+    if supported.sum() < 2:
+        spans = [f"{t.stamps_ns[0] / 1e9:.3f} to {t.stamps_ns[-1] / 1e9:.3f} s" for t in (estimate, truth) if len(t)]
+        raise ValueError(
+            f"estimate and ground truth ({' and '.join(spans)}) have fewer than two poses within {max_difference_s} s"
+        )
+    poses = truth.interpolate(stamps[supported]) if interpolate else truth.poses[nearest[supported]]
+    return estimate.select(supported), poses
+
+
+def align(estimate: FloatArray, truth: FloatArray, alignment: str = "se3") -> FloatArray:
+    """Estimated poses (n, 4, 4) moved into the frame of the true ones.
+
+    "se3": the least-squares rigid transform of the positions (what evo's ``--align`` does); "origin": so that the first
+    poses agree; "none": unchanged.
+    """
+    if alignment == "se3":
+        if len(estimate) < 3:
+            return align(estimate, truth, "origin")
+        return np.asarray(umeyama(estimate[:, :3, 3], truth[:, :3, 3]) @ estimate)
+    if alignment == "origin":
+        return np.asarray(truth[0] @ invert_transform(estimate[0]) @ estimate)
+    if alignment == "none":
+        return estimate
+    raise ValueError(f"alignment must be one of {', '.join(ALIGNMENTS)}, got '{alignment}'")
+
+
+def absolute_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances (m) and angles (rad), each (n,), between poses (n, 4, 4) of a common frame."""
+    d = boxminus(estimate, truth)
+    return np.linalg.norm(d[:, :3], axis=1), np.linalg.norm(d[:, 3:], axis=1)
+
+
+def relative_errors(estimate: FloatArray, truth: FloatArray, delta: int = 1) -> tuple[FloatArray, FloatArray]:
+    """RPE over ``delta`` frames, ``(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)``: translations m, angles rad, each (n - delta,)."""
+    if not 1 <= delta < len(estimate):
+        raise ValueError(f"delta must be between 1 and {len(estimate) - 1} frames, got {delta}")
+    moved = invert_transform(estimate[:-delta]) @ estimate[delta:]
+    truly = invert_transform(truth[:-delta]) @ truth[delta:]
+    error = invert_transform(truly) @ moved
+    return np.linalg.norm(error[:, :3, 3], axis=1), np.linalg.norm(so3_log(error[:, :3, :3]), axis=1)
+
+
+def end_error(estimate: FloatArray, truth: FloatArray) -> float:
+    """Distance (m) of the last pose from the truth when the first poses agree."""
+    return float(absolute_errors(align(estimate, truth, "origin")[-1:], truth[-1:])[0][0])
+
+
+def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Normalised estimation error squared ``e' P^-1 e``; error (..., d), covariance (..., d, d)."""
+    return np.asarray(np.einsum("...i,...i->...", error, np.linalg.solve(covariance, error[..., None])[..., 0]))
+
+
+def pose_nees(estimate: Trajectory, truth: FloatArray) -> FloatArray:
+    """NEES (m,) of the poses whose covariance is positive definite, with the first poses made to agree.
+
+    The frame of a SLAM map is its first pose, known exactly, so the comparison aligns there and nowhere else.
+    """
+    if estimate.covariances is None:
+        raise ValueError("NEES needs covariances")
+    in_map = estimate.poses[0] @ invert_transform(truth[0]) @ truth
+    usable = np.linalg.eigvalsh(estimate.covariances)[:, 0] > 1e-14
+    usable[0] = False
+    return nees(boxminus(in_map[usable], estimate.poses[usable]), estimate.covariances[usable])
+
+
+def anees_bounds(dimension: int, samples: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Interval in which the average NEES per dimension of ``samples`` independent errors lies with this confidence."""
+    if dimension < 1 or samples < 1:
+        raise ValueError(f"dimension and samples must be positive, got {dimension} and {samples}")
+    freedom = dimension * samples
+    tail = (1.0 - confidence) / 2.0
+    return float(chi2.ppf(tail, freedom) / freedom), float(chi2.ppf(1.0 - tail, freedom) / freedom)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All figures of one trajectory against ground truth; m and deg. ``anees`` is None without covariances."""
+
+    ate: ErrorStatistics
+    ate_rotation_deg: ErrorStatistics
+    rpe: ErrorStatistics
+    rpe_rotation_deg: ErrorStatistics
+    end_error_m: float
+    drift_percent: float
+    truth_length_m: float
+    anees: float | None
+    anees_low: float | None
+    anees_high: float | None
+
+
+def evaluate(
+    estimate: Trajectory,
+    truth: Trajectory,
+    *,
+    alignment: str = "se3",
+    delta: int = 1,
+    max_difference_s: float = 0.01,
+    interpolate: bool = False,
+) -> Evaluation:
+    """Compare a trajectory with ground truth.
+
+    ``drift_percent`` is the end error relative to the true path length. The ANEES bounds assume independent poses,
+    which those of one run are not: over one run it is an indication, over many runs a test.
+    """
+    matched, true_poses = associate(estimate, truth, max_difference_s, interpolate)
+    aligned = align(matched.poses, true_poses, alignment)
+    distance, angle = absolute_errors(aligned, true_poses)
+    step, turn = relative_errors(matched.poses, true_poses, min(delta, len(matched) - 1))
+    length = Trajectory(matched.stamps_ns, true_poses).length_m
+    end = end_error(matched.poses, true_poses)
+    values = None if matched.covariances is None else pose_nees(matched, true_poses)
+    anees = low = high = None
+    if values is not None and len(values):
+        anees, (low, high) = float(np.mean(values) / 6.0), anees_bounds(6, len(values))
+    return Evaluation(
+        ate=ErrorStatistics.of(distance),
+        ate_rotation_deg=ErrorStatistics.of(np.rad2deg(angle)),
+        rpe=ErrorStatistics.of(step),
+        rpe_rotation_deg=ErrorStatistics.of(np.rad2deg(turn)),
+        end_error_m=end,
+        drift_percent=100.0 * end / length if length > 0 else 0.0,
+        truth_length_m=length,
+        anees=anees,
+        anees_low=low,
+        anees_high=high,
+    )
