@@ -1,0 +1,184 @@
+"""From what a range camera measures to a rectified depth image that knows how good each pixel is.
+
+    metres -> judge each pixel -> sigma -> reject flying pixels -> depth along z -> rectify
+
+Works the same for time-of-flight cameras (range along the ray, amplitude) and for any depth camera topic (depth along z, no
+amplitude): only :class:`DepthConfig` differs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_core.camera import Camera
+from slam_core.config import Config, group, parameter
+from slam_core.types import AnyArray, ByteArray, Counters, DepthImage, Float32Array
+from tof_driver.mask import MaskConfig, Reason, judge_pixels, reject_flying_pixels
+from tof_driver.noise import NoiseConfig, range_sigma
+from tof_driver.resample import RectificationMap
+
+MILLIMETRES_INVALID = 65535
+
+
+@dataclass(frozen=True)
+class DepthConfig(Config):
+    """Configuration of a range or depth camera."""
+
+    measurement: str = parameter(
+        "range",
+        "what a pixel of the input holds: range along its ray, or depth along z (REP-118)",
+        choices=("range", "depth"),
+    )
+    noise: NoiseConfig = group(NoiseConfig)
+    mask: MaskConfig = group(MaskConfig)
+
+
+class DepthProcessor:
+    """Turns the images of one range camera into :class:`DepthImage` objects.
+
+    Parameters
+    ----------
+    config
+        What the input holds, noise model and limits.
+    camera
+        Intrinsics and lens distortion of the raw images. The output is the pinhole camera with the same camera matrix
+        (:attr:`output_camera`); a camera without distortion is passed through without resampling.
+
+    Attributes
+    ----------
+    counters
+        ``images``, raw pixels by :class:`Reason` and ``output_pixels`` (rectified pixels with depth) since the start.
+    """
+
+    def __init__(self, config: DepthConfig, camera: Camera) -> None:
+        self.config = config
+        self.camera = camera
+        self.counters = Counters()
+        self._rectification = None if camera.is_rectified else RectificationMap.of(camera)
+        self._ray_length = _ray_length(camera)
+        self._pixel_angle = 1.0 / min(camera.fx, camera.fy)
+
+    @property
+    def output_camera(self) -> Camera:
+        """Camera of the depth images that :meth:`process` returns."""
+        return self.camera if self._rectification is None else self._rectification.camera
+
+    def process(
+        self, stamp_ns: int, image: AnyArray, amplitude: AnyArray | None = None, intensity: AnyArray | None = None
+    ) -> DepthImage:
+        """Rectified depth with sigma of one measurement.
+
+        Parameters
+        ----------
+        image
+            Range or depth, shape (height, width): uint16 in mm (0 and 65535: no reading) or float in m (NaN, infinite,
+            zero or negative: no reading).
+        amplitude, intensity
+            Same shape, any real type, or None where the camera has none.
+
+        Raises
+        ------
+        ValueError
+            For a shape that is not the camera's, or a type that is neither uint16 nor floating.
+        """
+        measured = self._metres(image)
+        amplitude = self._picture("amplitude", amplitude)
+        intensity = self._picture("intensity", intensity)
+        distance = measured * self._ray_length if self.config.measurement == "depth" else measured
+        reason, sigma = self._believable(distance, amplitude)
+        depth, sigma = self._along_z(distance, sigma, reason)
+        depth, sigma = self._rectified(depth, sigma, reason)
+        self._count(reason, depth)
+        return DepthImage(
+            stamp_ns,
+            depth,
+            sigma,
+            self.output_camera,
+            self._rectified_picture(amplitude),
+            self._rectified_picture(normalise(intensity)),
+        )
+
+    def _metres(self, image: AnyArray) -> Float32Array:
+        self._check_shape("image", image)
+        if image.dtype == np.uint16:
+            metres = image.astype(np.float32) * np.float32(0.001)
+            metres[image == MILLIMETRES_INVALID] = np.nan
+            return metres
+        if not np.issubdtype(image.dtype, np.floating):
+            raise ValueError(f"range image must be uint16 (mm) or float (m), got {image.dtype}")
+        return image.astype(np.float32)
+
+    def _picture(self, name: str, image: AnyArray | None) -> Float32Array | None:
+        if image is None:
+            return None
+        self._check_shape(name, image)
+        return image.astype(np.float32)
+
+    def _check_shape(self, name: str, image: AnyArray) -> None:
+        expected = (self.camera.height, self.camera.width)
+        if image.shape != expected:
+            raise ValueError(
+                f"{name} must have shape {expected} (rows, columns) like its camera_info, got {image.shape}"
+            )
+
+    def _believable(self, distance: Float32Array, amplitude: Float32Array | None) -> tuple[ByteArray, Float32Array]:
+        noise, mask = self.config.noise, self.config.mask
+        white_amplitude = noise.reference_amplitude * noise.reference_range**2
+        reason = judge_pixels(mask, distance, amplitude, white_amplitude)
+        if noise.model == "quadratic":
+            sigma = range_sigma(noise, distance / self._ray_length, None) * self._ray_length
+        else:
+            sigma = range_sigma(noise, distance, amplitude)
+        if mask.flying_pixels:
+            reject_flying_pixels(mask, distance, sigma, reason, self._pixel_angle)
+        return reason, sigma
+
+    def _along_z(
+        self, distance: Float32Array, sigma: Float32Array, reason: ByteArray
+    ) -> tuple[Float32Array, Float32Array]:
+        masked = reason != Reason.VALID
+        depth, sigma = distance / self._ray_length, sigma / self._ray_length
+        depth[masked] = np.nan
+        sigma[masked] = np.nan
+        return depth, sigma
+
+    def _rectified(
+        self, depth: Float32Array, sigma: Float32Array, reason: ByteArray
+    ) -> tuple[Float32Array, Float32Array]:
+        if self._rectification is None:
+            return depth, sigma
+        mask = self.config.mask
+        slope = self._pixel_angle * np.tan(np.radians(mask.maximum_incidence_deg))
+        return self._rectification.depth(depth, sigma, slope, mask.noise_multiple)
+
+    def _rectified_picture(self, image: Float32Array | None) -> Float32Array | None:
+        return image if image is None or self._rectification is None else self._rectification.image(image)
+
+    def _count(self, reason: ByteArray, depth: Float32Array) -> None:
+        self.counters.add("images")
+        self.counters.add("output_pixels", int(np.isfinite(depth).sum()))
+        for value, amount in enumerate(np.bincount(reason.ravel(), minlength=len(Reason))):
+            if amount:
+                self.counters.add(Reason(value).name.lower(), int(amount))
+
+
+def normalise(intensity: Float32Array | None) -> Float32Array | None:
+    """``(I - min) / (max - min)`` (Eq. 3.3), in [0, 1]; zero for a constant image and where the input is not finite."""
+    if intensity is None:
+        return None
+    finite = np.isfinite(intensity)
+    if not finite.any():
+        return np.zeros_like(intensity)
+    low, high = intensity[finite].min(), intensity[finite].max()
+    scaled = (intensity - low) / max(high - low, np.float32(1e-12))
+    return np.where(finite, scaled, np.float32(0.0)).astype(np.float32)
+
+
+def _ray_length(camera: Camera) -> Float32Array:
+    """Range over depth of each raw pixel, |(x/z, y/z, 1)|, shape (height, width)."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    xy = camera.normalised_from_pixels(np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
+    length = np.sqrt(1.0 + np.square(xy).sum(axis=1))
+    return length.reshape(camera.height, camera.width).astype(np.float32)

@@ -1,0 +1,61 @@
+"""Standard deviation of a range measurement from what the sensor tells with it.
+
+Time of flight (continuous-wave modulation): the phase noise is inversely proportional to the amplitude of the returned
+light (Lange and Seitz 2001), which itself falls with the square of the range. Structured light and active stereo:
+the disparity noise is constant, so the depth noise grows with the square of depth (Khoshelham and Elberink 2012).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_core.config import Config, parameter
+from slam_core.types import Float32Array
+
+
+@dataclass(frozen=True)
+class NoiseConfig(Config):
+    """Noise model of a depth camera; the defaults are the CamCube's (thesis 2.2: below 3 mm at 2 m)."""
+
+    model: str = parameter(
+        "amplitude",
+        "amplitude: time of flight, sigma from amplitude (from range squared where there is no amplitude image); "
+        "quadratic: structured light or stereo, sigma = constant + quadratic * depth^2",
+        choices=("amplitude", "quadratic"),
+    )
+    reference_range: float = parameter(
+        2.0, "range at which reference_sigma and reference_amplitude hold", unit="m", minimum=0.1
+    )
+    reference_sigma: float = parameter(0.003, "standard deviation at the reference", unit="m", minimum=1e-5)
+    reference_amplitude: float = parameter(
+        1000.0, "amplitude of a white wall, seen straight on, at the reference range", unit="digits", minimum=1e-6
+    )
+    floor: float = parameter(0.0005, "part of sigma that no amplitude removes", unit="m", minimum=0.0)
+    constant: float = parameter(0.0012, "model quadratic: sigma at depth zero", unit="m", minimum=0.0)
+    quadratic: float = parameter(
+        0.001425,
+        "model quadratic: growth with depth squared (Kinect: Khoshelham and Elberink 2012)",
+        unit="1/m",
+        minimum=0.0,
+    )
+
+
+def range_sigma(config: NoiseConfig, distance: Float32Array, amplitude: Float32Array | None) -> Float32Array:
+    """Standard deviation (m) of each range; any shape.
+
+    Parameters
+    ----------
+    distance
+        Range along the ray (model amplitude) or depth along z (model quadratic), m; NaN passes through.
+    amplitude
+        Same shape, sensor digits; None where the sensor has none.
+    """
+    if config.model == "quadratic":
+        return np.asarray(config.constant + config.quadratic * distance * distance, dtype=np.float32)
+    if amplitude is None:
+        relative = np.square(distance / np.float32(config.reference_range))
+    else:
+        relative = np.float32(config.reference_amplitude) / np.maximum(amplitude, np.float32(1e-6))
+    return np.asarray(np.hypot(config.floor, config.reference_sigma * relative), dtype=np.float32)
