@@ -2,8 +2,8 @@
 
     metres -> judge each pixel -> sigma -> reject flying pixels -> depth along z -> rectify
 
-Works the same for time-of-flight cameras (range along the ray, amplitude) and for any depth camera topic (depth along z, no
-amplitude): only :class:`DepthConfig` differs.
+Works the same for time-of-flight cameras (range along the ray, amplitude) and for any depth camera topic (depth
+along z, no amplitude): only :class:`DepthConfig` differs.
 """
 
 from __future__ import annotations
@@ -72,6 +72,8 @@ class DepthProcessor:
 
         Parameters
         ----------
+        stamp_ns
+            Header stamp, handed through.
         image
             Range or depth, shape (height, width): uint16 in mm (0 and 65535: no reading) or float in m (NaN, infinite,
             zero or negative: no reading).
@@ -181,4 +183,4 @@ def _ray_length(camera: Camera) -> Float32Array:
     v, u = np.mgrid[: camera.height, : camera.width]
     xy = camera.normalised_from_pixels(np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
     length = np.sqrt(1.0 + np.square(xy).sum(axis=1))
-    return length.reshape(camera.height, camera.width).astype(np.float32)
+    return np.asarray(length.reshape(camera.height, camera.width), dtype=np.float32)

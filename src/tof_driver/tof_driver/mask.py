@@ -1,7 +1,7 @@
 """Which range pixels can be believed, and the reason for each one that cannot.
 
-A pixel is judged alone first (no reading, too dark, saturated, out of range, wrapped round the ambiguity range), then among
-its neighbours: a pixel at a depth edge mixes the light of foreground and background and flies between them.
+A pixel is judged alone first (no reading, too dark, saturated, out of range, wrapped round the ambiguity range), then
+among its neighbours: a pixel at a depth edge mixes the light of foreground and background and flies between them.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class MaskConfig(Config):
     )
     minimum_reflectivity: float = parameter(
         0.02,
-        "apparent reflectivity (amplitude x range^2, white wall = 1) below which a range is taken to have wrapped round the "
-        "ambiguity range; 0 switches the test off",
+        "apparent reflectivity (amplitude x range^2, white wall = 1) below which a range is taken to have wrapped "
+        "round the ambiguity range; 0 switches the test off",
         minimum=0.0,
         maximum=1.0,
     )
@@ -62,6 +62,8 @@ def judge_pixels(
 
     Parameters
     ----------
+    config
+        Limits of range, amplitude and apparent reflectivity.
     distance
         Range along the ray, m; NaN, infinite or not positive where the sensor has no reading.
     amplitude
@@ -96,6 +98,8 @@ def reject_flying_pixels(
 
     Parameters
     ----------
+    config
+        Steepest surface, noise multiple and number of neighbours.
     distance, sigma, reason
         Range and its standard deviation (m) and reasons so far, shape (height, width).
     pixel_angle
@@ -111,12 +115,31 @@ def reject_flying_pixels(
 @njit(cache=True, nogil=True)
 def _flying(distance, sigma, reason, slope, noise_multiple, minimum_neighbours):  # type: ignore[no-untyped-def]
     height, width = distance.shape
+    suspect = _suspects(distance, sigma, reason, slope, noise_multiple)
     flying = np.zeros((height, width), dtype=np.bool_)
     for v in range(height):
         for u in range(width):
-            if reason[v, u] == 0:
+            if suspect[v, u] and reason[v, u] == 0:
                 flying[v, u] = _pixel_flies(distance, sigma, reason, v, u, slope, noise_multiple, minimum_neighbours)
     return flying
+
+
+@njit(cache=True, nogil=True)
+def _suspects(distance, sigma, reason, slope, noise_multiple):  # type: ignore[no-untyped-def]
+    """Pixels not surely on one surface with all eight neighbours: few, and the only ones worth the full test."""
+    height, width = distance.shape
+    suspect = np.ones((height, width), dtype=np.bool_)
+    shrink = np.float32(1.0) / (np.float32(1.0) + slope)
+    for v in range(1, height - 1):
+        for u in range(1, width - 1):
+            r = distance[v, u]
+            limit = (slope * r + noise_multiple * sigma[v, u]) * shrink
+            smooth = True
+            for dv in range(-1, 2):
+                for du in range(-1, 2):
+                    smooth &= (abs(distance[v + dv, u + du] - r) <= limit) & (reason[v + dv, u + du] == 0)
+            suspect[v, u] = not smooth
+    return suspect
 
 
 @njit(cache=True, nogil=True)

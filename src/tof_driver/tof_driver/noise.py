@@ -47,6 +47,8 @@ def range_sigma(config: NoiseConfig, distance: Float32Array, amplitude: Float32A
 
     Parameters
     ----------
+    config
+        Noise model.
     distance
         Range along the ray (model amplitude) or depth along z (model quadratic), m; NaN passes through.
     amplitude

@@ -1,8 +1,8 @@
 """From the distorted pixel grid of a lens to the pinhole grid of the same camera without distortion.
 
-Depth is interpolated as inverse depth, which is linear over the image of a plane, and only within one surface: the four
-pixels around an ideal position must agree, one of them may be missing (the plane through the others replaces it), otherwise
-the output has no depth there. Foreground and background are never mixed.
+Depth is interpolated as inverse depth, which is linear over the image of a plane, and only within one surface: the
+four pixels around an ideal position must agree, one of them may be missing (the plane through the others replaces it),
+otherwise the output has no depth there. Foreground and background are never mixed.
 """
 
 from __future__ import annotations
@@ -45,61 +45,60 @@ class RectificationMap:
 
         Parameters
         ----------
+        depth, sigma
+            Distorted images, shape (height, width), m, NaN where there is no depth.
         slope
             Change of depth per pixel, relative to depth, of the steepest believable surface.
         noise_multiple
             Difference of neighbours explained by noise, in standard deviations.
         """
-        result: tuple[Float32Array, Float32Array] = _resample(
-            depth, sigma, self.u, self.v, np.float32(slope), np.float32(noise_multiple)
+        with np.errstate(divide="ignore"):
+            inverse = np.float32(1.0) / depth
+        inverse_sigma = sigma * np.square(inverse)
+        out, out_sigma = _resample(
+            inverse, inverse_sigma, self.u, self.v, np.float32(2.0 * slope), np.float32(1.5 * noise_multiple)
         )
-        return result
+        return 1.0 / out, out_sigma / np.square(out)
 
 
 @njit(cache=True, nogil=True)
-def _resample(depth, sigma, map_u, map_v, slope, noise_multiple):  # type: ignore[no-untyped-def]
-    height, width = depth.shape
+def _resample(q, s, map_u, map_v, slope, noise_multiple):  # type: ignore[no-untyped-def]
+    """Interpolated ``q`` with standard deviation ``s`` where the four corners are one surface, else NaN."""
+    height, width = q.shape
     out = np.full(map_u.shape, np.nan, dtype=np.float32)
     out_sigma = np.full(map_u.shape, np.nan, dtype=np.float32)
+    margin, one = np.float32(0.001), np.float32(1.0)
     for i in range(map_u.shape[0]):
         for j in range(map_u.shape[1]):
             u, v = map_u[i, j], map_v[i, j]
-            if not (-0.001 <= u <= width - 0.999 and -0.001 <= v <= height - 0.999):
+            if not (-margin <= u <= width - 1 + margin and -margin <= v <= height - 1 + margin):
                 continue
-            u0, v0 = min(max(int(u), 0), width - 2), min(max(int(v), 0), height - 2)
-            window = depth[v0 : v0 + 2, u0 : u0 + 2]
-            window_sigma = sigma[v0 : v0 + 2, u0 : u0 + 2]
-            out[i, j], out_sigma[i, j] = _interpolate(window, window_sigma, u - u0, v - v0, slope, noise_multiple)
+            m, n = min(max(int(v), 0), height - 2), min(max(int(u), 0), width - 2)
+            a, b = u - np.float32(n), v - np.float32(m)
+            q4 = (q[m, n], q[m, n + 1], q[m + 1, n], q[m + 1, n + 1])
+            s4 = (s[m, n], s[m, n + 1], s[m + 1, n], s[m + 1, n + 1])
+            w4 = ((one - a) * (one - b), a * (one - b), (one - a) * b, a * b)
+            if np.isnan(q4[0] + q4[1] + q4[2] + q4[3]):
+                q4, s4, w4 = _without_missing_corner(q4, s4, w4)
+            low, high = min(q4), max(q4)
+            if high - low <= slope * low + noise_multiple * max(s4):
+                out[i, j] = w4[0] * q4[0] + w4[1] * q4[1] + w4[2] * q4[2] + w4[3] * q4[3]
+                variance = (w4[0] * s4[0]) ** 2 + (w4[1] * s4[1]) ** 2 + (w4[2] * s4[2]) ** 2 + (w4[3] * s4[3]) ** 2
+                out_sigma[i, j] = np.sqrt(variance)
     return out, out_sigma
 
 
 @njit(cache=True, nogil=True)
-def _interpolate(z, s, a, b, slope, noise_multiple):  # type: ignore[no-untyped-def]
-    """Depth and sigma at (a, b) inside a 2x2 window of one surface; NaN if it is not one."""
-    w00, w01, w10, w11 = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
-    missing = 0
-    low, high, noise = np.inf, 0.0, 0.0
-    for k in range(4):
-        value = z[k // 2, k % 2]
-        if np.isfinite(value):
-            low, high, noise = min(low, value), max(high, value), max(noise, s[k // 2, k % 2])
-        else:
-            missing += 1
-    if missing > 1 or high - low > 2.0 * slope * low + 1.5 * noise_multiple * noise:
-        return np.nan, np.nan
-    # A missing corner is the plane through the other three: its weight goes +, +, - to them.
-    if not np.isfinite(z[0, 0]):
-        w01, w10, w11, w00 = w01 + w00, w10 + w00, w11 - w00, 0.0
-    elif not np.isfinite(z[0, 1]):
-        w00, w11, w10, w01 = w00 + w01, w11 + w01, w10 - w01, 0.0
-    elif not np.isfinite(z[1, 0]):
-        w00, w11, w01, w10 = w00 + w10, w11 + w10, w01 - w10, 0.0
-    elif not np.isfinite(z[1, 1]):
-        w01, w10, w00, w11 = w01 + w11, w10 + w11, w00 - w11, 0.0
-    inverse, variance = 0.0, 0.0
-    for k, w in enumerate((w00, w01, w10, w11)):
-        if w != 0.0:
-            value = z[k // 2, k % 2]
-            inverse += w / value
-            variance += (w * s[k // 2, k % 2] / (value * value)) ** 2
-    return 1.0 / inverse, np.sqrt(variance) / (inverse * inverse)
+def _without_missing_corner(q, s, w):  # type: ignore[no-untyped-def]
+    """Corners and weights with a missing corner as the plane through the others; all NaN if two are missing."""
+    zero = np.float32(0.0)
+    if np.isnan(q[0]):
+        q, s, w = (q[1], q[1], q[2], q[3]), (zero, s[1], s[2], s[3]), (zero, w[1] + w[0], w[2] + w[0], w[3] - w[0])
+    elif np.isnan(q[1]):
+        q, s, w = (q[0], q[0], q[2], q[3]), (s[0], zero, s[2], s[3]), (w[0] + w[1], zero, w[2] - w[1], w[3] + w[1])
+    elif np.isnan(q[2]):
+        q, s, w = (q[0], q[1], q[0], q[3]), (s[0], s[1], zero, s[3]), (w[0] + w[2], w[1] - w[2], zero, w[3] + w[2])
+    else:
+        q, s, w = (q[0], q[1], q[2], q[1]), (s[0], s[1], s[2], zero), (w[0] - w[3], w[1] + w[3], w[2] + w[3], zero)
+    nan = np.float32(np.nan)
+    return ((nan, nan, nan, nan) if np.isnan(q[0] + q[1] + q[2] + q[3]) else q), s, w
