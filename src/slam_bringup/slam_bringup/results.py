@@ -1,0 +1,136 @@
+"""What a run ends with, the same for ``slam run`` and ``slam nodes``, and its summary."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.evaluation import Evaluation, evaluate
+from slam_core.geometry import FloatArray
+from slam_core.trajectory import Trajectory
+from slam_core.types import Float32Array
+
+EMPTY_TRAJECTORY = Trajectory.from_estimates([])
+
+
+@dataclass(frozen=True, eq=False)
+class AgentResult:
+    """One rig: its smoothed trajectory (map frame), the filter's own (odom frame), scan odometry and ground truth."""
+
+    name: str
+    trajectory: Trajectory
+    filtered: Trajectory = EMPTY_TRAJECTORY
+    scan_odometry: Trajectory = EMPTY_TRAJECTORY
+    truth: Trajectory = EMPTY_TRAJECTORY
+    feature_counts: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def evaluation(self, trajectory: Trajectory | None = None) -> Evaluation | None:
+        """A trajectory (by default the smoothed one) against ground truth, or None where the two do not meet."""
+        trajectory = self.trajectory if trajectory is None else trajectory
+        if len(self.truth) < 2 or len(trajectory) < 2:
+            return None
+        try:
+            return evaluate(trajectory, self.truth)
+        except ValueError:
+            return None
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkMap:
+    """Landmarks of the joined map: positions (n, 3) m in the map frame, covariances (n, 3, 3) m2, sightings (n,)."""
+
+    positions: FloatArray
+    covariances: FloatArray
+    sightings: npt.NDArray[np.int32]
+
+    @classmethod
+    def empty(cls) -> LandmarkMap:
+        """A map without landmarks."""
+        return cls(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, dtype=np.int32))
+
+
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """Everything a run found out. ``stage_ms`` holds the time of every call of a stage, in order."""
+
+    bag: str
+    mode: str
+    mapper: str
+    odometry: str
+    agents: tuple[AgentResult, ...]
+    landmarks: LandmarkMap
+    dense_points: Float32Array
+    dense_grey: npt.NDArray[np.uint8]
+    submaps: int
+    loop_closures: int
+    frames: int
+    dropped: Mapping[str, int]
+    sensor_s: float
+    wall_s: float
+    stage_ms: Mapping[str, list[float]]
+    events: tuple[str, ...] = ()
+    solver: str = ""
+
+
+def summarise(result: RunResult) -> dict[str, Any]:
+    """The content of ``summary.json``; figures against ground truth only where there is one."""
+    first = result.agents[0] if result.agents else AgentResult("", EMPTY_TRAJECTORY)
+    summary: dict[str, Any] = {
+        "bag": result.bag,
+        "mode": result.mode,
+        "mapper": result.mapper,
+        "odometry": result.odometry,
+        "frames": result.frames,
+        "dropped": int(sum(result.dropped.values())),
+        "dropped_by_reason": dict(result.dropped),
+        "landmarks": len(result.landmarks.positions),
+        "submaps": result.submaps,
+        "loop_closures": result.loop_closures,
+        "path_length_m": sum(agent.trajectory.length_m for agent in result.agents),
+        "sensor_s": result.sensor_s,
+        "wall_s": result.wall_s,
+        "real_time_factor": result.sensor_s / result.wall_s if result.wall_s > 0 else 0.0,
+        "stage_ms": {name: _stage(times) for name, times in result.stage_ms.items()},
+        "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        "solver": result.solver,
+        "events": list(result.events),
+        **_accuracy(first, first.trajectory),
+    }
+    if len(first.scan_odometry):
+        summary["scan_odometry"] = {
+            "path_length_m": first.scan_odometry.length_m,
+            **_accuracy(first, first.scan_odometry),
+        }
+    if len(first.filtered):
+        summary["filtered"] = _accuracy(first, first.filtered)
+    if len(result.agents) > 1:
+        summary["agents"] = {
+            agent.name: {"path_length_m": agent.trajectory.length_m, **_accuracy(agent, agent.trajectory)}
+            for agent in result.agents
+        }
+    return summary
+
+
+def _stage(times: list[float]) -> dict[str, float]:
+    return (
+        {"mean": float(np.mean(times)), "median": float(np.median(times)), "max": float(np.max(times))} if times else {}
+    )
+
+
+def _accuracy(agent: AgentResult, trajectory: Trajectory) -> dict[str, Any]:
+    evaluation = agent.evaluation(trajectory)
+    if evaluation is None:
+        return {"end_error_m": None}
+    return {
+        "end_error_m": evaluation.end_error_m,
+        "drift_percent": evaluation.drift_percent,
+        "ate_rmse_m": evaluation.ate.rmse,
+        "rpe": {"translation_m": evaluation.rpe.rmse, "rotation_deg": evaluation.rpe_rotation_deg.rmse},
+        "anees": evaluation.anees,
+        "chi2": None if evaluation.anees is None else [evaluation.anees_low, evaluation.anees_high],
+    }
