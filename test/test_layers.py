@@ -1,0 +1,51 @@
+"""The two rules of the architecture: imports point down, and ROS stays in the nodes."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+SRC = Path(__file__).resolve().parent.parent / "src"
+LAYER = {
+    "slam_core": 0,
+    "stereo_frontend": 1,
+    "tof_driver": 1,
+    "ndt_registration": 1,
+    "ekf_slam_node": 2,
+    "sjsam_node": 2,
+    "slam_bringup": 3,
+}
+ROS = re.compile(r"^(rclpy|tf2_ros|launch(_ros)?|ament_index_python|builtin_interfaces|std_srvs|[a-z0-9]+_msgs)$")
+MAY_IMPORT_ROS = re.compile(r"(^|/)(node|[a-z_]+_node|ros|[a-z_]+\.launch)\.py$")
+FILES = sorted(path for path in SRC.rglob("*.py") if path.name != "setup.py")
+
+
+def imported(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield node.module or ""
+
+
+def test_every_package_is_known():
+    assert {path.name for path in SRC.iterdir() if path.is_dir()} == set(LAYER)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SRC)))
+def test_imports_point_down_and_ros_stays_in_nodes(path):
+    package = path.relative_to(SRC).parts[0]
+    for name in imported(path):
+        root = name.split(".")[0]
+        if root in LAYER:
+            assert root == package or LAYER[root] < LAYER[package], f"{path} imports {name} of the same or a higher layer"
+            # A node imports the algorithm, never the reverse.
+            if not MAY_IMPORT_ROS.search(str(path)):
+                module = name.split(".")[-1]
+                assert not re.fullmatch(r"node|\w+_node|ros", module) or module in LAYER, f"{path} imports the node {name}"
+        assert not ROS.match(root) or MAY_IMPORT_ROS.search(str(path)), f"{path} imports {name}: ROS belongs in nodes"
