@@ -1,0 +1,120 @@
+"""Depth of stereo features from the ToF camera beside it: replaced or fused (thesis sections 11.2-11.4).
+
+A left pixel is mapped into the ToF image through the extrinsics (11.3). The mapping needs the depth that is looked for:
+the depth is iterated until the pixel stands still, which handles the parallax between the cameras. Fused depth is ``R =
+(1/R1 + 1/R2)^-1``, ``d = R (d1/R1 + d2/R2)`` where stereo and ToF agree within their joint chi-square gate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.camera import Camera
+from slam_core.config import Config, group, parameter
+from slam_core.geometry import FloatArray, invert_transform
+from slam_core.types import DepthImage
+from stereo_frontend.depth_lookup import DepthLookupConfig, DepthSamples, sample_depth
+
+_ITERATIONS = 8
+
+
+@dataclass(frozen=True)
+class FusionConfig(Config):
+    """How ToF depth meets stereo features."""
+
+    gate: float = parameter(9.0, "chi-square gate (1 DoF) on the disagreement of stereo and ToF depth", minimum=0.1)
+    max_age: float = parameter(0.06, "greatest time between the stereo pair and the depth image", unit="s", minimum=0.0)
+    motion_speed: float = parameter(
+        0.3,
+        "speed of the rig assumed when the stamps differ: depth sigma grows by speed times age",
+        unit="m/s",
+        minimum=0.0,
+    )
+    motion_rate: float = parameter(
+        0.3,
+        "turn rate assumed when the stamps differ: pixel sigma grows by rate times age times f",
+        unit="rad/s",
+        minimum=0.0,
+    )
+    mapping_sigma: float = parameter(
+        0.3, "standard deviation of the mapping into the ToF image", unit="px", minimum=0.0
+    )
+    lookup: DepthLookupConfig = group(DepthLookupConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class MappedDepth:
+    """Depth from the ToF camera for left pixels.
+
+    depth, sigma: (n,) m along the left camera's z, NaN where the ToF camera sees no single surface. uv: (n, 2) px in
+    the ToF image.
+    """
+
+    depth: FloatArray
+    sigma: FloatArray
+    uv: FloatArray
+
+
+def map_depth(
+    uv: npt.ArrayLike,
+    initial_depth: FloatArray,
+    camera: Camera,
+    image: DepthImage,
+    T_left_tof: FloatArray,
+    config: FusionConfig,
+    age: float = 0.0,
+) -> MappedDepth:
+    """ToF depth of left pixels.
+
+    Parameters
+    ----------
+    uv
+        Pixels (n, 2) of the rectified left image.
+    initial_depth
+        First guess (n,) m, from stereo; NaN takes the median of the depth image.
+    camera, image, T_left_tof
+        Left camera, depth image and the pose (4, 4) of the ToF optical frame in the left one.
+    config
+        Lookup and the assumed motion.
+    age
+        Difference of the stamps, s; its sign does not matter.
+    """
+    rays = camera.unproject(np.asarray(uv, np.float64), np.ones(len(initial_depth)))
+    T_tof_left = invert_transform(T_left_tof)
+    rays_tof, origin = rays @ T_tof_left[:3, :3].T, T_tof_left[:3, 3]
+    depth = np.where(np.isfinite(initial_depth), initial_depth, _median_depth(image))
+    for _ in range(_ITERATIONS):
+        pixels = image.camera.project(rays_tof * depth[:, None] + origin)
+        samples = sample_depth(image, pixels, config.lookup)
+        update = (samples.depth - origin[2]) / rays_tof[:, 2]
+        moved = np.abs(update - depth)
+        depth = np.where(np.isfinite(update), update, depth)
+    settled = moved <= np.maximum(samples.sigma, 1e-3)
+    sigma = _mapped_sigma(samples, image.camera, config, age) / np.abs(rays_tof[:, 2])
+    blank = np.where(settled & (depth > 0.0), 0.0, np.nan)
+    return MappedDepth(update + blank, sigma + blank, pixels)
+
+
+def fuse_depth(
+    stereo_depth: FloatArray, stereo_sigma: FloatArray, tof: MappedDepth, gate: float
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
+    """Fused depth, its standard deviation (n,) m and which features were fused; the others keep stereo's (11.4)."""
+    R1, R2 = stereo_sigma**2, tof.sigma**2
+    agrees = (stereo_depth - tof.depth) ** 2 <= gate * (R1 + R2)
+    R = 1.0 / (1.0 / R1 + 1.0 / R2)
+    depth = R * (stereo_depth / R1 + tof.depth / R2)
+    return np.where(agrees, depth, stereo_depth), np.where(agrees, np.sqrt(R), stereo_sigma), agrees
+
+
+def _mapped_sigma(samples: DepthSamples, camera: Camera, config: FusionConfig, age: float) -> FloatArray:
+    pixel = np.hypot(config.mapping_sigma, config.motion_rate * age * camera.fx)
+    across = np.linalg.norm(samples.gradient, axis=1) * pixel
+    return np.asarray(np.sqrt(samples.sigma**2 + across**2 + (config.motion_speed * age) ** 2))
+
+
+def _median_depth(image: DepthImage) -> float:
+    valid = image.depth[np.isfinite(image.depth) & (image.depth > 0.0)]
+    return float(np.median(valid)) if len(valid) else 1.0

@@ -1,0 +1,78 @@
+"""Depth at sub-pixel positions of a depth image, safe at edges.
+
+Over a plane the *inverse* depth is affine in the pixel, whatever the slant. So a plane of inverse depth is fitted to
+the 3x3 pixels around a position: it averages the noise, interpolates without bias, gives the gradient that turns pixel
+errors into depth errors, and its misfit shows a depth edge, where any interpolation would invent a surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray
+from slam_core.types import DepthImage
+
+_DU, _DV = (g.ravel() for g in np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]))
+
+
+@dataclass(frozen=True)
+class DepthLookupConfig(Config):
+    """When a neighbourhood counts as one surface."""
+
+    max_misfit: float = parameter(4.0, "greatest deviation of a pixel from the local plane, in its sigma", minimum=1.0)
+    min_step: float = parameter(0.005, "deviations below this share of the depth are never an edge", minimum=0.0)
+    max_slope: float = parameter(0.06, "greatest change of depth per pixel, as a share of depth", minimum=0.001)
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSamples:
+    """depth (n,) m along z, NaN where there is no single surface; sigma (n,) m; gradient (n, 2) m/px along u and v."""
+
+    depth: FloatArray
+    sigma: FloatArray
+    gradient: FloatArray
+
+
+def sample_depth(image: DepthImage, uv: npt.ArrayLike, config: DepthLookupConfig) -> DepthSamples:
+    """Depth of positions (n, 2) px; positions outside the image or beside missing pixels are NaN."""
+    uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+    centre, inside = _nearest_inner_pixels(uv, image.depth.shape)
+    u = centre[:, 0, None] + _DU.astype(np.intp)
+    v = centre[:, 1, None] + _DV.astype(np.intp)
+    depth = image.depth[v, u].astype(np.float64)
+    sigma = image.sigma[v, u].astype(np.float64)
+    usable = inside & np.all(np.isfinite(depth) & (depth > 0.0) & np.isfinite(sigma), axis=1)
+    depth[~usable], sigma[~usable] = 1.0, 1.0
+    return _fit_plane(depth, sigma, uv - centre, usable, config)
+
+
+def _nearest_inner_pixels(uv: FloatArray, shape: tuple[int, ...]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
+    limit = np.array([shape[1] - 2, shape[0] - 2])
+    finite = np.where(np.isfinite(uv), uv, -1.0)
+    rounded = np.floor(np.clip(finite, -1e6, 1e6) + 0.5).astype(np.intp)
+    inside = np.all((rounded >= 1) & (rounded <= limit), axis=1)
+    return np.clip(rounded, 1, np.maximum(limit, 1)), inside
+
+
+def _fit_plane(
+    depth: FloatArray, sigma: FloatArray, offset: FloatArray, usable: npt.NDArray[np.bool_], config: DepthLookupConfig
+) -> DepthSamples:
+    inverse = 1.0 / depth
+    mean, slope_u, slope_v = inverse.mean(axis=1), inverse @ _DU / 6.0, inverse @ _DV / 6.0
+    fitted = mean[:, None] + slope_u[:, None] * _DU + slope_v[:, None] * _DV
+    value = mean + slope_u * offset[:, 0] + slope_v * offset[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = 1.0 / value
+        step = np.abs(inverse - fitted) * z[:, None] ** 2
+        gradient = -np.column_stack([slope_u, slope_v]) * z[:, None] ** 2
+    limit = np.maximum(config.max_misfit * sigma, config.min_step * z[:, None])
+    smooth = np.all(step <= limit, axis=1) & np.all(np.abs(gradient) <= config.max_slope * z[:, None], axis=1)
+    ok = usable & smooth & (value > 0.0) & (depth.min(axis=1) * 0.9 <= z) & (z <= depth.max(axis=1) * 1.1)
+    weight = 1.0 / 9.0 + (offset**2).sum(axis=1) / 6.0
+    noise = np.sqrt(weight * (sigma**2).mean(axis=1))
+    blank = np.where(ok, 0.0, np.nan)
+    return DepthSamples(z + blank, noise + blank, gradient + blank[:, None])

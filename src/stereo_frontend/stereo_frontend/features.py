@@ -1,0 +1,95 @@
+"""Features of one image: keypoints spread over a grid, with unit-norm descriptors, behind one interface.
+
+Every detector runs the same way: it returns all keypoints above a threshold; a grid keeps the strongest of each cell,
+so that features cover the image (thesis section 3.2); the threshold follows the number found from frame to frame
+(thesis ch. 9), so that a second pass over the image is the exception. Detectors: ``surf``
+(:mod:`stereo_frontend.surf`), and ``sift``, ``rootsift``, ``orb``, ``akaze`` from OpenCV
+(:mod:`stereo_frontend.opencv_detectors`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.config import Config, parameter
+from slam_core.types import ByteArray, Float32Array
+from stereo_frontend.keypoints import Detector, Keypoints, spread_over_grid
+from stereo_frontend.opencv_detectors import OpenCvDetector
+
+DETECTORS = ("sift", "rootsift", "orb", "akaze")
+_THRESHOLD_RANGE = (0.02, 20.0)
+_MOST_PASSES = 3
+
+
+@dataclass(frozen=True)
+class FeatureConfig(Config):
+    """Which features, how many and how they are spread."""
+
+    detector: str = parameter("sift", "keypoint detector and descriptor", choices=DETECTORS)
+    target: int = parameter(500, "number of features wanted per image", minimum=10, maximum=20000)
+    grid_columns: int = parameter(10, "columns of the coverage grid", minimum=1, maximum=200)
+    grid_rows: int = parameter(8, "rows of the coverage grid", minimum=1, maximum=200)
+    surplus: float = parameter(
+        1.5, "candidates wanted per feature kept: the grid chooses among them", minimum=1.0, maximum=10.0
+    )
+    adaptation: float = parameter(
+        0.7, "how fast the threshold follows the number of candidates; 0 keeps it fixed", minimum=0.0, maximum=1.0
+    )
+
+
+class FeatureExtractor:
+    """Extracts features from the images of one camera, remembering the detector threshold from frame to frame.
+
+    The state is that one number, so equal images give equal features however they arrive.
+    """
+
+    def __init__(self, config: FeatureConfig | None = None) -> None:
+        self.config = config or FeatureConfig()
+        self.threshold = 1.0
+        self._detect: Detector = OpenCvDetector(self.config.detector)
+
+    def __call__(self, image: ByteArray) -> Keypoints:
+        """At most ``target`` keypoints of an image, uint8 (height, width), best of each grid cell first.
+
+        Raises
+        ------
+        ValueError
+            If the image is not uint8 grey.
+        """
+        if image.ndim != 2 or image.dtype != np.uint8:
+            raise ValueError(f"features need a uint8 grey image (height, width), got {image.dtype} {image.shape}")
+        for _ in range(_MOST_PASSES):
+            keypoints, candidates = self._one_pass(image)
+            enough = candidates >= self.config.target or self.threshold <= _THRESHOLD_RANGE[0]
+            self._adapt(candidates)
+            if enough or self.config.adaptation == 0.0:
+                break
+        return keypoints
+
+    def reset(self) -> None:
+        """Forget the threshold."""
+        self.threshold = 1.0
+
+    def _one_pass(self, image: ByteArray) -> tuple[Keypoints, int]:
+        candidates = 0
+
+        def select(uv: Float32Array, response: Float32Array) -> npt.NDArray[np.intp]:
+            nonlocal candidates
+            candidates = len(uv)
+            c = self.config
+            return spread_over_grid(
+                uv, response, (image.shape[0], image.shape[1]), (c.grid_rows, c.grid_columns), c.target
+            )
+
+        keypoints = self._detect(image, self.threshold, select)
+        return keypoints, candidates
+
+    def _adapt(self, candidates: int) -> None:
+        """Move the threshold so that the next image gives ``surplus * target`` candidates (their number falls as
+        1/threshold).
+        """
+        ratio = np.clip(candidates / (self.config.surplus * self.config.target), 0.25, 4.0)
+        self.threshold = float(np.clip(self.threshold * ratio**self.config.adaptation, *_THRESHOLD_RANGE))

@@ -1,0 +1,186 @@
+"""The front end: a stereo pair, a depth image or both become features with depth and honest standard deviations.
+
+``stereo``: features of both images, matched, disparity refined, ``d = f b / (u_left - u_right)`` (Eqs. 4.3-4.4).
+``tof``: features and depth of the ToF camera alone. ``replace``: stereo features, depth from the ToF camera where it
+sees them (11.2). ``fuse``: both depths weighted by their variances (11.4).
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_core.config import Config, group, parameter
+from slam_core.geometry import FloatArray
+from slam_core.types import Counters, DepthImage, Features, FeatureSource, StereoImages
+from stereo_frontend.assembly import DepthEstimate, make_features
+from stereo_frontend.depth_fusion import FusionConfig, MappedDepth, fuse_depth, map_depth
+from stereo_frontend.disparity import DisparityConfig, refine_disparity
+from stereo_frontend.features import FeatureConfig, FeatureExtractor
+from stereo_frontend.keypoints import Keypoints
+from stereo_frontend.matching import MatchingConfig, disparity_bounds, match_stereo, swapped_share
+from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
+from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
+
+MODES = ("stereo", "tof", "replace", "fuse")
+_FEW_MATCHES = 30
+_SWAPPED_SHARE = 0.7
+
+
+@dataclass(frozen=True)
+class FrontendConfig(Config):
+    """Everything between rectified images and features."""
+
+    mode: str = parameter("stereo", "where depth comes from", choices=MODES)
+    max_relative_sigma: float = parameter(
+        0.2, "features whose depth sigma exceeds this share of their depth are dropped", minimum=0.001, maximum=1.0
+    )
+    features: FeatureConfig = group(FeatureConfig)
+    matching: MatchingConfig = group(MatchingConfig)
+    disparity: DisparityConfig = group(DisparityConfig)
+    noise: PixelNoiseConfig = group(PixelNoiseConfig)
+    fusion: FusionConfig = group(FusionConfig)
+    tof: TofFeatureConfig = group(TofFeatureConfig)
+
+
+class Frontend:
+    """Processes frames one by one.
+
+    Its state is the detector thresholds and the noise factor, so the same frames in the same order give the same bytes.
+    ``counters`` tells what was accepted and rejected since the start.
+    """
+
+    def __init__(self, config: FrontendConfig | None = None) -> None:
+        self.config = config or FrontendConfig()
+        self.counters = Counters()
+        self._left = FeatureExtractor(self.config.features)
+        self._right = FeatureExtractor(self.config.features)
+        self._noise = PixelNoise(self.config.noise)
+        self._tof = TofFeatures(self.config.tof, self.config.features, self.config.noise)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="right_image")
+
+    def process(
+        self, images: StereoImages | None, depth: DepthImage | None = None, T_left_tof: FloatArray | None = None
+    ) -> Features:
+        """Features of one instant.
+
+        Parameters
+        ----------
+        images
+            Rectified pair; required in every mode but ``tof``.
+        depth
+            Depth image; required in mode ``tof``. Where it is missing or too old, ``replace`` and ``fuse`` fall back to
+            stereo.
+        T_left_tof
+            Pose (4, 4) of the ToF optical frame in the left optical frame; required with ``depth`` in ``replace`` and
+            ``fuse``.
+
+        Raises
+        ------
+        ValueError
+            If a required input is missing, or if left and right images are swapped.
+        """
+        if self.config.mode == "tof":
+            if depth is None:
+                raise ValueError("mode 'tof' needs a depth image, got none")
+            return self._tof(depth, self.config.max_relative_sigma)
+        if images is None:
+            raise ValueError(f"mode '{self.config.mode}' needs a stereo pair, got none")
+        left, right = self._extract(images)
+        estimate = self._stereo_depth(images, left, right)
+        if self.config.mode != "stereo":
+            estimate = self._with_tof(images, left, estimate, depth, T_left_tof)
+        return make_features(
+            images.stamp_ns, left, estimate, self._noise.sigma(left.size), images.stereo.camera,
+            "stereo_left_optical_frame", self.config.max_relative_sigma,
+        )  # fmt: skip
+
+    def reset(self) -> None:
+        """Forget thresholds, noise and counts."""
+        for part in (self._left, self._right, self._noise, self._tof):
+            part.reset()
+        self.counters = Counters()
+
+    def _extract(self, images: StereoImages) -> tuple[Keypoints, Keypoints]:
+        future = self._pool.submit(self._right, images.right)
+        left = self._left(images.left)
+        return left, future.result()
+
+    def _stereo_depth(self, images: StereoImages, left: Keypoints, right: Keypoints) -> DepthEstimate:
+        focal_baseline = images.stereo.camera.fx * images.stereo.baseline
+        bounds = disparity_bounds(self.config.matching, focal_baseline)
+        matches = match_stereo(left, right, self.config.matching, bounds)
+        if len(matches) < _FEW_MATCHES:
+            self._reject_swapped(left, right, bounds)
+        uv = left.uv[matches.left]
+        self._noise.learn(uv[:, 1] - right.uv[matches.right, 1], left.size[matches.left])
+        refined = refine_disparity(images.left, images.right, uv, right.uv[matches.right, 0], self.config.disparity)
+        disparity = np.where(refined.disparity >= bounds[0], refined.disparity, np.nan).astype(np.float64)
+        estimate = DepthEstimate.unknown(len(left))
+        estimate.depth[matches.left] = focal_baseline / disparity
+        estimate.sigma[matches.left] = focal_baseline / disparity**2 * refined.sigma
+        self._count(left, right, len(matches), int(np.isfinite(disparity).sum()))
+        return estimate
+
+    def _with_tof(
+        self,
+        images: StereoImages,
+        left: Keypoints,
+        stereo: DepthEstimate,
+        depth: DepthImage | None,
+        T: FloatArray | None,
+    ) -> DepthEstimate:
+        tof = self._map_tof(images, left, stereo, depth, T)
+        if tof is None:
+            return stereo
+        seen = np.isfinite(tof.depth)
+        alone = seen & ~np.isfinite(stereo.depth) if self.config.mode == "fuse" else seen
+        fused, sigma, agrees = fuse_depth(stereo.depth, stereo.sigma, tof, self.config.fusion.gate)
+        if self.config.mode == "replace":
+            agrees = np.zeros_like(seen)
+        self.counters.add("fused", int(agrees.sum()))
+        self.counters.add("tof_alone", int(alone.sum()))
+        source = np.where(alone, FeatureSource.TOF, np.where(agrees, FeatureSource.FUSED, stereo.source)).astype(
+            np.uint8
+        )
+        return DepthEstimate(
+            np.where(alone, tof.depth, np.where(agrees, fused, stereo.depth)),
+            np.where(alone, tof.sigma, np.where(agrees, sigma, stereo.sigma)),
+            source,
+        )
+
+    def _map_tof(
+        self,
+        images: StereoImages,
+        left: Keypoints,
+        stereo: DepthEstimate,
+        depth: DepthImage | None,
+        T: FloatArray | None,
+    ) -> MappedDepth | None:
+        if depth is None:
+            self.counters.add("tof_missing")
+            return None
+        if T is None:
+            raise ValueError(f"mode '{self.config.mode}' needs T_left_tof: a missing transform is never identity")
+        age = abs(depth.stamp_ns - images.stamp_ns) * 1e-9
+        if age > self.config.fusion.max_age:
+            self.counters.add("tof_too_old")
+            return None
+        return map_depth(left.uv, stereo.depth, images.stereo.camera, depth, T, self.config.fusion, age)
+
+    def _reject_swapped(self, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> None:
+        share, matches = swapped_share(left, right, self.config.matching, bounds)
+        if matches >= _FEW_MATCHES and share > _SWAPPED_SHARE:
+            self.counters.add("swapped")
+            raise ValueError(
+                f"left and right images are swapped: {share:.0%} of {matches} matches have a negative disparity"
+            )
+
+    def _count(self, left: Keypoints, right: Keypoints, matched: int, refined: int) -> None:
+        self.counters.add("frames")
+        self.counters.add("keypoints_left", len(left))
+        self.counters.add("keypoints_right", len(right))
+        self.counters.add("matched", matched)
+        self.counters.add("disparity_rejected", matched - refined)

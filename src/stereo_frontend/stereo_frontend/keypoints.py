@@ -1,0 +1,75 @@
+"""Keypoints of one image and their spread over it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.types import AnyArray, ByteArray, Float32Array
+
+Selector = Callable[[Float32Array, Float32Array], npt.NDArray[np.intp]]
+"""Chooses keypoints: (uv (n, 2) px, response (n,)) to the indices kept, in their final order."""
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """uv (n, 2) px; size (n,) px, diameter of the region described; response (n,); descriptors (n, d), unit norm."""
+
+    uv: Float32Array
+    size: Float32Array
+    response: Float32Array
+    descriptors: Float32Array
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    def select(self, index: AnyArray) -> Keypoints:
+        """The keypoints at ``index`` (mask or indices)."""
+        return Keypoints(self.uv[index], self.size[index], self.response[index], self.descriptors[index])
+
+    @staticmethod
+    def none(dimension: int = 128) -> Keypoints:
+        """No keypoints at all."""
+        empty = np.zeros(0, np.float32)
+        return Keypoints(np.zeros((0, 2), np.float32), empty, empty, np.zeros((0, dimension), np.float32))
+
+
+class Detector(Protocol):
+    """Finds and describes keypoints."""
+
+    def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
+        """Keypoints of ``image`` above ``threshold`` (1.0 is the detector's customary one), thinned out by
+        ``select``.
+        """
+        ...
+
+
+def spread_over_grid(
+    uv: Float32Array, response: Float32Array, shape: tuple[int, int], grid: tuple[int, int], target: int
+) -> npt.NDArray[np.intp]:
+    """Indices of at most ``target`` keypoints: the best of every cell first, then every cell's second, and so on.
+
+    Parameters
+    ----------
+    uv, response
+        Pixels (n, 2) and strength (n,).
+    shape
+        Height and width of the image, px.
+    grid
+        Rows and columns of cells.
+    target
+        Number of keypoints kept at most.
+    """
+    rows, columns = grid
+    row = np.clip((uv[:, 1] * (rows / shape[0])).astype(np.intp), 0, rows - 1)
+    column = np.clip((uv[:, 0] * (columns / shape[1])).astype(np.intp), 0, columns - 1)
+    cell = row * columns + column
+    order = np.lexsort((uv[:, 0], uv[:, 1], -response, cell))
+    sorted_cell = cell[order]
+    first_of_cell = np.searchsorted(sorted_cell, sorted_cell)
+    rank = np.arange(len(order)) - first_of_cell
+    return order[np.lexsort((-response[order], rank))][:target]
