@@ -36,9 +36,12 @@ class Camera:
         if self.width <= 0 or self.height <= 0:
             raise ValueError(f"image size must be positive, got {self.width} x {self.height} px")
         if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0 and self.fy > 0):
-            raise ValueError(f"focal lengths must be positive and finite, got {self.fx}, {self.fy} px: is the camera calibrated?")
+            raise ValueError(
+                f"focal lengths must be positive and finite, got {self.fx}, {self.fy} px: is the camera calibrated?"
+            )
         if self.distortion_model not in DISTORTION_MODELS:
-            raise ValueError(f"unknown distortion model '{self.distortion_model}', known: {', '.join(DISTORTION_MODELS)}")
+            known = ", ".join(DISTORTION_MODELS)
+            raise ValueError(f"unknown distortion model '{self.distortion_model}', known: {known}")
         if not np.isfinite(self.distortion).all():
             raise ValueError(f"distortion coefficients must be finite, got {self.distortion}")
 
@@ -50,6 +53,8 @@ class Camera:
     @property
     def is_rectified(self) -> bool:
         """Whether straight lines stay straight: no distortion left."""
+        if self.distortion_model == "equidistant":
+            return False  # a fisheye even with all coefficients zero: the radius is the angle, not its tangent
         return self.distortion_model == "none" or not np.any(self.distortion)
 
     def project(self, points: FloatArray) -> FloatArray:
@@ -69,7 +74,10 @@ class Camera:
         return self.distort(xy) * [self.fx, self.fy] + [self.cx, self.cy]
 
     def normalised_from_pixels(self, pixels: FloatArray) -> FloatArray:
-        """Ideal image-plane coordinates x/z, y/z of distorted pixels, shape (n, 2): the exact inverse, by Newton."""
+        """Image-plane coordinates x/z, y/z of distorted pixels, shape (n, 2): the exact inverse, by Newton.
+
+        NaN for pixels that no ray reaches: beyond the turning point of the radial polynomial, or at 90 degrees and more.
+        """
         distorted = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         if self.is_rectified:
             return np.asarray(distorted)
@@ -82,43 +90,50 @@ class Camera:
             return xy
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
+        ideal = xy * self._radial_scale(r2)[:, None]
         if self.distortion_model == "equidistant":
-            k = np.zeros(4)
-            k[: len(self.distortion)] = self.distortion
+            return np.asarray(ideal)
+        _, _, p1, p2 = (*self.distortion, 0.0, 0.0, 0.0, 0.0)[:4]
+        tangential = [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
+        return np.asarray(ideal + np.column_stack(tangential))
+
+    def _radial_scale(self, r2: FloatArray) -> FloatArray:
+        """Distorted over ideal radius, of squared ideal radii (n,)."""
+        if self.distortion_model == "equidistant":
+            k = (*self.distortion, 0.0, 0.0, 0.0, 0.0)
             r = np.sqrt(r2)
-            theta = np.arctan(r)
-            t2 = theta * theta
-            theta_d = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
-            scale = np.where(r > 1e-12, theta_d / np.where(r > 1e-12, r, 1.0), 1.0)
-            return np.asarray(xy * scale[:, None])
-        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *([0.0] * 8))[:8]
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        return np.column_stack([x * radial + dx, y * radial + dy])
+            t2 = np.square(np.arctan(r))
+            theta_d = np.arctan(r) * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+            return np.where(r > 1e-12, theta_d / np.maximum(r, 1e-12), 1.0)
+        k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *([0.0] * 8))[:8]
+        return np.asarray((1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6))))
 
     def _undistort(self, distorted: FloatArray) -> FloatArray:
-        xy = distorted.copy()
-        if self.distortion_model == "equidistant":
-            theta_d = np.linalg.norm(distorted, axis=1)
-            theta = np.minimum(theta_d, 1.5)
-            xy = distorted * np.where(theta_d > 1e-12, np.tan(theta) / np.maximum(theta_d, 1e-12), 1.0)[:, None]
-        step = 1e-6
+        xy = self._undistort_radially(distorted)
+        step, tolerance = 1e-6, 1e-11
+        step_x = np.array([step, 0.0])
         for _ in range(20):
             residual = self.distort(xy) - distorted
-            if np.nanmax(np.abs(residual), initial=0.0) < 1e-11:
+            if np.nanmax(np.abs(residual), initial=0.0) < tolerance:
                 break
-            jx = (self.distort(xy + [step, 0]) - self.distort(xy - [step, 0])) / (2 * step)
-            jy = (self.distort(xy + [0, step]) - self.distort(xy - [0, step])) / (2 * step)
+            jx = (self.distort(xy + step_x) - self.distort(xy - step_x)) / (2 * step)
+            jy = (self.distort(xy + step_x[::-1]) - self.distort(xy - step_x[::-1])) / (2 * step)
             determinant = jx[:, 0] * jy[:, 1] - jx[:, 1] * jy[:, 0]
-            determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-            xy = xy - np.column_stack(
-                [
-                    (jy[:, 1] * residual[:, 0] - jy[:, 0] * residual[:, 1]) / determinant,
-                    (jx[:, 0] * residual[:, 1] - jx[:, 1] * residual[:, 0]) / determinant,
-                ]
-            )
-        return xy
+            determinant = np.where(determinant > 1e-9, determinant, np.nan)  # past the turning point: no ray
+            dx = (jy[:, 1] * residual[:, 0] - jy[:, 0] * residual[:, 1]) / determinant
+            dy = (jx[:, 0] * residual[:, 1] - jx[:, 1] * residual[:, 0]) / determinant
+            xy = xy - np.column_stack([dx, dy])
+        converged = np.abs(self.distort(xy) - distorted).max(axis=1, initial=0.0) < 1e-9
+        return np.where(converged[:, None], xy, np.nan)
+
+    def _undistort_radially(self, distorted: FloatArray) -> FloatArray:
+        """Start of the inverse: the radial curve alone, up to its turning point, from a table."""
+        ideal = np.tan(np.linspace(0.0, 1.565, 4000))
+        curve = ideal * self._radial_scale(ideal**2)
+        turning = int(np.argmax(np.append(np.diff(curve) <= 0.0, True))) + 1
+        radius = np.linalg.norm(distorted, axis=1)
+        scale = np.interp(radius, curve[:turning], ideal[:turning]) / np.maximum(radius, 1e-12)
+        return np.asarray(distorted * np.where(radius > 1e-12, scale, 1.0)[:, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +141,8 @@ class CameraInfo:
     """What a sensor_msgs/CameraInfo says of one camera, without ROS.
 
     camera: intrinsics K and distortion D of the *raw* image. R: (3, 3) rotation from the raw to the rectified optical
-    frame. P: (3, 4) projection of the rectified image; ``P[0, 3] = -fx * baseline`` for the right camera of a pair, zero
-    for the left one. A P of zeros (drivers that never rectify) means the raw K.
+    frame. P: (3, 4) projection of the rectified image; ``P[0, 3] = -fx * baseline`` for the right camera of a pair,
+    zero for the left one. A P of zeros (drivers that never rectify) means the raw K.
     """
 
     camera: Camera

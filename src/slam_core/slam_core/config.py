@@ -1,12 +1,12 @@
-"""Typed configuration: one frozen dataclass per algorithm is the only place for names, defaults, ranges and descriptions.
+"""Typed configuration: one frozen dataclass per algorithm, the only place for names, defaults, ranges, descriptions.
 
     @dataclass(frozen=True)
     class NdtConfig(Config):
         voxel_size: float = parameter(0.5, "edge of a cell", unit="m", minimum=0.05)
 
-Nodes declare their ROS parameters from it (``slam_core.ros.declare_config``), the command line and YAML files override it
-(:func:`from_mapping`), and every value is checked when the object is made. A field whose type is itself a ``Config`` is a
-group: its parameters are named ``group.name``.
+Nodes declare their ROS parameters from it (``slam_core.ros.declare_config``), the command line and YAML files override
+it (:func:`from_mapping`), and every value is checked when the object is made. A field whose type is itself a ``Config``
+is a group: its parameters are named ``group.name``.
 """
 
 from __future__ import annotations
@@ -52,9 +52,7 @@ def parameter(
     choices: tuple[str, ...] = (),
 ) -> Any:
     """A dataclass field that is a parameter. ``minimum`` and ``maximum`` are inclusive."""
-    return field(
-        default=default, metadata={"parameter": ParameterInfo(description, unit, minimum, maximum, choices)}
-    )
+    return field(default=default, metadata={"parameter": ParameterInfo(description, unit, minimum, maximum, choices)})
 
 
 def group(config_type: type[C]) -> Any:
@@ -83,7 +81,7 @@ def _checked(name: str, value: Any, kind: Any, info: ParameterInfo) -> Any:
     if origin is tuple and isinstance(value, list):
         value = tuple(value)
     if origin is tuple and typing.get_args(kind)[:1] == (float,):
-        value = tuple(float(v) for v in value)
+        value = tuple(_finite_number(name, v, unit) for v in value)
     if not isinstance(value, origin) or (origin in (int, float) and isinstance(value, bool)):
         raise ValueError(f"parameter '{name}' must be {getattr(kind, '__name__', kind)}, got {value!r}")
     if isinstance(value, float) and not math.isfinite(value):
@@ -95,6 +93,12 @@ def _checked(name: str, value: Any, kind: Any, info: ParameterInfo) -> Any:
     if info.choices and value not in info.choices:
         raise ValueError(f"parameter '{name}' must be one of {', '.join(info.choices)}, got {value!r}")
     return value
+
+
+def _finite_number(name: str, value: Any, unit: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ValueError(f"parameter '{name}' must hold finite numbers, got {value!r}{unit}")
+    return float(value)
 
 
 def iterate_parameters(config: Config, prefix: str = "") -> Iterator[tuple[str, Any, ParameterInfo]]:
