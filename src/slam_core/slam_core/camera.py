@@ -74,9 +74,9 @@ class Camera:
         return self.distort(xy) * [self.fx, self.fy] + [self.cx, self.cy]
 
     def normalised_from_pixels(self, pixels: FloatArray) -> FloatArray:
-        """Image-plane coordinates x/z, y/z of distorted pixels, shape (n, 2): the exact inverse, by Newton.
+        """Image-plane coordinates x/z, y/z of distorted pixels, shape (n, 2): the inverse, by Newton.
 
-        NaN for pixels that no ray reaches: beyond the turning point of the radial polynomial, or at 90 degrees and more.
+        NaN for pixels that no ray reaches: past the turning point of the radial polynomial, at 90 degrees and more.
         """
         distorted = (np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
         if self.is_rectified:

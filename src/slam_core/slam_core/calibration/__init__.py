@@ -1,0 +1,1 @@
+"""Camera calibration from pictures of a board: intrinsics, distortion and extrinsics with their uncertainties (2.4)."""
