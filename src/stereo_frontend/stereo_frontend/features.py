@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from slam_core.config import Config, parameter
+from slam_core.config import Config, group, parameter
 from slam_core.types import ByteArray, Float32Array
 from stereo_frontend.keypoints import Detector, Keypoints, spread_over_grid
 from stereo_frontend.opencv_detectors import OpenCvDetector
+from stereo_frontend.surf import SurfConfig, SurfDetector
 
-DETECTORS = ("sift", "rootsift", "orb", "akaze")
+DETECTORS = ("surf", "sift", "rootsift", "orb", "akaze")
 _THRESHOLD_RANGE = (0.02, 20.0)
 _MOST_PASSES = 3
 
@@ -28,7 +29,7 @@ _MOST_PASSES = 3
 class FeatureConfig(Config):
     """Which features, how many and how they are spread."""
 
-    detector: str = parameter("sift", "keypoint detector and descriptor", choices=DETECTORS)
+    detector: str = parameter("surf", "keypoint detector and descriptor", choices=DETECTORS)
     target: int = parameter(500, "number of features wanted per image", minimum=10, maximum=20000)
     grid_columns: int = parameter(10, "columns of the coverage grid", minimum=1, maximum=200)
     grid_rows: int = parameter(8, "rows of the coverage grid", minimum=1, maximum=200)
@@ -38,6 +39,18 @@ class FeatureConfig(Config):
     adaptation: float = parameter(
         0.7, "how fast the threshold follows the number of candidates; 0 keeps it fixed", minimum=0.0, maximum=1.0
     )
+    surf: SurfConfig = group(SurfConfig)
+
+
+def make_detector(config: FeatureConfig) -> Detector:
+    """The configured detector.
+
+    Raises
+    ------
+    ValueError
+        If the installed OpenCV lacks it.
+    """
+    return SurfDetector(config.surf) if config.detector == "surf" else OpenCvDetector(config.detector)
 
 
 class FeatureExtractor:
@@ -49,7 +62,7 @@ class FeatureExtractor:
     def __init__(self, config: FeatureConfig | None = None) -> None:
         self.config = config or FeatureConfig()
         self.threshold = 1.0
-        self._detect: Detector = OpenCvDetector(self.config.detector)
+        self._detect = make_detector(self.config)
 
     def __call__(self, image: ByteArray) -> Keypoints:
         """At most ``target`` keypoints of an image, uint8 (height, width), best of each grid cell first.

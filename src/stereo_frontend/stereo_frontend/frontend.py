@@ -7,6 +7,7 @@ sees them (11.2). ``fuse``: both depths weighted by their variances (11.4).
 
 from __future__ import annotations
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -37,12 +38,19 @@ class FrontendConfig(Config):
     max_relative_sigma: float = parameter(
         0.2, "features whose depth sigma exceeds this share of their depth are dropped", minimum=0.001, maximum=1.0
     )
+    right_surplus: float = parameter(
+        1.6, "features wanted in the right image per feature of the left, so that few partners are missing", minimum=1.0
+    )
     features: FeatureConfig = group(FeatureConfig)
     matching: MatchingConfig = group(MatchingConfig)
     disparity: DisparityConfig = group(DisparityConfig)
     noise: PixelNoiseConfig = group(PixelNoiseConfig)
     fusion: FusionConfig = group(FusionConfig)
     tof: TofFeatureConfig = group(TofFeatureConfig)
+
+
+def _more(config: FeatureConfig, factor: float) -> FeatureConfig:
+    return dataclasses.replace(config, target=int(factor * config.target))
 
 
 class Frontend:
@@ -56,7 +64,7 @@ class Frontend:
         self.config = config or FrontendConfig()
         self.counters = Counters()
         self._left = FeatureExtractor(self.config.features)
-        self._right = FeatureExtractor(self.config.features)
+        self._right = FeatureExtractor(_more(self.config.features, self.config.right_surplus))
         self._noise = PixelNoise(self.config.noise)
         self._tof = TofFeatures(self.config.tof, self.config.features, self.config.noise)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="right_image")

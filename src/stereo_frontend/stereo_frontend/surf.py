@@ -1,0 +1,71 @@
+"""SURF-128 (Bay, Ess, Tuytelaars, Van Gool: Speeded-Up Robust Features, CVIU 2008), the thesis's choice of feature (ch.
+3).
+
+Extended descriptor, upright by default: a rig that a robot or a person carries level rolls by less than the 15 degrees
+that the upright one bears, and what it does not spend on orientation it gains in distinctiveness.
+
+Patents: SURF was covered by US 8,165,401 and EP 1 850 270 (Bay et al., filed 2006-2007). Whoever ships a product should
+have their status checked; SIFT, whose patent US 6,711,293 ended in March 2020, is one configuration value away
+(``detector: sift``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_core.config import Config, parameter
+from slam_core.types import ByteArray, Float32Array
+from stereo_frontend.keypoints import Keypoints, Selector
+from stereo_frontend.surf_descriptor import DIMENSION, describe_oriented, describe_upright, region_weights
+from stereo_frontend.surf_detector import MAX_PIXELS, IntegralImage, find_maxima, hessian_octaves, integral_image
+
+_MOST_KEYPOINTS = 20000
+_DIAMETER = 9.0 / 1.2
+"""Size of a keypoint (px) per unit of its scale: that of the filter that found it."""
+
+
+@dataclass(frozen=True)
+class SurfConfig(Config):
+    """Parameters of SURF, named as in the paper."""
+
+    octaves: int = parameter(3, "octaves of four filter sizes", minimum=1, maximum=6)
+    threshold: float = parameter(
+        26.0, "determinant of the Hessian of a customary keypoint, grey values 0 to 255", minimum=0.01
+    )
+    upright: bool = parameter(True, "describe along the image axes (U-SURF) instead of the keypoint's orientation")
+
+
+class SurfDetector:
+    """Finds and describes SURF keypoints."""
+
+    def __init__(self, config: SurfConfig | None = None) -> None:
+        self.config = config or SurfConfig()
+        self._weights = region_weights()
+
+    def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
+        """Keypoints above ``threshold`` times the configured one, thinned out by ``select`` before they are described.
+
+        Raises
+        ------
+        ValueError
+            If the image is too large for a 32-bit integral image.
+        """
+        if image.size > MAX_PIXELS:
+            raise ValueError(f"SURF takes images of at most {MAX_PIXELS} px, got {image.shape[1]} x {image.shape[0]}")
+        integral = integral_image(np.ascontiguousarray(image))
+        found = self._find(integral, threshold * self.config.threshold)
+        found = found[select(found[:, :2], found[:, 3])]
+        descriptors = np.empty((len(found), DIMENSION), np.float32)
+        describe = describe_upright if self.config.upright else describe_oriented
+        describe(integral, found[:, :3].astype(np.float64), self._weights, descriptors)
+        return Keypoints(found[:, :2].copy(), _DIAMETER * found[:, 2], found[:, 3].copy(), descriptors)
+
+    def _find(self, integral: IntegralImage, threshold: float) -> Float32Array:
+        """Rows of u, v, scale, response."""
+        buffer = np.empty((_MOST_KEYPOINTS, 4), np.float32)
+        parts = []
+        for octave, layers in enumerate(hessian_octaves(integral, self.config.octaves)):
+            parts.append(buffer[: find_maxima(layers, octave, np.float32(threshold), buffer)].copy())
+        return np.concatenate(parts) if parts else buffer[:0]

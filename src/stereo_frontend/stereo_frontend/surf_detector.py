@@ -1,0 +1,171 @@
+"""Compiled kernels that find SURF keypoints: box-filter Hessian on the integral image (Bay et al. 2008, section 3).
+
+A filter of size S stands for a Gaussian of scale ``1.2 S / 9``. An octave has four sizes; the next octave starts at the
+second of them, with twice the step between sizes and twice the sampling distance, so two of its four layers are the
+previous octave's, thinned out. The sums that the boxes of one row share are built once per row, which leaves 20 loads
+per pixel and layer instead of 32, all along the row, so that the compiler vectorises them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from slam_core.types import ByteArray, Float32Array
+
+LAYERS = 4
+MAX_PIXELS = 2**31 // 255
+"""A larger image would overflow the 32-bit integral image."""
+
+IntegralImage = npt.NDArray[np.int32]
+
+
+def filter_sizes(octave: int) -> list[int]:
+    """Sizes (px) of the four box filters of an octave: 9 15 21 27, 15 27 39 51, 27 51 75 99, ..."""
+    step = 3 * 2 ** (octave + 1)
+    return [step + 3 + step * layer for layer in range(LAYERS)]
+
+
+def hessian_octaves(integral: IntegralImage, octaves: int) -> list[Float32Array]:
+    """Determinants of the Hessian, one array (4, rows, columns) per octave, sampled every 2^octave pixels.
+
+    Octaves whose smallest filter does not fit the image are left out.
+    """
+    height, width = integral.shape[0] - 1, integral.shape[1] - 1
+    found: list[Float32Array] = []
+    for octave in range(octaves):
+        sizes, step = filter_sizes(octave), 2**octave
+        if sizes[2] + 2 * step >= min(height, width):
+            break
+        layers = np.zeros((LAYERS, -(-height // step), -(-width // step)), np.float32)
+        for layer, size in enumerate(sizes):
+            if found and layer < 2:
+                layers[layer] = found[-1][2 * layer + 1, ::2, ::2]
+            else:
+                hessian_layer(integral, size, step, layers[layer])
+        found.append(layers)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def integral_image(image: ByteArray) -> IntegralImage:
+    """Sums over all pixels above and to the left, int32 (height + 1, width + 1)."""
+    height, width = image.shape
+    out = np.zeros((height + 1, width + 1), np.int32)
+    for y in range(height):
+        above, here, row = out[y, 1:], out[y + 1, 1:], image[y]
+        total = np.int32(0)
+        for x in range(width):
+            total += np.int32(row[x])
+            here[x] = above[x] + total
+    return out
+
+
+@njit(cache=True, nogil=True)
+def hessian_layer(integral, size, step, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with ``Dxx Dyy - (0.9 Dxy)^2``, normalised by the filter's area; the border stays as it is."""
+    height, width = integral.shape[0] - 1, integral.shape[1] - 1
+    lobe, half = size // 3, size // 2
+    middle = lobe // 2
+    scale = np.float32(1.0 / (size * size))
+    n = width - 2 * half
+    first = -(-half // step)
+    last = (height - 1 - half) // step
+    band = np.empty(width + 1, np.int32)
+    stack = np.empty(width + 1, np.int32)
+    cross = np.empty(width + 1, np.int32)
+    line = np.empty(max(n, 0), np.float32)
+    for row in range(first, last + 1):
+        y = row * step
+        _row_sums(integral, y, lobe, half, middle, band, stack, cross)
+        a3, a0 = band[2 * half + 1 :], band
+        a2, a1 = band[half + middle + 1 :], band[half - middle :]
+        b1, b0 = stack[half + lobe :], stack[half - lobe + 1 :]
+        c3, c2, c1, c0 = cross[half + lobe + 1 :], cross[half + 1 :], cross[half:], cross[half - lobe :]
+        for x in range(n):
+            dxx = np.float32(a3[x] - a0[x] - 3 * (a2[x] - a1[x])) * scale
+            dyy = np.float32(b1[x] - b0[x]) * scale
+            dxy = np.float32(c1[x] - c0[x] - c3[x] + c2[x]) * scale
+            line[x] = dxx * dyy - np.float32(0.81) * dxy * dxy
+        target = out[row]
+        for column in range(-(-half // step), (width - 1 - half) // step + 1):
+            target[column] = line[column * step - half]
+
+
+@njit(cache=True, nogil=True)
+def _row_sums(integral, y, lobe, half, middle, band, stack, cross):  # type: ignore[no-untyped-def]
+    """Column sums of the boxes around row ``y``: of Dxx's band, of Dyy's weighted stack, of Dxy's upper minus lower
+    boxes.
+    """
+    band_top, band_bottom = integral[y - lobe + 1], integral[y + lobe]
+    stack_top, stack_bottom = integral[y - half], integral[y + half + 1]
+    inner_top, inner_bottom = integral[y - middle], integral[y + middle + 1]
+    upper_top, upper_bottom = integral[y - lobe], integral[y]
+    lower_top, lower_bottom = integral[y + 1], integral[y + lobe + 1]
+    for x in range(band.shape[0]):
+        band[x] = band_bottom[x] - band_top[x]
+        stack[x] = stack_bottom[x] - stack_top[x] - 3 * (inner_bottom[x] - inner_top[x])
+        cross[x] = upper_bottom[x] - upper_top[x] - lower_bottom[x] + lower_top[x]
+
+
+@njit(cache=True, nogil=True)
+def find_maxima(layers, octave, threshold, found):  # type: ignore[no-untyped-def]
+    """Write maxima of 3x3x3 neighbourhoods above ``threshold`` to ``found`` rows u, v, scale, response; return their
+    number.
+
+    Position and scale are those of the vertex of the parabola through the neighbourhood (Brown and Lowe 2002).
+    """
+    step = 2**octave
+    increment = 3 * 2 ** (octave + 1)
+    count = 0
+    offset = np.empty(3)
+    for layer in range(1, 3):
+        size = increment + 3 + increment * layer
+        border = (size + increment) // 2 // step + 2
+        for y in range(border, layers.shape[1] - border):
+            row = layers[layer, y]
+            for x in range(border, layers.shape[2] - border):
+                value = row[x]
+                if value <= threshold or not _is_maximum(layers, layer, y, x, value):
+                    continue
+                if count < found.shape[0] and _vertex(layers, layer, y, x, offset):
+                    found[count, 0] = (x + offset[0]) * step
+                    found[count, 1] = (y + offset[1]) * step
+                    found[count, 2] = 1.2 / 9.0 * (size + offset[2] * increment)
+                    found[count, 3] = value
+                    count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _is_maximum(layers, layer, y, x, value):  # type: ignore[no-untyped-def]
+    for k in (layer, layer - 1, layer + 1):
+        for j in range(y - 1, y + 2):
+            for i in range(x - 1, x + 2):
+                if layers[k, j, i] >= value and not (k == layer and j == y and i == x):
+                    return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _vertex(layers, k, y, x, offset):  # type: ignore[no-untyped-def]
+    """Vertex of the parabola through a neighbourhood relative to its centre; False if it lies outside of it."""
+    centre = np.float64(layers[k, y, x])
+    gx = 0.5 * (layers[k, y, x + 1] - layers[k, y, x - 1])
+    gy = 0.5 * (layers[k, y + 1, x] - layers[k, y - 1, x])
+    gs = 0.5 * (layers[k + 1, y, x] - layers[k - 1, y, x])
+    xx = layers[k, y, x + 1] + layers[k, y, x - 1] - 2.0 * centre
+    yy = layers[k, y + 1, x] + layers[k, y - 1, x] - 2.0 * centre
+    ss = layers[k + 1, y, x] + layers[k - 1, y, x] - 2.0 * centre
+    xy = 0.25 * (layers[k, y + 1, x + 1] - layers[k, y + 1, x - 1] - layers[k, y - 1, x + 1] + layers[k, y - 1, x - 1])
+    xs = 0.25 * (layers[k + 1, y, x + 1] - layers[k + 1, y, x - 1] - layers[k - 1, y, x + 1] + layers[k - 1, y, x - 1])
+    ys = 0.25 * (layers[k + 1, y + 1, x] - layers[k + 1, y - 1, x] - layers[k - 1, y + 1, x] + layers[k - 1, y - 1, x])
+    m00, m01, m02 = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - xs * yy
+    determinant = xx * m00 + xy * m01 + xs * m02
+    if abs(determinant) < 1e-30:
+        return False
+    offset[0] = -(m00 * gx + m01 * gy + m02 * gs) / determinant
+    offset[1] = -(m01 * gx + (xx * ss - xs * xs) * gy + (xy * xs - xx * ys) * gs) / determinant
+    offset[2] = -(m02 * gx + (xy * xs - xx * ys) * gy + (xx * yy - xy * xy) * gs) / determinant
+    return abs(offset[0]) <= 0.6 and abs(offset[1]) <= 0.6 and abs(offset[2]) <= 0.6
