@@ -1,0 +1,338 @@
+"""What every node shares: typed parameters, guarded inputs, diagnostics, watchdog, reset and pause, and a clean end.
+
+    class NdtNode(SlamNode[NdtNodeConfig]):
+        def __init__(self) -> None:
+            super().__init__("ndt_odometry", NdtNodeConfig)
+            self.odometry = ScanOdometry(self.config.odometry)
+            self.advertise("ndt/odometry", "Odometry")
+            self.listen("tof/points", "PointCloud2", self.on_points)
+
+        def on_points(self, cloud: Message) -> None:
+            result = self.odometry.process(stamp_ns(cloud), points_from_message(cloud))
+            self.publish("ndt/odometry", odometry_message(self.types, "odom", "base_link", result.pose))
+
+        def on_reset(self) -> None:
+            self.odometry.reset()
+
+    def main() -> None:
+        run_node(NdtNode)  # of slam_core.ros
+
+A callback that raises ``ValueError`` rejects its message: logged, counted, never the end of the node. Header stamps are
+the only time; a stamp that jumps backwards resets the node. Whatever a node has finished is announced on ``/progress``
+(Header: stamp, node name), which is what lets a player wait for it instead of losing messages.
+"""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls, disable-error-code="attr-defined,union-attr,arg-type,misc"
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from std_srvs.srv import SetBool, Trigger
+
+from slam_core.config import Config, parameter
+from slam_core.frame_tree import FrameTree
+from slam_core.geometry import FloatArray
+from slam_core.health import Health, State
+from slam_core.messages import header_message, stamp_ns, transform_from_message
+from slam_core.messages.base import Message
+from slam_core.ros import RosTypes, declare_config, has_tf2_msgs, incompatibility, sensor_qos
+from slam_core.synchronizer import ExactSynchronizer
+
+C = TypeVar("C", bound=Config)
+
+WATCHDOG_S = 5.0
+LATCHED_DEPTH = 1000
+PROGRESS_TOPIC = "/progress"
+STATIC_TRANSFORMS_TOPIC = "static_transforms"
+"""TransformStamped, latched, one message per transform: /tf_static for installations without tf2_msgs."""
+
+
+@dataclass(frozen=True)
+class InputConfig(Config):
+    """How a node subscribes and pairs; parameters ``input.*`` of every node."""
+
+    reliability: str = parameter(
+        "match",
+        "reliability of subscriptions; match: what the publisher offers",
+        choices=("match", "reliable", "best_effort"),
+    )
+    depth: int = parameter(200, "messages kept per topic while the node is busy", minimum=1)
+    pairing_tolerance_s: float = parameter(
+        0.0, "largest difference of stamps that belong together", unit="s", minimum=0.0
+    )
+
+
+@dataclass
+class _Input:
+    """One subscription and what is known of its traffic; ``handler`` takes (stamp_ns, message)."""
+
+    topic: str
+    message_class: Any
+    handler: Callable[[int, Message], None]
+    latched: bool
+    required: bool
+    subscription: Any = None
+    best_effort: bool = False
+    volatile: bool = False
+    last_stamp_ns: int | None = None
+    seen_at_s: float | None = None
+
+
+class SlamNode(Node, Generic[C]):
+    """Base of all nodes, see the example above. ``config`` is the checked configuration, ``types`` makes messages."""
+
+    def __init__(self, name: str, config_type: type[C]) -> None:
+        super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        self.input_config = declare_config(self, InputConfig, "input.")
+        self.config: C = declare_config(self, config_type, ignore=("input.",))
+        self.types = RosTypes()
+        self.health = Health()
+        self.frames = FrameTree()
+        self._inputs: dict[str, _Input] = {}
+        self._synchronizers: list[ExactSynchronizer[Message]] = []
+        self._outputs: dict[str, Any] = {}
+        self._paused = False
+        self._silent = False
+        self._started_at_s = time.monotonic()
+        self._progress = self.create_publisher(self.types.Header, PROGRESS_TOPIC, sensor_qos(self.input_config.depth))
+        self._diagnostics = self.create_publisher(self.types.DiagnosticArray, "/diagnostics", sensor_qos(10))
+        self._listen_to_static_transforms()
+        self._tf = self._advertise_tf()
+        self.create_service(Trigger, "~/reset", self._on_reset_service)
+        self.create_service(SetBool, "~/pause", self._on_pause_service)
+        self.create_service(Trigger, "~/finish", self._on_finish_service)
+        self.create_timer(1.0, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    # -- for the nodes -------------------------------------------------------------------------------------------------
+
+    def listen(
+        self,
+        topic: str,
+        type_name: str,
+        callback: Callable[[Message], None],
+        *,
+        latched: bool = False,
+        required: bool = True,
+    ) -> None:
+        """Subscribe. The silence of ``required`` inputs is reported. ``type_name`` as in MESSAGE_PACKAGES."""
+        self._add_input(topic, type_name, lambda stamp, m: self._process(topic, stamp, callback, m), latched, required)
+
+    def listen_together(
+        self, topics: Mapping[str, str], callback: Callable[..., None], *, latched: bool = False, required: bool = True
+    ) -> None:
+        """Subscribe to several topics (topic: type); ``callback`` gets the messages of one stamp in that order."""
+        names = list(topics)
+
+        def on_set(stamp: int, messages: tuple[Message, ...]) -> None:
+            self._process(" + ".join(names), stamp, callback, *messages)
+
+        tolerance_ns = round(self.input_config.pairing_tolerance_s * 1e9)
+        pairs = ExactSynchronizer[Message](names, on_set, tolerance_ns=tolerance_ns, depth=self.input_config.depth)
+        self._synchronizers.append(pairs)
+        for topic, type_name in topics.items():
+            self._add_input(topic, type_name, lambda stamp, m, t=topic: pairs.add(t, stamp, m), latched, required)
+
+    def advertise(self, topic: str, type_name: str, *, latched: bool = False, depth: int | None = None) -> None:
+        """Offer a topic: reliable; ``latched`` ones (maps) keep what they sent for those who come later."""
+        depth = depth or (LATCHED_DEPTH if latched else self.input_config.depth)
+        self._outputs[topic] = self.create_publisher(getattr(self.types, type_name), topic, sensor_qos(depth, latched))
+
+    def publish(self, topic: str, message: Message) -> None:
+        """Send on an advertised topic."""
+        self._outputs[topic].publish(message)
+
+    def has_listeners(self, topic: str) -> bool:
+        """Whether anybody subscribes to an advertised topic: costly pictures are made only then."""
+        return bool(self._outputs[topic].get_subscription_count() > 0)
+
+    def lookup(self, target: str, source: str) -> FloatArray:
+        """T_target_source (4, 4) from the static transforms; ValueError, so a counted rejection, if unknown."""
+        return self.frames.lookup(target, source)
+
+    def broadcast(self, *transforms: Message) -> None:
+        """Send TransformStamped messages on /tf where tf2_msgs is installed."""
+        if self._tf is not None:
+            self._tf.publish(self.types.TFMessage(transforms=list(transforms)))
+
+    def on_reset(self) -> None:
+        """Start anew; override where there is state."""
+
+    def on_finish(self) -> str:
+        """The input has ended: publish what is still open. Override where there is any; returns a line for the log."""
+        return "nothing open"
+
+    def on_shutdown(self) -> None:
+        """The node ends; override to close files."""
+
+    # -- inputs --------------------------------------------------------------------------------------------------------
+
+    def _add_input(
+        self, topic: str, type_name: str, handler: Callable[[int, Message], None], latched: bool, required: bool
+    ) -> None:
+        entry = _Input(self.resolve_topic_name(topic), getattr(self.types, type_name), handler, latched, required)
+        entry.best_effort = self.input_config.reliability == "best_effort"
+        self._inputs[topic] = entry
+        self._subscribe(entry)
+
+    def _subscribe(self, entry: _Input) -> None:
+        if entry.subscription is not None:
+            self.destroy_subscription(entry.subscription)
+        depth = LATCHED_DEPTH if entry.latched else self.input_config.depth
+        profile = sensor_qos(depth, entry.latched and not entry.volatile, best_effort=entry.best_effort)
+        events = SubscriptionEventCallbacks(
+            message_lost=lambda event: self.health.count("lost_by_transport", event.total_count_change),
+            incompatible_qos=lambda event: None,
+        )
+        entry.subscription = self.create_subscription(
+            entry.message_class, entry.topic, lambda m: self._receive(entry, m), profile, event_callbacks=events
+        )
+
+    def _receive(self, entry: _Input, message: Message) -> None:
+        entry.seen_at_s = time.monotonic()
+        if self._paused:
+            self.health.count("ignored_while_paused")
+            return
+        stamp = stamp_ns(message)
+        if entry.last_stamp_ns is not None and stamp < entry.last_stamp_ns:
+            self.reset(f"time jumped back by {(entry.last_stamp_ns - stamp) / 1e9:.3f} s on {entry.topic}")
+        entry.last_stamp_ns = stamp
+        entry.handler(stamp, message)
+
+    def _process(self, source: str, stamp: int, callback: Callable[..., None], *messages: Message) -> None:
+        started = time.perf_counter()
+        try:
+            callback(*messages)
+            self.health.processed(time.perf_counter() - started)
+        except ValueError as error:
+            self._reject(f"{source}: message rejected: {error}")
+        except Exception:
+            self._reject(f"{source}: message rejected after a fault:\n{traceback.format_exc()}")
+        self._progress.publish(header_message(self.types, stamp, self.get_fully_qualified_name()))
+
+    def _reject(self, why: str) -> None:
+        self.health.count("rejected")
+        self.get_logger().warning(why, throttle_duration_sec=1.0)
+
+    # -- reset, pause, finish ------------------------------------------------------------------------------------------
+
+    def reset(self, why: str) -> None:
+        """Flush the queues and start anew."""
+        self.get_logger().warning(f"reset: {why}")
+        self.health.count("resets")
+        for synchronizer in self._synchronizers:
+            synchronizer.clear()
+        for entry in self._inputs.values():
+            entry.last_stamp_ns = None
+        self.on_reset()
+        self.health.set(State.OK, f"reset: {why}")
+
+    def _on_reset_service(self, _: Any, response: Any) -> Any:
+        self.reset("asked by service")
+        response.success = True
+        return response
+
+    def _on_pause_service(self, request: Any, response: Any) -> Any:
+        self._paused = bool(request.data)
+        response.success, response.message = True, "paused" if self._paused else "running"
+        return response
+
+    def _on_finish_service(self, _: Any, response: Any) -> Any:
+        try:
+            response.success, response.message = True, self.on_finish()
+        except ValueError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    # -- diagnostics ---------------------------------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        self._match_publishers()
+        silence = self._silence()
+        if silence and not self._silent:
+            self.get_logger().warning(silence)
+        self._silent = bool(silence)
+        self._diagnostics.publish(self._diagnostic_message(silence))
+
+    def _diagnostic_message(self, silence: str) -> Message:
+        self.health.counters["unpaired"] = sum(s.unpaired for s in self._synchronizers)
+        values = self.health.report(time.monotonic())
+        level = max(int(self.health.state), int(State.DEGRADED) if silence else 0)
+        status = self.types.DiagnosticStatus(
+            level=bytes([level]),
+            name=self.get_fully_qualified_name(),
+            message=silence or self.health.reason or "OK",
+            values=[self.types.KeyValue(key=key, value=value) for key, value in values.items()],
+        )
+        header = self.types.Header(stamp=self.get_clock().now().to_msg())
+        return self.types.DiagnosticArray(header=header, status=[status])
+
+    def _silence(self) -> str:
+        """Which required topics have been silent for five seconds and why, or "" if none has."""
+        now, texts = time.monotonic(), []
+        for entry in self._inputs.values():
+            if entry.required and not self._paused and now - (entry.seen_at_s or self._started_at_s) > WATCHDOG_S:
+                texts.append(f"no input on {entry.topic} for {WATCHDOG_S:.0f} s ({self._publishers_text(entry)})")
+        return "; ".join(texts)
+
+    def _publishers_text(self, entry: _Input) -> str:
+        publishers = self.get_publishers_info_by_topic(entry.topic)
+        if not publishers:
+            return "it has no publisher"
+        wanted = entry.subscription.qos_profile
+        texts = []
+        for info in publishers:
+            why = incompatibility(info.qos_profile, wanted)
+            texts.append(
+                f"{info.node_namespace.rstrip('/')}/{info.node_name}" + (f", incompatible: {why}" if why else "")
+            )
+        return "published by " + ", ".join(texts)
+
+    def _match_publishers(self) -> None:
+        """Subscribe again where every publisher offers less than was asked for, as ``ros2 topic echo`` would."""
+        if self.input_config.reliability != "match":
+            return
+        for entry in self._inputs.values():
+            publishers = self.get_publishers_info_by_topic(entry.topic) if entry.seen_at_s is None else []
+            if not publishers:
+                continue
+            best_effort = all(p.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for p in publishers)
+            volatile = all(p.qos_profile.durability == DurabilityPolicy.VOLATILE for p in publishers)
+            if (best_effort, volatile and entry.latched) != (entry.best_effort, entry.volatile):
+                entry.best_effort, entry.volatile = best_effort, volatile and entry.latched
+                self._subscribe(entry)
+
+    # -- transforms ----------------------------------------------------------------------------------------------------
+
+    def _listen_to_static_transforms(self) -> None:
+        profile = sensor_qos(LATCHED_DEPTH, latched=True)
+        self.create_subscription(
+            self.types.TransformStamped, STATIC_TRANSFORMS_TOPIC, self._on_static_transform, profile
+        )
+        if has_tf2_msgs():
+            self.create_subscription(self.types.TFMessage, "/tf_static", self._on_tf_static, profile)
+
+    def _on_tf_static(self, message: Message) -> None:
+        for transform in message.transforms:
+            self._on_static_transform(transform)
+
+    def _on_static_transform(self, message: Message) -> None:
+        try:
+            self.frames.add(*transform_from_message(message))
+        except ValueError as error:
+            self._reject(f"static transform rejected: {error}")
+
+    def _advertise_tf(self) -> Any:
+        if has_tf2_msgs():
+            return self.create_publisher(self.types.TFMessage, "/tf", sensor_qos(100))
+        self.get_logger().info("tf2_msgs is not installed: transforms are published as TransformStamped topics only")
+        return None

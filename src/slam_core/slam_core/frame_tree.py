@@ -1,0 +1,52 @@
+"""The rigid transforms between the frames of a rig, from ``tf_static``; a missing one is never identity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
+
+
+class FrameTree:
+    """Static transforms by (parent, child), looked up along any chain of them."""
+
+    def __init__(self) -> None:
+        self._neighbours: dict[str, dict[str, FloatArray]] = {}
+
+    def add(self, parent: str, child: str, T_parent_child: FloatArray) -> None:
+        """Set or replace one transform (4, 4)."""
+        if not is_rigid_transform(T_parent_child):
+            raise ValueError(f"transform {parent} <- {child} is not rigid: {T_parent_child.tolist()}")
+        self._neighbours.setdefault(parent, {})[child] = T_parent_child
+        self._neighbours.setdefault(child, {})[parent] = invert_transform(T_parent_child)
+
+    def __contains__(self, frame: str) -> bool:
+        return frame in self._neighbours
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of all frames, sorted."""
+        return tuple(sorted(self._neighbours))
+
+    def lookup(self, target: str, source: str) -> FloatArray:
+        """T_target_source (4, 4).
+
+        Raises
+        ------
+        ValueError
+            If no chain of transforms joins the two frames.
+        """
+        if target == source:
+            return np.eye(4)
+        reached: dict[str, FloatArray] = {target: np.eye(4)}
+        waiting = [target]
+        while waiting:
+            frame = waiting.pop(0)
+            for neighbour, T in self._neighbours.get(frame, {}).items():
+                if neighbour not in reached:
+                    reached[neighbour] = reached[frame] @ T
+                    waiting.append(neighbour)
+        if source not in reached:
+            known = ", ".join(self.frames) or "none"
+            raise ValueError(f"no transform from '{source}' to '{target}' (known frames: {known})")
+        return reached[source]

@@ -1,0 +1,49 @@
+"""A node's own condition: state, counters, rate and time per message; the content of ``/diagnostics``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from enum import IntEnum
+
+
+class State(IntEnum):
+    """Condition of an estimator, as in its diagnostics; the values are DiagnosticStatus levels."""
+
+    OK = 0
+    DEGRADED = 1
+    LOST = 2
+
+
+class Health:
+    """State with reason, counters since the start, and rate and duration since the last report."""
+
+    def __init__(self) -> None:
+        self.state = State.OK
+        self.reason = "waiting for input"
+        self.counters: Counter[str] = Counter()
+        self._durations: list[float] = []
+        self._reported_at: float | None = None
+
+    def set(self, state: State, reason: str = "") -> None:
+        """Set the state; ``reason`` says why it is not OK."""
+        self.state, self.reason = state, reason
+
+    def count(self, what: str, number: int = 1) -> None:
+        """Add to a counter, for instance "rejected"."""
+        self.counters[what] += number
+
+    def processed(self, duration_s: float) -> None:
+        """One input was processed in ``duration_s``."""
+        self.count("processed")
+        self._durations.append(duration_s)
+
+    def report(self, now_s: float) -> dict[str, str]:
+        """Key and text of every value; starts a new period for rate and durations. ``now_s`` is any steady clock."""
+        period = now_s - self._reported_at if self._reported_at is not None else 0.0
+        durations, self._durations, self._reported_at = self._durations, [], now_s
+        values = {"state": self.state.name, "reason": self.reason}
+        values["rate_hz"] = f"{len(durations) / period:.2f}" if period > 0.0 else "0.00"
+        if durations:
+            values["latency_mean_ms"] = f"{1e3 * sum(durations) / len(durations):.2f}"
+            values["latency_max_ms"] = f"{1e3 * max(durations):.2f}"
+        return values | {name: str(number) for name, number in sorted(self.counters.items())}

@@ -1,0 +1,93 @@
+"""Conversions between the data types of ``slam_core`` and ROS messages, written once and without ROS.
+
+Messages are read by attribute (duck typing) and made through a :class:`MessageTypes`, so that the same code serves the
+messages of rclpy (``slam_core.ros.RosTypes``) and those of a bag read by rosbags (``slam_bringup.bag_types.BagTypes``).
+``x_message(types, ...)`` makes a message, ``x_from_message(message)`` reads one. A message that contradicts
+itself raises ``ValueError`` naming what is wrong.
+"""
+
+from slam_core.messages.base import MessageTypes, header_message, ns_from_time, stamp_ns, time_message
+from slam_core.messages.cameras import camera_info_from_message, camera_info_message, rectified_info
+from slam_core.messages.clouds import (
+    cloud_from_message,
+    cloud_message,
+    landmark_cloud,
+    points_from_message,
+    points_message,
+)
+from slam_core.messages.depth import DEPTH_TOPICS, DepthMessages, depth_from_messages, depth_messages
+from slam_core.messages.features import FEATURE_TOPICS, FeatureMessages, features_from_messages, features_messages
+from slam_core.messages.images import (
+    compressed_image_message,
+    grey_from_message,
+    image_from_message,
+    image_message,
+    metres_from_message,
+)
+from slam_core.messages.markers import ellipsoid_markers, path_marker
+from slam_core.messages.poses import (
+    estimate_from_message,
+    imu_from_message,
+    imu_message,
+    motion_from_message,
+    motion_message,
+    odometry_message,
+    path_from_message,
+    path_message,
+    pose_from_message,
+    pose_message,
+    pose_stamped_message,
+    pose_with_covariance_message,
+    transform_from_message,
+    transform_message,
+)
+from slam_core.messages.submaps import SUBMAP_TOPICS, SubmapMessages, submap_from_messages, submap_messages
+
+__all__ = [
+    "DEPTH_TOPICS",
+    "FEATURE_TOPICS",
+    "SUBMAP_TOPICS",
+    "DepthMessages",
+    "FeatureMessages",
+    "MessageTypes",
+    "SubmapMessages",
+    "camera_info_from_message",
+    "camera_info_message",
+    "cloud_from_message",
+    "cloud_message",
+    "compressed_image_message",
+    "depth_from_messages",
+    "depth_messages",
+    "ellipsoid_markers",
+    "estimate_from_message",
+    "features_from_messages",
+    "features_messages",
+    "grey_from_message",
+    "header_message",
+    "image_from_message",
+    "image_message",
+    "imu_from_message",
+    "imu_message",
+    "landmark_cloud",
+    "metres_from_message",
+    "motion_from_message",
+    "motion_message",
+    "ns_from_time",
+    "odometry_message",
+    "path_from_message",
+    "path_marker",
+    "path_message",
+    "points_from_message",
+    "points_message",
+    "pose_from_message",
+    "pose_message",
+    "pose_stamped_message",
+    "pose_with_covariance_message",
+    "rectified_info",
+    "stamp_ns",
+    "submap_from_messages",
+    "submap_messages",
+    "time_message",
+    "transform_from_message",
+    "transform_message",
+]

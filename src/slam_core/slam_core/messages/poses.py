@@ -1,0 +1,144 @@
+"""Poses, motions and IMU readings. Covariances need no conversion: see the tangent order of ``slam_core.geometry``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from slam_core.geometry import FloatArray, pose7_from_transform, transform_from_pose7
+from slam_core.messages.base import Message, MessageTypes, header_message, stamp_ns
+from slam_core.types import ImuSample, PoseEstimate, RelativeMotion
+
+
+def pose_message(types: MessageTypes, T: FloatArray) -> Message:
+    """geometry_msgs/Pose of a transform (4, 4)."""
+    x, y, z, qx, qy, qz, qw = (float(v) for v in pose7_from_transform(T))
+    return types.Pose(position=types.Point(x=x, y=y, z=z), orientation=types.Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
+def pose_from_message(pose: Message) -> FloatArray:
+    """Transform (4, 4) of a geometry_msgs/Pose; ValueError if not finite or with a quaternion not of unit norm."""
+    return _transform(pose.position, pose.orientation)
+
+
+def pose_stamped_message(types: MessageTypes, stamp: int, frame_id: str, T: FloatArray) -> Message:
+    """geometry_msgs/PoseStamped of T_frame_child (4, 4)."""
+    return types.PoseStamped(header=header_message(types, stamp, frame_id), pose=pose_message(types, T))
+
+
+def pose_with_covariance_message(types: MessageTypes, frame_id: str, estimate: PoseEstimate) -> Message:
+    """geometry_msgs/PoseWithCovarianceStamped."""
+    return types.PoseWithCovarianceStamped(
+        header=header_message(types, estimate.stamp_ns, frame_id), pose=_with_covariance(types, estimate)
+    )
+
+
+def odometry_message(types: MessageTypes, frame_id: str, child_frame_id: str, estimate: PoseEstimate) -> Message:
+    """nav_msgs/Odometry of T_frame_child; the twist, which nobody estimates here, is marked unknown (covariance -1)."""
+    unknown = np.zeros(36)
+    unknown[0] = -1.0
+    return types.Odometry(
+        header=header_message(types, estimate.stamp_ns, frame_id), child_frame_id=child_frame_id,
+        pose=_with_covariance(types, estimate), twist=types.TwistWithCovariance(covariance=unknown),
+    )  # fmt: skip
+
+
+def estimate_from_message(message: Message) -> PoseEstimate:
+    """Pose with covariance of an Odometry or a PoseWithCovarianceStamped."""
+    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+    if not np.isfinite(covariance).all():
+        raise ValueError("pose covariance is not finite")
+    return PoseEstimate(stamp_ns(message), pose_from_message(message.pose.pose), covariance)
+
+
+def motion_message(types: MessageTypes, frame_id: str, stamp: int, motion: RelativeMotion | None) -> Message:
+    """PoseWithCovarianceStamped of the motion that ended at ``stamp``, in the frame as it was at its start.
+
+    That frame is named ``<frame>@<start ns>``. A motion that is not known starts at its own end: a reader who pairs by
+    stamp then need not wait for what will never come.
+    """
+    motion = motion or RelativeMotion(stamp, stamp, np.eye(4), np.zeros((6, 6)))
+    end = PoseEstimate(motion.end_stamp_ns, motion.T, motion.covariance)
+    return pose_with_covariance_message(types, f"{frame_id}@{motion.start_stamp_ns}", end)
+
+
+def motion_from_message(message: Message) -> RelativeMotion | None:
+    """Inverse of :func:`motion_message`; None for a motion that is not known."""
+    _, separator, start = message.header.frame_id.rpartition("@")
+    if not separator or not start.isdigit():
+        raise ValueError(f"a motion's frame is '<frame>@<start ns>', got '{message.header.frame_id}'")
+    end = estimate_from_message(message)
+    motion = RelativeMotion(int(start), end.stamp_ns, end.T, end.covariance)
+    return motion if motion.start_stamp_ns != motion.end_stamp_ns else None
+
+
+def path_message(types: MessageTypes, stamp: int, frame_id: str, poses: Iterable[PoseEstimate]) -> Message:
+    """nav_msgs/Path of poses T_frame_rig; each keeps its own stamp."""
+    stamped = [pose_stamped_message(types, p.stamp_ns, frame_id, p.T) for p in poses]
+    return types.Path(header=header_message(types, stamp, frame_id), poses=stamped)
+
+
+def path_from_message(message: Message) -> list[tuple[int, FloatArray]]:
+    """Stamps (ns) and transforms (4, 4) of a nav_msgs/Path."""
+    return [(stamp_ns(pose), pose_from_message(pose.pose)) for pose in message.poses]
+
+
+def transform_message(types: MessageTypes, stamp: int, parent: str, child: str, T_parent_child: FloatArray) -> Message:
+    """geometry_msgs/TransformStamped."""
+    x, y, z, qx, qy, qz, qw = (float(v) for v in pose7_from_transform(T_parent_child))
+    transform = types.Transform(
+        translation=types.Vector3(x=x, y=y, z=z), rotation=types.Quaternion(x=qx, y=qy, z=qz, w=qw)
+    )
+    return types.TransformStamped(
+        header=header_message(types, stamp, parent), child_frame_id=child, transform=transform
+    )
+
+
+def transform_from_message(message: Message) -> tuple[str, str, FloatArray]:
+    """Parent, child and T_parent_child (4, 4) of a geometry_msgs/TransformStamped."""
+    transform = message.transform
+    T = _transform(transform.translation, transform.rotation)
+    return message.header.frame_id, message.child_frame_id, T
+
+
+def imu_message(types: MessageTypes, frame_id: str, sample: ImuSample) -> Message:
+    """sensor_msgs/Imu without orientation (its covariance starts with -1, as REP-145 asks)."""
+    unknown = np.zeros(9)
+    unknown[0] = -1.0
+    return types.Imu(
+        header=header_message(types, sample.stamp_ns, frame_id), orientation=types.Quaternion(w=1.0),
+        orientation_covariance=unknown, angular_velocity=_vector(types, sample.angular_velocity),
+        linear_acceleration=_vector(types, sample.linear_acceleration),
+    )  # fmt: skip
+
+
+def imu_from_message(message: Message) -> ImuSample:
+    """Angular velocity and acceleration of a sensor_msgs/Imu, in the axes of its frame."""
+    rate, acceleration = _xyz(message.angular_velocity), _xyz(message.linear_acceleration)
+    if not (np.isfinite(rate).all() and np.isfinite(acceleration).all()):
+        raise ValueError(f"IMU reading is not finite: {rate} rad/s, {acceleration} m/s2")
+    if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
+        raise ValueError("IMU message has no angular velocity or no acceleration (covariance -1)")
+    return ImuSample(stamp_ns(message), rate, acceleration)
+
+
+def _with_covariance(types: MessageTypes, estimate: PoseEstimate) -> Message:
+    covariance = np.asarray(estimate.covariance, dtype=np.float64).ravel()
+    return types.PoseWithCovariance(pose=pose_message(types, estimate.T), covariance=covariance)
+
+
+def _transform(position: Message, orientation: Message) -> FloatArray:
+    q = orientation
+    pose = np.array([*_xyz(position), q.x, q.y, q.z, q.w], dtype=np.float64)
+    if not np.isfinite(pose).all():
+        raise ValueError(f"pose is not finite: {pose.tolist()}")
+    return transform_from_pose7(pose)
+
+
+def _vector(types: MessageTypes, xyz: FloatArray) -> Message:
+    return types.Vector3(x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
+
+
+def _xyz(vector: Message) -> FloatArray:
+    return np.array([vector.x, vector.y, vector.z], dtype=np.float64)

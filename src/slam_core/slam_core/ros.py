@@ -1,0 +1,158 @@
+"""The bridge to rclpy: message classes, parameters from a :class:`Config`, quality of service, and a node's life.
+
+The node base class is :class:`slam_core.base_node.SlamNode`.
+"""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls, disable-error-code="attr-defined,union-attr,arg-type,misc"
+
+from __future__ import annotations
+
+import array
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+import rclpy
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from slam_core.config import Config, ParameterInfo, from_mapping, iterate_parameters
+from slam_core.messages import MessageTypes
+from slam_core.messages.base import Message
+from slam_core.types import AnyArray
+
+C = TypeVar("C", bound=Config)
+
+
+class RosTypes(MessageTypes):
+    """Makes rclpy messages."""
+
+    def load(self, package: str, name: str) -> Any:
+        """The message class."""
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+
+    def octets(self, values: AnyArray) -> Any:
+        """``array.array('B')``: any other sequence is copied element by element by rclpy."""
+        octets = array.array("B")
+        octets.frombytes(memoryview(np.ascontiguousarray(values).reshape(-1).view(np.uint8)))
+        return octets
+
+
+def declare_config(node: Node, config_type: type[C], prefix: str = "", ignore: tuple[str, ...] = ()) -> C:
+    """Declare every parameter of ``config_type`` and return the configuration with the values set from outside.
+
+    The node must declare parameters from overrides automatically, so that unknown names are seen and refused.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name below ``prefix``, a wrong type or a value out of range.
+    """
+    given = {name: _plain(p.value) for name, p in node.get_parameters_by_prefix(prefix.rstrip(".")).items()}
+    foreign = ("use_sim_time", "start_type_description_service", "qos_overrides.", *ignore)
+    config = from_mapping(config_type, {k: v for k, v in given.items() if prefix or not k.startswith(foreign)})
+    for name, value, info in iterate_parameters(config, prefix):
+        _declare(node, name, list(value) if isinstance(value, tuple) else value, info)
+    return config
+
+
+def _declare(node: Node, name: str, value: Any, info: ParameterInfo) -> None:
+    descriptor = _descriptor(name, value, info)
+    if node.has_parameter(name):
+        node.set_parameters([Parameter(name, value=value)])
+        node.set_descriptor(name, descriptor)
+    else:
+        node.declare_parameter(name, value, descriptor)
+
+
+def _descriptor(name: str, value: Any, info: ParameterInfo) -> Message:
+    descriptor = ParameterDescriptor(name=name, description=info.text(), read_only=True, dynamic_typing=True)
+    low, high = info.minimum, info.maximum
+    if low is None and high is None:
+        return descriptor
+    if isinstance(value, float):
+        largest = sys.float_info.max
+        bounds = (-largest if low is None else float(low), largest if high is None else float(high))
+        descriptor.floating_point_range = [FloatingPointRange(from_value=bounds[0], to_value=bounds[1], step=0.0)]
+    elif isinstance(value, int) and not isinstance(value, bool):
+        bounds_int = (-(2**63) if low is None else int(low), 2**63 - 1 if high is None else int(high))
+        descriptor.integer_range = [IntegerRange(from_value=bounds_int[0], to_value=bounds_int[1], step=0)]
+    return descriptor
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, array.array | np.ndarray) else value
+
+
+def sensor_qos(depth: int, latched: bool = False, *, best_effort: bool = False) -> QoSProfile:
+    """Keep the last ``depth`` messages; reliable unless ``best_effort``; transient-local if ``latched``."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def incompatibility(offered: QoSProfile, wanted: QoSProfile) -> str:
+    """Why a publisher's offer does not serve a subscription, or ""."""
+    reasons = []
+    if (offered.reliability, wanted.reliability) == (ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE):
+        reasons.append("offers best effort, reliable is asked for (input.reliability)")
+    if (offered.durability, wanted.durability) == (DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL):
+        reasons.append("offers volatile, transient local is asked for")
+    return " and ".join(reasons)
+
+
+def has_tf2_msgs() -> bool:
+    """Whether tf2_msgs can be imported: it is part of every ROS installation but has no wheel on PyPI."""
+    return importlib.util.find_spec("tf2_msgs") is not None
+
+
+class RunnableNode(Protocol):
+    """What :func:`run_node` needs of a node beside rclpy's own."""
+
+    def on_shutdown(self) -> None:
+        """Close what is open."""
+
+    def destroy_node(self) -> None:
+        """As rclpy's."""
+
+    def get_logger(self) -> Any:
+        """As rclpy's."""
+
+
+def run_node(node_type: Callable[[], RunnableNode], args: list[str] | None = None) -> None:
+    """Run a node until SIGINT, SIGTERM or shutdown: exit code 0; a bad parameter ends it with one line and 2."""
+    rclpy.init(args=args)
+    executor = SingleThreadedExecutor()
+    node: RunnableNode | None = None
+    try:
+        node = node_type()
+        executor.add_node(node)
+        node.get_logger().info("ready")
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except ValueError as error:
+        if node is not None:
+            raise
+        print(f"cannot start: {error}", file=sys.stderr)
+        sys.exit(2)
+    finally:
+        _end(executor, node)
+
+
+def _end(executor: SingleThreadedExecutor, node: RunnableNode | None) -> None:
+    executor.shutdown(timeout_sec=2.0)
+    if node is not None:
+        node.on_shutdown()
+        node.destroy_node()
+    rclpy.try_shutdown()
