@@ -1,0 +1,15 @@
+"""A simulated building and the rig that moves through it: worlds of textured surfaces, a ray caster, cameras and motion.
+
+    scenario = Scenario.load("small_room")
+    for frame in simulate(scenario):
+        ...  # frame.left, frame.right, frame.tof, frame.imu, frame.T_world_rig
+
+:mod:`world` holds surfaces, :mod:`building` and :mod:`furniture` make them from a floor plan, :mod:`raycaster` and
+:mod:`shading` draw them, :mod:`stereo_sensor`, :mod:`tof_sensor` and :mod:`imu` add what real sensors add,
+:mod:`trajectory` moves the rig, :mod:`feature_level` and :mod:`planar` simulate features without images.
+"""
+
+from slam_core.simulation.scenario import Scenario
+from slam_core.simulation.simulator import SimulatedFrame, Simulator, simulate
+
+__all__ = ["Scenario", "SimulatedFrame", "Simulator", "simulate"]
