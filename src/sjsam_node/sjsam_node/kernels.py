@@ -1,0 +1,371 @@
+"""Compiled inner loops of the joining problem: residuals and normal equations of local maps, written for 2D and 3D
+alike.
+
+A local map holds, in the frame of its reference pose ``(R_i, t_i)``, other poses and landmarks. Its measurement
+function is ``h = R_i^T (l - t_i)`` for a landmark (Eq. 7.2) and ``(R_i^T (t_j - t_i), angle(R_i^T R_j))`` for a pose
+(Eq. 7.3); the residual is ``h [-] z``. Poses move as in ``slam_core.geometry``: ``t + d[:d], Exp(d[d:]) R``.
+
+``model`` says how an angle residual is measured: 0 planar (one wrapped angle), 1 rotation vector ``Log(R_h R_z^T)``,
+2 difference of Euler angles yaw, pitch, roll, each wrapped. The local maps are stored flat, as
+:class:`~sjsam_node.problem.FlatMaps`.
+"""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+PLANAR, TANGENT, EULER = 0, 1, 2
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _wrap(angle):
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@njit(cache=True, nogil=True)
+def _exp(v, out):
+    """Rodrigues' formula for a rotation vector (3,), or a planar angle (1,)."""
+    if len(v) == 1:
+        c, s = math.cos(v[0]), math.sin(v[0])
+        out[0, 0], out[0, 1], out[1, 0], out[1, 1] = c, -s, s, c
+        return
+    angle = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    if angle < 1e-7:
+        a, b = 1.0 - angle * angle / 6.0, 0.5 - angle * angle / 24.0
+    else:
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
+    x, y, z = v[0], v[1], v[2]
+    out[0, 0], out[1, 1], out[2, 2] = 1 - b * (y * y + z * z), 1 - b * (x * x + z * z), 1 - b * (x * x + y * y)
+    out[0, 1], out[0, 2], out[1, 2] = b * x * y - a * z, b * x * z + a * y, b * y * z - a * x
+    out[1, 0], out[2, 0], out[2, 1] = b * x * y + a * z, b * x * z - a * y, b * y * z + a * x
+
+
+@njit(cache=True, nogil=True)
+def _log(R, out):
+    """Rotation vector of R, through the quaternion so that it holds up to and at pi."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    q = np.empty(4)
+    big = 3
+    best = trace
+    for i in range(3):
+        if R[i, i] > best:
+            big, best = i, R[i, i]
+    if big == 3:
+        q[0], q[1], q[2], q[3] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace
+    else:
+        i, j, k = big, (big + 1) % 3, (big + 2) % 3
+        q[i] = 1.0 - trace + 2.0 * R[i, i]
+        q[j] = R[j, i] + R[i, j]
+        q[k] = R[k, i] + R[i, k]
+        q[3] = R[k, j] - R[j, k]
+    if q[3] < 0.0:
+        q = -q
+    q /= math.sqrt((q * q).sum())
+    sine = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    scale = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, q[3]) / sine
+    for i in range(3):
+        out[i] = scale * q[i]
+
+
+@njit(cache=True, nogil=True)
+def _angle_error(model, Rh, z, r, B):
+    """Angle residual ``r`` of the relative rotation ``Rh`` against ``z``, and ``B`` = d r / d(left rotation of Rh)."""
+    if model == PLANAR:
+        r[0] = _wrap(math.atan2(Rh[1, 0], Rh[0, 0]) - z[0])
+        B[0, 0] = 1.0
+        return
+    if model == TANGENT:
+        Rz = np.empty((3, 3))
+        _exp(z, Rz)
+        _log(Rh @ Rz.T, r)
+        angle = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+        b = 1.0 / 12.0 + angle * angle / 720.0
+        if angle > 1e-3:
+            b = (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / (angle * angle)
+        sq = angle * angle
+        for i in range(3):
+            for j in range(3):
+                B[i, j] = b * r[i] * r[j]
+            B[i, i] += 1.0 - b * sq
+        B[0, 1] += 0.5 * r[2]
+        B[0, 2] -= 0.5 * r[1]
+        B[1, 0] -= 0.5 * r[2]
+        B[1, 2] += 0.5 * r[0]
+        B[2, 0] += 0.5 * r[1]
+        B[2, 1] -= 0.5 * r[0]
+        return
+    yaw = math.atan2(Rh[1, 0], Rh[0, 0])
+    pitch = math.asin(min(1.0, max(-1.0, -Rh[2, 0])))
+    roll = math.atan2(Rh[2, 1], Rh[2, 2])
+    r[0], r[1], r[2] = _wrap(yaw - z[0]), _wrap(pitch - z[1]), _wrap(roll - z[2])
+    # Inverse of the map from Euler rates to the angular velocity in the reference frame; singular at pitch = 90 deg.
+    c, s = math.cos(yaw), math.sin(yaw)
+    cp = max(math.cos(pitch), 1e-9)
+    tp = math.sin(pitch) / cp
+    B[0, 0], B[0, 1], B[0, 2] = c * tp, s * tp, 1.0
+    B[1, 0], B[1, 1], B[1, 2] = -s, c, 0.0
+    B[2, 0], B[2, 1], B[2, 2] = c / cp, s / cp, 0.0
+
+
+@njit(cache=True, nogil=True)
+def local_residual(model, Ri, ti, poses, landmarks, z, R, t, points, r, B):
+    """Residual ``r`` (m,) of one local map and the angle Jacobians ``B`` (poses, a, a)."""
+    d = len(ti)
+    a = 1 if d == 2 else 3
+    Rh = np.empty((d, d))
+    row = 0
+    for k in range(len(poses)):
+        j = poses[k]
+        for p in range(d):
+            value = -z[row + p]
+            for q in range(d):
+                value += Ri[q, p] * (t[j, q] - ti[q])
+            r[row + p] = value
+        for p in range(d):
+            for q in range(d):
+                value = 0.0
+                for s in range(d):
+                    value += Ri[s, p] * R[j, s, q]
+                Rh[p, q] = value
+        _angle_error(model, Rh, z[row + d : row + d + a], r[row + d : row + d + a], B[k])
+        row += d + a
+    for k in range(len(landmarks)):
+        j = landmarks[k]
+        for p in range(d):
+            value = -z[row + p]
+            for q in range(d):
+                value += Ri[q, p] * (points[j, q] - ti[q])
+            r[row + p] = value
+        row += d
+
+
+@njit(cache=True, nogil=True)
+def joint_cost(model, maps, R, t, points):
+    """Sum of ``r^T information r`` over all local maps."""
+    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info = maps
+    total = 0.0
+    d = t.shape[1]
+    a = 1 if d == 2 else 3
+    for f in range(len(ref)):
+        m = z_ptr[f + 1] - z_ptr[f]
+        r = np.empty(m)
+        B = np.empty((pose_ptr[f + 1] - pose_ptr[f], a, a))
+        local_residual(
+            model, R[ref[f]], t[ref[f]], pose_idx[pose_ptr[f] : pose_ptr[f + 1]], lm_idx[lm_ptr[f] : lm_ptr[f + 1]],
+            z[z_ptr[f] : z_ptr[f + 1]], R, t, points, r, B,
+        )  # fmt: skip
+        base = info_ptr[f]
+        for i in range(m):
+            row = 0.0
+            for j in range(m):
+                row += info[base + i * m + j] * r[j]
+            total += r[i] * row
+    return total
+
+
+@njit(cache=True, nogil=True)
+def reference_jacobian(Ri, ti, poses, landmarks, t, points, B, J):
+    """Columns of the reference pose, ``J`` (m, d + a): ``-R^T`` and ``R^T [l - t]x``, with ``-B R^T`` for angles."""
+    d = len(ti)
+    a = 1 if d == 2 else 3
+    J[:] = 0.0
+    v = np.empty(d)
+    row = 0
+    for k in range(len(poses) + len(landmarks)):
+        is_pose = k < len(poses)
+        for q in range(d):
+            v[q] = (t[poses[k], q] if is_pose else points[landmarks[k - len(poses)], q]) - ti[q]
+        for p in range(d):
+            for q in range(d):
+                J[row + p, q] = -Ri[q, p]
+            if d == 2:
+                J[row + p, 2] = Ri[0, p] * v[1] - Ri[1, p] * v[0]
+            else:
+                J[row + p, 3] = Ri[1, p] * v[2] - Ri[2, p] * v[1]
+                J[row + p, 4] = Ri[2, p] * v[0] - Ri[0, p] * v[2]
+                J[row + p, 5] = Ri[0, p] * v[1] - Ri[1, p] * v[0]
+        row += d
+        if is_pose:
+            for p in range(a):
+                for q in range(a):
+                    J[row + p, d + q] = -_angle_column(B[k], Ri, p, q, a)
+            row += a
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _angle_column(B, Ri, p, q, a):
+    """Entry (p, q) of ``B R_i^T``; in the plane rotations commute and it is ``B`` itself."""
+    if a == 1:
+        return B[0, 0]
+    return B[p, 0] * Ri[q, 0] + B[p, 1] * Ri[q, 1] + B[p, 2] * Ri[q, 2]
+
+
+@njit(cache=True, nogil=True)
+def other_blocks(Ri, poses, landmarks, B, JB):
+    """Diagonal blocks of the Jacobian for the measured poses and landmarks; ``JB`` (m, 3) row by row.
+
+    Row i of JB holds the entries of row i inside its own block of width d (positions, landmarks) or a (angles).
+    """
+    d = Ri.shape[0]
+    a = 1 if d == 2 else 3
+    row = 0
+    for k in range(len(poses) + len(landmarks)):
+        for p in range(d):
+            for q in range(d):
+                JB[row + p, q] = Ri[q, p]
+        row += d
+        if k < len(poses):
+            for p in range(a):
+                for q in range(a):
+                    JB[row + p, q] = _angle_column(B[k], Ri, p, q, a)
+            row += a
+
+
+@njit(cache=True, nogil=True)
+def _block_starts(d, poses, landmarks):
+    """First row and width of every diagonal block of one local map (a pose is two: position and angle)."""
+    a = 1 if d == 2 else 3
+    count = 2 * poses + landmarks
+    start, width = np.empty(count, np.int64), np.empty(count, np.int64)
+    row = 0
+    for k in range(count):
+        start[k] = row
+        width[k] = a if k < 2 * poses and k % 2 == 1 else d
+        row += width[k]
+    return start, width
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(J, JB, start, width, info, r, H, g):
+    """Dense ``H = J^T info J`` and ``g = J^T info r`` of one local map over (reference pose, poses, landmarks).
+
+    The part of J beyond the reference pose is block diagonal, so that H costs O(m^2), not O(m^3).
+    """
+    m, dp = J.shape
+    M = np.empty((m, m))
+    for b in range(len(start)):
+        s, w = start[b], width[b]
+        for i in range(m):
+            for q in range(w):
+                value = 0.0
+                for p in range(w):
+                    value += info[i, s + p] * JB[s + p, q]
+                M[i, s + q] = value
+    weighted = info @ J
+    for p in range(dp):
+        for q in range(dp):
+            value = 0.0
+            for i in range(m):
+                value += J[i, p] * weighted[i, q]
+            H[p, q] = value
+    whitened = info @ r
+    for p in range(dp):
+        g[p] = 0.0
+        for i in range(m):
+            g[p] += J[i, p] * whitened[i]
+    for b in range(len(start)):
+        s, w = start[b], width[b]
+        for q in range(w):
+            for c in range(dp):
+                value = 0.0
+                for p in range(w):
+                    value += JB[s + p, q] * weighted[s + p, c]
+                H[dp + s + q, c] = value
+                H[c, dp + s + q] = value
+            for c in range(m):
+                value = 0.0
+                for p in range(w):
+                    value += JB[s + p, q] * M[s + p, c]
+                H[dp + s + q, dp + c] = value
+            value = 0.0
+            for p in range(w):
+                value += JB[s + p, q] * whitened[s + p]
+            g[dp + s + q] = value
+
+
+@njit(cache=True, nogil=True)
+def local_normal_equations(model, f, maps, R, t, points):
+    """H (n, n), g (n,) and residual of local map ``f`` at the given state."""
+    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info = maps
+    d = t.shape[1]
+    a = 1 if d == 2 else 3
+    m = z_ptr[f + 1] - z_ptr[f]
+    poses, landmarks = pose_idx[pose_ptr[f] : pose_ptr[f + 1]], lm_idx[lm_ptr[f] : lm_ptr[f + 1]]
+    Ri, ti = R[ref[f]], t[ref[f]]
+    r, B = np.empty(m), np.empty((len(poses), a, a))
+    local_residual(model, Ri, ti, poses, landmarks, z[z_ptr[f] : z_ptr[f + 1]], R, t, points, r, B)
+    J, JB = np.empty((m, d + a)), np.zeros((m, 3))
+    reference_jacobian(Ri, ti, poses, landmarks, t, points, B, J)
+    other_blocks(Ri, poses, landmarks, B, JB)
+    start, width = _block_starts(d, len(poses), len(landmarks))
+    H, g = np.empty((d + a + m, d + a + m)), np.empty(d + a + m)
+    matrix = info[info_ptr[f] : info_ptr[f + 1]].reshape((m, m))
+    normal_equations(J, JB, start, width, matrix, r, H, g)
+    return H, g, r
+
+
+@njit(cache=True, nogil=True)
+def joint_linearize(model, maps, R, t, points, scatter, values, gradient):
+    """Add the normal equations of every local map to the sparse ``values`` and the ``gradient`` (see
+    ``layout.Scatter``).
+    """
+    for f in range(len(maps[0])):
+        H, g, _ = local_normal_equations(model, f, maps, R, t, points)
+        scatter_dense(f, H, g, scatter, values, gradient)
+
+
+@njit(cache=True, nogil=True)
+def scatter_dense(f, H, g, scatter, values, gradient):
+    """Add dense normal equations over the items of map ``f`` to the sparse ones."""
+    item_ptr, item_group, item_offset, item_width, group_ptr, group_start, pair_ptr, position, stride, swapped = scatter
+    row = 0
+    for i in range(item_ptr[f], item_ptr[f + 1]):
+        gi, oi, height = item_group[i], item_offset[i], item_width[i]
+        start = group_start[group_ptr[f] + gi]
+        if start >= 0:
+            for p in range(height):
+                gradient[start + oi + p] += g[row + p]
+        column = 0
+        for j in range(item_ptr[f], i + 1):
+            gj, oj, width = item_group[j], item_offset[j], item_width[j]
+            low, high = min(gi, gj), max(gi, gj)
+            pair = pair_ptr[f] + high * (high + 1) // 2 + low
+            first, step = position[pair], stride[pair]
+            # Rows of the stored block belong to the group that is eliminated later.
+            if first >= 0 and ((gi > gj) != (swapped[pair] != 0) if gi != gj else oi >= oj):
+                first += oj * step + oi
+                for q in range(width):
+                    for p in range(height):
+                        values[first + q * step + p] += H[row + p, column + q]
+            elif first >= 0:
+                first += oi * step + oj
+                for p in range(height):
+                    for q in range(width):
+                        values[first + p * step + q] += H[row + p, column + q]
+            column += width
+        row += height
+
+
+@njit(cache=True, nogil=True)
+def retract(R, t, points, pose_offset, landmark_offset, step, R_out, t_out, points_out):
+    """State moved by ``step``; an offset of -1 stays."""
+    d = t.shape[1]
+    a = 1 if d == 2 else 3
+    E = np.empty((d, d))
+    for i in range(len(t)):
+        o = pose_offset[i]
+        if o < 0:
+            R_out[i], t_out[i] = R[i], t[i]
+            continue
+        _exp(step[o + d : o + d + a], E)
+        R_out[i] = E @ R[i]
+        for p in range(d):
+            t_out[i, p] = t[i, p] + step[o + p]
+    for i in range(len(points)):
+        o = landmark_offset[i]
+        for p in range(d):
+            points_out[i, p] = points[i, p] + (step[o + p] if o >= 0 else 0.0)

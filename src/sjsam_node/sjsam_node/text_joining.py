@@ -1,0 +1,215 @@
+"""Joins text submaps to one map: the problem, a start, and the optimum.
+
+The start is what each map says, chained. From there batch Gauss-Newton can end in a local minimum, so that the
+optimum is approached in two ways: all maps at once, and incrementally, where each further part of the maps is placed
+against what is joined so far. The lower chi2 is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sjsam_node import kernels
+from sjsam_node.joining import JoiningProblem
+from sjsam_node.linear_slam_text import Progress, TextMap
+from sjsam_node.problem import FlatMaps, LocalMap, State, block_rows, flatten
+from slam_core.config import Config, group, parameter
+from slam_core.geometry import FloatArray, euler_from_rotation, rotation_from_euler
+from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
+from slam_core.sparse_cholesky import IntArray
+
+ROWS = ("joint", "block")
+
+
+@dataclass(frozen=True)
+class TextJoiningConfig(Config):
+    """How text submaps are joined."""
+
+    rows: str = parameter("joint", "a submap as one Gaussian, or pose and landmarks each on their own", choices=ROWS)
+    solver: str = parameter("auto", "sparse solver", choices=("auto", "cholmod", "superlu"))
+    growth: float = parameter(0.08, "share of maps added per step of incremental joining", minimum=0.001, maximum=1.0)
+    step_iterations: int = parameter(4, "iterations per step of incremental joining", minimum=1)
+    optimizer: LevenbergMarquardtConfig = group(LevenbergMarquardtConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class TextJoiningResult:
+    """The joined map in the frame of the first map's reference pose, and how it came about."""
+
+    chi2: float
+    start_chi2: float
+    pose_ids: IntArray
+    poses: FloatArray
+    feature_ids: IntArray
+    features: FloatArray
+    solver: str
+    iterations: int
+    converged: bool
+    start: str
+
+
+def join_text_maps(
+    maps: list[TextMap], dimension: int, config: TextJoiningConfig | None = None, progress: Progress | None = None
+) -> TextJoiningResult:
+    """Join all ``maps`` of one ``dimension`` to the optimum of their joint cost.
+
+    Raises
+    ------
+    ValueError
+        If a map hangs on none of the others.
+    """
+    config = config or TextJoiningConfig()
+    index = TextIndex.of(maps, dimension)
+    joiner = TextJoiner(index, config)
+    best, optimum = joiner.best(progress)
+    return TextJoiningResult(
+        optimum.cost, joiner.start_cost, index.pose_ids, _pose_values(best), index.feature_ids, best.landmarks,
+        joiner.solver, optimum.iterations, optimum.converged, joiner.start,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class TextIndex:
+    """Text maps in an order in which each hangs on one before it, with ids turned into indices of the state."""
+
+    dimension: int
+    pose_ids: IntArray
+    feature_ids: IntArray
+    maps: list[LocalMap]
+
+    @classmethod
+    def of(cls, maps: list[TextMap], dimension: int) -> TextIndex:
+        """Index ``maps``; poses and features keep the order in which they first appear."""
+        maps = _connected_order(maps)
+        pose_index: dict[int, int] = {}
+        feature_index: dict[int, int] = {}
+        local = []
+        for m in maps:
+            reference = pose_index.setdefault(m.reference, len(pose_index))
+            poses = [pose_index.setdefault(int(i), len(pose_index)) for i in m.pose_ids]
+            features = [feature_index.setdefault(int(i), len(feature_index)) for i in m.feature_ids]
+            mean = np.concatenate([m.poses.ravel(), m.features.ravel()])
+            local.append(
+                LocalMap(reference, np.array(poses, np.int64), np.array(features, np.int64), mean, m.information)
+            )
+        return cls(dimension, np.array(list(pose_index)), np.array(list(feature_index), np.int64), local)
+
+
+def _connected_order(maps: list[TextMap]) -> list[TextMap]:
+    """The maps, each after one that shares a pose with it; the given order where that already holds."""
+    known = {maps[0].reference}
+    ordered: list[TextMap] = []
+    waiting = list(maps)
+    while waiting:
+        left = []
+        for m in waiting:
+            ids = {m.reference, *m.pose_ids.tolist()}
+            if known & ids:
+                known |= ids
+                ordered.append(m)
+            else:
+                left.append(m)
+        if len(left) == len(waiting):
+            raise ValueError(
+                f"{len(left)} submaps share no pose with the others; the first has reference {left[0].reference}"
+            )
+        waiting = left
+    return ordered
+
+
+class TextJoiner:
+    """The optimisation of one set: keeps the flat maps, so that every prefix is joined without copying."""
+
+    def __init__(self, index: TextIndex, config: TextJoiningConfig) -> None:
+        self.index, self.config = index, config
+        self.model = kernels.PLANAR if index.dimension == 2 else kernels.EULER
+        size = 3 if index.dimension == 2 else 6
+        self.flat = flatten(
+            [block_rows(m, size, index.dimension) for m in index.maps] if config.rows == "block" else index.maps
+        )
+        self.solver, self.start, self.start_cost = "", "", np.nan
+
+    def best(self, progress: Progress | None) -> tuple[State, LeastSquaresResult]:
+        """The lower of the optima reached from the chained start and incrementally."""
+        chained = self._blank()
+        self._place(chained, 0, len(self.index.maps), set())
+        candidates = [
+            ("chained", *self._optimize(chained)),
+            ("incremental", *self._optimize(self._incremental(progress))),
+        ]
+        self.start_cost = candidates[0][2].initial_cost
+        self.start, state, result = min(candidates, key=lambda c: c[2].cost)
+        return state, result
+
+    def _optimize(self, state: State) -> tuple[State, LeastSquaresResult]:
+        problem = self._problem(self.flat, state)
+        self.solver = problem.backend
+        return problem.optimize(state, self.config.optimizer)
+
+    def _problem(self, flat: FlatMaps, state: State) -> JoiningProblem:
+        return JoiningProblem(flat, state, np.array([0]), self.model, self.config.solver)
+
+    def _incremental(self, progress: Progress | None) -> State:
+        """Place and join a growing share of the maps, so that each part starts near its optimum."""
+        state, known, done, total = self._blank(), set[tuple[bool, int]](), 0, len(self.index.maps)
+        few = LevenbergMarquardtConfig(max_iterations=self.config.step_iterations, relative_tolerance=1e-4)
+        while done < total:
+            added = min(total, max(done + 1, int(done * (1.0 + self.config.growth))))
+            self._place(state, done, added, known)
+            done = added
+            state, _ = self._problem(self.flat.first(done), state).optimize(state, few)
+            if progress is not None:
+                progress(done, total)
+        return state
+
+    def _blank(self) -> State:
+        d = self.index.dimension
+        poses = len(self.index.pose_ids)
+        return State(
+            np.tile(np.eye(d), (poses, 1, 1)), np.zeros((poses, d)), np.zeros((len(self.index.feature_ids), d))
+        )
+
+    def _place(self, state: State, first: int, last: int, known: set[tuple[bool, int]]) -> None:
+        """Initialise (in place) what the maps ``first`` to ``last`` see for the first time, from where they start."""
+        known.add((True, 0))
+        for m in self.index.maps[first:last]:
+            rotations, translations, points = _local_values(m, self.index.dimension)
+            if (True, m.reference) not in known:
+                anchor = next(k for k, j in enumerate(m.poses) if (True, int(j)) in known)
+                R = state.rotations[m.poses[anchor]] @ rotations[anchor].T
+                state.rotations[m.reference] = R
+                state.translations[m.reference] = state.translations[m.poses[anchor]] - R @ translations[anchor]
+                known.add((True, m.reference))
+            R, t = state.rotations[m.reference], state.translations[m.reference]
+            for k, j in enumerate(m.poses):
+                if (True, int(j)) not in known:
+                    state.rotations[j], state.translations[j] = R @ rotations[k], R @ translations[k] + t
+                    known.add((True, int(j)))
+            for k, j in enumerate(m.landmarks):
+                if (False, int(j)) not in known:
+                    state.landmarks[j] = R @ points[k] + t
+                    known.add((False, int(j)))
+
+
+def _local_values(m: LocalMap, dimension: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotations, translations and points of one map, in its own frame."""
+    size = 3 if dimension == 2 else 6
+    poses = m.mean[: size * len(m.poses)].reshape(-1, size)
+    angles = poses[:, dimension:]
+    if dimension == 2:
+        c, s = np.cos(angles[:, 0]), np.sin(angles[:, 0])
+        rotations = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    else:
+        rotations = np.array([rotation_from_euler(*a) for a in angles]).reshape(-1, 3, 3)
+    return rotations, poses[:, :dimension], m.mean[size * len(m.poses) :].reshape(-1, dimension)
+
+
+def _pose_values(state: State) -> FloatArray:
+    """Poses as the format writes them: x y phi, or x y z yaw pitch roll."""
+    if state.translations.shape[1] == 2:
+        angles = np.arctan2(state.rotations[:, 1, 0], state.rotations[:, 0, 0])[:, None]
+    else:
+        angles = euler_from_rotation(state.rotations)
+    return np.concatenate([state.translations, angles], axis=1)

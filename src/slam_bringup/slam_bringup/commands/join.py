@@ -1,0 +1,65 @@
+"""``slam join``: joins text submaps of the Linear SLAM format, 2D and 3D."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.progress import Progress
+
+from sjsam_node.linear_slam_text import find_maps, read_maps, write_values
+from sjsam_node.text_joining import ROWS, TextJoiningConfig, TextJoiningResult, join_text_maps
+from slam_core.config import from_mapping
+
+
+@click.command("join")
+@click.argument("folder", metavar="DIR", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("-o", "--output", metavar="OUT", required=True, type=click.Path(file_okay=False, path_type=Path))
+@click.option("--rows", type=click.Choice(ROWS), default=TextJoiningConfig().rows, show_default=True,
+              help="joint: each submap's full information; block: each landmark and pose alone (Algorithm 4)")  # fmt: skip
+@click.option("--config", "config_file", metavar="FILE", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+              help="YAML with parameters of the joining")  # fmt: skip
+def command(folder: Path, output: Path, rows: str, config_file: Path | None) -> None:
+    """Join the submaps localmap_<k>.txt in DIR; writes summary.json, poses.txt and features.txt to OUT."""
+    config = from_mapping(TextJoiningConfig, {**_yaml(config_file), "rows": rows})
+    began = time.perf_counter()
+    maps, dimension = read_maps(find_maps(folder))
+    with Progress(transient=True) as bar:
+        task = bar.add_task("joining", total=len(maps))
+        result = join_text_maps(
+            maps, dimension, config, lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    summary = _summary(result, len(maps), dimension, rows, time.perf_counter() - began)
+    _write(output, result, summary)
+    click.echo(json.dumps(summary))
+
+
+def _yaml(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    import yaml
+
+    values = yaml.safe_load(path.read_text()) or {}
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: expected a mapping of parameters, got {type(values).__name__}")
+    return values
+
+
+def _summary(result: TextJoiningResult, submaps: int, dimension: int, rows: str, wall_s: float) -> dict[str, Any]:
+    return {
+        "chi2": result.chi2, "submaps": submaps, "features": len(result.feature_ids), "wall_s": round(wall_s, 3),
+        "poses": len(result.pose_ids), "dimension": dimension, "rows": rows, "chi2_chained_start": result.start_chi2,
+        "start": result.start, "iterations": result.iterations, "converged": result.converged, "solver": result.solver,
+    }  # fmt: skip
+
+
+def _write(output: Path, result: TextJoiningResult, summary: dict[str, Any]) -> None:
+    output.mkdir(parents=True, exist_ok=True)
+    write_values(output / "poses.txt", result.pose_ids.tolist(), result.poses)
+    write_values(output / "features.txt", result.feature_ids.tolist(), result.features)
+    temporary = output / "summary.json.part"
+    temporary.write_text(json.dumps(summary, indent=2) + "\n")
+    temporary.replace(output / "summary.json")

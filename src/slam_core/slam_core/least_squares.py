@@ -1,0 +1,149 @@
+"""Nonlinear least squares: whitening, robust losses, and Levenberg-Marquardt over any problem that can linearise
+itself.
+
+The sparse factors and their marginals are in :mod:`slam_core.sparse_cholesky`. Costs are plain sums of squared
+residuals, ``chi2 = sum r^T r`` (no factor one half), so that they compare with the chi-square distribution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+import scipy.linalg
+
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray
+
+State = TypeVar("State")
+
+LOSSES = ("none", "huber", "cauchy", "geman_mcclure")
+
+
+def whitening(covariance: FloatArray) -> FloatArray:
+    """``W`` with ``W covariance W^T = I`` (lower triangular), so that ``W e`` is a residual of unit variance.
+
+    Raises
+    ------
+    ValueError
+        If ``covariance`` (n, n) is not positive definite.
+    """
+    try:
+        lower = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(f"covariance {np.shape(covariance)} is not positive definite") from error
+    return np.asarray(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True))
+
+
+def robust_weight(squared: FloatArray, loss: str, scale: float = 1.0) -> FloatArray:
+    """Weight of a residual in iteratively reweighted least squares (Holland and Welsch 1977).
+
+    Parameters
+    ----------
+    squared
+        Squared norm of the whitened residual, any shape.
+    loss
+        ``none``, ``huber``, ``cauchy`` or ``geman_mcclure``.
+    scale
+        Norm at which the loss leaves the quadratic, in standard deviations.
+    """
+    u = np.asarray(squared, dtype=np.float64) / scale**2
+    if loss == "none":
+        return np.ones_like(u)
+    if loss == "huber":
+        return 1.0 / np.sqrt(np.maximum(u, 1.0))
+    if loss == "cauchy":
+        return 1.0 / (1.0 + u)
+    if loss == "geman_mcclure":
+        return 1.0 / (1.0 + u) ** 2
+    raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}")
+
+
+def robust_cost(squared: FloatArray, loss: str, scale: float = 1.0) -> FloatArray:
+    """Loss whose derivative with respect to ``squared`` is :func:`robust_weight`; same arguments."""
+    u = np.asarray(squared, dtype=np.float64) / scale**2
+    if loss == "none":
+        return scale**2 * u
+    if loss == "huber":
+        return scale**2 * np.where(u <= 1.0, u, 2.0 * np.sqrt(np.maximum(u, 1.0)) - 1.0)
+    if loss == "cauchy":
+        return scale**2 * np.log1p(u)
+    if loss == "geman_mcclure":
+        return scale**2 * u / (1.0 + u)
+    raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}")
+
+
+@dataclass(frozen=True)
+class LevenbergMarquardtConfig(Config):
+    """When to stop, and how to damp."""
+
+    max_iterations: int = parameter(100, "linearisations at most", minimum=1)
+    relative_tolerance: float = parameter(1e-12, "stop when a step promises to lower the cost by less than this share",
+                                          minimum=0.0)  # fmt: skip
+    initial_damping: float = parameter(
+        1e-9, "first damping, relative to the diagonal of the normal matrix", minimum=0.0
+    )
+    max_damping: float = parameter(1e8, "give up above this damping", minimum=0.0)
+
+
+class LeastSquaresProblem(Protocol[State]):
+    """What :func:`levenberg_marquardt` needs of a problem."""
+
+    def cost(self, state: State) -> float:
+        """Sum of squared whitened residuals at ``state``."""
+
+    def linearize(self, state: State) -> FloatArray:
+        """Prepare the normal equations at ``state``; the gradient ``J^T r`` of half the cost, shape (n,)."""
+
+    def solve(self, damping: float) -> FloatArray | None:
+        """Step of ``(H + damping diag H) step = -J^T r`` at the last linearisation; None if not positive definite."""
+
+    def retract(self, state: State, step: FloatArray) -> State:
+        """``state`` moved by ``step``."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSquaresResult:
+    """Cost before and after, linearisations done, whether the tolerance was reached, and why it stopped otherwise."""
+
+    initial_cost: float
+    cost: float
+    iterations: int
+    converged: bool
+    reason: str
+
+
+def levenberg_marquardt(
+    problem: LeastSquaresProblem[State], state: State, config: LevenbergMarquardtConfig | None = None
+) -> tuple[State, LeastSquaresResult]:
+    """Minimise ``problem`` from ``state``: Gauss-Newton where that works, gradient-like steps where it does not.
+
+    A step is taken only if it lowers the cost; the damping follows the ratio of true to promised decrease
+    (Nielsen 1999). The Newton decrement ``-g^T step`` tells how far the optimum still is, which is what the tolerance
+    is on.
+    """
+    config = config or LevenbergMarquardtConfig()
+    initial = cost = problem.cost(state)
+    damping, growth = config.initial_damping, 2.0
+    for iteration in range(1, config.max_iterations + 1):
+        gradient = problem.linearize(state)
+        while True:
+            step = problem.solve(damping)
+            decrement = np.inf if step is None else float(-gradient @ step)
+            if step is not None:
+                candidate = problem.retract(state, step)
+                candidate_cost = problem.cost(candidate)
+                if np.isfinite(candidate_cost) and candidate_cost <= cost:
+                    break
+            if abs(decrement) <= config.relative_tolerance * max(cost, 1e-9):
+                return state, LeastSquaresResult(initial, cost, iteration, True, "")
+            damping, growth = max(damping, 1e-9) * growth * 2.0, growth * 2.0
+            if damping > config.max_damping:
+                return state, LeastSquaresResult(initial, cost, iteration, False, "no step lowers the cost")
+        ratio = (cost - candidate_cost) / max(decrement, 1e-300)
+        state, cost = candidate, candidate_cost
+        if decrement <= config.relative_tolerance * max(cost, 1e-9):
+            return state, LeastSquaresResult(initial, cost, iteration, True, "")
+        damping, growth = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), config.initial_damping), 2.0
+    return state, LeastSquaresResult(initial, cost, config.max_iterations, False, "iteration limit")
