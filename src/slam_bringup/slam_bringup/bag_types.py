@@ -74,4 +74,5 @@ def _is_numeric(element: Any) -> bool:
 
 
 def _dtype(element: Any) -> np.dtype[Any]:
-    return np.dtype(element[1][0].replace("octet", "uint8"))
+    dtype: np.dtype[Any] = np.dtype(element[1][0].replace("octet", "uint8"))
+    return dtype

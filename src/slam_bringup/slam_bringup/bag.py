@@ -1,0 +1,297 @@
+"""Reading and writing rosbag2 bags (mcap and sqlite3) without ROS.
+
+A bag is a folder with ``metadata.yaml``, as ``ros2 bag`` makes it; a path that ends in ``.mcap`` is a single file, as
+Foxglove opens it. Writing is all or nothing, and the same input gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import tempfile
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, NamedTuple, Self
+
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
+
+from slam_bringup.bag_types import typestore
+from slam_core.messages.base import Message
+
+LATCHED_TOPICS = ("tf_static", "static_transforms", "robot_description")
+"""Last parts of topics that are transient-local wherever they stand."""
+
+_FOREVER = QosTime(2147483647, 4294967295)
+_MAGIC = b"\x89MCAP0\r\n"
+_FOOTER = struct.Struct("<BQQQI")
+_BLOCK = 1 << 20
+_STORAGE_SUFFIXES = (".mcap", ".db3")
+
+
+class BagMessage(NamedTuple):
+    """One message of a bag; ``stamp_ns`` is the time of recording."""
+
+    topic: str
+    stamp_ns: int
+    message: Message
+
+
+class RawMessage(NamedTuple):
+    """One message of a bag as CDR bytes."""
+
+    topic: str
+    stamp_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """A topic of a bag: its type (``sensor_msgs/msg/Image``), its messages, and whether it is latched."""
+
+    type_name: str
+    count: int
+    latched: bool = False
+    best_effort: bool = False
+
+
+def offered_qos(latched: bool = False, depth: int = 1000) -> Qos:
+    """The profile a bag says its publisher offered: reliable, transient-local if ``latched``."""
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    return Qos(
+        QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, durability, _FOREVER, _FOREVER, QosLiveliness.AUTOMATIC,
+        _FOREVER, False,
+    )  # fmt: skip
+
+
+class BagWriter:
+    """Writes a bag under a temporary name; leaving the ``with`` block without an error renames it to ``path``.
+
+    Parameters
+    ----------
+    path
+        Folder, or a single file if it ends in ``.mcap``. What was there before is replaced.
+    storage
+        "mcap" or "sqlite3".
+    """
+
+    def __init__(self, path: Path, storage: str = "mcap") -> None:
+        if storage not in ("mcap", "sqlite3"):
+            raise ValueError(f"bag storage must be mcap or sqlite3, got '{storage}'")
+        self.path = Path(path)
+        self._single_file = self.path.suffix == ".mcap"
+        if self._single_file and storage != "mcap":
+            raise ValueError(f"{path} is an mcap file, storage is '{storage}'")
+        self._storage = StoragePlugin[storage.upper()]
+        self._connections: dict[str, Connection] = {}
+
+    def __enter__(self) -> Self:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._workshop = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", suffix=".part", dir=self.path.parent))
+        name = self.path.stem if self._single_file else self.path.name
+        self._writer = Writer(self._workshop / name, version=9, storage_plugin=self._storage)
+        self._writer.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is not None:
+                self._writer.abort()
+                return
+            self._writer.close()
+            self._rename()
+        finally:
+            shutil.rmtree(self._workshop, ignore_errors=True)
+
+    def write(self, topic: str, message: Message, stamp_ns: int) -> None:
+        """Append one message made by :class:`slam_bringup.bag_types.BagTypes`."""
+        type_name = message.__msgtype__
+        self.write_raw(topic, type_name, bytes(typestore().serialize_cdr(message, type_name)), stamp_ns)
+
+    def write_raw(self, topic: str, type_name: str, data: bytes, stamp_ns: int) -> None:
+        """Append one message of type ``type_name`` as CDR bytes."""
+        if topic not in self._connections:
+            self.declare(topic, type_name)
+        self._writer.write(self._connections[topic], stamp_ns, data)
+
+    def declare(self, topic: str, type_name: str, *, latched: bool | None = None) -> None:
+        """Make a topic known before its first message; ``latched`` follows from the name unless given."""
+        latched = topic.rsplit("/", 1)[-1] in LATCHED_TOPICS if latched is None else latched
+        if type_name not in typestore().fielddefs:
+            raise ValueError(f"{topic}: message type {type_name} is not known")
+        self._connections[topic] = self._writer.add_connection(
+            topic, type_name, typestore=typestore(), offered_qos_profiles=[offered_qos(latched)]
+        )
+
+    def _rename(self) -> None:
+        made = self._writer.path
+        if self._single_file:
+            made = made / f"{made.name}.mcap"
+        if self.path.is_dir() and not self.path.is_symlink():
+            shutil.rmtree(self.path)
+        os.replace(made, self.path)
+
+
+class BagReader:
+    """Reads a bag folder, or a single ``.mcap`` or ``.db3`` file.
+
+    A truncated mcap file is read up to where it breaks off; ``warning`` then says so.
+
+    Raises
+    ------
+    ValueError
+        If there is no bag at ``path`` or it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self.warning = ""
+        self._salvaged: tempfile.TemporaryDirectory[str] | None = None
+
+    def __enter__(self) -> Self:
+        source = _storage_of(self.path)
+        try:
+            self._reader = _opened(source)
+        except ValueError as error:
+            if source.suffix != ".mcap":
+                raise
+            self._reader = self._open_salvaged(source, error)
+        self._order = {c.id: number for number, c in enumerate(self._reader.connections)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._reader.close()
+        if self._salvaged is not None:
+            self._salvaged.cleanup()
+
+    @property
+    def topics(self) -> dict[str, TopicInfo]:
+        """Every topic with its type and number of messages, sorted by name."""
+        return {c.topic: _topic_info(c) for c in sorted(self._reader.connections, key=lambda c: c.topic)}
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the first message, ns."""
+        return int(self._reader.start_time)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last message, s."""
+        return max(int(self._reader.duration) - 1, 0) / 1e9
+
+    def raw(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
+        """Messages of some topics (all by default) as bytes, in the order of their time."""
+        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
+        if not wanted:
+            return
+        try:
+            for connection, stamp, data in self._reader.messages(wanted):
+                yield RawMessage(connection.topic, int(stamp), bytes(data))
+        except (ReaderError, AssertionError, struct.error) as error:
+            raise ValueError(f"{self.path} cannot be read to its end: {error}") from error
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
+        """Messages of some topics (all by default), decoded, in the order of their time."""
+        types = {name: info.type_name for name, info in self.topics.items()}
+        for topic, stamp, data in self.raw(topics):
+            yield BagMessage(topic, stamp, self.decode(types[topic], data))
+
+    def decode(self, type_name: str, data: bytes) -> Message:
+        """A message of its CDR bytes; ValueError if it is of an unknown type or broken."""
+        try:
+            return typestore().deserialize_cdr(data, type_name)
+        except KeyError as error:
+            raise ValueError(f"{self.path}: message type {type_name} is not known") from error
+        except Exception as error:
+            raise ValueError(f"{self.path}: a {type_name} cannot be decoded: {error}") from error
+
+    def _open_salvaged(self, source: Path, error: ValueError) -> Reader:
+        self._salvaged = tempfile.TemporaryDirectory(prefix="slam-bag-")
+        target = Path(self._salvaged.name) / source.name
+        kept = _salvage_mcap(source, target)
+        try:
+            reader = _opened(target)
+        except ValueError:
+            self._salvaged.cleanup()
+            raise error from None
+        self.warning = f"{source} is truncated: read {kept} of {source.stat().st_size} bytes, what follows is lost"
+        return reader
+
+
+def _storage_of(path: Path) -> Path:
+    """The folder if it is a whole bag, else its one storage file: a killed recorder leaves no metadata.yaml."""
+    if not path.exists():
+        raise ValueError(f"no bag at {path}")
+    if path.is_file() or (path / "metadata.yaml").exists():
+        files = [p for p in path.glob("*.mcap")] if path.is_dir() else []
+        damaged = [p for p in files if not _is_whole_mcap(p)]
+        return damaged[0] if len(files) == 1 and damaged else path
+    files = sorted(p for p in path.iterdir() if p.suffix in _STORAGE_SUFFIXES)
+    if len(files) != 1:
+        raise ValueError(f"{path} is no bag: no metadata.yaml and {len(files)} storage files (.mcap, .db3)")
+    return files[0]
+
+
+def _opened(path: Path) -> Reader:
+    try:
+        reader = Reader(path)
+        reader.open()
+    except (ReaderError, FileNotFoundError, AssertionError, struct.error, OSError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} cannot be read as a bag: {error}") from error
+    return reader
+
+
+def _topic_info(connection: Connection) -> TopicInfo:
+    extension = connection.ext
+    profiles = extension.offered_qos_profiles if isinstance(extension, ConnectionExtRosbag2) else []
+    latched = any(q.durability == QosDurability.TRANSIENT_LOCAL for q in profiles)
+    best_effort = bool(profiles) and all(q.reliability == QosReliability.BEST_EFFORT for q in profiles)
+    return TopicInfo(connection.msgtype, connection.msgcount, latched, best_effort)
+
+
+def _is_whole_mcap(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(0, os.SEEK_END)
+        if file.tell() < 2 * len(_MAGIC):
+            return False
+        file.seek(-len(_MAGIC), os.SEEK_END)
+        return file.read() == _MAGIC
+
+
+def _salvage_mcap(source: Path, target: Path) -> int:
+    """Copy the whole records of a truncated mcap file and close it with an empty footer; returns the bytes kept.
+
+    Records are an opcode (1 byte), a length (8 bytes) and the content (MCAP specification, section Records).
+    """
+    with source.open("rb") as old, target.open("wb") as new:
+        end = _end_of_whole_records(old, source.stat().st_size)
+        old.seek(0)
+        for start in range(0, end, _BLOCK):
+            new.write(old.read(min(_BLOCK, end - start)))
+        new.write(_FOOTER.pack(0x02, 20, 0, 0, 0) + _MAGIC)
+    return end
+
+
+def _end_of_whole_records(file: BinaryIO, size: int) -> int:
+    position = len(_MAGIC)
+    while position + 9 <= size:
+        file.seek(position)
+        opcode, length = struct.unpack("<BQ", file.read(9))
+        if opcode == 0x02 or position + 9 + length > size:
+            break
+        position += 9 + length
+    return min(position, size)
