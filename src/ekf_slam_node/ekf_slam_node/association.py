@@ -1,0 +1,107 @@
+"""Association of features with candidates under a known motion (thesis chapter 4).
+
+Gate first: a pair must lie within the chi-square gate of its innovation covariance S and its descriptors must agree.
+Among the pairs that pass, the cheapest come first and every feature and candidate is used once, which is Algorithm 2's
+"a better one takes over" without its dependence on the order of the features.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from ekf_slam_node.candidates import Candidates, innovation_covariance, predict
+from ekf_slam_node.config import AssociationConfig
+from ekf_slam_node.models import Frame, rig_points
+from slam_core.geometry import FloatArray, transform_points
+
+IndexArray = npt.NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def _gated_costs(z, variance, seen_z, S, visible, similarity, threshold, gate, weight, out):  # type: ignore[no-untyped-def]
+    """Cost of Eq. 4.8 plus the descriptors' for every pair inside the gate; the others are left at infinity."""
+    for i in range(len(seen_z)):
+        if not visible[i]:
+            continue
+        reach_u = np.sqrt(gate * (S[i, 0, 0] + 4.0))
+        for j in range(len(z)):
+            du = z[j, 0] - seen_z[i, 0]
+            if similarity[i, j] < threshold or abs(du) > reach_u + 4.0 * np.sqrt(gate * variance[j, 0]):
+                continue
+            dv, dw = z[j, 1] - seen_z[i, 1], z[j, 2] - seen_z[i, 2]
+            # Cholesky factor of the 3x3 S + R, by hand: this runs for every pair.
+            a = np.sqrt(S[i, 0, 0] + variance[j, 0])
+            b = S[i, 1, 0] / a
+            c = np.sqrt(S[i, 1, 1] + variance[j, 1] - b * b)
+            d = S[i, 2, 0] / a
+            e = (S[i, 2, 1] - d * b) / c
+            f = np.sqrt(max(S[i, 2, 2] + variance[j, 2] - d * d - e * e, 1e-300))
+            y0 = du / a
+            y1 = (dv - b * y0) / c
+            y2 = (dw - d * y0 - e * y1) / f
+            nis = y0 * y0 + y1 * y1 + y2 * y2
+            if nis < gate:
+                out[i, j] = nis + 2.0 * np.log(a * c * f) + weight * (1.0 - similarity[i, j])
+
+
+def pair_up(costs: FloatArray) -> tuple[IndexArray, IndexArray]:
+    """Rows and columns of the pairs taken in the order of their finite costs, each row and column once."""
+    rows, columns = np.nonzero(np.isfinite(costs))
+    order = np.argsort(costs[rows, columns], kind="stable")
+    row_free, column_free = np.ones(costs.shape[0], dtype=bool), np.ones(costs.shape[1], dtype=bool)
+    chosen = []
+    for k in order:
+        i, j = rows[k], columns[k]
+        if row_free[i] and column_free[j]:
+            row_free[i] = column_free[j] = False
+            chosen.append(k)
+    picked = np.array(chosen, dtype=np.int64)
+    return rows[picked], columns[picked]
+
+
+def associate_mahalanobis(
+    candidates: Candidates, frame: Frame, similarity: FloatArray, T_previous_now: FloatArray,
+    motion_covariance: FloatArray, T_rig_optical: FloatArray, config: AssociationConfig,
+) -> tuple[IndexArray, IndexArray]:  # fmt: skip
+    """Algorithm 2: indices of candidates and of features, paired by normalised distance and descriptors.
+
+    ``similarity`` (n, m) are the cosines of the candidates' and the features' descriptors.
+    """
+    seen = predict(candidates, T_previous_now, T_rig_optical, frame)
+    S = innovation_covariance(seen, candidates, motion_covariance)
+    visible = seen.in_image(frame.camera, margin_px=-50.0)
+    costs = np.full(similarity.shape, np.inf)
+    _gated_costs(
+        frame.z, frame.variance, seen.z, S, visible, similarity, config.descriptor_threshold, config.gate,
+        config.descriptor_weight, costs,
+    )  # fmt: skip
+    return pair_up(costs)
+
+
+def associate_nearest(
+    candidates: Candidates, frame: Frame, T_previous_now: FloatArray, T_rig_optical: FloatArray, gate: float
+) -> tuple[IndexArray, IndexArray]:
+    """Algorithm 1: the nearest in space within ``gate`` (m), noise and descriptors left aside."""
+    points, _ = rig_points(frame, T_rig_optical)
+    moved = transform_points(T_previous_now, points)
+    distance = np.linalg.norm(candidates.points[:, None] - moved[None], axis=2)
+    return pair_up(np.where(distance < gate, distance, np.inf))
+
+
+def match_descriptors(similarity: FloatArray, threshold: float, ratio: float) -> tuple[IndexArray, IndexArray]:
+    """Mutual best pairs without any motion: better than ``threshold`` and clearly better than each one's second
+    best.
+    """
+    if min(similarity.shape) < 2:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    best = np.argmax(similarity, axis=1)
+    rows = np.arange(len(similarity))
+    value = similarity[rows, best]
+    mutual = (np.argmax(similarity, axis=0)[best] == rows) & (value >= threshold)
+    second = np.partition(similarity, -2, axis=1)[:, -2]
+    # Distances of unit vectors: |a - b|^2 = 2 - 2 cos.
+    distinct = (1.0 - value) <= ratio**2 * (1.0 - second)
+    rows = rows[mutual & distinct]
+    return rows, best[rows]

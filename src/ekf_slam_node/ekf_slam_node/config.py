@@ -1,0 +1,130 @@
+"""Every parameter of the EKF: names, defaults, units and ranges (the node declares its ROS parameters from here)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam_core.config import Config, group, parameter
+
+
+@dataclass(frozen=True)
+class MotionConfig(Config):
+    """Constant-velocity model: the rig's accelerations are its noise (Eq. 5.6)."""
+
+    sigma_acceleration: float = parameter(3.0, "noise of the linear acceleration", unit="m/s2", minimum=1e-6)
+    sigma_angular_acceleration: float = parameter(4.0, "noise of the angular acceleration", unit="rad/s2", minimum=1e-6)
+    sigma_initial_velocity: float = parameter(
+        2.0, "uncertainty of the speed of a rig never seen before", unit="m/s", minimum=0.0
+    )
+    sigma_initial_turn_rate: float = parameter(2.0, "the same for its turn rate", unit="rad/s", minimum=0.0)
+    coast_time: float = parameter(0.5, "a lost rig is assumed to stop after this time", unit="s", minimum=0.0)
+    sigma_gyro: float = parameter(
+        0.02, "noise of the mean turn rate of an IMU between two frames", unit="rad/s", minimum=1e-6
+    )
+    aid_gate: float = parameter(22.46, "chi-square gate of a motion aid, 6 degrees of freedom (99.9 %)", minimum=1.0)
+    aid_stamp_tolerance: float = parameter(
+        0.005, "largest difference of the stamps of a motion aid and of the frames it joins", unit="s", minimum=0.0
+    )
+
+
+@dataclass(frozen=True)
+class MeasurementConfig(Config):
+    """Which features are good enough to be measurements."""
+
+    max_relative_depth_sigma: float = parameter(
+        0.12, "features with a larger sigma of depth / depth are not used: their position is far from Gaussian",
+        minimum=0.001, maximum=0.5,
+    )  # fmt: skip
+    min_sigma_px: float = parameter(0.05, "floor of the pixel noise", unit="px", minimum=1e-3)
+    min_sigma_depth: float = parameter(1e-4, "floor of the depth noise", unit="m", minimum=1e-6)
+    max_features: int = parameter(800, "the strongest features of a frame that are looked at", minimum=10)
+    max_observations: int = parameter(120, "largest number of landmarks used in one update", minimum=6)
+
+
+@dataclass(frozen=True)
+class AssociationConfig(Config):
+    """How features find their landmarks (thesis chapter 4)."""
+
+    method: str = parameter(
+        "mahalanobis", "how a feature chooses among its candidates", choices=("nearest", "mahalanobis", "jcbb")
+    )
+    gate: float = parameter(16.27, "chi-square gate of one feature, 3 degrees of freedom (99.9 %)", minimum=1.0)
+    descriptor_threshold: float = parameter(0.75, "least cosine of the descriptors", minimum=-1.0, maximum=1.0)
+    descriptor_weight: float = parameter(
+        40.0,
+        "weight of 1 - cosine beside the normalised distance of Eq. 4.8; 0 is Algorithm 2 as published",
+        minimum=0.0,
+    )
+    nearest_associate: float = parameter(0.15, "gate g_A of Algorithm 1", unit="m", minimum=0.0)
+    min_inliers: int = parameter(8, "associations below which the rig is lost", minimum=3)
+    min_inlier_ratio: float = parameter(
+        0.25, "inliers among the descriptor matches below which a motion guess is not trusted", minimum=0.0, maximum=1.0
+    )
+    guess_min_inliers: int = parameter(12, "associations a motion guess from descriptors alone needs", minimum=4)
+    guess_ratio: float = parameter(
+        0.85, "a match of a motion guess needs a second best whose descriptor distance is larger by 1 / this",
+        minimum=0.1, maximum=1.0,
+    )  # fmt: skip
+    hypotheses: int = parameter(200, "samples drawn for the motion guess", minimum=10)
+    max_gate_px: float = parameter(
+        80.0,
+        "prediction uncertainty (one sigma in the image) above which the prediction is not tried",
+        unit="px",
+        minimum=1.0,
+    )
+    seed: int = parameter(0, "seed of the random samples", minimum=0)
+
+
+@dataclass(frozen=True)
+class LandmarkConfig(Config):
+    """Which features become landmarks and which landmarks stay (section 4.4)."""
+
+    target_in_view: int = parameter(80, "new landmarks are added until so many are observed", minimum=6)
+    min_sightings: int = parameter(3, "s_min of section 4.4", minimum=1)
+    probation_frames: int = parameter(6, "N of section 4.4: frames a landmark has to reach min_sightings", minimum=1)
+    min_hit_ratio: float = parameter(
+        0.1,
+        "a landmark seen in a smaller share of the frames in which it should be seen is removed",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    min_expected: int = parameter(12, "frames in which it should be seen before that share is judged", minimum=1)
+
+
+@dataclass(frozen=True)
+class SubmapConfig(Config):
+    """When a submap ends and how the next one starts (section 7.1)."""
+
+    start: str = parameter(
+        "independent", "what the next submap takes over: nothing but the last frame's own measurement, or Eq. 7.1",
+        choices=("independent", "conditional"),
+    )  # fmt: skip
+    max_distance: float = parameter(1.0, "a submap ends this far from its start", unit="m", minimum=0.05)
+    max_landmarks: int = parameter(400, "a submap ends at this number of landmarks", minimum=10)
+    max_frames: int = parameter(300, "a submap ends after this number of frames", minimum=2)
+    min_frames: int = parameter(5, "a submap has at least so many frames", minimum=2)
+    min_shared: int = parameter(15, "landmarks seen in the last frame, below which the end is put off", minimum=3)
+    lost_frames: int = parameter(2, "frames without association after which a new submap may start", minimum=1)
+    restart_sigma_velocity: float = parameter(
+        1.0, "uncertainty of the speed at an independent start", unit="m/s", minimum=0.0
+    )
+    restart_sigma_turn_rate: float = parameter(
+        1.0, "uncertainty of the turn rate at an independent start", unit="rad/s", minimum=0.0
+    )
+
+
+@dataclass(frozen=True)
+class EkfSlamConfig(Config):
+    """Everything the EKF node can be told."""
+
+    agent: str = parameter("", "name of this rig, prefix of its submap frames")
+    error: str = parameter(
+        "invariant",
+        "error state: landmarks' errors rotate with the rig's, or stand alone",
+        choices=("invariant", "standard"),
+    )
+    motion: MotionConfig = group(MotionConfig)
+    measurement: MeasurementConfig = group(MeasurementConfig)
+    association: AssociationConfig = group(AssociationConfig)
+    landmark: LandmarkConfig = group(LandmarkConfig)
+    submap: SubmapConfig = group(SubmapConfig)

@@ -1,0 +1,233 @@
+"""The filter: one joint Gaussian of the rig and its landmarks, its time update, augmentation and measurement update.
+
+Error state: position, rotation, velocities (see ``models``), then three coordinates per landmark, all in the map frame.
+
+**Consistency.** With landmark errors that stand alone, every update linearises the unobservable motion of the whole
+map at another estimate and so invents information about heading. In the right-invariant error (Barrau and Bonnabel
+2015; Zhang et al. 2017) landmark and position errors rotate with the rig's rotation error and this cannot happen. The
+covariance is stored in the plain coordinates all the same, in which F and H stay sparse: after each update, which
+moves point x by dx, the change of coordinates between the old and the new estimate is ``dx_error -= [dx]x
+rotation_error``, a product of rank three.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekf_slam_node.covariance import Covariance, IndexArray, whiten
+from ekf_slam_node.models import (
+    CORE_DIM,
+    Observation,
+    increment_jacobian,
+    motion_jacobian,
+    noise_gain,
+    relative_motion,
+    velocity_of_motion,
+)  # fmt: skip
+from slam_core.geometry import FloatArray, make_transform, skew, so3_exp, so3_left_jacobian
+
+
+@dataclass(frozen=True, eq=False)
+class UpdateReport:
+    """Outcome of one measurement update: NIS, its degrees of freedom, whether it was applied."""
+
+    nis: float
+    dof: int
+    applied: bool
+
+
+@dataclass(frozen=True, eq=False)
+class TimeUpdate:
+    """A prediction that is not applied yet, linearised at a motion that may come from elsewhere than the velocity.
+
+    T: (4, 4) the pose it is linearised at; velocity: (6,) the same for the velocities; offset: (12,) predicted mean
+    minus linearisation point, zero unless a motion guess is used; head: (n, 12) predicted covariance of everything
+    with the core; increment: (n, 6) covariance of everything with the motion of this step, for aids that measure it;
+    increment_covariance (6, 6); increment_offset (6,).
+    """
+
+    T: FloatArray
+    velocity: FloatArray
+    offset: FloatArray
+    head: FloatArray
+    increment: FloatArray
+    increment_covariance: FloatArray
+    increment_offset: FloatArray
+
+
+class Ekf:
+    """State and covariance of a rig (frame ``T``, body ``velocity``) and landmarks (m, 3), all in the frame of the
+    submap.
+
+    Parameters
+    ----------
+    velocity
+        (6,) linear and angular, m/s and rad/s, in the rig frame; the pose is the identity.
+    covariance
+        Shape (12 + 3 m, 12 + 3 m) at the start.
+    invariant
+        Whether landmark errors rotate with the rig's rotation error.
+    landmarks
+        (m, 3) to start with; None for none.
+    """
+
+    def __init__(
+        self, velocity: FloatArray, covariance: FloatArray, invariant: bool = True, landmarks: FloatArray | None = None
+    ) -> None:
+        self.T = np.eye(4)
+        self.velocity = velocity.copy()
+        self.landmarks = np.zeros((0, 3)) if landmarks is None else landmarks.copy()
+        self.covariance = Covariance(covariance)
+        self._invariant = invariant
+        self._offset = np.zeros(CORE_DIM)
+
+    # ------------------------------------------------------------------------------------------------------ time
+    def time_update(self, dt: float, sigma: FloatArray, T_previous_now: FloatArray | None = None) -> TimeUpdate:
+        """Predict dt (s) ahead with acceleration noise sigma (6,); with a motion guess, linearised there (iterated
+        EKF).
+        """
+        at = self.velocity if T_previous_now is None else velocity_of_motion(T_previous_now, dt)
+        F, R = motion_jacobian(self.T, at, dt), self.T[:3, :3]
+        G, variance = noise_gain(R, at, dt), np.square(sigma)
+        head = self.covariance.head(CORE_DIM)
+        predicted = head @ F.T
+        predicted[:CORE_DIM] = F @ predicted[:CORE_DIM] + (G * variance) @ G.T
+        B, C = increment_jacobian(R, at, dt) * dt, G[:6]
+        increment = head[:, 6:] @ B.T
+        increment[:CORE_DIM] = F @ increment[:CORE_DIM] + (G * variance) @ C.T
+        covariance = B @ head[6:12, 6:] @ B.T + (C * variance) @ C.T
+        difference = self.velocity - at
+        offset = np.concatenate([B @ difference, difference])
+        return TimeUpdate(
+            self.T @ relative_motion(at, dt), at, offset, predicted, increment, covariance, B @ difference
+        )
+
+    def apply_time_update(self, step: TimeUpdate) -> None:
+        """Move the state to a prediction; a measurement update must follow if it was linearised at a guess."""
+        self.T, self.velocity, self._offset = step.T, step.velocity, step.offset
+        self.covariance.set_head(step.head)
+
+    def update_increment(
+        self, step: TimeUpdate, error: FloatArray, covariance: FloatArray, rows: slice, gate: float
+    ) -> UpdateReport:
+        """Measure the motion of the step just applied: error (k,) of its rows (translation, rotation) in the map's
+        axes.
+
+        Not applied if its NIS is beyond the gate.
+
+        The previous pose is no part of the state: its place is taken by the covariance of everything with the step
+        (stochastic cloning, Roumeliotis and Burdick 2002, with the clone marginalised at once).
+        """
+        cross = np.zeros((self.covariance.capacity, 6), order="F")
+        cross[: len(step.increment)] = step.increment
+        S = step.increment_covariance[rows, rows] + covariance
+        innovation = error - step.increment_offset[rows]
+        nis = float(innovation @ np.linalg.solve(S, innovation))
+        if not nis < gate:
+            return UpdateReport(nis, len(innovation), False)
+        return self._update(S, np.asfortranarray(cross[:, rows]), innovation)
+
+    # --------------------------------------------------------------------------------------------------- measurement
+    def innovation_blocks(self, seen: Observation, slots: IndexArray, variance: FloatArray) -> FloatArray:
+        """Each observation's own innovation covariance S (m, 3, 3), correlations of rig and landmark included."""
+        rows = CORE_DIM + 3 * np.asarray(slots)
+        head = self.covariance.head(6)
+        cross = np.swapaxes(head[rows[:, None] + np.arange(3)], 1, 2)
+        J_pose, J_point = seen.J_pose, seen.J_point
+        mixed = J_pose @ cross @ np.swapaxes(J_point, 1, 2)
+        S = J_pose @ head[:6] @ np.swapaxes(J_pose, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
+        S += J_point @ self.covariance.blocks(rows) @ np.swapaxes(J_point, 1, 2)
+        S[:, np.arange(3), np.arange(3)] += variance
+        return np.asarray(S)
+
+    def innovation(self, z: FloatArray, seen: Observation) -> FloatArray:
+        """``z - h(x)`` (m, 3) at the predicted mean, also when the prediction was linearised elsewhere."""
+        return np.asarray(z - seen.z - seen.J_pose @ self._offset[:6])
+
+    def update(self, z: FloatArray, variance: FloatArray, seen: Observation, slots: IndexArray) -> UpdateReport:
+        """Measurements z (m, 3) with variances (m, 3) of the landmarks ``slots`` (m,), predicted as ``seen`` (Eqs.
+        6.16-6.21).
+        """
+        rows = CORE_DIM + 3 * np.asarray(slots, dtype=np.int64)
+        cross = self.covariance.cross_covariance(seen.J_pose, seen.J_point, rows)
+        points = cross[rows[:, None] + np.arange(3)]
+        k = 3 * len(rows)
+        S = (seen.J_pose @ cross[:6] + seen.J_point @ points).reshape(k, k)
+        S[np.arange(k), np.arange(k)] += variance.ravel()
+        return self._update(np.asfortranarray(0.5 * (S + S.T)), cross, self.innovation(z, seen).ravel())
+
+    def _update(self, S: FloatArray, cross: FloatArray, innovation: FloatArray) -> UpdateReport:
+        whitened = whiten(S, cross, innovation)
+        if whitened is None or not np.isfinite(whitened[1]).all():
+            return UpdateReport(np.nan, len(innovation), False)
+        W, y = whitened
+        self.covariance.subtract_square(W)
+        self._move(W[: self.covariance.size] @ y)
+        return UpdateReport(float(y @ y), len(y), True)
+
+    def _move(self, delta: FloatArray) -> None:
+        delta[:CORE_DIM] += self._offset
+        self._offset = np.zeros(CORE_DIM)
+        self.velocity = self.velocity + delta[6:12]
+        old = np.vstack([self.T[:3, 3], self.landmarks])
+        shift = np.vstack([delta[:3], delta[CORE_DIM:].reshape(-1, 3)])
+        new = _moved_points(old, shift, delta[3:6]) if self._invariant else old + shift
+        self.T = make_transform(so3_exp(delta[3:6]) @ self.T[:3, :3], new[0])
+        self.landmarks = new[1:]
+        if self._invariant:
+            self._change_coordinates(new - old)
+
+    def _change_coordinates(self, moved: FloatArray) -> None:
+        A = np.zeros((self.covariance.capacity, 3), order="F")
+        turned = -skew(moved)
+        A[:3] = turned[0]
+        A[CORE_DIM : self.covariance.size] = turned[1:].reshape(-1, 3)
+        B = self.covariance.columns(np.array([3, 4, 5]))
+        self.covariance.add_product(A, B + 0.5 * A @ B[3:6])
+
+    # -------------------------------------------------------------------------------------------------- augmentation
+    def augment(self, points: FloatArray, covariances: FloatArray) -> IndexArray:
+        """Add landmarks measured at (k, 3) in the rig frame with covariances (k, 3, 3); returns their slots (Eqs.
+        6.22-6.24).
+        """
+        k, R = len(points), self.T[:3, :3]
+        arm = points @ R.T
+        J = np.concatenate([np.broadcast_to(np.eye(3), (k, 3, 3)), -skew(arm)], axis=2).reshape(3 * k, 6)
+        head = self.covariance.head(6)
+        block = J @ head[:6] @ J.T
+        own = R @ covariances @ R.T
+        for i in range(k):
+            block[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += own[i]
+        self.covariance.append(J @ head.T, block)
+        self.landmarks = np.vstack([self.landmarks, arm + self.T[:3, 3]])
+        return np.arange(len(self.landmarks) - k, len(self.landmarks))
+
+    def remove(self, slot: int) -> None:
+        """Marginalise a landmark; the last one takes its slot."""
+        self.covariance.remove(CORE_DIM + 3 * slot, 3)
+        self.landmarks[slot] = self.landmarks[-1]
+        self.landmarks = self.landmarks[:-1]
+
+    # ------------------------------------------------------------------------------------------------------- views
+    def pose_covariance(self) -> FloatArray:
+        """Covariance (6, 6) of the rig's pose."""
+        return self.covariance.head(6)[:6]
+
+    def landmarks_in_rig(self) -> tuple[FloatArray, FloatArray]:
+        """Landmarks as the rig has them around itself: positions (m, 3) in the rig frame and covariances (m, 3, 3)."""
+        R, arm = self.T[:3, :3], self.landmarks - self.T[:3, 3]
+        m = len(arm)
+        rows = CORE_DIM + 3 * np.arange(m)
+        head = self.covariance.head(6)
+        J = np.concatenate([np.broadcast_to(-np.eye(3), (m, 3, 3)), skew(arm)], axis=2)
+        mixed = J @ np.swapaxes(head[CORE_DIM:].reshape(m, 3, 6), 1, 2)
+        C = J @ head[:6] @ np.swapaxes(J, 1, 2) + mixed + np.swapaxes(mixed, 1, 2) + self.covariance.blocks(rows)
+        return arm @ R, R.T @ C @ R
+
+
+def _moved_points(points: FloatArray, shift: FloatArray, turn: FloatArray) -> FloatArray:
+    """Apply a right-invariant error, given in plain coordinates: ``shift`` (n, 3) of the points, ``turn`` (3,)."""
+    own = shift - np.cross(turn, points)
+    return np.asarray(points @ so3_exp(turn).T + own @ so3_left_jacobian(turn).T)

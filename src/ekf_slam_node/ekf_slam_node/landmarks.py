@@ -1,0 +1,105 @@
+"""What is known of landmarks beside their positions: identity, descriptor, and whether they can be relied on (4.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekf_slam_node.candidates import Candidates
+from ekf_slam_node.config import LandmarkConfig
+from ekf_slam_node.covariance import IndexArray
+from slam_core.geometry import FloatArray
+from slam_core.types import Float32Array
+
+
+@dataclass(frozen=True, eq=False)
+class Pending:
+    """Features of the last frame that are no landmarks (yet): a feature becomes one when a second frame confirms it.
+
+    candidates: points in the rig frame of that frame. ids: (n,) of the landmarks they belong to where a new submap has
+    just begun, else -1. sightings: (n,) so far.
+    """
+
+    candidates: Candidates
+    ids: IndexArray
+    sightings: np.ndarray
+
+
+class LandmarkBook:
+    """One row per landmark, in the order of the filter's slots."""
+
+    def __init__(self, descriptor_size: int) -> None:
+        self.ids = np.zeros(0, dtype=np.int64)
+        self.sightings = np.zeros(0, dtype=np.int32)
+        self.descriptors: Float32Array = np.zeros((0, descriptor_size), dtype=np.float32)
+        self._first_frame = np.zeros(0, dtype=np.int64)
+        self._expected = np.zeros(0, dtype=np.int64)
+        self._hits = np.zeros(0, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def add(self, ids: IndexArray, sightings: np.ndarray, descriptors: Float32Array, frame: int) -> None:
+        """Append landmarks first seen in ``frame``."""
+        self.ids = np.concatenate([self.ids, ids])
+        self.sightings = np.concatenate([self.sightings, sightings.astype(np.int32)])
+        self.descriptors = np.concatenate([self.descriptors, descriptors])
+        self._first_frame = np.concatenate([self._first_frame, np.full(len(ids), frame)])
+        self._expected = np.concatenate([self._expected, np.zeros(len(ids), dtype=np.int64)])
+        self._hits = np.concatenate([self._hits, np.zeros(len(ids), dtype=np.int64)])
+
+    def select(self, slots: IndexArray) -> LandmarkBook:
+        """A book of the landmarks ``slots`` alone, their record of hits and misses starting anew."""
+        book = LandmarkBook(self.descriptors.shape[1])
+        book.add(self.ids[slots], self.sightings[slots], self.descriptors[slots], 0)
+        return book
+
+    def count(self, seen: IndexArray, descriptors: Float32Array, expected: np.ndarray) -> None:
+        """Count the sightings of slots ``seen`` with their new descriptors; ``expected`` masks those that are in
+        view.
+        """
+        self.sightings[seen] += 1
+        self._hits[seen] += 1
+        self._expected[expected] += 1
+        # The mean of old and new follows the change of viewpoint and averages the noise.
+        blended = self.descriptors[seen] + descriptors
+        self.descriptors[seen] = blended / np.maximum(np.linalg.norm(blended, axis=1, keepdims=True), 1e-6)
+
+    def unreliable(self, frame: int, config: LandmarkConfig) -> IndexArray:
+        """Slots to be removed, highest first: too few sightings in their first frames, or missed where they should be
+        seen.
+        """
+        probation = (frame - self._first_frame >= config.probation_frames) & (self.sightings < config.min_sightings)
+        missed = (self._expected >= config.min_expected) & (self._hits < config.min_hit_ratio * self._expected)
+        return np.flatnonzero(probation | missed)[::-1]
+
+    def remove(self, slot: int) -> None:
+        """Drop a landmark; the last one takes its slot, as in the filter."""
+        for name in ("ids", "sightings", "descriptors", "_first_frame", "_expected", "_hits"):
+            values = getattr(self, name)
+            values[slot] = values[-1]
+            setattr(self, name, values[:-1])
+
+
+def spread_choice(points_px: FloatArray, occupied_px: FloatArray, amount: int, size: tuple[int, int]) -> IndexArray:
+    """Choose up to ``amount`` of the points (n, 2) px so that, with the occupied ones (m, 2), they cover the image.
+
+    The image is divided into 8 x 6 cells; each next point comes from the cell with the fewest so far, in the order
+    given.
+    """
+    cells = np.array([8, 6])
+    to_cell = np.array([8.0 / size[0], 6.0 / size[1]])
+
+    def cell(px: FloatArray) -> np.ndarray:
+        column_row = np.clip((px * to_cell).astype(np.int64), 0, cells - 1)
+        return np.asarray(column_row[:, 0] * cells[1] + column_row[:, 1])
+
+    load = np.bincount(cell(occupied_px), minlength=48)
+    own = cell(points_px)
+    order = np.argsort(own, kind="stable")
+    # The place of a point in its cell's queue on top of what the cell already holds: the smallest come first.
+    place = np.empty(len(own), dtype=np.int64)
+    first = np.searchsorted(own[order], own[order])
+    place[order] = np.arange(len(own)) - first
+    return np.argsort(load[own] + place, kind="stable")[:amount]

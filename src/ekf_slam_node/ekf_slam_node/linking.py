@@ -1,0 +1,117 @@
+"""Linking a frame to what is known: association under the prediction, or under a motion guess where the prediction
+fails.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekf_slam_node.association import IndexArray, associate_mahalanobis, associate_nearest, match_descriptors
+from ekf_slam_node.candidates import Candidates, MotionPrior
+from ekf_slam_node.config import AssociationConfig
+from ekf_slam_node.models import Frame
+from ekf_slam_node.motion_guess import MotionGuess, guess_motion, refine_motion
+from slam_core.geometry import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """Pairs of candidates ``rows`` and features ``columns`` (k,), and the motion they agree on.
+
+    T, covariance: (4, 4) T_previous_now from these pairs alone, with its covariance (6, 6).
+    """
+
+    T: FloatArray
+    covariance: FloatArray
+    rows: IndexArray
+    columns: IndexArray
+
+
+class Linker:
+    """Associates one frame after the other.
+
+    Parameters
+    ----------
+    T_rig_optical
+        Mounting of the camera, (4, 4).
+    """
+
+    def __init__(self, config: AssociationConfig, T_rig_optical: FloatArray) -> None:
+        self._config = config
+        self._T_rig_optical = T_rig_optical
+
+    def link(self, candidates: Candidates, frame: Frame, prior: MotionPrior) -> Link | None:
+        """Pairs of candidates and features and their motion; None if the frame cannot be linked."""
+        if min(len(candidates), len(frame)) < self._config.min_inliers:
+            return None
+        # Seeded by the frame's own stamp: the result does not depend on what happened before.
+        rng = np.random.default_rng((self._config.seed, frame.stamp_ns))
+        similarity = np.asarray(candidates.descriptors @ frame.descriptors.T, dtype=np.float64)
+        return self._by_prediction(candidates, frame, similarity, prior, rng) or self._by_guess(
+            candidates, frame, similarity, rng
+        )
+
+    def _by_prediction(
+        self, candidates: Candidates, frame: Frame, similarity: FloatArray, prior: MotionPrior, rng: np.random.Generator
+    ) -> Link | None:
+        config = self._config
+        if _image_spread(prior, frame) > config.max_gate_px:
+            return None
+        rows, columns = self._associate(candidates, frame, similarity, prior)
+        guess = guess_motion(
+            candidates.select(rows),
+            frame.select(columns),
+            self._T_rig_optical,
+            rng,
+            config.hypotheses,
+            config.gate,
+            prior.T,
+        )
+        if guess is None or guess.inliers.sum() < max(config.min_inliers, 0.5 * len(rows)):
+            return None
+        return self._settle(candidates, frame, similarity, guess, config.min_inliers)
+
+    def _by_guess(
+        self, candidates: Candidates, frame: Frame, similarity: FloatArray, rng: np.random.Generator
+    ) -> Link | None:
+        config = self._config
+        rows, columns = match_descriptors(similarity, config.descriptor_threshold, config.guess_ratio)
+        guess = guess_motion(
+            candidates.select(rows), frame.select(columns), self._T_rig_optical, rng, 2 * config.hypotheses, config.gate
+        )
+        if guess is None or guess.inliers.sum() < max(config.min_inliers, config.min_inlier_ratio * len(rows)):
+            return None
+        return self._settle(candidates, frame, similarity, guess, config.guess_min_inliers)
+
+    def _associate(
+        self, candidates: Candidates, frame: Frame, similarity: FloatArray, prior: MotionPrior
+    ) -> tuple[IndexArray, IndexArray]:
+        config = self._config
+        if config.method == "nearest":
+            return associate_nearest(candidates, frame, prior.T, self._T_rig_optical, config.nearest_associate)
+        return associate_mahalanobis(
+            candidates, frame, similarity, prior.T, prior.covariance, self._T_rig_optical, config
+        )
+
+    def _settle(
+        self, candidates: Candidates, frame: Frame, similarity: FloatArray, guess: MotionGuess, least: int
+    ) -> Link | None:
+        """Associate once more around the motion found, where the gates are as small as they can be."""
+        rows, columns = self._associate(candidates, frame, similarity, MotionPrior(guess.T, guess.covariance))
+        final = refine_motion(
+            candidates.select(rows), frame.select(columns), self._T_rig_optical, guess.T, self._config.gate
+        )
+        if final is None or final.inliers.sum() < least:
+            return None
+        return Link(final.T, final.covariance, rows[final.inliers], columns[final.inliers])
+
+
+def _image_spread(prior: MotionPrior, frame: Frame) -> float:
+    """One sigma (px) by which the prior's motion moves the image of a point at the frame's median distance."""
+    rotation, translation = (
+        np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1],
+        np.linalg.eigvalsh(prior.covariance[:3, :3])[-1],
+    )
+    return float(frame.camera.fx * np.sqrt(rotation + translation * np.median(frame.z[:, 2]) ** 2))

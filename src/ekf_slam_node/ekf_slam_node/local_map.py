@@ -1,0 +1,143 @@
+"""The map under construction: filter, landmarks' book and the last frame's other features, kept in step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekf_slam_node.candidates import Candidates
+from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.covariance import IndexArray
+from ekf_slam_node.ekf import Ekf, UpdateReport
+from ekf_slam_node.landmarks import LandmarkBook, Pending, spread_choice
+from ekf_slam_node.linking import Link
+from ekf_slam_node.models import Frame, observe, rig_points
+from slam_core.geometry import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Landmarks ``slots`` (k,) seen as features ``columns`` (k,) of a frame, to be measured."""
+
+    slots: IndexArray
+    columns: IndexArray
+
+    def __len__(self) -> int:
+        return len(self.slots)
+
+    def select(self, index: np.ndarray) -> Sight:
+        """The sightings at ``index``."""
+        return Sight(self.slots[index], self.columns[index])
+
+
+class LocalMap:
+    """Landmarks around the start of one submap.
+
+    Parameters
+    ----------
+    ekf, book
+        The same landmarks in the same order.
+    pending
+        Features of the frame at which the map begins.
+    """
+
+    def __init__(
+        self, config: EkfSlamConfig, T_rig_optical: FloatArray, ekf: Ekf, book: LandmarkBook, pending: Pending
+    ) -> None:
+        self.ekf = ekf
+        self.book = book
+        self.pending = pending
+        self._config = config
+        self._T_rig_optical = T_rig_optical
+        self._frames = 0
+
+    def candidates(self) -> Candidates:
+        """Everything a frame can be linked to: landmarks first, then the pending features."""
+        points, covariances = self.ekf.landmarks_in_rig()
+        pending = self.pending.candidates
+        return Candidates(
+            np.concatenate([points, pending.points]), np.concatenate([covariances, pending.covariances]),
+            np.concatenate([self.book.descriptors, pending.descriptors]),
+        )  # fmt: skip
+
+    # ---------------------------------------------------------------------------------------------- one frame, in order
+    def confirm(self, frame: Frame, link: Link, wanted: int, new_ids: IndexArray) -> Sight:
+        """Make landmarks of the pending features that the frame confirms, until ``wanted`` are in sight.
+
+        The rig must still be at the previous frame: a new landmark's place comes from that frame's measurement.
+        Features that belong to a landmark of the submap before (``ids``) come first.
+        """
+        known = np.flatnonzero(link.rows < len(self.book))
+        fresh = np.flatnonzero(link.rows >= len(self.book))
+        pixels = frame.z[link.columns, :2]
+        size = (frame.camera.width, frame.camera.height)
+        known = known[spread_choice(pixels[known], pixels[:0], self._config.measurement.max_observations, size)]
+        which = link.rows[fresh] - len(self.book)
+        inherited = self.pending.ids[which] >= 0
+        first = fresh[inherited]
+        others = fresh[~inherited]
+        room = max(wanted - len(known) - len(first), 0)
+        others = others[spread_choice(pixels[others], pixels[np.concatenate([known, first])], room, size)]
+        chosen = np.concatenate([first, others])
+        slots = self._add(link.rows[chosen] - len(self.book), new_ids)
+        return Sight(
+            np.concatenate([link.rows[known], slots]), np.concatenate([link.columns[known], link.columns[chosen]])
+        )
+
+    def _add(self, which: IndexArray, new_ids: IndexArray) -> IndexArray:
+        pending = self.pending
+        candidates = pending.candidates.select(which)
+        slots = self.ekf.augment(candidates.points, candidates.covariances)
+        ids = np.where(pending.ids[which] >= 0, pending.ids[which], new_ids[: len(which)])
+        self.book.add(ids, pending.sightings[which], candidates.descriptors, self._frames)
+        return slots
+
+    def measure(self, frame: Frame, sight: Sight) -> tuple[UpdateReport, Sight]:
+        """Measurement update with the sightings whose innovation is inside the gate; returns those."""
+        seen = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
+        z, variance = frame.z[sight.columns], frame.variance[sight.columns]
+        S = self.ekf.innovation_blocks(seen, sight.slots, variance)
+        innovation = self.ekf.innovation(z, seen)
+        distance = np.einsum("ni,ni->n", innovation, np.linalg.solve(S, innovation[:, :, None])[:, :, 0])
+        good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > 0.05))
+        report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good])
+        return report, sight.select(good)
+
+    def remember(self, frame: Frame, used: IndexArray) -> None:
+        """Keep the features of a frame, without those at ``used``, as the next frame's pending ones."""
+        self.pending = pending_of(frame, self._T_rig_optical, used)
+
+    def tidy(self, frame: Frame, sight: Sight) -> None:
+        """Count who was seen and who should have been, and remove landmarks that cannot be relied on."""
+        view = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks, frame.camera)
+        self.book.count(sight.slots, frame.descriptors[sight.columns], view.in_image(frame.camera, margin_px=10.0))
+        self._frames += 1
+        for slot in self.book.unreliable(self._frames, self._config.landmark):
+            self.ekf.remove(slot)
+            self.book.remove(slot)
+
+
+def pending_of(frame: Frame, T_rig_optical: FloatArray, used: IndexArray) -> Pending:
+    """The features of a frame but those at ``used``, as candidates for the next one."""
+    free = np.ones(len(frame), dtype=bool)
+    free[used] = False
+    rest = frame.select(np.flatnonzero(free))
+    points, covariances = rig_points(rest, T_rig_optical)
+    n = len(rest)
+    return Pending(
+        Candidates(points, covariances, rest.descriptors), np.full(n, -1, dtype=np.int64), np.ones(n, dtype=np.int32)
+    )
+
+
+def inheriting(frame: Frame, T_rig_optical: FloatArray, sight: Sight, book: LandmarkBook) -> Pending:
+    """All features of a frame, those of known landmarks with their identity: what an independent submap starts from.
+
+    Only names and descriptors are inherited. The places come from this frame's measurement, which the submap before
+    has not used: the two submaps share no information.
+    """
+    pending = pending_of(frame, T_rig_optical, np.zeros(0, dtype=np.int64))
+    pending.ids[sight.columns] = book.ids[sight.slots]
+    pending.sightings[sight.columns] = book.sightings[sight.slots] + 1
+    pending.candidates.descriptors[sight.columns] = book.descriptors[sight.slots]
+    return pending

@@ -1,0 +1,174 @@
+"""The two models of the filter: how the rig moves, how it sees a landmark, each with its Jacobians.
+
+Core state of the rig, 12 error coordinates: position and rotation in the map frame (error of ``slam_core.geometry``),
+then linear and angular velocity in the rig frame. Body velocities stay what they are while the rig turns, and when a
+new submap starts.
+
+A measurement is ``z = (u, v, 1/d)``: stereo noise is Gaussian in disparity, that is in inverse depth, not in depth;
+for a ToF depth, whose sigma is small against d, both are the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_core.camera import Camera
+from slam_core.geometry import FloatArray, make_transform, skew, so3_exp, so3_left_jacobian, so3_log
+from slam_core.types import Features
+
+CORE_DIM = 12
+"""Error coordinates of the rig: position 3, rotation 3, linear and angular velocity 3 + 3."""
+
+
+# ---- motion
+def relative_motion(velocity: FloatArray, dt: float) -> FloatArray:
+    """``T_previous_now`` (4, 4) of body velocities (6,), m/s and rad/s, held for dt (s)."""
+    return make_transform(so3_exp(velocity[3:] * dt), velocity[:3] * dt)
+
+
+def velocity_of_motion(T_previous_now: FloatArray, dt: float) -> FloatArray:
+    """Body velocities (6,) that make a motion within dt: inverse of :func:`relative_motion`."""
+    return np.concatenate([T_previous_now[:3, 3], so3_log(T_previous_now[:3, :3])]) / dt
+
+
+def motion_jacobian(T_map_rig: FloatArray, velocity: FloatArray, dt: float) -> FloatArray:
+    """Transition matrix F (12, 12) of the core state over dt, at the pose before the motion (Eq. 5.6)."""
+    F = np.eye(CORE_DIM)
+    R = T_map_rig[:3, :3]
+    F[:3, 3:6] = -skew(R @ velocity[:3]) * dt
+    F[:6, 6:] = increment_jacobian(R, velocity, dt) * dt
+    return F
+
+
+def increment_jacobian(rotation: FloatArray, velocity: FloatArray, dt: float) -> FloatArray:
+    """Derivative (6, 6) of the pose with respect to the increment (translation, rotation vector) in the rig frame."""
+    J = np.zeros((6, 6))
+    J[:3, :3] = rotation
+    J[3:, 3:] = rotation @ so3_left_jacobian(velocity[3:] * dt)
+    return J
+
+
+def noise_gain(rotation: FloatArray, velocity: FloatArray, dt: float) -> FloatArray:
+    """G (12, 6): how accelerations, constant over dt and in the rig frame, enter the core state (Eq. 5.6)."""
+    return np.vstack([increment_jacobian(rotation, velocity, dt) * (0.5 * dt * dt), np.eye(6) * dt])
+
+
+# ---- measurement
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The usable features of one instant as measurements.
+
+    z: (n, 3) u px, v px, inverse depth 1/m. variance: (n, 3) of z. descriptors: (n, d) float32, unit norm. index: (n,)
+    into the features they came from.
+    """
+
+    stamp_ns: int
+    z: FloatArray
+    variance: FloatArray
+    descriptors: np.ndarray
+    camera: Camera
+    index: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def select(self, index: np.ndarray) -> Frame:
+        """The measurements at ``index``."""
+        return Frame(
+            self.stamp_ns, self.z[index], self.variance[index], self.descriptors[index], self.camera, self.index[index]
+        )
+
+
+def frame_from_features(features: Features, usable: np.ndarray, min_sigma_px: float, min_sigma_depth: float) -> Frame:
+    """Measurements of the features at ``usable`` (indices), with floors on their noise."""
+    uv = features.uv[usable].astype(np.float64)
+    depth = features.depth[usable].astype(np.float64)
+    sigma_uv = np.maximum(features.sigma_uv[usable].astype(np.float64), min_sigma_px)
+    sigma_depth = np.maximum(features.sigma_depth[usable].astype(np.float64), min_sigma_depth)
+    z = np.column_stack([uv, 1.0 / depth])
+    variance = np.column_stack([sigma_uv, sigma_depth / depth**2]) ** 2
+    return Frame(features.stamp_ns, z, variance, features.descriptors[usable], features.camera, usable)
+
+
+def project(points: FloatArray, camera: Camera) -> FloatArray:
+    """Measurements (n, 3) of points (n, 3) in the optical frame; depths are kept away from zero, see the visibility
+    test.
+    """
+    w = 1.0 / _safe_depth(points[:, 2])
+    return np.column_stack([camera.fx * points[:, 0] * w + camera.cx, camera.fy * points[:, 1] * w + camera.cy, w])
+
+
+def project_jacobian(points: FloatArray, camera: Camera) -> FloatArray:
+    """Derivative (n, 3, 3) of :func:`project`."""
+    w = 1.0 / _safe_depth(points[:, 2])
+    J = np.zeros((len(points), 3, 3))
+    J[:, 0, 0], J[:, 0, 2] = camera.fx * w, -camera.fx * points[:, 0] * w * w
+    J[:, 1, 1], J[:, 1, 2] = camera.fy * w, -camera.fy * points[:, 1] * w * w
+    J[:, 2, 2] = -w * w
+    return J
+
+
+def _safe_depth(depth: FloatArray) -> FloatArray:
+    return np.where(depth > 1e-3, depth, 1e-3)
+
+
+def back_project(z: FloatArray, camera: Camera) -> FloatArray:
+    """Points (n, 3) in the optical frame of measurements (n, 3) (the inverse measurement, Eq. 6.22)."""
+    depth = 1.0 / z[:, 2]
+    x, y = (z[:, 0] - camera.cx) / camera.fx, (z[:, 1] - camera.cy) / camera.fy
+    return np.column_stack([x * depth, y * depth, depth])
+
+
+def back_project_jacobian(z: FloatArray, camera: Camera) -> FloatArray:
+    """Derivative (n, 3, 3) of :func:`back_project` (Eq. 6.24)."""
+    depth = 1.0 / z[:, 2]
+    J = np.zeros((len(z), 3, 3))
+    J[:, 0, 0], J[:, 1, 1] = depth / camera.fx, depth / camera.fy
+    J[:, :, 2] = -back_project(z, camera) * depth[:, None]
+    return J
+
+
+def rig_points(frame: Frame, T_rig_optical: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Positions (n, 3) of a frame's features in the rig frame and their covariances (n, 3, 3)."""
+    R = T_rig_optical[:3, :3]
+    J = R @ back_project_jacobian(frame.z, frame.camera)
+    points = back_project(frame.z, frame.camera) @ R.T + T_rig_optical[:3, 3]
+    return points, np.einsum("nij,nj,nkj->nik", J, frame.variance, J)
+
+
+def observe(T_parent_rig: FloatArray, T_rig_optical: FloatArray, points: FloatArray, camera: Camera) -> Observation:
+    """What a rig at ``T_parent_rig`` sees of points (n, 3) in the parent frame."""
+    T = T_parent_rig @ T_rig_optical
+    optical = (points - T[:3, 3]) @ T[:3, :3]
+    J_point = project_jacobian(optical, camera) @ T[:3, :3].T
+    J_rotation = J_point @ skew(points - T_parent_rig[:3, 3])
+    return Observation(project(optical, camera), optical[:, 2], np.concatenate([-J_point, J_rotation], axis=2), J_point)
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Predicted measurements (n, 3), depths (n,) m, Jacobians with respect to the rig's pose (n, 3, 6) and the points
+    (n, 3, 3).
+    """
+
+    z: FloatArray
+    depth: FloatArray
+    J_pose: FloatArray
+    J_point: FloatArray
+
+    def select(self, index: np.ndarray) -> Observation:
+        """The observations at ``index``."""
+        return Observation(self.z[index], self.depth[index], self.J_pose[index], self.J_point[index])
+
+    def in_image(self, camera: Camera, margin_px: float = 0.0) -> np.ndarray:
+        """Mask of the points in front of the camera and inside the image, by more than the margin."""
+        u, v = self.z[:, 0], self.z[:, 1]
+        inside = (
+            (u >= margin_px)
+            & (u <= camera.width - 1 - margin_px)
+            & (v >= margin_px)
+            & (v <= camera.height - 1 - margin_px)
+        )
+        return np.asarray(inside & (self.depth > 0.05))

@@ -1,0 +1,338 @@
+"""EKF-SLAM from frame to frame: features in, poses, landmarks and finished submaps out (thesis chapter 6, Algorithm
+3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ekf_slam_node.aids import ALL, Aid, MotionAids, aid_error
+from ekf_slam_node.candidates import MotionPrior, motion_prior
+from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.ekf import Ekf, TimeUpdate, UpdateReport
+from ekf_slam_node.landmarks import LandmarkBook, Pending
+from ekf_slam_node.linking import Link, Linker
+from ekf_slam_node.local_map import LocalMap, Sight, inheriting, pending_of
+from ekf_slam_node.models import CORE_DIM, Frame, frame_from_features, relative_motion
+from ekf_slam_node.odometry import OdometryChain
+from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
+from ekf_slam_node.submap_builder import SubmapBuilder, conditional_start
+from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, boxminus, is_rigid_transform, make_transform
+from slam_core.types import Counters, Features, ImuSample, PoseEstimate, RelativeMotion, Submap
+
+_MOTION_GATE = 22.46
+"""99.9 % of chi-square with 6 degrees of freedom: a motion beyond it contradicts the prediction."""
+
+_NO_UPDATE = UpdateReport(0.0, 0, False)
+
+
+class EkfSlam:
+    """Builds submaps from features, one frame after the other.
+
+    A frame is *linked* to the previous one first: its features are associated with the landmarks of the filter and
+    with the previous frame's other features. Those confirmed in this way become landmarks at the previous pose, from
+    the previous measurement; only then does the filter move on to the new frame and use the new measurement. So every
+    measurement is used once, and nothing that was seen only once burdens the filter.
+
+    Parameters
+    ----------
+    T_rig_optical
+        Mounting of the camera, (4, 4); by default at the rig's origin, looking along its X axis.
+    """
+
+    def __init__(self, config: EkfSlamConfig, T_rig_optical: FloatArray | None = None) -> None:
+        if T_rig_optical is None:
+            T_rig_optical = make_transform(OPTICAL_FROM_RIG.T, np.zeros(3))
+        if not is_rigid_transform(T_rig_optical):
+            raise ValueError(f"T_rig_optical must be a rigid transform (4, 4), got {T_rig_optical}")
+        self.config = config
+        self._T_rig_optical = T_rig_optical
+        self._linker = Linker(config.association, T_rig_optical)
+        self._sigma = np.repeat([config.motion.sigma_acceleration, config.motion.sigma_angular_acceleration], 3)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, as if just made."""
+        self.counters = Counters()
+        self._aids = MotionAids(self.config.motion)
+        self._odometry = OdometryChain()
+        self._map: LocalMap | None = None
+        self._builder = SubmapBuilder(self.config.agent, 0, 0, False)
+        self._next_submap = 0
+        self._next_id = 0
+        self._stamp_ns = 0
+        self._newest_stamp_ns: int | None = None
+        self._missed: Frame | None = None
+        self._lost_frames = 0
+
+    # --------------------------------------------------------------------------------------------------------- input
+    def process(self, features: Features, motion: RelativeMotion | None = None) -> EkfResult:
+        """One frame of features, with the motion since the previous one where something else has measured it.
+
+        Bad input is counted in ``counters`` and named in the result's reason, never raised.
+        """
+        if motion is not None and not self._aids.add_motion(motion):
+            self.counters.add("motion_rejected")
+        if self._newest_stamp_ns is not None and features.stamp_ns <= self._newest_stamp_ns:
+            self.counters.add("stamp_not_newer")
+            return self._report(self._newest_stamp_ns, TrackingState.DEGRADED, "frame is not newer than the last")
+        self._newest_stamp_ns = features.stamp_ns
+        frame = self._usable(features)
+        return self._begin(frame) if self._map is None else self._advance(self._map, frame)
+
+    def process_imu(self, sample: ImuSample) -> None:
+        """A reading of an IMU, in the order of the stamps, before the frames that come after it."""
+        if not self._aids.add_imu(sample):
+            self.counters.add("imu_rejected")
+
+    def finish(self) -> tuple[Submap, ...]:
+        """Close the open submap; the next frame begins a new one that does not follow it."""
+        submaps = self._closed()
+        if self._map is not None:
+            self._odometry.advance(self._pose(self._stamp_ns))
+        self._map = None
+        return submaps
+
+    def _usable(self, features: Features) -> Frame:
+        limits = self.config.measurement
+        sigma = np.column_stack([features.sigma_uv, features.sigma_depth])
+        with np.errstate(invalid="ignore"):
+            usable = np.isfinite(features.uv).all(axis=1) & np.isfinite(features.depth) & np.isfinite(sigma).all(axis=1)
+            usable &= (features.depth > 0.05) & (sigma > 0.0).all(axis=1)
+            usable &= features.sigma_depth < limits.max_relative_depth_sigma * features.depth
+            usable &= np.isfinite(features.descriptors).all(axis=1)
+        self.counters.add("features_unusable", int(len(features) - usable.sum()))
+        index = np.flatnonzero(usable)
+        strongest = np.argsort(-features.response[index], kind="stable")[: limits.max_features]
+        return frame_from_features(features, np.sort(index[strongest]), limits.min_sigma_px, limits.min_sigma_depth)
+
+    # --------------------------------------------------------------------------------------------------- frame by frame
+    def _advance(self, local: LocalMap, frame: Frame) -> EkfResult:
+        dt = (frame.stamp_ns - self._stamp_ns) * 1e-9
+        aid = self._aids.between(self._stamp_ns, frame.stamp_ns)
+        expected = self._expected_motion(local, dt)
+        link = self._linker.link(local.candidates(), frame, _aided(expected, aid))
+        if link is not None:
+            return self._follow(local, frame, dt, link, expected, aid)
+        if aid is not None and aid.rows == ALL:
+            return self._coast(local, frame, dt, aid)
+        return self._miss(local, frame, dt)
+
+    def _expected_motion(self, local: LocalMap, dt: float) -> MotionPrior:
+        velocity_covariance = local.ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:]
+        return motion_prior(local.ekf.velocity, velocity_covariance, self._sigma, dt)
+
+    def _follow(
+        self, local: LocalMap, frame: Frame, dt: float, link: Link, expected: MotionPrior, aid: Aid | None
+    ) -> EkfResult:
+        """The frame is linked: augmentation at the previous pose, time update, measurement update, perhaps a new
+        submap.
+        """
+        surprising = _is_surprising(link, expected)
+        sight = self._confirm(local, frame, link, surprising)
+        step = local.ekf.time_update(dt, self._excused_sigma(local, link, dt) if surprising else self._sigma, link.T)
+        local.ekf.apply_time_update(step)
+        self._use_aid(local, step, aid, link.T)
+        shared = 0 if surprising else int((link.rows < len(local.book)).sum())
+        closing = self._builder.is_complete(local.ekf, self.config.submap, shared)
+        submaps: tuple[Submap, ...] = ()
+        if closing and self.config.submap.start == "independent":
+            submaps = self._closed_before_measurement(frame.stamp_ns)
+            report, sight = local.measure(frame, sight)
+        else:
+            report, sight = local.measure(frame, sight)
+            self._builder.add_pose(frame.stamp_ns, local.ekf)
+        self._reached(frame)
+        if not report.applied:
+            self.counters.add("updates_failed")
+        names = local.book.ids[sight.slots]
+        if closing:
+            submaps = submaps or self._closed()
+            self._succeed(local, frame, sight)
+        else:
+            local.remember(frame, sight.columns)
+            local.tidy(frame, sight)
+        return self._report(frame.stamp_ns, TrackingState.OK, "", submaps, report, names, frame.index[sight.columns])
+
+    def _confirm(self, local: LocalMap, frame: Frame, link: Link, surprising: bool) -> Sight:
+        # A surprising motion rests on these pairs alone: all of them are worth their cost.
+        wanted = self.config.measurement.max_observations if surprising else self.config.landmark.target_in_view
+        new_ids = np.arange(self._next_id, self._next_id + len(link.rows))
+        self._next_id += len(link.rows)
+        return local.confirm(frame, link, wanted, new_ids)
+
+    def _excused_sigma(self, local: LocalMap, link: Link, dt: float) -> FloatArray:
+        """Acceleration noise with which the model can explain the motion found."""
+        needed = 2.0 * boxminus(link.T, relative_motion(local.ekf.velocity, dt)) / dt**2
+        sizes = np.repeat(np.linalg.norm(needed.reshape(2, 3), axis=1), 3)
+        return np.asarray(np.maximum(self._sigma, sizes))
+
+    def _use_aid(self, local: LocalMap, step: TimeUpdate, aid: Aid | None, T_previous_now: FloatArray) -> None:
+        if aid is None:
+            return
+        rotation = step.T[:3, :3] @ T_previous_now[:3, :3].T
+        error, covariance = aid_error(aid, T_previous_now, rotation)
+        if local.ekf.update_increment(step, error, covariance, aid.rows, self.config.motion.aid_gate).applied:
+            self.counters.add("aids_used")
+        else:
+            self.counters.add("aids_rejected")
+
+    def _reached(self, frame: Frame) -> None:
+        self._stamp_ns = frame.stamp_ns
+        self._missed = None
+        self._lost_frames = 0
+        self._aids.forget_before(frame.stamp_ns)
+
+    # ------------------------------------------------------------------------------------------------ without a link
+    def _coast(self, local: LocalMap, frame: Frame, dt: float, aid: Aid) -> EkfResult:
+        """No link, but something else has measured the motion: go with it."""
+        step = local.ekf.time_update(dt, self._sigma, aid.T)
+        local.ekf.apply_time_update(step)
+        self._use_aid(local, step, aid, aid.T)
+        self._builder.add_pose(frame.stamp_ns, local.ekf)
+        self._reached(frame)
+        local.remember(frame, np.zeros(0, dtype=np.int64))
+        return self._report(frame.stamp_ns, TrackingState.DEGRADED, "no visual association, moved by odometry alone")
+
+    def _miss(self, local: LocalMap, frame: Frame, dt: float) -> EkfResult:
+        """No link: nothing is mapped. The filter stays at the last linked frame, so that the old map can be found
+        again.
+        """
+        self.counters.add("frames_lost")
+        self._lost_frames += 1
+        if self._lost_frames > self.config.submap.lost_frames and self._links_to_missed(frame):
+            return self._restart(frame)
+        self._missed = frame
+        reason = f"{len(frame)} features, fewer than {self.config.association.min_inliers} associations"
+        return self._report(frame.stamp_ns, TrackingState.LOST, reason)
+
+    def _links_to_missed(self, frame: Frame) -> bool:
+        missed = self._missed
+        if missed is None:
+            return False
+        dt = (frame.stamp_ns - missed.stamp_ns) * 1e-9
+        prior = motion_prior(np.zeros(6), np.diag(self._first_variance()), self._sigma, dt)
+        nobody = np.zeros(0, dtype=np.int64)
+        return self._linker.link(pending_of(missed, self._T_rig_optical, nobody).candidates, frame, prior) is not None
+
+    def _restart(self, frame: Frame) -> EkfResult:
+        """The old map is not found again, but two missed frames agree: a new submap begins at the first of them."""
+        missed = self._missed
+        assert missed is not None
+        pose = self._pose(missed.stamp_ns)
+        submaps = self._closed()
+        self._odometry.advance(pose)
+        result = self._advance(self._start(missed), frame)
+        return replace(result, submaps=submaps + result.submaps)
+
+    # ------------------------------------------------------------------------------------------------------- submaps
+    def _begin(self, frame: Frame) -> EkfResult:
+        self._start(frame)
+        if len(frame) < self.config.association.min_inliers:
+            return self._report(frame.stamp_ns, TrackingState.DEGRADED, f"only {len(frame)} features to begin with")
+        return self._report(frame.stamp_ns, TrackingState.OK, "")
+
+    def _start(self, frame: Frame) -> LocalMap:
+        """A submap at a frame of which nothing is known before: position zero, velocity unknown."""
+        pending = pending_of(frame, self._T_rig_optical, np.zeros(0, dtype=np.int64))
+        local = self._empty_map(frame, np.zeros(6), self._first_variance(), pending)
+        self._open(local, frame, follows=False)
+        return local
+
+    def _empty_map(self, frame: Frame, velocity: FloatArray, variance: FloatArray, pending: Pending) -> LocalMap:
+        covariance = np.zeros((CORE_DIM, CORE_DIM))
+        covariance[6:, 6:] = np.diag(variance)
+        ekf = Ekf(velocity, covariance, self.config.error == "invariant")
+        return LocalMap(self.config, self._T_rig_optical, ekf, LandmarkBook(frame.descriptors.shape[1]), pending)
+
+    def _open(self, local: LocalMap, frame: Frame, follows: bool) -> None:
+        self._map = local
+        self._builder = SubmapBuilder(self.config.agent, self._next_submap, frame.stamp_ns, follows)
+        self._reached(frame)
+
+    def _first_variance(self) -> FloatArray:
+        motion = self.config.motion
+        return np.repeat([motion.sigma_initial_velocity, motion.sigma_initial_turn_rate], 3) ** 2
+
+    def _succeed(self, local: LocalMap, frame: Frame, sight: Sight) -> None:
+        """Open the submap that follows, at the rig's pose in this frame."""
+        self._odometry.advance(self._pose(frame.stamp_ns))
+        if self.config.submap.start == "independent":
+            following = self._independent_start(local, frame, sight)
+        else:
+            ekf = conditional_start(local.ekf, sight.slots, self.config.error == "invariant")
+            pending = pending_of(frame, self._T_rig_optical, sight.columns)
+            following = LocalMap(self.config, self._T_rig_optical, ekf, local.book.select(sight.slots), pending)
+        self._open(following, frame, follows=True)
+
+    def _independent_start(self, local: LocalMap, frame: Frame, sight: Sight) -> LocalMap:
+        """Nothing is taken over but names and, as a mere starting point with a wide variance, the velocity."""
+        pending = inheriting(frame, self._T_rig_optical, sight, local.book)
+        config = self.config.submap
+        wide = np.repeat([config.restart_sigma_velocity, config.restart_sigma_turn_rate], 3) ** 2
+        return self._empty_map(frame, local.ekf.velocity, wide, pending)
+
+    def _closed_before_measurement(self, stamp_ns: int) -> tuple[Submap, ...]:
+        """The submap up to this frame's predicted pose: this frame's measurement belongs to the next submap alone."""
+        assert self._map is not None
+        self._builder.add_pose(stamp_ns, self._map.ekf)
+        return self._closed()
+
+    def _closed(self) -> tuple[Submap, ...]:
+        if self._map is None or self._builder.is_empty:
+            return ()
+        self._next_submap += 1
+        return (self._builder.close(self._map.ekf, self._map.book),)
+
+    # -------------------------------------------------------------------------------------------------------- output
+    def _pose(self, stamp_ns: int) -> PoseEstimate:
+        """T_odom_rig at a stamp not before the filter's: beyond it the rig is assumed to go on for a while and then to
+        stop.
+        """
+        assert self._map is not None
+        ekf = self._map.ekf
+        dt = (stamp_ns - self._stamp_ns) * 1e-9
+        if dt <= 0.0:
+            return self._odometry.pose(stamp_ns, ekf.T, ekf.pose_covariance())
+        T = ekf.T @ relative_motion(ekf.velocity, min(dt, self.config.motion.coast_time))
+        return self._odometry.pose(stamp_ns, T, ekf.time_update(dt, self._sigma).head[:6, :6])
+
+    def _report(
+        self, stamp_ns: int, state: TrackingState, reason: str, submaps: tuple[Submap, ...] = (),
+        update: UpdateReport = _NO_UPDATE, ids: np.ndarray | None = None, index: np.ndarray | None = None,
+    ) -> EkfResult:  # fmt: skip
+        assert self._map is not None
+        ekf, nobody = self._map.ekf, np.zeros(0, dtype=np.int64)
+        return EkfResult(
+            stamp_ns, self._pose(stamp_ns), ekf.velocity, ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:], state, reason,
+            submaps, self._landmark_view(), update.nis, update.dof, nobody if ids is None else ids, nobody if index is
+            None else index,
+        )  # fmt: skip
+
+    def _landmark_view(self) -> LandmarkView:
+        assert self._map is not None
+        ekf, book = self._map.ekf, self._map.book
+        blocks = ekf.covariance.blocks(CORE_DIM + 3 * np.arange(len(ekf.landmarks)))
+        positions, covariances = self._odometry.points(ekf.landmarks, blocks)
+        return LandmarkView(book.ids.copy(), positions, covariances, book.sightings.copy(), book.descriptors.copy())
+
+
+def _is_surprising(link: Link, expected: MotionPrior) -> bool:
+    """Whether the motion found contradicts constant velocity."""
+    error = boxminus(link.T, expected.T)
+    return float(error @ np.linalg.solve(expected.covariance + link.covariance, error)) > _MOTION_GATE
+
+
+def _aided(expected: MotionPrior, aid: Aid | None) -> MotionPrior:
+    """What to expect of the next frame where something else has measured the motion, or its rotation."""
+    if aid is None:
+        return expected
+    T, covariance = expected.T.copy(), expected.covariance.copy()
+    if aid.rows == ALL:
+        return MotionPrior(aid.T, aid.covariance)
+    T[:3, :3] = aid.T[:3, :3]
+    covariance[3:, :] = covariance[:, 3:] = 0.0
+    covariance[3:, 3:] = aid.covariance
+    return MotionPrior(T, covariance)

@@ -1,0 +1,82 @@
+"""The submap that is being built (section 7.1): when it ends, what it hands over, how it chains to the one before."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ekf_slam_node.config import SubmapConfig
+from ekf_slam_node.covariance import IndexArray
+from ekf_slam_node.ekf import Ekf
+from ekf_slam_node.landmarks import LandmarkBook
+from ekf_slam_node.models import CORE_DIM
+from slam_core.types import PoseEstimate, Submap
+
+
+class SubmapBuilder:
+    """Collects the poses inside one submap and makes the joint Gaussian of its end.
+
+    Parameters
+    ----------
+    index, start_stamp_ns, follows_previous
+        As in :class:`slam_core.types.Submap`.
+    """
+
+    def __init__(self, agent: str, index: int, start_stamp_ns: int, follows_previous: bool) -> None:
+        self._agent = agent
+        self.index = index
+        self._start_stamp_ns = start_stamp_ns
+        self._follows_previous = follows_previous
+        self._path = [PoseEstimate(start_stamp_ns, np.eye(4), np.zeros((6, 6)))]
+
+    def add_pose(self, stamp_ns: int, ekf: Ekf) -> None:
+        """Add the filter's present pose to the path."""
+        self._path.append(PoseEstimate(stamp_ns, ekf.T.copy(), ekf.pose_covariance()))
+
+    def is_complete(self, ekf: Ekf, config: SubmapConfig, shared: int) -> bool:
+        """Whether the rig is far enough from the start, or the submap large or old enough.
+
+        Landmarks ``shared`` with the next submap hold the two together: with too few of them the end is put off, up to
+        twice the limits.
+        """
+        size = max(
+            float(np.linalg.norm(ekf.T[:3, 3])) / config.max_distance,
+            len(ekf.landmarks) / config.max_landmarks,
+            len(self._path) / config.max_frames,
+        )
+        limit = 1.0 if shared >= config.min_shared else 2.0
+        return len(self._path) >= config.min_frames and size > limit
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the submap has no pose beside its first."""
+        return len(self._path) < 2
+
+    def close(self, ekf: Ekf, book: LandmarkBook) -> Submap:
+        """The submap as it is now: its end pose is the last pose added."""
+        keep = np.concatenate([np.arange(6), np.arange(CORE_DIM, ekf.covariance.size)])
+        covariance = ekf.covariance.dense()[np.ix_(keep, keep)]
+        end = self._path[-1]
+        return Submap(
+            agent=self._agent, index=self.index, start_stamp_ns=self._start_stamp_ns, end_stamp_ns=end.stamp_ns,
+            end_pose=end.T, landmarks=ekf.landmarks.copy(), covariance=covariance, landmark_ids=book.ids.copy(),
+            sightings=book.sightings.copy(), descriptors=book.descriptors.copy(), path=tuple(self._path),
+            follows_previous=self._follows_previous,
+        )  # fmt: skip
+
+
+def conditional_start(ekf: Ekf, slots: IndexArray, invariant: bool) -> Ekf:
+    """The seed's start: landmarks ``slots`` and velocity given the rig's pose, in the rig's frame (Eq. 7.1).
+
+    ``P_ll - P_lr P_rr^-1 P_rl`` is what the old submap knows of the landmarks if its end pose were known exactly. That
+    knowledge stays in the old submap too, so that joining counts it twice: the joint NEES test shows it.
+    """
+    R, t = ekf.T[:3, :3], ekf.T[:3, 3]
+    rows = np.concatenate([np.arange(6, CORE_DIM), (CORE_DIM + 3 * slots[:, None] + np.arange(3)).ravel()])
+    columns = ekf.covariance.columns(rows)
+    given = np.linalg.solve(ekf.pose_covariance(), columns[:6])
+    conditional = columns[rows] - columns[:6].T @ given
+    turn = np.kron(np.eye(len(slots) + 2), R.T)
+    turn[:6, :6] = np.eye(6)
+    start = np.zeros((6 + len(conditional),) * 2)
+    start[6:, 6:] = turn @ conditional @ turn.T
+    return Ekf(ekf.velocity, start, invariant, (ekf.landmarks[slots] - t) @ R)

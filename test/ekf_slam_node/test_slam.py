@@ -1,0 +1,188 @@
+"""The estimator frame by frame on simulated features: accuracy, submaps, loss, rejection of what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.results import EkfResult, TrackingState
+from ekf_slam_node.slam import EkfSlam
+from feature_world import PointWorld, loop, room
+from slam_core.config import from_mapping
+from slam_core.geometry import FloatArray, boxminus, invert_transform
+from slam_core.types import Features, Submap
+
+STEP_NS = 100_000_000
+
+
+@pytest.fixture
+def world(rng: np.random.Generator) -> PointWorld:
+    return room(rng)
+
+
+def run(
+    slam: EkfSlam, world: PointWorld, poses: list[FloatArray], rng: np.random.Generator, step_ns: int = STEP_NS
+) -> list[EkfResult]:
+    return [slam.process(world.features(T, k * step_ns, rng)[0]) for k, T in enumerate(poses)]
+
+
+def error_of(result: EkfResult, poses: list[FloatArray], index: int) -> FloatArray:
+    return boxminus(invert_transform(poses[0]) @ poses[index], result.pose.T)
+
+
+def submaps_of(results: list[EkfResult], slam: EkfSlam) -> list[Submap]:
+    return [submap for result in results for submap in result.submaps] + list(slam.finish())
+
+
+def test_handheld_loop_is_accurate_and_chained(world: PointWorld, rng: np.random.Generator) -> None:
+    poses, slam = loop(100, handheld=0.02), EkfSlam(EkfSlamConfig(agent="a"))
+    results = run(slam, world, poses, rng)
+    assert all(result.state is TrackingState.OK for result in results)
+    error = error_of(results[-1], poses, 99)
+    assert np.linalg.norm(error[:3]) < 0.1
+    assert np.linalg.norm(error[3:]) < 0.03
+    submaps = submaps_of(results, slam)
+    assert [submap.index for submap in submaps] == list(range(len(submaps)))
+    assert len(submaps) >= 7
+    assert [submap.follows_previous for submap in submaps] == [False] + [True] * (len(submaps) - 1)
+    for before, after in zip(submaps, submaps[1:], strict=False):
+        assert before.end_stamp_ns == after.start_stamp_ns
+        assert len(np.intersect1d(before.landmark_ids, after.landmark_ids)) >= 15
+
+
+def test_submap_is_a_proper_joint_gaussian(world: PointWorld, rng: np.random.Generator) -> None:
+    slam = EkfSlam(EkfSlamConfig(agent="a"))
+    submap = submaps_of(run(slam, world, loop(30), rng), slam)[0]
+    assert np.linalg.eigvalsh(submap.covariance)[0] > 0.0
+    np.testing.assert_array_equal(submap.path[0].T, np.eye(4))
+    np.testing.assert_array_equal(submap.path[-1].T, submap.end_pose)
+    np.testing.assert_allclose(submap.path[-1].covariance, submap.covariance[:6, :6], atol=1e-12)
+    assert len(np.unique(submap.landmark_ids)) == len(submap.landmark_ids)
+
+
+def test_same_input_gives_the_same_bytes(world: PointWorld) -> None:
+    ends = []
+    for _ in range(2):
+        rng = np.random.default_rng(3)
+        ends.append(run(EkfSlam(EkfSlamConfig()), world, loop(25), rng)[-1].pose)
+    np.testing.assert_array_equal(ends[0].T, ends[1].T)
+    np.testing.assert_array_equal(ends[0].covariance, ends[1].covariance)
+
+
+def blank(features: Features) -> Features:
+    return features.select(np.zeros(0, dtype=np.int64))
+
+
+def test_blackout_is_said_at_once_and_the_old_map_is_found_again(world: PointWorld, rng: np.random.Generator) -> None:
+    poses, slam = loop(60), EkfSlam(EkfSlamConfig())
+    results = []
+    for k, T in enumerate(poses):
+        features, _ = world.features(T, k * STEP_NS, rng)
+        results.append(slam.process(blank(features) if 20 <= k < 25 else features))
+    assert [r.state for r in results[20:25]] == [TrackingState.LOST] * 5
+    sizes = [np.trace(r.pose.covariance) for r in results[19:25]]
+    assert all(b > a for a, b in zip(sizes, sizes[1:], strict=False))
+    assert all(r.state is TrackingState.OK for r in results[25:])
+    assert np.linalg.norm(error_of(results[30], poses, 30)[:3]) < 0.05
+    assert all(s.follows_previous for r in results for s in r.submaps[1:])
+
+
+def test_another_place_begins_a_submap_that_does_not_follow(rng: np.random.Generator) -> None:
+    slam, here, there = EkfSlam(EkfSlamConfig()), room(rng), room(rng)
+    poses = loop(40)
+    results = []
+    for k, T in enumerate(poses):
+        results.append(slam.process((here if k < 20 else there).features(T, k * STEP_NS, rng)[0]))
+    assert results[20].state is TrackingState.LOST
+    assert results[-1].state is TrackingState.OK
+    submaps = submaps_of(results, slam)
+    broken = [s for s in submaps[1:] if not s.follows_previous]
+    assert len(broken) == 1
+    before = submaps[submaps.index(broken[0]) - 1]
+    assert not np.intersect1d(before.landmark_ids, broken[0].landmark_ids).size
+    assert before.end_stamp_ns == 19 * STEP_NS
+
+
+@pytest.mark.parametrize("rate", [5.0, 2.0])
+def test_large_steps_are_bridged_by_a_motion_guess(world: PointWorld, rng: np.random.Generator, rate: float) -> None:
+    steps = int(6 * rate)
+    poses, slam = loop(steps, rate), EkfSlam(EkfSlamConfig())
+    results = run(slam, world, poses, rng, int(1e9 / rate))
+    assert all(result.state is TrackingState.OK for result in results)
+    error = error_of(results[-1], poses, steps - 1)
+    assert np.linalg.norm(error[:3]) < 0.2
+
+
+def test_moving_crowd_is_not_mapped(world: PointWorld, rng: np.random.Generator) -> None:
+    """A fifth of the points walks sideways at 1 m/s: none of them may stay a landmark."""
+    poses, slam = loop(40), EkfSlam(EkfSlamConfig())
+    moving = rng.random(len(world.points)) < 0.2
+    seen: dict[int, list[bool]] = {}
+    for k, T in enumerate(poses):
+        shifted = PointWorld(world.points + np.outer(moving, [0.1 * k, 0.0, 0.0]), world.descriptors)
+        features, index = shifted.features(T, k * STEP_NS, rng)
+        result = slam.process(features)
+        for landmark, feature in zip(result.landmark_ids, result.feature_index, strict=True):
+            seen.setdefault(int(landmark), []).append(bool(moving[index[feature]]))
+    share = np.mean([any(flags) for flags in seen.values() if len(flags) >= 5])
+    assert share < 0.01
+    assert np.linalg.norm(error_of(result, poses, 39)[:3]) < 0.06
+
+
+def test_bad_features_are_counted_and_left_out(world: PointWorld, rng: np.random.Generator) -> None:
+    slam = EkfSlam(EkfSlamConfig())
+    for k, T in enumerate(loop(10)):
+        features, _ = world.features(T, k * STEP_NS, rng)
+        depth = features.depth.copy()
+        depth[:3] = [np.nan, -1.0, np.inf]
+        descriptors = features.descriptors.copy()
+        descriptors[3] = np.nan
+        result = slam.process(dataclasses.replace(features, depth=depth, descriptors=descriptors))
+    assert slam.counters.counts["features_unusable"] >= 40
+    assert result.state is TrackingState.OK
+    assert np.isfinite(result.pose.covariance).all()
+
+
+def test_old_and_repeated_frames_change_nothing(world: PointWorld, rng: np.random.Generator) -> None:
+    slam = EkfSlam(EkfSlamConfig())
+    poses = loop(10)
+    last = run(slam, world, poses, rng)[-1]
+    for stamp in (9 * STEP_NS, 3 * STEP_NS):
+        again = slam.process(world.features(poses[2], stamp, rng)[0])
+        assert again.state is TrackingState.DEGRADED
+        np.testing.assert_array_equal(again.pose.T, last.pose.T)
+    assert slam.counters.counts["stamp_not_newer"] == 2
+
+
+def test_empty_beginning_is_degraded_then_recovers(world: PointWorld, rng: np.random.Generator) -> None:
+    slam = EkfSlam(EkfSlamConfig())
+    states = []
+    for k, T in enumerate(loop(20)):
+        features, _ = world.features(T, k * STEP_NS, rng)
+        states.append(slam.process(blank(features) if k < 3 else features).state)
+    assert states[0] is TrackingState.DEGRADED
+    assert states[-1] is TrackingState.OK
+
+
+def test_reset_forgets_everything(world: PointWorld, rng: np.random.Generator) -> None:
+    slam = EkfSlam(EkfSlamConfig())
+    run(slam, world, loop(20), rng)
+    slam.reset()
+    result = slam.process(world.features(loop(2)[0], 0, rng)[0])
+    np.testing.assert_array_equal(result.pose.T, np.eye(4))
+    assert len(result.landmarks.ids) == 0
+    assert slam.finish() == ()
+
+
+def test_wrong_mounting_is_refused() -> None:
+    with pytest.raises(ValueError, match="rigid"):
+        EkfSlam(EkfSlamConfig(), np.diag([1.0, 1.0, -1.0, 1.0]))
+
+
+def test_configuration_by_name() -> None:
+    config = from_mapping(EkfSlamConfig, {"submap.start": "conditional", "motion.sigma_acceleration": 1})
+    assert config.submap.start == "conditional"
+    with pytest.raises(ValueError, match="did you mean"):
+        from_mapping(EkfSlamConfig, {"submap.max_distence": 2.0})
