@@ -26,8 +26,10 @@ from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
 
 MODES = ("stereo", "tof", "replace", "fuse")
-_FEW_MATCHES = 30
+_FEW_MATCHES = 0.25
+"""Share of matched keypoints below which the sign of the disparities is questioned."""
 _SWAPPED_SHARE = 0.7
+_SWAPPED_MATCHES = 30
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,7 @@ class Frontend:
         focal_baseline = images.stereo.camera.fx * images.stereo.baseline
         bounds = disparity_bounds(self.config.matching, focal_baseline)
         matches = match_stereo(left, right, self.config.matching, bounds)
-        if len(matches) < _FEW_MATCHES:
+        if len(matches) < _FEW_MATCHES * len(left):
             self._reject_swapped(left, right, bounds)
         uv = left.uv[matches.left]
         self._noise.learn(uv[:, 1] - right.uv[matches.right, 1], left.size[matches.left])
@@ -180,7 +182,7 @@ class Frontend:
 
     def _reject_swapped(self, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> None:
         share, matches = swapped_share(left, right, self.config.matching, bounds)
-        if matches >= _FEW_MATCHES and share > _SWAPPED_SHARE:
+        if matches >= _SWAPPED_MATCHES and share > _SWAPPED_SHARE:
             self.counters.add("swapped")
             raise ValueError(
                 f"left and right images are swapped: {share:.0%} of {matches} matches have a negative disparity"

@@ -56,7 +56,7 @@ def describe_upright(integral, keypoints, weights, out):  # type: ignore[no-unty
 
 @njit(cache=True, nogil=True)
 def describe_oriented(integral, keypoints, weights, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` (n, 128) for keypoints (n, 3) of u, v, scale with the square turned to each one's own orientation."""
+    """Fill ``out`` (n, 128) for keypoints (n, 3) of u, v, scale, the square turned to each one's own orientation."""
     dx = np.empty((SAMPLES, SAMPLES))
     dy = np.empty((SAMPLES, SAMPLES))
     for k in range(keypoints.shape[0]):
@@ -88,8 +88,8 @@ def orientation(integral, keypoint):  # type: ignore[no-untyped-def]
                 angle[n] = np.arctan2(b, a)
                 n += 1
     best, direction = -1.0, 0.0
-    for step in range(42):
-        start = step * (2.0 * np.pi / 42.0) - np.pi
+    for step in range(40):
+        start = step * (2.0 * np.pi / 40.0) - np.pi
         sx, sy = 0.0, 0.0
         for i in range(n):
             if (angle[i] - start) % (2.0 * np.pi) < np.pi / 3.0:

@@ -1,0 +1,158 @@
+"""The whole front end on synthetic frames with known depth, in every mode, and on bad frames."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from slam_core.camera import Camera
+from slam_core.config import from_mapping
+from slam_core.types import DepthImage, FeatureSource, StereoImages
+from stereo_frontend.frontend import Frontend, FrontendConfig
+
+DEPTH = 200.0 * 0.12 / 12.3
+FIELDS = ("xyz", "uv", "depth", "sigma_uv", "sigma_depth", "response", "source", "descriptors")
+IDENTITY = np.eye(4)
+
+
+def frontend(mode: str = "stereo", **options) -> Frontend:
+    return Frontend(from_mapping(FrontendConfig, {"mode": mode, "features.target": 300, **options}))
+
+
+def tof_image(
+    pair: StereoImages, depth: float = DEPTH, sigma: float = 0.004, stamp_ns: int = 1_000_000_000
+) -> DepthImage:
+    """A depth camera in the place of the left one, seeing its middle."""
+    camera = Camera(160, 120, 200.0, 200.0, 80.0, 60.0)
+    noise = np.random.default_rng(4).normal(0, sigma, (120, 160))
+    values = (depth + noise).astype(np.float32)
+    amplitude = pair.left[60:180, 80:240].astype(np.float32)
+    return DepthImage(stamp_ns, values, np.full_like(values, sigma), camera, amplitude)
+
+
+def test_stereo_depth_is_right_and_its_sigma_true(stereo_pair):
+    features = frontend().process(stereo_pair())
+    assert len(features) > 150
+    error = (features.depth - DEPTH) / features.sigma_depth
+    assert 0.6 < 1.4826 * np.median(np.abs(error)) < 1.4
+    assert np.mean(np.abs(features.depth / DEPTH - 1) < 0.05) > 0.99
+    assert set(features.source) == {FeatureSource.STEREO}
+    assert features.frame_id == "stereo_left_optical_frame"
+
+
+def test_xyz_uv_and_depth_agree_and_arrays_are_single_precision(stereo_pair):
+    features = frontend().process(stereo_pair())
+    np.testing.assert_allclose(features.camera.project(features.xyz), features.uv, atol=1e-3)
+    np.testing.assert_array_equal(features.xyz[:, 2], features.depth)
+    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1.0, atol=1e-5)
+    for field in set(FIELDS) - {"source"}:
+        assert getattr(features, field).dtype == np.float32
+    assert features.source.dtype == np.uint8
+
+
+def test_the_same_frames_give_the_same_bytes(stereo_pair):
+    runs = []
+    for _ in range(2):
+        front = frontend()
+        runs.append([front.process(stereo_pair(seed=s)) for s in (1, 2, 1)])
+    for first, second in zip(*runs, strict=True):
+        for field in FIELDS:
+            np.testing.assert_array_equal(getattr(first, field), getattr(second, field))
+
+
+def test_reset_forgets(stereo_pair):
+    front = frontend()
+    first = front.process(stereo_pair())
+    front.process(stereo_pair(seed=5, noise=8.0))
+    front.reset()
+    np.testing.assert_array_equal(front.process(stereo_pair()).descriptors, first.descriptors)
+    assert front.counters.counts["frames"] == 1
+
+
+def test_replace_takes_the_tof_depth_inside_its_view_only(stereo_pair):
+    pair = stereo_pair()
+    features = frontend("replace").process(pair, tof_image(pair), IDENTITY)
+    inside = np.all((features.uv > [84, 64]) & (features.uv < [236, 176]), axis=1)
+    outside = np.any((features.uv < [79, 59]) | (features.uv > [241, 181]), axis=1)
+    assert inside.sum() > 30
+    assert outside.sum() > 30
+    assert np.all(features.source[inside] == FeatureSource.TOF)
+    assert np.all(features.source[outside] == FeatureSource.STEREO)
+    assert np.all(features.sigma_depth[inside] < 0.005)
+
+
+def test_fused_depth_has_less_error_than_stereo_and_tof(stereo_pair):
+    pair = stereo_pair(noise=6.0)
+    tof = tof_image(pair, sigma=0.02)
+    errors = {}
+    for mode in ("stereo", "replace", "fuse"):
+        features = frontend(mode).process(pair, tof, IDENTITY)
+        inside = np.all((features.uv > [84, 64]) & (features.uv < [236, 176]), axis=1)
+        errors[mode] = np.sqrt(np.mean((features.depth[inside] - DEPTH) ** 2))
+    assert errors["fuse"] < min(errors["stereo"], errors["replace"])
+
+
+def test_a_tof_depth_that_disagrees_does_not_spoil_stereo(stereo_pair):
+    pair = stereo_pair()
+    features = frontend("fuse").process(pair, tof_image(pair, depth=1.3 * DEPTH), IDENTITY)
+    stereo = frontend("stereo").process(pair)
+    assert not np.any(features.source == FeatureSource.FUSED)
+    shared = np.isin(features.uv[:, 0], stereo.uv[:, 0])
+    np.testing.assert_allclose(features.depth[shared], stereo.depth)
+
+
+@pytest.mark.parametrize(("stamp_ns", "count"), [(2_000_000_000, "tof_too_old"), (None, "tof_missing")])
+def test_without_a_fresh_depth_image_stereo_stands_alone(stereo_pair, stamp_ns, count):
+    pair = stereo_pair()
+    depth = None if stamp_ns is None else tof_image(pair, stamp_ns=stamp_ns)
+    front = frontend("fuse")
+    features = front.process(pair, depth, IDENTITY)
+    assert set(features.source) == {FeatureSource.STEREO}
+    assert front.counters.counts[count] == 1
+
+
+@pytest.mark.parametrize("images", ["amplitude", "range", "both"])
+def test_tof_alone(stereo_pair, images):
+    pair = stereo_pair()
+    tof = tof_image(pair)
+    wavy = tof.depth + 0.1 * (tof.amplitude / 255.0)
+    features = frontend("tof", **{"tof.images": images}).process(None, dataclasses.replace(tof, depth=wavy))
+    assert len(features) > 20
+    assert features.frame_id == "tof_optical_frame"
+    assert set(features.source) == {FeatureSource.TOF}
+    assert np.all(np.abs(features.depth - DEPTH - 0.05) < 0.07)
+
+
+def test_swapped_images_are_named_as_such(stereo_pair):
+    pair = stereo_pair()
+    swapped = dataclasses.replace(pair, left=pair.right, right=pair.left)
+    with pytest.raises(ValueError, match="left and right images are swapped"):
+        frontend().process(swapped)
+
+
+@pytest.mark.parametrize("grey", [0, 255])
+@pytest.mark.parametrize("mode", ["stereo", "fuse"])
+def test_black_and_white_frames_give_no_features(stereo_pair, grey, mode):
+    pair = stereo_pair()
+    blank = dataclasses.replace(pair, left=np.full_like(pair.left, grey), right=np.full_like(pair.right, grey))
+    assert len(frontend(mode).process(blank, tof_image(pair), IDENTITY)) == 0
+
+
+def test_depth_without_a_number_gives_no_tof_features(stereo_pair):
+    pair = stereo_pair()
+    tof = tof_image(pair)
+    nothing = dataclasses.replace(tof, depth=np.full_like(tof.depth, np.nan), sigma=np.full_like(tof.depth, np.nan))
+    assert len(frontend("tof").process(None, nothing)) == 0
+    assert set(frontend("fuse").process(pair, nothing, IDENTITY).source) == {FeatureSource.STEREO}
+
+
+def test_missing_inputs_are_named(stereo_pair):
+    pair = stereo_pair()
+    with pytest.raises(ValueError, match="needs a depth image"):
+        frontend("tof").process(pair)
+    with pytest.raises(ValueError, match="needs a stereo pair"):
+        frontend("fuse").process(None, tof_image(pair), IDENTITY)
+    with pytest.raises(ValueError, match="T_left_tof"):
+        frontend("fuse").process(pair, tof_image(pair))

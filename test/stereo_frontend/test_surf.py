@@ -1,0 +1,180 @@
+"""SURF's compiled kernels against plain NumPy that follows the paper word by word."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from stereo_frontend.surf import SurfConfig, SurfDetector
+from stereo_frontend.surf_descriptor import describe_oriented, describe_upright, orientation, region_weights
+from stereo_frontend.surf_detector import filter_sizes, find_maxima, hessian_layer, hessian_octaves, integral_image
+
+
+@pytest.fixture(scope="module")
+def image() -> np.ndarray:
+    noise = np.random.default_rng(3).uniform(0, 255, (130, 170)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.5)
+    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def keep_all(uv, response):
+    return np.arange(len(uv))
+
+
+def twin_hessian(image: np.ndarray, size: int) -> np.ndarray:
+    """Box filters written out as kernels and applied by correlation."""
+    lobe, half = size // 3, size // 2
+    dxx, dxy = np.zeros((size, size)), np.zeros((size, size))
+    dxx[half - lobe + 1 : half + lobe] = 1.0
+    dxx[half - lobe + 1 : half + lobe, half - lobe // 2 : half + lobe // 2 + 1] = -2.0
+    dxy[half - lobe : half, half - lobe : half] = dxy[half + 1 : half + 1 + lobe, half + 1 : half + 1 + lobe] = 1.0
+    dxy[half - lobe : half, half + 1 : half + 1 + lobe] = dxy[half + 1 : half + 1 + lobe, half - lobe : half] = -1.0
+    xx, yy, xy = (cv2.filter2D(image.astype(np.float64), -1, k / size**2) for k in (dxx, dxx.T, dxy))
+    return xx * yy - (0.9 * xy) ** 2
+
+
+def twin_descriptor(image: np.ndarray, u: float, v: float, scale: float, angle: float = 0.0) -> np.ndarray:
+    """Haar wavelets by summing pixel areas, sample by sample."""
+    weights = region_weights()
+    c, s = np.cos(angle), np.sin(angle)
+    out = np.zeros((4, 4, 8))
+    for j in range(20):
+        for i in range(20):
+            a, b = (i - 9.5) * scale, (j - 9.5) * scale
+            x, y = u + 0.5 + c * a - s * b, v + 0.5 + s * a + c * b
+            gx, gy = twin_wavelet(image, x, y, scale)
+            dx, dy = c * gx + s * gy, c * gy - s * gx
+            terms = np.zeros(8)
+            terms[[0, 1] if dy >= 0 else [2, 3]] = dx, abs(dx)
+            terms[[4, 5] if dx >= 0 else [6, 7]] = dy, abs(dy)
+            out += weights[:, j, None, None] * weights[None, :, i, None] * terms
+    return out.ravel() / np.linalg.norm(out)
+
+
+def twin_wavelet(image: np.ndarray, x: float, y: float, half: float) -> tuple[float, float]:
+    height, width = image.shape
+    if x < half or y < half or x > width - half or y > height - half:
+        return 0.0, 0.0
+
+    def cover(low: float, high: float, n: int) -> np.ndarray:
+        return np.clip(np.minimum(high, np.arange(n) + 1.0) - np.maximum(low, np.arange(n)), 0.0, 1.0)
+
+    left, right = cover(x - half, x, width), cover(x, x + half, width)
+    upper, lower = cover(y - half, y, height), cover(y, y + half, height)
+    return float((upper + lower) @ image @ (right - left)), float((lower - upper) @ image @ (left + right))
+
+
+def test_filter_sizes_are_the_papers():
+    assert [filter_sizes(o) for o in range(4)] == [
+        [9, 15, 21, 27],
+        [15, 27, 39, 51],
+        [27, 51, 75, 99],
+        [51, 99, 147, 195],
+    ]
+
+
+def test_the_integral_image_is_opencvs(image):
+    np.testing.assert_array_equal(integral_image(image), cv2.integral(image))
+
+
+@pytest.mark.parametrize(("size", "step"), [(9, 1), (15, 1), (27, 2), (39, 2)])
+def test_hessian_equals_its_twin(image, size, step):
+    out = np.zeros((-(-image.shape[0] // step), -(-image.shape[1] // step)), np.float32)
+    hessian_layer(integral_image(image), size, step, out)
+    expected = twin_hessian(image, size)[::step, ::step]
+    inside = np.zeros_like(out, bool)
+    edge = -(-(size // 2) // step)
+    inside[edge : (image.shape[0] - 1 - size // 2) // step + 1, edge : (image.shape[1] - 1 - size // 2) // step + 1] = (
+        True
+    )
+    np.testing.assert_allclose(out[inside], expected[inside], rtol=1e-4, atol=1e-2)
+    assert not out[~inside].any()
+
+
+def test_octaves_share_layers(image):
+    first, second, third = hessian_octaves(integral_image(image), 3)
+    separate = np.zeros_like(second[1])
+    hessian_layer(integral_image(image), 27, 2, separate)
+    border = 14
+    np.testing.assert_allclose(
+        second[1][border:-border, border:-border], separate[border:-border, border:-border], rtol=1e-5
+    )
+    np.testing.assert_array_equal(second[0], first[1][::2, ::2])
+    np.testing.assert_array_equal(third[0], second[1][::2, ::2])
+
+
+def test_maxima_are_those_of_an_exhaustive_search(image):
+    layers = hessian_octaves(integral_image(image), 1)[0]
+    found = np.empty((5000, 4), np.float32)
+    n = find_maxima(layers, 0, np.float32(5.0), found)
+    expected = set()
+    for k in (1, 2):
+        for y in range(25, 105):
+            for x in range(25, 145):
+                cube = layers[k - 1 : k + 2, y - 1 : y + 2, x - 1 : x + 2]
+                if layers[k, y, x] > 5.0 and (cube >= layers[k, y, x]).sum() == 1:
+                    expected.add((x, y, layers[k, y, x]))
+    inner = [f for f in found[:n] if 26 <= f[0] <= 143 and 26 <= f[1] <= 103]
+    assert len(inner) > 20
+    for u, v, _, response in inner:
+        assert any(abs(u - x) <= 0.6 and abs(v - y) <= 0.6 and response == r for x, y, r in expected)
+
+
+def test_a_gaussian_blob_is_found_at_its_place_and_scale():
+    u, v = np.meshgrid(np.arange(200.0), np.arange(160.0))
+    for sigma in (3.0, 4.0, 8.0):
+        blob = (200 * np.exp(-((u - 93.3) ** 2 + (v - 80.6) ** 2) / (2 * sigma**2))).astype(np.uint8)
+        keypoints = SurfDetector()(blob, 1.0, keep_all)
+        best = keypoints.select(np.argmax(keypoints.response)[None])
+        np.testing.assert_allclose(best.uv[0], [93.3, 80.6], atol=0.25)
+        assert best.size[0] * 1.2 / 9.0 == pytest.approx(0.72 * sigma, rel=0.06)
+
+
+@pytest.mark.parametrize("keypoint", [(81.37, 61.71, 1.63), (70.0, 60.0, 2.9), (20.4, 100.2, 2.2), (165.0, 3.0, 1.3)])
+def test_upright_descriptor_equals_its_twin(image, keypoint):
+    out = np.empty((1, 128), np.float32)
+    describe_upright(integral_image(image), np.array([keypoint]), region_weights(), out)
+    np.testing.assert_allclose(out[0], twin_descriptor(image, *keypoint), atol=2e-6)
+
+
+def test_oriented_descriptor_equals_its_twin(image):
+    keypoint = np.array([80.3, 61.7, 2.1])
+    out = np.empty((1, 128), np.float32)
+    describe_oriented(integral_image(image), keypoint[None], region_weights(), out)
+    angle = orientation(integral_image(image), keypoint)
+    np.testing.assert_allclose(out[0], twin_descriptor(image, *keypoint, angle), atol=2e-6)
+
+
+def test_orientation_follows_a_turned_image(image):
+    turned = np.ascontiguousarray(np.rot90(image, -1))
+    keypoint = np.array([80.0, 61.0, 2.1])
+    in_turned = np.array([image.shape[0] - 1 - keypoint[1], keypoint[0], keypoint[2]])
+    difference = orientation(integral_image(turned), in_turned) - orientation(integral_image(image), keypoint)
+    assert (difference - np.pi / 2 + np.pi) % (2 * np.pi) - np.pi == pytest.approx(0.0, abs=1e-6)
+    out = np.empty((2, 128), np.float32)
+    describe_oriented(integral_image(image), keypoint[None], region_weights(), out[:1])
+    describe_oriented(integral_image(turned), in_turned[None], region_weights(), out[1:])
+    np.testing.assert_allclose(out[0], out[1], atol=1e-5)
+
+
+def test_brightness_and_contrast_do_not_matter(image):
+    darker = (0.5 * image + 20).astype(np.uint8)
+    points = np.array([[80.0, 61.0, 2.0], [60.0, 70.0, 3.0]])
+    out = np.empty((2, 2, 128), np.float32)
+    for k, picture in enumerate((image, darker)):
+        describe_upright(integral_image(picture), points, region_weights(), out[k])
+    assert np.all(np.sum(out[0] * out[1], axis=1) > 0.995)
+
+
+@pytest.mark.parametrize(
+    "picture", [np.zeros((100, 120), np.uint8), np.full((100, 120), 255, np.uint8), np.zeros((5, 7), np.uint8)]
+)
+@pytest.mark.parametrize("upright", [True, False])
+def test_flat_and_tiny_images_have_no_keypoints(picture, upright):
+    assert len(SurfDetector(SurfConfig(upright=upright))(picture, 0.02, keep_all)) == 0
+
+
+def test_images_beyond_the_integral_image_are_refused():
+    with pytest.raises(ValueError, match="at most"):
+        SurfDetector()(np.broadcast_to(np.uint8(0), (4000, 4000)), 1.0, keep_all)
