@@ -1,0 +1,26 @@
+"""Poses and motions of a sensor as poses and motions of the rig that carries it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_core.geometry import FloatArray, compose_jacobians, invert_transform
+from slam_core.types import PoseEstimate, RelativeMotion
+
+
+def motion_of_rig(motion: RelativeMotion, T_rig_sensor: FloatArray) -> RelativeMotion:
+    """``T_rig(start)_rig(end)`` of the sensor's own motion, with its covariance."""
+    T, covariance = _conjugate(motion.T, motion.covariance, T_rig_sensor)
+    return RelativeMotion(motion.start_stamp_ns, motion.end_stamp_ns, T, covariance)
+
+
+def pose_of_rig(pose: PoseEstimate, T_rig_sensor: FloatArray) -> PoseEstimate:
+    """``T_odom_rig`` of the sensor's pose in the frame of its own first scan; the rig's first pose is the new origin."""
+    return PoseEstimate(pose.stamp_ns, *_conjugate(pose.T, pose.covariance, T_rig_sensor))
+
+
+def _conjugate(T: FloatArray, covariance: FloatArray, T_rig_sensor: FloatArray) -> tuple[FloatArray, FloatArray]:
+    T_sensor_rig = invert_transform(T_rig_sensor)
+    onward = T @ T_sensor_rig
+    J = compose_jacobians(T_rig_sensor, onward)[1] @ compose_jacobians(T, T_sensor_rig)[0]
+    return T_rig_sensor @ onward, np.asarray(J @ covariance @ J.T)
