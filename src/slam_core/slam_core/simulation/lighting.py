@@ -93,7 +93,7 @@ def _hemisphere() -> FloatArray:
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _blocked(
     x: float, y: float, z: float, dx: float, dy: float, dz: float, own: int, blockers: FloatArray
 ) -> bool:  # pragma: no cover - compiled
@@ -116,7 +116,7 @@ def _blocked(
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _direct(
     p: FloatArray, normal: FloatArray, own: int, blockers: FloatArray, lamps: FloatArray
 ) -> float:  # pragma: no cover - compiled
@@ -135,7 +135,7 @@ def _direct(
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _openness(
     p: FloatArray, axes: FloatArray, own: int, blockers: FloatArray, directions: FloatArray
 ) -> float:  # pragma: no cover - compiled
@@ -151,7 +151,7 @@ def _openness(
     return free / directions.shape[0]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _irradiance(
     out: Float32Array,
     shape: tuple[int, int],

@@ -65,24 +65,24 @@ def _plaster(rng: np.random.Generator) -> FloatArray:
 
 
 def _blotches(rng: np.random.Generator) -> FloatArray:
-    return 0.5 + 0.11 * noise(rng, (4, 4), 5)
+    return 0.5 + 0.09 * noise(rng, (8, 8), 5)
 
 
 def _concrete(rng: np.random.Generator) -> FloatArray:
-    image = 0.45 + 0.05 * noise(rng, (8, 8), 6, 0.7)
-    _speckle(rng, image, 250, 3, 0.10)
+    image = 0.45 + 0.035 * noise(rng, (16, 16), 5, 0.75)
+    _speckle(rng, image, 250, 3, 0.08)
     return image
 
 
 def _brick(rng: np.random.Generator) -> FloatArray:
     rows, columns = 16, 4
-    image = np.full((SIZE, SIZE), 0.62)
+    image = np.full((SIZE, SIZE), 0.5)
     height, width = SIZE // rows, SIZE // columns
     for row in range(rows):
         for column in range(columns):
             x = column * width + (row % 2) * width // 2
             columns_px = np.arange(x + 3, x + width - 3) % SIZE
-            image[row * height + 3 : (row + 1) * height - 3, columns_px] = rng.uniform(0.22, 0.42)
+            image[row * height + 3 : (row + 1) * height - 3, columns_px] = rng.uniform(0.28, 0.42)
     return image + 0.03 * noise(rng, (16, 16), 5, 0.7)
 
 

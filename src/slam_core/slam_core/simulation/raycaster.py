@@ -129,45 +129,46 @@ def for_tile_rows(rows: int, pool: ThreadPoolExecutor | None, work: Callable[[in
         future.result()
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
 def meet(
-    x: float, y: float, plane: FloatArray, shift: FloatArray
+    x: float, y: float, planes: FloatArray, shifts: FloatArray, q: int
 ) -> tuple[float, float, float]:  # pragma: no cover - compiled
-    """Depth z and place (u, v) in the rectangle where the ray (x, y, 1) meets its plane; z < 0 behind or outside."""
-    inverse = plane[0] * x + plane[1] * y + plane[2]
+    """Depth z and place (u, v) in rectangle ``q`` where the ray (x, y, 1) meets it; z < 0 behind or outside."""
+    inverse = planes[q, 0] * x + planes[q, 1] * y + planes[q, 2]
     if inverse <= 1e-9:
         return -1.0, 0.0, 0.0
     z = 1.0 / inverse
-    u = z * (plane[3] * x + plane[4] * y + plane[5]) - shift[0]
-    v = z * (plane[6] * x + plane[7] * y + plane[8]) - shift[1]
+    u = z * (planes[q, 3] * x + planes[q, 4] * y + planes[q, 5]) - shifts[q, 0]
+    v = z * (planes[q, 6] * x + planes[q, 7] * y + planes[q, 8]) - shifts[q, 1]
     if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0 or z < NEAR:
         return -1.0, u, v
     return z, u, v
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def nearest(
     x: float,
     y: float,
     candidates: npt.NDArray[np.int32],
     count: int,
+    tile: int,
     planes: FloatArray,
     shifts: FloatArray,
     near: FloatArray,
 ) -> tuple[int, float, float, float]:  # pragma: no cover - compiled
-    """Nearest of a tile's rectangles along the ray (x, y, 1): row of the view or -1, z, u, v."""
+    """Nearest of a tile's first ``count`` rectangles along the ray (x, y, 1): row of the view or -1, z, u, v."""
     best, best_z, best_u, best_v = -1, 1e30, 0.0, 0.0
     for k in range(count):
-        q = candidates[k]
+        q = candidates[tile, k]
         if near[q] >= best_z:
             break
-        z, u, v = meet(x, y, planes[q], shifts[q])
+        z, u, v = meet(x, y, planes, shifts, q)
         if 0.0 < z < best_z:
             best, best_z, best_u, best_v = q, z, u, v
     return best, best_z, best_u, best_v
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cull(
     bound: FloatArray,
     planes: FloatArray,
@@ -193,7 +194,7 @@ def _cull(
             continue
         farthest = 0.0
         for c in range(4):
-            z, _, _ = meet(x0 if c % 2 == 0 else x1, y0 if c < 2 else y1, planes[q], shifts[q])
+            z, _, _ = meet(x0 if c % 2 == 0 else x1, y0 if c < 2 else y1, planes, shifts, q)
             farthest = 1e30 if z <= 0.0 else max(farthest, z)
         cover = min(cover, farthest)
         k = count
@@ -207,7 +208,7 @@ def _cull(
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _trace_rows(
     first: int,
     last: int,
@@ -231,7 +232,7 @@ def _trace_rows(
             for i in range(row * TILE, min((row + 1) * TILE, height)):
                 for j in range(column * TILE, min((column + 1) * TILE, width)):
                     q, z, _, _ = nearest(
-                        rays[i, j, 0], rays[i, j, 1], candidates[tile], counts[tile], planes, shifts, near
+                        rays[i, j, 0], rays[i, j, 1], candidates, counts[tile], tile, planes, shifts, near
                     )
                     if q >= 0:
                         surface[i, j] = q

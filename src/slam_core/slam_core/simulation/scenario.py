@@ -18,7 +18,7 @@ agents:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -96,6 +96,8 @@ class Scenario:
     objects: tuple[FurnitureObject, ...] = ()
     description: str = ""
     suite: SensorSuite = field(default_factory=SensorSuite)
+    full_frames: int = 0
+    """Frames of the whole motion, if ``frames`` has been cut."""
 
     def __post_init__(self) -> None:
         if self.rate <= 0.0 or self.frames < 1:
@@ -137,6 +139,13 @@ class Scenario:
         plain["sensors"] = tuple(plain.get("sensors", SENSORS))
         return _make(cls, {**plain, "name": name, "suite": from_mapping(SensorSuite, suite)}, name)
 
+    def shortened(self, frames: int) -> Scenario:
+        """The same scenario, cut off after ``frames`` frames; the motion stays as it was."""
+        if frames < 1:
+            raise ValueError(f"a scenario needs at least one frame, got {frames}")
+        full = self.full_frames or self.frames
+        return replace(self, frames=min(frames, self.frames), full_frames=full)
+
     def world(self) -> World:
         """The building, furnished from the seed."""
         world = World(self.seed)
@@ -173,7 +182,7 @@ class Scenario:
         who = self.agents[agent]
         if who.stations:
             return StationPath(resolve_waypoints([list(r) for r in who.stations], who.height), who.scans / self.rate)
-        duration = max(self.frames - 1, 1) / self.rate
+        duration = max((self.full_frames or self.frames) - 1, 1) / self.rate
         rng = np.random.default_rng([self.seed, 1, agent])
         waypoints = resolve_waypoints([list(r) for r in who.path], who.height)
         return SplinePath(waypoints, duration, MOTION_STYLES[who.motion], rng)

@@ -47,7 +47,7 @@ def render(
     return image
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _bilinear(
     texels: ByteArray, offset: int, width: int, height: int, clamp: int, u: float, v: float
 ) -> float:  # pragma: no cover - compiled
@@ -68,13 +68,13 @@ def _bilinear(
     return upper * (1.0 - ay) + lower * ay
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _trilinear(
-    texels: ByteArray, entry: npt.NDArray[np.int64], u: float, v: float, level: float
+    texels: ByteArray, index: npt.NDArray[np.int64], t: int, u: float, v: float, level: float
 ) -> float:  # pragma: no cover - compiled
-    """Texture value 0 to 1 at (u, v) of a level between two of the mip chain."""
-    offset, width, height, clamp = entry[0], 1 << entry[1], 1 << entry[2], entry[3]
-    top = max(entry[1], entry[2])
+    """Value 0 to 1 of texture ``t`` at (u, v) of a level between two of the mip chain."""
+    offset, width, height, clamp = index[t, 0], 1 << index[t, 1], 1 << index[t, 2], index[t, 3]
+    top = max(index[t, 1], index[t, 2])
     level = min(max(level, 0.0), float(top))
     whole = int(level)
     for _ in range(whole):
@@ -86,13 +86,14 @@ def _trilinear(
         offset += width * height
         coarse = _bilinear(texels, offset, max(width >> 1, 1), max(height >> 1, 1), clamp, u, v)
         value += part * (coarse - value)
-    return value * (1.0 / 255.0)
+    return float(value * (1.0 / 255.0))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sample_texture(
     texels: ByteArray,
-    entry: npt.NDArray[np.int64],
+    index: npt.NDArray[np.int64],
+    t: int,
     u: float,
     v: float,
     au: float,
@@ -100,8 +101,8 @@ def sample_texture(
     bu: float,
     bv: float,
 ) -> float:  # pragma: no cover - compiled
-    """Mean texture value 0 to 1 over the parallelogram of sides (au, av), (bu, bv) around (u, v), in repetitions."""
-    width, height = float(1 << entry[1]), float(1 << entry[2])
+    """Mean of texture ``t``, 0 to 1, over the parallelogram of sides (au, av), (bu, bv) around (u, v), in repetitions."""
+    width, height = float(1 << index[t, 1]), float(1 << index[t, 2])
     a = np.sqrt((au * width) ** 2 + (av * height) ** 2)
     b = np.sqrt((bu * width) ** 2 + (bv * height) ** 2)
     if b > a:
@@ -111,103 +112,118 @@ def sample_texture(
     count = min(int(np.ceil(a / max(across, 1.0))), MAX_SAMPLES)
     level = np.log2(across) if across > 1.0 else 0.0
     if count <= 1:
-        return _trilinear(texels, entry, u, v, level)
+        return float(_trilinear(texels, index, t, u, v, level))
     total = 0.0
     for k in range(count):
-        t = (k + 0.5) / count - 0.5
-        total += _trilinear(texels, entry, u + t * au, v + t * av, level)
+        s = (k + 0.5) / count - 0.5
+        total += _trilinear(texels, index, t, u + s * au, v + s * av, level)
     return total / count
 
 
-@njit(cache=True, nogil=True)
-def surface_light(world: SurfaceTable, w: int, u: float, v: float) -> float:  # pragma: no cover - compiled
+@njit(cache=True, nogil=True, error_model="numpy")
+def surface_light(
+    light: Float32Array, lookup: npt.NDArray[np.int64], w: int, u: float, v: float
+) -> float:  # pragma: no cover - compiled
     """Baked irradiance at (u, v) of surface ``w``, bilinear between the nodes."""
-    offset, columns, rows = world.lookup[w, 2], world.lookup[w, 3], world.lookup[w, 4]
+    columns, rows = lookup[w, 3], lookup[w, 4]
     x, y = u * (columns - 1), v * (rows - 1)
     x0, y0 = min(int(x), columns - 2), min(int(y), rows - 2)
     ax, ay = x - x0, y - y0
-    k = offset + y0 * columns + x0
-    upper = world.light[k] * (1.0 - ax) + world.light[k + 1] * ax
-    lower = world.light[k + columns] * (1.0 - ax) + world.light[k + columns + 1] * ax
-    return upper * (1.0 - ay) + lower * ay
+    k = lookup[w, 2] + y0 * columns + x0
+    upper = light[k] * (1.0 - ax) + light[k + 1] * ax
+    lower = light[k + columns] * (1.0 - ax) + light[k + columns + 1] * ax
+    return float(upper * (1.0 - ay) + lower * ay)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def reflectance(
-    world: SurfaceTable, w: int, u: float, v: float, au: float, av: float, bu: float, bv: float
+    look: FloatArray,
+    lookup: npt.NDArray[np.int64],
+    texels: ByteArray,
+    index: npt.NDArray[np.int64],
+    w: int,
+    u: float,
+    v: float,
+    au: float,
+    av: float,
+    bu: float,
+    bv: float,
 ) -> float:  # pragma: no cover - compiled
     """Diffuse reflectance of surface ``w`` over a footprint in its own (u, v)."""
-    look, texels = world.look[w], world.textures.texels
-    su, sv = look[SCALE_U], look[SCALE_V]
-    entry = world.textures.index[world.lookup[w, 0]]
-    value = sample_texture(
-        texels, entry, look[SHIFT_U] + su * u, look[SHIFT_V] + sv * v, su * au, sv * av, su * bu, sv * bv
-    )
-    if world.lookup[w, 1] >= 0:
-        entry = world.textures.index[world.lookup[w, 1]]
-        su, sv = look[OVERLAY_SCALE_U], look[OVERLAY_SCALE_V]
-        size = np.sqrt(abs(au * bv - av * bu) * su * sv) * (1 << entry[1])
+    su, sv = look[w, SCALE_U], look[w, SCALE_V]
+    tu, tv = look[w, SHIFT_U] + su * u, look[w, SHIFT_V] + sv * v
+    value = sample_texture(texels, index, lookup[w, 0], tu, tv, su * au, sv * av, su * bu, sv * bv)
+    overlay = lookup[w, 1]
+    if overlay >= 0:
+        su, sv = look[w, OVERLAY_SCALE_U], look[w, OVERLAY_SCALE_V]
+        size = np.sqrt(abs((au * bv - av * bu) * su * sv)) * (1 << index[overlay, 1])
         level = np.log2(size) if size > 1.0 else 0.0
-        layer = _trilinear(texels, entry, look[OVERLAY_U] + su * u, look[OVERLAY_V] + sv * v, level)
-        value *= 1.0 + look[OVERLAY_GAIN] * (layer - 0.5)
-    return value * look[BRIGHTNESS]
+        layer = _trilinear(texels, index, overlay, look[w, OVERLAY_U] + su * u, look[w, OVERLAY_V] + sv * v, level)
+        value *= 1.0 + look[w, OVERLAY_GAIN] * (layer - 0.5)
+    return float(value * look[w, BRIGHTNESS])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _highlight(
-    world: SurfaceTable, w: int, plane: FloatArray, x: float, y: float, z: float, lamps: FloatArray
+    lamps: FloatArray, room: int, planes: FloatArray, q: int, x: float, y: float, z: float
 ) -> float:  # pragma: no cover - compiled
     """Mirror-like reflection of the room's lamps (Blinn 1977), which moves with the camera."""
-    scale = -1.0 / np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
+    nx, ny, nz = planes[q, 0], planes[q, 1], planes[q, 2]
+    scale = -1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
     view = 1.0 / np.sqrt(x * x + y * y + 1.0)
     total = 0.0
     for k in range(lamps.shape[0]):
-        if lamps[k, 4] != world.lookup[w, 5]:
+        if lamps[k, 4] != room:
             continue
         lx, ly, lz = lamps[k, 0] - x * z, lamps[k, 1] - y * z, lamps[k, 2] - z
         distance_sq = lx * lx + ly * ly + lz * lz
         inverse = 1.0 / np.sqrt(distance_sq)
         hx, hy, hz = lx * inverse - x * view, ly * inverse - y * view, lz * inverse - view
         length = np.sqrt(hx * hx + hy * hy + hz * hz)
-        cosine = scale * (plane[0] * hx + plane[1] * hy + plane[2] * hz) / max(length, 1e-9)
-        if cosine > 0.8:
+        cosine = scale * (nx * hx + ny * hy + nz * hz) / max(length, 1e-9)
+        if cosine > 0.9:
             total += lamps[k, 3] / distance_sq * np.exp(SHININESS * np.log(cosine))
-    return total * world.look[w, GLOSS]
+    return float(total)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _radiance(
-    world: SurfaceTable,
-    view: View,
-    q: int,
     x: float,
     y: float,
     z: float,
-    u: float,
-    v: float,
-    ray: Float32Array,
     share: float,
+    q: int,
+    w: int,
+    i: int,
+    j: int,
+    rays: Float32Array,
+    planes: FloatArray,
+    shifts: FloatArray,
+    look: FloatArray,
+    lookup: npt.NDArray[np.int64],
+    light: Float32Array,
+    texels: ByteArray,
+    index: npt.NDArray[np.int64],
     lamps: FloatArray,
 ) -> float:  # pragma: no cover - compiled
-    """Radiance along one ray; the footprint is ``share`` of the pixel's."""
-    w, p = view.ids[q], view.planes[q]
-    # d(u)/d(pixel) on the plane: u = z (e . r) - shift and z = 1 / (n . r).
-    e1, e2 = p[3] * x + p[4] * y + p[5], p[6] * x + p[7] * y + p[8]
-    zz = z * z * share
-    na, nb = p[0] * ray[2] + p[1] * ray[3], p[0] * ray[4] + p[1] * ray[5]
-    zs = z * share
-    au = zs * (p[3] * ray[2] + p[4] * ray[3]) - zz * na * e1
-    av = zs * (p[6] * ray[2] + p[7] * ray[3]) - zz * na * e2
-    bu = zs * (p[3] * ray[4] + p[4] * ray[5]) - zz * nb * e1
-    bv = zs * (p[6] * ray[4] + p[7] * ray[5]) - zz * nb * e2
-    value = reflectance(world, w, u, v, au, av, bu, bv)
-    light = surface_light(world, w, u, v) + world.look[w, EMISSION]
-    if world.look[w, GLOSS] > 0.0:
-        return value * light + _highlight(world, w, p, x, y, z, lamps)
-    return value * light
+    """Radiance along the ray (x, y, 1) that meets surface ``w`` at ``z``; the footprint is ``share`` of pixel (i, j)."""
+    p = planes
+    xu, yu, xv, yv = rays[i, j, 2], rays[i, j, 3], rays[i, j, 4], rays[i, j, 5]
+    # u = z (e . r) - shift and z = 1 / (n . r), so du = z e . dr - z^2 (n . dr) (e . r).
+    e1, e2 = p[q, 3] * x + p[q, 4] * y + p[q, 5], p[q, 6] * x + p[q, 7] * y + p[q, 8]
+    u, v, zs = z * e1 - shifts[q, 0], z * e2 - shifts[q, 1], z * share
+    na, nb = z * zs * (p[q, 0] * xu + p[q, 1] * yu), z * zs * (p[q, 0] * xv + p[q, 1] * yv)
+    au, av = zs * (p[q, 3] * xu + p[q, 4] * yu) - na * e1, zs * (p[q, 6] * xu + p[q, 7] * yu) - na * e2
+    bu, bv = zs * (p[q, 3] * xv + p[q, 4] * yv) - nb * e1, zs * (p[q, 6] * xv + p[q, 7] * yv) - nb * e2
+    value = reflectance(look, lookup, texels, index, w, u, v, au, av, bu, bv)
+    value *= surface_light(light, lookup, w, u, v) + look[w, EMISSION]
+    gloss = look[w, GLOSS]
+    if gloss > 0.0:
+        value += gloss * _highlight(lamps, lookup[w, 5], p, q, x, y, z)
+    return float(value)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def is_edge(surface: npt.NDArray[np.int32], i: int, j: int) -> bool:  # pragma: no cover - compiled
     """Whether one of the four neighbours of a pixel sees another surface."""
     q = surface[i, j]
@@ -220,46 +236,39 @@ def is_edge(surface: npt.NDArray[np.int32], i: int, j: int) -> bool:  # pragma: 
     )
 
 
-@njit(cache=True, nogil=True)
-def _edge_pixel(
-    world: SurfaceTable, view: View, ray: Float32Array, hits: Hits, tile: int, lamps: FloatArray
-) -> float:  # pragma: no cover - compiled
-    """Mean radiance over EDGE_RAYS x EDGE_RAYS rays of a pixel."""
-    total = 0.0
-    for a in range(EDGE_RAYS):
-        for b in range(EDGE_RAYS):
-            s, t = (a + 0.5) / EDGE_RAYS - 0.5, (b + 0.5) / EDGE_RAYS - 0.5
-            x, y = ray[0] + s * ray[2] + t * ray[4], ray[1] + s * ray[3] + t * ray[5]
-            q, z, u, v = nearest(x, y, hits.candidates[tile], hits.counts[tile], view.planes, view.shifts, view.near)
-            if q >= 0:
-                total += _radiance(world, view, q, x, y, z, u, v, ray, 1.0 / EDGE_RAYS, lamps)
-    return total / EDGE_RAYS**2
-
-
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _render_rows(
     first: int,
     last: int,
     world: SurfaceTable,
     view: View,
-    rays: Rays,
+    all_rays: Rays,
     hits: Hits,
     lamps: FloatArray,
     image: Float32Array,
 ) -> None:  # pragma: no cover - compiled
+    # Arrays are taken out of the tuples once: passing the tuples on per pixel costs more than the shading.
+    surface, depth, candidates, counts = hits.surface, hits.depth, hits.candidates, hits.counts
+    rays, planes, shifts, near, ids = all_rays.rays, view.planes, view.shifts, view.near, view.ids
+    look, lookup, light = world.look, world.lookup, world.light
+    texels, index = world.textures.texels, world.textures.index
     height, width = image.shape
-    columns = rays.bounds.shape[1]
+    columns = all_rays.bounds.shape[1]
     for i in range(first * TILE, min(last * TILE, height)):
         for j in range(width):
-            ray = rays.rays[i, j]
-            if is_edge(hits.surface, i, j):
-                image[i, j] = _edge_pixel(world, view, ray, hits, (i // TILE) * columns + j // TILE, lamps)
-                continue
-            q = hits.surface[i, j]
-            if q < 0:
-                continue
-            x, y, z = float(ray[0]), float(ray[1]), float(hits.depth[i, j])
-            p = view.planes[q]
-            u = z * (p[3] * x + p[4] * y + p[5]) - view.shifts[q, 0]
-            v = z * (p[6] * x + p[7] * y + p[8]) - view.shifts[q, 1]
-            image[i, j] = _radiance(world, view, q, x, y, z, u, v, ray, 1.0, lamps)
+            q, n, tile, total = surface[i, j], 1, (i // TILE) * columns + j // TILE, 0.0
+            if is_edge(surface, i, j):
+                n = EDGE_RAYS
+            for k in range(n * n):
+                s, t = (k // n + 0.5) / n - 0.5, (k % n + 0.5) / n - 0.5
+                x = rays[i, j, 0] + s * rays[i, j, 2] + t * rays[i, j, 4]
+                y = rays[i, j, 1] + s * rays[i, j, 3] + t * rays[i, j, 5]
+                z = float(depth[i, j])
+                if n > 1:
+                    q, z, _, _ = nearest(x, y, candidates, counts[tile], tile, planes, shifts, near)
+                if q >= 0:
+                    total += _radiance(
+                        x, y, z, 1.0 / n, q, ids[q], i, j, rays, planes, shifts,
+                        look, lookup, light, texels, index, lamps,
+                    )  # fmt: skip
+            image[i, j] = total / (n * n)

@@ -68,6 +68,8 @@ class Simulator:
         Threads that draw; None takes all processors. The images do not depend on it.
     truth
         Also give the true depth of the rectified left image.
+    rectified
+        Stereo images as an ideal pair would take them, instead of raw ones.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class Simulator:
         threads: int | None = None,
         *,
         truth: bool = False,
+        rectified: bool = False,
     ) -> None:
         if not 0 <= agent < len(scenario.agents):
             raise ValueError(
@@ -86,7 +89,7 @@ class Simulator:
         self.scenario, self.agent = scenario, agent
         self.world = compile_world(scenario.world()) if world is None else world
         self.path = scenario.path(agent)
-        self.stereo = StereoSensor(scenario.suite.stereo)
+        self.stereo = StereoSensor(scenario.suite.stereo, rectified=rectified)
         self.tof = TofSensor(scenario.suite.tof, scenario.seed)
         self.imu = ImuSensor(scenario.suite.imu, (scenario.seed, 9, agent))
         self.threads = threads or os.cpu_count() or 1

@@ -68,10 +68,10 @@ class StereoSensorConfig(Config):
 class StereoSensor:
     """Renders raw pairs. Keeps the state of the exposure control, so frames must be taken in order."""
 
-    def __init__(self, config: StereoSensorConfig) -> None:
+    def __init__(self, config: StereoSensorConfig, *, rectified: bool = False) -> None:
         self.config = config
         c = config
-        self.infos = (camera_info(c, "left"), camera_info(c, "right"))
+        self.infos = tuple(camera_info(c, side, rectified=rectified) for side in SIDES)
         self.stereo = StereoCamera(self.infos[0].rectified, c.baseline)
         self.rays = tuple(camera_rays(info.camera) for info in self.infos)
         self.T_rig_raw = tuple(
@@ -115,20 +115,19 @@ class StereoSensor:
         return image
 
 
-def camera_info(config: StereoSensorConfig, side: str) -> CameraInfo:
-    """Calibration of one raw camera and its rectification."""
-    c = config
-    right = side == "right"
-    scale = 1.0 + (c.distortion_spread if right else 0.0)
-    offset = (3.1, -2.4) if right else (-1.7, 1.2)
-    focal = c.raw_focal_length * (1.002 if right else 1.0)
+def camera_info(config: StereoSensorConfig, side: str, *, rectified: bool = False) -> CameraInfo:
+    """Calibration of one raw camera and its rectification, or of the ideal camera of the rectified images."""
+    c, right = config, side == "right"
     cx, cy = (c.width - 1) / 2, (c.height - 1) / 2
-    distortion = tuple(scale * d for d in c.distortion)
-    camera = Camera(c.width, c.height, focal, focal, cx + offset[0], cy + offset[1], "plumb_bob", distortion)
-    R = so3_exp(np.radians(c.right_tilt_deg if right else c.left_tilt_deg))
     P = np.array([[c.focal_length, 0, cx, 0], [0, c.focal_length, cy, 0], [0, 0, 1.0, 0]])
     P[0, 3] = -c.focal_length * c.baseline if right else 0.0
-    return CameraInfo(camera, R, P)
+    if rectified:
+        return CameraInfo(Camera(c.width, c.height, c.focal_length, c.focal_length, cx, cy), np.eye(3), P)
+    # Two lenses are never alike.
+    focal, offset = (1.002 * c.raw_focal_length, (3.1, -2.4)) if right else (c.raw_focal_length, (-1.7, 1.2))
+    distortion = tuple((1.0 + c.distortion_spread * right) * d for d in c.distortion)
+    camera = Camera(c.width, c.height, focal, focal, cx + offset[0], cy + offset[1], "plumb_bob", distortion)
+    return CameraInfo(camera, so3_exp(np.radians(c.right_tilt_deg if right else c.left_tilt_deg)), P)
 
 
 def _mounting(info: CameraInfo, offset: float) -> FloatArray:
@@ -164,24 +163,24 @@ def motion_blur(image: Float32Array, depth: Float32Array, rays: Float32Array, sh
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _smear(
     image: Float32Array, depth: Float32Array, rays: Float32Array, shift: FloatArray, out: Float32Array
 ) -> None:  # pragma: no cover - compiled
     height, width = image.shape
     for i in range(height):
         for j in range(width):
-            ray = rays[i, j]
-            x, y = ray[0], ray[1]
+            x, y = rays[i, j, 0], rays[i, j, 1]
+            xu, yu, xv, yv = rays[i, j, 2], rays[i, j, 3], rays[i, j, 4], rays[i, j, 5]
             inverse = 1.0 / depth[i, j] if depth[i, j] > 0.0 else 0.0
             # Motion of the point in the camera's frame, over its depth: -(v / z + w x (x, y, 1)).
             px = -shift[0] * inverse - (shift[4] - shift[5] * y)
             py = -shift[1] * inverse - (shift[5] * x - shift[3])
             pz = -shift[2] * inverse - (shift[3] * y - shift[4] * x)
             dx, dy = px - x * pz, py - y * pz
-            determinant = ray[2] * ray[5] - ray[4] * ray[3]
-            du = (ray[5] * dx - ray[4] * dy) / determinant
-            dv = (ray[2] * dy - ray[3] * dx) / determinant
+            determinant = xu * yv - xv * yu
+            du = (yv * dx - xv * dy) / determinant
+            dv = (xu * dy - yu * dx) / determinant
             steps = min(int(max(abs(du), abs(dv)) + 0.7), 24)
             if steps < 1:
                 out[i, j] = image[i, j]

@@ -16,7 +16,7 @@ from slam_core.simulation.world import Surface, World
 from slam_core.types import Float32Array
 
 OVERLAY = "blotches"
-OVERLAY_GAIN = 0.5
+OVERLAY_GAIN = 0.35
 """Pattern laid over every repeating pattern, and its contrast."""
 
 

@@ -121,7 +121,7 @@ class TofSensor:
         return np.asarray(scale * (out[..., 0] + 1j * out[..., 1])), np.asarray(self.config.ambient_scale * out[..., 2])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _add_ray(
     world: SurfaceTable,
     view: View,
@@ -136,40 +136,42 @@ def _add_ray(
     total: FloatArray,
 ) -> None:  # pragma: no cover - compiled
     """Add the light that returns along one ray: phasor (2) and ambient; ``pixel`` is the ray's width at one metre."""
-    w, p = view.ids[q], view.planes[q]
+    w, p, look = view.ids[q], view.planes, world.look
     ray_length = np.sqrt(x * x + y * y + 1.0)
     distance = z * ray_length
     # planes[:3] is normal / (normal . p), its product with the ray is 1/z.
-    cosine = 1.0 / (z * ray_length * np.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2))
-    size_u = pixel * z * np.sqrt(p[3] ** 2 + p[4] ** 2 + p[5] ** 2) / max(cosine, 0.2)
-    size_v = pixel * z * np.sqrt(p[6] ** 2 + p[7] ** 2 + p[8] ** 2) / max(cosine, 0.2)
-    visible = reflectance(world, w, u, v, size_u, 0.0, 0.0, size_v)
-    infrared = min((0.12 + 0.85 * visible) * world.look[w, INFRARED], 1.0)
+    cosine = 1.0 / (z * ray_length * np.sqrt(p[q, 0] ** 2 + p[q, 1] ** 2 + p[q, 2] ** 2))
+    width = pixel * z / max(cosine, 0.2)
+    size_u = width * np.sqrt(p[q, 3] ** 2 + p[q, 4] ** 2 + p[q, 5] ** 2)
+    size_v = width * np.sqrt(p[q, 6] ** 2 + p[q, 7] ** 2 + p[q, 8] ** 2)
+    texels, index = world.textures.texels, world.textures.index
+    visible = reflectance(look, world.lookup, texels, index, w, u, v, size_u, 0.0, 0.0, size_v)
+    infrared = min((0.12 + 0.85 * visible) * look[w, INFRARED], 1.0)
     amplitude = infrared * cosine / (distance * distance)
     total[0] += amplitude * np.cos(wave * distance)
     total[1] += amplitude * np.sin(wave * distance)
-    total[2] += infrared * surface_light(world, w, u, v)
+    total[2] += infrared * surface_light(world.light, world.lookup, w, u, v)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _phasor_rows(
-    first: int, last: int, world: SurfaceTable, view: View, rays: Rays, hits: Hits, wave: float, out: FloatArray
+    first: int, last: int, world: SurfaceTable, view: View, all_rays: Rays, hits: Hits, wave: float, out: FloatArray
 ) -> None:  # pragma: no cover - compiled
     height, width = hits.surface.shape
-    columns = rays.bounds.shape[1]
+    columns, rays, total = all_rays.bounds.shape[1], all_rays.rays, np.zeros(3)
     for i in range(first * TILE, min(last * TILE, height)):
         for j in range(width):
             tile = (i // TILE) * columns + j // TILE
-            ray, total = rays.rays[i, j], out[i, j]
             n = EDGE_RAYS if is_edge(hits.surface, i, j) else 1
-            for a in range(n):
-                for b in range(n):
-                    s, t = (a + 0.5) / n - 0.5, (b + 0.5) / n - 0.5
-                    x, y = ray[0] + s * ray[2] + t * ray[4], ray[1] + s * ray[3] + t * ray[5]
-                    q, z, u, v = nearest(
-                        x, y, hits.candidates[tile], hits.counts[tile], view.planes, view.shifts, view.near
-                    )
-                    if q >= 0:
-                        _add_ray(world, view, q, z, u, v, x, y, ray[2] / n, wave, total)
+            total[:] = 0.0
+            for k in range(n * n):
+                s, t = (k // n + 0.5) / n - 0.5, (k % n + 0.5) / n - 0.5
+                x = rays[i, j, 0] + s * rays[i, j, 2] + t * rays[i, j, 4]
+                y = rays[i, j, 1] + s * rays[i, j, 3] + t * rays[i, j, 5]
+                q, z, u, v = nearest(
+                    x, y, hits.candidates, hits.counts[tile], tile, view.planes, view.shifts, view.near
+                )
+                if q >= 0:
+                    _add_ray(world, view, q, z, u, v, x, y, rays[i, j, 2] / n, wave, total)
             for k in range(3):
-                total[k] /= n * n
+                out[i, j, k] = total[k] / (n * n)
