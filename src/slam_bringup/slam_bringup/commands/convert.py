@@ -1,0 +1,46 @@
+"""``slam convert``: a public data set becomes a bag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+from rich.progress import track
+
+from slam_bringup.bag import BagWriter
+from slam_bringup.datasets.euroc import EurocDataset
+from slam_bringup.datasets.files import Dataset
+from slam_bringup.datasets.kitti import KittiDataset
+from slam_bringup.datasets.rgbd import RgbdDataset
+from slam_bringup.sensor_writer import SensorWriter
+
+DATASETS: dict[str, Callable[[Path, Path | None, Path | None], Dataset]] = {
+    "euroc": EurocDataset,
+    "kitti": KittiDataset,
+    "rgbd": RgbdDataset,
+}
+
+
+def convert(dataset: Dataset, target: Path, storage: str = "mcap") -> int:
+    """Write a data set to a bag; returns the number of frames."""
+    with BagWriter(target, storage) as bag:
+        frames = dataset.write(SensorWriter(bag))
+        for _ in track(frames, description=f"writing {target.name}", total=len(dataset), transient=True):
+            pass
+    return len(dataset)
+
+
+@click.command()
+@click.argument("kind", type=click.Choice(sorted(DATASETS)))
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="the bag to write")
+@click.option("--calibration", type=click.Path(path_type=Path), help="calibration, where the source has none")
+@click.option("--ground-truth", type=click.Path(path_type=Path), help="poses, where the source has none")
+@click.option("--storage", type=click.Choice(["mcap", "sqlite3"]), default="mcap", show_default=True)
+def command(
+    kind: str, source: Path, output: Path, calibration: Path | None, ground_truth: Path | None, storage: str
+) -> None:
+    """Convert a public data set (EuRoC, KITTI odometry, RGB-D) to a bag."""
+    frames = convert(DATASETS[kind](source, calibration, ground_truth), output, storage)
+    click.echo(f"{output}: {frames} frames")

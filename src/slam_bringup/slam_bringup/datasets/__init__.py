@@ -1,0 +1,1 @@
+"""Public data sets as streams of readings, one module per layout; ``slam convert`` writes them to bags."""

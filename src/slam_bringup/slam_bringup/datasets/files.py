@@ -1,0 +1,60 @@
+"""What the readers of all data sets share: images from files, and a source of readings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from slam_bringup.sensor_writer import SensorWriter
+from slam_core.types import AnyArray, ByteArray
+
+START_NS = 1_000_000_000
+"""Stamp of the first frame where a data set counts from zero: ROS reads the stamp 0 as "no time"."""
+
+
+class Dataset(Protocol):
+    """A data set that can be written to a bag frame by frame."""
+
+    def __len__(self) -> int:
+        """Number of frames."""
+
+    def write(self, writer: SensorWriter) -> Iterator[int]:
+        """Write everything; yields the number of each frame when it is written."""
+
+
+@dataclass(frozen=True)
+class StampedPair:
+    """Files of two images taken together."""
+
+    stamp_ns: int
+    first: Path
+    second: Path
+
+
+def read_grey(path: Path) -> ByteArray:
+    """A grey image uint8 (height, width) of a file; ValueError if it is none."""
+    return _checked(path, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
+def read_depth(path: Path) -> AnyArray:
+    """A depth image uint16 (height, width), values as in the file; ValueError if it is none."""
+    return _checked(path, cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.uint16)
+
+
+def existing(path: Path, what: str) -> Path:
+    """``path``, or ValueError saying what was looked for."""
+    if not path.exists():
+        raise ValueError(f"{what} not found at {path}")
+    return path
+
+
+def _checked(path: Path, image: AnyArray | None, dtype: type) -> AnyArray:
+    if image is None or image.ndim != 2 or image.dtype != dtype:
+        found = "nothing readable" if image is None else f"{image.dtype} {image.shape}"
+        raise ValueError(f"{path}: expected an image of {np.dtype(dtype)} (height, width), found {found}")
+    return image

@@ -1,0 +1,180 @@
+"""RGB-D sequences as a depth camera with a grey picture: 7-Scenes, TUM RGB-D, and plain folders.
+
+- 7-Scenes (Shotton et al. 2013): ``frame-000000.color.png``, ``.depth.png`` (mm; 0 and 65535 are invalid),
+  ``.pose.txt`` (camera to world); 30 Hz; ``camera-intrinsics.txt`` if there is one.
+- TUM RGB-D (Sturm et al. 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; depth in 1/5000 m; paired by time.
+- plain: ``color/<n>.png``, ``depth/<n>.png`` (mm), ``pose.txt`` with x y z qx qy qz qw per frame; 30 Hz.
+
+The depth is along z, so it goes to ``tof/depth/image_raw`` as it is; the grey picture becomes the amplitude.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+
+from slam_bringup.datasets.files import START_NS, StampedPair, existing, read_depth, read_grey
+from slam_bringup.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
+from slam_core.calibration.camera_info import read_camera_info
+from slam_core.camera import Camera, CameraInfo
+from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, invert_transform, make_transform, transform_from_pose7
+from slam_core.messages import rectified_info
+from slam_core.trajectory import read_trajectory
+from slam_core.types import AnyArray
+
+_PERIOD_NS = 33_333_333
+_MILLIMETRES_INVALID = 65535
+_PAIRING_NS = 20_000_000
+_KINECT_SEVEN_SCENES = (585.0, 585.0, 320.0, 240.0)
+_KINECT_TUM = (525.0, 525.0, 319.5, 239.5)
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Files, unit of the depth (units per metre), default intrinsics fx fy cx cy, and poses T_world_camera by stamp."""
+
+    pairs: list[StampedPair]
+    units_per_metre: float
+    intrinsics: tuple[float, float, float, float]
+    poses: list[tuple[int, FloatArray]]
+
+
+class RgbdDataset:
+    """Depth and grey images of one RGB-D sequence.
+
+    Parameters
+    ----------
+    source
+        Folder in one of the layouts.
+    calibration
+        Camera info YAML or a text file with the 3x3 camera matrix; default: what the data set states.
+    ground_truth
+        TUM file of camera poses; default: those of the source.
+    """
+
+    def __init__(self, source: Path, calibration: Path | None = None, ground_truth: Path | None = None) -> None:
+        self._layout = _find_layout(existing(source, "RGB-D folder"))
+        self._calibration = calibration
+        self._poses = _read_tum(ground_truth) if ground_truth else self._layout.poses
+
+    def __len__(self) -> int:
+        return len(self._layout.pairs)
+
+    def write(self, writer: SensorWriter) -> Iterator[int]:
+        """Extrinsics first (the depth camera is the rig's origin), then images, then ground truth."""
+        pairs = self._layout.pairs
+        writer.extrinsics(pairs[0].stamp_ns, {LEFT_FRAME: T_BASE_OPTICAL, TOF_FRAME: T_BASE_OPTICAL})
+        info: CameraInfo | None = None
+        for number, pair in enumerate(pairs):
+            depth = _clean(read_depth(pair.second), self._layout.units_per_metre)
+            info = info or self._info(depth.shape)
+            grey = read_grey(pair.first)
+            writer.depth(pair.stamp_ns, depth, info, measurement="depth", amplitude=grey)
+            yield number
+        for stamp, T_world_camera in self._poses:
+            writer.ground_truth(stamp, _level(T_world_camera))
+
+    def _info(self, shape: tuple[int, ...]) -> CameraInfo:
+        if self._calibration is not None and self._calibration.suffix in (".yaml", ".yml"):
+            return read_camera_info(existing(self._calibration, "calibration")).info
+        numbers = self._layout.intrinsics
+        if self._calibration is not None:
+            numbers = _read_camera_matrix(existing(self._calibration, "calibration"))
+        return rectified_info(Camera(shape[1], shape[0], *numbers))
+
+
+def _level(T_world_camera: FloatArray) -> FloatArray:
+    """T_world_base with the world's axes turned as the rig's, so that Z is roughly up where the camera's y was down."""
+    turn = make_transform(OPTICAL_FROM_RIG.T, np.zeros(3))
+    return turn @ T_world_camera @ invert_transform(T_BASE_OPTICAL)
+
+
+def _clean(depth: AnyArray, units_per_metre: float) -> AnyArray:
+    """uint16 mm with 0 for no reading; float32 m where the unit is another."""
+    depth = np.where(depth == _MILLIMETRES_INVALID, 0, depth).astype(np.uint16)
+    return depth if units_per_metre == 1000.0 else depth.astype(np.float32) / np.float32(units_per_metre)
+
+
+def _find_layout(source: Path) -> _Layout:
+    for candidate in (source, source / "data"):
+        if any(candidate.glob("frame-*.depth.png")):
+            return _seven_scenes(candidate)
+        if (candidate / "depth.txt").exists():
+            return _tum(candidate)
+        if (candidate / "depth").is_dir() and (candidate / "color").is_dir():
+            return _plain(candidate)
+    raise ValueError(f"{source} is no RGB-D folder: no frame-*.depth.png, no depth.txt, no depth/ and color/")
+
+
+def _seven_scenes(folder: Path) -> _Layout:
+    pairs, poses = [], []
+    for number, depth in enumerate(sorted(folder.glob("frame-*.depth.png"))):
+        stem = depth.name.removesuffix(".depth.png")
+        colour = [p for p in (folder / f"{stem}.color.{kind}" for kind in ("png", "jpg")) if p.exists()]
+        stamp = START_NS + number * _PERIOD_NS
+        pairs.append(StampedPair(stamp, existing((colour or [folder / f"{stem}.color.png"])[0], "colour image"), depth))
+        pose = folder / f"{stem}.pose.txt"
+        if pose.exists():
+            poses.append((stamp, _read_matrix(pose)))
+    matrix = folder / "camera-intrinsics.txt"
+    intrinsics = _read_camera_matrix(matrix) if matrix.exists() else _KINECT_SEVEN_SCENES
+    return _Layout(pairs, 1000.0, intrinsics, poses)
+
+
+def _tum(folder: Path) -> _Layout:
+    colour, depth = (_read_file_list(folder, name) for name in ("rgb.txt", "depth.txt"))
+    colour_stamps = sorted(colour)
+    pairs = []
+    for stamp in sorted(depth):
+        after = bisect.bisect_left(colour_stamps, stamp)
+        nearest = min(colour_stamps[max(after - 1, 0) : after + 1], key=lambda s: abs(s - stamp), default=None)
+        if nearest is not None and abs(nearest - stamp) <= _PAIRING_NS:
+            pairs.append(StampedPair(stamp, colour[nearest], depth[stamp]))
+    if not pairs:
+        raise ValueError(f"{folder}: no depth image has a colour image within {_PAIRING_NS / 1e6:.0f} ms")
+    truth = folder / "groundtruth.txt"
+    return _Layout(pairs, 5000.0, _KINECT_TUM, _read_tum(truth) if truth.exists() else [])
+
+
+def _plain(folder: Path) -> _Layout:
+    depths = sorted((folder / "depth").iterdir(), key=lambda p: (len(p.stem), p.stem))
+    pairs = [
+        StampedPair(START_NS + i * _PERIOD_NS, existing(folder / "color" / f"{p.stem}.png", "colour image"), p)
+        for i, p in enumerate(depths)
+    ]
+    pose_file = folder / "pose.txt"
+    rows = np.loadtxt(pose_file, ndmin=2) if pose_file.exists() else np.empty((0, 7))
+    poses = [(pair.stamp_ns, transform_from_pose7(row)) for pair, row in zip(pairs, rows, strict=False)]
+    return _Layout(pairs, 1000.0, _KINECT_TUM, poses)
+
+
+def _read_file_list(folder: Path, name: str) -> dict[int, Path]:
+    lines = existing(folder / name, "file list").read_text().splitlines()
+    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
+    return {int(Decimal(row[0]) * 10**9): folder / row[1] for row in rows}
+
+
+def _read_tum(path: Path) -> list[tuple[int, FloatArray]]:
+    truth = read_trajectory(existing(path, "ground truth"))
+    return [(int(stamp), T) for stamp, T in zip(truth.stamps_ns, truth.poses, strict=True)]
+
+
+def _read_matrix(path: Path) -> FloatArray:
+    T = np.loadtxt(path)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise ValueError(f"{path} holds no finite 4x4 pose")
+    # Stored with few digits: the nearest rotation keeps the pose rigid.
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    return make_transform(U @ Vt, T[:3, 3])
+
+
+def _read_camera_matrix(path: Path) -> tuple[float, float, float, float]:
+    K = np.loadtxt(path)
+    if K.shape != (3, 3):
+        raise ValueError(f"{path} holds no 3x3 camera matrix, found {K.shape}")
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
