@@ -1,0 +1,79 @@
+"""A cloud made ready for registration: finite, thinned, shuffled, in coordinates near its sensor, with its own scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.geometry import FloatArray
+
+_SEED = 20100610
+"""Thinning is random but always the same: two runs on the same cloud give the same bytes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points (n, 3) m in random order, so that the first k are a fair sample of any size.
+
+    scale: median distance from the viewpoint, m, the unit of every length that no one has set. planar: the points came as
+    (n, 2) and z is 0.
+    """
+
+    points: FloatArray
+    scale: float
+    planar: bool
+
+    def sample(self, count: int) -> FloatArray:
+        """A fair sample of at most ``count`` points."""
+        return self.points[:count]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def finite_points(points: npt.ArrayLike) -> FloatArray:
+    """Finite points as float64 (n, 3) of an array (..., 2) or (..., 3); z is 0 where there was none.
+
+    Raises
+    ------
+    ValueError
+        If the last dimension is neither 2 nor 3.
+    """
+    array = np.asarray(points, dtype=np.float64)
+    if array.size == 0:
+        return np.empty((0, 3))
+    if array.ndim < 2 or array.shape[-1] not in (2, 3):
+        raise ValueError(f"a cloud must have shape (..., 3) or (..., 2), got {array.shape}")
+    flat = array.reshape(-1, array.shape[-1])
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    return flat if flat.shape[1] == 3 else np.column_stack([flat, np.zeros(len(flat))])
+
+
+def is_planar(points: npt.ArrayLike) -> bool:
+    """Whether a cloud is two-dimensional: shape (..., 2)."""
+    return bool(np.shape(points)[-1:] == (2,))
+
+
+def prepare(points: FloatArray, limit: int, *, planar: bool, centre: FloatArray) -> Cloud:
+    """Thin finite points (n, 3) to at most ``limit`` and move ``centre`` to the origin."""
+    rng = np.random.default_rng(_SEED)
+    n = len(points)
+    if n > limit:
+        points = points[((np.arange(limit) + rng.random(limit)) * (n / limit)).astype(np.int64)]
+    points = np.ascontiguousarray(points[rng.permutation(len(points))] - centre)
+    scale = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+    return Cloud(points, scale, planar)
+
+
+def viewpoint(points: FloatArray) -> FloatArray:
+    """The origin if the cloud lies around it, as a scan does, else the centroid, as of a cloud in map coordinates.
+
+    Angles and lengths are only comparable, and sums only exact, in coordinates that start near the points.
+    """
+    if len(points) == 0:
+        return np.zeros(3)
+    centroid = points.mean(axis=0)
+    radius = float(np.sqrt(((points - centroid) ** 2).sum(axis=1).mean()))
+    return np.zeros(3) if np.linalg.norm(centroid) <= 4.0 * radius else centroid

@@ -1,0 +1,82 @@
+"""How a moved cloud lies on the cells of another: the share that fits, how closely, and the pull of every block."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ndt_registration.voxel_grid import NormalGrid, find_block, hash_table, pack_key, slot_of
+from slam_core.geometry import FloatArray
+
+
+class Fit(NamedTuple):
+    """Share of points on the target's surfaces, their root mean square distance (m), gradient of the cost by block (b, 6)."""
+
+    overlap: float
+    inlier_rmse: float
+    pulls: FloatArray
+
+
+@njit(cache=True, nogil=True)
+def fit_to_grid(
+    points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGrid, max_distance: float, block_size: float
+) -> Fit:
+    """Fit of points (n, 3) at a pose; a point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m of its plane."""
+    n = points.shape[0]
+    keys = hash_table(n)
+    rows = np.empty(keys.shape[0], np.int32)
+    pulls = np.zeros((n, 6))
+    blocks = 0
+    inliers = 0
+    squares = 0.0
+    for i in range(n):
+        px = R[0, 0] * points[i, 0] + R[0, 1] * points[i, 1] + R[0, 2] * points[i, 2]
+        py = R[1, 0] * points[i, 0] + R[1, 1] * points[i, 1] + R[1, 2] * points[i, 2]
+        pz = R[2, 0] * points[i, 0] + R[2, 1] * points[i, 1] + R[2, 2] * points[i, 2]
+        mx, my, mz = px + t[0], py + t[1], pz + t[2]
+        s = 1.0 / grid.block_size
+        row = find_block(grid.keys, grid.rows, int(np.floor(mx * s)), int(np.floor(my * s)), int(np.floor(mz * s)))
+        if row < 0:
+            continue
+        vx = vy = vz = weight = 0.0
+        best, distance = 4.5, 0.0
+        for k in range(8):
+            cell = grid.cells[row, k]
+            if cell < 0:
+                continue
+            qx, qy, qz = mx - grid.mean[cell, 0], my - grid.mean[cell, 1], mz - grid.mean[cell, 2]
+            b = grid.information[cell]
+            ux = b[0] * qx + b[1] * qy + b[2] * qz
+            uy = b[1] * qx + b[3] * qy + b[4] * qz
+            uz = b[2] * qx + b[4] * qy + b[5] * qz
+            exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
+            e = 0.125 * np.exp(-min(exponent, 30.0))
+            weight += e
+            vx += e * ux
+            vy += e * uy
+            vz += e * uz
+            if exponent < best:
+                best = exponent
+                distance = abs(qx * grid.normal[cell, 0] + qy * grid.normal[cell, 1] + qz * grid.normal[cell, 2])
+        if best < 4.5 and distance < max_distance:
+            inliers += 1
+            squares += distance * distance
+        if weight == 0.0:
+            continue
+        c = 1.0 / block_size
+        key = pack_key(int(np.floor(mx * c)), int(np.floor(my * c)), int(np.floor(mz * c)))
+        slot = slot_of(keys, key)
+        if keys[slot] == -1:
+            keys[slot] = key
+            rows[slot] = blocks
+            blocks += 1
+        row = rows[slot]
+        pulls[row, 0] += vx
+        pulls[row, 1] += vy
+        pulls[row, 2] += vz
+        pulls[row, 3] += py * vz - pz * vy
+        pulls[row, 4] += pz * vx - px * vz
+        pulls[row, 5] += px * vy - py * vx
+    return Fit(inliers / max(n, 1), np.sqrt(squares / max(inliers, 1)), pulls[:blocks].copy())

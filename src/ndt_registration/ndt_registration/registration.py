@@ -1,0 +1,242 @@
+"""Registration of one cloud to another: ``register(source, target) -> RegistrationResult``, one setting for every motion.
+
+Without an initial guess the pose is searched globally (:mod:`ndt_registration.search`), each promising pose is refined by NDT
+from coarse to fine, and the one that respects best what the target has seen, surfaces and free space, wins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare, viewpoint
+from ndt_registration.matching import fit_to_grid
+from ndt_registration.ndt import NdtOptimum, ndt_align
+from ndt_registration.pyramid import GridConfig, Pyramid
+from ndt_registration.search import Candidate, SearchConfig, distinct, judge, planar_constraint, search
+from ndt_registration.uncertainty import UncertaintyConfig, direction_names, sandwich, unknown
+from ndt_registration.visibility import RangeImage, range_image
+from slam_core.config import Config, group, parameter
+from slam_core.geometry import FloatArray, is_rigid_transform, make_transform, skew
+
+
+@dataclass(frozen=True)
+class RegistrationConfig(Config):
+    """One setting for all: everything of length is relative to the cloud's scale unless it is set."""
+
+    method: str = parameter("ndt", "registration method", choices=("ndt", "icp", "icp_plane"))
+    target_points: int = parameter(20000, "most points of the target that are used", minimum=10)
+    source_points: int = parameter(8000, "most points of the source that are used", minimum=10)
+    coarse_points: int = parameter(2000, "most points of the source on all but the finest level", minimum=10)
+    min_points: int = parameter(50, "fewest finite points of a cloud", minimum=10)
+    max_iterations: int = parameter(30, "most iterations per level", minimum=1)
+    tolerance: float = parameter(1e-5, "length of the last step, over the scale", minimum=0.0)
+    start_level: int = parameter(2, "coarsest level used from a given initial guess", minimum=0, maximum=7)
+    image_size: int = parameter(64, "edge of the range image that holds free space", unit="px", minimum=8)
+    min_overlap: float = parameter(
+        0.15, "least share of source points on the target's surfaces", minimum=0.0, maximum=1.0
+    )
+    max_conflict: float = parameter(0.3, "largest visibility cost of a success", minimum=0.0)
+    grid: GridConfig = group(GridConfig)
+    search: SearchConfig = group(SearchConfig)
+    uncertainty: UncertaintyConfig = group(UncertaintyConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class RegistrationResult:
+    """Outcome of a registration; ``T_target_source`` must only be used where ``converged``.
+
+    covariance: (6, 6) of the pose error of ``slam_core.geometry``, very large along ``degenerate`` directions, which are named.
+    score: mean over the points that overlap of how well they fit, 0 to 1. overlap: share of the source's points that lie on
+    surfaces of the target. inlier_rmse: their distance from those surfaces, m. reason: why it failed or what to mind; empty
+    for a plain success.
+    """
+
+    T_target_source: FloatArray
+    covariance: FloatArray
+    converged: bool
+    iterations: int
+    score: float
+    overlap: float
+    inlier_rmse: float
+    reason: str
+    degenerate: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A cloud that others are registered to, with everything that can be computed beforehand; ``centre`` is its origin."""
+
+    cloud: Cloud
+    pyramid: Pyramid
+    image: RangeImage
+    centre: FloatArray
+
+    @staticmethod
+    def build(points: npt.ArrayLike, config: RegistrationConfig) -> Target:
+        """Prepare a cloud (..., 3) or (..., 2).
+
+        Raises
+        ------
+        ValueError
+            If fewer than ``config.min_points`` points are finite, or all of them coincide.
+        """
+        finite = finite_points(points)
+        check_cloud(finite, "target", config)
+        centre = viewpoint(finite)
+        cloud = prepare(finite, config.target_points, planar=is_planar(points), centre=centre)
+        return Target(cloud, Pyramid.build(cloud, config.grid), range_image(cloud.points, config.image_size), centre)
+
+
+def register(
+    source: npt.ArrayLike,
+    target: npt.ArrayLike | Target,
+    initial_guess: FloatArray | None = None,
+    config: RegistrationConfig | None = None,
+) -> RegistrationResult:
+    """Find T_target_source, the pose of the source's frame in the target's.
+
+    Parameters
+    ----------
+    source, target
+        Points, shape (..., 3) or, in the plane, (..., 2), m; NaN points are skipped. The target may be prepared beforehand.
+    initial_guess
+        T_target_source to start from, shape (4, 4); None searches.
+    config
+        Settings; the defaults serve rooms and vehicles alike.
+
+    Returns
+    -------
+    RegistrationResult
+        Also for clouds that cannot be registered: then ``converged`` is False and ``reason`` says why.
+
+    Raises
+    ------
+    ValueError
+        For arrays of a wrong shape or a guess that is no rigid transform: errors of the program, not of the data.
+    """
+    config = config or RegistrationConfig()
+    if initial_guess is not None and not is_rigid_transform(np.asarray(initial_guess, dtype=np.float64), 1e-4):
+        raise ValueError(f"the initial guess must be a rigid transform (4, 4), got {initial_guess}")
+    points = finite_points(source)
+    try:
+        check_cloud(points, "source", config)
+        prepared = target if isinstance(target, Target) else Target.build(target, config)
+    except DegenerateCloudError as error:
+        return _failure(str(error), config)
+    cloud = prepare(points, config.source_points, planar=prepared.cloud.planar, centre=prepared.centre)
+    guess = None if initial_guess is None else _shifted(np.asarray(initial_guess, dtype=np.float64), -prepared.centre)
+    return _register(cloud, prepared, guess, config)
+
+
+class DegenerateCloudError(ValueError):
+    """A cloud that no method could register: too few points, or all in one place."""
+
+
+def check_cloud(points: FloatArray, name: str, config: RegistrationConfig) -> None:
+    if len(points) < config.min_points:
+        raise DegenerateCloudError(
+            f"the {name} has {len(points)} finite points, at least {config.min_points} are needed"
+        )
+    if float(np.ptp(points, axis=0).max()) < 1e-6:
+        raise DegenerateCloudError(f"all points of the {name} coincide")
+
+
+def _register(
+    source: Cloud, target: Target, guess: FloatArray | None, config: RegistrationConfig
+) -> RegistrationResult:
+    scale = max(target.cloud.scale, 1e-6)
+    if guess is not None:
+        candidates, start = [Candidate(guess, 0.0)], config.start_level
+    elif config.search.enabled:
+        candidates, start = search(source, target.pyramid, target.image, scale, config.search), 1
+    else:
+        candidates, start = [Candidate(np.eye(4), 0.0)], config.grid.levels - 1
+    refined = [(_descend(source, target, candidate.T, start, scale, config)) for candidate in candidates]
+    costs = [judge(source, target.image, scale, _pose(optimum), config.search) for optimum, _ in refined]
+    best = int(np.argmin(costs))
+    ranked = sorted((Candidate(_pose(o), c) for (o, _), c in zip(refined, costs, strict=True)), key=lambda c: c.cost)
+    rivals = distinct(ranked, 0.05, scale, 2)[1:]
+    optimum, iterations = refined[best]
+    return _result(source, target, optimum, iterations, costs[best], rivals, config)
+
+
+def _pose(optimum: NdtOptimum) -> FloatArray:
+    return make_transform(optimum.rotation, optimum.translation)
+
+
+def _descend(
+    source: Cloud, target: Target, T: FloatArray, start: int, scale: float, config: RegistrationConfig
+) -> tuple[NdtOptimum, int]:
+    """NDT from level ``start`` down to the finest; the optimum there and the iterations in all."""
+    grids = target.pyramid.grids
+    iterations = 0
+    fixed = planar_constraint(source.planar)
+    R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+    for level in range(min(start, len(grids) - 1), -1, -1):
+        points = source.points if level == 0 else source.sample(config.coarse_points)
+        optimum = ndt_align(points, R, t, grids[level], fixed, scale, config.max_iterations, config.tolerance * scale)
+        R, t = optimum.rotation, optimum.translation
+        iterations += optimum.iterations
+    return optimum, iterations
+
+
+def _result(
+    source: Cloud,
+    target: Target,
+    optimum: NdtOptimum,
+    iterations: int,
+    cost: float,
+    rivals: list[Candidate],
+    config: RegistrationConfig,
+) -> RegistrationResult:
+    scale = max(target.cloud.scale, 1e-6)
+    grid = target.pyramid.grids[0]
+    fit = fit_to_grid(
+        source.points, optimum.rotation, optimum.translation, grid, 3.0 * grid.block_size, 2.0 * grid.block_size
+    )
+    fixed = planar_constraint(source.planar) > 0.0
+    uncertainty = sandwich(optimum.hessian, fit.pulls, scale, fixed, config.uncertainty)
+    reason = _reason_of_failure(optimum, fit.overlap, cost, config)
+    names = direction_names(uncertainty.free)
+    covariance = uncertainty.covariance if not reason else unknown(scale, config.uncertainty)
+    return RegistrationResult(
+        T_target_source=_shifted(_pose(optimum), target.centre),
+        covariance=_shifted_covariance(covariance, optimum.rotation @ target.centre),
+        converged=not reason,
+        iterations=iterations,
+        score=min(optimum.score / max(fit.overlap, 1e-9), 1.0),
+        overlap=fit.overlap,
+        inlier_rmse=fit.inlier_rmse,
+        reason=reason or ("not determined: " + "; ".join(names) if names else ""),
+        degenerate=names,
+    )
+
+
+def _reason_of_failure(optimum: NdtOptimum, overlap: float, cost: float, config: RegistrationConfig) -> str:
+    if overlap < config.min_overlap:
+        return f"only {100 * overlap:.0f} % of the source lie on the target, at least {100 * config.min_overlap:.0f} % are needed"
+    if cost > config.max_conflict:
+        return (
+            f"the source lies in space that the target saw as free (cost {cost:.2f}, at most {config.max_conflict:.2f})"
+        )
+    if not optimum.converged:
+        return f"no convergence within {config.max_iterations} iterations"
+    return ""
+
+
+def _failure(reason: str, config: RegistrationConfig) -> RegistrationResult:
+    return RegistrationResult(np.eye(4), unknown(1.0, config.uncertainty), False, 0, 0.0, 0.0, 0.0, reason)
+
+
+def _shifted(T: FloatArray, centre: FloatArray) -> FloatArray:
+    """The transform in coordinates whose origin was at ``centre`` of both frames."""
+    return make_transform(T[:3, :3], T[:3, 3] + centre - T[:3, :3] @ centre)
+
+
+def _shifted_covariance(covariance: FloatArray, rotated_centre: FloatArray) -> FloatArray:
+    J = np.eye(6)
+    J[:3, 3:] = skew(rotated_centre)
+    return np.asarray(J @ covariance @ J.T)

@@ -1,0 +1,91 @@
+"""How well a registration determines the pose: covariance from the scatter of the cells' pulls, and directions left free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray
+
+
+@dataclass(frozen=True)
+class UncertaintyConfig(Config):
+    """Covariance and degeneracy of a registration."""
+
+    degeneracy: float = parameter(
+        0.004,
+        "least curvature of a determined direction over the largest, angles times the scale",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    free_sigma: float = parameter(1.0, "standard deviation given to a free direction, over the scale", minimum=0.0)
+    inflation: float = parameter(1.0, "factor on the covariance of determined directions", minimum=0.01)
+    sigma_floor: float = parameter(1e-4, "least standard deviation of any direction, over the scale", minimum=0.0)
+
+
+class Uncertainty(NamedTuple):
+    """Covariance (6, 6) of the pose error and the unit directions (k, 6), angles times the scale, that are not determined."""
+
+    covariance: FloatArray
+    free: FloatArray
+
+
+def sandwich(
+    hessian: FloatArray, pulls: FloatArray, scale: float, fixed: npt.NDArray[np.bool_], config: UncertaintyConfig
+) -> Uncertainty:
+    """Covariance ``H^-1 (sum g g') H^-1`` of an M-estimate whose errors are independent between blocks only (White 1982).
+
+    Neighbouring points share the errors of the cell they are matched with, so taking points as independent promises far too
+    much. The gradients ``g`` of the blocks vanish in sum at the optimum; their scatter contains noise, discretisation and
+    wrong matches alike.
+
+    Parameters
+    ----------
+    hessian
+        Of the cost at the optimum, shape (6, 6).
+    pulls
+        Gradient of the cost of each block, shape (b, 6).
+    scale
+        Makes angles comparable with lengths, m.
+    fixed
+        Components of the pose error that were held, shape (6,); their variance is that of the floor.
+    """
+    units = np.array([1.0, 1.0, 1.0, 1 / scale, 1 / scale, 1 / scale])
+    H = hessian * np.outer(units, units)
+    G = pulls * units
+    H[fixed], H[:, fixed], G[:, fixed] = 0.0, 0.0, 0.0
+    values, vectors = np.linalg.eigh(H)
+    held = np.abs(vectors[fixed]).sum(axis=0) > 0.5
+    free = (values < config.degeneracy * max(values[-1], 1e-300)) & ~held
+    inverse = (vectors * np.where(free | held, 0.0, 1.0 / np.where(free | held, 1.0, values))) @ vectors.T
+    blocks = len(pulls)
+    scatter = G.T @ G * (blocks / max(blocks - 6, 1))
+    covariance = config.inflation * inverse @ scatter @ inverse
+    covariance += (config.sigma_floor * scale) ** 2 * np.eye(6)
+    covariance += (vectors[:, free] * (config.free_sigma * scale) ** 2) @ vectors[:, free].T
+    covariance = covariance * np.outer(units, units)
+    return Uncertainty(0.5 * (covariance + covariance.T), vectors[:, free].T)
+
+
+def unknown(scale: float, config: UncertaintyConfig) -> FloatArray:
+    """Covariance (6, 6) of a pose of which nothing is known: every direction free."""
+    sigma = config.free_sigma * max(scale, 1.0)
+    return np.diag(np.r_[np.full(3, sigma), np.full(3, config.free_sigma)] ** 2)
+
+
+def direction_names(free: FloatArray) -> tuple[str, ...]:
+    """Readable names of free directions (k, 6), such as ``translation along (0.00, 1.00, 0.00)``."""
+    names = []
+    for direction in free:
+        translation, rotation = np.linalg.norm(direction[:3]), np.linalg.norm(direction[3:])
+        kind, axis = (
+            ("translation along", direction[:3]) if translation >= rotation else ("rotation about", direction[3:])
+        )
+        axis = axis / np.linalg.norm(axis)
+        axis = axis * (1.0 if axis[np.argmax(np.abs(axis))] > 0 else -1.0) + 0.0
+        names.append(f"{kind} ({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f})")
+    return tuple(names)

@@ -1,0 +1,246 @@
+"""Overlapping cells of normal distributions over a point cloud, found through a hash table.
+
+The eight grids of the thesis (8.2.2), shifted by half a cell, are together all cubes of edge ``h`` whose corner lies on a
+lattice of spacing ``h / 2``. So the moments are summed once in blocks of edge ``h / 2``, and each cell is the sum of eight
+blocks: the eight overlapping grids cost one pass over the points. A point lies in exactly eight cells, and all points of one
+block lie in the same eight: one look-up finds them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from ndt_registration.eigen import symmetric_eigen3
+from slam_core.geometry import FloatArray
+
+IntArray = npt.NDArray[np.int64]
+Int32Array = npt.NDArray[np.int32]
+
+_OFFSET = 1 << 20
+MAX_CELLS_PER_AXIS = _OFFSET - 4
+"""Largest absolute block coordinate that the packed 63-bit key can hold."""
+
+
+class Moments(NamedTuple):
+    """Sums over the points of each block: corner (m, 3) in blocks, count (m,), sum (m, 3), outer (m, 6) xx xy xz yy yz zz."""
+
+    corner: IntArray
+    count: FloatArray
+    sum: FloatArray
+    outer: FloatArray
+
+
+class NormalGrid(NamedTuple):
+    """Normal distributions in overlapping cells of edge ``2 * block_size``, as flat arrays for the kernels.
+
+    ``keys`` and ``rows`` are the hash table of blocks; ``cells`` (m, 8) holds the cells that cover a block, -1 where there is
+    none; ``mean`` (k, 3), ``information`` (k, 6) upper triangle of the inverse covariance, ``normal`` (k, 3) direction of least
+    variance, ``variance`` (k, 3) raw ascending eigenvalues, ``count`` (k,) points.
+    """
+
+    block_size: float
+    keys: IntArray
+    rows: Int32Array
+    cells: Int32Array
+    mean: FloatArray
+    information: FloatArray
+    normal: FloatArray
+    variance: FloatArray
+    count: FloatArray
+
+
+@njit(cache=True, nogil=True, inline="always")
+def pack_key(ix: int, iy: int, iz: int) -> int:
+    return ((ix + _OFFSET) << 42) | ((iy + _OFFSET) << 21) | (iz + _OFFSET)
+
+
+@njit(cache=True, nogil=True)
+def slot_of(keys: IntArray, key: int) -> int:
+    """Place of ``key`` in the table, or of the empty slot where it belongs (linear probing, Fibonacci hashing)."""
+    mask = keys.shape[0] - 1
+    mixed = key * np.int64(-7046029254386353131)
+    slot = ((mixed >> 32) ^ mixed) & mask
+    while keys[slot] != -1 and keys[slot] != key:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@njit(cache=True, nogil=True)
+def find_block(keys: IntArray, rows: Int32Array, ix: int, iy: int, iz: int) -> int:
+    """Row of the block at integer coordinates, -1 where there is none."""
+    slot = slot_of(keys, pack_key(ix, iy, iz))
+    return rows[slot] if keys[slot] != -1 else -1
+
+
+@njit(cache=True, nogil=True)
+def hash_table(entries: int) -> IntArray:
+    size = 16
+    while size < 2 * entries:
+        size *= 2
+    return np.full(size, -1, np.int64)
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(
+    corner: IntArray, count: FloatArray, first: FloatArray, outer: FloatArray, children: int
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Sum entries with equal corners; with ``children`` = 8 each entry goes to the eight corners below it as well."""
+    n = corner.shape[0]
+    keys = hash_table(n * children)
+    rows = np.empty(keys.shape[0], np.int32)
+    out_corner = np.empty((n * children, 3), np.int64)
+    out_count = np.zeros(n * children)
+    out_sum = np.zeros((n * children, 3))
+    out_outer = np.zeros((n * children, 6))
+    used = 0
+    for i in range(n):
+        for child in range(children):
+            ix = corner[i, 0] - (child & 1)
+            iy = corner[i, 1] - ((child >> 1) & 1)
+            iz = corner[i, 2] - (child >> 2)
+            key = pack_key(ix, iy, iz)
+            slot = slot_of(keys, key)
+            if keys[slot] == -1:
+                keys[slot] = key
+                rows[slot] = used
+                out_corner[used, 0], out_corner[used, 1], out_corner[used, 2] = ix, iy, iz
+                used += 1
+            row = rows[slot]
+            out_count[row] += count[i]
+            for k in range(3):
+                out_sum[row, k] += first[i, k]
+            for k in range(6):
+                out_outer[row, k] += outer[i, k]
+    return out_corner[:used], out_count[:used], out_sum[:used], out_outer[:used]
+
+
+@njit(cache=True, nogil=True)
+def _point_moments(points: FloatArray, block_size: float) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Moments of the points' blocks, in order of first appearance."""
+    n = points.shape[0]
+    keys = hash_table(n)
+    rows = np.empty(keys.shape[0], np.int32)
+    corner = np.empty((n, 3), np.int64)
+    count = np.zeros(n)
+    first = np.zeros((n, 3))
+    outer = np.zeros((n, 6))
+    used = 0
+    for i in range(n):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        ix, iy, iz = int(np.floor(x / block_size)), int(np.floor(y / block_size)), int(np.floor(z / block_size))
+        key = pack_key(ix, iy, iz)
+        slot = slot_of(keys, key)
+        if keys[slot] == -1:
+            keys[slot] = key
+            rows[slot] = used
+            corner[used, 0], corner[used, 1], corner[used, 2] = ix, iy, iz
+            used += 1
+        row = rows[slot]
+        count[row] += 1.0
+        first[row, 0] += x
+        first[row, 1] += y
+        first[row, 2] += z
+        outer[row, 0] += x * x
+        outer[row, 1] += x * y
+        outer[row, 2] += x * z
+        outer[row, 3] += y * y
+        outer[row, 4] += y * z
+        outer[row, 5] += z * z
+    return corner[:used], count[:used], first[:used], outer[:used]
+
+
+@njit(cache=True, nogil=True)
+def _distributions(
+    count: FloatArray, first: FloatArray, outer: FloatArray, relative_floor: float, variance_floor: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Mean, information, normal and raw eigenvalues of each cell; eigenvalues are raised to the floor before inversion."""
+    n = count.shape[0]
+    mean = np.empty((n, 3))
+    information = np.empty((n, 6))
+    normal = np.empty((n, 3))
+    variance = np.empty((n, 3))
+    a = np.empty((3, 3))
+    vectors = np.empty((3, 3))
+    values = np.empty(3)
+    for i in range(n):
+        for k in range(3):
+            mean[i, k] = first[i, k] / count[i]
+        m = 0
+        for r in range(3):
+            for c in range(r, 3):
+                a[r, c] = (outer[i, m] - count[i] * mean[i, r] * mean[i, c]) / (count[i] - 1.0)
+                a[c, r] = a[r, c]
+                m += 1
+        symmetric_eigen3(a, vectors, values)
+        floor = max(relative_floor * values[2], variance_floor)
+        m = 0
+        for r in range(3):
+            normal[i, r] = vectors[r, 0]
+            variance[i, r] = max(values[r], 0.0)
+            for c in range(r, 3):
+                s = 0.0
+                for k in range(3):
+                    s += vectors[r, k] * vectors[c, k] / max(values[k], floor)
+                information[i, m] = s
+                m += 1
+    return mean, information, normal, variance
+
+
+@njit(cache=True, nogil=True)
+def _cover(corner: IntArray) -> tuple[IntArray, Int32Array, Int32Array]:
+    """Hash table from a block to the eight cells that cover it, in a fixed order of offsets."""
+    n = corner.shape[0]
+    keys = hash_table(8 * n)
+    rows = np.empty(keys.shape[0], np.int32)
+    cells = np.full((8 * n, 8), -1, np.int32)
+    used = 0
+    for i in range(n):
+        for child in range(8):
+            key = pack_key(corner[i, 0] + (child & 1), corner[i, 1] + ((child >> 1) & 1), corner[i, 2] + (child >> 2))
+            slot = slot_of(keys, key)
+            if keys[slot] == -1:
+                keys[slot] = key
+                rows[slot] = used
+                used += 1
+            cells[rows[slot], child] = i
+    return keys, rows, cells[:used].copy()
+
+
+def block_moments(points: FloatArray, block_size: float) -> Moments:
+    """Sums over the points, shape (n, 3) m, in blocks of edge ``block_size`` m.
+
+    Raises
+    ------
+    ValueError
+        If the blocks are so small beside the extent of the cloud that their coordinates overflow the hash key.
+    """
+    reach = float(np.abs(points).max(initial=0.0)) / block_size
+    if not reach < MAX_CELLS_PER_AXIS:
+        raise ValueError(f"blocks of {block_size} m are too small for a cloud that reaches {reach * block_size:.3g} m")
+    return Moments(*_point_moments(np.ascontiguousarray(points, dtype=np.float64), block_size))
+
+
+def coarser(moments: Moments) -> Moments:
+    """Moments in blocks of twice the edge."""
+    return Moments(*_accumulate(moments.corner >> 1, moments.count, moments.sum, moments.outer, 1))
+
+
+def normal_grid(
+    moments: Moments, block_size: float, *, min_points: int, relative_floor: float, variance_floor: float
+) -> NormalGrid:
+    """Cells of edge ``2 * block_size`` m with at least ``min_points`` points.
+
+    Each eigenvalue of a cell's covariance is at least ``relative_floor`` times the largest (8.2.1) and ``variance_floor`` m2.
+    """
+    corner, count, first, outer = _accumulate(moments.corner, moments.count, moments.sum, moments.outer, 8)
+    keep = count >= max(min_points, 2)
+    count = count[keep]
+    mean, information, normal, variance = _distributions(
+        count, first[keep], outer[keep], relative_floor, variance_floor
+    )
+    keys, rows, cells = _cover(corner[keep])
+    return NormalGrid(block_size, keys, rows, cells, mean, information, normal, variance, count)
