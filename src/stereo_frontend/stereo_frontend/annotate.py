@@ -1,0 +1,37 @@
+"""A picture of what the front end sees: features over the image, coloured by depth, shaped by where the depth came
+from.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from slam_core.types import ByteArray, Features, FeatureSource
+
+_NEAR, _FAR = 0.5, 8.0
+"""Depths (m) at the ends of the colour scale, on a scale of inverse depth."""
+
+
+def annotated_image(image: ByteArray, features: Features) -> ByteArray:
+    """Colour picture (height, width, 3), BGR, of a grey image and its features: stereo circles, ToF squares, fused
+    both.
+    """
+    picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    colours = _depth_colours(features.depth)
+    for uv, source, colour in zip(np.round(features.uv).astype(int), features.source, colours, strict=True):
+        u, v = int(uv[0]), int(uv[1])
+        if source != FeatureSource.TOF:
+            cv2.circle(picture, (u, v), 4, colour, 1, cv2.LINE_AA)
+        if source != FeatureSource.STEREO:
+            cv2.rectangle(picture, (u - 4, v - 4), (u + 4, v + 4), colour, 1)
+    cv2.putText(picture, f"{len(features)} features", (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
+    return np.asarray(picture)
+
+
+def _depth_colours(depth: np.ndarray) -> list[tuple[int, int, int]]:
+    share = np.clip((1.0 / np.maximum(depth, 1e-3) - 1.0 / _FAR) / (1.0 / _NEAR - 1.0 / _FAR), 0.0, 1.0)
+    if not len(share):
+        return []
+    table = cv2.applyColorMap((255 * share).astype(np.uint8)[:, None], cv2.COLORMAP_JET)[:, 0]
+    return [(int(b), int(g), int(r)) for b, g, r in table]

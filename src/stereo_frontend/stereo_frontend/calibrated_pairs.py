@@ -1,0 +1,59 @@
+"""Holds stereo pairs back until both camera infos are known, so that the first frames of a recording are not lost."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from slam_core.camera import CameraInfo
+
+T = TypeVar("T")
+SIDES = ("left", "right")
+
+
+class CalibratedPairs(Generic[T]):
+    """Items that need the camera infos of both sides; at most ``depth`` wait, ``dropped`` counts the older ones."""
+
+    def __init__(self, depth: int = 100) -> None:
+        self.dropped = 0
+        self._infos: dict[str, CameraInfo] = {}
+        self._waiting: deque[T] = deque()
+        self._depth = depth
+
+    @property
+    def infos(self) -> tuple[CameraInfo, CameraInfo] | None:
+        """Left and right info; None until both are known."""
+        return (self._infos["left"], self._infos["right"]) if len(self._infos) == len(SIDES) else None
+
+    def set_info(self, side: str, info: CameraInfo) -> bool:
+        """Take the info of "left" or "right"; whether it differs from the one known."""
+        known = self._infos.get(side)
+        if known is not None and _equal(known, info):
+            return False
+        self._infos[side] = info
+        return True
+
+    def add(self, item: T) -> None:
+        """Take an item; :meth:`ready` returns it when its infos are there."""
+        self._waiting.append(item)
+        if self.infos is None and len(self._waiting) > self._depth:
+            self._waiting.popleft()
+            self.dropped += 1
+
+    def ready(self) -> list[T]:
+        """The items that may go on, oldest first."""
+        if self.infos is None:
+            return []
+        items = list(self._waiting)
+        self._waiting.clear()
+        return items
+
+    def clear(self) -> None:
+        """Forget the items; calibrations stay."""
+        self._waiting.clear()
+
+
+def _equal(a: CameraInfo, b: CameraInfo) -> bool:
+    return a.camera == b.camera and np.array_equal(a.R, b.R) and np.array_equal(a.P, b.P)

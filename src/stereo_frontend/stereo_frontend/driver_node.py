@@ -1,0 +1,201 @@
+"""The ``stereo_driver`` node: raw pairs from a camera, a video, a folder or topics; rectified pairs out.
+
+With ``source: topics`` raw images and camera infos of any vendor's driver (or a bag) come in on
+``stereo/{left,right}/image_raw`` and ``.../camera_info``. The other sources publish those topics themselves, with
+camera infos from YAML files. ``stereo/{left,right}/set_camera_info`` writes new ones.
+"""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sensor_msgs.srv import SetCameraInfo
+
+from slam_core.base_node import SlamNode
+from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info
+from slam_core.camera import CameraInfo
+from slam_core.config import Config, parameter
+from slam_core.messages import (
+    camera_info_from_message,
+    camera_info_message,
+    grey_from_message,
+    header_message,
+    image_message,
+)
+from slam_core.messages.base import Message
+from slam_core.ros import run_node
+from slam_core.types import ByteArray
+from stereo_frontend.calibrated_pairs import SIDES, CalibratedPairs
+from stereo_frontend.rectify import StereoRectifier
+from stereo_frontend.sources import FolderSource, RawPair, SideBySideSource
+
+
+@dataclass(frozen=True)
+class StereoDriverConfig(Config):
+    """Where the images come from and how they are calibrated."""
+
+    source: str = parameter("topics", "origin of the raw pairs", choices=("topics", "camera", "video", "folder"))
+    path: str = parameter("0", "camera number or device, video file, or folder of images; unused with source topics")
+    compressed: bool = parameter(False, "subscribe to image_raw/compressed instead of image_raw")
+    left_info: str = parameter("", "camera_info YAML of the left camera; empty: from the topic")
+    right_info: str = parameter("", "camera_info YAML of the right camera; empty: from the topic")
+    left_frame: str = parameter("stereo_left_optical_frame", "frame of the left images of a camera, video or folder")
+    right_frame: str = parameter("stereo_right_optical_frame", "frame of the right images of a camera, video or folder")
+    rate: float = parameter(0.0, "pairs per second of a video or folder; 0: as recorded", unit="Hz", minimum=0.0)
+    frame_width: int = parameter(0, "width asked of a camera for both images; 0 leaves it", unit="px", minimum=0)
+    frame_height: int = parameter(0, "height asked of a camera; 0 leaves it", unit="px", minimum=0)
+
+
+class StereoDriverNode(SlamNode[StereoDriverConfig]):
+    """Publishes ``stereo/{left,right}/image_rect``; with a source of its own ``image_raw`` and ``camera_info`` too."""
+
+    def __init__(self) -> None:
+        super().__init__("stereo_driver", StereoDriverConfig)
+        self.calibrated = CalibratedPairs[tuple[Message, Message]]()
+        self.files = {"left": self.config.left_info, "right": self.config.right_info}
+        self._rectifier: StereoRectifier | None = None
+        self._open_files()
+        for side in SIDES:
+            self.advertise(f"stereo/{side}/image_rect", "Image")
+            self.create_service(
+                SetCameraInfo, f"stereo/{side}/set_camera_info", lambda q, a, s=side: self._on_set_info(s, q, a)
+            )
+        self.source = None if self.config.source == "topics" else self._open_source()
+        if self.source is None:
+            self._listen_to_topics()
+        else:
+            self._start_source(self.source.rate)
+
+    def on_reset(self) -> None:
+        """Forget what waits."""
+        self.calibrated.clear()
+
+    def on_shutdown(self) -> None:
+        """Let go of the camera."""
+        if self.source is not None:
+            self.source.close()
+
+    # -- topics --------------------------------------------------------------------------------------------------------
+
+    def _listen_to_topics(self) -> None:
+        for side in SIDES:
+            if not self.files[side]:
+                self.listen(f"stereo/{side}/camera_info", "CameraInfo", lambda m, s=side: self._on_info(s, m))
+        ending, kind = ("/compressed", "CompressedImage") if self.config.compressed else ("", "Image")
+        self.listen_together({f"stereo/{side}/image_raw{ending}": kind for side in SIDES}, self._on_pair)
+
+    def _on_info(self, side: str, message: Message) -> None:
+        self._set_info(side, camera_info_from_message(message))
+        self._release()
+
+    def _on_pair(self, left: Message, right: Message) -> None:
+        self.calibrated.add((left, right))
+        self._release()
+
+    def _release(self) -> None:
+        for left, right in self.calibrated.ready():
+            self._publish_rectified(left.header, right.header, grey_from_message(left), grey_from_message(right))
+        self.health.counters["pairs_without_camera_info"] = self.calibrated.dropped
+
+    # -- own sources ---------------------------------------------------------------------------------------------------
+
+    def _open_source(self) -> SideBySideSource | FolderSource:
+        if not all(self.files.values()):
+            raise ValueError(
+                f"source '{self.config.source}' needs the parameters left_info and right_info (YAML files)"
+            )
+        try:
+            return self._make_source()
+        except OSError as error:
+            raise ValueError(str(error)) from error
+
+    def _make_source(self) -> SideBySideSource | FolderSource:
+        c = self.config
+        if c.source == "folder":
+            return FolderSource(Path(c.path).expanduser(), c.rate or 10.0)
+        size = (c.frame_width, c.frame_height) if c.frame_width and c.frame_height else None
+        clock = (lambda: int(self.get_clock().now().nanoseconds)) if c.source == "camera" else None
+        return SideBySideSource(c.path, clock, size)
+
+    def _start_source(self, rate: float) -> None:
+        for side in SIDES:
+            self.advertise(f"stereo/{side}/image_raw", "Image")
+            self.advertise(f"stereo/{side}/camera_info", "CameraInfo")
+        self._timer = self.create_timer(1.0 / (self.config.rate or rate), self._on_timer)
+
+    def _on_timer(self) -> None:
+        assert self.source is not None
+        pair = self.source.read()
+        if pair is None:
+            self.get_logger().info(f"the {self.config.source} has ended")
+            self._timer.cancel()
+            return
+        try:
+            self._publish_pair(pair)
+        except ValueError as error:
+            self.health.count("rejected")
+            self.get_logger().warning(f"pair rejected: {error}", throttle_duration_sec=1.0)
+
+    def _publish_pair(self, pair: RawPair) -> None:
+        frames = self.config.left_frame, self.config.right_frame
+        headers = [header_message(self.types, pair.stamp_ns, frame) for frame in frames]
+        infos = self.calibrated.infos
+        assert infos is not None
+        for side, header, image, info in zip(SIDES, headers, (pair.left, pair.right), infos, strict=True):
+            self.publish(f"stereo/{side}/image_raw", image_message(self.types, header, image))
+            self.publish(f"stereo/{side}/camera_info", camera_info_message(self.types, header, info))
+        self._publish_rectified(*headers, pair.left, pair.right)
+
+    # -- both ----------------------------------------------------------------------------------------------------------
+
+    def _publish_rectified(
+        self, left_header: Message, right_header: Message, left: ByteArray, right: ByteArray
+    ) -> None:
+        if self._rectifier is None:
+            infos = self.calibrated.infos
+            assert infos is not None
+            self._rectifier = StereoRectifier(*infos)
+        images = self._rectifier(0, left, right)
+        self.publish("stereo/left/image_rect", image_message(self.types, left_header, images.left))
+        self.publish("stereo/right/image_rect", image_message(self.types, right_header, images.right))
+
+    # -- calibration ---------------------------------------------------------------------------------------------------
+
+    def _open_files(self) -> None:
+        for side, path in self.files.items():
+            if path:
+                try:
+                    self._set_info(side, read_camera_info(Path(path).expanduser()).info)
+                except OSError as error:
+                    raise ValueError(f"{side}_info: {error}") from error
+
+    def _set_info(self, side: str, info: CameraInfo) -> None:
+        if self.calibrated.set_info(side, info):
+            self._rectifier = None
+
+    def _on_set_info(self, side: str, request: Any, response: Any) -> Any:
+        try:
+            response.status_message = self._store_info(side, camera_info_from_message(request.camera_info))
+            response.success = True
+        except (ValueError, OSError) as error:
+            response.success, response.status_message = False, str(error)
+        return response
+
+    def _store_info(self, side: str, info: CameraInfo) -> str:
+        if not self.files[side]:
+            raise ValueError(
+                f"the {side} camera info comes from its topic: set the parameter {side}_info to a YAML file"
+            )
+        CameraInfoFile(info, side).write(Path(self.files[side]).expanduser())
+        self._set_info(side, info)
+        return f"written to {self.files[side]} and in use"
+
+
+def main() -> None:
+    """Entry point of ``ros2 run stereo_frontend stereo_driver``."""
+    run_node(StereoDriverNode)
