@@ -23,7 +23,7 @@ import numpy as np
 from slam_bringup.bag import BagReader
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
-from slam_core.geometry import FloatArray, invert_transform, make_transform
+from slam_core.geometry import FloatArray
 from slam_core.messages import (
     camera_info_from_message,
     grey_from_message,
@@ -99,19 +99,6 @@ class AgentSensors:
         """T_target_source between "base", "left" and "tof"; ValueError if the bag does not know it."""
         names = {"base": self.base_frame, "left": self.left_frame, "tof": self.tof_frame}
         return self.frames.lookup(names[target], names[source])
-
-    @property
-    def T_base_left(self) -> FloatArray:
-        """Mounting of the *rectified* left camera: rectification turns the optical frame by R of its camera info."""
-        T = self.transform("base", "left")
-        if self.left is None or self.topics["left"].endswith("image_rect"):
-            return T
-        return np.asarray(T @ make_transform(self.left.R.T, np.zeros(3)))
-
-    @property
-    def T_left_tof(self) -> FloatArray:
-        """Pose of the ToF camera in the rectified left optical frame."""
-        return np.asarray(invert_transform(self.T_base_left) @ self.transform("base", "tof"))
 
 
 class SensorBag:
