@@ -42,7 +42,7 @@ TYPES = BagTypes()
 class BagOptions:
     """How a simulated bag is stored.
 
-    images: "raw" Image messages, or CompressedImage "png" (lossless) or "jpeg" (quality 95). compact: ToF images in
+    images: "raw" Image messages, or CompressedImage "png" (lossless) or "jpeg" (quality 90). compact: ToF images in
     16 bits (mm and counts, no intensity): their rounding is a tenth of the sensor's noise. truth: add the true depth of
     the left image on ``ground_truth/depth``. rectified: stereo images without distortion, as ``image_rect``.
     """
@@ -190,7 +190,7 @@ class _Recorder:
 
 def _compressed(header: Message, image: ByteArray, kind: str) -> Message:
     suffix, setting = (
-        (".png", [cv2.IMWRITE_PNG_COMPRESSION, 3]) if kind == "png" else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 95])
+        (".png", [cv2.IMWRITE_PNG_COMPRESSION, 3]) if kind == "png" else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 90])
     )
     ok, data = cv2.imencode(suffix, image, setting)
     if not ok:

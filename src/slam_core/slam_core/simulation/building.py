@@ -154,7 +154,7 @@ def _build_lamps(world: World, index: int, room: Room) -> None:
             origin = np.array([cx - length / 2, cy + width / 2, room.height - 0.06])
             edge_u, edge_v = np.array([length, 0, 0]), np.array([0, -width, 0])
             lamp = Surface(origin, edge_u, edge_v, Material("metal", 1.8, emission=2.0), index)
-            world.add_lamp(lamp, 0.9 * room.height)
+            world.add_lamp(lamp, 0.38 * room.height)
 
 
 def build_doorways(world: World, doorways: list[Doorway], walls: list[Wall]) -> None:

@@ -55,6 +55,18 @@ def _against(wall: Wall, s: float, width: float, depth: float) -> tuple[FloatArr
     return centre, float(np.arctan2(wall.inward[1], wall.inward[0]))
 
 
+def _pictures_above(world: World, wall: Wall, s: float, width: float, low: float, rng: Generator) -> None:
+    """Small pictures and notices over a piece of furniture that is ``low`` m high."""
+    at = s + float(rng.uniform(0.0, 0.15))
+    while at < s + width - 0.25:
+        wide, bottom = float(rng.uniform(0.2, 0.5)), low + float(rng.uniform(0.15, 0.4))
+        top = min(bottom + wide * float(rng.uniform(0.9, 1.5)), wall.height - 0.1)
+        if top > bottom + 0.15 and rng.random() < 0.75:
+            kind = str(rng.choice(["poster", "poster", "label", "notices"]))
+            world.add(wall.panel((at, min(at + wide, s + width)), (bottom, top), Material(kind), 0.012))
+        at += wide + float(rng.uniform(0.05, 0.3))
+
+
 def _cupboard(front: str, side: str, depth: float, height: tuple[float, float]) -> Callable[..., None]:
     """A builder of boxes with a picture in front."""
 
@@ -65,6 +77,7 @@ def _cupboard(front: str, side: str, depth: float, height: tuple[float, float]) 
         world.add(*box(centre, np.array([depth, width, tall]), faces, wall.room, yaw))
         if tall < 1.5:
             _things(world, wall.room, centre + [0, 0, tall], yaw, (depth, width), rng)
+            _pictures_above(world, wall, s, width, tall + 0.3, rng)
 
     return build
 
@@ -93,6 +106,7 @@ def _desk(world: World, wall: Wall, s: float, width: float, rng: Generator) -> N
     at = centre + [*(turn @ [-0.12, rng.uniform(-0.2, 0.2) * width]), height]
     world.add(*box(at, np.array([0.06, 0.5, 0.38]), screen, wall.room, yaw + float(rng.normal(0, 0.15))))
     _things(world, wall.room, centre + [0, 0, height], yaw, (depth, width), rng)
+    _pictures_above(world, wall, s, width, height + 0.4, rng)
     chair(world, wall.room, centre + [*(turn @ [0.6, rng.uniform(-0.2, 0.2)]), 0.0], yaw + float(rng.normal(3.1, 0.5)))
 
 
@@ -104,6 +118,7 @@ def _cartons(world: World, wall: Wall, s: float, width: float, rng: Generator) -
         faces = {"front": Material("label"), "left": Material("label"), SIDE: Material("cardboard")}
         world.add(*box(centre + [0, 0, z], size, faces, wall.room, yaw + float(rng.normal(0, 0.1))))
         z += float(size[2])
+    _pictures_above(world, wall, s, width, z + 0.1, rng)
 
 
 def _radiator(world: World, wall: Wall, s: float, width: float, rng: Generator) -> None:
@@ -142,8 +157,13 @@ def pillar(world: World, room: int, centre: FloatArray, height: float, side: flo
     world.add(*box(centre, np.array([side, side, height]), faces, room))
 
 
+def _pictures(world: World, wall: Wall, s: float, width: float, rng: Generator) -> None:
+    _pictures_above(world, wall, s, width, 0.8, rng)
+
+
 ITEMS: dict[str, WallItem] = {
     "poster": WallItem(_hang("poster", (0.9, 1.4), (0.6, 1.0)), (0.45, 0.9), 0.03),
+    "pictures": WallItem(_pictures, (0.5, 1.2), 0.03),
     "notices": WallItem(_hang("notices", (1.0, 1.2), (0.8, 1.0)), (0.9, 1.4), 0.03),
     "whiteboard": WallItem(_hang("whiteboard", (0.9, 1.0), (1.0, 1.2), gloss=0.5), (1.5, 2.2), 0.03),
     "pegboard": WallItem(_hang("pegboard", (0.9, 1.1), (0.8, 1.1)), (1.0, 1.8), 0.03),
@@ -157,29 +177,45 @@ ITEMS: dict[str, WallItem] = {
 }
 
 CONTENTS: dict[str, tuple[str, ...]] = {
-    "office": ("desk", "poster", "bookshelf", "window", "notices", "cabinet", "whiteboard", "poster"),
-    "lab": ("desk", "machine", "poster", "cabinet", "whiteboard", "window", "bookshelf", "cartons", "poster"),
-    "workshop": ("machine", "pegboard", "cartons", "poster", "cabinet", "pegboard", "desk", "notices"),
-    "conference": ("whiteboard", "poster", "window", "poster", "cabinet", "radiator", "notices"),
-    "corridor": ("poster", "notices", "poster", "poster", "radiator"),
-    "store": ("cartons", "cabinet", "cartons", "machine", "bookshelf", "poster"),
+    "office": ("desk", "poster", "bookshelf", "window", "notices", "cabinet", "pictures", "whiteboard", "poster"),
+    "lab": ("desk", "machine", "poster", "cabinet", "whiteboard", "window", "bookshelf", "cartons", "pictures"),
+    "workshop": ("machine", "pegboard", "cartons", "pictures", "cabinet", "pegboard", "desk", "notices", "poster"),
+    "conference": ("whiteboard", "poster", "pictures", "window", "cabinet", "poster", "radiator", "notices"),
+    "corridor": ("poster", "notices", "pictures", "poster", "radiator", "pictures"),
+    "store": ("cartons", "cabinet", "cartons", "machine", "bookshelf", "pictures"),
 }
 
 
 def furnish_wall(world: World, wall: Wall, room: Room, rng: Generator) -> None:
     """Fill a wall from left to right with the things of the room's style; ``clutter`` scales how close they stand."""
-    kinds, margin = list(CONTENTS[room.style]), 0.35
+    kinds = list(CONTENTS[room.style])
     rng.shuffle(kinds)
-    s, k = margin + float(rng.uniform(0, 0.4)), 0
-    while s < wall.length - margin and k < 40:
-        item = ITEMS[kinds[k % len(kinds)]]
-        width = float(rng.uniform(*item.width))
-        if _free(wall, s, s + width, item.depth):
-            item.build(world, wall, s, width, rng)
-            s += width + float(rng.uniform(0.15, 0.7)) / max(room.clutter, 0.1)
+    s = 0.15 + float(rng.uniform(0, 0.3))
+    while s < wall.length - 0.3:
+        for kind in kinds:
+            item, width = ITEMS[kind], float(rng.uniform(*ITEMS[kind].width))
+            if _free(wall, s, s + width, item.depth):
+                item.build(world, wall, s, width, rng)
+                kinds.append(kinds.pop(kinds.index(kind)))
+                s += width + float(rng.uniform(0.08, 0.4)) / max(room.clutter, 0.1)
+                break
         else:
-            s += 0.25
-        k += 1
+            s += 0.2
+    _fittings(world, wall, rng)
+
+
+def _fittings(world: World, wall: Wall, rng: Generator) -> None:
+    """Sockets near the floor, a cable duct, and a switch beside every opening."""
+    plastic = Material("label", 1.2)
+    for s in np.arange(0.6 + float(rng.uniform(0, 0.5)), wall.length - 0.3, 1.7):
+        if _free(wall, float(s), float(s) + 0.16, 0.02):
+            world.add(wall.panel((float(s), float(s) + 0.16), (0.28, 0.36), plastic, 0.01))
+    for first, last, _ in wall.openings:
+        s = last + 0.15 if last + 0.3 < wall.length else first - 0.25
+        if 0.05 < s < wall.length - 0.15:
+            world.add(wall.panel((s, s + 0.09), (1.05, 1.2), plastic, 0.01))
+    if not wall.openings:
+        world.add(wall.panel((0.02, wall.length - 0.02), (0.78, 0.86), Material("metal", 1.3), 0.008))
 
 
 def _free(wall: Wall, first: float, last: float, depth: float) -> bool:

@@ -17,7 +17,7 @@ from slam_core.types import Float32Array
 NODE_SPACING = 0.2
 MAX_NODES = 33
 LAMP_POINTS = 4
-AMBIENT = 0.35
+AMBIENT = 0.7
 OPEN_DISTANCE = 0.8
 """Surfaces nearer than this (m) weaken the ambient light."""
 
