@@ -32,7 +32,7 @@ def result(rng) -> RunResult:
         agents=(AgentResult("", noisy, truth=truth, feature_counts=np.full(80, 250)),),
         landmarks=LandmarkMap(positions, covariances, np.full(200, 5, dtype=np.int32)),
         dense_points=rng.uniform(-3, 3, (500, 3)).astype(np.float32), dense_grey=np.full(500, 128, dtype=np.uint8),
-        submaps=4, loop_closures=1, frames=80, dropped={"features without depth": 2}, sensor_s=8.0, wall_s=2.0,
+        submaps=4, loop_closures=1, frames=80, dropped={"features without depth": 2}, rejections={"outlier": 3}, sensor_s=8.0, wall_s=2.0,
         stage_ms={"features": [40.0] * 80, "ekf": [8.0] * 80}, events=("12.3 s: <lost>",),
     )  # fmt: skip
 
@@ -66,7 +66,7 @@ def test_the_same_result_gives_the_same_bytes(result, tmp_path):
 def test_a_run_without_anything_still_has_its_files(tmp_path):
     empty = RunResult(
         "empty", "stereo", "sjsam", "none", (AgentResult("", Trajectory.from_estimates([])),), LandmarkMap.empty(),
-        np.empty((0, 3), np.float32), np.empty(0, np.uint8), 0, 0, 0, {}, 0.0, 0.0, {},
+        np.empty((0, 3), np.float32), np.empty(0, np.uint8), 0, 0, 0, {}, {}, 0.0, 0.0, {},
     )  # fmt: skip
     summary = write_results(tmp_path, empty)
     assert summary["end_error_m"] is None

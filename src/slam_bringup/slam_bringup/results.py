@@ -70,6 +70,7 @@ class RunResult:
     loop_closures: int
     frames: int
     dropped: Mapping[str, int]
+    rejections: Mapping[str, int]
     sensor_s: float
     wall_s: float
     stage_ms: Mapping[str, list[float]]
@@ -88,6 +89,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "frames": result.frames,
         "dropped": int(sum(result.dropped.values())),
         "dropped_by_reason": dict(result.dropped),
+        "rejections": dict(result.rejections),
         "landmarks": len(result.landmarks.positions),
         "submaps": result.submaps,
         "loop_closures": result.loop_closures,

@@ -8,7 +8,7 @@ along z, no amplitude): only :class:`DepthConfig` differs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,6 +56,7 @@ class DepthProcessor:
         self.config = config
         self.camera = camera
         self.counters = Counters()
+        self._noise = _with_model(config.noise, config.measurement)
         self._rectification = None if camera.is_rectified else RectificationMap.of(camera)
         self._ray_length = _ray_length(camera)
         self._pixel_angle = 1.0 / min(camera.fx, camera.fy)
@@ -126,7 +127,9 @@ class DepthProcessor:
             )
 
     def _believable(self, distance: Float32Array, amplitude: Float32Array | None) -> tuple[ByteArray, Float32Array]:
-        noise, mask = self.config.noise, self.config.mask
+        noise, mask = self._noise, self.config.mask
+        if noise.model == "quadratic":
+            amplitude = None  # a picture, not the strength of the camera's own light: it judges nothing
         white_amplitude = noise.reference_amplitude * noise.reference_range**2
         reason = judge_pixels(mask, distance, amplitude, white_amplitude)
         if noise.model == "quadratic":
@@ -176,6 +179,12 @@ def normalise(intensity: Float32Array | None) -> Float32Array | None:
     low, high = intensity[finite].min(), intensity[finite].max()
     scaled = (intensity - low) / max(high - low, np.float32(1e-12))
     return np.where(finite, scaled, np.float32(0.0)).astype(np.float32)
+
+
+def _with_model(noise: NoiseConfig, measurement: str) -> NoiseConfig:
+    """``auto`` resolved: cameras that measure range are taken for time of flight, others for structured light."""
+    model = {"range": "amplitude", "depth": "quadratic"}[measurement] if noise.model == "auto" else noise.model
+    return replace(noise, model=model)
 
 
 def _ray_length(camera: Camera) -> Float32Array:

@@ -20,10 +20,11 @@ class NoiseConfig(Config):
     """Noise model of a depth camera; the defaults are the CamCube's (thesis 2.2: below 3 mm at 2 m)."""
 
     model: str = parameter(
-        "amplitude",
+        "auto",
         "amplitude: time of flight, sigma from amplitude (from range squared where there is no amplitude image); "
-        "quadratic: structured light or stereo, sigma = constant + quadratic * depth^2",
-        choices=("amplitude", "quadratic"),
+        "quadratic: structured light or stereo, sigma = constant + quadratic * depth^2; "
+        "auto: amplitude for cameras that measure range, quadratic for those that measure depth",
+        choices=("auto", "amplitude", "quadratic"),
     )
     reference_range: float = parameter(
         2.0, "range at which reference_sigma and reference_amplitude hold", unit="m", minimum=0.1

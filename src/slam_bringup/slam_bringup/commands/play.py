@@ -1,0 +1,22 @@
+"""``slam play``: publish a bag's topics; the node ``bag_player`` behind a friendlier command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from slam_bringup.node_arguments import ros_arguments
+
+
+@click.command()
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("--rate", type=click.FloatRange(min=0.0), default=1.0, show_default=True, help="0: as fast as possible")
+@click.option("--loop", is_flag=True, help="start again at the end")
+@click.option("--clock", is_flag=True, help="publish /clock")
+@click.option("--topics", multiple=True, metavar="TOPIC", help="play only this topic (may be repeated)")
+def command(bag: Path, rate: float, loop: bool, clock: bool, topics: tuple[str, ...]) -> None:
+    """Publish the topics of BAG over ROS."""
+    from slam_bringup.bag_player_node import main
+
+    main(ros_arguments({"bag": str(bag), "rate": rate, "loop": loop, "clock": clock, "topics": topics}))

@@ -1,0 +1,20 @@
+"""``slam record``: write ROS topics to a bag; the node ``recorder`` behind a friendlier command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from slam_bringup.node_arguments import ros_arguments
+
+
+@click.command()
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="the bag to write")
+@click.option("--storage", type=click.Choice(["mcap", "sqlite3"]), default="mcap", show_default=True)
+@click.argument("topics", nargs=-1)
+def command(output: Path, storage: str, topics: tuple[str, ...]) -> None:
+    """Record TOPICS (all by default) until Ctrl-C."""
+    from slam_bringup.recorder_node import main
+
+    main(ros_arguments({"bag": str(output), "storage": storage, "topics": topics}))

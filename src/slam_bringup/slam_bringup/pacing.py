@@ -1,0 +1,115 @@
+"""How a player waits for those who process: the stamps on their way to each node, and the clock of a replay."""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+
+
+def header_stamp_ns(data: bytes) -> int:
+    """Header stamp of a message that starts with a header, from its CDR bytes (encapsulation, then sec and nanosec)."""
+    order = "<" if data[1] & 1 else ">"
+    seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+class FlowControl:
+    """Lets at most ``window`` messages of a topic be on their way to the node that has to have processed them.
+
+    Thread-safe: one thread sends, another one reports progress.
+
+    Parameters
+    ----------
+    pairs
+        "node=topic" texts: full node name, full topic name.
+    window
+        Messages of a topic that may be unprocessed.
+    patience_s
+        How long to wait for a node that reports nothing before going on without it.
+    """
+
+    def __init__(self, pairs: Iterable[str], window: int, patience_s: float) -> None:
+        split = [pair.partition("=") for pair in pairs]
+        if bad := [pair for pair in split if not pair[0] or not pair[2]]:
+            raise ValueError(f"pace must be '<node>=<topic>', got {''.join(bad[0])!r}")
+        self._on_the_way: dict[tuple[str, str], deque[int]] = {(node, topic): deque() for node, _, topic in split}
+        self._window = window
+        self._patience_s = patience_s
+        self._changed = threading.Condition()
+        self.gave_up = 0
+        """Times that patience ran out."""
+
+    @property
+    def topics(self) -> set[str]:
+        """Topics that are paced."""
+        return {topic for _, topic in self._on_the_way}
+
+    def progress(self, node: str, stamp_ns: int) -> None:
+        """``node`` has processed everything up to ``stamp_ns``."""
+        with self._changed:
+            for (name, _), stamps in self._on_the_way.items():
+                while name == node and stamps and stamps[0] <= stamp_ns:
+                    stamps.popleft()
+            self._changed.notify_all()
+
+    def sent(self, topic: str, stamp_ns: int) -> None:
+        """A message of ``topic`` has been published."""
+        with self._changed:
+            for (_, paced), stamps in self._on_the_way.items():
+                if paced == topic:
+                    stamps.append(stamp_ns)
+
+    def wait(self, topic: str) -> bool:
+        """Block until ``topic`` may send again; False if patience ran out, and what was on its way is then forgotten."""
+        return self._wait_until(lambda: self._most_on_the_way(topic) < self._window)
+
+    def drain(self) -> bool:
+        """Block until everything sent has been processed; False if patience ran out."""
+        return self._wait_until(lambda: not any(self._on_the_way.values()))
+
+    def clear(self) -> None:
+        """Forget what is on its way, for instance when a bag starts again."""
+        with self._changed:
+            for stamps in self._on_the_way.values():
+                stamps.clear()
+
+    def _most_on_the_way(self, topic: str) -> int:
+        return max((len(s) for (_, paced), s in self._on_the_way.items() if paced == topic), default=0)
+
+    def _wait_until(self, condition: Callable[[], bool]) -> bool:
+        with self._changed:
+            left = self._total()
+            while not condition():
+                if not self._changed.wait(self._patience_s) and self._total() == left:
+                    self.gave_up += 1
+                    for stamps in self._on_the_way.values():
+                        stamps.clear()
+                    return False
+                left = self._total()
+        return True
+
+    def _total(self) -> int:
+        return sum(len(s) for s in self._on_the_way.values())
+
+
+class ReplayClock:
+    """When a message of a bag is due: ``rate`` times as fast as it was recorded; rate 0 is as fast as possible."""
+
+    def __init__(self, rate: float) -> None:
+        if rate < 0.0:
+            raise ValueError(f"rate must not be negative, got {rate}")
+        self._rate = rate
+        self._origin: tuple[float, int] | None = None
+
+    def delay_s(self, stamp_ns: int) -> float:
+        """Seconds until the message of ``stamp_ns`` is due, 0 if it is late; the first one starts the clock."""
+        if self._rate == 0.0:
+            return 0.0
+        now = time.monotonic()
+        if self._origin is None:
+            self._origin = (now, stamp_ns)
+        started, first_ns = self._origin
+        return max(started + (stamp_ns - first_ns) / 1e9 / self._rate - now, 0.0)

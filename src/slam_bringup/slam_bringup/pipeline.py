@@ -1,0 +1,162 @@
+"""The chain of the launch file without ROS: the same classes, called frame by frame.
+
+    readings of a bag -> depth -> features ----------> EKF-SLAM -> submaps -> SJSAM -> trajectory and map
+                           \\-> scan odometry (optional) --^
+
+Images and filter run on two threads; each stage keeps its own order, so the result does not depend on that.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from slam_bringup.configuration import SystemConfig
+from slam_bringup.dense_map import ColouredCloud
+from slam_bringup.dense_run import dense_model
+from slam_bringup.eyes import AgentEyes, FilterInput
+from slam_bringup.mapper import Mapper
+from slam_bringup.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
+from slam_bringup.sensor_bag import SensorBag
+from slam_bringup.stage_times import StageTimes
+from slam_core.trajectory import Trajectory
+
+T = TypeVar("T")
+_AHEAD = 4
+"""Frames that the images may be ahead of the filter."""
+
+
+def run_bag(
+    path: Path,
+    config: SystemConfig,
+    *,
+    mapper: str = "sjsam",
+    odometry: str = "none",
+    on_reading: Callable[[], None] = lambda: None,
+) -> tuple[RunResult, Mapper]:
+    """Map a bag, offline and as fast as it goes.
+
+    Parameters
+    ----------
+    config
+        Already adapted to mode, mapper and odometry by :func:`slam_bringup.configuration.choose`.
+    mapper, odometry
+        Named in the result; ``odometry`` other than "none" runs scan odometry as well.
+    on_reading
+        Called after every reading of the bag, for a progress bar.
+
+    Raises
+    ------
+    ValueError
+        If the bag cannot be read or lacks what the mode needs.
+    """
+    times = StageTimes()
+    start = time.perf_counter()
+    with SensorBag(path) as bag:
+        eyes = {agent: AgentEyes(config, bag.sensors[agent], odometry != "none", times) for agent in bag.agents}
+        mapping = Mapper(config, {agent: e.T_rig_optical for agent, e in eyes.items()}, times)
+        for item in _ahead(_filter_inputs(bag, eyes, on_reading)):
+            mapping.process(item)
+        mapping.finish()
+        wall_s = time.perf_counter() - start
+        agents = tuple(_agent_result(agent, bag, mapping) for agent in bag.agents)
+        with times.measure("dense model"):
+            dense = dense_model(bag, config, {a.name: a.trajectory for a in agents})
+        dropped = {"images without a partner of their stamp": bag.unpaired} if bag.unpaired else {}
+        if bag.reader.warning:
+            mapping.records[bag.agents[0]].events.append(bag.reader.warning)
+    choice = (config.feature_extractor.mode, mapper, odometry)
+    return _run_result(path, choice, mapping, agents, dense, dropped, times, wall_s), mapping
+
+
+def _filter_inputs(bag: SensorBag, eyes: dict[str, AgentEyes], on_reading: Callable[[], None]) -> Iterator[FilterInput]:
+    for reading in bag.readings():
+        agent = reading.agent
+        yield from eyes[agent].process(reading)
+        on_reading()
+    for agent_eyes in eyes.values():
+        yield from agent_eyes.finish()
+
+
+def _ahead(items: Iterable[T]) -> Iterator[T]:
+    """The same items, made by another thread a few ahead of their use."""
+    made: queue.Queue[tuple[T | None, BaseException | None]] = queue.Queue(_AHEAD)
+    stopped = threading.Event()
+
+    def make() -> None:
+        error: BaseException | None = None
+        try:
+            for item in items:
+                made.put((item, None))
+                if stopped.is_set():
+                    return
+        except BaseException as caught:  # handed to the consumer, who raises it
+            error = caught
+        made.put((None, error))
+
+    thread = threading.Thread(target=make, name="images", daemon=True)
+    thread.start()
+    try:
+        while True:
+            item, error = made.get()
+            if error is not None:
+                raise error
+            if item is None:
+                return
+            yield item
+    finally:
+        stopped.set()
+
+
+def _agent_result(agent: str, bag: SensorBag, mapping: Mapper) -> AgentResult:
+    record = mapping.records[agent]
+    return AgentResult(
+        name=agent,
+        trajectory=Trajectory.from_estimates(mapping.global_map.trajectory(agent)),
+        filtered=Trajectory.from_estimates(record.filtered),
+        scan_odometry=Trajectory.from_estimates(record.scans),
+        truth=bag.ground_truth(agent) or EMPTY_TRAJECTORY,
+        feature_counts=np.array(record.feature_counts, dtype=np.int64),
+    )
+
+
+def _run_result(
+    path: Path,
+    choice: tuple[str, str, str],
+    mapping: Mapper,
+    agents: tuple[AgentResult, ...],
+    dense: ColouredCloud,
+    dropped: dict[str, int],
+    times: StageTimes,
+    wall_s: float,
+) -> RunResult:
+    mode, mapper, odometry = choice
+    landmarks = mapping.global_map.landmarks()
+    stamps = [agent.filtered.stamps_ns for agent in agents if len(agent.filtered)]
+    events = [f"{name}: {e}" if name else e for name, record in mapping.records.items() for e in record.events]
+    return RunResult(
+        bag=path.name,
+        mode=mode,
+        mapper=mapper,
+        odometry=odometry,
+        agents=agents,
+        landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings),
+        dense_points=dense.points,
+        dense_grey=dense.grey,
+        submaps=len(mapping.reports),
+        loop_closures=sum(len(report.closures) for report in mapping.reports),
+        frames=sum(len(s) for s in stamps),
+        dropped=dropped,
+        rejections=mapping.rejections(),
+        sensor_s=max((s[-1] - s[0]) / 1e9 for s in stamps) if stamps else 0.0,
+        wall_s=wall_s,
+        stage_ms=dict(times.ms),
+        events=tuple(events),
+        solver=next((r.solver for r in reversed(mapping.reports) if r.solver), ""),
+    )

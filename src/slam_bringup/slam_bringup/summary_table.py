@@ -1,0 +1,44 @@
+"""The table that a run ends with on the console."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+
+def summary_table(summary: dict[str, Any], out: Path) -> Table:
+    """The figures of ``summary.json`` that a person wants to see first, and where the rest is."""
+    table = Table(title=f"{summary['bag']} ({summary['mode']}, {summary['mapper']})", show_header=False)
+    table.add_column(style="bold")
+    table.add_column()
+    dropped = f", {summary['dropped']} dropped" if summary["dropped"] else ", none dropped"
+    table.add_row("frames", f"{summary['frames']}{dropped}")
+    table.add_row("path", f"{summary['path_length_m']:.2f} m")
+    table.add_row("map", f"{summary['landmarks']} landmarks, {summary['submaps']} submaps")
+    table.add_row("loop closures", str(summary["loop_closures"]))
+    for name, part in (("", summary), *summary.get("agents", {}).items()):
+        table.add_row(f"accuracy {name}".strip(), _accuracy(part))
+    if "scan_odometry" in summary:
+        table.add_row("scan odometry", _accuracy(summary["scan_odometry"]))
+    table.add_row(
+        "time",
+        f"{summary['wall_s']:.1f} s for {summary['sensor_s']:.1f} s, {summary['real_time_factor']:.1f} x real time",
+    )
+    stages = [f"{name} {s['median']:.1f}" for name, s in summary["stage_ms"].items() if s]
+    table.add_row("ms per call", ", ".join(stages))
+    if summary["events"]:
+        table.add_row("events", "\n".join(summary["events"][:8]))
+    table.add_row("results", str(out))
+    return table
+
+
+def _accuracy(part: dict[str, Any]) -> str:
+    if "ate_rmse_m" not in part:
+        return "no ground truth"
+    anees = f", ANEES {part['anees']:.1f}" if part.get("anees") is not None else ""
+    return (
+        f"ATE {part['ate_rmse_m'] * 1000:.1f} mm, end error {part['end_error_m'] * 1000:.1f} mm "
+        f"({part['drift_percent']:.2f} %){anees}"
+    )
