@@ -126,7 +126,7 @@ def rig_twist(path: Path, t: float, step: float = 1e-3) -> FloatArray:
 def resolve_waypoints(rows: list[list[float]], height: float) -> FloatArray:
     """Way points (n, 5) from rows (x, y[, yaw deg[, pitch deg[, z]]]); without a yaw the rig looks along its path.
 
-    Yaw is unwrapped to the nearest turn unless it is given; given angles are taken as they stand, so 360 is a full turn.
+    No turn between two way points is longer than half a circle: yaw is taken at the turn nearest to the one before.
     """
     n = len(rows)
     xy = np.array([row[:2] for row in rows], dtype=np.float64)
@@ -137,7 +137,7 @@ def resolve_waypoints(rows: list[list[float]], height: float) -> FloatArray:
     tangent[0], tangent[-1] = xy[min(1, n - 1)] - xy[0], xy[-1] - xy[max(n - 2, 0)]
     for i, row in enumerate(rows):
         out[i, 3] = np.radians(row[2]) if len(row) > 2 else np.arctan2(tangent[i, 1], tangent[i, 0])
-        if len(row) <= 2 and i > 0:
+        if i > 0:
             out[i, 3] += 2 * np.pi * np.round((out[i - 1, 3] - out[i, 3]) / (2 * np.pi))
         out[i, 4] = np.radians(row[3]) if len(row) > 3 else 0.0
         out[i, 2] = row[4] if len(row) > 4 else height
