@@ -54,6 +54,7 @@ class JoiningProblem:
         dimension = state.translations.shape[1]
         self.layout: Layout = make_layout(maps, len(state.translations), len(state.landmarks), fixed, dimension, last)
         self.factor = SparseCholesky(self.layout.pattern, backend)
+        self._pose_size = state.model_dimensions[0]
         pattern = self.layout.pattern
         self._diagonal = np.nonzero(pattern.indices == pattern.columns)[0]
         self._values = np.zeros(len(pattern.indices))
@@ -93,6 +94,10 @@ class JoiningProblem:
         """The optimum reached from ``state``."""
         return levenberg_marquardt(self, state, config)
 
+    def columns(self, poses: IntArray) -> FloatArray:
+        """Joint covariance of a few poses by solving for their columns with the last factor."""
+        return solved_covariance(self.factor, pose_scalars(self.layout, poses, self._pose_size))
+
     def marginals(self, state: State) -> Marginals:
         """Exact marginal covariances, linearised at ``state``.
 
@@ -123,9 +128,8 @@ class Marginals:
     def scalars(self, poses: IntArray | list[int], landmarks: IntArray | list[int]) -> IntArray:
         """Scalar unknowns of these poses and landmarks, in order; -1 for what is fixed."""
         dp, dl = self.dimensions
-        runs = [_run(self.layout.pose_offset[i], dp) for i in poses]
-        runs += [_run(self.layout.landmark_offset[i], dl) for i in landmarks]
-        return np.concatenate(runs) if runs else np.empty(0, dtype=np.int64)
+        starts = self.layout.landmark_offset[np.asarray(landmarks, dtype=np.int64)]
+        return np.concatenate([pose_scalars(self.layout, poses, dp), _runs(starts, dl)])
 
     def covariance(self, poses: IntArray | list[int], landmarks: IntArray | list[int] = ()) -> FloatArray:  # type: ignore[assignment]
         """Joint covariance of any poses and landmarks.
@@ -133,21 +137,32 @@ class Marginals:
         Inside one local map it is read from the factor's pattern (Takahashi); for others columns are solved for.
         """
         scalars = self.scalars(poses, landmarks)
-        out = np.zeros((len(scalars), len(scalars)))
         free = np.nonzero(scalars >= 0)[0]
         try:
             block = self.entries.block(scalars[free])
         except KeyError:
-            block = self._solved(scalars[free])
+            return solved_covariance(self.factor, scalars)
+        out = np.zeros((len(scalars), len(scalars)))
         out[np.ix_(free, free)] = block
         return out
 
-    def _solved(self, scalars: IntArray) -> FloatArray:
-        unit = np.zeros((self.layout.pattern.n, len(scalars)))
-        unit[scalars, np.arange(len(scalars))] = 1.0
-        block = self.factor.solve(unit)[scalars]
-        return np.asarray(0.5 * (block + block.T))
+
+def solved_covariance(factor: SparseCholesky, scalars: IntArray) -> FloatArray:
+    """Covariance of any unknowns by solving for their columns; zero where ``scalars`` is -1 (fixed)."""
+    free = np.nonzero(scalars >= 0)[0]
+    unit = np.zeros((factor.pattern.n, len(free)))
+    unit[scalars[free], np.arange(len(free))] = 1.0
+    block = factor.solve(unit)[scalars[free]]
+    out = np.zeros((len(scalars), len(scalars)))
+    out[np.ix_(free, free)] = 0.5 * (block + block.T)
+    return out
 
 
-def _run(start: int, length: int) -> IntArray:
-    return np.arange(start, start + length) if start >= 0 else np.full(length, -1)
+def pose_scalars(layout: Layout, poses: IntArray | list[int], size: int) -> IntArray:
+    """Scalar unknowns of poses, -1 for fixed ones."""
+    return _runs(layout.pose_offset[np.asarray(poses, dtype=np.int64)], size)
+
+
+def _runs(starts: IntArray, length: int) -> IntArray:
+    runs = np.where(starts[:, None] >= 0, starts[:, None] + np.arange(length), -1)
+    return np.asarray(runs.ravel(), dtype=np.int64)

@@ -1,0 +1,274 @@
+"""Links between submaps: to the ones just before, to ones the estimate says are near, and to ones that look alike.
+
+A link is believed only after three questions: do enough landmarks, spread in space, agree on one rigid alignment
+within both submaps' joint covariance; does that alignment agree with what the map already knows of the two poses;
+and, where the map knows little, does a second link say the same. Two rooms that look alike fail the second or the
+third.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import chi2
+
+from sjsam_node.association import (
+    Alignment,
+    AssociationConfig,
+    PointSet,
+    Prior,
+    align,
+    jointly_compatible,
+    match,
+    mutual_best,
+    similarity,
+)  # fmt: skip
+from sjsam_node.map_graph import Link, MapGraph, Record
+from sjsam_node.place_recognition import PlaceIndex, PlaceRecognitionConfig
+from slam_core.config import Config, group, parameter
+from slam_core.geometry import (
+    FloatArray,
+    boxminus,
+    compose_covariance,
+    compose_jacobians,
+    inverse_jacobian,
+    invert_transform,
+    skew,
+)  # fmt: skip
+from slam_core.rigid_alignment import ransac_rigid_transform
+from slam_core.sparse_cholesky import IntArray
+
+RelativePose = Callable[[int, int], "Prior | None"]
+"""Given two records: T_first_second of their starts with covariance, None if the map says nothing (other component)."""
+
+
+@dataclass(frozen=True)
+class ClosureConfig(Config):
+    """What a link between submaps must show before it is believed."""
+
+    window: int = parameter(3, "submaps back along the agent's path that a new one is linked to directly", minimum=1)
+    proximity: float = parameter(
+        3.0, "distance between the middles of submaps that are tried as near", unit="m", minimum=0.0
+    )
+    near_candidates: int = parameter(4, "near submaps tried per new one", minimum=0)
+    informative_sigma: float = parameter(
+        0.5, "largest standard deviation of a relative position that can tell two places apart", unit="m", minimum=0.0
+    )
+    ratio: float = parameter(
+        0.9, "second best to best angle of descriptors, where no prior helps", minimum=0.1, maximum=1.0
+    )
+    place_threshold: float = parameter(0.7, "least scalar product of descriptors, where no prior helps", maximum=1.0)
+    ransac_distance: float = parameter(
+        0.15, "largest distance of an inlier of the first alignment", unit="m", minimum=0.001
+    )
+    min_near_inliers: int = parameter(5, "least matches of a link to a near submap", minimum=3)
+    min_inliers: int = parameter(10, "least matches of a link to a submap found by its looks", minimum=3)
+    min_spread: float = parameter(
+        0.25, "least second-largest standard deviation of the matched landmarks", unit="m", minimum=0.0
+    )
+    min_overlap: float = parameter(
+        0.3, "least share of the landmarks expected in both that match", minimum=0.0, maximum=1.0
+    )
+    confirmations: int = parameter(2, "links that must agree where the map cannot judge", minimum=1)
+    probability: float = parameter(
+        0.9999, "share of true closures inside the chi-square gate", minimum=0.9, maximum=0.9999999
+    )
+    seed: int = parameter(1, "seed of the random samples", minimum=0)
+    association: AssociationConfig = group(AssociationConfig)
+    places: PlaceRecognitionConfig = group(PlaceRecognitionConfig)
+
+
+def at_start(record: Record) -> PointSet:
+    """Landmarks of a record in its start frame."""
+    submap = record.submap
+    return PointSet(submap.landmarks, submap.covariance[6:, 6:], submap.descriptors)
+
+
+def at_end(record: Record) -> PointSet:
+    """Landmarks of a record as seen from its end pose, with the exact joint covariance of both (Eq. 7.2 applied to
+    it).
+    """
+    submap = record.submap
+    R, t = submap.end_pose[:3, :3], submap.end_pose[:3, 3]
+    n = len(submap.landmarks)
+    J = np.zeros((n, 3, 6 + 3 * n))
+    J[:, :, :3] = -R.T
+    J[:, :, 3:6] = R.T @ skew(submap.landmarks - t)
+    for axis in range(3):
+        J[np.arange(n), :, 6 + 3 * np.arange(n) + axis] = R.T[:, axis]
+    rows = J.reshape(3 * n, 6 + 3 * n)
+    return PointSet((submap.landmarks - t) @ R, rows @ submap.covariance @ rows.T, submap.descriptors)
+
+
+@dataclass
+class LinkFinder:
+    """Finds and judges the links of a new record."""
+
+    config: ClosureConfig = field(default_factory=ClosureConfig)
+    index: PlaceIndex = field(init=False)
+    pending: list[Link] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.index = PlaceIndex(self.config.places)
+
+    def sequential(self, graph: MapGraph, chain: list[int], new: int) -> list[Link]:
+        """Links of record ``new`` to the records ``chain`` before it, newest first, by their odometry."""
+        links, T, covariance = [], np.eye(4), np.zeros((6, 6))
+        for k, previous in enumerate(chain[: self.config.window]):
+            record = graph.records[previous]
+            prior = Prior(T, covariance if k else None)
+            found = match(at_end(record), at_start(graph.records[new]), prior, self.config.association)
+            if len(found.pairs):
+                end = record.submap.end_pose
+                end_covariance = record.submap.covariance[:6, :6]
+                links.append(Link(previous, new, found.pairs, end @ found.T,
+                                  compose_covariance(end, end_covariance, found.T, found.covariance)))  # fmt: skip
+            covariance = compose_covariance(record.submap.end_pose, record.submap.covariance[:6, :6], T, covariance)
+            T = record.submap.end_pose @ T
+        return links
+
+    def closures(self, graph: MapGraph, chain: list[int], new: int, relative_pose: RelativePose) -> list[Link]:
+        """Links of record ``new`` beyond its chain that may be believed now; others may wait for confirmation."""
+        recent = {new, *chain[: self.config.window]}
+        near = self._near(graph, new, recent)
+        looks = self.index.query(graph.records[new].submap.descriptors, recent | set(near))
+        believed: list[Link] = []
+        for old in [*near, *looks]:
+            prior = relative_pose(old, new)
+            link, certain = self._judge(graph, old, new, prior)
+            if link is not None:
+                believed += [link] if certain else self._confirmed(graph, link)
+        return believed
+
+    def _near(self, graph: MapGraph, new: int, recent: set[int]) -> list[int]:
+        """Older records of the same component whose landmarks are around those of ``new``, nearest first."""
+        middle = _middle(graph, new)
+        others = [i for i in graph.records_of(graph.component(new)) if i not in recent]
+        distance = {i: float(np.linalg.norm(_middle(graph, i) - middle)) for i in others}
+        ranked = sorted((d, i) for i, d in distance.items() if d < self.config.proximity)
+        return [i for _, i in ranked[: self.config.near_candidates]]
+
+    def _judge(self, graph: MapGraph, old: int, new: int, prior: Prior | None) -> tuple[Link | None, bool]:
+        """The link between two records if geometry supports it, and whether the map can vouch for it."""
+        first, second = at_start(graph.records[old]), at_start(graph.records[new])
+        informative = prior is not None and _sigma(prior.covariance) < self.config.informative_sigma
+        if informative and prior is not None:
+            found = match(first, second, prior, self.config.association)
+            if len(found.pairs) >= self.config.min_near_inliers and self._overlaps(first, second, found):
+                return Link(old, new, found.pairs, found.T, found.covariance, True), True
+            return None, False
+        guess = self._by_looks(first, second, old, new)
+        if guess is None or not self._supported(first, second, guess):
+            return None, False
+        if prior is not None and not self._agrees(guess, prior):
+            return None, False
+        return Link(old, new, guess.pairs, guess.T, guess.covariance, True), False
+
+    def _by_looks(self, first: PointSet, second: PointSet, old: int, new: int) -> Alignment | None:
+        """Alignment from descriptors alone, refined with all landmarks around it."""
+        pairs = self._distinct_pairs(first, second)
+        rng = np.random.default_rng([self.config.seed, old, new])
+        coarse = ransac_rigid_transform(
+            second.points[pairs[:, 1]], first.points[pairs[:, 0]], self.config.ransac_distance, rng,
+            min_inliers=max(3, self.config.min_inliers // 2),
+        )  # fmt: skip
+        if not coarse.success:
+            return None
+        loose = np.diag([self.config.ransac_distance**2] * 3 + [0.05**2] * 3)
+        found = match(first, second, Prior(coarse.T, loose), self.config.association)
+        # The guess came from the same landmarks: without its weight the covariance is that of the landmarks alone.
+        free = Prior(found.T, 1e4 * np.eye(6))
+        return jointly_compatible(first, second, found.pairs, free, self.config.association)
+
+    def _distinct_pairs(self, first: PointSet, second: PointSet) -> IntArray:
+        """Mutually best descriptor pairs, clearly better than the second best."""
+        S = similarity(first, second)
+        if min(S.shape) < 2:
+            return np.empty((0, 2), dtype=np.int64)
+        i, j = np.nonzero(self.config.place_threshold <= S)
+        pairs = mutual_best(i, j, -S[i, j].astype(np.float64))
+        angle = np.arccos(np.clip(np.partition(S[pairs[:, 0]], -2, axis=1)[:, -2:], -1.0, 1.0))
+        return pairs[angle[:, 1] <= self.config.ratio * angle[:, 0]]
+
+    def _supported(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
+        return len(found.pairs) >= self.config.min_inliers and self._overlaps(first, second, found)
+
+    def _overlaps(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
+        """Matches are spread, and most landmarks that lie among them on both sides are matched."""
+        matched = first.points[found.pairs[:, 0]]
+        if np.sqrt(max(np.linalg.eigvalsh(np.cov(matched.T))[1], 0.0)) < self.config.min_spread:
+            return False
+        low, high = matched.min(axis=0), matched.max(axis=0)
+        moved = second.points @ found.T[:3, :3].T + found.T[:3, 3]
+        expected = min(_inside(first.points, low, high), _inside(moved, low, high))
+        return len(matched) >= self.config.min_overlap * expected
+
+    def _agrees(self, found: Alignment, prior: Prior) -> bool:
+        assert prior.covariance is not None
+        error = boxminus(found.T, prior.T)
+        nis = error @ np.linalg.solve(prior.covariance + found.covariance, error)
+        return bool(nis < chi2.ppf(self.config.probability, 6))
+
+    def _confirmed(self, graph: MapGraph, link: Link) -> list[Link]:
+        """The link with those waiting that say the same, if together they are enough; otherwise it waits too."""
+        agreeing = [other for other in self.pending if self._same_loop(graph, other, link)]
+        self.pending.append(link)
+        if len(agreeing) + 1 < self.config.confirmations:
+            return []
+        group_ = [*agreeing, link]
+        self.pending = [p for p in self.pending if not any(p is g for g in group_)]
+        return group_
+
+    def _same_loop(self, graph: MapGraph, a: Link, b: Link) -> bool:
+        """Whether two links between the same two stretches imply the same transform, within what both claim."""
+        paths = []
+        for link in (a, b):
+            T_first, T_second = (
+                graph.poses[graph.records[link.first].start],
+                graph.poses[graph.records[link.second].start],
+            )
+            paths.append((link, T_first, T_second))
+        if graph.component(a.first) != graph.component(b.first) or graph.component(a.second) != graph.component(
+            b.second
+        ):
+            return False
+        if a.first == b.first and a.second == b.second:
+            return False
+        T_a = paths[0][1] @ a.T @ invert_transform(paths[0][2])
+        T_b = paths[1][1] @ b.T @ invert_transform(paths[1][2])
+        # Both move the second stretch; they must put its landmarks in the same place, up to the drift in between.
+        middle = _middle(graph, b.second)
+        gap = np.linalg.norm((T_a @ np.append(middle, 1.0) - T_b @ np.append(middle, 1.0))[:3])
+        turn = np.linalg.norm(boxminus(T_a, T_b)[3:])
+        travelled = np.linalg.norm(_middle(graph, a.second) - middle) + np.linalg.norm(
+            _middle(graph, a.first) - _middle(graph, b.first)
+        )
+        return bool(gap < 0.1 + 0.05 * travelled + 3.0 * (_sigma(a.covariance) + _sigma(b.covariance)) and turn < 0.15)
+
+
+def relative_prior(T_map_a: FloatArray, T_map_b: FloatArray, joint: FloatArray) -> Prior:
+    """T_a_b of two poses with joint covariance (12, 12), and its covariance."""
+    T_a_map = invert_transform(T_map_a)
+    J_a, J_b = compose_jacobians(T_a_map, T_map_b)
+    J = np.concatenate([J_a @ inverse_jacobian(T_map_a), J_b], axis=1)
+    return Prior(T_a_map @ T_map_b, J @ joint @ J.T)
+
+
+def _middle(graph: MapGraph, record: int) -> FloatArray:
+    r = graph.records[record]
+    points = graph.points[r.observations]
+    return np.median(points, axis=0) if len(points) else graph.poses[r.start][:3, 3]
+
+
+def _sigma(covariance: FloatArray | None) -> float:
+    """Largest standard deviation of a position, m."""
+    return 0.0 if covariance is None else float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+
+
+def _inside(points: FloatArray, low: FloatArray, high: FloatArray) -> int:
+    return int(np.all((points >= low) & (points <= high), axis=1).sum())
+
+
+__all__ = ["ClosureConfig", "LinkFinder", "align", "at_end", "at_start", "relative_prior"]

@@ -1,0 +1,173 @@
+"""From the map graph to the joining problem and back: reduce, optimise, judge, recover.
+
+A landmark that only one submap has seen constrains nothing. It is marginalised out of its submap before joining (a
+Gaussian's rows are dropped) and recovered afterwards from its correlation with what was joined, both exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sjsam_node import kernels
+from sjsam_node.joining import JoiningProblem, Marginals
+from sjsam_node.map_graph import BoolArray, MapGraph, Record
+from sjsam_node.problem import LocalMap, State, block_rows, flatten
+from slam_core.config import Config, group, parameter
+from slam_core.geometry import FloatArray, boxminus, make_transform, so3_log
+from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
+from slam_core.sparse_cholesky import BACKENDS, IntArray
+
+
+@dataclass(frozen=True)
+class EstimatorConfig(Config):
+    """How the joining problem is posed and solved."""
+
+    rows: str = parameter(
+        "joint", "noise of a submap: its joint covariance, or per landmark", choices=("joint", "block")
+    )
+    iterations: int = parameter(30, "Gauss-Newton iterations per closure; 1 is Algorithm 4 as written", minimum=1)
+    solver: str = parameter("auto", "sparse solver", choices=BACKENDS)
+    optimizer: LevenbergMarquardtConfig = group(LevenbergMarquardtConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedMap:
+    """A submap without its private landmarks.
+
+    shared, private: indices of its landmarks. mean (m,) of (end position, end rotation vector, shared landmarks) and
+    information (m, m). gain (3p, m): private landmarks move by ``gain @ residual``; spread (p, 3, 3): the covariance
+    of each given everything that was kept.
+    """
+
+    shared: IntArray
+    private: IntArray
+    mean: FloatArray
+    information: FloatArray
+    gain: FloatArray
+    spread: FloatArray
+
+
+def reduce_map(record: Record, is_shared: BoolArray, rows: str) -> ReducedMap:
+    """Marginalise the private landmarks of a record out."""
+    submap = record.submap
+    shared, private = np.nonzero(is_shared)[0], np.nonzero(~is_shared)[0]
+    kept = np.concatenate([np.arange(6), (6 + 3 * shared[:, None] + np.arange(3)).ravel()])
+    dropped = (6 + 3 * private[:, None] + np.arange(3)).ravel()
+    end = submap.end_pose
+    mean = np.concatenate([end[:3, 3], so3_log(end[:3, :3]), submap.landmarks[shared].ravel()])
+    covariance = submap.covariance
+    information = np.linalg.inv(covariance[np.ix_(kept, kept)])
+    gain = covariance[np.ix_(dropped, kept)] @ information
+    blocks = dropped.reshape(-1, 3)
+    spread = covariance[blocks[:, :, None], blocks[:, None, :]]
+    if rows == "block":
+        local = block_rows(LocalMap(0, np.array([1]), shared, mean, information), 6, 3)
+        return ReducedMap(shared, private, mean, local.information, np.zeros_like(gain), spread)
+    spread = spread - np.einsum("pim,pmj->pij", gain.reshape(-1, 3, len(kept)),
+                                covariance[kept[None, :, None], blocks[:, None, :]])  # fmt: skip
+    return ReducedMap(shared, private, mean, 0.5 * (information + information.T), gain, spread)
+
+
+@dataclass(frozen=True, eq=False)
+class Assembled:
+    """One component as a joining problem: which nodes, landmarks and records it is made of."""
+
+    records: list[int]
+    nodes: IntArray
+    landmarks: IntArray
+    reduced: list[ReducedMap]
+    problem: JoiningProblem
+    state: State
+
+    def covariance(self, nodes: list[int]) -> FloatArray:
+        """Joint covariance (6k, 6k) of nodes, from the factor of the last linearisation."""
+        return self.problem.columns(np.searchsorted(self.nodes, nodes))
+
+
+@dataclass
+class Estimator:
+    """Optimises components of a map graph; keeps the reduced submaps, which change only where links change."""
+
+    config: EstimatorConfig = field(default_factory=EstimatorConfig)
+    _cache: dict[int, tuple[bytes, ReducedMap]] = field(default_factory=dict)
+
+    def assemble(self, graph: MapGraph, component: int) -> Assembled:
+        """Pose the joining problem of a component, its frame fixed at the start of its oldest record."""
+        records, is_shared = graph.records_of(component), graph.shared()
+        reduced = [self._reduced(graph, i, is_shared) for i in records]
+        nodes = np.nonzero(graph.component_of == component)[0]
+        seen = [
+            graph.landmark_of[graph.records[i].observations[m.shared]] for i, m in zip(records, reduced, strict=True)
+        ]
+        landmarks = np.unique(np.concatenate(seen))
+        maps = [
+            LocalMap(
+                int(np.searchsorted(nodes, graph.records[i].start)), np.searchsorted(nodes, [graph.records[i].end]),
+                np.searchsorted(landmarks, ids), m.mean, m.information,
+            )
+            for i, m, ids in zip(records, reduced, seen, strict=True)
+        ]  # fmt: skip
+        poses = graph.poses[nodes]
+        state = State(
+            np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), graph.points[landmarks]
+        )
+        anchor = np.searchsorted(nodes, [graph.oldest(component).start])
+        problem = JoiningProblem(flatten(maps), state, anchor, kernels.TANGENT, self.config.solver)
+        return Assembled(records, nodes, landmarks, reduced, problem, state)
+
+    def _reduced(self, graph: MapGraph, record: int, is_shared: BoolArray) -> ReducedMap:
+        mask = is_shared[graph.records[record].observations]
+        known = self._cache.get(record)
+        if known is None or known[0] != mask.tobytes():
+            known = (mask.tobytes(), reduce_map(graph.records[record], mask, self.config.rows))
+            self._cache[record] = known
+        return known[1]
+
+    def optimize(self, graph: MapGraph, component: int) -> tuple[Assembled, LeastSquaresResult]:
+        """Bring a component to its optimum and write it back to the graph."""
+        assembled = self.assemble(graph, component)
+        limit = min(self.config.iterations, self.config.optimizer.max_iterations)
+        optimizer = LevenbergMarquardtConfig(
+            limit, self.config.optimizer.relative_tolerance,
+            self.config.optimizer.initial_damping, self.config.optimizer.max_damping,
+        )  # fmt: skip
+        state, result = assembled.problem.optimize(assembled.state, optimizer)
+        graph.poses[assembled.nodes] = make_transform(state.rotations, state.translations)
+        graph.points[assembled.landmarks] = state.landmarks
+        for i, reduced in zip(assembled.records, assembled.reduced, strict=True):
+            self._recover(graph, graph.records[i], reduced)
+        return Assembled(
+            assembled.records, assembled.nodes, assembled.landmarks, assembled.reduced, assembled.problem, state
+        ), result
+
+    @staticmethod
+    def _recover(graph: MapGraph, record: Record, reduced: ReducedMap) -> None:
+        """Private landmarks of a record given what was joined."""
+        T = graph.poses[record.start]
+        shift = (reduced.gain @ local_residual(graph, record, reduced)).reshape(-1, 3)
+        private = record.submap.landmarks[reduced.private] + shift
+        graph.points[record.observations[reduced.private]] = private @ T[:3, :3].T + T[:3, 3]
+
+
+def local_residual(graph: MapGraph, record: Record, reduced: ReducedMap) -> FloatArray:
+    """Residual ``h [-] z`` (m,) of a record at the graph's estimate."""
+    T = graph.poses[record.start]
+    R, t = T[:3, :3], T[:3, 3]
+    end = graph.poses[record.end]
+    relative = make_transform(R.T @ end[:3, :3], R.T @ (end[:3, 3] - t))
+    points = graph.points[graph.landmark_of[record.observations[reduced.shared]]]
+    landmarks = (points - t) @ R - record.submap.landmarks[reduced.shared]
+    return np.concatenate([boxminus(relative, record.submap.end_pose), landmarks.ravel()])
+
+
+def observation_nis(residual: FloatArray, information: FloatArray) -> FloatArray:
+    """Squared error of each landmark of a local map as all its other rows predict it; 3 degrees of freedom each."""
+    n = (len(residual) - 6) // 3
+    weighted = (information @ residual)[6:].reshape(n, 3)
+    blocks = information[6:, 6:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+    return np.asarray(np.einsum("ni,ni->n", weighted, np.linalg.solve(blocks, weighted[..., None])[..., 0]))
+
+
+__all__ = ["Assembled", "Estimator", "EstimatorConfig", "Marginals", "ReducedMap", "local_residual", "observation_nis"]

@@ -1,0 +1,266 @@
+"""The map of all agents: submaps go in one by one, a consistent map and trajectories with covariances come out.
+
+    global_map = GlobalMap(GlobalMapConfig())
+    for submap in submaps:
+        report = global_map.add(submap)
+
+:meth:`GlobalMap.add` reads as Algorithm 4 does: place the submap, associate, join; and beyond it: look for closures,
+judge them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from sjsam_node import map_view
+from sjsam_node.association import Prior
+from sjsam_node.closures import ClosureConfig, LinkFinder, relative_prior
+from sjsam_node.estimator import Assembled, Estimator, EstimatorConfig, local_residual, observation_nis
+from sjsam_node.map_graph import Link, MapGraph, without
+from slam_core.config import Config, group, parameter
+from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
+from slam_core.types import Counters, PoseEstimate, Submap
+
+
+@dataclass(frozen=True)
+class GlobalMapConfig(Config):
+    """The joined map."""
+
+    outlier_probability: float = parameter(
+        0.99999, "share of true matches that a joined map keeps", minimum=0.9, maximum=0.99999999
+    )
+    outlier_rounds: int = parameter(5, "times a joined map is searched for false matches", minimum=0)
+    unlinked_sigma: float = parameter(
+        100.0, "standard deviation given to poses of a stretch that nothing ties to the map yet", unit="m", minimum=1.0
+    )
+    estimator: EstimatorConfig = group(EstimatorConfig)
+    closure: ClosureConfig = group(ClosureConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class JoinReport:
+    """What became of one submap.
+
+    accepted with reason otherwise; matched: its landmarks already in the map; new_landmarks; closures: links believed
+    now, as (agent, index) of the older submap; dropped_links: links taken back; components: parts of the map that
+    hang together; chi2, iterations, converged and solver of the joining; update: ``batch`` or ``incremental``.
+    """
+
+    accepted: bool
+    reason: str = ""
+    matched: int = 0
+    new_landmarks: int = 0
+    closures: tuple[tuple[str, int], ...] = ()
+    dropped_links: int = 0
+    components: int = 0
+    chi2: float = 0.0
+    iterations: int = 0
+    converged: bool = True
+    solver: str = ""
+    update: str = ""
+
+
+class GlobalMap:
+    """Joins submaps of one or several agents, each as it comes."""
+
+    def __init__(self, config: GlobalMapConfig | None = None) -> None:
+        self.config = config or GlobalMapConfig()
+        self.counters = Counters()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.graph = MapGraph()
+        self.finder = LinkFinder(self.config.closure)
+        self.estimator = Estimator(self.config.estimator)
+        self._sessions: dict[str, int] = {}
+        self._assembled: dict[int, Assembled] = {}
+        self._lookup: dict[tuple[str, int, int], int] = {}
+
+    def add(self, submap: Submap) -> JoinReport:
+        """Join one submap; a faulty one is refused with the reason, counted, and changes nothing."""
+        reason = self._fault(submap)
+        if reason:
+            self.counters.add(f"refused: {reason}")
+            return JoinReport(False, reason)
+        new = self._place(submap)
+        chain = self._chain(new)
+        for link in self.finder.sequential(self.graph, chain, new):
+            self.graph.add_link(link)
+        cost, iterations, converged = self._optimize(new)
+        matched = self._matched(new)
+        closures, dropped = self._close_loops(new, chain, cost)
+        self.finder.index.add(new, submap.descriptors)
+        final = self._assembled[self.graph.component(new)]
+        return JoinReport(
+            True, "", matched, len(submap.landmarks) - self._matched(new), tuple(closures), dropped, self.components,
+            final.problem.cost(final.state), iterations, converged, final.problem.backend, "batch",
+        )  # fmt: skip
+
+    @property
+    def components(self) -> int:
+        """Parts of the map that nothing ties together yet."""
+        return len(np.unique(self.graph.component_of))
+
+    def _fault(self, submap: Submap) -> str:
+        """Why a submap cannot be joined; empty if it can."""
+        if not (np.all(np.isfinite(submap.covariance)) and np.all(np.isfinite(submap.landmarks))):
+            return "not finite"
+        if not is_rigid_transform(submap.end_pose):
+            return "end pose is not a rigid transform"
+        try:
+            np.linalg.cholesky(submap.covariance)
+        except np.linalg.LinAlgError:
+            return "covariance is not positive definite"
+        known = self.graph.records[0].submap.descriptors.shape[1] if self.graph.records else None
+        if known is not None and submap.descriptors.shape[1] != known and len(submap.landmarks):
+            return f"descriptors of {submap.descriptors.shape[1]} columns in a map of {known}"
+        held = self._lookup.get((submap.agent, self._session_of(submap), submap.index))
+        return "" if held is None else "already joined"
+
+    def _session_of(self, submap: Submap) -> int:
+        """Run of the agent: an index that is already taken by another stamp means that the agent has started anew."""
+        session = self._sessions.get(submap.agent, 0)
+        held = self._lookup.get((submap.agent, session, submap.index))
+        if held is not None and self.graph.records[held].submap.start_stamp_ns != submap.start_stamp_ns:
+            return session + 1
+        return session
+
+    def _place(self, submap: Submap) -> int:
+        """Add a record at the end of its predecessor, or as a component of its own where the agent was last seen."""
+        session = self._session_of(submap)
+        self._sessions[submap.agent] = session
+        previous = self._lookup.get((submap.agent, session, submap.index - 1))
+        follows = submap.follows_previous and previous is not None
+        start = self.graph.records[previous].end if follows and previous is not None else None
+        self.graph.append(submap, session, start, self._last_pose(submap.agent))
+        new = len(self.graph.records) - 1
+        self._lookup[submap.agent, session, submap.index] = new
+        return new
+
+    def _last_pose(self, agent: str) -> FloatArray:
+        """Where an agent was last; the origin for one not seen before."""
+        own = [r for r in self.graph.records if r.submap.agent == agent]
+        return self.graph.poses[own[-1].end] if own else np.eye(4)
+
+    def _chain(self, new: int) -> list[int]:
+        """Records before ``new`` along its agent's odometry, newest first."""
+        chain, record = [], self.graph.records[new]
+        agent, session, index = record.key
+        while (previous := self._lookup.get((agent, session, index - 1))) is not None and (
+            self.graph.records[previous].end == self.graph.records[self._lookup[agent, session, index]].start
+        ):
+            chain.append(previous)
+            index -= 1
+        return chain
+
+    def _matched(self, new: int) -> int:
+        """Landmarks of a record that another record sees too."""
+        return int(self.graph.shared()[self.graph.records[new].observations].sum())
+
+    def _optimize(self, record: int) -> tuple[float, int, bool]:
+        """Optimise the component of a record; cost, iterations, converged."""
+        component = self.graph.component(record)
+        assembled, result = self.estimator.optimize(self.graph, component)
+        self._assembled[component] = assembled
+        return result.cost, result.iterations, result.converged
+
+    def _relative_pose(self, first: int, second: int) -> Prior | None:
+        """What the map knows of T_first_second (starts of two records)."""
+        component = self.graph.component(first)
+        if component != self.graph.component(second):
+            return None
+        assembled = self._assembled[component]
+        nodes = [self.graph.records[i].start for i in (first, second)]
+        joint = assembled.covariance(nodes)
+        return relative_prior(self.graph.poses[nodes[0]], self.graph.poses[nodes[1]], joint)
+
+    def _close_loops(self, new: int, chain: list[int], cost: float) -> tuple[list[tuple[str, int]], int]:
+        """Believe the closures that the joined map can live with."""
+        closed, dropped = [], 0
+        for link in self.finder.closures(self.graph, chain, new, self._relative_pose):
+            taken, cost = self._try_closure(link, cost)
+            if not taken:
+                self.counters.add("closures refused by the joined map")
+                continue
+            older = self.graph.records[link.first].submap
+            closed.append((older.agent, older.index))
+        if closed:
+            dropped = self._drop_outliers(new)
+        return closed, dropped
+
+    def _try_closure(self, link: Link, cost: float) -> tuple[bool, float]:
+        """Join with the closure; keep it if the cost rises no more than true matches make it rise."""
+        joins_components = self.graph.component(link.first) != self.graph.component(link.second)
+        before = self.graph.snapshot()
+        if joins_components:
+            cost = sum(self._assembled_cost(i) for i in (link.first, link.second))
+        self.graph.add_link(link)
+        after, _, _ = self._optimize(link.second)
+        dof = 3 * len(link.pairs) - (6 if joins_components else 0)
+        if after - cost <= chi2.ppf(self.config.closure.probability, max(dof, 1)):
+            return True, after
+        self.graph.restore(before)
+        self._optimize(link.second)
+        return False, cost
+
+    def _assembled_cost(self, record: int) -> float:
+        assembled = self._assembled[self.graph.component(record)]
+        return assembled.problem.cost(assembled.state)
+
+    def _drop_outliers(self, record: int) -> int:
+        """Take back matches that the joined map contradicts, worst first, and links that lose most of theirs."""
+        dropped = 0
+        for _ in range(self.config.outlier_rounds):
+            outliers = self._outliers(self.graph.component(record))
+            if not outliers:
+                break
+            links = [kept for link in self.graph.links if (kept := without(self.graph, link, outliers)) is not None]
+            dropped += len(self.graph.links) - len(links)
+            self.counters.add("matches taken back", len(outliers))
+            self.graph.replace_links(links)
+            self._optimize(record)
+        return dropped
+
+    def _outliers(self, component: int) -> set[int]:
+        """The worst observation of each record, where it is beyond its gate."""
+        gate = chi2.ppf(self.config.outlier_probability, 3)
+        assembled, worst = self._assembled[component], set()
+        for i, reduced in zip(assembled.records, assembled.reduced, strict=True):
+            record = self.graph.records[i]
+            nis = observation_nis(local_residual(self.graph, record, reduced), reduced.information)
+            if len(nis) and nis.max() > gate:
+                worst.add(int(record.observations[reduced.shared[nis.argmax()]]))
+        return worst
+
+    def trajectory(self) -> dict[str, list[PoseEstimate]]:
+        """Every agent's rig poses in the map frame with covariances (see :func:`sjsam_node.map_view.trajectory`)."""
+        return map_view.trajectory(self)
+
+    def landmarks(self) -> map_view.MapLandmarks:
+        """Every landmark once, with covariance, descriptor and id."""
+        return map_view.landmarks(self)
+
+    def map_to_odom(self, agent: str) -> FloatArray:
+        """T_map_odom of an agent: what its newest joined pose adds to its own odometry (chained submap end poses)."""
+        own = [r for r in self.graph.records if r.submap.agent == agent]
+        if not own:
+            return np.eye(4)
+        return np.asarray(self.graph.poses[own[-1].end] @ invert_transform(self.odometry_pose(agent)))
+
+    def odometry_pose(self, agent: str) -> FloatArray:
+        """End pose of an agent's newest submap in its own odometry frame: the chain of end poses of its current run."""
+        own = [r.submap for r in self.graph.records if r.submap.agent == agent and r.session == self._sessions[agent]]
+        T = np.eye(4)
+        for submap in sorted(own, key=lambda s: s.index):
+            T = T @ submap.end_pose
+        return T
+
+    def assembled(self, component: int) -> Assembled:
+        """The joining problem of a component at its optimum."""
+        if component not in self._assembled:
+            self._assembled[component], _ = self.estimator.optimize(self.graph, component)
+        return self._assembled[component]

@@ -1,0 +1,196 @@
+"""What has been joined so far: submaps, the poses between them, and which of their landmarks are the same.
+
+*Nodes* are the poses at which submaps start and end (the skeleton of chapter 7). An *observation* is one landmark of
+one submap, numbered through all submaps. *Links* say that observations of two submaps are the same thing; a landmark
+of the map is a set of observations that hang together by links, named after its oldest observation. Links can be
+taken back, so that a closure that turns out false leaves no trace. A *component* is what hangs together by submaps
+and links; each has its own frame until it is joined to another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.geometry import FloatArray, invert_transform
+from slam_core.sparse_cholesky import IntArray
+from slam_core.types import Submap
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A submap in the map: its nodes, its first observation, and the run of the agent it belongs to."""
+
+    submap: Submap
+    session: int
+    start: int
+    end: int
+    first_observation: int
+
+    @property
+    def key(self) -> tuple[str, int, int]:
+        """Agent, session and index: unique, and an order that does not depend on when a submap arrived."""
+        return self.submap.agent, self.session, self.submap.index
+
+    @property
+    def observations(self) -> IntArray:
+        """Numbers of its observations, (n,)."""
+        return np.arange(self.first_observation, self.first_observation + len(self.submap.landmarks))
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """Matched landmarks of two records: index pairs (k, 2) and the alignment T_first_second they imply (6x6
+    covariance).
+    """
+
+    first: int
+    second: int
+    pairs: IntArray
+    T: FloatArray
+    covariance: FloatArray
+    is_closure: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """Links and estimate of a map graph at one time."""
+
+    links: list[Link]
+    poses: FloatArray
+    points: FloatArray
+    component_of: IntArray
+
+
+@dataclass
+class MapGraph:
+    """Submaps, nodes, links and the current estimate of all of them."""
+
+    records: list[Record] = field(default_factory=list)
+    links: list[Link] = field(default_factory=list)
+    poses: FloatArray = field(default_factory=lambda: np.empty((0, 4, 4)))
+    points: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    landmark_of: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    component_of: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    _seen_in: dict[int, set[int]] = field(default_factory=dict)
+    _members: dict[int, list[int]] = field(default_factory=dict)
+
+    def append(self, submap: Submap, session: int, start: int | None, guess: FloatArray) -> Record:
+        """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own."""
+        if start is None:
+            start = self._new_node(guess, len(self.poses))
+        T = self.poses[start]
+        end = self._new_node(T @ submap.end_pose, int(self.component_of[start]))
+        record = Record(submap, session, start, end, len(self.points))
+        self.points = np.concatenate([self.points, submap.landmarks @ T[:3, :3].T + T[:3, 3]])
+        self.landmark_of = np.concatenate([self.landmark_of, record.observations])
+        for observation in record.observations.tolist():
+            self._seen_in[observation] = {len(self.records)}
+            self._members[observation] = [observation]
+        self.records.append(record)
+        return record
+
+    def _new_node(self, T: FloatArray, component: int) -> int:
+        self.poses = np.concatenate([self.poses, T[None]])
+        self.component_of = np.append(self.component_of, component)
+        return len(self.poses) - 1
+
+    def component(self, record: int) -> int:
+        """Component that a record is in."""
+        return int(self.component_of[self.records[record].start])
+
+    def records_of(self, component: int) -> list[int]:
+        """Records of a component, ascending."""
+        return [i for i in range(len(self.records)) if self.component(i) == component]
+
+    def add_link(self, link: Link) -> int:
+        """Believe a link: fuse the landmarks that its pairs name; the number of pairs that could be fused.
+
+        Where the two records are in different components the younger one (by key) is moved onto the older.
+        """
+        if self.component(link.first) != self.component(link.second):
+            self._merge(link)
+        self.links.append(link)
+        return self._fuse(link)
+
+    def _fuse(self, link: Link) -> int:
+        a, b = self.records[link.first].first_observation, self.records[link.second].first_observation
+        return sum(self._unite(a + int(i), b + int(j)) for i, j in link.pairs)
+
+    def _unite(self, a: int, b: int) -> bool:
+        """Make two observations one landmark, unless a submap would then see the same landmark twice."""
+        keep, gone = sorted((int(self.landmark_of[a]), int(self.landmark_of[b])))
+        if keep == gone:
+            return True
+        if self._seen_in[keep] & self._seen_in[gone]:
+            return False
+        self._seen_in[keep] |= self._seen_in.pop(gone)
+        members = self._members.pop(gone)
+        self._members[keep] += members
+        self.landmark_of[members] = keep
+        return True
+
+    def _merge(self, link: Link) -> None:
+        first, second = self.component(link.first), self.component(link.second)
+        T_first_second = link.T
+        anchor, moved = link.first, link.second
+        if self.oldest(first).key > self.oldest(second).key:
+            first, second, anchor, moved = second, first, moved, anchor
+            T_first_second = invert_transform(link.T)
+        T_map_moved = self.poses[self.records[anchor].start] @ T_first_second
+        self.move(second, T_map_moved @ invert_transform(self.poses[self.records[moved].start]))
+        self.component_of[self.component_of == second] = first
+
+    def oldest(self, component: int) -> Record:
+        """The record of a component with the least key: its start defines the component's frame."""
+        return min((self.records[i] for i in self.records_of(component)), key=lambda r: r.key)
+
+    def move(self, component: int, T: FloatArray) -> None:
+        """Transform the estimate of a whole component by ``T``, on the left."""
+        nodes = self.component_of == component
+        self.poses[nodes] = T @ self.poses[nodes]
+        for i in self.records_of(component):
+            rows = self.records[i].observations
+            self.points[rows] = self.points[rows] @ T[:3, :3].T + T[:3, 3]
+
+    def replace_links(self, links: Iterable[Link]) -> None:
+        """Believe exactly these links (of those there were): landmarks are fused anew from them."""
+        self.links = list(links)
+        self.landmark_of = np.arange(len(self.points))
+        self._members = {i: [i] for i in range(len(self.points))}
+        self._seen_in = {o: {i} for i, r in enumerate(self.records) for o in r.observations.tolist()}
+        for link in self.links:
+            self._fuse(link)
+
+    def snapshot(self) -> Snapshot:
+        """The beliefs and the estimate, to come back to."""
+        return Snapshot(list(self.links), self.poses.copy(), self.points.copy(), self.component_of.copy())
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Back to a snapshot taken since the last submap was added."""
+        self.poses, self.points = snapshot.poses.copy(), snapshot.points.copy()
+        self.component_of = snapshot.component_of.copy()
+        self.replace_links(snapshot.links)
+
+    def shared(self) -> BoolArray:
+        """Whether each observation's landmark is seen by more than one submap, (observations,) bool."""
+        return np.asarray(np.bincount(self.landmark_of, minlength=len(self.points))[self.landmark_of] > 1)
+
+    def members(self, landmark: int) -> list[int]:
+        """Observations of a landmark."""
+        return self._members[landmark]
+
+
+def without(graph: MapGraph, link: Link, observations: set[int]) -> Link | None:
+    """The link without pairs that name any of the observations; None if fewer than three are left."""
+    a, b = graph.records[link.first].first_observation, graph.records[link.second].first_observation
+    bad = [a + int(i) in observations or b + int(j) in observations for i, j in link.pairs]
+    if not any(bad):
+        return link
+    kept = link.pairs[~np.array(bad)]
+    return replace(link, pairs=kept) if len(kept) >= 3 or not link.is_closure else None
