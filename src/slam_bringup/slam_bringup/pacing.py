@@ -63,7 +63,7 @@ class FlowControl:
                     stamps.append(stamp_ns)
 
     def wait(self, topic: str) -> bool:
-        """Block until ``topic`` may send again; False if patience ran out, and what was on its way is then forgotten."""
+        """Block until ``topic`` may send again; False if patience ran out: what was on its way is then forgotten."""
         return self._wait_until(lambda: self._most_on_the_way(topic) < self._window)
 
     def drain(self) -> bool:

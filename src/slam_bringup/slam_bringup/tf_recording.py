@@ -1,7 +1,7 @@
 """Transforms for a recording made without tf2_msgs: /tf and /tf_static from the topics that carry the same.
 
-tf2_msgs has no wheel on PyPI, so in a pip installation the nodes publish TransformStamped only; the bag gets /tf anyway,
-because every viewer needs it.
+tf2_msgs has no wheel on PyPI, so in a pip installation the nodes publish TransformStamped only; the bag gets /tf
+anyway, because every viewer needs it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _CARRIERS = {"map_to_odom": "/tf", "static_transforms": "/tf_static", "odom": "/
 
 
 def transform_topic(topic: str) -> str | None:
-    """ "/tf" or "/tf_static" if messages of ``topic`` carry a transform, else None."""
+    """Where transforms carried by ``topic`` belong, /tf or /tf_static; None if it carries none."""
     return _CARRIERS.get(topic.rsplit("/", 1)[-1])
 
 

@@ -53,7 +53,7 @@ C = TypeVar("C", bound=Config)
 WATCHDOG_S = 5.0
 LATCHED_DEPTH = 1000
 PROGRESS_TOPIC = "/progress"
-STATIC_TRANSFORMS_TOPIC = "static_transforms"
+STATIC_TRANSFORMS_TOPIC = "/static_transforms"
 """TransformStamped, latched, one message per transform: /tf_static for installations without tf2_msgs."""
 
 

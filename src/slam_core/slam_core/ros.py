@@ -116,6 +116,15 @@ def has_tf2_msgs() -> bool:
     return importlib.util.find_spec("tf2_msgs") is not None
 
 
+def message_class(type_name: str) -> Any:
+    """The class of ``package/msg/Name``, or None where the package is not installed."""
+    package, _, name = type_name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError):
+        return None
+
+
 class RunnableNode(Protocol):
     """What :func:`run_node` needs of a node beside rclpy's own."""
 
