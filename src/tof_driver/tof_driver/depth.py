@@ -43,28 +43,29 @@ class DepthProcessor:
     config
         What the input holds, noise model and limits.
     camera
-        Intrinsics and lens distortion of the raw images. The output is the pinhole camera with the same camera matrix
-        (:attr:`output_camera`); a camera without distortion is passed through without resampling.
+        Intrinsics and lens distortion of the raw images.
+    rectified
+        Camera of the output, without distortion (the P of a camera info); None: the same camera matrix. Where it equals
+        ``camera`` the images are passed through without resampling.
 
     Attributes
     ----------
+    output_camera
+        Camera of the depth images that :meth:`process` returns.
     counters
         ``images``, raw pixels by :class:`Reason` and ``output_pixels`` (rectified pixels with depth) since the start.
     """
 
-    def __init__(self, config: DepthConfig, camera: Camera) -> None:
+    def __init__(self, config: DepthConfig, camera: Camera, rectified: Camera | None = None) -> None:
         self.config = config
         self.camera = camera
+        self.output_camera = rectified or replace(camera, distortion_model="none", distortion=())
         self.counters = Counters()
         self._noise = _with_model(config.noise, config.measurement)
-        self._rectification = None if camera.is_rectified else RectificationMap.of(camera)
+        same = camera.is_rectified and np.allclose(self.output_camera.K, camera.K, atol=1e-6)
+        self._rectification = None if same else RectificationMap.between(camera, self.output_camera)
         self._ray_length = _ray_length(camera)
         self._pixel_angle = 1.0 / min(camera.fx, camera.fy)
-
-    @property
-    def output_camera(self) -> Camera:
-        """Camera of the depth images that :meth:`process` returns."""
-        return self.camera if self._rectification is None else self._rectification.camera
 
     def process(
         self, stamp_ns: int, image: AnyArray, amplitude: AnyArray | None = None, intensity: AnyArray | None = None
@@ -130,8 +131,7 @@ class DepthProcessor:
         noise, mask = self._noise, self.config.mask
         if noise.model == "quadratic":
             amplitude = None  # a picture, not the strength of the camera's own light: it judges nothing
-        white_amplitude = noise.reference_amplitude * noise.reference_range**2
-        reason = judge_pixels(mask, distance, amplitude, white_amplitude)
+        reason = judge_pixels(mask, distance, amplitude)
         if noise.model == "quadratic":
             sigma = range_sigma(noise, distance / self._ray_length, None) * self._ray_length
         else:

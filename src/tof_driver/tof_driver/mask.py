@@ -36,7 +36,10 @@ class MaskConfig(Config):
     maximum_range: float = parameter(7.5, "farthest believable range", unit="m", minimum=0.1)
     minimum_amplitude: float = parameter(20.0, "below: too dark; 0 switches the test off", unit="digits", minimum=0.0)
     saturated_amplitude: float = parameter(
-        60000.0, "at or above: saturated; 0 switches the test off", unit="digits", minimum=0.0
+        2200.0, "at or above: saturated; 0 switches the test off", unit="digits", minimum=0.0
+    )
+    white_amplitude: float = parameter(
+        1000.0, "amplitude of a white surface at 1 m, seen straight on", unit="digits", minimum=1e-6
     )
     minimum_reflectivity: float = parameter(
         0.02,
@@ -55,9 +58,7 @@ class MaskConfig(Config):
     )
 
 
-def judge_pixels(
-    config: MaskConfig, distance: Float32Array, amplitude: Float32Array | None, white_amplitude: float
-) -> ByteArray:
+def judge_pixels(config: MaskConfig, distance: Float32Array, amplitude: Float32Array | None) -> ByteArray:
     """The :class:`Reason` of each pixel judged alone, uint8, the shape of ``distance``.
 
     Parameters
@@ -68,19 +69,17 @@ def judge_pixels(
         Range along the ray, m; NaN, infinite or not positive where the sensor has no reading.
     amplitude
         Same shape, digits, or None.
-    white_amplitude
-        Amplitude of a white wall at 1 m, digits: amplitude * range^2 of reflectivity one.
     """
     reason = np.zeros(distance.shape, dtype=np.uint8)
     if amplitude is not None:
         with np.errstate(invalid="ignore", over="ignore"):
-            reflectivity = amplitude * np.square(distance) / np.float32(white_amplitude)
+            reflectivity = amplitude * np.square(distance) / np.float32(config.white_amplitude)
         reason[reflectivity < config.minimum_reflectivity] = Reason.WRAPPED
-        if config.saturated_amplitude > 0.0:
-            reason[amplitude >= config.saturated_amplitude] = Reason.SATURATED
         reason[(amplitude < config.minimum_amplitude) | ~np.isfinite(amplitude)] = Reason.TOO_DARK
     reason[(distance < config.minimum_range) | (distance > config.maximum_range)] = Reason.OUT_OF_RANGE
     reason[~(np.isfinite(distance) & (distance > 0.0))] = Reason.NO_READING
+    if amplitude is not None and config.saturated_amplitude > 0.0:
+        reason[amplitude >= config.saturated_amplitude] = Reason.SATURATED
     return reason
 
 

@@ -31,9 +31,11 @@ class NoiseConfig(Config):
     )
     reference_sigma: float = parameter(0.003, "standard deviation at the reference", unit="m", minimum=1e-5)
     reference_amplitude: float = parameter(
-        1000.0, "amplitude of a white wall, seen straight on, at the reference range", unit="digits", minimum=1e-6
+        125.0, "amplitude at which reference_sigma holds: grey wall at the reference range", unit="digits", minimum=1e-6
     )
-    floor: float = parameter(0.0005, "part of sigma that no amplitude removes", unit="m", minimum=0.0)
+    floor: float = parameter(
+        0.002, "part of sigma that no light removes: constant range errors of the pixels", unit="m", minimum=0.0
+    )
     constant: float = parameter(0.0012, "model quadratic: sigma at depth zero", unit="m", minimum=0.0)
     quadratic: float = parameter(
         0.001425,

@@ -7,7 +7,7 @@ otherwise the output has no depth there. Foreground and background are never mix
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -21,18 +21,16 @@ from slam_core.types import Float32Array
 class RectificationMap:
     """Where each pixel of the ideal image lies in the distorted one: ``u``, ``v`` float32 (height, width) px."""
 
-    camera: Camera
     u: Float32Array
     v: Float32Array
 
     @classmethod
-    def of(cls, camera: Camera) -> RectificationMap:
-        """Map from ``camera`` to the pinhole camera with the same camera matrix and size."""
-        ideal = replace(camera, distortion_model="none", distortion=())
-        v, u = np.mgrid[: camera.height, : camera.width]
+    def between(cls, camera: Camera, ideal: Camera) -> RectificationMap:
+        """Map from the images of ``camera`` to those of ``ideal``, a camera without distortion at the same place."""
+        v, u = np.mgrid[: ideal.height, : ideal.width]
         rays = ideal.normalised_from_pixels(np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
-        pixels = camera.pixels_from_normalised(rays).astype(np.float32).reshape(camera.height, camera.width, 2)
-        return cls(ideal, np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1]))
+        pixels = camera.pixels_from_normalised(rays).astype(np.float32).reshape(ideal.height, ideal.width, 2)
+        return cls(np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1]))
 
     def image(self, image: Float32Array) -> Float32Array:
         """Bilinear resampling of a picture (amplitude, intensity); zero outside the distorted image."""

@@ -1,0 +1,182 @@
+"""The ``tof_driver`` node: raw images of a ToF or any depth camera in, rectified depth with its noise and points out.
+
+    tof/range/image_raw (or tof/depth/image_raw), tof/{amplitude,intensity}/image_raw, tof/camera_info
+        -> tof/depth/image, tof/noise/image, tof/points, tof/{amplitude,intensity}/image
+
+One ``tof/camera_info`` serves raw and rectified images, as everywhere in ROS: K and D are those of the raw image, P of
+the rectified one. It comes from the camera's own driver; with the parameter ``info`` it comes from a YAML file and this
+node publishes it. ``tof/set_camera_info`` writes that file.
+"""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sensor_msgs.srv import SetCameraInfo
+
+from slam_core.base_node import SlamNode
+from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info
+from slam_core.camera import CameraInfo
+from slam_core.config import parameter
+from slam_core.health import State
+from slam_core.messages import (
+    DEPTH_TOPICS,
+    camera_info_from_message,
+    camera_info_message,
+    cloud_message,
+    depth_messages,
+    image_from_message,
+    stamp_ns,
+)
+from slam_core.messages.base import Message
+from slam_core.ros import run_node
+from slam_core.types import AnyArray
+from tof_driver.depth import DepthConfig, DepthProcessor
+from tof_driver.points import depth_cloud
+
+WAITING = 100
+"""Images kept while no camera info has come."""
+FEW_PIXELS = 0.05
+"""A smaller share of pixels with depth is reported as DEGRADED."""
+
+
+@dataclass(frozen=True)
+class TofDriverConfig(DepthConfig):
+    """Depth processing, and which topics the images come from."""
+
+    pictures: str = parameter(
+        "auto",
+        "images beside range; auto: amplitude and intensity with measurement range, none with depth",
+        choices=("auto", "both", "amplitude", "none"),
+    )
+    info: str = parameter("", "camera_info YAML file; empty: from the topic tof/camera_info")
+
+
+class TofDriverNode(SlamNode[TofDriverConfig]):
+    """Publishes the topics of :data:`slam_core.messages.DEPTH_TOPICS`."""
+
+    def __init__(self) -> None:
+        super().__init__("tof_driver", TofDriverConfig)
+        self.info: CameraInfo | None = None
+        self.processor: DepthProcessor | None = None
+        self._waiting: deque[tuple[Message, ...]] = deque()
+        self._pictures = self._picture_names()
+        if self.config.info:
+            self._use(_read(self.config.info))
+        self._advertise_outputs()
+        self._listen_to_inputs()
+        self.create_service(SetCameraInfo, "tof/set_camera_info", self._on_set_info)
+
+    def on_reset(self) -> None:
+        """Forget what waits; the calibration stays."""
+        self._waiting.clear()
+
+    # -- topics --------------------------------------------------------------------------------------------------------
+
+    def _picture_names(self) -> tuple[str, ...]:
+        chosen = self.config.pictures
+        if chosen == "auto":
+            chosen = "both" if self.config.measurement == "range" else "none"
+        return {"both": ("amplitude", "intensity"), "amplitude": ("amplitude",), "none": ()}[chosen]
+
+    def _advertise_outputs(self) -> None:
+        unused = {f"tof/{name}/image" for name in ("amplitude", "intensity") if name not in self._pictures}
+        if not self.config.info:
+            unused.add("tof/camera_info")
+        for topic, kind in DEPTH_TOPICS.items():
+            if topic not in unused:
+                self.advertise(topic, kind)
+
+    def _listen_to_inputs(self) -> None:
+        if not self.config.info:
+            self.listen("tof/camera_info", "CameraInfo", self._on_info)
+        names = (self.config.measurement, *self._pictures)
+        self.listen_together({f"tof/{name}/image_raw": "Image" for name in names}, self._on_images)
+
+    # -- inputs --------------------------------------------------------------------------------------------------------
+
+    def _on_info(self, message: Message) -> None:
+        self._use(camera_info_from_message(message))
+        while self._waiting:
+            self._process_images(self._waiting.popleft())
+
+    def _on_images(self, *messages: Message) -> None:
+        if self.processor is not None:
+            self._process_images(messages)
+            return
+        self._waiting.append(messages)
+        if len(self._waiting) > WAITING:
+            self._waiting.popleft()
+            self.health.count("images_without_camera_info")
+
+    def _process_images(self, messages: tuple[Message, ...]) -> None:
+        assert self.processor is not None
+        pictures: list[AnyArray | None] = [image_from_message(m) for m in messages]
+        pictures += [None] * (3 - len(pictures))
+        image, amplitude, intensity = pictures
+        assert image is not None
+        depth = self.processor.process(stamp_ns(messages[0]), image, amplitude, intensity)
+        self.health.counters.update(self.processor.counters.counts)
+        share = float(np.isfinite(depth.depth).mean())
+        few = share < FEW_PIXELS
+        self.health.set(
+            State.DEGRADED if few else State.OK, f"{100 * share:.1f} % of the pixels have depth" if few else ""
+        )
+        header = messages[0].header
+        outputs = depth_messages(self.types, depth, header.frame_id)
+        outputs = outputs._replace(points=cloud_message(self.types, header, depth_cloud(depth)))
+        if self.info is not None and self.config.info:
+            outputs = outputs._replace(camera_info=camera_info_message(self.types, header, self.info))
+        for topic, message in zip(DEPTH_TOPICS, outputs, strict=True):
+            if topic in self._outputs and message is not None:
+                self.publish(topic, message)
+
+    # -- calibration ---------------------------------------------------------------------------------------------------
+
+    def _use(self, info: CameraInfo) -> None:
+        known = self.info
+        if known is not None and known.camera == info.camera and np.array_equal(known.P, info.P):
+            return
+        self.processor = DepthProcessor(depth_config(self.config), info.camera, info.rectified)
+        self.info = info
+
+    def _on_set_info(self, request: Any, response: Any) -> Any:
+        try:
+            response.status_message = self._store_info(camera_info_from_message(request.camera_info))
+            response.success = True
+        except (ValueError, OSError) as error:
+            response.success, response.status_message = False, str(error)
+        return response
+
+    def _store_info(self, info: CameraInfo) -> str:
+        if not self.config.info:
+            raise ValueError(
+                "the camera info comes from the topic tof/camera_info: set the parameter info to a YAML file"
+            )
+        CameraInfoFile(info, "tof").write(Path(self.config.info).expanduser())
+        self._use(info)
+        return f"written to {self.config.info} and in use"
+
+
+def depth_config(config: TofDriverConfig) -> DepthConfig:
+    """The part of the node's configuration that is the algorithm's."""
+    return DepthConfig(**{f.name: getattr(config, f.name) for f in fields(DepthConfig)})
+
+
+def _read(path: str) -> CameraInfo:
+    try:
+        return read_camera_info(Path(path).expanduser()).info
+    except OSError as error:
+        raise ValueError(f"info: {error}") from error
+
+
+def main() -> None:
+    """Entry point of ``ros2 run tof_driver tof_driver``."""
+    run_node(TofDriverNode)
