@@ -30,7 +30,7 @@ class FeatureConfig(Config):
     """Which features, how many and how they are spread."""
 
     detector: str = parameter("surf", "keypoint detector and descriptor", choices=DETECTORS)
-    target: int = parameter(500, "number of features wanted per image", minimum=10, maximum=20000)
+    target: int = parameter(600, "number of features wanted per image", minimum=10, maximum=20000)
     grid_columns: int = parameter(10, "columns of the coverage grid", minimum=1, maximum=200)
     grid_rows: int = parameter(8, "rows of the coverage grid", minimum=1, maximum=200)
     surplus: float = parameter(

@@ -1,0 +1,201 @@
+"""Compiled kernels that register patches of the left image onto the right one; see :mod:`stereo_frontend.disparity`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+UNKNOWNS = 4
+_MOST_ITERATIONS = 12
+_CONVERGED = 0.005
+_LEAST_ENERGY = 1.0
+_ROUNDING_VARIANCE = 0.1
+"""Variance of grey values rounded to integers, both images."""
+
+
+@njit(cache=True, nogil=True)
+def align_patches(left, right, uv_left, u_right, radius, max_shift, information, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (n, 4): disparity, variance from residual and curvature, correlation, row shift; NaN where it fails.
+
+    The unknowns ``p`` are corrections of the right patch: shift in u, shift in v, slopes of the shift in u along u and
+    v. ``information`` (4,) is their prior's.
+    """
+    n = (2 * radius + 1) ** 2
+    template, patch = np.empty(n), np.empty(n)
+    jacobian = np.empty((UNKNOWNS, n))
+    normal, hessian = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
+    step, p = np.empty(UNKNOWNS), np.empty(UNKNOWNS)
+    for k in range(len(uv_left)):
+        u, v = uv_left[k, 0], uv_left[k, 1]
+        if not (np.isfinite(u) and np.isfinite(v) and np.isfinite(u_right[k])):
+            continue
+        energy = _take_template(left, u, v, radius, template, jacobian)
+        if energy < _LEAST_ENERGY * n:
+            continue
+        _normal_matrix(jacobian, hessian)
+        p[:] = 0.0
+        length = 1.0
+        for _ in range(_MOST_ITERATIONS):
+            power = _sample_patch(right, u, v, u_right[k], p, radius, patch)
+            if power < _LEAST_ENERGY * n or abs(p[0]) > max_shift:
+                break
+            noise, correlation = _right_hand_side(template, patch, jacobian, energy, power, step)
+            for i in range(UNKNOWNS):
+                step[i] -= noise * information[i] * p[i]
+                for j in range(UNKNOWNS):
+                    normal[i, j] = hessian[i, j]
+                normal[i, i] += noise * information[i]
+            if length < _CONVERGED:
+                out[k, 0] = u - u_right[k] - p[0]
+                out[k, 1] = noise * _first_of_inverse(normal) * _correlation_factor(template, patch, radius)
+                out[k, 2] = correlation
+                out[k, 3] = p[1]
+                break
+            if not _solve(normal, step):
+                break
+            length = abs(step[0]) + abs(step[1])
+            scale = 1.0 / max(length, 1.0)
+            for i in range(UNKNOWNS):
+                p[i] += scale * step[i]
+
+
+@njit(cache=True, nogil=True)
+def _take_template(image, u, v, radius, template, jacobian):  # type: ignore[no-untyped-def]
+    """Patch around the whole pixel nearest to (u, v), its Jacobian, means removed; returns its energy, 0 at the
+    border.
+    """
+    height, width = image.shape
+    u0, v0 = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+    if u0 < radius + 1 or v0 < radius + 1 or u0 > width - radius - 2 or v0 > height - radius - 2:
+        return 0.0
+    n = 0
+    mean = 0.0
+    for y in range(v0 - radius, v0 + radius + 1):
+        for x in range(u0 - radius, u0 + radius + 1):
+            template[n] = image[y, x]
+            gx = 0.5 * (np.float64(image[y, x + 1]) - image[y, x - 1])
+            jacobian[0, n] = gx
+            jacobian[1, n] = 0.5 * (np.float64(image[y + 1, x]) - image[y - 1, x])
+            jacobian[2, n] = gx * (x - u)
+            jacobian[3, n] = gx * (y - v)
+            mean += template[n]
+            n += 1
+    for i in range(UNKNOWNS):
+        row = jacobian[i]
+        row -= np.sum(row) / n
+    energy = 0.0
+    for i in range(n):
+        template[i] -= mean / n
+        energy += template[i] * template[i]
+    return energy
+
+
+@njit(cache=True, nogil=True)
+def _sample_patch(image, u, v, u_right, p, radius, patch):  # type: ignore[no-untyped-def]
+    """Right patch under the correction ``p``, bilinear, mean removed; returns its energy, 0 at the border."""
+    height, width = image.shape
+    u0, v0 = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+    n = 0
+    mean = 0.0
+    for j in range(-radius, radius + 1):
+        y = v0 + j + p[1]
+        y0 = int(np.floor(y))
+        start = u_right + (u0 - u) + p[0] + p[2] * (u0 - u) + p[3] * (v0 + j - v)
+        reach = radius * (1.0 + p[2])
+        if reach <= 0.0 or start < reach or start + reach >= width - 1 or y0 < 0 or y0 >= height - 1:
+            return 0.0
+        fy = y - y0
+        above, below = image[y0], image[y0 + 1]
+        for i in range(-radius, radius + 1):
+            x = start + i * (1.0 + p[2])
+            x0 = int(x)
+            fx = x - x0
+            upper = (1.0 - fx) * above[x0] + fx * above[x0 + 1]
+            lower = (1.0 - fx) * below[x0] + fx * below[x0 + 1]
+            patch[n] = upper + fy * (lower - upper)
+            mean += patch[n]
+            n += 1
+    power = 0.0
+    for i in range(n):
+        patch[i] -= mean / n
+        power += patch[i] * patch[i]
+    return power
+
+
+@njit(cache=True, nogil=True)
+def _normal_matrix(jacobian, hessian):  # type: ignore[no-untyped-def]
+    for i in range(UNKNOWNS):
+        for j in range(i + 1):
+            hessian[i, j] = np.sum(jacobian[i] * jacobian[j])
+            hessian[j, i] = hessian[i, j]
+
+
+@njit(cache=True, nogil=True)
+def _right_hand_side(template, patch, jacobian, energy, power, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with ``J^T r`` after the best gain; returns the residual's variance and the correlation."""
+    cross = np.sum(template * patch)
+    gain = cross / power
+    out[:] = 0.0
+    residual = 0.0
+    for i in range(len(template)):
+        r = template[i] - gain * patch[i]
+        residual += r * r
+        for j in range(UNKNOWNS):
+            out[j] += jacobian[j, i] * r
+    return residual / (len(template) - UNKNOWNS - 2) + _ROUNDING_VARIANCE, cross / np.sqrt(power * energy)
+
+
+@njit(cache=True, nogil=True)
+def _correlation_factor(template, patch, radius):  # type: ignore[no-untyped-def]
+    """How much more variance correlated noise leaves than white noise, ``(1 + 2 rho_u) (1 + 2 rho_v)``.
+
+    Rectification interpolates, which makes neighbouring pixels share their noise: the residual's own correlation shows it.
+    """
+    side = 2 * radius + 1
+    gain = np.sum(template * patch) / np.sum(patch * patch)
+    total, along, across = 0.0, 0.0, 0.0
+    for j in range(side):
+        for i in range(side):
+            k = j * side + i
+            r = template[k] - gain * patch[k]
+            total += r * r
+            if i + 1 < side:
+                along += r * (template[k + 1] - gain * patch[k + 1])
+            if j + 1 < side:
+                across += r * (template[k + side] - gain * patch[k + side])
+    scale = 2.0 * side / (side - 1.0) / max(total, 1e-12)
+    return (1.0 + max(0.0, scale * along)) * (1.0 + max(0.0, scale * across))
+
+
+@njit(cache=True, nogil=True)
+def _solve(matrix, vector):  # type: ignore[no-untyped-def]
+    """Solve in place by Cholesky; False if the matrix is not positive definite."""
+    n = len(vector)
+    for j in range(n):
+        for i in range(j, n):
+            value = matrix[i, j]
+            for k in range(j):
+                value -= matrix[i, k] * matrix[j, k]
+            if i > j:
+                matrix[i, j] = value / matrix[j, j]
+            elif value <= 1e-12:
+                return False
+            else:
+                matrix[j, j] = np.sqrt(value)
+    for i in range(n):
+        for k in range(i):
+            vector[i] -= matrix[i, k] * vector[k]
+        vector[i] /= matrix[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            vector[i] -= matrix[k, i] * vector[k]
+        vector[i] /= matrix[i, i]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _first_of_inverse(matrix):  # type: ignore[no-untyped-def]
+    """First diagonal element of the inverse, infinite if there is none."""
+    unit = np.zeros(matrix.shape[0])
+    unit[0] = 1.0
+    return unit[0] if _solve(matrix, unit) else np.inf
