@@ -51,6 +51,9 @@ from slam_core.synchronizer import ExactSynchronizer
 C = TypeVar("C", bound=Config)
 
 WATCHDOG_S = 5.0
+_NOT_A_FRAME = ("CameraInfo", "Imu")
+"""Types whose messages accompany a frame: having processed one says nothing of the frame of its stamp."""
+
 LATCHED_DEPTH = 1000
 PROGRESS_TOPIC = "/progress"
 STATIC_TRANSFORMS_TOPIC = "/static_transforms"
@@ -125,7 +128,12 @@ class SlamNode(Node, Generic[C]):
         required: bool = True,
     ) -> None:
         """Subscribe. The silence of ``required`` inputs is reported. ``type_name`` as in MESSAGE_PACKAGES."""
-        self._add_input(topic, type_name, lambda stamp, m: self._process(topic, stamp, callback, m), latched, required)
+        announce = type_name not in _NOT_A_FRAME
+
+        def handle(stamp: int, message: Message) -> None:
+            self._process(topic, stamp, callback, message, announce=announce)
+
+        self._add_input(topic, type_name, handle, latched, required)
 
     def listen_together(
         self, topics: Mapping[str, str], callback: Callable[..., None], *, latched: bool = False, required: bool = True
@@ -208,7 +216,9 @@ class SlamNode(Node, Generic[C]):
         entry.last_stamp_ns = stamp
         entry.handler(stamp, message)
 
-    def _process(self, source: str, stamp: int, callback: Callable[..., None], *messages: Message) -> None:
+    def _process(
+        self, source: str, stamp: int, callback: Callable[..., None], *messages: Message, announce: bool = True
+    ) -> None:
         started = time.perf_counter()
         try:
             callback(*messages)
@@ -217,7 +227,8 @@ class SlamNode(Node, Generic[C]):
             self._reject(f"{source}: message rejected: {error}")
         except Exception:
             self._reject(f"{source}: message rejected after a fault:\n{traceback.format_exc()}")
-        self._progress.publish(header_message(self.types, stamp, self.get_fully_qualified_name()))
+        if announce:
+            self._progress.publish(header_message(self.types, stamp, self.get_fully_qualified_name()))
 
     def _reject(self, why: str) -> None:
         self.health.count("rejected")
@@ -266,6 +277,7 @@ class SlamNode(Node, Generic[C]):
     def _diagnostic_message(self, silence: str) -> Message:
         self.health.counters["unpaired"] = sum(s.unpaired for s in self._synchronizers)
         values = self.health.report(time.monotonic())
+        values["unconnected"] = " ".join(self._unconnected())
         level = max(int(self.health.state), int(State.DEGRADED) if silence else 0)
         status = self.types.DiagnosticStatus(
             level=bytes([level]),
@@ -275,6 +287,11 @@ class SlamNode(Node, Generic[C]):
         )
         header = self.types.Header(stamp=self.get_clock().now().to_msg())
         return self.types.DiagnosticArray(header=header, status=[status])
+
+    def _unconnected(self) -> list[str]:
+        """Required topics that no publisher has been matched with."""
+        inputs = self._inputs.values()
+        return [entry.topic for entry in inputs if entry.required and not entry.subscription.get_publisher_count()]
 
     def _silence(self) -> str:
         """Which required topics have been silent for five seconds and why, or "" if none has."""

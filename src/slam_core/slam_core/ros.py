@@ -11,6 +11,7 @@ from __future__ import annotations
 import array
 import importlib
 import importlib.util
+import signal
 import sys
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
@@ -160,8 +161,16 @@ def run_node(node_type: Callable[[], RunnableNode], args: list[str] | None = Non
 
 
 def _end(executor: SingleThreadedExecutor, node: RunnableNode | None) -> None:
+    _ignore_signals()
     executor.shutdown(timeout_sec=2.0)
     if node is not None:
         node.on_shutdown()
         node.destroy_node()
     rclpy.try_shutdown()
+    _ignore_signals()
+
+
+def _ignore_signals() -> None:
+    """A second Ctrl-C must not interrupt the end; rclpy's shutdown puts Python's handlers back."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
