@@ -1,0 +1,161 @@
+"""A bag through the real nodes: start them, play the bag no faster than they follow, record, stop, collect.
+
+private domain -> nodes ready and connected -> recorder -> player -> input has ended -> map saved -> nodes stopped
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from slam_bringup.configuration import SystemConfig
+from slam_bringup.node_arguments import ros_arguments
+from slam_bringup.node_graph import NodeGraph, plan_nodes
+from slam_bringup.processes import NodeCommand, NodeGroup, PrivateDomain, ament_prefixes, node_environment
+from slam_bringup.sensor_bag import SensorBag
+from slam_bringup.supervisor_node import Supervisor
+
+START_TIMEOUT_S = 180.0
+"""A cold start compiles kernels."""
+
+_SERVICE_TIMEOUT_S = 300.0
+_WINDOW = 4
+_SJSAM = "/sjsam"
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineRun:
+    """What the nodes left behind.
+
+    recording: the bag of their topics. map_folder: the map that ``sjsam`` saved. diagnostics: last values by full node
+    name. exit_codes: by full node name. wall_s: from the first message played to the last submap joined.
+    """
+
+    recording: Path
+    map_folder: Path
+    diagnostics: dict[str, dict[str, str]]
+    exit_codes: dict[str, int]
+    wall_s: float
+
+
+def run_nodes(
+    bag: Path,
+    config: SystemConfig,
+    out: Path,
+    *,
+    odometry: bool,
+    rate: float = 0.0,
+    on_progress: Callable[[int], None] = lambda frames: None,
+) -> OnlineRun:
+    """Map a bag with the nodes of the workspace.
+
+    Parameters
+    ----------
+    bag
+        The bag to play.
+    config
+        Already adapted to mode, mapper and odometry by :func:`slam_bringup.configuration.choose`.
+    out
+        Folder for the recording ``result.mcap``, the map and the nodes' logs.
+    odometry
+        Whether scan odometry runs as well.
+    rate
+        Speed of the replay; 0: as fast as the nodes follow. Nothing is lost either way.
+    on_progress
+        Called with the number of frames that the filters have processed.
+
+    Raises
+    ------
+    ValueError
+        If a node does not start, ends by itself, or does not answer; the message holds the end of its log.
+    """
+    with SensorBag(bag) as opened:
+        graph = plan_nodes(config, opened.sensors, odometry, str(out / "map"))
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(out / "map", ignore_errors=True)
+    with PrivateDomain() as domain:
+        environment = node_environment(domain, fastdds_profile())
+        with NodeGroup(environment, out / "logs") as group, Supervisor(environment, group.check) as supervisor:
+            run = _Choreography(group, supervisor, graph, out)
+            run.start_nodes()
+            started = time.monotonic()
+            run.play(bag, rate, on_progress)
+            run.finish()
+            wall_s = time.monotonic() - started
+            diagnostics = run.last_diagnostics()
+            group.stop()
+    return OnlineRun(out / "result.mcap", out / "map", diagnostics, group.exit_codes, wall_s)
+
+
+def fastdds_profile() -> Path | None:
+    """The Fast DDS profile of this package: installed, or in the source tree."""
+    folders = [Path(p) / "share/slam_bringup" for p in ament_prefixes()] + [Path(__file__).resolve().parent.parent]
+    return next((f / "config/fastdds.xml" for f in folders if (f / "config/fastdds.xml").exists()), None)
+
+
+class _Choreography:
+    """The steps of a run, in the order of its methods."""
+
+    def __init__(self, group: NodeGroup, supervisor: Supervisor, graph: NodeGraph, out: Path) -> None:
+        self._group = group
+        self._supervisor = supervisor
+        self._graph = graph
+        self._recording = out / "result.mcap"
+
+    def start_nodes(self) -> None:
+        """All nodes, then the recorder; returns when every topic has reached whoever listens to it."""
+        for command in self._graph.commands:
+            self._group.start(command)
+        names = [command.full_name for command in self._graph.commands]
+        ready = self._supervisor.is_ready
+        played = self._graph.played_topics
+        self._supervisor.wait(
+            lambda: all(ready(name, played) for name in names), START_TIMEOUT_S, f"start of {', '.join(names)}"
+        )
+        self._start_recorder()
+
+    def _start_recorder(self) -> None:
+        parameters = {"bag": str(self._recording), "topics": self._graph.recorded_topics, "header_stamps": True}
+        self._group.start(NodeCommand("slam_bringup", "recorder", tuple(ros_arguments(parameters))))
+        topics = [t for t in self._graph.recorded_topics if self._supervisor.publishes(t)]
+        recorded = self._supervisor.subscribers
+        self._supervisor.wait(
+            lambda: all("recorder" in recorded(topic) for topic in topics), START_TIMEOUT_S, "start of the recorder"
+        )
+
+    def play(self, bag: Path, rate: float, on_progress: Callable[[int], None]) -> None:
+        """Play the bag to its end; the player ends when the paced nodes have processed everything."""
+        parameters = {
+            "bag": str(bag), "rate": rate, "topics": self._graph.played_topics, "pace": self._graph.pace,
+            "window": _WINDOW, "wait_for_subscribers": 10.0,
+        }  # fmt: skip
+        player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
+        self._supervisor.count_submaps(f"{name.rpartition('/')[0]}/submap/info" for name in self._graph.filters)
+        while player.is_running:
+            self._supervisor.listen(0.2)
+            on_progress(sum(self._supervisor.progress[name] for name in self._graph.filters))
+        self._group.check()
+
+    def finish(self) -> None:
+        """Tell the nodes that the input has ended, front to back, and have the map saved when all is joined."""
+        for name in self._graph.finishers:
+            self._supervisor.call(f"{name}/finish", _SERVICE_TIMEOUT_S)
+            self._supervisor.wait_until_quiet(1.0, _SERVICE_TIMEOUT_S)
+        self._supervisor.wait(self._all_joined, _SERVICE_TIMEOUT_S, "joining of the last submap")
+        self._supervisor.call(f"{_SJSAM}/save_map", _SERVICE_TIMEOUT_S)
+
+    def last_diagnostics(self) -> dict[str, dict[str, str]]:
+        """The final values of all nodes, once they have reported after the end."""
+        self._supervisor.listen(1.5)
+        return dict(self._supervisor.diagnostics)
+
+    def _all_joined(self) -> bool:
+        return self._supervisor.progress[_SJSAM] >= self._supervisor.submaps
+
+
+def unclean_ends(run: OnlineRun) -> list[str]:
+    """Nodes that did not end with exit code 0."""
+    return [f"{name} ended with code {code}" for name, code in sorted(run.exit_codes.items()) if code != 0]

@@ -1,0 +1,137 @@
+"""Node ``supervisor`` of ``slam nodes``: hears when nodes are ready and how far they are, and calls their services."""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls, disable-error-code="attr-defined,union-attr,arg-type,misc"
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from types import TracebackType
+from typing import Any, Self
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
+
+from slam_core.base_node import PROGRESS_TOPIC
+from slam_core.ros import RosTypes, sensor_qos
+
+_SPIN_S = 0.1
+
+
+class Supervisor:
+    """A node in a context of its own; every method that waits also listens. Use it in a ``with`` block.
+
+    Parameters
+    ----------
+    environment
+        Domain, discovery range and profile of the nodes to watch.
+    check
+        Called again and again while waiting; it raises if a node has died.
+    """
+
+    def __init__(self, environment: Mapping[str, str], check: Callable[[], None]) -> None:
+        for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
+            if name in environment:
+                os.environ[name] = environment[name]
+        self._check = check
+        self._context = Context()
+        rclpy.init(
+            context=self._context,
+            domain_id=int(environment["ROS_DOMAIN_ID"]),
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self._node = Node("supervisor", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self.diagnostics: dict[str, dict[str, str]] = {}
+        """Latest diagnostic values by full node name."""
+        self.progress: Counter[str] = Counter()
+        """Inputs processed so far by full node name."""
+        self.submaps = 0
+        types = RosTypes()
+        self._node.create_subscription(types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(1000))
+        self._node.create_subscription(types.Header, PROGRESS_TOPIC, self._on_progress, sensor_qos(10_000))
+        self._types = types
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._executor.shutdown(timeout_sec=2.0)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def count_submaps(self, topics: Iterable[str]) -> None:
+        """Count what comes on topics of the type of ``submap/info`` in :attr:`submaps`."""
+        for topic in topics:
+            self._node.create_subscription(
+                self._types.DiagnosticArray, topic, self._on_submap, sensor_qos(1000, latched=True)
+            )
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """Listen until ``condition`` holds; ValueError saying ``what`` did not happen after ``timeout_s``."""
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            self.listen(_SPIN_S)
+            if time.monotonic() > deadline:
+                raise ValueError(f"{what} did not happen within {timeout_s:.0f} s")
+
+    def wait_until_quiet(self, quiet_s: float, timeout_s: float) -> None:
+        """Listen until no progress has been reported for ``quiet_s``."""
+        deadline, since, seen = time.monotonic() + timeout_s, time.monotonic(), self.progress.total()
+        while time.monotonic() - since < quiet_s and time.monotonic() < deadline:
+            self.listen(_SPIN_S)
+            if self.progress.total() != seen:
+                since, seen = time.monotonic(), self.progress.total()
+
+    def listen(self, seconds: float) -> None:
+        """Handle what comes in."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+        self._check()
+
+    def is_ready(self, name: str, from_outside: Iterable[str]) -> bool:
+        """Whether a node has reported itself, with all inputs connected but those ``from_outside``."""
+        values = self.diagnostics.get(name)
+        return values is not None and set(values.get("unconnected", "").split()) <= set(from_outside)
+
+    def subscribers(self, topic: str) -> set[str]:
+        """Names of the nodes that subscribe to a topic."""
+        return {info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)}
+
+    def publishes(self, topic: str) -> bool:
+        """Whether anybody publishes a topic."""
+        return bool(self._node.get_publishers_info_by_topic(topic))
+
+    def call(self, service: str, timeout_s: float = 60.0) -> str:
+        """Call a std_srvs/Trigger service; returns its text, ValueError if it fails or does not answer."""
+        client = self._node.create_client(Trigger, service)
+        self.wait(client.service_is_ready, timeout_s, f"service {service}")
+        future = client.call_async(Trigger.Request())
+        self.wait(future.done, timeout_s, f"answer of {service}")
+        self._node.destroy_client(client)
+        response = future.result()
+        if not response.success:
+            raise ValueError(f"{service}: {response.message}")
+        return str(response.message)
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            values = {entry.key: entry.value for entry in status.values}
+            self.diagnostics[status.name] = values | {"message": status.message}
+
+    def _on_progress(self, header: Any) -> None:
+        self.progress[header.frame_id] += 1
+
+    def _on_submap(self, _: Any) -> None:
+        self.submaps += 1
