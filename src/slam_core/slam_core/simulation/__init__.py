@@ -1,4 +1,5 @@
-"""A simulated building and the rig that moves through it: worlds of textured surfaces, a ray caster, cameras and motion.
+"""A simulated building and the rig that moves through it: worlds of textured surfaces, a ray caster, cameras and
+motion.
 
     scenario = Scenario.load("small_room")
     for frame in simulate(scenario):
@@ -9,7 +10,21 @@
 :mod:`trajectory` moves the rig, :mod:`feature_level` and :mod:`planar` simulate features without images.
 """
 
+from slam_core.simulation.feature_level import FeatureFrame, FeatureLevelConfig, FeatureSimulator, simulate_features
+from slam_core.simulation.planar import PlanarConfig, PlanarRun, simulate_planar
 from slam_core.simulation.scenario import Scenario
 from slam_core.simulation.simulator import SimulatedFrame, Simulator, simulate
 
-__all__ = ["Scenario", "SimulatedFrame", "Simulator", "simulate"]
+__all__ = [
+    "FeatureFrame",
+    "FeatureLevelConfig",
+    "FeatureSimulator",
+    "PlanarConfig",
+    "PlanarRun",
+    "Scenario",
+    "SimulatedFrame",
+    "Simulator",
+    "simulate",
+    "simulate_features",
+    "simulate_planar",
+]

@@ -1,8 +1,8 @@
 """Texture atlas: every texture with its mip chain in one flat byte array, ready for the compiled sampler.
 
-A texture is a grey image of reflectance, 0 to 255 for 0 to 1, with sides that are powers of two. The mip chain (Williams
-1983) halves both sides down to one texel, so that a pixel that covers many texels reads their mean instead of one of them:
-features then move with the surface, as in a real image, and do not sparkle.
+A texture is a grey image of reflectance, 0 to 255 for 0 to 1, with sides that are powers of two. The mip chain
+(Williams 1983) halves both sides down to one texel, so that a pixel that covers many texels reads their mean instead
+of one of them: features then move with the surface, as in a real image, and do not sparkle.
 """
 
 from __future__ import annotations
@@ -19,10 +19,12 @@ from slam_core.types import ByteArray
 
 
 class TextureTable(NamedTuple):
-    """What the kernels read: ``texels`` flat uint8; ``index`` int64 (n, 4) = offset, log2 width, log2 height, clamp."""
+    """What the kernels read: ``texels`` flat uint8; ``entries`` int64 (n, 4) = offset, log2 width, log2 height,
+    clamp.
+    """
 
     texels: ByteArray
-    index: npt.NDArray[np.int64]
+    entries: npt.NDArray[np.int64]
 
 
 class TextureAtlas:
@@ -41,7 +43,9 @@ class TextureAtlas:
         return self._ids[name]
 
     def add(self, name: str, image: FloatArray, *, clamp: bool) -> int:
-        """Number of the texture of reflectance ``image`` (h, w) in [0, 1]; ``clamp`` for pictures, False for patterns."""
+        """Number of the texture of reflectance ``image`` (h, w) in [0, 1]; ``clamp`` for pictures, False for
+        patterns.
+        """
         bytes_ = np.clip(np.round(image * 255.0), 0, 255).astype(np.uint8)
         height, width = bytes_.shape
         if height & (height - 1) or width & (width - 1):

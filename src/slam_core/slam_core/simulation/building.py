@@ -1,7 +1,7 @@
 """From a floor plan to surfaces: rooms with walls, floors, ceilings and lamps, joined by doorways.
 
-Rooms are axis-aligned rectangles on one floor; a doorway is given by a point between two rooms (or on the wall of one) and
-cuts an opening into every wall that passes within ``WALL_GAP`` of it.
+Rooms are axis-aligned rectangles on one floor; a doorway is given by a point between two rooms (or on the wall of
+one) and cuts an opening into every wall that passes within ``WALL_GAP`` of it.
 """
 
 from __future__ import annotations
@@ -110,13 +110,9 @@ def room_walls(index: int, room: Room, doorways: list[Doorway]) -> list[Wall]:
         openings = []
         for door in doorways:
             place = np.array(door.at) - s
-            middle = float(place @ a)
-            if (
-                abs(place @ inward) <= WALL_GAP
-                and -0.01 <= middle - door.width / 2
-                and middle + door.width / 2 <= length + 0.01
-            ):
-                openings.append((middle - door.width / 2, middle + door.width / 2, door.height))
+            first, last = float(place @ a) - door.width / 2, float(place @ a) + door.width / 2
+            if abs(place @ inward) <= WALL_GAP and first > -0.01 and last < length + 0.01:
+                openings.append((first, last, door.height))
         walls.append(Wall(index, s, a, length, room.height, tuple(sorted(openings))))
     return walls
 

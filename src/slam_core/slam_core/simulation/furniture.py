@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_core.geometry import FloatArray
 from slam_core.simulation.building import Room, Wall
-from slam_core.simulation.world import Material, World, box
+from slam_core.simulation.world import Material, Surface, World, box
 
 Generator = np.random.Generator
 SIDE = "side"
@@ -21,7 +21,9 @@ SIDE = "side"
 
 @dataclass(frozen=True)
 class WallItem:
-    """A kind of thing at a wall: how to build it at ``s`` along the wall, its width (least, greatest) and how deep it is."""
+    """A kind of thing at a wall: how to build it at ``s`` along the wall, its width (least, greatest) and how deep
+    it is.
+    """
 
     build: Callable[[World, Wall, float, float, Generator], None]
     width: tuple[float, float]
@@ -49,10 +51,29 @@ def _window(world: World, wall: Wall, s: float, width: float, rng: Generator) ->
     world.add(wall.panel((s - 0.05, s + width + 0.05), (0.88, 0.95), Material("wood", 1.3), 0.015))
 
 
-def _against(wall: Wall, s: float, width: float, depth: float) -> tuple[FloatArray, float]:
-    """Centre on the floor and yaw of a box of ``width`` x ``depth`` that stands against the wall, front to the room."""
-    centre = wall.point(s + width / 2, 0.0, depth / 2 + 0.02)
-    return centre, float(np.arctan2(wall.inward[1], wall.inward[0]))
+@dataclass(frozen=True, eq=False)
+class Spot:
+    """Where a thing stands: ``floor`` (3,) m, turned by ``yaw`` rad, in a room. Its x axis is its front."""
+
+    room: int
+    floor: FloatArray
+    yaw: float
+
+    def at(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
+        """A point of the thing's own frame in the world, (3,)."""
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        return np.asarray(self.floor + np.array([c * x - s * y, s * x + c * y, z]))
+
+    def box(
+        self, place: tuple[float, float, float], size: tuple[float, ...], faces: dict[str, Material], turn: float = 0.0
+    ) -> list[Surface]:
+        """A box of ``size`` (x, y, z) m that stands at ``place`` of this frame, turned by ``turn`` rad."""
+        return box(self.at(*place), np.array(size), faces, self.room, self.yaw + turn)
+
+
+def _against(wall: Wall, s: float, width: float, depth: float) -> Spot:
+    """The spot of a thing of ``width`` x ``depth`` that stands against the wall, front to the room."""
+    return Spot(wall.room, wall.point(s + width / 2, 0.0, depth / 2 + 0.02), float(np.arctan2(*wall.inward[::-1])))
 
 
 def _pictures_above(world: World, wall: Wall, s: float, width: float, low: float, rng: Generator) -> None:
@@ -71,90 +92,81 @@ def _cupboard(front: str, side: str, depth: float, height: tuple[float, float]) 
     """A builder of boxes with a picture in front."""
 
     def build(world: World, wall: Wall, s: float, width: float, rng: Generator) -> None:
-        centre, yaw = _against(wall, s, width, depth)
-        tall = float(rng.uniform(*height))
+        spot, tall = _against(wall, s, width, depth), float(rng.uniform(*height))
         faces = {"front": Material(front), SIDE: Material(side, float(rng.uniform(0.7, 1.2)))}
-        world.add(*box(centre, np.array([depth, width, tall]), faces, wall.room, yaw))
+        world.add(*spot.box((0, 0, 0), (depth, width, tall), faces))
         if tall < 1.5:
-            _things(world, wall.room, centre + [0, 0, tall], yaw, (depth, width), rng)
+            _things(world, spot, tall, (depth, width), rng)
             _pictures_above(world, wall, s, width, tall + 0.3, rng)
 
     return build
 
 
-def _things(world: World, room: int, centre: FloatArray, yaw: float, area: tuple[float, float], rng: Generator) -> None:
-    """A few small boxes on a top of ``area`` (deep, wide) m."""
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+def _things(world: World, spot: Spot, z: float, area: tuple[float, float], rng: Generator) -> None:
+    """A few small boxes on a top of ``area`` (deep, wide) m at height ``z``."""
     for place in np.linspace(-0.35, 0.35, int(rng.integers(1, 4))):
-        size = rng.uniform([0.08, 0.1, 0.08], [0.25, 0.3, 0.35])
-        offset = turn @ [rng.uniform(-0.15, 0.1) * area[0], (place + rng.uniform(-0.05, 0.05)) * area[1]]
+        size = tuple(rng.uniform([0.08, 0.1, 0.08], [0.25, 0.3, 0.35]))
+        x, y = rng.uniform(-0.15, 0.1) * area[0], (place + rng.uniform(-0.05, 0.05)) * area[1]
         faces = {"front": Material(str(rng.choice(["label", "panel", "poster"]))), SIDE: Material("cardboard")}
-        world.add(*box(centre + [*offset, 0.0], size, faces, room, yaw + float(rng.normal(0, 0.2))))
+        world.add(*spot.box((float(x), float(y), z), size, faces, float(rng.normal(0, 0.2))))
 
 
 def _desk(world: World, wall: Wall, s: float, width: float, rng: Generator) -> None:
     depth, height = 0.7, 0.74
-    centre, yaw = _against(wall, s, width, depth)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    wood = Material("wood", float(rng.uniform(0.8, 1.3)))
-    top = {"top": Material("desktop"), SIDE: wood}
-    world.add(*box(centre + [0, 0, height - 0.03], np.array([depth, width, 0.03]), top, wall.room, yaw))
+    spot, wood = _against(wall, s, width, depth), Material("wood", float(rng.uniform(0.8, 1.3)))
+    world.add(*spot.box((0, 0, height - 0.03), (depth, width, 0.03), {"top": Material("desktop"), SIDE: wood}))
     for side in (-0.5, 0.5):
-        leg = centre + [*(turn @ [0.0, side * (width - 0.06)]), 0.0]
-        world.add(*box(leg, np.array([depth - 0.1, 0.03, height - 0.03]), {SIDE: wood}, wall.room, yaw))
+        world.add(*spot.box((0, side * (width - 0.06), 0), (depth - 0.1, 0.03, height - 0.03), {SIDE: wood}))
     screen = {"front": Material("screen", 1.0, 0.1, 0.4), SIDE: Material("fabric", 0.4)}
-    at = centre + [*(turn @ [-0.12, rng.uniform(-0.2, 0.2) * width]), height]
-    world.add(*box(at, np.array([0.06, 0.5, 0.38]), screen, wall.room, yaw + float(rng.normal(0, 0.15))))
-    _things(world, wall.room, centre + [0, 0, height], yaw, (depth, width), rng)
+    place = (-0.12, float(rng.uniform(-0.2, 0.2)) * width, height)
+    world.add(*spot.box(place, (0.06, 0.5, 0.38), screen, float(rng.normal(0, 0.15))))
+    _things(world, spot, height, (depth, width), rng)
     _pictures_above(world, wall, s, width, height + 0.4, rng)
-    chair(world, wall.room, centre + [*(turn @ [0.6, rng.uniform(-0.2, 0.2)]), 0.0], yaw + float(rng.normal(3.1, 0.5)))
+    seat = spot.at(0.6, float(rng.uniform(-0.2, 0.2)))
+    chair(world, Spot(wall.room, seat, spot.yaw + float(rng.normal(3.1, 0.5))))
 
 
 def _cartons(world: World, wall: Wall, s: float, width: float, rng: Generator) -> None:
-    z = 0.0
+    spot, z = _against(wall, s, width, 0.5), 0.0
+    faces = {"front": Material("label"), "left": Material("label"), SIDE: Material("cardboard")}
     for _ in range(int(rng.integers(1, 4))):
-        size = rng.uniform([0.3, 0.3, 0.2], [0.45, max(0.35, 0.9 * width), 0.4])
-        centre, yaw = _against(wall, s, width, 0.5)
-        faces = {"front": Material("label"), "left": Material("label"), SIDE: Material("cardboard")}
-        world.add(*box(centre + [0, 0, z], size, faces, wall.room, yaw + float(rng.normal(0, 0.1))))
+        size = tuple(rng.uniform([0.3, 0.3, 0.2], [0.45, max(0.35, 0.9 * width), 0.4]))
+        world.add(*spot.box((0, 0, z), size, faces, float(rng.normal(0, 0.1))))
         z += float(size[2])
     _pictures_above(world, wall, s, width, z + 0.1, rng)
 
 
 def _radiator(world: World, wall: Wall, s: float, width: float, rng: Generator) -> None:
-    for k in range(int(width / 0.08)):
-        centre, yaw = _against(wall, s + 0.08 * k, 0.05, 0.1)
-        world.add(*box(centre + [0, 0, 0.12], np.array([0.1, 0.05, 0.6]), {SIDE: Material("plaster")}, wall.room, yaw))
+    for k in range(int(width / 0.1)):
+        spot = _against(wall, s + 0.1 * k, 0.07, 0.1)
+        world.add(*spot.box((0, 0, 0.12), (0.1, 0.07, 0.6), {SIDE: Material("plaster")}))
 
 
-def chair(world: World, room: int, centre: FloatArray, yaw: float) -> None:
+def chair(world: World, spot: Spot) -> None:
     """A chair of six boxes; its back is at -x of its own frame."""
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     fabric, steel = {SIDE: Material("fabric", 1.4)}, {SIDE: Material("metal", 0.6)}
-    world.add(*box(centre + [0, 0, 0.42], np.array([0.44, 0.44, 0.06]), fabric, room, yaw))
-    world.add(*box(centre + [*(turn @ [-0.2, 0.0]), 0.55], np.array([0.05, 0.42, 0.4]), fabric, room, yaw))
+    world.add(*spot.box((0, 0, 0.42), (0.44, 0.44, 0.06), fabric))
+    world.add(*spot.box((-0.2, 0, 0.55), (0.05, 0.42, 0.4), fabric))
     for x in (-0.19, 0.19):
         for y in (-0.19, 0.19):
-            world.add(*box(centre + [*(turn @ [x, y]), 0.0], np.array([0.03, 0.03, 0.42]), steel, room, yaw))
+            world.add(*spot.box((x, y, 0), (0.03, 0.03, 0.42), steel))
 
 
-def table(world: World, room: int, centre: FloatArray, size: tuple[float, float], yaw: float, rng: Generator) -> None:
+def table(world: World, spot: Spot, size: tuple[float, float], rng: Generator) -> None:
     """A table of ``size`` (x, y) m with things on it."""
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    faces = {"top": Material("desktop"), SIDE: Material("wood")}
-    world.add(*box(centre + [0, 0, 0.71], np.array([*size, 0.035]), faces, room, yaw))
+    world.add(*spot.box((0, 0, 0.71), (*size, 0.035), {"top": Material("desktop"), SIDE: Material("wood")}))
     for x in (-0.45, 0.45):
         for y in (-0.42, 0.42):
-            leg = centre + [*(turn @ [x * size[0], y * size[1]]), 0.0]
-            world.add(*box(leg, np.array([0.06, 0.06, 0.71]), {SIDE: Material("metal")}, room, yaw))
+            world.add(*spot.box((x * size[0], y * size[1], 0), (0.06, 0.06, 0.71), {SIDE: Material("metal")}))
     for along in np.arange(-0.4, 0.41, 0.4 / max(size[0], 0.4)):
-        _things(world, room, centre + [*(turn @ [along * size[0], 0.0]), 0.745], yaw, (size[1], 0.4), rng)
+        middle = Spot(spot.room, spot.at(float(along) * size[0]), spot.yaw)
+        _things(world, middle, 0.745, (0.4, size[1]), rng)
 
 
-def pillar(world: World, room: int, centre: FloatArray, height: float, side: float = 0.4) -> None:
+def pillar(world: World, spot: Spot, height: float, side: float = 0.4) -> None:
     """A square pillar with a notice on two of its sides."""
     faces = {"front": Material("poster"), "left": Material("notices"), SIDE: Material("concrete", 1.3)}
-    world.add(*box(centre, np.array([side, side, height]), faces, room))
+    world.add(*spot.box((0, 0, 0), (side, side, height), faces))
 
 
 def _pictures(world: World, wall: Wall, s: float, width: float, rng: Generator) -> None:

@@ -60,4 +60,4 @@ def ideal_reading(path: Path, t: float) -> tuple[FloatArray, FloatArray]:
     R = now[:3, :3]
     acceleration = (after[:3, 3] - 2.0 * now[:3, 3] + before[:3, 3]) / STEP**2
     rotation_rate = so3_log(before[:3, :3].T @ after[:3, :3]) / (2.0 * STEP)
-    return rotation_rate, np.asarray(R.T @ (acceleration + [0.0, 0.0, GRAVITY]))
+    return rotation_rate, np.asarray(R.T @ (acceleration + np.array([0.0, 0.0, GRAVITY])))

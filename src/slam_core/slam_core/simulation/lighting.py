@@ -1,7 +1,7 @@
 """Baked light: irradiance on a grid of every surface from the lamps of its room, with shadows and darker corners.
 
-Each node of the grid sums over a few points of each lamp, ``power cos(at lamp) cos(at node) / distance^2`` where nothing
-stands between, and an even sky light that is weakened where neighbouring surfaces hide part of the room.
+Each node of the grid sums over a few points of each lamp, ``power cos(at lamp) cos(at node) / distance^2`` where
+nothing stands between, and an even sky light that is weakened where neighbouring surfaces hide part of the room.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _direct(
             continue
         if not _blocked(p[0], p[1], p[2], dx, dy, dz, own, blockers):
             total += lamps[k, 6] * cos_node * cos_lamp / distance_sq
-    return total
+    return float(total)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -148,7 +148,7 @@ def _openness(
         dz = a * axes[0, 2] + b * axes[1, 2] + c * axes[2, 2]
         if not _blocked(p[0], p[1], p[2], dx, dy, dz, own, blockers):
             free += 1
-    return free / directions.shape[0]
+    return float(free / directions.shape[0])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -162,7 +162,9 @@ def _irradiance(
     lamps: FloatArray,
     directions: FloatArray,
 ) -> None:  # pragma: no cover - compiled
-    """Fill the grid of one surface; ``frame`` = origin, edge_u, edge_v and ``axes`` = unit edges and normal, (3, 3) each."""
+    """Fill the grid of one surface; ``frame`` = origin, edge_u, edge_v and ``axes`` = unit edges and normal, (3, 3)
+    each.
+    """
     columns, rows = shape
     for row in range(rows):
         for column in range(columns):

@@ -1,7 +1,7 @@
 """Pictures that occur once: posters, book spines, doors, screens, windows, notices. Each is drawn from a seed.
 
-A picture fills a whole surface; its reflectance image has sides that are powers of two, chosen from the surface's size so
-that a texel is about 3 mm: finer than a pixel of the cameras at the distances at which they look at walls.
+A picture fills a whole surface; its reflectance image has sides that are powers of two, chosen from the surface's
+size so that a texel is about 3 mm: finer than a pixel of the cameras at the distances at which they look at walls.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def draw_picture(kind: str, width: float, height: float, rng: np.random.Generato
     PICTURES[kind](canvas, rng)
     # Print and paint have no edges sharper than this, and no surface is perfectly even.
     grain = cv2.resize(rng.normal(0.0, 0.012, (max(h // 4, 1), max(w // 4, 1))).astype(np.float32), (w, h))
-    return np.clip(cv2.GaussianBlur(canvas, (3, 3), 0.6) + grain, 0.02, 0.97).astype(np.float64)
+    return np.asarray(np.clip(cv2.GaussianBlur(canvas, (3, 3), 0.6) + grain, 0.02, 0.97), dtype=np.float64)
 
 
 def _rectangle(canvas: Float32Array, x: float, y: float, w: float, h: float, value: float) -> None:
@@ -38,7 +38,9 @@ def _rectangle(canvas: Float32Array, x: float, y: float, w: float, h: float, val
 def _text(
     canvas: Float32Array, box: tuple[float, float, float, float], rng: np.random.Generator, ink: float, size: float
 ) -> None:
-    """Lines of made-up letters in ``box`` (x, y, w, h fractions); ``size`` is the height of a letter, fraction of the canvas."""
+    """Lines of made-up letters in ``box`` (x, y, w, h fractions); ``size`` is the height of a letter, fraction of
+    the canvas.
+    """
     H, W = canvas.shape
     alphabet = rng.random((26, 7, 5)) < 0.45
     letter_h = max(int(size * H), 4)
@@ -102,8 +104,8 @@ def _whiteboard(canvas: Float32Array, rng: np.random.Generator) -> None:
         points = np.cumsum(rng.normal(0, 0.05, (12, 2)), axis=0) + rng.uniform(0.15, 0.85, 2)
         cv2.polylines(canvas, [(points * [W, H]).astype(np.int32)], False, float(rng.uniform(0.15, 0.5)), 2)
     _text(canvas, (0.1, 0.1, 0.35, 0.4), rng, 0.25, 0.05)
-    for edge in ((0, 0, 1, 0.02), (0, 0.975, 1, 0.03), (0, 0, 0.012, 1), (0.985, 0, 0.02, 1)):
-        _rectangle(canvas, *edge, 0.45)
+    for x, y, w, h in ((0, 0, 1, 0.02), (0, 0.975, 1, 0.03), (0, 0, 0.012, 1), (0.985, 0, 0.02, 1)):
+        _rectangle(canvas, x, y, w, h, 0.45)
 
 
 def _bookshelf(canvas: Float32Array, rng: np.random.Generator) -> None:
@@ -145,8 +147,8 @@ def _cabinet(canvas: Float32Array, rng: np.random.Generator) -> None:
 
 def _door(canvas: Float32Array, rng: np.random.Generator) -> None:
     canvas[:] = rng.uniform(0.3, 0.6)
-    for edge in ((0, 0, 1, 0.035), (0, 0, 0.07, 1), (0.93, 0, 0.07, 1)):
-        _rectangle(canvas, *edge, 0.82)
+    for x, y, w, h in ((0, 0, 1, 0.035), (0, 0, 0.07, 1), (0.93, 0, 0.07, 1)):
+        _rectangle(canvas, x, y, w, h, 0.82)
     _rectangle(canvas, 0.82, 0.5, 0.1, 0.012, 0.1)
     _rectangle(canvas, 0.84, 0.49, 0.05, 0.09, 0.7)
     _rectangle(canvas, 0.3, 0.22, 0.4, 0.08, 0.9)
@@ -166,13 +168,12 @@ def _screen(canvas: Float32Array, rng: np.random.Generator) -> None:
 
 
 def _window(canvas: Float32Array, rng: np.random.Generator) -> None:
-    H, W = canvas.shape
-    canvas[:] = np.linspace(0.95, 0.55, H, dtype=np.float32)[:, None]
+    canvas[:] = np.linspace(0.95, 0.55, len(canvas), dtype=np.float32)[:, None]
     for x in rng.uniform(0, 0.9, 7):
         top = rng.uniform(0.45, 0.75)
         _rectangle(canvas, float(x), float(top), float(rng.uniform(0.05, 0.2)), 1.0, float(rng.uniform(0.25, 0.6)))
-    for edge in ((0, 0, 1, 0.04), (0, 0.96, 1, 0.04), (0, 0, 0.035, 1), (0.965, 0, 0.04, 1), (0.485, 0, 0.03, 1)):
-        _rectangle(canvas, *edge, 0.4)
+    for x, y, w, h in ((0, 0, 1, 0.04), (0, 0.96, 1, 0.04), (0, 0, 0.035, 1), (0.965, 0, 0.04, 1), (0.485, 0, 0.03, 1)):
+        _rectangle(canvas, x, y, w, h, 0.4)
 
 
 def _pegboard(canvas: Float32Array, rng: np.random.Generator) -> None:

@@ -1,9 +1,9 @@
 """Which surface does each pixel see? A tiled ray caster over rectangles.
 
-All geometry is brought into the camera's frame once per view, where pixel rays are fixed. The image is cut into tiles of
-16 x 16 pixels; each tile keeps only the rectangles that its pyramid of rays can meet, nearest first, and drops those behind
-one that covers the tile entirely. A pixel then tests a handful of rectangles instead of hundreds. Tiles are independent, so
-the result does not depend on how many threads work on them.
+All geometry is brought into the camera's frame once per view, where pixel rays are fixed. The image is cut into tiles
+of 16 x 16 pixels; each tile keeps only the rectangles that its pyramid of rays can meet, nearest first, and drops
+those behind one that covers the tile entirely. A pixel then tests a handful of rectangles instead of hundreds. Tiles
+are independent, so the result does not depend on how many threads work on them.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ class View(NamedTuple):
     """The visible part of a world in the frame of one camera.
 
     planes: (m, 9) = normal / distance (so that 1/z = planes[:3] . (x, y, 1)), edge_u / |edge_u|^2, edge_v / |edge_v|^2;
-    shifts: (m, 2) the edges' products with the origin; corners: (m, 4, 3); near: (m,) least z; ids: (m,) rows of the world.
+    shifts: (m, 2) the edges' products with the origin; corners: (m, 4, 3); near: (m,) least z; ids: (m,) rows of the
+    world.
     """
 
     planes: FloatArray

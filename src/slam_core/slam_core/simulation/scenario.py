@@ -27,7 +27,7 @@ import yaml
 
 from slam_core.config import Config, from_mapping, group, parameter
 from slam_core.simulation.building import Doorway, Room, build_doorways, build_shell, room_walls
-from slam_core.simulation.furniture import chair, furnish_wall, pillar, table
+from slam_core.simulation.furniture import Spot, chair, furnish_wall, pillar, table
 from slam_core.simulation.imu import ImuSensorConfig
 from slam_core.simulation.stereo_sensor import StereoSensorConfig
 from slam_core.simulation.tof_sensor import TofSensorConfig
@@ -68,7 +68,6 @@ class FurnitureObject:
     at: tuple[float, float]
     size: tuple[float, float] = (1.6, 0.8)
     yaw: float = 0.0
-    room: str = ""
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,8 @@ class Scenario:
             kind = {"rooms": Room, "agents": Agent, "doorways": Doorway, "objects": FurnitureObject}[key]
             plain[key] = tuple(_make(kind, row, name) for row in values.get(key, ()))
         plain["sensors"] = tuple(plain.get("sensors", SENSORS))
-        return _make(cls, {**plain, "name": name, "suite": from_mapping(SensorSuite, suite)}, name)
+        made: Scenario = _make(cls, {**plain, "name": name, "suite": from_mapping(SensorSuite, suite)}, name)
+        return made
 
     def shortened(self, frames: int) -> Scenario:
         """The same scenario, cut off after ``frames`` frames; the motion stays as it was."""
@@ -161,13 +161,14 @@ class Scenario:
         return world
 
     def _place(self, world: World, item: FurnitureObject, rng: np.random.Generator) -> None:
-        room, centre, yaw = self._room_at(item.at), np.array([*item.at, 0.0]), float(np.radians(item.yaw))
+        room = self._room_at(item.at)
+        spot = Spot(room, np.array([*item.at, 0.0]), float(np.radians(item.yaw)))
         if item.kind == "table":
-            table(world, room, centre, item.size, yaw, rng)
+            table(world, spot, item.size, rng)
         elif item.kind == "chair":
-            chair(world, room, centre, yaw)
+            chair(world, spot)
         elif item.kind == "pillar":
-            pillar(world, room, centre, self.rooms[room].height)
+            pillar(world, spot, self.rooms[room].height)
         else:
             raise ValueError(f"scenario '{self.name}': unknown object '{item.kind}', known: table, chair, pillar")
 

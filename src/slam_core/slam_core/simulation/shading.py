@@ -1,8 +1,7 @@
 """What does a pixel see? Radiance of the traced image: filtered textures, baked light, highlights, smooth edges.
 
-A pixel's footprint on a surface is the parallelogram that its ray derivatives span. The texture is read along the longer
-side with several trilinear samples of the level that fits the shorter one (Heckbert 1989): sharp where a wall recedes, and
-still free of aliasing. Pixels at the border of two surfaces are averaged over 4 x 4 rays.
+Textures are averaged over the parallelogram that a pixel's ray derivatives span on the surface. Pixels at the border of
+surfaces are shared out among them by 4 x 4 rays, and each surface is shaded once.
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ from numba import njit
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.simulation.raycaster import TILE, Hits, Rays, View, for_tile_rows, nearest
 from slam_core.simulation.surface_table import Look, SurfaceTable
+from slam_core.simulation.texture_sampling import sample_texture, trilinear
 from slam_core.types import ByteArray, Float32Array
 
 EDGE_RAYS = 4
-MAX_SAMPLES = 6
 SHININESS = 80.0
 SHIFT_U, SHIFT_V, SCALE_U, SCALE_V = Look.SHIFT_U, Look.SHIFT_V, Look.SCALE_U, Look.SCALE_V
 OVERLAY_U, OVERLAY_V, OVERLAY_SCALE_U = Look.OVERLAY_U, Look.OVERLAY_V, Look.OVERLAY_SCALE_U
@@ -45,79 +44,6 @@ def render(
         lambda first, last: _render_rows(first, last, world, view, rays, hits, lamps, image),
     )
     return image
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _bilinear(
-    texels: ByteArray, offset: int, width: int, height: int, clamp: int, u: float, v: float
-) -> float:  # pragma: no cover - compiled
-    """Texture value 0 to 255 at (u, v), in repetitions, of one level."""
-    x, y = u * width - 0.5, v * height - 0.5
-    fx, fy = np.floor(x), np.floor(y)
-    ax, ay = x - fx, y - fy
-    x0, y0 = int(fx), int(fy)
-    x1, y1 = x0 + 1, y0 + 1
-    if clamp:
-        x0, x1 = min(max(x0, 0), width - 1), min(max(x1, 0), width - 1)
-        y0, y1 = min(max(y0, 0), height - 1), min(max(y1, 0), height - 1)
-    else:
-        x0, x1, y0, y1 = x0 & (width - 1), x1 & (width - 1), y0 & (height - 1), y1 & (height - 1)
-    top, bottom = offset + y0 * width, offset + y1 * width
-    upper = texels[top + x0] * (1.0 - ax) + texels[top + x1] * ax
-    lower = texels[bottom + x0] * (1.0 - ax) + texels[bottom + x1] * ax
-    return upper * (1.0 - ay) + lower * ay
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _trilinear(
-    texels: ByteArray, index: npt.NDArray[np.int64], t: int, u: float, v: float, level: float
-) -> float:  # pragma: no cover - compiled
-    """Value 0 to 1 of texture ``t`` at (u, v) of a level between two of the mip chain."""
-    offset, width, height, clamp = index[t, 0], 1 << index[t, 1], 1 << index[t, 2], index[t, 3]
-    top = max(index[t, 1], index[t, 2])
-    level = min(max(level, 0.0), float(top))
-    whole = int(level)
-    for _ in range(whole):
-        offset += width * height
-        width, height = max(width >> 1, 1), max(height >> 1, 1)
-    value = _bilinear(texels, offset, width, height, clamp, u, v)
-    part = level - whole
-    if part > 0.01 and whole < top:
-        offset += width * height
-        coarse = _bilinear(texels, offset, max(width >> 1, 1), max(height >> 1, 1), clamp, u, v)
-        value += part * (coarse - value)
-    return float(value * (1.0 / 255.0))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def sample_texture(
-    texels: ByteArray,
-    index: npt.NDArray[np.int64],
-    t: int,
-    u: float,
-    v: float,
-    au: float,
-    av: float,
-    bu: float,
-    bv: float,
-) -> float:  # pragma: no cover - compiled
-    """Mean of texture ``t``, 0 to 1, over the parallelogram of sides (au, av), (bu, bv) around (u, v), in repetitions."""
-    width, height = float(1 << index[t, 1]), float(1 << index[t, 2])
-    a = np.sqrt((au * width) ** 2 + (av * height) ** 2)
-    b = np.sqrt((bu * width) ** 2 + (bv * height) ** 2)
-    if b > a:
-        a, au, av, bu, bv = b, bu, bv, au, av
-    across = abs(au * bv - av * bu) * width * height / max(a, 1e-9)
-    across = max(across, a / MAX_SAMPLES)
-    count = min(int(np.ceil(a / max(across, 1.0))), MAX_SAMPLES)
-    level = np.log2(across) if across > 1.0 else 0.0
-    if count <= 1:
-        return float(_trilinear(texels, index, t, u, v, level))
-    total = 0.0
-    for k in range(count):
-        s = (k + 0.5) / count - 0.5
-        total += _trilinear(texels, index, t, u + s * au, v + s * av, level)
-    return total / count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -157,8 +83,9 @@ def reflectance(
     if overlay >= 0:
         su, sv = look[w, OVERLAY_SCALE_U], look[w, OVERLAY_SCALE_V]
         size = np.sqrt(abs((au * bv - av * bu) * su * sv)) * (1 << index[overlay, 1])
-        level = np.log2(size) if size > 1.0 else 0.0
-        layer = _trilinear(texels, index, overlay, look[w, OVERLAY_U] + su * u, look[w, OVERLAY_V] + sv * v, level)
+        # The overlay is smooth: the nearest level of the mip chain will do.
+        level = np.floor(np.log2(size) + 0.5) if size > 1.0 else 0.0
+        layer = trilinear(texels, index, overlay, look[w, OVERLAY_U] + su * u, look[w, OVERLAY_V] + sv * v, level)
         value *= 1.0 + look[w, OVERLAY_GAIN] * (layer - 0.5)
     return float(value * look[w, BRIGHTNESS])
 
@@ -190,8 +117,6 @@ def _highlight(
 def _radiance(
     x: float,
     y: float,
-    z: float,
-    share: float,
     q: int,
     w: int,
     i: int,
@@ -206,15 +131,17 @@ def _radiance(
     index: npt.NDArray[np.int64],
     lamps: FloatArray,
 ) -> float:  # pragma: no cover - compiled
-    """Radiance along the ray (x, y, 1) that meets surface ``w`` at ``z``; the footprint is ``share`` of pixel (i, j)."""
+    """Radiance of surface ``w`` (row ``q`` of the view) along the ray (x, y, 1), over the footprint of pixel (i, j)."""
     p = planes
+    z = 1.0 / (p[q, 0] * x + p[q, 1] * y + p[q, 2])
     xu, yu, xv, yv = rays[i, j, 2], rays[i, j, 3], rays[i, j, 4], rays[i, j, 5]
     # u = z (e . r) - shift and z = 1 / (n . r), so du = z e . dr - z^2 (n . dr) (e . r).
     e1, e2 = p[q, 3] * x + p[q, 4] * y + p[q, 5], p[q, 6] * x + p[q, 7] * y + p[q, 8]
-    u, v, zs = z * e1 - shifts[q, 0], z * e2 - shifts[q, 1], z * share
-    na, nb = z * zs * (p[q, 0] * xu + p[q, 1] * yu), z * zs * (p[q, 0] * xv + p[q, 1] * yv)
-    au, av = zs * (p[q, 3] * xu + p[q, 4] * yu) - na * e1, zs * (p[q, 6] * xu + p[q, 7] * yu) - na * e2
-    bu, bv = zs * (p[q, 3] * xv + p[q, 4] * yv) - nb * e1, zs * (p[q, 6] * xv + p[q, 7] * yv) - nb * e2
+    u = min(max(z * e1 - shifts[q, 0], 0.0), 1.0)
+    v = min(max(z * e2 - shifts[q, 1], 0.0), 1.0)
+    na, nb = z * z * (p[q, 0] * xu + p[q, 1] * yu), z * z * (p[q, 0] * xv + p[q, 1] * yv)
+    au, av = z * (p[q, 3] * xu + p[q, 4] * yu) - na * e1, z * (p[q, 6] * xu + p[q, 7] * yu) - na * e2
+    bu, bv = z * (p[q, 3] * xv + p[q, 4] * yv) - nb * e1, z * (p[q, 6] * xv + p[q, 7] * yv) - nb * e2
     value = reflectance(look, lookup, texels, index, w, u, v, au, av, bu, bv)
     value *= surface_light(light, lookup, w, u, v) + look[w, EMISSION]
     gloss = look[w, GLOSS]
@@ -237,6 +164,49 @@ def is_edge(surface: npt.NDArray[np.int32], i: int, j: int) -> bool:  # pragma: 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def split_pixel(
+    i: int,
+    j: int,
+    tile: int,
+    rays: Float32Array,
+    candidates: npt.NDArray[np.int32],
+    counts: npt.NDArray[np.int32],
+    planes: FloatArray,
+    shifts: FloatArray,
+    near: FloatArray,
+    parts: FloatArray,
+) -> int:  # pragma: no cover - compiled
+    """Which surfaces share a pixel? EDGE_RAYS x EDGE_RAYS rays, gathered by surface.
+
+    Fills a row of ``parts`` (EDGE_RAYS^2, 4) for each: row of the view, share of the pixel, mean x and mean y of its
+    rays; returns their number.
+    """
+    found = 0
+    for k in range(EDGE_RAYS * EDGE_RAYS):
+        s, t = (k // EDGE_RAYS + 0.5) / EDGE_RAYS - 0.5, (k % EDGE_RAYS + 0.5) / EDGE_RAYS - 0.5
+        x = rays[i, j, 0] + s * rays[i, j, 2] + t * rays[i, j, 4]
+        y = rays[i, j, 1] + s * rays[i, j, 3] + t * rays[i, j, 5]
+        q, _, _, _ = nearest(x, y, candidates, counts[tile], tile, planes, shifts, near)
+        if q < 0:
+            continue
+        m = 0
+        while m < found and parts[m, 0] != q:
+            m += 1
+        if m == found:
+            parts[m, 0] = q
+            parts[m, 1] = parts[m, 2] = parts[m, 3] = 0.0
+            found += 1
+        parts[m, 1] += 1.0
+        parts[m, 2] += x
+        parts[m, 3] += y
+    for m in range(found):
+        parts[m, 2] /= parts[m, 1]
+        parts[m, 3] /= parts[m, 1]
+        parts[m, 1] /= EDGE_RAYS * EDGE_RAYS
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _render_rows(
     first: int,
     last: int,
@@ -248,27 +218,22 @@ def _render_rows(
     image: Float32Array,
 ) -> None:  # pragma: no cover - compiled
     # Arrays are taken out of the tuples once: passing the tuples on per pixel costs more than the shading.
-    surface, depth, candidates, counts = hits.surface, hits.depth, hits.candidates, hits.counts
+    surface, candidates, counts = hits.surface, hits.candidates, hits.counts
     rays, planes, shifts, near, ids = all_rays.rays, view.planes, view.shifts, view.near, view.ids
     look, lookup, light = world.look, world.lookup, world.light
-    texels, index = world.textures.texels, world.textures.index
+    texels, index = world.textures.texels, world.textures.entries
     height, width = image.shape
     columns = all_rays.bounds.shape[1]
+    parts = np.empty((EDGE_RAYS * EDGE_RAYS, 4))
     for i in range(first * TILE, min(last * TILE, height)):
         for j in range(width):
-            q, n, tile, total = surface[i, j], 1, (i // TILE) * columns + j // TILE, 0.0
+            found = 1 if surface[i, j] >= 0 else 0
+            parts[0, 0], parts[0, 1], parts[0, 2], parts[0, 3] = surface[i, j], 1.0, rays[i, j, 0], rays[i, j, 1]
             if is_edge(surface, i, j):
-                n = EDGE_RAYS
-            for k in range(n * n):
-                s, t = (k // n + 0.5) / n - 0.5, (k % n + 0.5) / n - 0.5
-                x = rays[i, j, 0] + s * rays[i, j, 2] + t * rays[i, j, 4]
-                y = rays[i, j, 1] + s * rays[i, j, 3] + t * rays[i, j, 5]
-                z = float(depth[i, j])
-                if n > 1:
-                    q, z, _, _ = nearest(x, y, candidates, counts[tile], tile, planes, shifts, near)
-                if q >= 0:
-                    total += _radiance(
-                        x, y, z, 1.0 / n, q, ids[q], i, j, rays, planes, shifts,
-                        look, lookup, light, texels, index, lamps,
-                    )  # fmt: skip
-            image[i, j] = total / (n * n)
+                tile = (i // TILE) * columns + j // TILE
+                found = split_pixel(i, j, tile, rays, candidates, counts, planes, shifts, near, parts)
+            for m in range(found):
+                q, x, y = int(parts[m, 0]), parts[m, 2], parts[m, 3]
+                image[i, j] += parts[m, 1] * _radiance(
+                    x, y, q, ids[q], i, j, rays, planes, shifts, look, lookup, light, texels, index, lamps
+                )

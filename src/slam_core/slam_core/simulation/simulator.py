@@ -1,7 +1,7 @@
 """Frame by frame: what every sensor of a rig reports while it moves through a scenario's building.
 
-Every random number is drawn from (scenario seed, agent, frame, sensor), so a frame is the same whatever else is rendered and
-on however many threads.
+Every random number is drawn from (scenario seed, agent, frame, sensor), so a frame is the same whatever else is
+rendered and on however many threads.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ from slam_core.types import ByteArray, Float32Array, ImuSample
 
 @dataclass(frozen=True, eq=False)
 class DepthTruth:
-    """True depth of the *rectified* left image: float32 (h, w) m along z, and the surface of each pixel, int32 (h, w)."""
+    """True depth of the *rectified* left image: float32 (h, w) m along z, and the surface of each pixel, int32 (h,
+    w).
+    """
 
     depth: Float32Array
     surface: npt.NDArray[np.int32]
@@ -37,8 +39,9 @@ class DepthTruth:
 class SimulatedFrame:
     """All that one agent's sensors report at one moment.
 
-    left, right: raw uint8 images, None for a sensor that is not carried or a frame that was lost; right_stamp_ns differs
-    from stamp_ns by the jitter between the cameras. tof: raw images or None. imu: samples since the previous frame.
+    left, right: raw uint8 images, None for a sensor that is not carried or a frame that was lost; right_stamp_ns
+    differs from stamp_ns by the jitter between the cameras. tof: raw images or None. imu: samples since the previous
+    frame.
     """
 
     index: int

@@ -1,8 +1,8 @@
 """The stereo camera: Bumblebee2 geometry, and what lens, exposure and sensor do to the light.
 
-Both raw cameras are turned a little out of the rectified frame and have barrel distortion, so that rectification matters. The
-rectified left frame is the rig's origin: ``T_rig_left`` is the fixed axes change, the right camera stands ``baseline`` to the
-right of it.
+Both raw cameras are turned a little out of the rectified frame and have barrel distortion, so that rectification
+matters. The rectified left frame is the rig's origin: ``T_rig_left`` is the fixed axes change, the right camera
+stands ``baseline`` to the right of it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numba import njit
 from slam_core.camera import Camera, CameraInfo, StereoCamera
 from slam_core.config import Config, parameter
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, make_transform, so3_exp
-from slam_core.simulation.raycaster import Rays, camera_rays, make_view, trace
+from slam_core.simulation.raycaster import TILE, Rays, camera_rays, for_tile_rows, make_view, trace
 from slam_core.simulation.shading import render
 from slam_core.simulation.surface_table import SurfaceTable
 from slam_core.types import ByteArray, Float32Array
@@ -108,7 +108,7 @@ class StereoSensor:
         image = render(world, view, rays, hits, T_world_camera, pool)
         if self.config.exposure_ms > 0.0:
             shift = camera_twist(twist, self.T_rig_raw[k]) * (self.config.exposure_ms * 1e-3)
-            image = motion_blur(image, hits.depth, rays.rays, shift)
+            image = motion_blur(image, hits.depth, rays, shift, pool)
         image *= self._shading[k]
         if self.config.blur_px > 0.0:
             image = np.asarray(cv2.GaussianBlur(image, (0, 0), self.config.blur_px), dtype=np.float32)
@@ -153,22 +153,31 @@ def expose(light: Float32Array, gain: float, config: StereoSensorConfig, rng: np
     level = light * np.float32(255.0 * gain)
     sigma = np.sqrt(level / np.float32(config.electrons_per_level) + np.float32(config.read_noise**2))
     level += sigma * rng.standard_normal(level.shape, dtype=np.float32)
-    return np.clip(np.rint(level), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(level), 0, 255), dtype=np.uint8)
 
 
-def motion_blur(image: Float32Array, depth: Float32Array, rays: Float32Array, shift: FloatArray) -> Float32Array:
+def motion_blur(
+    image: Float32Array, depth: Float32Array, rays: Rays, shift: FloatArray, pool: ThreadPoolExecutor | None = None
+) -> Float32Array:
     """Smear every pixel along the path its surface takes while the camera moves by ``shift`` (6,), m and rad."""
     out = np.empty_like(image)
-    _smear(image, depth, rays, shift, out)
+    bands = rays.bounds.shape[0]
+    for_tile_rows(bands, pool, lambda first, last: _smear_rows(first, last, image, depth, rays.rays, shift, out))
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _smear(
-    image: Float32Array, depth: Float32Array, rays: Float32Array, shift: FloatArray, out: Float32Array
+def _smear_rows(
+    first: int,
+    last: int,
+    image: Float32Array,
+    depth: Float32Array,
+    rays: Float32Array,
+    shift: FloatArray,
+    out: Float32Array,
 ) -> None:  # pragma: no cover - compiled
     height, width = image.shape
-    for i in range(height):
+    for i in range(first * TILE, min(last * TILE, height)):
         for j in range(width):
             x, y = rays[i, j, 0], rays[i, j, 1]
             xu, yu, xv, yv = rays[i, j, 2], rays[i, j, 3], rays[i, j, 4], rays[i, j, 5]

@@ -1,9 +1,9 @@
 """The time-of-flight camera: CamCube geometry, and range by the phase of modulated light.
 
-Each pixel measures a phasor ``A exp(j 4 pi f r / c)``: amplitude A from reflectance, angle and distance, phase from range.
-Noise is white on the phasor, which gives everything else for free (Lange 2000): range noise ``sigma_r = L / (2 pi) sigma / A``
-that falls with amplitude, wrapping at the ambiguity range L, random ranges in dark pixels, and flying pixels, where a pixel
-at an edge adds the phasors of two surfaces.
+Each pixel measures a phasor ``A exp(j 4 pi f r / c)``: amplitude A from reflectance, angle and distance, phase from
+range. Noise is white on the phasor, which gives everything else for free (Lange 2000): range noise ``sigma_r = L / (2
+pi) sigma / A`` that falls with amplitude, wrapping at the ambiguity range L, random ranges in dark pixels, and flying
+pixels, where a pixel at an edge adds the phasors of two surfaces.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from slam_core.camera import Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, make_transform, so3_exp
-from slam_core.simulation.raycaster import TILE, Hits, Rays, View, camera_rays, for_tile_rows, make_view, nearest, trace
-from slam_core.simulation.shading import is_edge, reflectance, surface_light
+from slam_core.simulation.raycaster import TILE, Hits, Rays, View, camera_rays, for_tile_rows, make_view, trace
+from slam_core.simulation.shading import EDGE_RAYS, is_edge, reflectance, split_pixel, surface_light
 from slam_core.simulation.surface_table import Look, SurfaceTable
-from slam_core.types import Float32Array
+from slam_core.types import ByteArray, Float32Array
 
-EDGE_RAYS = 4
 INFRARED = Look.INFRARED
 
 
@@ -122,56 +122,62 @@ class TofSensor:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_ray(
-    world: SurfaceTable,
-    view: View,
-    q: int,
-    z: float,
-    u: float,
-    v: float,
+def _echo(
     x: float,
     y: float,
+    q: int,
+    w: int,
     pixel: float,
-    wave: float,
-    total: FloatArray,
-) -> None:  # pragma: no cover - compiled
-    """Add the light that returns along one ray: phasor (2) and ambient; ``pixel`` is the ray's width at one metre."""
-    w, p, look = view.ids[q], view.planes, world.look
+    planes: FloatArray,
+    shifts: FloatArray,
+    look: FloatArray,
+    lookup: npt.NDArray[np.int64],
+    texels: ByteArray,
+    index: npt.NDArray[np.int64],
+) -> tuple[float, float, float, float, float]:  # pragma: no cover - compiled
+    """Distance, amplitude, infrared reflectance and place (u, v) where the ray (x, y, 1) meets row ``q`` of the
+    view.
+    """
+    p = planes
+    z = 1.0 / (p[q, 0] * x + p[q, 1] * y + p[q, 2])
+    u = min(max(z * (p[q, 3] * x + p[q, 4] * y + p[q, 5]) - shifts[q, 0], 0.0), 1.0)
+    v = min(max(z * (p[q, 6] * x + p[q, 7] * y + p[q, 8]) - shifts[q, 1], 0.0), 1.0)
     ray_length = np.sqrt(x * x + y * y + 1.0)
     distance = z * ray_length
     # planes[:3] is normal / (normal . p), its product with the ray is 1/z.
-    cosine = 1.0 / (z * ray_length * np.sqrt(p[q, 0] ** 2 + p[q, 1] ** 2 + p[q, 2] ** 2))
+    cosine = 1.0 / (distance * np.sqrt(p[q, 0] * p[q, 0] + p[q, 1] * p[q, 1] + p[q, 2] * p[q, 2]))
     width = pixel * z / max(cosine, 0.2)
-    size_u = width * np.sqrt(p[q, 3] ** 2 + p[q, 4] ** 2 + p[q, 5] ** 2)
-    size_v = width * np.sqrt(p[q, 6] ** 2 + p[q, 7] ** 2 + p[q, 8] ** 2)
-    texels, index = world.textures.texels, world.textures.index
-    visible = reflectance(look, world.lookup, texels, index, w, u, v, size_u, 0.0, 0.0, size_v)
+    size_u = width * np.sqrt(p[q, 3] * p[q, 3] + p[q, 4] * p[q, 4] + p[q, 5] * p[q, 5])
+    size_v = width * np.sqrt(p[q, 6] * p[q, 6] + p[q, 7] * p[q, 7] + p[q, 8] * p[q, 8])
+    visible = reflectance(look, lookup, texels, index, w, u, v, size_u, 0.0, 0.0, size_v)
     infrared = min((0.12 + 0.85 * visible) * look[w, INFRARED], 1.0)
-    amplitude = infrared * cosine / (distance * distance)
-    total[0] += amplitude * np.cos(wave * distance)
-    total[1] += amplitude * np.sin(wave * distance)
-    total[2] += infrared * surface_light(world.light, world.lookup, w, u, v)
+    return distance, infrared * cosine / (distance * distance), infrared, u, v
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _phasor_rows(
     first: int, last: int, world: SurfaceTable, view: View, all_rays: Rays, hits: Hits, wave: float, out: FloatArray
 ) -> None:  # pragma: no cover - compiled
-    height, width = hits.surface.shape
-    columns, rays, total = all_rays.bounds.shape[1], all_rays.rays, np.zeros(3)
+    """Fill ``out`` (h, w, 3): phasor (2) and ambient light of each pixel, summed over the surfaces that share it."""
+    surface, candidates, counts = hits.surface, hits.candidates, hits.counts
+    rays, planes, shifts, near, ids = all_rays.rays, view.planes, view.shifts, view.near, view.ids
+    look, lookup, light = world.look, world.lookup, world.light
+    texels, index = world.textures.texels, world.textures.entries
+    height, width = surface.shape
+    columns = all_rays.bounds.shape[1]
+    parts = np.empty((EDGE_RAYS * EDGE_RAYS, 4))
     for i in range(first * TILE, min(last * TILE, height)):
         for j in range(width):
-            tile = (i // TILE) * columns + j // TILE
-            n = EDGE_RAYS if is_edge(hits.surface, i, j) else 1
-            total[:] = 0.0
-            for k in range(n * n):
-                s, t = (k // n + 0.5) / n - 0.5, (k % n + 0.5) / n - 0.5
-                x = rays[i, j, 0] + s * rays[i, j, 2] + t * rays[i, j, 4]
-                y = rays[i, j, 1] + s * rays[i, j, 3] + t * rays[i, j, 5]
-                q, z, u, v = nearest(
-                    x, y, hits.candidates, hits.counts[tile], tile, view.planes, view.shifts, view.near
+            found = 1 if surface[i, j] >= 0 else 0
+            parts[0, 0], parts[0, 1], parts[0, 2], parts[0, 3] = surface[i, j], 1.0, rays[i, j, 0], rays[i, j, 1]
+            if is_edge(surface, i, j):
+                tile = (i // TILE) * columns + j // TILE
+                found = split_pixel(i, j, tile, rays, candidates, counts, planes, shifts, near, parts)
+            for m in range(found):
+                q, share = int(parts[m, 0]), parts[m, 1]
+                distance, amplitude, infrared, u, v = _echo(
+                    parts[m, 2], parts[m, 3], q, ids[q], rays[i, j, 2], planes, shifts, look, lookup, texels, index
                 )
-                if q >= 0:
-                    _add_ray(world, view, q, z, u, v, x, y, rays[i, j, 2] / n, wave, total)
-            for k in range(3):
-                out[i, j, k] = total[k] / (n * n)
+                out[i, j, 0] += share * amplitude * np.cos(wave * distance)
+                out[i, j, 1] += share * amplitude * np.sin(wave * distance)
+                out[i, j, 2] += share * infrared * surface_light(light, lookup, ids[q], u, v)

@@ -1,8 +1,8 @@
 """How the rig moves: a smooth path through way points, and what a walking person adds to it.
 
-Position, heading and pitch are cubic splines of time with zero velocity at both ends (twice continuously differentiable). A
-motion style adds bob and sway at the step frequency and slow unrest, faded in and out so that a loop returns to its start
-exactly.
+Position, heading and pitch are cubic splines of time with zero velocity at both ends (twice continuously
+differentiable). A motion style adds bob and sway at the step frequency and slow unrest, faded in and out so that a
+loop returns to its start exactly.
 """
 
 from __future__ import annotations
@@ -37,8 +37,10 @@ MOTION_STYLES = {
 }
 FADE_S = 1.0
 UNREST_WAVES = 5
-TURN_COST = 0.5
+TURN_COST = 0.8
 """One radian of turning takes as long as this many metres."""
+SWITCH_EARLY = 0.02
+"""A tripod is moved this share of its stay before the next stay's first frame, so that it stands when that is taken."""
 
 
 class Path(Protocol):
@@ -110,7 +112,7 @@ class StationPath:
 
     def pose(self, t: float) -> FloatArray:
         """``T_world_rig`` at time ``t``."""
-        k = int(np.clip(np.floor(t / self._dwell + 1e-9), 0, len(self._stations) - 1))
+        k = int(np.clip(np.floor(t / self._dwell + SWITCH_EARLY), 0, len(self._stations) - 1))
         x, y, z, yaw, pitch = self._stations[k]
         return make_transform(rotation_from_euler(yaw, pitch), np.array([x, y, z]))
 

@@ -1,7 +1,7 @@
 """A world of textured rectangles: what the ray caster draws.
 
-A surface is a rectangle given by a corner and two orthogonal edges; it is seen from the side to which ``edge_u x edge_v``
-points. Boxes are six of them. Everything else (rooms, doors, furniture) is built from these two.
+A surface is a rectangle given by a corner and two orthogonal edges; it is seen from the side to which ``edge_u x
+edge_v`` points. Boxes are six of them. Everything else (rooms, doors, furniture) is built from these two.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One rectangle: ``origin`` (3,) m, ``edge_u``, ``edge_v`` (3,) m, orthogonal; ``room`` for the light it receives."""
+    """One rectangle: ``origin`` (3,) m, ``edge_u``, ``edge_v`` (3,) m, orthogonal; ``room`` for the light it
+    receives.
+    """
 
     origin: FloatArray
     edge_u: FloatArray
