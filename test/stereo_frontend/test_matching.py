@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereo_frontend.keypoints import Keypoints
-from stereo_frontend.matching import MatchingConfig, disparity_bounds, match_stereo, mutual_best, swapped_share
+from stereo_frontend.matching import MatchingConfig, disparity_bounds, match_stereo, swapped_share
 
 BOUNDS = (0.5, 60.0)
 
@@ -48,12 +48,38 @@ def test_partners_off_the_row_or_beyond_the_disparities_are_not(pair):
     assert set(range(80)) - set(matches.left.tolist()) == {0, 1, 2, 3}
 
 
-def test_a_match_must_be_the_best_of_both_sides_and_clear():
-    similarity = np.array([[0.9, 0.2, 0.1], [0.95, 0.3, 0.1], [0.1, 0.80, 0.79]], np.float32)
-    matches = mutual_best(similarity, 0.7, 0.9)
-    assert list(zip(matches.left, matches.right, strict=True)) == [(1, 0)]
-    assert list(mutual_best(similarity, 0.7, 1.0).left) == [1, 2]
-    assert len(mutual_best(similarity, 0.96, 1.0)) == 0
+def twin(left, right, config, bounds):
+    """The same by one matrix product over all pairs."""
+    disparity = left.uv[:, None, 0] - right.uv[None, :, 0]
+    allowed = (np.abs(left.uv[:, None, 1] - right.uv[None, :, 1]) <= config.epipolar_band) & (disparity >= bounds[0])
+    allowed &= (disparity <= bounds[1]) & (
+        np.abs(np.log(left.size[:, None] / right.size[None])) <= np.log(config.max_size_ratio)
+    )
+    similarity = np.where(allowed, left.descriptors @ right.descriptors.T, -2.0)
+    best = similarity.argmax(axis=1)
+    rows = np.arange(len(best))
+    value, second = similarity[rows, best], np.sort(similarity, axis=1)[:, -2]
+    keep = (value >= config.min_similarity) & (similarity.argmax(axis=0)[best] == rows)
+    keep &= (1 - value) <= config.max_ratio**2 * (1 - second)
+    return rows[keep], best[keep]
+
+
+@pytest.mark.parametrize("ratio", [0.9, 1.0])
+def test_crowded_keypoints_match_as_by_the_full_matrix_product(rng, ratio):
+    """Few prototypes and much noise: every rule decides some pairs."""
+    prototypes = rng.normal(size=(6, 32))
+    sides = []
+    for _ in range(2):
+        uv = rng.uniform([0, 0], [120, 40], (300, 2))
+        descriptors = prototypes[rng.integers(0, 6, 300)] + 0.35 * rng.normal(size=(300, 32))
+        sides.append(keypoints(uv, descriptors))
+        sides[-1].size[:] = rng.uniform(8, 16, 300)
+    config = MatchingConfig(max_ratio=ratio, min_similarity=0.85)
+    matches = match_stereo(*sides, config, BOUNDS)
+    left, right = twin(*sides, config, BOUNDS)
+    assert len(left) > 20
+    np.testing.assert_array_equal(matches.left, left)
+    np.testing.assert_array_equal(matches.right, right)
 
 
 def test_swapped_images_show_in_the_sign_of_the_disparity(pair):

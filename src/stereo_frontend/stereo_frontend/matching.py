@@ -1,8 +1,7 @@
 """Stereo matching of described keypoints: the normalised scalar product (Eq. 3.1) within the epipolar band.
 
-``argmax_j  delta_i . delta_j >= alpha`` for unit-norm descriptors, as one matrix product; a match must be the best of
-both sides, lie in the band of rows around its partner, and have a disparity between the bounds that the depth range
-sets.
+``argmax_j  delta_i . delta_j >= alpha`` for unit-norm descriptors; a match must be the best of both sides, lie in the
+band of rows around its partner, and have a disparity between the bounds that the depth range sets.
 """
 
 from __future__ import annotations
@@ -11,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from slam_core.config import Config, parameter
 from slam_core.types import Float32Array
 from stereo_frontend.keypoints import Keypoints
 
 IndexArray = npt.NDArray[np.intp]
-_EXCLUDED = np.float32(-2.0)
 
 
 @dataclass(frozen=True)
@@ -60,34 +59,49 @@ def disparity_bounds(config: MatchingConfig, focal_baseline: float) -> tuple[flo
 
 def match_stereo(left: Keypoints, right: Keypoints, config: MatchingConfig, bounds: tuple[float, float]) -> Matches:
     """Mutual best matches of a rectified pair with a disparity within ``bounds`` (px)."""
-    if len(left) == 0 or len(right) == 0:
+    if len(left) == 0 or len(right) == 0 or left.descriptors.shape[1] != right.descriptors.shape[1]:
         return _matches([], [], [])
-    similarity = left.descriptors @ right.descriptors.T
-    similarity[~candidate_mask(left, right, config, bounds)] = _EXCLUDED
-    return mutual_best(similarity, config.min_similarity, config.max_ratio)
+    by_row = np.argsort(right.uv[:, 1], kind="stable")
+    ordered = right.select(by_row)
+    limits = np.array([config.epipolar_band, bounds[0], bounds[1], np.log(config.max_size_ratio)])
+    best, value, second, best_of_right = _best_in_band(
+        left.uv, np.log(left.size), left.descriptors, ordered.uv, np.log(ordered.size), ordered.descriptors, limits
+    )
+    keep = (value >= config.min_similarity) & (best_of_right[best] == np.arange(len(left)))
+    if config.max_ratio < 1.0:
+        keep &= (1.0 - value) <= config.max_ratio**2 * (1.0 - second)
+    return _matches(np.flatnonzero(keep), by_row[best[keep]], value[keep])
 
 
-def candidate_mask(
-    left: Keypoints, right: Keypoints, config: MatchingConfig, bounds: tuple[float, float]
-) -> npt.NDArray[np.bool_]:
-    """Which pairs geometry allows, shape (n_left, n_right)."""
-    disparity = left.uv[:, None, 0] - right.uv[None, :, 0]
-    rows = np.abs(left.uv[:, None, 1] - right.uv[None, :, 1])
-    size = np.abs(np.log(left.size)[:, None] - np.log(right.size)[None, :])
-    in_depth = (disparity >= bounds[0]) & (disparity <= bounds[1])
-    return np.asarray(in_depth & (rows <= config.epipolar_band) & (size <= np.log(config.max_size_ratio)))
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _best_in_band(uv, log_size, descriptors, uv_right, log_size_right, descriptors_right, limits):  # type: ignore[no-untyped-def]
+    """Best and second-best scalar product of each left keypoint, and the best left one of each right keypoint.
 
-
-def mutual_best(similarity: Float32Array, min_similarity: float, max_ratio: float) -> Matches:
-    """Pairs that are each other's best in ``similarity`` (n, m) and clearly better than the row's second best."""
-    rows = np.arange(len(similarity))
-    best = similarity.argmax(axis=1)
-    value = similarity[rows, best]
-    keep = (value >= min_similarity) & (similarity.argmax(axis=0)[best] == rows)
-    if max_ratio < 1.0 and similarity.shape[1] > 1:
-        second = np.partition(similarity, -2, axis=1)[:, -2]
-        keep &= (1.0 - value) <= max_ratio**2 * (1.0 - second)
-    return _matches(rows[keep], best[keep], value[keep])
+    The right keypoints come sorted by row, so that only those in the band are multiplied: a hundredth of all pairs.
+    """
+    n, m = len(uv), len(uv_right)
+    best = np.zeros(n, np.intp)
+    value, second = np.full(n, np.float32(-2.0)), np.full(n, np.float32(-2.0))
+    best_of_right, value_of_right = np.full(m, -1, np.intp), np.full(m, np.float32(-2.0))
+    rows = uv_right[:, 1].copy()
+    for i in range(n):
+        first = np.searchsorted(rows, uv[i, 1] - limits[0])
+        for j in range(first, m):
+            if rows[j] > uv[i, 1] + limits[0]:
+                break
+            disparity = uv[i, 0] - uv_right[j, 0]
+            if disparity < limits[1] or disparity > limits[2] or abs(log_size[i] - log_size_right[j]) > limits[3]:
+                continue
+            product = np.float32(0.0)
+            for k in range(descriptors.shape[1]):
+                product += descriptors[i, k] * descriptors_right[j, k]
+            if product > value[i]:
+                best[i], second[i], value[i] = j, value[i], product
+            elif product > second[i]:
+                second[i] = product
+            if product > value_of_right[j]:
+                best_of_right[j], value_of_right[j] = i, product
+    return best, value, second, best_of_right
 
 
 def swapped_share(

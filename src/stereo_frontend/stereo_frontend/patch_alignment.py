@@ -6,8 +6,10 @@ import numpy as np
 from numba import njit
 
 UNKNOWNS = 4
+REORDER = {"reassoc", "contract"}
+"""What a sum needs to be vectorised; the rest of fastmath would forget that NaN exists."""
 _MOST_ITERATIONS = 12
-_CONVERGED = 0.005
+_CONVERGED = 0.01
 _LEAST_ENERGY = 1.0
 _ROUNDING_VARIANCE = 0.1
 """Variance of grey values rounded to integers, both images."""
@@ -21,8 +23,8 @@ def align_patches(left, right, uv_left, u_right, radius, max_shift, information,
     v. ``information`` (4,) is their prior's.
     """
     n = (2 * radius + 1) ** 2
-    template, patch = np.empty(n), np.empty(n)
-    jacobian = np.empty((UNKNOWNS, n))
+    template, patch = np.empty(n, np.float32), np.empty(n, np.float32)
+    jacobian = np.empty((UNKNOWNS, n), np.float32)
     normal, hessian = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
     step, p = np.empty(UNKNOWNS), np.empty(UNKNOWNS)
     for k in range(len(uv_left)):
@@ -47,7 +49,7 @@ def align_patches(left, right, uv_left, u_right, radius, max_shift, information,
                 normal[i, i] += noise * information[i]
             if length < _CONVERGED:
                 out[k, 0] = u - u_right[k] - p[0]
-                out[k, 1] = noise * _first_of_inverse(normal) * _correlation_factor(template, patch, radius)
+                out[k, 1] = noise * _first_of_inverse(normal) * _correlation_factor(patch, radius)
                 out[k, 2] = correlation
                 out[k, 3] = p[1]
                 break
@@ -69,25 +71,20 @@ def _take_template(image, u, v, radius, template, jacobian):  # type: ignore[no-
     if u0 < radius + 1 or v0 < radius + 1 or u0 > width - radius - 2 or v0 > height - radius - 2:
         return 0.0
     n = 0
-    mean = 0.0
     for y in range(v0 - radius, v0 + radius + 1):
+        row, above, below = image[y], image[y - 1], image[y + 1]
         for x in range(u0 - radius, u0 + radius + 1):
-            template[n] = image[y, x]
-            gx = 0.5 * (np.float64(image[y, x + 1]) - image[y, x - 1])
+            gx = np.float32(0.5) * (np.float32(row[x + 1]) - np.float32(row[x - 1]))
+            template[n] = row[x]
             jacobian[0, n] = gx
-            jacobian[1, n] = 0.5 * (np.float64(image[y + 1, x]) - image[y - 1, x])
+            jacobian[1, n] = np.float32(0.5) * (np.float32(below[x]) - np.float32(above[x]))
             jacobian[2, n] = gx * (x - u)
             jacobian[3, n] = gx * (y - v)
-            mean += template[n]
             n += 1
     for i in range(UNKNOWNS):
-        row = jacobian[i]
-        row -= np.sum(row) / n
-    energy = 0.0
-    for i in range(n):
-        template[i] -= mean / n
-        energy += template[i] * template[i]
-    return energy
+        _remove_mean(jacobian[i])
+    _remove_mean(template)
+    return _dot(template, template)
 
 
 @njit(cache=True, nogil=True)
@@ -96,74 +93,83 @@ def _sample_patch(image, u, v, u_right, p, radius, patch):  # type: ignore[no-un
     height, width = image.shape
     u0, v0 = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
     n = 0
-    mean = 0.0
     for j in range(-radius, radius + 1):
         y = v0 + j + p[1]
         y0 = int(np.floor(y))
         start = u_right + (u0 - u) + p[0] + p[2] * (u0 - u) + p[3] * (v0 + j - v)
         reach = radius * (1.0 + p[2])
         if reach <= 0.0 or start < reach or start + reach >= width - 1 or y0 < 0 or y0 >= height - 1:
-            return 0.0
-        fy = y - y0
+            return np.float32(0.0)
+        fy = np.float32(y - y0)
         above, below = image[y0], image[y0 + 1]
         for i in range(-radius, radius + 1):
             x = start + i * (1.0 + p[2])
             x0 = int(x)
-            fx = x - x0
-            upper = (1.0 - fx) * above[x0] + fx * above[x0 + 1]
-            lower = (1.0 - fx) * below[x0] + fx * below[x0 + 1]
+            fx = np.float32(x - x0)
+            upper = np.float32(above[x0]) + fx * (np.float32(above[x0 + 1]) - np.float32(above[x0]))
+            lower = np.float32(below[x0]) + fx * (np.float32(below[x0 + 1]) - np.float32(below[x0]))
             patch[n] = upper + fy * (lower - upper)
-            mean += patch[n]
             n += 1
-    power = 0.0
-    for i in range(n):
-        patch[i] -= mean / n
-        power += patch[i] * patch[i]
-    return power
+    _remove_mean(patch)
+    return _dot(patch, patch)
+
+
+@njit(cache=True, nogil=True, fastmath=REORDER)
+def _remove_mean(values):  # type: ignore[no-untyped-def]
+    total = np.float32(0.0)
+    for i in range(len(values)):
+        total += values[i]
+    mean = total / np.float32(len(values))
+    for i in range(len(values)):
+        values[i] -= mean
+
+
+@njit(cache=True, nogil=True, fastmath=REORDER)
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    total = np.float32(0.0)
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
 
 
 @njit(cache=True, nogil=True)
 def _normal_matrix(jacobian, hessian):  # type: ignore[no-untyped-def]
     for i in range(UNKNOWNS):
         for j in range(i + 1):
-            hessian[i, j] = np.sum(jacobian[i] * jacobian[j])
+            hessian[i, j] = _dot(jacobian[i], jacobian[j])
             hessian[j, i] = hessian[i, j]
 
 
 @njit(cache=True, nogil=True)
 def _right_hand_side(template, patch, jacobian, energy, power, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` with ``J^T r`` after the best gain; returns the residual's variance and the correlation."""
-    cross = np.sum(template * patch)
+    """Turn ``patch`` into the residual r after the best gain, fill ``out`` with ``J^T r``; its variance and
+    correlation.
+    """
+    cross = _dot(template, patch)
     gain = cross / power
-    out[:] = 0.0
-    residual = 0.0
-    for i in range(len(template)):
-        r = template[i] - gain * patch[i]
-        residual += r * r
-        for j in range(UNKNOWNS):
-            out[j] += jacobian[j, i] * r
-    return residual / (len(template) - UNKNOWNS - 2) + _ROUNDING_VARIANCE, cross / np.sqrt(power * energy)
+    for i in range(len(patch)):
+        patch[i] = template[i] - gain * patch[i]
+    for i in range(UNKNOWNS):
+        out[i] = _dot(jacobian[i], patch)
+    freedom = len(template) - UNKNOWNS - 2
+    return _dot(patch, patch) / freedom + _ROUNDING_VARIANCE, cross / np.sqrt(power * energy)
 
 
 @njit(cache=True, nogil=True)
-def _correlation_factor(template, patch, radius):  # type: ignore[no-untyped-def]
+def _correlation_factor(residual, radius):  # type: ignore[no-untyped-def]
     """How much more variance correlated noise leaves than white noise, ``(1 + 2 rho_u) (1 + 2 rho_v)``.
 
-    Rectification interpolates, which makes neighbouring pixels share their noise: the residual's own correlation shows it.
+    Rectification interpolates, which makes neighbouring pixels share their noise: the residual's own correlation shows
+    it.
     """
     side = 2 * radius + 1
-    gain = np.sum(template * patch) / np.sum(patch * patch)
-    total, along, across = 0.0, 0.0, 0.0
+    grid = residual.reshape(side, side)
+    along, across = 0.0, 0.0
     for j in range(side):
-        for i in range(side):
-            k = j * side + i
-            r = template[k] - gain * patch[k]
-            total += r * r
-            if i + 1 < side:
-                along += r * (template[k + 1] - gain * patch[k + 1])
-            if j + 1 < side:
-                across += r * (template[k + side] - gain * patch[k + side])
-    scale = 2.0 * side / (side - 1.0) / max(total, 1e-12)
+        for i in range(side - 1):
+            along += grid[j, i] * grid[j, i + 1]
+            across += grid[i, j] * grid[i + 1, j]
+    scale = 2.0 * side / (side - 1.0) / max(_dot(residual, residual), 1e-12)
     return (1.0 + max(0.0, scale * along)) * (1.0 + max(0.0, scale * across))
 
 
