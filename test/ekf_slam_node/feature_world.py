@@ -109,17 +109,20 @@ def loop(
 
 
 def wander(
-    steps: int, dt: float, sigma: FloatArray, velocity_sigma: FloatArray, rng: np.random.Generator
+    steps: int, dt: float, sigma: FloatArray, velocity_sigma: FloatArray, rng: np.random.Generator, reach: float = 1.5
 ) -> list[FloatArray]:
-    """Poses T_world_rig that follow the filter's own motion model: random accelerations (6,), a random first
-    velocity.
+    """Poses T_world_rig that follow the filter's own motion model within ``reach`` (m) of the origin.
+
+    Random accelerations (6,) and a random first velocity; a walk that leaves the reach is drawn again.
     """
-    T, velocity = np.eye(4), velocity_sigma * rng.standard_normal(6)
-    poses = [T]
-    for _ in range(steps - 1):
-        a = sigma * rng.standard_normal(6)
-        step = velocity * dt + 0.5 * a * dt * dt
-        T = T @ make_transform(so3_exp(step[3:]), step[:3])
-        velocity = velocity + a * dt
-        poses.append(T)
-    return poses
+    while True:
+        T, velocity = np.eye(4), velocity_sigma * rng.standard_normal(6)
+        poses = [T]
+        for _ in range(steps - 1):
+            a = sigma * rng.standard_normal(6)
+            step = velocity * dt + 0.5 * a * dt * dt
+            T = T @ make_transform(so3_exp(step[3:]), step[:3])
+            velocity = velocity + a * dt
+            poses.append(T)
+        if max(np.linalg.norm(pose[:3, 3]) for pose in poses) < reach:
+            return poses

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ekf_slam_node.config import MotionConfig
-from slam_core.geometry import FloatArray, compose_covariance, make_transform, so3_exp, so3_log
+from slam_core.geometry import (
+    FloatArray,
+    compose_covariance,
+    interpolate_transform,
+    make_transform,
+    so3_exp,
+    so3_log,
+)  # fmt: skip
 from slam_core.types import ImuSample, RelativeMotion
 
 ALL = slice(0, 6)
@@ -24,24 +31,24 @@ class Aid:
 
 
 class MotionAids:
-    """Collects aids between two frames of the filter."""
+    """Collects what other sensors say of the motion and sums it up between two frames of the filter.
+
+    Scans need not have the frames' stamps: a scan's motion is taken as even, and the last one goes on for at most its
+    own length, with the noise of the constant-velocity model on top.
+    """
 
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
-        self._motion: RelativeMotion | None = None
+        self._motions: list[RelativeMotion] = []
         self._samples: list[ImuSample] = []
 
     def add_motion(self, motion: RelativeMotion) -> bool:
-        """Take a motion; chained to the ones before if it continues them. False if it is not finite or not positive
-        definite.
-        """
+        """Take a motion; False if it is not finite, not positive definite or not forward in time."""
         if not _is_usable(motion):
             return False
-        last = self._motion
-        if last is not None and self._is_same_time(last.end_stamp_ns, motion.start_stamp_ns):
-            covariance = compose_covariance(last.T, last.covariance, motion.T, motion.covariance)
-            motion = RelativeMotion(last.start_stamp_ns, motion.end_stamp_ns, last.T @ motion.T, covariance)
-        self._motion = motion
+        if self._motions and not self._is_same_time(self._motions[-1].end_stamp_ns, motion.start_stamp_ns):
+            self._motions = []
+        self._motions.append(motion)
         return True
 
     def add_imu(self, sample: ImuSample) -> bool:
@@ -53,37 +60,62 @@ class MotionAids:
         return True
 
     def between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
-        """The best aid that covers the time between two stamps."""
-        motion = self._motion
-        if (
-            motion is not None
-            and self._is_same_time(motion.start_stamp_ns, start_stamp_ns)
-            and self._is_same_time(motion.end_stamp_ns, end_stamp_ns)
-        ):
-            return Aid(motion.T, motion.covariance, ALL)
-        return self._rotation_between(start_stamp_ns, end_stamp_ns)
+        """The best aid that covers the time between two stamps, or None."""
+        return self._motion_between(start_stamp_ns, end_stamp_ns) or self._rotation_between(
+            start_stamp_ns, end_stamp_ns
+        )
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop what lies before the frame the filter has reached."""
-        if self._motion is not None and self._motion.end_stamp_ns <= stamp_ns:
-            self._motion = None
-        # One sample from before stays: it holds until the next one.
+        """Drop what lies before the frame the filter has reached; the last of it stays, it may go on."""
+        older = sum(motion.end_stamp_ns <= stamp_ns for motion in self._motions)
+        del self._motions[: max(older - 1, 0)]
         older = sum(sample.stamp_ns <= stamp_ns for sample in self._samples)
         del self._samples[: max(older - 1, 0)]
 
+    # ---- scans
+    def _motion_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+        if not self._motions or not self._motions_cover(start_stamp_ns, end_stamp_ns):
+            return None
+        T, covariance = np.eye(4), np.zeros((6, 6))
+        for number, motion in enumerate(self._motions):
+            last = number == len(self._motions) - 1
+            begin = max(start_stamp_ns, motion.start_stamp_ns)
+            end = end_stamp_ns if last else min(end_stamp_ns, motion.end_stamp_ns)
+            if end > begin:
+                share = (end - begin) / (motion.end_stamp_ns - motion.start_stamp_ns)
+                beyond = max(end - motion.end_stamp_ns, 0) * 1e-9
+                part = self._part(motion, share, beyond)
+                T, covariance = T @ part.T, compose_covariance(T, covariance, part.T, part.covariance)
+        return Aid(T, covariance, ALL)
+
+    def _motions_cover(self, start_stamp_ns: int, end_stamp_ns: int) -> bool:
+        first, last = self._motions[0], self._motions[-1]
+        tolerance = self._config.aid_stamp_tolerance * 1e9
+        reach = last.end_stamp_ns + max(tolerance, last.end_stamp_ns - last.start_stamp_ns)
+        return first.start_stamp_ns <= start_stamp_ns + tolerance and end_stamp_ns <= reach
+
+    def _part(self, motion: RelativeMotion, share: float, beyond: float) -> RelativeMotion:
+        T = interpolate_transform(np.eye(4), motion.T, np.array(share))
+        length = (motion.end_stamp_ns - motion.start_stamp_ns) * 1e-9
+        sigma = np.repeat([self._config.sigma_acceleration, self._config.sigma_angular_acceleration], 3)
+        noise = np.diag(np.square(sigma * beyond * (beyond + length)))
+        return replace(motion, T=T, covariance=motion.covariance * max(share, 1.0) ** 2 + noise)
+
+    # ---- turn rates
     def _rotation_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
         stamps = np.array([sample.stamp_ns for sample in self._samples], dtype=np.int64)
-        inside = (stamps > start_stamp_ns) & (stamps < end_stamp_ns)
         gap_limit = 0.5 * (end_stamp_ns - start_stamp_ns)
         if len(stamps) < 2 or stamps[0] > start_stamp_ns + gap_limit or stamps[-1] < end_stamp_ns - gap_limit:
             return None
+        inside = (stamps > start_stamp_ns) & (stamps < end_stamp_ns)
         edges = np.concatenate([[start_stamp_ns], stamps[inside], [end_stamp_ns]])
         rates = np.array([sample.angular_velocity for sample in self._samples])
-        middle = 0.5 * (edges[1:] + edges[:-1]) - stamps[0]
+        middle = 0.5 * (edges[1:] + edges[:-1]) - start_stamp_ns
+        times = (stamps - start_stamp_ns).astype(np.float64)
+        at_middle = np.column_stack([np.interp(middle, times, rates[:, axis]) for axis in range(3)])
         rotation = np.eye(3)
-        for when, dt in zip(middle, np.diff(edges) * 1e-9, strict=True):
-            rate = [np.interp(when, stamps - stamps[0], rates[:, axis]) for axis in range(3)]
-            rotation = rotation @ so3_exp(np.array(rate) * dt)
+        for step in so3_exp(at_middle * np.diff(edges)[:, None] * 1e-9):
+            rotation = rotation @ step
         sigma = self._config.sigma_gyro * (end_stamp_ns - start_stamp_ns) * 1e-9
         return Aid(make_transform(rotation, np.zeros(3)), np.eye(3) * sigma**2, ROTATION)
 

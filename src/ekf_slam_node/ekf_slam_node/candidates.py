@@ -63,12 +63,6 @@ def innovation_covariance(
     return np.asarray(S)
 
 
-def squared_distances(
-    z: FloatArray, variance: FloatArray, seen_z: FloatArray, S: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """NIS (n,) of paired measurements and ln det of their innovation covariances (Eq. 4.8)."""
-    S = S.copy()
-    S[:, np.arange(3), np.arange(3)] += variance
-    innovation = z - seen_z
-    solved = np.linalg.solve(S, innovation[:, :, None])[:, :, 0]
-    return np.einsum("ni,ni->n", innovation, solved), np.linalg.slogdet(S)[1]
+def squared_distances(innovation: FloatArray, S: FloatArray) -> FloatArray:
+    """NIS (n,) of innovations (n, 3) with covariances S (n, 3, 3)."""
+    return np.asarray(np.einsum("ni,ni->n", innovation, np.linalg.solve(S, innovation[:, :, None])[:, :, 0]))

@@ -37,6 +37,18 @@ class MeasurementConfig(Config):
     )  # fmt: skip
     min_sigma_px: float = parameter(0.05, "floor of the pixel noise", unit="px", minimum=1e-3)
     min_sigma_depth: float = parameter(1e-4, "floor of the depth noise", unit="m", minimum=1e-6)
+    noise_memory: float = parameter(
+        0.9,
+        "share of the past in the running estimate of how much larger the noise is than claimed",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    noise_tolerance: float = parameter(
+        1.5, "variances of one frame are enlarged only if its errors exceed them by more than this factor", minimum=1.0
+    )
+    max_noise_factor: float = parameter(
+        25.0, "largest factor on the claimed variances; 1 trusts every claim", minimum=1.0, maximum=1e4
+    )
     max_features: int = parameter(800, "the strongest features of a frame that are looked at", minimum=10)
     max_observations: int = parameter(120, "largest number of landmarks used in one update", minimum=6)
 
@@ -83,7 +95,7 @@ class LandmarkConfig(Config):
     min_sightings: int = parameter(3, "s_min of section 4.4", minimum=1)
     probation_frames: int = parameter(6, "N of section 4.4: frames a landmark has to reach min_sightings", minimum=1)
     min_hit_ratio: float = parameter(
-        0.1,
+        0.15,
         "a landmark seen in a smaller share of the frames in which it should be seen is removed",
         minimum=0.0,
         maximum=1.0,

@@ -18,12 +18,24 @@ class Pending:
     """Features of the last frame that are no landmarks (yet): a feature becomes one when a second frame confirms it.
 
     candidates: points in the rig frame of that frame. ids: (n,) of the landmarks they belong to where a new submap has
-    just begun, else -1. sightings: (n,) so far.
+    just begun, else -1. sightings: (n,) so far. free: (n,) whether the measurement may be used; where the submap before
+    has used it, it only helps to link the frames.
     """
 
     candidates: Candidates
     ids: IndexArray
     sightings: np.ndarray
+    free: np.ndarray
+
+    def select(self, index: np.ndarray) -> Pending:
+        """The features at ``index``."""
+        return Pending(self.candidates.select(index), self.ids[index], self.sightings[index], self.free[index])
+
+    def without(self, index: IndexArray) -> Pending:
+        """All but the features at ``index``."""
+        keep = np.ones(len(self.ids), dtype=bool)
+        keep[index] = False
+        return self.select(np.flatnonzero(keep))
 
 
 class LandmarkBook:

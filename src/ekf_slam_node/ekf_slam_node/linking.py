@@ -20,11 +20,13 @@ from slam_core.geometry import FloatArray
 class Link:
     """Pairs of candidates ``rows`` and features ``columns`` (k,), and the motion they agree on.
 
-    T, covariance: (4, 4) T_previous_now from these pairs alone, with its covariance (6, 6).
+    T, covariance: (4, 4) T_previous_now from these pairs alone, with its covariance (6, 6). excess: (3,) by what
+    factors the pairs' errors exceed their claimed variances.
     """
 
     T: FloatArray
     covariance: FloatArray
+    excess: FloatArray
     rows: IndexArray
     columns: IndexArray
 
@@ -99,13 +101,14 @@ class Linker:
         self, candidates: Candidates, frame: Frame, similarity: FloatArray, guess: MotionGuess, least: int
     ) -> Link | None:
         """Associate once more around the motion found, where the gates are as small as they can be."""
-        rows, columns = self._associate(candidates, frame, similarity, MotionPrior(guess.T, guess.covariance))
+        noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))
+        rows, columns = self._associate(candidates, noisier, similarity, MotionPrior(guess.T, guess.covariance))
         final = refine_motion(
             candidates.select(rows), frame.select(columns), self._T_rig_optical, guess.T, self._config.gate
         )
         if final is None or final.inliers.sum() < least:
             return None
-        return Link(final.T, final.covariance, rows[final.inliers], columns[final.inliers])
+        return Link(final.T, final.covariance, final.excess, rows[final.inliers], columns[final.inliers])
 
 
 def _image_spread(prior: MotionPrior, frame: Frame) -> float:

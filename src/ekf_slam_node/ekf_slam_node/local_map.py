@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,10 @@ class Sight:
     def select(self, index: np.ndarray) -> Sight:
         """The sightings at ``index``."""
         return Sight(self.slots[index], self.columns[index])
+
+    def every_second(self) -> Sight:
+        """Half of the sightings."""
+        return self.select(np.arange(0, len(self), 2))
 
 
 class LocalMap:
@@ -70,6 +74,7 @@ class LocalMap:
         """
         known = np.flatnonzero(link.rows < len(self.book))
         fresh = np.flatnonzero(link.rows >= len(self.book))
+        fresh = fresh[self.pending.free[link.rows[fresh] - len(self.book)]]
         pixels = frame.z[link.columns, :2]
         size = (frame.camera.width, frame.camera.height)
         known = known[spread_choice(pixels[known], pixels[:0], self._config.measurement.max_observations, size)]
@@ -104,9 +109,14 @@ class LocalMap:
         report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good])
         return report, sight.select(good)
 
-    def remember(self, frame: Frame, used: IndexArray) -> None:
-        """Keep the features of a frame, without those at ``used``, as the next frame's pending ones."""
-        self.pending = pending_of(frame, self._T_rig_optical, used)
+    def remember(self, frame: Frame, sight: Sight, link: Link, landmarks_before: int) -> None:
+        """Keep the features of a frame that measured nothing as the next frame's pending ones, with any names."""
+        named = np.flatnonzero(link.rows >= landmarks_before)
+        which = link.rows[named] - landmarks_before
+        pending = pending_of(frame, self._T_rig_optical)
+        pending.ids[link.columns[named]] = self.pending.ids[which]
+        pending.sightings[link.columns[named]] = self.pending.sightings[which] + 1
+        self.pending = pending.without(sight.columns)
 
     def tidy(self, frame: Frame, sight: Sight) -> None:
         """Count who was seen and who should have been, and remove landmarks that cannot be relied on."""
@@ -118,26 +128,27 @@ class LocalMap:
             self.book.remove(slot)
 
 
-def pending_of(frame: Frame, T_rig_optical: FloatArray, used: IndexArray) -> Pending:
-    """The features of a frame but those at ``used``, as candidates for the next one."""
-    free = np.ones(len(frame), dtype=bool)
-    free[used] = False
-    rest = frame.select(np.flatnonzero(free))
-    points, covariances = rig_points(rest, T_rig_optical)
-    n = len(rest)
+def pending_of(frame: Frame, T_rig_optical: FloatArray) -> Pending:
+    """All features of a frame, nameless, as candidates for the next one."""
+    points, covariances = rig_points(frame, T_rig_optical)
+    n = len(frame)
     return Pending(
-        Candidates(points, covariances, rest.descriptors), np.full(n, -1, dtype=np.int64), np.ones(n, dtype=np.int32)
-    )
+        Candidates(points, covariances, frame.descriptors), np.full(n, -1, dtype=np.int64), np.ones(n, dtype=np.int32),
+        np.ones(n, dtype=bool),
+    )  # fmt: skip
 
 
-def inheriting(frame: Frame, T_rig_optical: FloatArray, sight: Sight, book: LandmarkBook) -> Pending:
-    """All features of a frame, those of known landmarks with their identity: what an independent submap starts from.
+def inheriting(frame: Frame, T_rig_optical: FloatArray, sight: Sight, used: Sight, book: LandmarkBook) -> Pending:
+    """All features of a frame, those in ``sight`` with their landmarks' names: what an independent submap starts from.
 
-    Only names and descriptors are inherited. The places come from this frame's measurement, which the submap before
-    has not used: the two submaps share no information.
+    Names and descriptors are inherited, no places: these come from this frame's measurements except the ``used`` ones,
+    which have gone into the submap before. So the two submaps share no information.
     """
-    pending = pending_of(frame, T_rig_optical, np.zeros(0, dtype=np.int64))
+    pending = pending_of(frame, T_rig_optical)
+    descriptors = pending.candidates.descriptors.copy()
+    descriptors[sight.columns] = book.descriptors[sight.slots]
     pending.ids[sight.columns] = book.ids[sight.slots]
     pending.sightings[sight.columns] = book.sightings[sight.slots] + 1
-    pending.candidates.descriptors[sight.columns] = book.descriptors[sight.slots]
-    return pending
+    pending.free[used.columns] = False
+    candidates = replace(pending.candidates, descriptors=descriptors)
+    return replace(pending, candidates=candidates)

@@ -74,6 +74,10 @@ class Frame:
     def __len__(self) -> int:
         return len(self.z)
 
+    def with_larger_noise(self, factor: FloatArray) -> Frame:
+        """The same measurements with their variances multiplied by (3,)."""
+        return Frame(self.stamp_ns, self.z, self.variance * factor, self.descriptors, self.camera, self.index)
+
     def select(self, index: np.ndarray) -> Frame:
         """The measurements at ``index``."""
         return Frame(

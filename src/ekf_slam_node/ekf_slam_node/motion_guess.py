@@ -17,17 +17,27 @@ from ekf_slam_node.models import Frame, rig_points
 from slam_core.geometry import FloatArray, boxplus, invert_transform
 from slam_core.rigid_alignment import umeyama
 
-_CORE_GATE = 7.81
-"""95 % of chi-square with 3 degrees of freedom: what a sample must explain to count in full."""
+_SAMPLE_GATE = 4.0 * 7.81
+"""What a sample must explain to count in full: 95 % of chi-square with 3 degrees of freedom, at twice the standard
+deviation, because three points alone do not give the best motion.
+"""
+
+_MEDIAN_CHI2 = 0.4549
+"""Median of chi-square with one degree of freedom."""
+
+_MAX_EXCESS = 25.0
 
 
 @dataclass(frozen=True, eq=False)
 class MotionGuess:
-    """``T`` = T_previous_now (4, 4), covariance (6, 6) of the pairs alone, mask of the pairs that agree (n,)."""
+    """``T`` = T_previous_now (4, 4), covariance (6, 6) of the pairs alone, mask of the pairs that agree (n,), and by
+    what factors (3,) their errors exceed the claimed variances.
+    """
 
     T: FloatArray
     covariance: FloatArray
     inliers: np.ndarray
+    excess: FloatArray
 
 
 @njit(cache=True, nogil=True)
@@ -95,7 +105,7 @@ def _best_sample(
         c.fy,
         c.cx,
         c.cy,
-        _CORE_GATE,
+        _SAMPLE_GATE,
     )
     return np.asarray(motions[int(np.argmin(costs))])
 
@@ -103,26 +113,39 @@ def _best_sample(
 def refine_motion(
     candidates: Candidates, frame: Frame, T_rig_optical: FloatArray, T: FloatArray, gate: float, iterations: int = 8
 ) -> MotionGuess | None:
-    """Gauss-Newton on the pairs inside the gate, chosen anew in each step, the gate closing from wide to its value."""
-    covariance = np.eye(6)
+    """Gauss-Newton on the pairs inside the gate, chosen anew in each step, the gate closing from wide to its value.
+
+    The spread of the pairs' errors tells how much larger they are than claimed (``excess``); gate and weights follow.
+    """
+    covariance, excess, trusted = np.eye(6), np.ones(3), np.ones(3)
     inliers = np.zeros(len(candidates), dtype=bool)
     for step in range(iterations):
         seen = predict(candidates, T, T_rig_optical, frame)
         S = innovation_covariance(seen, candidates, None)
-        distance, _ = squared_distances(frame.z, frame.variance, seen.z, S)
-        updated = (distance < gate * max(1.0, 4.0 - step)) & (seen.depth > 0.05)
+        S[:, np.arange(3), np.arange(3)] += frame.variance
+        error = frame.z - seen.z
+        scaled = S * np.sqrt(np.outer(trusted, trusted))
+        updated = (squared_distances(error, scaled) < gate * max(1.0, 4.0 - step)) & (seen.depth > 0.05)
         if updated.sum() < 4:
             return None
         if step > 3 and np.array_equal(updated, inliers):
             break
         inliers = updated
-        S = S[inliers] + frame.variance[inliers][:, :, None] * np.eye(3)
-        weighted = np.linalg.solve(S, seen.J_pose[inliers])
+        excess = _excess(error[inliers], S[inliers])
+        trusted = np.maximum(excess, 1.0)
+        weighted = np.linalg.solve(S[inliers] * np.sqrt(np.outer(trusted, trusted)), seen.J_pose[inliers])
         information = np.einsum("nki,nkj->ij", seen.J_pose[inliers], weighted)
-        gradient = np.einsum("nki,nk->i", weighted, (frame.z - seen.z)[inliers])
+        gradient = np.einsum("nki,nk->i", weighted, error[inliers])
         try:
             covariance = np.linalg.inv(information)
         except np.linalg.LinAlgError:
             return None
         T = boxplus(T, covariance @ gradient)
-    return MotionGuess(T, 0.5 * (covariance + covariance.T), inliers)
+    return MotionGuess(T, 0.5 * (covariance + covariance.T), inliers, excess)
+
+
+def _excess(error: FloatArray, S: FloatArray) -> FloatArray:
+    """By how much the median squares of pixel and inverse depth errors exceed their variances (3,)."""
+    ratio = error**2 / S[:, np.arange(3), np.arange(3)] / _MEDIAN_CHI2
+    pixels, depth = np.median(ratio[:, :2]), np.median(ratio[:, 2])
+    return np.asarray(np.clip([pixels, pixels, depth], 0.25, _MAX_EXCESS))

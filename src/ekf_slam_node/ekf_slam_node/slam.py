@@ -16,6 +16,7 @@ from ekf_slam_node.landmarks import LandmarkBook, Pending
 from ekf_slam_node.linking import Link, Linker
 from ekf_slam_node.local_map import LocalMap, Sight, inheriting, pending_of
 from ekf_slam_node.models import CORE_DIM, Frame, frame_from_features, relative_motion
+from ekf_slam_node.noise_monitor import NoiseMonitor
 from ekf_slam_node.odometry import OdometryChain
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.submap_builder import SubmapBuilder, conditional_start
@@ -57,6 +58,7 @@ class EkfSlam:
         """Forget everything, as if just made."""
         self.counters = Counters()
         self._aids = MotionAids(self.config.motion)
+        self._noise = NoiseMonitor(self.config.measurement)
         self._odometry = OdometryChain()
         self._map: LocalMap | None = None
         self._builder = SubmapBuilder(self.config.agent, 0, 0, False)
@@ -73,14 +75,19 @@ class EkfSlam:
 
         Bad input is counted in ``counters`` and named in the result's reason, never raised.
         """
-        if motion is not None and not self._aids.add_motion(motion):
-            self.counters.add("motion_rejected")
+        if motion is not None:
+            self.process_motion(motion)
         if self._newest_stamp_ns is not None and features.stamp_ns <= self._newest_stamp_ns:
             self.counters.add("stamp_not_newer")
             return self._report(self._newest_stamp_ns, TrackingState.DEGRADED, "frame is not newer than the last")
         self._newest_stamp_ns = features.stamp_ns
-        frame = self._usable(features)
+        frame = self._noise.corrected(self._usable(features))
         return self._begin(frame) if self._map is None else self._advance(self._map, frame)
+
+    def process_motion(self, motion: RelativeMotion) -> None:
+        """A motion of the rig, as scan registration measures it; stamps need not be those of the frames."""
+        if not self._aids.add_motion(motion):
+            self.counters.add("motion_rejected")
 
     def process_imu(self, sample: ImuSample) -> None:
         """A reading of an IMU, in the order of the stamps, before the frames that come after it."""
@@ -131,30 +138,28 @@ class EkfSlam:
         submap.
         """
         surprising = _is_surprising(link, expected)
+        frame = self._noise.learn(frame, link.excess)
+        landmarks_before = len(local.book)
         sight = self._confirm(local, frame, link, surprising)
+        # Linearised at the motion found, not at the predicted one: over a large step the two are far apart.
         step = local.ekf.time_update(dt, self._excused_sigma(local, link, dt) if surprising else self._sigma, link.T)
         local.ekf.apply_time_update(step)
         self._use_aid(local, step, aid, link.T)
-        shared = 0 if surprising else int((link.rows < len(local.book)).sum())
-        closing = self._builder.is_complete(local.ekf, self.config.submap, shared)
-        submaps: tuple[Submap, ...] = ()
-        if closing and self.config.submap.start == "independent":
-            submaps = self._closed_before_measurement(frame.stamp_ns)
-            report, sight = local.measure(frame, sight)
-        else:
-            report, sight = local.measure(frame, sight)
-            self._builder.add_pose(frame.stamp_ns, local.ekf)
-        self._reached(frame)
+        closing = self._builder.is_complete(local.ekf, self.config.submap, len(sight))
+        divided = closing and self.config.submap.start == "independent"
+        report, used = local.measure(frame, sight.every_second() if divided else sight)
         if not report.applied:
             self.counters.add("updates_failed")
-        names = local.book.ids[sight.slots]
+        self._builder.add_pose(frame.stamp_ns, local.ekf)
+        self._reached(frame)
+        submaps = self._closed() if closing else ()
+        ids, index = local.book.ids[used.slots], frame.index[used.columns]
         if closing:
-            submaps = submaps or self._closed()
-            self._succeed(local, frame, sight)
+            self._succeed(local, frame, sight, used)
         else:
-            local.remember(frame, sight.columns)
-            local.tidy(frame, sight)
-        return self._report(frame.stamp_ns, TrackingState.OK, "", submaps, report, names, frame.index[sight.columns])
+            local.remember(frame, used, link, landmarks_before)
+            local.tidy(frame, used)
+        return self._report(frame.stamp_ns, TrackingState.OK, "", submaps, report, ids, index)
 
     def _confirm(self, local: LocalMap, frame: Frame, link: Link, surprising: bool) -> Sight:
         # A surprising motion rests on these pairs alone: all of them are worth their cost.
@@ -193,7 +198,7 @@ class EkfSlam:
         self._use_aid(local, step, aid, aid.T)
         self._builder.add_pose(frame.stamp_ns, local.ekf)
         self._reached(frame)
-        local.remember(frame, np.zeros(0, dtype=np.int64))
+        local.pending = pending_of(frame, self._T_rig_optical)
         return self._report(frame.stamp_ns, TrackingState.DEGRADED, "no visual association, moved by odometry alone")
 
     def _miss(self, local: LocalMap, frame: Frame, dt: float) -> EkfResult:
@@ -214,8 +219,7 @@ class EkfSlam:
             return False
         dt = (frame.stamp_ns - missed.stamp_ns) * 1e-9
         prior = motion_prior(np.zeros(6), np.diag(self._first_variance()), self._sigma, dt)
-        nobody = np.zeros(0, dtype=np.int64)
-        return self._linker.link(pending_of(missed, self._T_rig_optical, nobody).candidates, frame, prior) is not None
+        return self._linker.link(pending_of(missed, self._T_rig_optical).candidates, frame, prior) is not None
 
     def _restart(self, frame: Frame) -> EkfResult:
         """The old map is not found again, but two missed frames agree: a new submap begins at the first of them."""
@@ -236,7 +240,7 @@ class EkfSlam:
 
     def _start(self, frame: Frame) -> LocalMap:
         """A submap at a frame of which nothing is known before: position zero, velocity unknown."""
-        pending = pending_of(frame, self._T_rig_optical, np.zeros(0, dtype=np.int64))
+        pending = pending_of(frame, self._T_rig_optical)
         local = self._empty_map(frame, np.zeros(6), self._first_variance(), pending)
         self._open(local, frame, follows=False)
         return local
@@ -256,29 +260,22 @@ class EkfSlam:
         motion = self.config.motion
         return np.repeat([motion.sigma_initial_velocity, motion.sigma_initial_turn_rate], 3) ** 2
 
-    def _succeed(self, local: LocalMap, frame: Frame, sight: Sight) -> None:
+    def _succeed(self, local: LocalMap, frame: Frame, sight: Sight, used: Sight) -> None:
         """Open the submap that follows, at the rig's pose in this frame."""
         self._odometry.advance(self._pose(frame.stamp_ns))
         if self.config.submap.start == "independent":
-            following = self._independent_start(local, frame, sight)
+            pending = inheriting(frame, self._T_rig_optical, sight, used, local.book)
+            config = self.config.submap
+            # The velocity is a starting point with a variance so wide that it carries no information over.
+            wide = np.repeat([config.restart_sigma_velocity, config.restart_sigma_turn_rate], 3) ** 2
+            following = self._empty_map(frame, local.ekf.velocity, wide, pending)
         else:
-            ekf = conditional_start(local.ekf, sight.slots, self.config.error == "invariant")
-            pending = pending_of(frame, self._T_rig_optical, sight.columns)
-            following = LocalMap(self.config, self._T_rig_optical, ekf, local.book.select(sight.slots), pending)
+            ekf = conditional_start(local.ekf, used.slots, self.config.error == "invariant")
+            following = LocalMap(
+                self.config, self._T_rig_optical, ekf, local.book.select(used.slots),
+                pending_of(frame, self._T_rig_optical).without(used.columns),
+            )  # fmt: skip
         self._open(following, frame, follows=True)
-
-    def _independent_start(self, local: LocalMap, frame: Frame, sight: Sight) -> LocalMap:
-        """Nothing is taken over but names and, as a mere starting point with a wide variance, the velocity."""
-        pending = inheriting(frame, self._T_rig_optical, sight, local.book)
-        config = self.config.submap
-        wide = np.repeat([config.restart_sigma_velocity, config.restart_sigma_turn_rate], 3) ** 2
-        return self._empty_map(frame, local.ekf.velocity, wide, pending)
-
-    def _closed_before_measurement(self, stamp_ns: int) -> tuple[Submap, ...]:
-        """The submap up to this frame's predicted pose: this frame's measurement belongs to the next submap alone."""
-        assert self._map is not None
-        self._builder.add_pose(stamp_ns, self._map.ekf)
-        return self._closed()
 
     def _closed(self) -> tuple[Submap, ...]:
         if self._map is None or self._builder.is_empty:

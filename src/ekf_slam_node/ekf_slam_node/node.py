@@ -1,0 +1,134 @@
+"""The ``ekf_slam`` node: features in, odometry, landmarks and finished submaps out."""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.results import EkfResult, TrackingState
+from ekf_slam_node.slam import EkfSlam
+from slam_core.base_node import SlamNode
+from slam_core.config import parameter
+from slam_core.health import State
+from slam_core.messages import (
+    FEATURE_TOPICS,
+    SUBMAP_TOPICS,
+    ellipsoid_markers,
+    features_from_messages,
+    header_message,
+    imu_from_message,
+    landmark_cloud,
+    motion_from_message,
+    odometry_message,
+    path_message,
+    pose_with_covariance_message,
+    submap_messages,
+    transform_message,
+)
+from slam_core.messages.base import Message
+from slam_core.ros import run_node
+from slam_core.types import PoseEstimate, Submap
+
+_STATES = {TrackingState.OK: State.OK, TrackingState.DEGRADED: State.DEGRADED, TrackingState.LOST: State.LOST}
+
+
+@dataclass(frozen=True)
+class EkfNodeConfig(EkfSlamConfig):
+    """The filter's parameters and the node's own."""
+
+    odom_frame: str = parameter("odom", "frame of the odometry")
+    base_frame: str = parameter("base_link", "frame of the rig; the features' frame is looked up in it")
+    path_length: int = parameter(2000, "newest poses shown in ``path``", minimum=1)
+
+
+class EkfNode(SlamNode[EkfNodeConfig]):
+    """Publishes ``odom``, ``pose``, ``path``, ``landmarks``, ``landmark_ellipsoids`` and, as they end, ``submap/*``."""
+
+    def __init__(self) -> None:
+        super().__init__("ekf_slam", EkfNodeConfig)
+        self.slam: EkfSlam | None = None
+        self.path = deque[PoseEstimate](maxlen=self.config.path_length)
+        prefix = f"{self.config.agent}/" if self.config.agent else ""
+        self.odom_frame = prefix + self.config.odom_frame
+        self._advertise_outputs()
+        self.listen_together(FEATURE_TOPICS, self.on_features)
+        self.listen("ndt/motion", "PoseWithCovarianceStamped", self.on_motion, required=False)
+        self.listen("imu", "Imu", self.on_imu, required=False)
+
+    def _advertise_outputs(self) -> None:
+        self.advertise("odom", "Odometry")
+        self.advertise("pose", "PoseWithCovarianceStamped")
+        self.advertise("path", "Path")
+        self.advertise("landmarks", "PointCloud2")
+        self.advertise("landmark_ellipsoids", "MarkerArray")
+        for topic, kind in SUBMAP_TOPICS.items():
+            self.advertise(topic, kind, latched=True)
+
+    def on_features(self, cloud: Message, descriptors: Message, camera_info: Message) -> None:
+        """One frame; the mounting of its camera is looked up at the first."""
+        features = features_from_messages(cloud, descriptors, camera_info)
+        if self.slam is None:
+            self.slam = EkfSlam(self.config, self.lookup(self.config.base_frame, features.frame_id))
+        result = self.slam.process(features)
+        self._publish_result(result)
+        self._publish_submaps(result.submaps)
+        self.health.set(_STATES[result.state], result.reason)
+        for name, count in self.slam.counters.counts.items():
+            self.health.counters[name] = count
+
+    def on_motion(self, message: Message) -> None:
+        """A motion measured by scan registration."""
+        motion = motion_from_message(message)
+        if motion is not None and self.slam is not None:
+            self.slam.process_motion(motion)
+
+    def on_imu(self, message: Message) -> None:
+        """A reading of the IMU."""
+        if self.slam is not None:
+            self.slam.process_imu(imu_from_message(message))
+
+    def on_reset(self) -> None:
+        """Forget everything; the mounting is looked up anew."""
+        self.slam = None
+        self.path.clear()
+
+    def on_finish(self) -> str:
+        """The input has ended: publish the open submap."""
+        submaps = self.slam.finish() if self.slam is not None else ()
+        self._publish_submaps(submaps)
+        return f"{len(submaps)} open submap published"
+
+    # -- outputs -------------------------------------------------------------------------------------------------------
+
+    def _publish_result(self, result: EkfResult) -> None:
+        pose, types = result.pose, self.types
+        self.path.append(pose)
+        self.publish("odom", odometry_message(types, self.odom_frame, self.config.base_frame, pose))
+        self.publish("pose", pose_with_covariance_message(types, self.odom_frame, pose))
+        self.broadcast(transform_message(types, pose.stamp_ns, self.odom_frame, self.config.base_frame, pose.T))
+        if self.has_listeners("path"):
+            self.publish("path", path_message(types, pose.stamp_ns, self.odom_frame, self.path))
+        self._publish_landmarks(result)
+
+    def _publish_landmarks(self, result: EkfResult) -> None:
+        header, view = header_message(self.types, result.stamp_ns, self.odom_frame), result.landmarks
+        if self.has_listeners("landmarks"):
+            cloud = landmark_cloud(self.types, header, view.positions, view.covariances, view.ids, view.sightings)
+            self.publish("landmarks", cloud)
+        if self.has_listeners("landmark_ellipsoids"):
+            markers = ellipsoid_markers(self.types, header, view.positions, view.covariances, view.ids)
+            self.publish("landmark_ellipsoids", markers)
+
+    def _publish_submaps(self, submaps: tuple[Submap, ...]) -> None:
+        for submap in submaps:
+            for topic, message in zip(SUBMAP_TOPICS, submap_messages(self.types, submap), strict=True):
+                self.publish(topic, message)
+
+
+def main() -> None:
+    """Entry point of ``ros2 run ekf_slam_node ekf_slam``."""
+    run_node(EkfNode)
