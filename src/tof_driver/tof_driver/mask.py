@@ -34,7 +34,7 @@ class MaskConfig(Config):
 
     minimum_range: float = parameter(0.2, "nearest believable range", unit="m", minimum=0.0)
     maximum_range: float = parameter(7.5, "farthest believable range", unit="m", minimum=0.1)
-    minimum_amplitude: float = parameter(20.0, "below: too dark; 0 switches the test off", unit="digits", minimum=0.0)
+    minimum_amplitude: float = parameter(5.0, "below: too dark; 0 switches the test off", unit="digits", minimum=0.0)
     saturated_amplitude: float = parameter(
         2200.0, "at or above: saturated; 0 switches the test off", unit="digits", minimum=0.0
     )
@@ -50,9 +50,9 @@ class MaskConfig(Config):
     )
     flying_pixels: bool = parameter(True, "reject pixels between foreground and background")
     maximum_incidence_deg: float = parameter(
-        82.0, "steepest surface, angle between ray and normal", unit="deg", minimum=10.0, maximum=89.5
+        75.0, "steepest surface, angle between ray and normal", unit="deg", minimum=10.0, maximum=89.5
     )
-    noise_multiple: float = parameter(4.0, "difference of neighbours explained by noise", unit="sigma", minimum=1.0)
+    noise_multiple: float = parameter(3.5, "difference of neighbours explained by noise", unit="sigma", minimum=1.0)
     minimum_neighbours: int = parameter(
         3, "of the eight neighbours, how many must lie on the same surface", minimum=0, maximum=8
     )
@@ -89,11 +89,9 @@ def reject_flying_pixels(
     """Mark flying pixels in ``reason`` (in place).
 
     Neighbours are on one surface where their ranges differ by no more than noise and the steepest believable surface
-    explain. A pixel flies if
-
-    - it has too few such neighbours, or
-    - in one of four directions it lies on a ramp: beyond the one neighbour and short of the other, or
-    - it sits at a jump and does not continue the line of its two neighbours on the other side.
+    explain. A pixel with a neighbour on another surface is at a depth edge: its light is a mixture that no test on the
+    range alone tells from a clean one, so all of them go. Neighbours count even where they are too dark or too far to
+    be kept, as long as there is a reading. A pixel with few neighbours on its own surface is a speckle and goes too.
 
     Parameters
     ----------
@@ -104,88 +102,30 @@ def reject_flying_pixels(
     pixel_angle
         Angle between the rays of neighbouring pixels, rad.
     """
-    slope = pixel_angle * np.tan(np.radians(config.maximum_incidence_deg))
-    flying = _flying(
-        distance, sigma, reason, np.float32(slope), np.float32(config.noise_multiple), config.minimum_neighbours
-    )
-    reason[flying] = Reason.FLYING
+    read = (reason != Reason.NO_READING) & (reason != Reason.SATURATED)
+    # A frame of NaN spares the kernel all tests for borders and missing neighbours: no comparison with NaN holds.
+    surrounded = np.pad(np.where(read, distance, np.float32(np.nan)), 1, constant_values=np.nan)
+    # Half of the noise of a difference: sqrt(a^2 + b^2) is taken as (a + b) / sqrt(2).
+    noise = np.pad(sigma * np.float32(config.noise_multiple / np.sqrt(2.0)), 1)
+    slope = np.float32(pixel_angle * np.tan(np.radians(config.maximum_incidence_deg)))
+    flying = _flying(surrounded, noise, slope, config.minimum_neighbours)
+    reason[flying & (reason == Reason.VALID)] = Reason.FLYING
 
 
 @njit(cache=True, nogil=True)
-def _flying(distance, sigma, reason, slope, noise_multiple, minimum_neighbours):  # type: ignore[no-untyped-def]
-    height, width = distance.shape
-    suspect = _suspects(distance, sigma, reason, slope, noise_multiple)
-    flying = np.zeros((height, width), dtype=np.bool_)
+def _flying(distance, noise, slope, minimum_neighbours):  # type: ignore[no-untyped-def]
+    height, width = distance.shape[0] - 2, distance.shape[1] - 2
+    flying = np.empty((height, width), dtype=np.bool_)
     for v in range(height):
         for u in range(width):
-            if suspect[v, u] and reason[v, u] == 0:
-                flying[v, u] = _pixel_flies(distance, sigma, reason, v, u, slope, noise_multiple, minimum_neighbours)
+            r, half = distance[v + 1, u + 1], noise[v + 1, u + 1]
+            jumps, same_surface = 0, -1  # the pixel itself is among the nine
+            for dv in range(3):
+                for du in range(3):
+                    other = distance[v + dv, u + du]
+                    steps = np.float32(1.4142) if dv != 1 and du != 1 else np.float32(1.0)
+                    limit = steps * slope * min(r, other) + half + noise[v + dv, u + du]
+                    jumps += abs(other - r) > limit
+                    same_surface += abs(other - r) <= limit
+            flying[v, u] = jumps > 0 or same_surface < minimum_neighbours
     return flying
-
-
-@njit(cache=True, nogil=True)
-def _suspects(distance, sigma, reason, slope, noise_multiple):  # type: ignore[no-untyped-def]
-    """Pixels not surely on one surface with all eight neighbours: few, and the only ones worth the full test."""
-    height, width = distance.shape
-    suspect = np.ones((height, width), dtype=np.bool_)
-    shrink = np.float32(1.0) / (np.float32(1.0) + slope)
-    for v in range(1, height - 1):
-        for u in range(1, width - 1):
-            r = distance[v, u]
-            limit = (slope * r + noise_multiple * sigma[v, u]) * shrink
-            smooth = True
-            for dv in range(-1, 2):
-                for du in range(-1, 2):
-                    smooth &= (abs(distance[v + dv, u + du] - r) <= limit) & (reason[v + dv, u + du] == 0)
-            suspect[v, u] = not smooth
-    return suspect
-
-
-@njit(cache=True, nogil=True)
-def _pixel_flies(distance, sigma, reason, v, u, slope, noise_multiple, minimum_neighbours):  # type: ignore[no-untyped-def]
-    same_surface = 0
-    for dv, du in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        ahead = _jump(distance, sigma, reason, v, u, v + dv, u + du, slope, noise_multiple)
-        behind = _jump(distance, sigma, reason, v, u, v - dv, u - du, slope, noise_multiple)
-        same_surface += (ahead == 0) + (behind == 0)
-        if ahead * behind == -1:
-            return True
-        if (
-            abs(ahead) == 1
-            and behind == 0
-            and _breaks_line(distance, sigma, reason, v, u, -dv, -du, slope, noise_multiple)
-        ):
-            return True
-        if (
-            abs(behind) == 1
-            and ahead == 0
-            and _breaks_line(distance, sigma, reason, v, u, dv, du, slope, noise_multiple)
-        ):
-            return True
-    return same_surface < minimum_neighbours
-
-
-@njit(cache=True, nogil=True)
-def _jump(distance, sigma, reason, v, u, vn, un, slope, noise_multiple):  # type: ignore[no-untyped-def]
-    """0: the neighbour is on the same surface; 1 or -1: beyond or before it; 2: no neighbour."""
-    height, width = distance.shape
-    if vn < 0 or un < 0 or vn >= height or un >= width or reason[vn, un] != 0:
-        return 2
-    r, rn = distance[v, u], distance[vn, un]
-    steps = 1.0 if v == vn or u == un else 1.4142
-    noise = np.sqrt(sigma[v, u] ** 2 + sigma[vn, un] ** 2)
-    limit = steps * slope * min(r, rn) + noise_multiple * noise
-    if abs(rn - r) <= limit:
-        return 0
-    return 1 if rn > r else -1
-
-
-@njit(cache=True, nogil=True)
-def _breaks_line(distance, sigma, reason, v, u, dv, du, slope, noise_multiple):  # type: ignore[no-untyped-def]
-    """Whether the pixel misses the line through its next two neighbours in a direction; False if they are no line."""
-    v1, u1, v2, u2 = v + dv, u + du, v + 2 * dv, u + 2 * du
-    if _jump(distance, sigma, reason, v1, u1, v2, u2, slope, noise_multiple) != 0:
-        return False
-    error = distance[v, u] - 2.0 * distance[v1, u1] + distance[v2, u2]
-    variance = sigma[v, u] ** 2 + 4.0 * sigma[v1, u1] ** 2 + sigma[v2, u2] ** 2
-    return error * error > noise_multiple * noise_multiple * variance
