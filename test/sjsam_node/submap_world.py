@@ -61,6 +61,7 @@ class Agent:
     sensor: Sensor = field(default_factory=Sensor)
     steps: int = 4
     stamp_ns: int = 0
+    seen: list[np.ndarray] = field(default_factory=list)  # world index of every submap's landmarks
     _ids: dict[int, int] = field(default_factory=dict)
     _next_id: int = 0
 
@@ -76,6 +77,7 @@ class Agent:
         T_start = poses[0]
         local = [invert_transform(T_start) @ T for T in poses]
         seen, visible = self._visible(poses)
+        self.seen.append(seen)
         points = (self.world.points[seen] - T_start[:3, 3]) @ T_start[:3, :3]
         covariance = self._posterior(local, points, visible)
         error = np.linalg.cholesky(covariance) @ self.rng.normal(size=len(covariance))

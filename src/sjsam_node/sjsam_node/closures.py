@@ -8,7 +8,7 @@ third.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,7 +19,6 @@ from sjsam_node.association import (
     AssociationConfig,
     PointSet,
     Prior,
-    align,
     jointly_compatible,
     match,
     mutual_best,
@@ -136,40 +135,45 @@ class LinkFinder:
         looks = self.index.query(graph.records[new].submap.descriptors, recent | set(near))
         believed: list[Link] = []
         for old in [*near, *looks]:
-            prior = relative_pose(old, new)
-            link, certain = self._judge(graph, old, new, prior)
-            if link is not None:
+            first, second = at_start(graph.records[old]), at_start(graph.records[new])
+            found, certain = self.judge(first, second, relative_pose(old, new), old, new)
+            if found is not None:
+                link = Link(old, new, found.pairs, found.T, found.covariance, True)
                 believed += [link] if certain else self._confirmed(graph, link)
         return believed
 
     def _near(self, graph: MapGraph, new: int, recent: set[int]) -> list[int]:
         """Older records of the same component whose landmarks are around those of ``new``, nearest first."""
-        middle = _middle(graph, new)
-        others = [i for i in graph.records_of(graph.component(new)) if i not in recent]
-        distance = {i: float(np.linalg.norm(_middle(graph, i) - middle)) for i in others}
+        return self.around(graph, _middle(graph, new), graph.records_of(graph.component(new)), recent)
+
+    def around(self, graph: MapGraph, middle: FloatArray, records: Iterable[int], excluded: set[int]) -> list[int]:
+        """Those of ``records`` whose landmarks are around a point (3,) of the map, nearest first."""
+        distance = {i: float(np.linalg.norm(_middle(graph, i) - middle)) for i in records if i not in excluded}
         ranked = sorted((d, i) for i, d in distance.items() if d < self.config.proximity)
         return [i for _, i in ranked[: self.config.near_candidates]]
 
-    def _judge(self, graph: MapGraph, old: int, new: int, prior: Prior | None) -> tuple[Link | None, bool]:
-        """The link between two records if geometry supports it, and whether the map can vouch for it."""
-        first, second = at_start(graph.records[old]), at_start(graph.records[new])
+    def judge(self, first: PointSet, second: PointSet, prior: Prior | None, *key: int) -> tuple[Alignment | None, bool]:
+        """The alignment of two submaps if geometry supports it, and whether the prior can vouch for it.
+
+        ``key`` seeds the random samples, so that the same pair is always judged alike.
+        """
         informative = prior is not None and _sigma(prior.covariance) < self.config.informative_sigma
         if informative and prior is not None:
             found = match(first, second, prior, self.config.association)
             if len(found.pairs) >= self.config.min_near_inliers and self._overlaps(first, second, found):
-                return Link(old, new, found.pairs, found.T, found.covariance, True), True
+                return found, True
             return None, False
-        guess = self._by_looks(first, second, old, new)
+        guess = self._by_looks(first, second, key)
         if guess is None or not self._supported(first, second, guess):
             return None, False
         if prior is not None and not self._agrees(guess, prior):
             return None, False
-        return Link(old, new, guess.pairs, guess.T, guess.covariance, True), False
+        return guess, False
 
-    def _by_looks(self, first: PointSet, second: PointSet, old: int, new: int) -> Alignment | None:
+    def _by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
         """Alignment from descriptors alone, refined with all landmarks around it."""
         pairs = self._distinct_pairs(first, second)
-        rng = np.random.default_rng([self.config.seed, old, new])
+        rng = np.random.default_rng([self.config.seed, *key])
         coarse = ransac_rigid_transform(
             second.points[pairs[:, 1]], first.points[pairs[:, 0]], self.config.ransac_distance, rng,
             min_inliers=max(3, self.config.min_inliers // 2),
@@ -248,12 +252,17 @@ class LinkFinder:
         return bool(gap < 0.1 + 0.05 * travelled + 3.0 * (_sigma(a.covariance) + _sigma(b.covariance)) and turn < 0.15)
 
 
+def prior_of_pair(T_a_b: FloatArray, covariance: FloatArray) -> Prior:
+    """A prior with a covariance that can be inverted: two poses that are tied exactly get a micrometre."""
+    return Prior(T_a_b, covariance + 1e-12 * np.eye(6))
+
+
 def relative_prior(T_map_a: FloatArray, T_map_b: FloatArray, joint: FloatArray) -> Prior:
     """T_a_b of two poses with joint covariance (12, 12), and its covariance."""
     T_a_map = invert_transform(T_map_a)
     J_a, J_b = compose_jacobians(T_a_map, T_map_b)
     J = np.concatenate([J_a @ inverse_jacobian(T_map_a), J_b], axis=1)
-    return Prior(T_a_map @ T_map_b, J @ joint @ J.T)
+    return prior_of_pair(T_a_map @ T_map_b, J @ joint @ J.T)
 
 
 def _middle(graph: MapGraph, record: int) -> FloatArray:
@@ -269,6 +278,3 @@ def _sigma(covariance: FloatArray | None) -> float:
 
 def _inside(points: FloatArray, low: FloatArray, high: FloatArray) -> int:
     return int(np.all((points >= low) & (points <= high), axis=1).sum())
-
-
-__all__ = ["ClosureConfig", "LinkFinder", "align", "at_end", "at_start", "relative_prior"]

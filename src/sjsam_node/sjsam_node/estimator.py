@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sjsam_node import kernels
-from sjsam_node.joining import JoiningProblem, Marginals
+from sjsam_node.joining import JoiningProblem
 from sjsam_node.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
 from slam_core.config import Config, group, parameter
@@ -82,8 +82,8 @@ class Assembled:
     state: State
 
     def covariance(self, nodes: list[int]) -> FloatArray:
-        """Joint covariance (6k, 6k) of nodes, from the factor of the last linearisation."""
-        return self.problem.columns(np.searchsorted(self.nodes, nodes))
+        """Joint covariance (6k, 6k) of nodes."""
+        return self.problem.columns(self.state, np.searchsorted(self.nodes, nodes))
 
 
 @dataclass
@@ -168,6 +168,3 @@ def observation_nis(residual: FloatArray, information: FloatArray) -> FloatArray
     weighted = (information @ residual)[6:].reshape(n, 3)
     blocks = information[6:, 6:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
     return np.asarray(np.einsum("ni,ni->n", weighted, np.linalg.solve(blocks, weighted[..., None])[..., 0]))
-
-
-__all__ = ["Assembled", "Estimator", "EstimatorConfig", "Marginals", "ReducedMap", "local_residual", "observation_nis"]

@@ -11,11 +11,13 @@ judge them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
 
 import numpy as np
 from scipy.stats import chi2
 
-from sjsam_node import map_view
+from sjsam_node import map_view, storage
 from sjsam_node.association import Prior
 from sjsam_node.closures import ClosureConfig, LinkFinder, relative_prior
 from sjsam_node.estimator import Assembled, Estimator, EstimatorConfig, local_residual, observation_nis
@@ -173,7 +175,7 @@ class GlobalMap:
         component = self.graph.component(first)
         if component != self.graph.component(second):
             return None
-        assembled = self._assembled[component]
+        assembled = self.assembled(component)
         nodes = [self.graph.records[i].start for i in (first, second)]
         joint = assembled.covariance(nodes)
         return relative_prior(self.graph.poses[nodes[0]], self.graph.poses[nodes[1]], joint)
@@ -208,7 +210,7 @@ class GlobalMap:
         return False, cost
 
     def _assembled_cost(self, record: int) -> float:
-        assembled = self._assembled[self.graph.component(record)]
+        assembled = self.assembled(self.graph.component(record))
         return assembled.problem.cost(assembled.state)
 
     def _drop_outliers(self, record: int) -> int:
@@ -236,9 +238,19 @@ class GlobalMap:
                 worst.add(int(record.observations[reduced.shared[nis.argmax()]]))
         return worst
 
-    def trajectory(self) -> dict[str, list[PoseEstimate]]:
-        """Every agent's rig poses in the map frame with covariances (see :func:`sjsam_node.map_view.trajectory`)."""
-        return map_view.trajectory(self)
+    @overload
+    def trajectory(self) -> dict[str, list[PoseEstimate]]: ...
+
+    @overload
+    def trajectory(self, agent: str) -> list[PoseEstimate]: ...
+
+    def trajectory(self, agent: str | None = None) -> dict[str, list[PoseEstimate]] | list[PoseEstimate]:
+        """Rig poses in the map frame with covariances (see :func:`sjsam_node.map_view.trajectory`).
+
+        Of every agent by name, or of one.
+        """
+        trajectories = map_view.trajectory(self)
+        return trajectories if agent is None else trajectories.get(agent, [])
 
     def landmarks(self) -> map_view.MapLandmarks:
         """Every landmark once, with covariance, descriptor and id."""
@@ -262,5 +274,37 @@ class GlobalMap:
     def assembled(self, component: int) -> Assembled:
         """The joining problem of a component at its optimum."""
         if component not in self._assembled:
-            self._assembled[component], _ = self.estimator.optimize(self.graph, component)
+            self._assembled[component] = self.estimator.assemble(self.graph, component)
         return self._assembled[component]
+
+    def start_pose(self, record: int) -> PoseEstimate:
+        """Start pose of a record in the map frame, with covariance."""
+        r = self.graph.records[record]
+        covariance = self.assembled(self.graph.component(record)).covariance([r.start])
+        return PoseEstimate(r.submap.start_stamp_ns, self.graph.poses[r.start], covariance)
+
+    def end_pose(self, agent: str) -> PoseEstimate | None:
+        """Where an agent's newest submap ends in the map frame; None for one not heard of."""
+        own = [i for i, r in enumerate(self.graph.records) if r.submap.agent == agent]
+        if not own:
+            return None
+        r = self.graph.records[own[-1]]
+        covariance = self.assembled(self.graph.component(own[-1])).covariance([r.end])
+        return PoseEstimate(r.submap.end_stamp_ns, self.graph.poses[r.end], covariance)
+
+    def save(self, path: Path | str) -> None:
+        """Write the map to a folder (see :mod:`sjsam_node.storage`)."""
+        storage.write(Path(path), self.graph, self.finder.pending)
+
+    @classmethod
+    def load(cls, path: Path | str, config: GlobalMapConfig | None = None) -> GlobalMap:
+        """The map that :meth:`save` wrote; ``ValueError`` if the folder is no such map."""
+        graph, pending = storage.read(Path(path))
+        loaded = cls(config)
+        loaded.graph, loaded.finder.pending = graph, pending
+        for i, record in enumerate(graph.records):
+            agent, session, _ = record.key
+            loaded._lookup[record.key] = i
+            loaded._sessions[agent] = max(session, loaded._sessions.get(agent, 0))
+            loaded.finder.index.add(i, record.submap.descriptors)
+        return loaded

@@ -59,6 +59,7 @@ class JoiningProblem:
         self._diagonal = np.nonzero(pattern.indices == pattern.columns)[0]
         self._values = np.zeros(len(pattern.indices))
         self._gradient = np.zeros(pattern.n)
+        self._factorized: State | None = None
 
     @property
     def backend(self) -> str:
@@ -80,6 +81,7 @@ class JoiningProblem:
 
     def solve(self, damping: float) -> FloatArray | None:
         """Damped step, or None where the matrix is not positive definite."""
+        self._factorized = None
         values = self._values.copy()
         values[self._diagonal] *= 1.0 + damping
         return self.factor.solve(-self._gradient) if self.factor.factorize(values) else None
@@ -94,8 +96,9 @@ class JoiningProblem:
         """The optimum reached from ``state``."""
         return levenberg_marquardt(self, state, config)
 
-    def columns(self, poses: IntArray) -> FloatArray:
-        """Joint covariance of a few poses by solving for their columns with the last factor."""
+    def columns(self, state: State, poses: IntArray) -> FloatArray:
+        """Joint covariance of a few poses, linearised at ``state``, by solving for their columns."""
+        self._factorize_at(state)
         return solved_covariance(self.factor, pose_scalars(self.layout, poses, self._pose_size))
 
     def marginals(self, state: State) -> Marginals:
@@ -106,10 +109,16 @@ class JoiningProblem:
         ValueError
             If the problem does not determine all its variables.
         """
+        self._factorize_at(state)
+        return Marginals(self.layout, state.model_dimensions, self.factor, self.factor.inverse_entries())
+
+    def _factorize_at(self, state: State) -> None:
+        if self._factorized is state:
+            return
         self.linearize(state)
         if not self.factor.factorize(self._values):
             raise ValueError("the normal equations are singular: part of the map hangs on nothing")
-        return Marginals(self.layout, state.model_dimensions, self.factor, self.factor.inverse_entries())
+        self._factorized = state
 
 
 def _arrays(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:

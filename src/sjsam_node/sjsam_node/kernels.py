@@ -240,56 +240,53 @@ def _block_starts(d, poses, landmarks):
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(J, JB, start, width, info, r, H, g):
+def _left_multiply(JB, start, width, A, out):
+    """``out = JB^T A`` for block diagonal JB, row by row so that the inner loop is contiguous."""
+    for b in range(len(start)):
+        s, w = start[b], width[b]
+        for q in range(w):
+            if w == 3:
+                x, y, z = JB[s, q], JB[s + 1, q], JB[s + 2, q]
+                for c in range(A.shape[1]):
+                    out[s + q, c] = x * A[s, c] + y * A[s + 1, c] + z * A[s + 2, c]
+            elif w == 2:
+                x, y = JB[s, q], JB[s + 1, q]
+                for c in range(A.shape[1]):
+                    out[s + q, c] = x * A[s, c] + y * A[s + 1, c]
+            else:
+                for c in range(A.shape[1]):
+                    out[s, c] = JB[s, 0] * A[s, c]
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(J, JB, start, width, info, r, work, H, g):
     """Dense ``H = J^T info J`` and ``g = J^T info r`` of one local map over (reference pose, poses, landmarks).
 
     The part of J beyond the reference pose is block diagonal, so that H costs O(m^2), not O(m^3).
     """
     m, dp = J.shape
-    M = np.empty((m, m))
-    for b in range(len(start)):
-        s, w = start[b], width[b]
-        for i in range(m):
-            for q in range(w):
-                value = 0.0
-                for p in range(w):
-                    value += info[i, s + p] * JB[s + p, q]
-                M[i, s + q] = value
+    half, turned = work[: m * m].reshape((m, m)), work[m * m : 2 * m * m].reshape((m, m))
+    _left_multiply(JB, start, width, info, half)
+    for i in range(m):
+        for j in range(m):
+            turned[j, i] = half[i, j]
+    _left_multiply(JB, start, width, turned, half)
     weighted = info @ J
-    for p in range(dp):
-        for q in range(dp):
-            value = 0.0
-            for i in range(m):
-                value += J[i, p] * weighted[i, q]
-            H[p, q] = value
-    whitened = info @ r
-    for p in range(dp):
-        g[p] = 0.0
-        for i in range(m):
-            g[p] += J[i, p] * whitened[i]
-    for b in range(len(start)):
-        s, w = start[b], width[b]
-        for q in range(w):
-            for c in range(dp):
-                value = 0.0
-                for p in range(w):
-                    value += JB[s + p, q] * weighted[s + p, c]
-                H[dp + s + q, c] = value
-                H[c, dp + s + q] = value
-            for c in range(m):
-                value = 0.0
-                for p in range(w):
-                    value += JB[s + p, q] * M[s + p, c]
-                H[dp + s + q, dp + c] = value
-            value = 0.0
-            for p in range(w):
-                value += JB[s + p, q] * whitened[s + p]
-            g[dp + s + q] = value
+    whitened = (info @ r).reshape((m, 1))
+    mixed, moved = np.empty((m, dp)), np.empty((m, 1))
+    _left_multiply(JB, start, width, weighted, mixed)
+    _left_multiply(JB, start, width, whitened, moved)
+    H[:dp, :dp] = J.T @ weighted
+    H[dp:, :dp] = mixed
+    H[:dp, dp:] = mixed.T
+    H[dp:, dp:] = half
+    g[:dp] = J.T @ whitened[:, 0]
+    g[dp:] = moved[:, 0]
 
 
 @njit(cache=True, nogil=True)
-def local_normal_equations(model, f, maps, R, t, points):
-    """H (n, n), g (n,) and residual of local map ``f`` at the given state."""
+def local_normal_equations(model, f, maps, R, t, points, work):
+    """H (n, n) and g (n,) of local map ``f`` at the given state; ``work`` as :func:`work_space` makes it."""
     ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info = maps
     d = t.shape[1]
     a = 1 if d == 2 else 3
@@ -302,25 +299,34 @@ def local_normal_equations(model, f, maps, R, t, points):
     reference_jacobian(Ri, ti, poses, landmarks, t, points, B, J)
     other_blocks(Ri, poses, landmarks, B, JB)
     start, width = _block_starts(d, len(poses), len(landmarks))
-    H, g = np.empty((d + a + m, d + a + m)), np.empty(d + a + m)
+    n = d + a + m
+    H, g = work[2 * m * m : 2 * m * m + n * n].reshape((n, n)), np.empty(n)
     matrix = info[info_ptr[f] : info_ptr[f + 1]].reshape((m, m))
-    normal_equations(J, JB, start, width, matrix, r, H, g)
-    return H, g, r
+    normal_equations(J, JB, start, width, matrix, r, work, H, g)
+    return H, g
+
+
+@njit(cache=True, nogil=True)
+def work_space(maps):
+    """Memory for the largest local map, so that none is asked for inside the loop."""
+    largest = 0
+    for f in range(len(maps[0])):
+        largest = max(largest, maps[5][f + 1] - maps[5][f])
+    return np.empty(2 * largest * largest + (largest + 6) * (largest + 6))
 
 
 @njit(cache=True, nogil=True)
 def joint_linearize(model, maps, R, t, points, scatter, values, gradient):
-    """Add the normal equations of every local map to the sparse ``values`` and the ``gradient`` (see
-    ``layout.Scatter``).
-    """
+    """Add the normal equations of every local map to the sparse ones; ``scatter`` (``layout.Scatter``) says where."""
+    work = work_space(maps)
     for f in range(len(maps[0])):
-        H, g, _ = local_normal_equations(model, f, maps, R, t, points)
+        H, g = local_normal_equations(model, f, maps, R, t, points, work)
         scatter_dense(f, H, g, scatter, values, gradient)
 
 
 @njit(cache=True, nogil=True)
 def scatter_dense(f, H, g, scatter, values, gradient):
-    """Add dense normal equations over the items of map ``f`` to the sparse ones."""
+    """Add dense symmetric normal equations over the items of map ``f`` to the sparse ones."""
     item_ptr, item_group, item_offset, item_width, group_ptr, group_start, pair_ptr, position, stride, swapped = scatter
     row = 0
     for i in range(item_ptr[f], item_ptr[f + 1]):
@@ -340,7 +346,7 @@ def scatter_dense(f, H, g, scatter, values, gradient):
                 first += oj * step + oi
                 for q in range(width):
                     for p in range(height):
-                        values[first + q * step + p] += H[row + p, column + q]
+                        values[first + q * step + p] += H[column + q, row + p]
             elif first >= 0:
                 first += oi * step + oj
                 for p in range(height):

@@ -56,8 +56,9 @@ def elimination_order(count: int, rows: IntArray, columns: IntArray) -> IntArray
         graph = scipy.sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), (count, count)).tocsr()
         return np.asarray(scipy.sparse.csgraph.reverse_cuthill_mckee(graph + graph.T, True), dtype=np.int64)
     low, high = np.minimum(rows, columns), np.maximum(rows, columns)
-    nodes = np.arange(count, dtype=np.int64)
-    pattern = _spmatrix(count, np.concatenate([high, nodes]), np.concatenate([low, nodes]))
+    # Sorted and unique: cvxopt inserts entries that come otherwise one by one.
+    edges = np.unique(np.concatenate([low * count + high, np.arange(count, dtype=np.int64) * (count + 1)]))
+    pattern = _spmatrix(count, edges % count, edges // count)
     return np.array(cvxopt.amd.order(pattern), dtype=np.int64).ravel()
 
 
@@ -231,38 +232,56 @@ class InverseEntries:
 
 @numba.njit(cache=True, nogil=True)
 def takahashi(indptr, indices, data):  # type: ignore[no-untyped-def]
-    """Entries of ``(L L^T)^-1`` at the nonzeros of L (CSC, rows ascending, diagonal first), from the last column
-    back.
+    """Entries of ``(L L^T)^-1`` at the nonzeros of L (CSC, rows ascending, diagonal first).
+
+    From the last columns back, a supernode (columns J of equal pattern, rows I below) at a time: with
+    ``Y = L_IJ L_JJ^-1`` the inverse has ``Z_IJ = -Z_II Y`` and ``Z_JJ = L_JJ^-T L_JJ^-1 - Y^T Z_IJ``; ``Z_II`` is known.
     """
     n = len(indptr) - 1
     out = np.zeros_like(data)
     slot = np.full(n, -1, dtype=np.int64)
-    row_sum = np.zeros(n)
-    for j in range(n - 1, -1, -1):
-        start, end = indptr[j], indptr[j + 1]
-        diagonal = data[start]
-        count = end - start - 1
-        for k in range(count):
-            slot[indices[start + 1 + k]] = k
-            row_sum[k] = 0.0
-        for k in range(count):
-            # Column indices[...] of the inverse is complete; its rows inside this column's pattern are what is needed.
-            weight = data[start + 1 + k]
-            column = indices[start + 1 + k]
-            row_sum[k] += out[indptr[column]] * weight
-            for p in range(indptr[column] + 1, indptr[column + 1]):
+    last = n
+    while last > 0:
+        first = last - 1
+        while first > 0 and last - first < 64 and _continues(indptr, indices, first):
+            first -= 1
+        w = last - first
+        rows = indices[indptr[first] + w : indptr[first + 1]]
+        h = len(rows)
+        for k in range(h):
+            slot[rows[k]] = k
+        Z = np.zeros((h, h))
+        for k in range(h):
+            for p in range(indptr[rows[k]], indptr[rows[k] + 1]):
                 s = slot[indices[p]]
                 if s >= 0:
-                    row_sum[s] += out[p] * weight
-                    row_sum[k] += out[p] * data[start + 1 + s]
-        total = 1.0 / diagonal
-        for k in range(count):
-            value = -row_sum[k] / diagonal
-            out[start + 1 + k] = value
-            total -= data[start + 1 + k] * value
-            slot[indices[start + 1 + k]] = -1
-        out[start] = total / diagonal
+                    Z[s, k] = out[p]
+                    Z[k, s] = out[p]
+        top, below = np.zeros((w, w)), np.zeros((h, w))
+        for j in range(w):
+            start = indptr[first + j]
+            top[j:, j] = data[start : start + w - j]
+            below[:, j] = data[start + w - j : indptr[first + j + 1]]
+        inverse = np.linalg.inv(top)
+        Y = np.dot(below, inverse)
+        Z_IJ = -np.dot(Z, Y)
+        Z_JJ = np.dot(inverse.T.copy(), inverse) - np.dot(Y.T.copy(), Z_IJ)
+        for j in range(w):
+            start = indptr[first + j]
+            out[start : start + w - j] = Z_JJ[j:, j]
+            out[start + w - j : indptr[first + j + 1]] = Z_IJ[:, j]
+        for k in range(h):
+            slot[rows[k]] = -1
+        last = first
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _continues(indptr, indices, column):  # type: ignore[no-untyped-def]
+    """Whether the column before ``column`` has the same pattern, itself added; in a factor its size and parent tell."""
+    before = column - 1
+    same_size = indptr[column] - indptr[before] == indptr[column + 1] - indptr[column] + 1
+    return same_size and indices[indptr[before] + 1] == column
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,0 +1,85 @@
+"""Where is an agent in a map that is not to change: an initial pose or a look at the surroundings, then tracking.
+
+A new submap is matched to the stored submaps around its predicted pose, or, without prediction, to those that look
+like it. Between matches its odometry carries the pose on, with growing covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sjsam_node.association import PointSet, Prior
+from sjsam_node.closures import at_start, prior_of_pair
+from slam_core.geometry import FloatArray, compose_covariance, inverse_jacobian, invert_transform
+from slam_core.types import PoseEstimate, Submap
+
+if TYPE_CHECKING:
+    from sjsam_node.global_map import GlobalMap
+
+
+@dataclass(frozen=True, eq=False)
+class Localization:
+    """Pose at the end of a submap in the map frame, None while unknown; matched: landmarks of the map that were
+    recognised.
+    """
+
+    pose: PoseEstimate | None
+    matched: int
+
+
+class Localizer:
+    """Follows one agent through a map; the map stays as it is."""
+
+    def __init__(self, global_map: GlobalMap) -> None:
+        self._map = global_map
+        self._pose: PoseEstimate | None = None
+
+    def set_pose(self, pose: PoseEstimate) -> None:
+        """Where the agent is believed to be (``initialpose``), map frame."""
+        self._pose = pose
+
+    def process(self, submap: Submap) -> Localization:
+        """Localise by one more submap of the agent; it must start where the one before ended, or follow a loss."""
+        if not submap.follows_previous:
+            self._pose = None
+        start, matched = self._fix(submap)
+        self._pose = None if start is None else _moved(start, submap)
+        return Localization(self._pose, matched)
+
+    def _fix(self, submap: Submap) -> tuple[PoseEstimate | None, int]:
+        """Pose of the submap's start from the stored submap that matches best; the prediction where none does."""
+        seen = PointSet(submap.landmarks, submap.covariance[6:, 6:], submap.descriptors)
+        best, most = self._pose, 0
+        for record in self._candidates(submap):
+            link, certain = self._map.finder.judge(
+                at_start(self._map.graph.records[record]), seen, self._prior(record), record
+            )
+            if link is not None and len(link.pairs) > most and (certain or self._pose is None):
+                anchor = self._map.start_pose(record)
+                covariance = compose_covariance(anchor.T, anchor.covariance, link.T, link.covariance)
+                best, most = PoseEstimate(submap.start_stamp_ns, anchor.T @ link.T, covariance), len(link.pairs)
+        return best, most
+
+    def _candidates(self, submap: Submap) -> list[int]:
+        finder, graph = self._map.finder, self._map.graph
+        if self._pose is None:
+            return finder.index.query(submap.descriptors, set())
+        middle = self._pose.T[:3, :3] @ np.median(submap.landmarks, axis=0) + self._pose.T[:3, 3]
+        return finder.around(graph, middle, range(len(graph.records)), set())
+
+    def _prior(self, record: int) -> Prior | None:
+        if self._pose is None:
+            return None
+        anchor = self._map.start_pose(record)
+        T = invert_transform(anchor.T)
+        J = inverse_jacobian(anchor.T)
+        covariance = compose_covariance(T, J @ anchor.covariance @ J.T, self._pose.T, self._pose.covariance)
+        return prior_of_pair(T @ self._pose.T, covariance)
+
+
+def _moved(start: PoseEstimate, submap: Submap) -> PoseEstimate:
+    covariance: FloatArray = compose_covariance(start.T, start.covariance, submap.end_pose, submap.covariance[:6, :6])
+    return PoseEstimate(submap.end_stamp_ns, start.T @ submap.end_pose, covariance)

@@ -1,0 +1,59 @@
+"""The joined map as messages, written without ROS like all conversions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sjsam_node.global_map import GlobalMap
+from sjsam_node.map_view import MapLandmarks
+from slam_core.geometry import FloatArray
+from slam_core.messages import ellipsoid_markers, landmark_cloud, path_marker
+from slam_core.messages.base import Message, MessageTypes
+
+_SKELETON = (0.1, 0.4, 1.0, 1.0)
+_CLOSURE = (0.9, 0.1, 0.1, 1.0)
+_MARK = (0.1, 0.8, 0.2, 1.0)
+_LINE_LIST, _SPHERE_LIST = 5, 7
+
+
+def landmarks_message(types: MessageTypes, header: Message, landmarks: MapLandmarks) -> Message:
+    """``map/landmarks``: PointCloud2 with ids and covariances."""
+    return landmark_cloud(
+        types, header, landmarks.positions, landmarks.covariances, landmarks.ids, landmarks.sightings.astype(np.int32)
+    )
+
+
+def ellipsoids_message(types: MessageTypes, header: Message, landmarks: MapLandmarks) -> Message:
+    """``map/ellipsoids``: 99.5 % ellipsoids of the landmarks whose place in the map is known."""
+    known = landmarks.linked
+    return ellipsoid_markers(
+        types, header, landmarks.positions[known], landmarks.covariances[known], landmarks.ids[known]
+    )
+
+
+def graph_message(types: MessageTypes, header: Message, global_map: GlobalMap) -> Message:
+    """``map/graph``: the skeleton as lines, one per submap, and the believed closures in another colour."""
+    graph = global_map.graph
+    skeleton = [graph.poses[[r.start, r.end], :3, 3] for r in graph.records]
+    closures = [
+        graph.poses[[graph.records[k.first].start, graph.records[k.second].start], :3, 3]
+        for k in graph.links
+        if k.is_closure
+    ]
+    lines = [_points(types, header, "skeleton", _LINE_LIST, skeleton, _SKELETON)]
+    return types.MarkerArray(markers=[*lines, _points(types, header, "closures", _LINE_LIST, closures, _CLOSURE)])
+
+
+def marks_message(types: MessageTypes, header: Message, positions: FloatArray) -> Message:
+    """``map/marks``: the marked finds."""
+    return types.MarkerArray(markers=[_points(types, header, "marks", _SPHERE_LIST, [positions], _MARK, 0.15)])
+
+
+def _points(
+    types: MessageTypes, header: Message, namespace: str, kind: int, points: list[FloatArray],
+    rgba: tuple[float, float, float, float], size: float = 0.02,
+) -> Message:  # fmt: skip
+    stacked = np.concatenate(points) if points else np.empty((0, 3))
+    marker = path_marker(types, header, stacked, namespace=namespace, colour=rgba)
+    marker.type, marker.scale = kind, types.Vector3(x=size, y=size, z=size)
+    return marker

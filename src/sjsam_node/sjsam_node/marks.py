@@ -1,0 +1,52 @@
+"""Finds that somebody marks in the map; a mark hangs on the nearest pose of the skeleton and moves with it at a
+closure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sjsam_node.map_graph import MapGraph
+from slam_core.geometry import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Mark:
+    """A named point (3,) in the frame of a node."""
+
+    name: str
+    node: int
+    point: FloatArray
+
+
+@dataclass
+class Marks:
+    """All marks of a map."""
+
+    marks: list[Mark] = field(default_factory=list)
+
+    def add(self, graph: MapGraph, point: FloatArray, name: str = "") -> Mark:
+        """Mark a point (3,) of the map frame, m.
+
+        Raises
+        ------
+        ValueError
+            If the map is empty or the point is not finite.
+        """
+        if not len(graph.poses):
+            raise ValueError("nothing can be marked in an empty map")
+        if point.shape != (3,) or not np.all(np.isfinite(point)):
+            raise ValueError(f"a mark needs three finite coordinates in m, got {point}")
+        node = int(np.argmin(np.linalg.norm(graph.poses[:, :3, 3] - point, axis=1)))
+        T = graph.poses[node]
+        mark = Mark(name or f"mark {len(self.marks) + 1}", node, T[:3, :3].T @ (point - T[:3, 3]))
+        self.marks.append(mark)
+        return mark
+
+    def positions(self, graph: MapGraph) -> FloatArray:
+        """Marks in the map frame as it is now, (n, 3) m."""
+        return np.array(
+            [graph.poses[m.node][:3, :3] @ m.point + graph.poses[m.node][:3, 3] for m in self.marks]
+        ).reshape(-1, 3)

@@ -1,0 +1,143 @@
+"""A joined map on disk: a folder with ``manifest.json`` and ``arrays.npz``, whole or absent, exact to the last bit.
+
+The manifest names the format, its version and a digest of the arrays, so that foreign, newer or damaged folders are
+refused with a clear line instead of giving a wrong map.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sjsam_node.map_graph import Link, MapGraph
+from slam_core.files import atomic_path
+from slam_core.types import AnyArray, PoseEstimate, Submap
+
+FORMAT, VERSION = "indoor-slam-map", 1
+Arrays = dict[str, AnyArray]
+
+
+def write(folder: Path, graph: MapGraph, pending: list[Link]) -> None:
+    """Write submaps, links and estimate to ``folder``, which is replaced if it is there."""
+    arrays = _graph_arrays(graph)
+    arrays.update(_link_arrays("links", graph.links))
+    arrays.update(_link_arrays("pending", pending))
+    for i, record in enumerate(graph.records):
+        arrays.update({f"submap_{i}/{name}": value for name, value in _submap_arrays(record.submap).items()})
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
+    data = buffer.getvalue()
+    manifest = {
+        "format": FORMAT, "version": VERSION, "submaps": len(graph.records),
+        "agents": sorted({r.submap.agent for r in graph.records}),
+        "records": [
+            [r.submap.agent, r.submap.index, r.session, r.start, r.submap.follows_previous] for r in graph.records
+        ],
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }  # fmt: skip
+    with atomic_path(folder) as temporary:
+        temporary.mkdir()
+        (temporary / "arrays.npz").write_bytes(data)
+        (temporary / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+
+
+def read(folder: Path) -> tuple[MapGraph, list[Link]]:
+    """The map graph and the pending links of a folder that :func:`write` made.
+
+    Raises
+    ------
+    ValueError
+        If the folder is missing, foreign, of another version or damaged.
+    """
+    manifest = _manifest(folder)
+    try:
+        data = (folder / "arrays.npz").read_bytes()
+    except OSError as error:
+        raise ValueError(f"{folder}: map without readable arrays.npz: {error}") from error
+    if hashlib.sha256(data).hexdigest() != manifest["sha256"]:
+        raise ValueError(f"{folder}: the map is damaged: arrays.npz does not match its digest")
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    try:
+        return _graph(manifest["records"], arrays), _links("pending", arrays)
+    except (KeyError, IndexError, TypeError) as error:
+        raise ValueError(f"{folder}: the map is incomplete: {error}") from error
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{folder}: not a map: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"{folder}: not a map: manifest.json is not JSON: {error}") from error
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise ValueError(f"{folder}: not a map of this program (format {FORMAT!r} expected)")
+    if manifest.get("version") != VERSION:
+        raise ValueError(f"{folder}: map version {manifest.get('version')} cannot be read, only version {VERSION}")
+    return manifest
+
+
+def _graph_arrays(graph: MapGraph) -> Arrays:
+    return {"poses": graph.poses, "points": graph.points, "component_of": graph.component_of}
+
+
+def _link_arrays(name: str, links: list[Link]) -> Arrays:
+    pairs = [link.pairs for link in links]
+    return {
+        f"{name}/ends": np.array(
+            [[k.first, k.second, len(k.pairs), k.is_closure] for k in links], dtype=np.int64
+        ).reshape(-1, 4),
+        f"{name}/pairs": np.concatenate(pairs) if pairs else np.empty((0, 2), dtype=np.int64),
+        f"{name}/T": np.array([link.T for link in links]).reshape(-1, 4, 4),
+        f"{name}/covariance": np.array([link.covariance for link in links]).reshape(-1, 6, 6),
+    }
+
+
+def _links(name: str, arrays: Arrays) -> list[Link]:
+    ends = arrays[f"{name}/ends"]
+    pairs = np.split(arrays[f"{name}/pairs"], np.cumsum(ends[:, 2])[:-1]) if len(ends) else []
+    return [
+        Link(int(first), int(second), pairs[i], arrays[f"{name}/T"][i], arrays[f"{name}/covariance"][i], bool(closure))
+        for i, (first, second, _, closure) in enumerate(ends)
+    ]
+
+
+def _submap_arrays(submap: Submap) -> Arrays:
+    return {
+        "stamps": np.array([submap.start_stamp_ns, submap.end_stamp_ns], dtype=np.int64),
+        "end_pose": submap.end_pose, "landmarks": submap.landmarks, "covariance": submap.covariance,
+        "landmark_ids": submap.landmark_ids, "sightings": submap.sightings, "descriptors": submap.descriptors,
+        "path_stamps": np.array([p.stamp_ns for p in submap.path], dtype=np.int64),
+        "path_poses": np.array([p.T for p in submap.path]).reshape(-1, 4, 4),
+        "path_covariances": np.array([p.covariance for p in submap.path]).reshape(-1, 6, 6),
+    }  # fmt: skip
+
+
+def _submap(agent: str, index: int, follows: bool, arrays: Arrays) -> Submap:
+    path = zip(arrays["path_stamps"].tolist(), arrays["path_poses"], arrays["path_covariances"], strict=True)
+    return Submap(
+        agent, index, int(arrays["stamps"][0]), int(arrays["stamps"][1]), arrays["end_pose"], arrays["landmarks"],
+        arrays["covariance"], arrays["landmark_ids"], arrays["sightings"], arrays["descriptors"],
+        tuple(PoseEstimate(stamp, T, P) for stamp, T, P in path), follows,
+    )  # fmt: skip
+
+
+def _graph(records: list[list[Any]], arrays: Arrays) -> MapGraph:
+    """Replays the submaps and links, then lays the stored estimate over them."""
+    graph = MapGraph()
+    for i, (agent, index, session, start, follows) in enumerate(records):
+        prefix = f"submap_{i}/"
+        own = {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}
+        graph.append(
+            _submap(agent, index, follows, own), session, start if start < len(graph.poses) else None, np.eye(4)
+        )
+    graph.component_of = arrays["component_of"]
+    graph.poses, graph.points = arrays["poses"], arrays["points"]
+    graph.replace_links(_links("links", arrays))
+    return graph
