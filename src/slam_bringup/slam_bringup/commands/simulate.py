@@ -1,12 +1,12 @@
 """``slam simulate``: renders a scenario to a bag with ground truth.
 
-Topics are those that the drivers publish and read, below each agent's namespace. The bag's times are header stamps, so the
-same scenario and seed give the same bytes.
+Topics are those that the drivers publish and read, below each agent's namespace. The bag's times are header stamps,
+so the same scenario and seed give the same bytes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from heapq import merge
 from pathlib import Path
@@ -17,25 +17,25 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from slam_bringup.bag import BagWriter
-from slam_bringup.bag_types import BagTypes
-from slam_core.camera import CameraInfo
-from slam_core.messages import (
-    camera_info_message,
-    compressed_image_message,
-    header_message,
-    image_message,
-    imu_message,
-    pose_stamped_message,
-    transform_message,
+from slam_bringup.sensor_writer import (
+    BASE_FRAME,
+    IMU_FRAME,
+    LEFT_FRAME,
+    RIGHT_FRAME,
+    TOF_FRAME,
+    WORLD_FRAME,
+    SensorWriter,
 )
-from slam_core.messages.base import Message
+from slam_core.camera import CameraInfo
+from slam_core.geometry import FloatArray
+from slam_core.messages import compressed_image_message, header_message, transform_message
 from slam_core.simulation import Scenario, SimulatedFrame, Simulator
 from slam_core.simulation.stereo_sensor import SIDES
 from slam_core.simulation.surface_table import compile_world
-from slam_core.types import AnyArray, ByteArray
+from slam_core.simulation.tof_sensor import TofImages
+from slam_core.types import ByteArray
 
 IMAGE_FORMATS = ("raw", "png", "jpeg")
-TYPES = BagTypes()
 
 
 @dataclass(frozen=True)
@@ -106,93 +106,85 @@ def write_bag(
         Simulator(scenario, k, world, threads, truth=options.truth, rectified=options.rectified)
         for k in range(len(scenario.agents))
     ]
-    recorders = {s.scenario.agents[s.agent].name: _Recorder(s, options) for s in agents}
     with BagWriter(output, options.storage) as bag:
-        start = min(s.stamp_ns(0) for s in agents)
-        transforms = [t for r in recorders.values() for t in r.static_transforms(start)]
-        bag.write("/tf_static", TYPES.TFMessage(transforms=transforms), start)
+        writers = {s.scenario.agents[s.agent].name: SimulationWriter(bag, s, options) for s in agents}
+        for writer in writers.values():
+            writer.mountings(min(s.stamp_ns(0) for s in agents))
         for frame in merge(*(s.run() for s in agents), key=lambda f: f.stamp_ns):
-            for topic, message, stamp in recorders[frame.agent].messages(frame):
-                bag.write(topic, message, stamp)
+            writers[frame.agent].frame(frame)
             advance()
 
 
-class _Recorder:
-    """Turns the frames of one agent into messages."""
+class SimulationWriter(SensorWriter):
+    """Writes the frames of one agent: the sensors' topics, and what only a simulation knows."""
 
-    def __init__(self, simulator: Simulator, options: BagOptions) -> None:
+    def __init__(self, bag: BagWriter, simulator: Simulator, options: BagOptions) -> None:
+        super().__init__(bag, simulator.scenario.agents[simulator.agent].name)
         self._simulator, self._options = simulator, options
-        self._agent = simulator.scenario.agents[simulator.agent].name
-        self._infos = dict(zip(SIDES, simulator.stereo.infos, strict=True))
 
-    def static_transforms(self, stamp: int) -> list[Message]:
+    def mountings(self, stamp: int) -> None:
         """Where the sensors sit on the rig."""
-        s = self._simulator
+        s, sensors = self._simulator, self._simulator.scenario.sensors
         T_rig_right = s.T_rig_left.copy()
-        T_rig_right[:3, 3] -= s.stereo.stereo.baseline * np.array([0.0, 1.0, 0.0])
-        mountings = []
-        if "stereo" in s.scenario.sensors:
-            mountings += [("stereo_left_optical_frame", s.T_rig_left), ("stereo_right_optical_frame", T_rig_right)]
-        if "tof" in s.scenario.sensors:
-            mountings.append(("tof_optical_frame", s.tof.T_rig_tof))
-        base = self._name("base_link")
-        return [transform_message(TYPES, stamp, base, self._name(frame), T) for frame, T in mountings]
+        T_rig_right[1, 3] -= s.stereo.stereo.baseline
+        frames: dict[str, FloatArray] = {}
+        if "stereo" in sensors:
+            frames |= {LEFT_FRAME: s.T_rig_left, RIGHT_FRAME: T_rig_right}
+        if "tof" in sensors:
+            frames[TOF_FRAME] = s.tof.T_rig_tof
+        if "imu" in sensors:
+            frames[IMU_FRAME] = np.eye(4)
+        self.extrinsics(stamp, frames)
 
-    def messages(self, frame: SimulatedFrame) -> Iterator[tuple[str, Message, int]]:
-        """Topic, message and time of recording of all that one frame brings."""
+    def frame(self, frame: SimulatedFrame) -> None:
+        """All that one frame brings."""
         for sample in frame.imu:
-            yield self._topic("imu"), imu_message(TYPES, self._name("base_link"), sample), sample.stamp_ns
-        now = frame.stamp_ns
-        truth = pose_stamped_message(TYPES, now, "world", frame.T_world_rig)
-        yield self._topic("ground_truth/pose"), truth, now
-        # Not base_link itself: a frame has one parent, and the estimators give it theirs.
-        moving = transform_message(TYPES, now, "world", self._name("ground_truth/base_link"), frame.T_world_rig)
-        yield "/tf", TYPES.TFMessage(transforms=[moving]), now
+            self.imu(sample)
+        self.ground_truth(frame.stamp_ns, frame.T_world_rig)
+        self._moving_truth(frame.stamp_ns, frame.T_world_rig)
         if frame.left is not None and frame.right is not None:
-            yield from self._stereo("left", frame.left, now, now)
-            yield from self._stereo("right", frame.right, frame.right_stamp_ns, now)
+            stamps = (frame.stamp_ns, frame.right_stamp_ns)
+            for k, (stamp, image) in enumerate(zip(stamps, (frame.left, frame.right), strict=True)):
+                self._stereo_image(k, stamp, image)
         if frame.tof is not None:
-            yield from self._tof(frame)
+            self._tof(frame.stamp_ns, frame.tof)
         if frame.truth is not None:
-            header = header_message(TYPES, now, self._name("stereo_left_optical_frame"))
-            yield self._topic("ground_truth/depth"), image_message(TYPES, header, frame.truth.depth), now
+            self.picture("ground_truth/depth", frame.stamp_ns, LEFT_FRAME, frame.truth.depth)
 
-    def _stereo(self, side: str, image: ByteArray, stamp: int, now: int) -> Iterator[tuple[str, Message, int]]:
-        header = header_message(TYPES, stamp, self._name(f"stereo_{side}_optical_frame"))
-        yield self._topic(f"stereo/{side}/camera_info"), camera_info_message(TYPES, header, self._infos[side]), now
-        topic = self._topic(f"stereo/{side}/image_{'rect' if self._options.rectified else 'raw'}")
+    def _moving_truth(self, stamp: int, T_world_rig: FloatArray) -> None:
+        """The true pose on ``/tf``, not as base_link: a frame has one parent, and the estimators give it theirs."""
+        child = self._frame(f"ground_truth/{BASE_FRAME}")
+        transform = transform_message(self._types, stamp, WORLD_FRAME, child, T_world_rig)
+        self._bag.write("/tf", self._types.TFMessage(transforms=[transform]), stamp)
+
+    def _stereo_image(self, k: int, stamp: int, image: ByteArray) -> None:
+        side, frame = SIDES[k], (LEFT_FRAME, RIGHT_FRAME)[k]
+        topic = f"stereo/{side}/image_{'rect' if self._options.rectified else 'raw'}"
+        self.info(f"stereo/{side}/camera_info", stamp, frame, self._simulator.stereo.infos[k])
         if self._options.images == "raw":
-            yield topic, image_message(TYPES, header, image), now
-        else:
-            yield f"{topic}/compressed", _compressed(header, image, self._options.images), now
+            self.picture(topic, stamp, frame, image)
+            return
+        header = header_message(self._types, stamp, self._frame(frame))
+        message = compressed_image_message(
+            self._types, header, encode(image, self._options.images), self._options.images
+        )
+        self._bag.write(f"{self._prefix}/{topic}/compressed", message, stamp)
 
-    def _tof(self, frame: SimulatedFrame) -> Iterator[tuple[str, Message, int]]:
-        assert frame.tof is not None
-        now, compact = frame.stamp_ns, self._options.compact
-        header = header_message(TYPES, now, self._name("tof_optical_frame"))
+    def _tof(self, stamp: int, images: TofImages) -> None:
         info = CameraInfo(self._simulator.tof.camera)
-        yield self._topic("tof/camera_info"), camera_info_message(TYPES, header, info), now
-        images = {"range": frame.tof.range, "amplitude": frame.tof.amplitude, "intensity": frame.tof.intensity}
-        if compact:
-            del images["intensity"]
-        for name, image in images.items():
-            stored: AnyArray = image
-            if compact:
-                stored = np.rint(image * (1000.0 if name == "range" else 1.0)).astype(np.uint16)
-            yield self._topic(f"tof/{name}/image_raw"), image_message(TYPES, header, stored), now
-
-    def _topic(self, name: str) -> str:
-        return f"/{self._agent}/{name}" if self._agent else f"/{name}"
-
-    def _name(self, frame: str) -> str:
-        return f"{self._agent}/{frame}" if self._agent else frame
+        if self._options.compact:
+            distance, amplitude = (np.rint(i).astype(np.uint16) for i in (images.range * 1000.0, images.amplitude))
+            self.depth(stamp, distance, info, measurement="range", amplitude=amplitude)
+        else:
+            pictures = {"amplitude": images.amplitude, "intensity": images.intensity}
+            self.depth(stamp, images.range, info, measurement="range", **pictures)
 
 
-def _compressed(header: Message, image: ByteArray, kind: str) -> Message:
-    suffix, setting = (
-        (".png", [cv2.IMWRITE_PNG_COMPRESSION, 3]) if kind == "png" else (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 90])
-    )
+def encode(image: ByteArray, kind: str) -> bytes:
+    """A grey image as a file: "png" without loss, or "jpeg" of quality 90."""
+    png, jpeg = (".png", [cv2.IMWRITE_PNG_COMPRESSION, 3]), (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 90])
+    suffix, setting = png if kind == "png" else jpeg
     ok, data = cv2.imencode(suffix, image, setting)
     if not ok:
         raise ValueError(f"OpenCV cannot encode {kind} images")
-    return compressed_image_message(TYPES, header, data.tobytes(), kind)
+    return bytes(data)

@@ -177,7 +177,7 @@ def _close(world: World, wall: Wall, place: FloatArray, door: Doorway) -> None:
 
 
 def _line(world: World, a: Wall, b: Wall, place: FloatArray, door: Doorway) -> None:
-    s, half, frame = float((place - a.start) @ a.along), door.width / 2, Material("wood", 1.3)
+    s, half, frame = float((place - a.start) @ a.along), door.width / 2, Material("plaster", 0.75)
     gap = float(abs((b.start - a.start) @ a.inward))
     outward = np.array([*(-a.inward * gap), 0.0])
     near, far = a.point(s - half), a.point(s + half)
@@ -203,7 +203,7 @@ def _line(world: World, a: Wall, b: Wall, place: FloatArray, door: Doorway) -> N
 
 def _frame(world: World, wall: Wall, s: tuple[float, float], height: float) -> None:
     """Architrave around an opening, on the room's side."""
-    wood, width = Material("wood", 1.3), 0.07
-    world.add(wall.panel((s[0] - width, s[0]), (0.0, height), wood, 0.012))
-    world.add(wall.panel((s[1], s[1] + width), (0.0, height), wood, 0.012))
-    world.add(wall.panel((s[0] - width, s[1] + width), (height, height + width), wood, 0.012))
+    paint, width = Material("plaster", 0.75), 0.07
+    world.add(wall.panel((s[0] - width, s[0]), (0.0, height), paint, 0.012))
+    world.add(wall.panel((s[1], s[1] + width), (0.0, height), paint, 0.012))
+    world.add(wall.panel((s[0] - width, s[1] + width), (height, height + width), paint, 0.012))

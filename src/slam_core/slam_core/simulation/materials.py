@@ -91,7 +91,7 @@ def _brick(rng: np.random.Generator) -> FloatArray:
 def _wood(rng: np.random.Generator) -> FloatArray:
     grain = noise(rng, (2, 32), 5, 0.7)
     rings = np.sin(6.0 * noise(rng, (2, 8), 3) + 2.0 * grain)
-    return np.asarray(0.42 + 0.06 * grain + 0.05 * rings)
+    return np.asarray(0.42 + 0.03 * grain + 0.025 * rings)
 
 
 def _planks(rng: np.random.Generator) -> FloatArray:
@@ -121,7 +121,7 @@ def _carpet(rng: np.random.Generator) -> FloatArray:
 
 
 def _linoleum(rng: np.random.Generator) -> FloatArray:
-    image = 0.45 + 0.03 * noise(rng, (8, 32), 5, 0.7)
+    image = 0.45 + 0.016 * noise(rng, (16, 32), 5, 0.7)
     _speckle(rng, image, 900, 4, 0.07)
     return image
 

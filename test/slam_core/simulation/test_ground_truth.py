@@ -1,0 +1,129 @@
+"""The circle closes: depth, poses, disparities and ranges of the simulation agree with each other and with the images."""
+
+import cv2
+import numpy as np
+import pytest
+
+from slam_core.geometry import invert_transform, transform_points
+from slam_core.simulation import Scenario, SimulatedFrame, Simulator
+from slam_core.simulation.raycaster import make_view, trace
+from slam_core.simulation.surface_table import compile_world
+from slam_core.types import ByteArray
+
+
+@pytest.fixture(scope="module")
+def frames(simulator: Simulator) -> list[SimulatedFrame]:
+    return list(simulator.run(11))
+
+
+def rectified(simulator: Simulator, side: int, image: ByteArray) -> ByteArray:
+    """Undistorted by OpenCV, from the camera info alone."""
+    info = simulator.stereo.infos[side]
+    size = (info.camera.width, info.camera.height)
+    maps = cv2.initUndistortRectifyMap(
+        info.camera.K, np.array(info.camera.distortion), info.R, info.P[:, :3], size, cv2.CV_32FC1
+    )
+    return np.asarray(cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR))
+
+
+def inner_grid() -> tuple[np.ndarray, np.ndarray]:
+    v, u = np.meshgrid(np.arange(60, 420, 6), np.arange(90, 550, 6), indexing="ij")
+    return u.ravel(), v.ravel()
+
+
+def test_depth_of_one_frame_reprojects_into_another(simulator: Simulator, frames: list[SimulatedFrame]) -> None:
+    a, b = frames[2], frames[5]
+    camera, (u, v) = simulator.stereo.stereo.camera, inner_grid()
+    assert a.truth is not None
+    assert b.truth is not None
+    points = camera.unproject(np.column_stack([u, v]).astype(float), a.truth.depth[v, u].astype(float))
+    T = invert_transform(b.T_world_rig @ simulator.T_rig_left) @ a.T_world_rig @ simulator.T_rig_left
+    moved = transform_points(T, points)
+    pixels = camera.project(moved)
+    inside = (pixels > 1).all(axis=1) & (pixels[:, 0] < 638) & (pixels[:, 1] < 478) & (moved[:, 2] > 0.1)
+    nearest = np.rint(pixels[inside]).astype(int)
+    same = b.truth.surface[nearest[:, 1], nearest[:, 0]] == a.truth.surface[v, u][inside]
+    assert same.mean() > 0.9
+    # The same surface in both: back into the first frame from the second's own depth closes to a fraction of a pixel.
+    back = camera.unproject(nearest.astype(float), b.truth.depth[nearest[:, 1], nearest[:, 0]].astype(float))
+    again = camera.project(transform_points(invert_transform(T), back))
+    start = np.column_stack([u, v])[inside] + (nearest - pixels[inside])
+    error = np.linalg.norm(again - start, axis=1)[same]
+    assert np.median(error) < 0.1
+    assert np.percentile(error, 95) < 0.5
+
+
+def test_rectified_pair_has_the_disparity_of_the_true_depth(
+    simulator: Simulator, frames: list[SimulatedFrame]
+) -> None:
+    frame = frames[4]
+    assert frame.left is not None
+    assert frame.right is not None
+    assert frame.truth is not None
+    left, right = rectified(simulator, 0, frame.left), rectified(simulator, 1, frame.right)
+    corners = cv2.goodFeaturesToTrack(left, 300, 0.02, 8, mask=np.pad(np.ones((360, 460), np.uint8), ((60, 60), (90, 90))))
+    tracked, ok, _ = cv2.calcOpticalFlowPyrLK(left, right, corners, None, winSize=(15, 15))
+    start, end, ok = corners[:, 0], tracked[:, 0], ok[:, 0] > 0
+    u, v = np.rint(start).astype(int).T
+    stereo = simulator.stereo.stereo
+    depth = frame.truth.depth[v, u]
+    # Away from depth edges, where one pixel has one disparity.
+    flat = np.array([np.ptp(frame.truth.depth[j - 8 : j + 9, i - 8 : i + 9]) < 0.05 for i, j in zip(u, v, strict=True)])
+    good = ok & flat
+    assert good.sum() > 30
+    residual = (start - end)[good, 0] - stereo.camera.fx * stereo.baseline / depth[good]
+    vertical = (start - end)[good, 1]
+    assert abs(np.median(residual)) < 0.05
+    assert np.median(np.abs(residual)) < 0.2
+    assert abs(np.median(vertical)) < 0.05
+    assert np.median(np.abs(vertical)) < 0.2
+
+
+def test_tof_points_lie_on_the_surfaces_within_their_sigma(simulator: Simulator) -> None:
+    tof, rng = simulator.tof, np.random.default_rng(5)
+    normalised = []
+    for t in (0.0, 1.0):
+        T = simulator.path.pose(t)
+        view = make_view(simulator.world, T @ tof.T_rig_tof, tof.rays.bounds)
+        hits = trace(view, tof.rays)
+        length = np.sqrt(1.0 + (tof.rays.rays[..., :2] ** 2).sum(axis=-1))
+        inner = np.ones(hits.surface.shape, bool)
+        for axis in (0, 1):
+            for step in (1, -1):
+                inner &= np.roll(hits.surface, step, axis) == hits.surface
+        inner[[0, -1]] = inner[:, [0, -1]] = False
+        images = tof.capture(simulator.world, T, rng, None)
+        sigma = np.hypot(tof.range_sigma(images.amplitude), tof.config.offset_noise)
+        use = inner & (images.amplitude > 5) & (images.range > 0)
+        normalised.append(((images.range - hits.depth * length) / sigma)[use])
+    error = np.concatenate(normalised)
+    assert len(error) > 50_000
+    assert 0.93 < error.std() < 1.07
+    assert abs(error.mean()) < 0.05
+    assert (np.abs(error) > 4).mean() < 1e-3
+
+
+def test_loop_ends_where_it_began(scenario: Scenario) -> None:
+    path = scenario.path()
+    np.testing.assert_allclose(path.pose(path.duration), path.pose(0.0), atol=1e-12)
+
+
+def test_images_do_not_depend_on_the_number_of_threads(scenario: Scenario) -> None:
+    world = compile_world(scenario.world())
+    for one, two in zip(
+        Simulator(scenario, world=world, threads=1).run(3), Simulator(scenario, world=world, threads=2).run(3), strict=True
+    ):
+        assert np.array_equal(one.left, two.left)
+        assert np.array_equal(one.right, two.right)
+        assert one.tof is not None
+        assert two.tof is not None
+        assert np.array_equal(one.tof.range, two.tof.range)
+        assert np.array_equal(one.tof.amplitude, two.tof.amplitude)
+
+
+def test_another_seed_is_another_building(scenario: Scenario) -> None:
+    from dataclasses import replace
+
+    a = compile_world(scenario.world())
+    b = compile_world(replace(scenario, seed=scenario.seed + 1).world())
+    assert a.textures.texels.shape != b.textures.texels.shape or not np.array_equal(a.textures.texels, b.textures.texels)
