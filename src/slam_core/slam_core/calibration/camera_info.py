@@ -5,7 +5,6 @@ ROS readers look up the keys they know, so ``standard_deviations`` travels along
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 import yaml
 
 from slam_core.camera import Camera, CameraInfo
+from slam_core.files import atomic_text
 from slam_core.geometry import FloatArray
 
 COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
@@ -36,11 +36,8 @@ class CameraInfoFile:
 
     def write(self, path: str | Path) -> None:
         """Write the file; it appears complete or not at all."""
-        target = Path(path)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.with_name(target.name + ".part")
-        temporary.write_text(yaml.safe_dump(self._document(), sort_keys=False, default_flow_style=None, width=110))
-        os.replace(temporary, target)
+        text = yaml.safe_dump(self._document(), sort_keys=False, default_flow_style=None, width=110)
+        atomic_text(Path(path), text)
 
     def _document(self) -> dict[str, Any]:
         camera = self.info.camera

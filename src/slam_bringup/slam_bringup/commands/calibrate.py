@@ -1,0 +1,123 @@
+"""``slam calibrate``: camera_info files with uncertainties from pictures of a board."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+import numpy as np
+import yaml
+from rich.progress import Progress
+
+from slam_bringup.figures import save_png
+from slam_core.calibration.board import Board, parse_board
+from slam_core.calibration.bundle import BundleResult
+from slam_core.calibration.camera_info import CameraInfoFile
+from slam_core.calibration.lens import DISTORTION_PARAMETERS
+from slam_core.calibration.pictures import BoardViews, find_views, pair_pictures
+from slam_core.calibration.rectification import stereo_infos
+from slam_core.calibration.report import (
+    board_poses_figure,
+    camera_deviations,
+    extrinsics_of,
+    residual_figure,
+    summary,
+    tables,
+)
+from slam_core.calibration.rig import calibrate
+from slam_core.camera import CameraInfo
+from slam_core.files import atomic_text
+from slam_core.geometry import quaternion_from_rotation
+
+CAMERAS = {"mono": ("camera",), "stereo": ("left", "right"), "stereo-tof": ("left", "tof")}
+FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_frame", "tof": "tof_optical_frame"}
+
+
+@click.command()
+@click.argument("kind", type=click.Choice(list(CAMERAS)))
+@click.argument("images", nargs=-1, required=True)
+@click.option(
+    "--board", "board_text", required=True,
+    help="chessboard:9x6:0.025 (inner corners, square in m), aprilgrid:6x6:0.088:0.3 (tags, edge in m, gap over edge) "
+    "or charuco:11x8:0.03:0.022 (squares, square and marker in m)",
+)  # fmt: skip
+@click.option(
+    "--model", default="plumb_bob", show_default=True,
+    help=f"lens model, or one per camera with a comma between: {', '.join(DISTORTION_PARAMETERS)}",
+)  # fmt: skip
+@click.option("-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path), help="folder to write")
+def command(kind: str, images: tuple[str, ...], board_text: str, model: str, output: Path) -> None:
+    """Calibrate one camera (mono), a stereo pair, or a stereo camera's left eye with a ToF camera (stereo-tof).
+
+    IMAGES are files, folders or quoted patterns; for two cameras one folder or pattern each, or all files of the first
+    followed by those of the second.
+    """
+    names, board = CAMERAS[kind], parse_board(board_text)
+    lenses = _lenses(model, len(names))
+    views = _find(board, pair_pictures(images, len(names)))
+    result = calibrate(board.points, views.corners, views.sizes, lenses)
+    _write(output, kind, result, board, views)
+    click.echo(tables(result, names))
+    click.echo(f"written to {output}")
+
+
+def _lenses(model: str, cameras: int) -> list[str]:
+    lenses = model.split(",")
+    lenses = lenses * cameras if len(lenses) == 1 else lenses
+    if len(lenses) != cameras:
+        raise ValueError(f"--model names {len(lenses)} lens models for {cameras} cameras: '{model}'")
+    return lenses
+
+
+def _find(board: Board, files: list[list[Path]]) -> BoardViews:
+    with Progress(transient=True) as bar:
+        task = bar.add_task("finding the board", total=sum(len(view) for view in files))
+        return find_views(board, files, lambda: bar.advance(task))
+
+
+def _write(output: Path, kind: str, result: BundleResult, board: Board, views: BoardViews) -> None:
+    names = CAMERAS[kind]
+    infos = _infos(kind, result)
+    output.mkdir(parents=True, exist_ok=True)
+    for c, (name, info) in enumerate(zip(names, infos, strict=True)):
+        CameraInfoFile(info, name, camera_deviations(result, c)).write(output / f"{name}.yaml")
+    if len(names) > 1:
+        atomic_text(output / "extrinsics.yaml", _extrinsics(result, names))
+    save_png(output / "residuals.png", residual_figure(result, names))
+    save_png(output / "board_poses.png", board_poses_figure(result, board.points, names))
+    atomic_text(output / "report.md", f"# Calibration\n\n{tables(result, names)}\n{_picture_table(result, views)}")
+    atomic_text(output / "summary.json", json.dumps(summary(result, names), indent=2) + "\n")
+
+
+def _infos(kind: str, result: BundleResult) -> Sequence[CameraInfo]:
+    states = result.rig.cameras
+    if kind == "stereo":
+        return stereo_infos(states[0].camera, states[1].camera, states[1].T)
+    return [CameraInfo(state.camera) for state in states]
+
+
+def _extrinsics(result: BundleResult, names: Sequence[str]) -> str:
+    """The second camera's place in the first one's (raw) optical frame, as a static transform needs it."""
+    T, covariance = extrinsics_of(result, 1)
+    document = {
+        "parent_frame": FRAMES[names[0]],
+        "child_frame": FRAMES[names[1]],
+        "translation_m": T[:3, 3].tolist(),
+        "rotation_xyzw": quaternion_from_rotation(T[:3, :3]).tolist(),
+        "standard_deviations": dict(
+            zip(("x", "y", "z", "rx", "ry", "rz"), np.sqrt(np.diag(covariance)).tolist(), strict=True)
+        ),
+        "covariance": covariance.tolist(),
+    }
+    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
+
+
+def _picture_table(result: BundleResult, views: BoardViews) -> str:
+    lines = ["## Pictures", "", "| picture | corners found | used | rms [px] |", "|---|---|---|---|"]
+    for files, found, used, residuals in zip(views.files, views.corners, result.views, result.residuals, strict=True):
+        for path, f, k, r in zip(files, found, used, residuals, strict=True):
+            rms = f"{np.sqrt(np.square(r).sum(axis=1).mean()):.3f}" if len(k) else "-"
+            lines.append(f"| {path.name} | {len(f)} | {len(k)} | {rms} |")
+    return "\n".join(lines) + "\n"
