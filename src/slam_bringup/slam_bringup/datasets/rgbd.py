@@ -5,7 +5,8 @@
 - TUM RGB-D (Sturm et al. 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; depth in 1/5000 m; paired by time.
 - plain: ``color/<n>.png``, ``depth/<n>.png`` (mm), ``pose.txt`` with x y z qx qy qz qw per frame; 30 Hz.
 
-The depth is along z, so it goes to ``tof/depth/image_raw`` as it is; the grey picture becomes the amplitude.
+The depth is along z, so it goes to ``tof/depth/image_raw`` as it is; the grey picture, registered to it, becomes the
+amplitude.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_bringup.datasets.files import START_NS, StampedPair, existing, read_depth, read_grey
+from slam_bringup.datasets.picture_registration import ColourCamera, register_picture
 from slam_bringup.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
 from slam_core.calibration.camera_info import read_camera_info
 from slam_core.camera import Camera, CameraInfo
@@ -31,6 +33,8 @@ _PERIOD_NS = 33_333_333
 _MILLIMETRES_INVALID = 65535
 _PAIRING_NS = 20_000_000
 _KINECT_SEVEN_SCENES = (585.0, 585.0, 320.0, 240.0)
+_KINECT_SEVEN_SCENES_COLOUR = ColourCamera((530.0, 530.0, 320.0, 240.0), (0.0256, 0.0, 0.0))
+"""7-Scenes does not register its pictures. Focal length and offset put depth edges on picture edges (redkitchen)."""
 _KINECT_TUM = (525.0, 525.0, 319.5, 239.5)
 
 
@@ -42,6 +46,8 @@ class _Layout:
     units_per_metre: float
     intrinsics: tuple[float, float, float, float]
     poses: list[tuple[int, FloatArray]]
+    colour: ColourCamera | None = None
+    """The camera of the pictures where they are not registered to the depth."""
 
 
 class RgbdDataset:
@@ -74,6 +80,9 @@ class RgbdDataset:
             depth = _clean(read_depth(pair.second), self._layout.units_per_metre)
             info = info or self._info(depth.shape)
             grey = read_grey(pair.first)
+            if self._layout.colour is not None:
+                metres = depth * (1.0 / self._layout.units_per_metre if depth.dtype == np.uint16 else 1.0)
+                grey = register_picture(grey, metres, info.camera, self._layout.colour)
             writer.depth(pair.stamp_ns, depth, info, measurement="depth", amplitude=grey)
             yield number
         for stamp, T_world_camera in self._poses:
@@ -123,7 +132,7 @@ def _seven_scenes(folder: Path) -> _Layout:
             poses.append((stamp, _read_matrix(pose)))
     matrix = folder / "camera-intrinsics.txt"
     intrinsics = _read_camera_matrix(matrix) if matrix.exists() else _KINECT_SEVEN_SCENES
-    return _Layout(pairs, 1000.0, intrinsics, poses)
+    return _Layout(pairs, 1000.0, intrinsics, poses, _KINECT_SEVEN_SCENES_COLOUR)
 
 
 def _tum(folder: Path) -> _Layout:
