@@ -44,7 +44,7 @@ class MeasurementConfig(Config):
         maximum=1.0,
     )
     noise_tolerance: float = parameter(
-        1.5, "variances of one frame are enlarged only if its errors exceed them by more than this factor", minimum=1.0
+        2.0, "variances of one frame are enlarged only if its errors exceed them by more than this factor", minimum=1.0
     )
     max_noise_factor: float = parameter(
         25.0, "largest factor on the claimed variances; 1 trusts every claim", minimum=1.0, maximum=1e4
@@ -70,13 +70,16 @@ class AssociationConfig(Config):
     nearest_associate: float = parameter(0.15, "gate g_A of Algorithm 1", unit="m", minimum=0.0)
     min_inliers: int = parameter(8, "associations below which the rig is lost", minimum=3)
     min_inlier_ratio: float = parameter(
-        0.25, "inliers among the descriptor matches below which a motion guess is not trusted", minimum=0.0, maximum=1.0
+        0.2, "inliers among the descriptor matches below which a motion guess is not trusted", minimum=0.0, maximum=1.0
     )
     guess_min_inliers: int = parameter(12, "associations a motion guess from descriptors alone needs", minimum=4)
     guess_ratio: float = parameter(
         0.85, "a match of a motion guess needs a second best whose descriptor distance is larger by 1 / this",
         minimum=0.1, maximum=1.0,
     )  # fmt: skip
+    guess_descriptor_threshold: float = parameter(
+        0.6, "least cosine of the descriptors in the second attempt at a motion guess", minimum=-1.0, maximum=1.0
+    )
     hypotheses: int = parameter(200, "samples drawn for the motion guess", minimum=10)
     max_gate_px: float = parameter(
         80.0,

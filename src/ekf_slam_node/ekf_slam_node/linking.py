@@ -78,14 +78,21 @@ class Linker:
     def _by_guess(
         self, candidates: Candidates, frame: Frame, similarity: FloatArray, rng: np.random.Generator
     ) -> Link | None:
+        """First with the descriptors that agree well, then with all that agree at all."""
         config = self._config
-        rows, columns = match_descriptors(similarity, config.descriptor_threshold, config.guess_ratio)
-        guess = guess_motion(
-            candidates.select(rows), frame.select(columns), self._T_rig_optical, rng, 2 * config.hypotheses, config.gate
-        )
-        if guess is None or guess.inliers.sum() < max(config.min_inliers, config.min_inlier_ratio * len(rows)):
-            return None
-        return self._settle(candidates, frame, similarity, guess, config.guess_min_inliers)
+        strict = match_descriptors(similarity, config.descriptor_threshold, config.guess_ratio)
+        loose = match_descriptors(similarity, config.guess_descriptor_threshold, 1.0)
+        for rows, columns in (strict, loose):
+            guess = guess_motion(
+                candidates.select(rows), frame.select(columns), self._T_rig_optical, rng, 2 * config.hypotheses, config.gate
+            )
+            enough = max(config.min_inliers, config.min_inlier_ratio * len(rows))
+            if guess is None or guess.inliers.sum() < enough:
+                continue
+            link = self._settle(candidates, frame, similarity, guess, config.guess_min_inliers)
+            if link is not None:
+                return link
+        return None
 
     def _associate(
         self, candidates: Candidates, frame: Frame, similarity: FloatArray, prior: MotionPrior

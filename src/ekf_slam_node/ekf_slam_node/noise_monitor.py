@@ -13,6 +13,9 @@ from ekf_slam_node.config import MeasurementConfig
 from ekf_slam_node.models import Frame
 from slam_core.geometry import FloatArray
 
+_CHANCE = 0.15
+"""Logarithm of a factor that true claims may reach by chance."""
+
 
 class NoiseMonitor:
     """Running factors (3,) on the variances of u, v and inverse depth, never below one."""
@@ -23,8 +26,8 @@ class NoiseMonitor:
 
     @property
     def factor(self) -> FloatArray:
-        """The present factors on claimed variances (3,)."""
-        return np.asarray(np.exp(self._log_factor))
+        """The present factors on claimed variances (3,); what may be chance is left alone."""
+        return np.asarray(np.exp(np.where(self._log_factor > _CHANCE, self._log_factor, 0.0)))
 
     def corrected(self, frame: Frame) -> Frame:
         """A new frame with the noise that the frames before had."""
@@ -35,7 +38,9 @@ class NoiseMonitor:
         corrected.
         """
         limit = np.log(self._config.max_noise_factor)
-        weight = 1.0 - self._config.noise_memory
-        own = np.minimum(np.where(ratio > self._config.noise_tolerance, ratio, 1.0), np.exp(limit - self._log_factor))
-        self._log_factor = np.clip(self._log_factor + weight * np.log(ratio), 0.0, limit)
+        applied = np.log(self.factor)
+        own = np.minimum(np.where(ratio > self._config.noise_tolerance, ratio, 1.0), np.exp(limit - applied))
+        seen = applied + np.log(ratio)
+        memory = self._config.noise_memory
+        self._log_factor = np.clip(memory * self._log_factor + (1.0 - memory) * seen, -_CHANCE, limit)
         return frame.with_larger_noise(own)

@@ -207,7 +207,7 @@ class EkfSlam:
         """
         self.counters.add("frames_lost")
         self._lost_frames += 1
-        if self._lost_frames > self.config.submap.lost_frames and self._links_to_missed(frame):
+        if self._lost_frames >= self.config.submap.lost_frames and self._links_to_missed(frame):
             return self._restart(frame)
         self._missed = frame
         reason = f"{len(frame)} features, fewer than {self.config.association.min_inliers} associations"
