@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from slam_bringup.configuration import SystemConfig
@@ -14,85 +14,124 @@ from slam_core.config import Config, iterate_parameters
 
 RESULT_TOPICS = (
     "odom", "pose", "features", "landmarks", "ndt/odometry", "ndt/motion", "map_to_odom", "submap/landmarks",
-    "submap/info",    "submap/path", "map/landmarks", "map/path", "map/graph", "map/ellipsoids", "map/cloud", "map/marks",
+    "submap/info", "submap/path", "map/landmarks", "map/path", "map/graph", "map/ellipsoids", "map/cloud", "map/marks",
 )  # fmt: skip
 """What ``slam nodes`` records, below each agent's namespace and at the root."""
 
 
 @dataclass(frozen=True)
+class NodeSpec:
+    """One node: where it is, in which namespace, and its parameters that differ from their defaults."""
+
+    package: str
+    executable: str
+    namespace: str
+    parameters: dict[str, Any]
+
+    @property
+    def command(self) -> NodeCommand:
+        """The same as a command line."""
+        arguments = ros_arguments(self.parameters, self.namespace)
+        return NodeCommand(self.package, self.executable, tuple(arguments), self.namespace)
+
+
+@dataclass(frozen=True)
 class NodeGraph:
-    """Nodes in the order of their start, and what the bag player must know of them."""
+    """Nodes in the order of their start, and what the bag player and the recorder must know of them.
+
+    filters: full names of the ekf_slam nodes, one per agent. finishers: full names of the nodes that are told that the
+    input has ended, in this order.
+    """
 
     commands: tuple[NodeCommand, ...]
     played_topics: tuple[str, ...]
     pace: tuple[str, ...]
     recorded_topics: tuple[str, ...]
-    filters: tuple[str, ...] = field(default=())
-    """Full names of the ekf_slam nodes, one per agent."""
-    finishers: tuple[str, ...] = field(default=())
-    """Full names of the nodes that are told that the input has ended, in this order."""
+    filters: tuple[str, ...]
+    finishers: tuple[str, ...]
+
+
+def live_nodes(
+    config: SystemConfig, agents: Iterable[str], *, odometry: bool, extra: Mapping[str, Mapping[str, Any]] | None = None
+) -> list[NodeSpec]:
+    """Nodes for rigs with the sensors that the mode of ``config`` needs; ``extra``: parameters by executable."""
+    mode, extra, agents = config.feature_extractor.mode, extra or {}, tuple(agents)
+    specs = []
+    for agent in agents:
+        if mode != "tof":
+            specs.append(_spec("stereo_frontend", "stereo_driver", None, agent, extra))
+        if mode != "stereo" or odometry:
+            specs.append(_spec("tof_driver", "tof_driver", config.tof_driver, agent, extra))
+        if odometry:
+            specs.append(_spec("ndt_registration", "ndt_odometry", config.ndt_odometry, agent, extra))
+        specs.append(_spec("stereo_frontend", "feature_extractor", config.feature_extractor, agent, extra))
+        specs.append(_spec("ekf_slam_node", "ekf_slam", config.ekf_slam, agent, extra, agent=agent))
+    specs.append(_spec("sjsam_node", "sjsam", config.sjsam, "", extra, agents=agents if any(agents) else ()))
+    return specs
 
 
 def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odometry: bool, map_path: str) -> NodeGraph:
     """The nodes of a run over the agents of a bag."""
     mode = config.feature_extractor.mode
-    commands: list[NodeCommand] = []
-    played: list[str] = []
-    pace: list[str] = []
-    for agent, sensor in sensors.items():
-        nodes, topics = _agent_nodes(config, sensor, mode, odometry)
-        commands += nodes
-        played += topics
-        pace += _pace(agent, sensor, mode, odometry)
-    agents = tuple(sensors)
-    commands.append(_command("sjsam_node", "sjsam", config.sjsam, "", {"agents": agents, "map_path": map_path}))
-    recorded = {_join(agent, topic) for agent in ("", *agents) for topic in RESULT_TOPICS} | {"/diagnostics"}
-    extractors = tuple(c.full_name for c in commands if c.executable == "feature_extractor")
-    filters = tuple(c.full_name for c in commands if c.executable == "ekf_slam")
+    first = next(iter(sensors.values()))
+    specs = live_nodes(config, sensors, odometry=odometry, extra=_bag_parameters(first, odometry, map_path))
+    names = {
+        e: tuple(s.command.full_name for s in specs if s.executable == e) for e in ("feature_extractor", "ekf_slam")
+    }
+    recorded = {_join(agent, topic) for agent in ("", *sensors) for topic in RESULT_TOPICS}
     return NodeGraph(
-        tuple(commands), tuple(played), tuple(pace), (*sorted(recorded), "/static_transforms"), filters,
-        (*extractors, *filters),
-    )  # fmt: skip
+        commands=tuple(spec.command for spec in specs),
+        played_topics=tuple(t for s in sensors.values() for t in _topics(s, mode, odometry)),
+        pace=tuple(p for s in sensors.values() for p in _pace(s, mode, odometry)),
+        recorded_topics=(*sorted(recorded), "/diagnostics", "/static_transforms"),
+        filters=names["ekf_slam"],
+        finishers=(*names["feature_extractor"], *names["ekf_slam"]),
+    )
 
 
-def _agent_nodes(
-    config: SystemConfig, sensor: AgentSensors, mode: str, odometry: bool
-) -> tuple[list[NodeCommand], list[str]]:
-    agent, commands, topics = sensor.agent, [], list[str]()
-    if mode != "tof":
-        compressed = sensor.topics["left"].endswith("/compressed")
-        commands.append(_command("stereo_frontend", "stereo_driver", None, agent, {"compressed": compressed}))
-        topics += [sensor.topics["left"], sensor.topics["right"]]
-        topics += [_join(agent, f"stereo/{side}/camera_info") for side in ("left", "right")]
+def _bag_parameters(sensor: AgentSensors, odometry: bool, map_path: str) -> dict[str, dict[str, Any]]:
+    """What the topics of a bag ask of the nodes."""
+    pictures = {"amplitude", "intensity"} & sensor.topics.keys()
+    chosen = {0: "none", 1: "amplitude", 2: "both"}[len(pictures)]
+    compressed = sensor.topics.get("left", "").endswith("/compressed")
+    return {
+        "stereo_driver": {"compressed": True} if compressed else {},
+        "tof_driver": {"measurement": sensor.measurement, "pictures": chosen},
+        "sjsam": {"map_path": map_path},
+    }
+
+
+def _topics(sensor: AgentSensors, mode: str, odometry: bool) -> list[str]:
+    topics = sensor.topics
+    roles = ["left", "right"] if mode != "tof" else []
+    infos = [f"stereo/{side}/camera_info" for side in roles]
     if mode != "stereo" or odometry:
-        commands.append(_command("tof_driver", "tof_driver", config.tof_driver, agent, {}))
-        topics += [sensor.topics[role] for role in ("depth", "amplitude", "intensity") if role in sensor.topics]
-        topics.append(_join(agent, "tof/camera_info"))
-    if odometry:
-        commands.append(_command("ndt_registration", "ndt_odometry", config.ndt_odometry, agent, {}))
-    if "imu" in sensor.topics:
-        topics.append(sensor.topics["imu"])
-    commands.append(_command("stereo_frontend", "feature_extractor", config.feature_extractor, agent, {}))
-    commands.append(_command("ekf_slam_node", "ekf_slam", config.ekf_slam, agent, {"agent": agent}))
-    return commands, topics
+        roles += ["depth", "amplitude", "intensity"]
+        infos.append("tof/camera_info")
+    return [topics[r] for r in (*roles, "imu") if r in topics] + [_join(sensor.agent, info) for info in infos]
 
 
-def _pace(agent: str, sensor: AgentSensors, mode: str, odometry: bool) -> Iterable[str]:
+def _pace(sensor: AgentSensors, mode: str, odometry: bool) -> Iterable[str]:
     """The filter is last in line of the images; scan odometry and depth have their own line."""
-    if mode != "tof":
-        yield f"{_join(agent, 'ekf_slam')}={sensor.topics['left']}"
-    if mode == "tof":
-        yield f"{_join(agent, 'ekf_slam')}={sensor.topics['depth']}"
+    agent = sensor.agent
+    yield f"{_join(agent, 'ekf_slam')}={sensor.topics['depth' if mode == 'tof' else 'left']}"
     if odometry:
         yield f"{_join(agent, 'ndt_odometry')}={sensor.topics['depth']}"
     elif mode in ("replace", "fuse"):
         yield f"{_join(agent, 'tof_driver')}={sensor.topics['depth']}"
 
 
-def _command(package: str, executable: str, config: Config | None, agent: str, extra: Mapping[str, Any]) -> NodeCommand:
-    parameters = dict(_changed(config)) if config is not None else {}
-    arguments = ros_arguments(parameters | {k: v for k, v in extra.items() if v not in ("", False)}, agent)
-    return NodeCommand(package, executable, tuple(arguments), agent)
+def _spec(
+    package: str,
+    executable: str,
+    config: Config | None,
+    namespace: str,
+    extra: Mapping[str, Mapping[str, Any]],
+    **own: Any,
+) -> NodeSpec:
+    changed = dict(_changed(config)) if config is not None else {}
+    given = {name: value for name, value in own.items() if value not in ("", ())}
+    return NodeSpec(package, executable, namespace, changed | given | dict(extra.get(executable, {})))
 
 
 def _changed(config: Config) -> Iterable[tuple[str, Any]]:

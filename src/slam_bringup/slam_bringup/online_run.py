@@ -153,7 +153,8 @@ class _Choreography:
         return dict(self._supervisor.diagnostics)
 
     def _all_joined(self) -> bool:
-        return self._supervisor.progress[_SJSAM] >= self._supervisor.submaps
+        values = self._supervisor.diagnostics.get(_SJSAM, {})
+        return sum(int(values.get(key, "0")) for key in ("submaps", "rejected")) >= self._supervisor.submaps
 
 
 def unclean_ends(run: OnlineRun) -> list[str]:

@@ -72,7 +72,7 @@ def collect(
         mapper=mapper,
         odometry=odometry,
         agents=agents,
-        landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings),
+        landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings.astype(np.int32)),
         dense_points=dense.points,
         dense_grey=dense.grey,
         submaps=recording.submaps,

@@ -7,8 +7,8 @@
 Topics are those of the nodes, below each agent's namespace:
 
 - ``stereo/{left,right}/image_raw`` (or ``image_rect``; also ``.../compressed``) with ``camera_info``;
-- ``tof/range/image_raw`` (along the ray) or ``tof/depth/image_raw`` (along z, any depth camera) with ``tof/camera_info``
-  and, where there are any, ``tof/{amplitude,intensity}/image_raw``;
+- ``tof/range/image_raw`` (along the ray) or ``tof/depth/image_raw`` (along z, any depth camera) with
+  ``tof/camera_info`` and, where there are any, ``tof/{amplitude,intensity}/image_raw``;
 - ``imu`` and ``ground_truth/pose``.
 
 Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts.
