@@ -30,7 +30,7 @@ def result(rng) -> RunResult:
     return RunResult(
         bag="circle", mode="stereo", mapper="sjsam", odometry="none",
         agents=(AgentResult("", noisy, truth=truth, feature_counts=np.full(80, 250)),),
-        landmarks=LandmarkMap(positions, covariances, np.full(200, 5, dtype=np.int32)),
+        landmarks=LandmarkMap(positions, covariances, np.full(200, 5)),
         dense_points=rng.uniform(-3, 3, (500, 3)).astype(np.float32), dense_grey=np.full(500, 128, dtype=np.uint8),
         submaps=4, loop_closures=1, frames=80, dropped={"features without depth": 2}, rejections={"outlier": 3}, sensor_s=8.0, wall_s=2.0,
         stage_ms={"features": [40.0] * 80, "ekf": [8.0] * 80}, events=("12.3 s: <lost>",),

@@ -25,7 +25,6 @@ from tof_driver.depth import DepthConfig
 MODES = ("stereo", "tof", "replace", "fuse")
 MAPPERS = ("ekf", "sjsam")
 ODOMETRIES = ("none", "ndt", "icp")
-_WITHOUT_END = {"max_distance": 1e6, "max_landmarks": 10**9, "max_frames": 10**9}
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,9 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
 
 def choose(config: SystemConfig, mode: str, mapper: str, odometry: str) -> SystemConfig:
     """Apply the choices of the command line: where depth comes from, submaps or one filter, scan odometry or none."""
-    submap = replace(config.ekf_slam.submap, **_WITHOUT_END) if mapper == "ekf" else config.ekf_slam.submap
+    submap = config.ekf_slam.submap
+    if mapper == "ekf":
+        submap = replace(submap, max_distance=1e6, max_landmarks=10**9, max_frames=10**9)
     registration = config.ndt_odometry.registration
     if odometry != "none":
         registration = replace(registration, method={"ndt": "ndt", "icp": "icp_plane"}[odometry])

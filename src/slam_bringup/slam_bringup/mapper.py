@@ -75,8 +75,8 @@ class Mapper:
     def rejections(self) -> dict[str, int]:
         """What all filters and the map rejected, by reason."""
         total: Counter[str] = Counter()
-        for part in (*self._filters.values(), self.global_map):
-            total.update(part.counters.counts)
+        for counters in (*(ekf.counters for ekf in self._filters.values()), self.global_map.counters):
+            total.update(counters.counts)
         return dict(sorted(total.items()))
 
     def _join(self, submaps: Iterable[Submap]) -> None:

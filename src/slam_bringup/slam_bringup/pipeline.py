@@ -1,7 +1,7 @@
-"""The chain of the launch file without ROS: the same classes, called frame by frame.
+r"""The chain of the launch file without ROS: the same classes, called frame by frame.
 
     readings of a bag -> depth -> features ----------> EKF-SLAM -> submaps -> SJSAM -> trajectory and map
-                           \\-> scan odometry (optional) --^
+                           \-> scan odometry (optional) --^
 
 Images and filter run on two threads; each stage keeps its own order, so the result does not depend on that.
 """
@@ -44,6 +44,8 @@ def run_bag(
 
     Parameters
     ----------
+    path
+        The bag.
     config
         Already adapted to mode, mapper and odometry by :func:`slam_bringup.configuration.choose`.
     mapper, odometry
@@ -65,7 +67,7 @@ def run_bag(
             mapping.process(item)
         mapping.finish()
         wall_s = time.perf_counter() - start
-        agents = tuple(_agent_result(agent, bag, mapping) for agent in bag.agents)
+        agents = _agent_results(bag, mapping)
         with times.measure("dense model"):
             dense = dense_model(bag, config, {a.name: a.trajectory for a in agents})
         dropped = {"images without a partner of their stamp": bag.unpaired} if bag.unpaired else {}
@@ -114,15 +116,18 @@ def _ahead(items: Iterable[T]) -> Iterator[T]:
         stopped.set()
 
 
-def _agent_result(agent: str, bag: SensorBag, mapping: Mapper) -> AgentResult:
-    record = mapping.records[agent]
-    return AgentResult(
-        name=agent,
-        trajectory=Trajectory.from_estimates(mapping.global_map.trajectory(agent)),
-        filtered=Trajectory.from_estimates(record.filtered),
-        scan_odometry=Trajectory.from_estimates(record.scans),
-        truth=bag.ground_truth(agent) or EMPTY_TRAJECTORY,
-        feature_counts=np.array(record.feature_counts, dtype=np.int64),
+def _agent_results(bag: SensorBag, mapping: Mapper) -> tuple[AgentResult, ...]:
+    trajectories = mapping.global_map.trajectory()
+    return tuple(
+        AgentResult(
+            name=agent,
+            trajectory=Trajectory.from_estimates(trajectories.get(agent, [])),
+            filtered=Trajectory.from_estimates(record.filtered),
+            scan_odometry=Trajectory.from_estimates(record.scans),
+            truth=bag.ground_truth(agent) or EMPTY_TRAJECTORY,
+            feature_counts=np.array(record.feature_counts, dtype=np.int64),
+        )
+        for agent, record in mapping.records.items()
     )
 
 

@@ -46,12 +46,12 @@ class LandmarkMap:
 
     positions: FloatArray
     covariances: FloatArray
-    sightings: npt.NDArray[np.int32]
+    sightings: npt.NDArray[np.int64]
 
     @classmethod
     def empty(cls) -> LandmarkMap:
         """A map without landmarks."""
-        return cls(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, dtype=np.int32))
+        return cls(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from slam_bringup.configuration import MAPPERS, MODES, ODOMETRIES, choose, load_system_config
 from slam_bringup.output import write_results
 from slam_bringup.pipeline import run_bag
+from slam_bringup.result_bag import write_result_bag
 from slam_bringup.sensor_bag import SensorBag
 from slam_bringup.summary_table import summary_table
 
@@ -36,5 +37,6 @@ def command(bag: Path, output: Path, mode: str | None, mapper: str, odometry: st
         result, mapping = run_bag(
             bag, system, mapper=mapper, odometry=odometry, on_reading=lambda: progress.advance(task)
         )
+    write_result_bag(output / "result.mcap", result)
     summary = write_results(output, result, mapping.global_map.save)
     Console().print(summary_table(summary, output))
