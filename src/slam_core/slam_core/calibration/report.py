@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from slam_core.calibration.bundle import BundleResult
 from slam_core.calibration.lens import parameter_names
@@ -86,18 +87,19 @@ def residual_figure(result: BundleResult, names: Sequence[str]) -> Figure:
         seen = [(k[c].pixels, r[c]) for k, r in zip(result.views, result.residuals, strict=True) if len(k[c])]
         pixels, residuals = (np.concatenate(parts) for parts in zip(*seen, strict=True))
         state = result.rig.cameras[c]
-        _draw_field(axes[0, c], pixels, residuals, state.width, state.height)
-        axes[0, c].set_title(f"{name}: residuals where they are")
+        scale = _draw_field(axes[0, c], pixels, residuals, state.width, state.height)
+        axes[0, c].set_title(f"{name}: residuals, {scale:.0f} times enlarged")
         _draw_scatter(axes[1, c], residuals)
     return figure
 
 
-def _draw_field(axes: Axes, pixels: FloatArray, residuals: FloatArray, width: int, height: int) -> None:
+def _draw_field(axes: Axes, pixels: FloatArray, residuals: FloatArray, width: int, height: int) -> float:
+    """Draw the vectors so that a typical one spans 2 % of the image; returns how many times they are enlarged."""
     typical = max(float(np.median(np.linalg.norm(residuals, axis=1))), 1e-6)
-    scale = typical / (0.02 * width)
-    arrows = axes.quiver(*pixels.T, *residuals.T, angles="xy", scale_units="xy", scale=scale, width=0.0015)
-    axes.quiverkey(arrows, 0.85, 1.03, 2.0 * typical, f"{2.0 * typical:.2f} px")
+    scale = 0.02 * width / typical
+    axes.quiver(*pixels.T, *residuals.T, angles="xy", scale_units="xy", scale=1.0 / scale, width=0.0015)
     axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="u [px]", ylabel="v [px]")
+    return scale
 
 
 def _draw_scatter(axes: Axes, residuals: FloatArray) -> None:
@@ -118,8 +120,9 @@ def board_poses_figure(result: BundleResult, board_points: FloatArray, names: Se
     for index, (view, T) in enumerate(zip(result.views, result.rig.board_poses, strict=True)):
         if any(len(corners) for corners in view):
             corners = _rig_axes(transform_points(T, outline[[0, 1, 2, 3, 0]]))
-            axes.plot(*corners.T, color="0.5", linewidth=0.8)
-            axes.text(*corners[0], str(index + 1), fontsize=7)
+            axes.plot(*corners.T, color="0.3", linewidth=0.8)
+            axes.add_collection3d(Poly3DCollection([corners], alpha=0.1, facecolor="0.5"))
+            axes.text(*corners.mean(axis=0), str(index + 1), fontsize=8)
     size = 0.3 * float(np.linalg.norm(high - low))
     for c, name in enumerate(names):
         _draw_camera(axes, result, c, name, size)
