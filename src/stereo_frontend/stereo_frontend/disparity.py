@@ -14,6 +14,7 @@ of the matches.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,13 +66,14 @@ class RefinedDisparity:
     """Result of n alignments.
 
     disparity (n,) px, NaN where it failed or is not trusted; sigma (n,) px; correlation (n,) of the aligned patches;
-    row_shift (n,) px, row of the partner minus row of the keypoint.
+    row_shift (n,) px, row of the partner minus row of the keypoint, with row_sigma (n,) px.
     """
 
     disparity: Float32Array
     sigma: Float32Array
     correlation: Float32Array
     row_shift: Float32Array
+    row_sigma: Float32Array
 
     @property
     def valid(self) -> npt.NDArray[np.bool_]:
@@ -94,7 +96,8 @@ def refine_disparity(
     agrees &= np.abs(inner_outer) <= config.max_disagreement * inner.sigma
     disagreement = _DISAGREEMENT_WEIGHT * np.hypot(there_and_back, inner_outer)
     disparity = np.where(agrees, found.disparity, np.float32(np.nan))
-    return RefinedDisparity(disparity, np.hypot(found.sigma, disagreement), found.correlation, found.row_shift)
+    sigma = np.hypot(found.sigma, disagreement)
+    return dataclasses.replace(found, disparity=disparity, sigma=sigma)
 
 
 def _align(
@@ -103,9 +106,9 @@ def _align(
     """One pass over all patches of ``template``, (n, 2) px; NaN positions stay NaN."""
     slope = 1.0 / config.slope_sigma**2
     information = np.array([0.0, 1.0 / config.row_sigma**2, slope, slope])
-    out = np.full((len(uv), 4), np.nan, np.float32)
+    out = np.full((len(uv), 5), np.nan, np.float32)
     align_patches(template, image, uv, u_start, radius, config.max_shift, information, out)
     out[~(out[:, 2] >= config.min_correlation)] = np.nan
-    disparity, variance, correlation, row_shift = out.T
+    disparity, variance, correlation, row_shift, row_variance = out.T
     sigma = np.sqrt(config.sigma_scale**2 * variance + config.sigma_floor**2).astype(np.float32)
-    return RefinedDisparity(disparity, sigma, correlation, row_shift)
+    return RefinedDisparity(disparity, sigma, correlation, row_shift, np.sqrt(row_variance))

@@ -125,12 +125,15 @@ class Frontend:
         if len(matches) < _FEW_MATCHES * len(left):
             self._reject_swapped(left, right, bounds)
         uv = left.uv[matches.left]
-        self._noise.learn(uv[:, 1] - right.uv[matches.right, 1], left.size[matches.left])
-        refined = refine_disparity(images.left, images.right, uv, right.uv[matches.right, 0], self.config.disparity)
+        partner = right.uv[matches.right]
+        refined = refine_disparity(images.left, images.right, uv, partner[:, 0], self.config.disparity)
+        self._noise.learn((uv - partner)[refined.valid, 1], left.size[matches.left][refined.valid])
+        self._noise.learn_rectification(refined.row_shift[refined.valid], refined.row_sigma[refined.valid])
+        sigma = np.hypot(refined.sigma, self._noise.rectification_sigma)
         disparity = np.where(refined.disparity >= bounds[0], refined.disparity, np.nan).astype(np.float64)
         estimate = DepthEstimate.unknown(len(left))
         estimate.depth[matches.left] = focal_baseline / disparity
-        estimate.sigma[matches.left] = focal_baseline / disparity**2 * refined.sigma
+        estimate.sigma[matches.left] = focal_baseline / disparity**2 * sigma
         self._count(left, right, len(matches), int(np.isfinite(disparity).sum()))
         return estimate
 

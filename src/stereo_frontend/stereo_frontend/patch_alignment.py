@@ -8,7 +8,7 @@ from numba import njit
 UNKNOWNS = 4
 REORDER = {"reassoc", "contract"}
 """What a sum needs to be vectorised; the rest of fastmath would forget that NaN exists."""
-_MOST_ITERATIONS = 12
+_MOST_ITERATIONS = 20
 _CONVERGED = 0.01
 _LEAST_ENERGY = 1.0
 _ROUNDING_VARIANCE = 0.1
@@ -17,7 +17,9 @@ _ROUNDING_VARIANCE = 0.1
 
 @njit(cache=True, nogil=True)
 def align_patches(left, right, uv_left, u_right, radius, max_shift, information, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` (n, 4): disparity, variance from residual and curvature, correlation, row shift; NaN where it fails.
+    """Fill ``out`` (n, 5): disparity, its variance, correlation, row shift, its variance; NaN where it fails.
+
+    Variances come from residual and curvature.
 
     The unknowns ``p`` are corrections of the right patch: shift in u, shift in v, slopes of the shift in u along u and
     v. ``information`` (4,) is their prior's.
@@ -49,9 +51,11 @@ def align_patches(left, right, uv_left, u_right, radius, max_shift, information,
                 normal[i, i] += noise * information[i]
             if length < _CONVERGED:
                 out[k, 0] = u - u_right[k] - p[0]
-                out[k, 1] = noise * _first_of_inverse(normal) * _correlation_factor(patch, radius)
+                noise *= _correlation_factor(patch, radius)
                 out[k, 2] = correlation
                 out[k, 3] = p[1]
+                for i in range(2):
+                    out[k, 1 + 3 * i] = noise * _diagonal_of_inverse(normal, i)
                 break
             if not _solve(normal, step):
                 break
@@ -174,6 +178,14 @@ def _correlation_factor(residual, radius):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _diagonal_of_inverse(matrix, index):  # type: ignore[no-untyped-def]
+    """Diagonal element of the inverse of a positive definite matrix, infinite if it is none."""
+    unit = np.zeros(matrix.shape[0])
+    unit[index] = 1.0
+    return unit[index] if _solve(matrix.copy(), unit) else np.inf
+
+
+@njit(cache=True, nogil=True)
 def _solve(matrix, vector):  # type: ignore[no-untyped-def]
     """Solve in place by Cholesky; False if the matrix is not positive definite."""
     n = len(vector)
@@ -197,11 +209,3 @@ def _solve(matrix, vector):  # type: ignore[no-untyped-def]
             vector[i] -= matrix[k, i] * vector[k]
         vector[i] /= matrix[i, i]
     return True
-
-
-@njit(cache=True, nogil=True)
-def _first_of_inverse(matrix):  # type: ignore[no-untyped-def]
-    """First diagonal element of the inverse, infinite if there is none."""
-    unit = np.zeros(matrix.shape[0])
-    unit[0] = 1.0
-    return unit[0] if _solve(matrix, unit) else np.inf

@@ -1,8 +1,11 @@
-"""Standard deviation of keypoint positions, learnt from what a stereo pair shows anyway.
+"""How well keypoints and disparities are placed, from their size and from what a stereo pair shows anyway.
 
-In a rectified pair the two rows of a match are equal, so their difference is a measured residual of the detector: two
-localisation errors, no truth needed. It grows with the size of the keypoint. The factor between size and error is kept
-as a running robust estimate, and u and v of every keypoint take their standard deviation from it.
+Seen again from elsewhere, a keypoint lies off the surface point it was first found on by an error that grows with its
+size (measured on simulated rooms, frames 0.3 s apart). How good the images are shows in every rectified pair: the two
+rows of a match are equal, so their difference is a measured residual of the detector, no truth needed. Its ratio to
+that of a clean image scales the standard deviations of u and v, as a running robust estimate. Rows that differ by more
+than the alignment of the patches leaves open are an error of lens model and rectification; it bends disparities as it
+bends rows.
 """
 
 from __future__ import annotations
@@ -19,30 +22,40 @@ _MAD_TO_SIGMA = 1.4826
 
 @dataclass(frozen=True)
 class PixelNoiseConfig(Config):
-    """``sigma = factor * sqrt(floor^2 + (slope * size)^2)``, the factor measured."""
+    """Position: ``factor * sqrt(floor^2 + (slope * size)^2)``; rows of a clean pair: the same form without the
+    factor.
+    """
 
-    floor: float = parameter(0.3, "standard deviation of the smallest keypoints", unit="px", minimum=0.01, maximum=10.0)
-    slope: float = parameter(
-        0.03, "growth of the standard deviation with the keypoint's diameter", minimum=0.0, maximum=1.0
+    floor: float = parameter(
+        0.13, "standard deviation of the smallest keypoints", unit="px", minimum=0.01, maximum=10.0
     )
+    slope: float = parameter(
+        0.0175, "growth of the standard deviation with the keypoint's diameter", minimum=0.0, maximum=1.0
+    )
+    row_floor: float = parameter(
+        0.06, "standard deviation of the row of the smallest keypoints in one clean image", unit="px", minimum=0.001
+    )
+    row_slope: float = parameter(0.003, "growth of that with the keypoint's diameter", minimum=0.0, maximum=1.0)
     memory: float = parameter(
         0.9, "weight of the past in the running factor; 1 keeps it constant", minimum=0.0, maximum=1.0
     )
     min_matches: int = parameter(30, "matches needed in a frame to learn from it", minimum=5)
-    min_factor: float = parameter(0.3, "least factor", minimum=0.01)
+    min_factor: float = parameter(0.7, "least factor", minimum=0.01)
     max_factor: float = parameter(3.0, "greatest factor", minimum=0.1)
 
 
 class PixelNoise:
-    """Keypoint position noise of one camera pair."""
+    """Keypoint position noise of one camera pair; ``factor`` compares its images with clean ones."""
 
     def __init__(self, config: PixelNoiseConfig | None = None) -> None:
         self.config = config or PixelNoiseConfig()
         self.factor = 1.0
+        self.rectification_sigma = 0.0
+        """Standard deviation (px) of the rectification's error over the image, beyond its mean."""
 
     def sigma(self, size: Float32Array) -> Float32Array:
         """Standard deviation (px) of u and of v for keypoints of diameter ``size`` (n,) px."""
-        return np.asarray(self.factor * self._shape(size), np.float32)
+        return np.asarray(self.factor * np.hypot(self.config.floor, self.config.slope * size), np.float32)
 
     def learn(self, row_difference: Float32Array, size: Float32Array) -> None:
         """Take in the row differences (n,) px of the matches of one pair, left minus right, of diameter ``size`` (n,)
@@ -53,13 +66,20 @@ class PixelNoise:
         c = self.config
         if len(row_difference) < c.min_matches:
             return
-        normalised = (row_difference - np.median(row_difference)) / (np.sqrt(2.0) * self._shape(size))
+        clean = np.sqrt(2.0) * np.hypot(c.row_floor, c.row_slope * size)
+        normalised = (row_difference - np.median(row_difference)) / clean
         measured = float(np.clip(_MAD_TO_SIGMA * np.median(np.abs(normalised)), c.min_factor, c.max_factor))
         self.factor = c.memory * self.factor + (1.0 - c.memory) * measured
 
+    def learn_rectification(self, row_shift: Float32Array, row_sigma: Float32Array) -> None:
+        """Take in the row shifts (n,) px of aligned patches and their standard deviations (n,) px."""
+        if len(row_shift) < self.config.min_matches:
+            return
+        spread = _MAD_TO_SIGMA * np.median(np.abs(row_shift - np.median(row_shift)))
+        excess = np.sqrt(max(0.0, float(spread**2 - np.median(row_sigma) ** 2)))
+        memory = self.config.memory
+        self.rectification_sigma = memory * self.rectification_sigma + (1.0 - memory) * excess
+
     def reset(self) -> None:
         """Forget what was learnt."""
-        self.factor = 1.0
-
-    def _shape(self, size: Float32Array) -> Float32Array:
-        return np.asarray(np.hypot(self.config.floor, self.config.slope * size), np.float32)
+        self.factor, self.rectification_sigma = 1.0, 0.0

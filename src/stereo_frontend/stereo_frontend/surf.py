@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from slam_core.config import Config, parameter
@@ -34,6 +35,7 @@ class SurfConfig(Config):
     threshold: float = parameter(
         26.0, "determinant of the Hessian of a customary keypoint, grey values 0 to 255", minimum=0.01
     )
+    doubled: bool = parameter(True, "search the image enlarged twice: keypoints down to half the size")
     upright: bool = parameter(True, "describe along the image axes (U-SURF) instead of the keypoint's orientation")
 
 
@@ -55,12 +57,22 @@ class SurfDetector:
         if image.size > MAX_PIXELS:
             raise ValueError(f"SURF takes images of at most {MAX_PIXELS} px, got {image.shape[1]} x {image.shape[0]}")
         integral = integral_image(np.ascontiguousarray(image))
-        found = self._find(integral, threshold * self.config.threshold)
+        found = self._find_all(image, integral, threshold * self.config.threshold)
         found = found[select(found[:, :2], found[:, 3])]
         descriptors = np.empty((len(found), DIMENSION), np.float32)
         describe = describe_upright if self.config.upright else describe_oriented
         describe(integral, found[:, :3].astype(np.float64), self._weights, descriptors)
         return Keypoints(found[:, :2].copy(), _DIAMETER * found[:, 2], found[:, 3].copy(), descriptors)
+
+    def _find_all(self, image: ByteArray, integral: IntegralImage, threshold: float) -> Float32Array:
+        """Rows of u, v, scale, response, in pixels of ``image``."""
+        if not self.config.doubled:
+            return self._find(integral, threshold)
+        large = np.asarray(cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_LINEAR), np.uint8)
+        found = self._find(integral_image(large), threshold)
+        found[:, :2] = 0.5 * found[:, :2] - 0.25
+        found[:, 2] *= 0.5
+        return found
 
     def _find(self, integral: IntegralImage, threshold: float) -> Float32Array:
         """Rows of u, v, scale, response."""
