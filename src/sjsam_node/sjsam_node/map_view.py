@@ -72,10 +72,14 @@ def _components(global_map: GlobalMap) -> list[tuple[Assembled, Marginals, Float
     out = []
     for component in np.unique(graph.component_of):
         assembled = global_map.assembled(int(component))
-        sigma = 0.0 if component == main else global_map.config.unlinked_sigma
-        widening = sigma**2 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+        widening = np.zeros((6, 6)) if component == main else _unknown(global_map.config.unlinked_sigma)
         out.append((assembled, assembled.problem.marginals(assembled.state), widening))
     return out
+
+
+def _unknown(sigma: float) -> FloatArray:
+    """Covariance (6, 6) of a frame of which nothing is known: position by ``sigma`` m, orientation by half a turn."""
+    return np.diag(np.square([sigma, sigma, sigma, np.pi, np.pi, np.pi]))
 
 
 def _unique_stamps(poses: list[PoseEstimate]) -> list[PoseEstimate]:
