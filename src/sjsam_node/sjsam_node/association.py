@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_solve
-from scipy.stats import chi2
 
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxplus, skew, transform_points
+from slam_core.least_squares import chi_square_bound
 from slam_core.sparse_cholesky import IntArray
 
 METHODS = ("nearest", "mahalanobis", "joint")
@@ -96,7 +96,7 @@ def candidate_pairs(first: PointSet, second: PointSet, prior: Prior, config: Ass
         S = _innovation_covariance(first, second, prior, i, j) + config.position_noise**2 * np.eye(3)
         nis = np.einsum("ni,ni->n", error, np.linalg.solve(S, error[..., None])[..., 0])
         score = nis + np.linalg.slogdet(S)[1]  # Eq. 4.8
-        inside = nis < chi2.ppf(config.probability, 3)
+        inside = nis < chi_square_bound(config.probability, 3)
     return mutual_best(i[inside], j[inside], score[inside])
 
 
@@ -135,8 +135,8 @@ def jointly_compatible(
     """The pairs left when the worst is dropped until all agree together with the joint covariance of both submaps."""
     while True:
         solved = _solve(first, second, pairs, prior, config)
-        bound = chi2.ppf(config.probability, max(solved.dof, 1))
-        outlier = solved.nis > chi2.ppf(config.probability, 3)
+        bound = chi_square_bound(config.probability, max(solved.dof, 1))
+        outlier = solved.nis > chi_square_bound(config.probability, 3)
         if len(pairs) == 0 or (solved.chi2 <= bound and not outlier.any()):
             return solved.alignment(pairs)
         # Those that stand out together are dropped together, but never more than a tenth at once: bad ones spoil

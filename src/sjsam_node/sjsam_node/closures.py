@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import chi2
 
 from sjsam_node.association import (
     Alignment,
@@ -36,6 +35,7 @@ from slam_core.geometry import (
     invert_transform,
     skew,
 )  # fmt: skip
+from slam_core.least_squares import chi_square_bound
 from slam_core.rigid_alignment import ransac_rigid_transform
 from slam_core.sparse_cholesky import IntArray
 
@@ -162,7 +162,6 @@ class LinkFinder:
             found = match(first, second, prior, self.config.association)
             if len(found.pairs) >= self.config.min_near_inliers and self._overlaps(first, second, found):
                 return found, True
-            return None, False
         guess = self._by_looks(first, second, key)
         if guess is None or not self._supported(first, second, guess):
             return None, False
@@ -173,6 +172,8 @@ class LinkFinder:
     def _by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
         """Alignment from descriptors alone, refined with all landmarks around it."""
         pairs = self._distinct_pairs(first, second)
+        if len(pairs) <= self.config.min_inliers // 2:
+            return None
         rng = np.random.default_rng([self.config.seed, *key])
         coarse = ransac_rigid_transform(
             second.points[pairs[:, 1]], first.points[pairs[:, 0]], self.config.ransac_distance, rng,
@@ -213,7 +214,7 @@ class LinkFinder:
         assert prior.covariance is not None
         error = boxminus(found.T, prior.T)
         nis = error @ np.linalg.solve(prior.covariance + found.covariance, error)
-        return bool(nis < chi2.ppf(self.config.probability, 6))
+        return bool(nis < chi_square_bound(self.config.probability, 6))
 
     def _confirmed(self, graph: MapGraph, link: Link) -> list[Link]:
         """The link with those waiting that say the same, if together they are enough; otherwise it waits too."""
@@ -257,12 +258,12 @@ def prior_of_pair(T_a_b: FloatArray, covariance: FloatArray) -> Prior:
     return Prior(T_a_b, covariance + 1e-12 * np.eye(6))
 
 
-def relative_prior(T_map_a: FloatArray, T_map_b: FloatArray, joint: FloatArray) -> Prior:
-    """T_a_b of two poses with joint covariance (12, 12), and its covariance."""
+def relative_pose(T_map_a: FloatArray, T_map_b: FloatArray, joint: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """T_a_b of two poses with joint covariance (12, 12), and its covariance (6, 6)."""
     T_a_map = invert_transform(T_map_a)
     J_a, J_b = compose_jacobians(T_a_map, T_map_b)
     J = np.concatenate([J_a @ inverse_jacobian(T_map_a), J_b], axis=1)
-    return prior_of_pair(T_a_map @ T_map_b, J @ joint @ J.T)
+    return T_a_map @ T_map_b, J @ joint @ J.T
 
 
 def _middle(graph: MapGraph, record: int) -> FloatArray:

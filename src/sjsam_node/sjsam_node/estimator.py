@@ -14,7 +14,7 @@ from sjsam_node import kernels
 from sjsam_node.joining import JoiningProblem
 from sjsam_node.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
-from slam_core.config import Config, group, parameter
+from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus, make_transform, so3_log
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
 from slam_core.sparse_cholesky import BACKENDS, IntArray
@@ -29,7 +29,9 @@ class EstimatorConfig(Config):
     )
     iterations: int = parameter(30, "Gauss-Newton iterations per closure; 1 is Algorithm 4 as written", minimum=1)
     solver: str = parameter("auto", "sparse solver", choices=BACKENDS)
-    optimizer: LevenbergMarquardtConfig = group(LevenbergMarquardtConfig)
+    relative_tolerance: float = parameter(
+        1e-9, "stop when a step promises to lower chi2 by less than this share", minimum=0.0
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +95,14 @@ class Estimator:
     config: EstimatorConfig = field(default_factory=EstimatorConfig)
     _cache: dict[int, tuple[bytes, ReducedMap]] = field(default_factory=dict)
 
-    def assemble(self, graph: MapGraph, component: int) -> Assembled:
-        """Pose the joining problem of a component, its frame fixed at the start of its oldest record."""
+    def assemble(self, graph: MapGraph, component: int, front: tuple[int, IntArray] | None = None) -> Assembled:
+        """Pose the joining problem of a component, its frame fixed at the start of its oldest record.
+
+        ``front``: a node and landmarks that are kept, even if private, and eliminated last.
+        """
         records, is_shared = graph.records_of(component), graph.shared()
+        if front is not None:
+            is_shared = is_shared | np.isin(graph.landmark_of, front[1])
         reduced = [self._reduced(graph, i, is_shared) for i in records]
         nodes = np.nonzero(graph.component_of == component)[0]
         seen = [
@@ -114,7 +121,10 @@ class Estimator:
             np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), graph.points[landmarks]
         )
         anchor = np.searchsorted(nodes, [graph.oldest(component).start])
-        problem = JoiningProblem(flatten(maps), state, anchor, kernels.TANGENT, self.config.solver)
+        last = None
+        if front is not None:
+            last = np.append(len(nodes) + np.searchsorted(landmarks, front[1]), np.searchsorted(nodes, front[0]))
+        problem = JoiningProblem(flatten(maps), state, anchor, kernels.TANGENT, self.config.solver, last)
         return Assembled(records, nodes, landmarks, reduced, problem, state)
 
     def _reduced(self, graph: MapGraph, record: int, is_shared: BoolArray) -> ReducedMap:
@@ -125,14 +135,12 @@ class Estimator:
             self._cache[record] = known
         return known[1]
 
-    def optimize(self, graph: MapGraph, component: int) -> tuple[Assembled, LeastSquaresResult]:
-        """Bring a component to its optimum and write it back to the graph."""
-        assembled = self.assemble(graph, component)
-        limit = min(self.config.iterations, self.config.optimizer.max_iterations)
-        optimizer = LevenbergMarquardtConfig(
-            limit, self.config.optimizer.relative_tolerance,
-            self.config.optimizer.initial_damping, self.config.optimizer.max_damping,
-        )  # fmt: skip
+    def optimize(
+        self, graph: MapGraph, component: int, front: tuple[int, IntArray] | None = None
+    ) -> tuple[Assembled, LeastSquaresResult]:
+        """Bring a component to its optimum and write it back to the graph; ``front`` as in :meth:`assemble`."""
+        assembled = self.assemble(graph, component, front)
+        optimizer = LevenbergMarquardtConfig(self.config.iterations, self.config.relative_tolerance)
         state, result = assembled.problem.optimize(assembled.state, optimizer)
         graph.poses[assembled.nodes] = make_transform(state.rotations, state.translations)
         graph.points[assembled.landmarks] = state.landmarks

@@ -15,13 +15,12 @@ from pathlib import Path
 from typing import overload
 
 import numpy as np
-from scipy.stats import chi2
 
 from sjsam_node import map_view, storage
-from sjsam_node.association import Prior
-from sjsam_node.closures import ClosureConfig, LinkFinder, relative_prior
-from sjsam_node.estimator import Assembled, Estimator, EstimatorConfig, local_residual, observation_nis
-from sjsam_node.map_graph import Link, MapGraph, without
+from sjsam_node.closures import ClosureConfig, LinkFinder
+from sjsam_node.estimator import Assembled
+from sjsam_node.joiner import Joiner, JoinerConfig
+from sjsam_node.map_graph import MapGraph
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
 from slam_core.types import Counters, PoseEstimate, Submap
@@ -31,14 +30,10 @@ from slam_core.types import Counters, PoseEstimate, Submap
 class GlobalMapConfig(Config):
     """The joined map."""
 
-    outlier_probability: float = parameter(
-        0.99999, "share of true matches that a joined map keeps", minimum=0.9, maximum=0.99999999
-    )
-    outlier_rounds: int = parameter(5, "times a joined map is searched for false matches", minimum=0)
     unlinked_sigma: float = parameter(
         100.0, "standard deviation given to poses of a stretch that nothing ties to the map yet", unit="m", minimum=1.0
     )
-    estimator: EstimatorConfig = group(EstimatorConfig)
+    joining: JoinerConfig = group(JoinerConfig)
     closure: ClosureConfig = group(ClosureConfig)
 
 
@@ -56,7 +51,7 @@ class JoinReport:
     matched: int = 0
     new_landmarks: int = 0
     closures: tuple[tuple[str, int], ...] = ()
-    dropped_links: int = 0
+    dropped: int = 0
     components: int = 0
     chi2: float = 0.0
     iterations: int = 0
@@ -77,9 +72,8 @@ class GlobalMap:
         """Forget everything."""
         self.graph = MapGraph()
         self.finder = LinkFinder(self.config.closure)
-        self.estimator = Estimator(self.config.estimator)
+        self.joiner = Joiner(self.graph, self.config.closure.window, self.config.joining)
         self._sessions: dict[str, int] = {}
-        self._assembled: dict[int, Assembled] = {}
         self._lookup: dict[tuple[str, int, int], int] = {}
 
     def add(self, submap: Submap) -> JoinReport:
@@ -92,14 +86,14 @@ class GlobalMap:
         chain = self._chain(new)
         for link in self.finder.sequential(self.graph, chain, new):
             self.graph.add_link(link)
-        cost, iterations, converged = self._optimize(new)
+        joined = self.joiner.absorb(new, chain)
         matched = self._matched(new)
-        closures, dropped = self._close_loops(new, chain, cost)
+        closures, dropped = self._close_loops(new, chain)
         self.finder.index.add(new, submap.descriptors)
-        final = self._assembled[self.graph.component(new)]
         return JoinReport(
             True, "", matched, len(submap.landmarks) - self._matched(new), tuple(closures), dropped, self.components,
-            final.problem.cost(final.state), iterations, converged, final.problem.backend, "batch",
+            self.joiner.cost(self.graph.component(new)), joined.iterations, joined.converged, joined.solver,
+            "batch" if closures else joined.update,
         )  # fmt: skip
 
     @property
@@ -163,80 +157,19 @@ class GlobalMap:
         """Landmarks of a record that another record sees too."""
         return int(self.graph.shared()[self.graph.records[new].observations].sum())
 
-    def _optimize(self, record: int) -> tuple[float, int, bool]:
-        """Optimise the component of a record; cost, iterations, converged."""
-        component = self.graph.component(record)
-        assembled, result = self.estimator.optimize(self.graph, component)
-        self._assembled[component] = assembled
-        return result.cost, result.iterations, result.converged
-
-    def _relative_pose(self, first: int, second: int) -> Prior | None:
-        """What the map knows of T_first_second (starts of two records)."""
-        component = self.graph.component(first)
-        if component != self.graph.component(second):
-            return None
-        assembled = self.assembled(component)
-        nodes = [self.graph.records[i].start for i in (first, second)]
-        joint = assembled.covariance(nodes)
-        return relative_prior(self.graph.poses[nodes[0]], self.graph.poses[nodes[1]], joint)
-
-    def _close_loops(self, new: int, chain: list[int], cost: float) -> tuple[list[tuple[str, int]], int]:
+    def _close_loops(self, new: int, chain: list[int]) -> tuple[list[tuple[str, int]], int]:
         """Believe the closures that the joined map can live with."""
-        closed, dropped = [], 0
-        for link in self.finder.closures(self.graph, chain, new, self._relative_pose):
-            taken, cost = self._try_closure(link, cost)
-            if not taken:
-                self.counters.add("closures refused by the joined map")
-                continue
-            older = self.graph.records[link.first].submap
-            closed.append((older.agent, older.index))
-        if closed:
-            dropped = self._drop_outliers(new)
-        return closed, dropped
-
-    def _try_closure(self, link: Link, cost: float) -> tuple[bool, float]:
-        """Join with the closure; keep it if the cost rises no more than true matches make it rise."""
-        joins_components = self.graph.component(link.first) != self.graph.component(link.second)
-        before = self.graph.snapshot()
-        if joins_components:
-            cost = sum(self._assembled_cost(i) for i in (link.first, link.second))
-        self.graph.add_link(link)
-        after, _, _ = self._optimize(link.second)
-        dof = 3 * len(link.pairs) - (6 if joins_components else 0)
-        if after - cost <= chi2.ppf(self.config.closure.probability, max(dof, 1)):
-            return True, after
-        self.graph.restore(before)
-        self._optimize(link.second)
-        return False, cost
-
-    def _assembled_cost(self, record: int) -> float:
-        assembled = self.assembled(self.graph.component(record))
-        return assembled.problem.cost(assembled.state)
-
-    def _drop_outliers(self, record: int) -> int:
-        """Take back matches that the joined map contradicts, worst first, and links that lose most of theirs."""
-        dropped = 0
-        for _ in range(self.config.outlier_rounds):
-            outliers = self._outliers(self.graph.component(record))
-            if not outliers:
-                break
-            links = [kept for link in self.graph.links if (kept := without(self.graph, link, outliers)) is not None]
-            dropped += len(self.graph.links) - len(links)
-            self.counters.add("matches taken back", len(outliers))
-            self.graph.replace_links(links)
-            self._optimize(record)
-        return dropped
-
-    def _outliers(self, component: int) -> set[int]:
-        """The worst observation of each record, where it is beyond its gate."""
-        gate = chi2.ppf(self.config.outlier_probability, 3)
-        assembled, worst = self._assembled[component], set()
-        for i, reduced in zip(assembled.records, assembled.reduced, strict=True):
-            record = self.graph.records[i]
-            nis = observation_nis(local_residual(self.graph, record, reduced), reduced.information)
-            if len(nis) and nis.max() > gate:
-                worst.add(int(record.observations[reduced.shared[nis.argmax()]]))
-        return worst
+        links = self.finder.closures(self.graph, chain, new, self.joiner.relative_pose)
+        if links and not self.joiner.try_links(links):
+            links = [link for link in links if len(links) > 1 and self.joiner.try_links([link])]
+            self.counters.add("closures refused by the joined map")
+        if not links:
+            return [], 0
+        dropped = self.joiner.drop_outliers(new)
+        if dropped:
+            self.counters.add("matches taken back", dropped)
+        older = [self.graph.records[link.first].submap for link in links]
+        return [(submap.agent, submap.index) for submap in older], dropped
 
     @overload
     def trajectory(self) -> dict[str, list[PoseEstimate]]: ...
@@ -272,10 +205,8 @@ class GlobalMap:
         return T
 
     def assembled(self, component: int) -> Assembled:
-        """The joining problem of a component at its optimum."""
-        if component not in self._assembled:
-            self._assembled[component] = self.estimator.assemble(self.graph, component)
-        return self._assembled[component]
+        """The joining problem of a component, everything in it, at its optimum."""
+        return self.joiner.assembled(component)
 
     def start_pose(self, record: int) -> PoseEstimate:
         """Start pose of a record in the map frame, with covariance."""
@@ -302,6 +233,7 @@ class GlobalMap:
         graph, pending = storage.read(Path(path))
         loaded = cls(config)
         loaded.graph, loaded.finder.pending = graph, pending
+        loaded.joiner = Joiner(graph, loaded.config.closure.window, loaded.config.joining)
         for i, record in enumerate(graph.records):
             agent, session, _ = record.key
             loaded._lookup[record.key] = i

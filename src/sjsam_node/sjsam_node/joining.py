@@ -10,6 +10,7 @@ rows, each landmark with its own 3x3, are the same maps through :func:`sjsam_nod
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,10 +52,11 @@ class JoiningProblem:
         last: IntArray | None = None,
     ) -> None:
         self.maps, self.model = maps, model
+        self.rows = int(maps.mean_ptr[-1])
         dimension = state.translations.shape[1]
         self.layout: Layout = make_layout(maps, len(state.translations), len(state.landmarks), fixed, dimension, last)
         self.factor = SparseCholesky(self.layout.pattern, backend)
-        self._pose_size = state.model_dimensions[0]
+        self._sizes = state.model_dimensions
         pattern = self.layout.pattern
         self._diagonal = np.nonzero(pattern.indices == pattern.columns)[0]
         self._values = np.zeros(len(pattern.indices))
@@ -99,7 +101,22 @@ class JoiningProblem:
     def columns(self, state: State, poses: IntArray) -> FloatArray:
         """Joint covariance of a few poses, linearised at ``state``, by solving for their columns."""
         self._factorize_at(state)
-        return solved_covariance(self.factor, pose_scalars(self.layout, poses, self._pose_size))
+        return solved_covariance(self.factor, self.scalars(poses, np.empty(0, dtype=np.int64)))
+
+    def scalars(self, poses: IntArray, landmarks: IntArray) -> IntArray:
+        """Scalar unknowns of poses and landmarks, in order; -1 for fixed ones."""
+        return variable_scalars(self.layout, self._sizes, poses, landmarks)
+
+    def trailing_information(self, state: State, scalars: IntArray) -> FloatArray:
+        """Marginal information of the variables that are eliminated last: their block of ``L L^T``, at ``state``."""
+        self._factorize_at(state)
+        factor, order = self.factor.lower()
+        position = np.empty_like(order)
+        position[order] = np.arange(len(order))
+        at = position[scalars]
+        block = factor[:, np.sort(at)][np.sort(at)].toarray()
+        unsorted = np.argsort(np.argsort(at))
+        return np.asarray((block @ block.T)[np.ix_(unsorted, unsorted)])
 
     def marginals(self, state: State) -> Marginals:
         """Exact marginal covariances, linearised at ``state``.
@@ -134,13 +151,11 @@ class Marginals:
     factor: SparseCholesky
     entries: InverseEntries
 
-    def scalars(self, poses: IntArray | list[int], landmarks: IntArray | list[int]) -> IntArray:
+    def scalars(self, poses: Sequence[int] | IntArray, landmarks: Sequence[int] | IntArray) -> IntArray:
         """Scalar unknowns of these poses and landmarks, in order; -1 for what is fixed."""
-        dp, dl = self.dimensions
-        starts = self.layout.landmark_offset[np.asarray(landmarks, dtype=np.int64)]
-        return np.concatenate([pose_scalars(self.layout, poses, dp), _runs(starts, dl)])
+        return variable_scalars(self.layout, self.dimensions, poses, landmarks)
 
-    def covariance(self, poses: IntArray | list[int], landmarks: IntArray | list[int] = ()) -> FloatArray:  # type: ignore[assignment]
+    def covariance(self, poses: Sequence[int] | IntArray, landmarks: Sequence[int] | IntArray = ()) -> FloatArray:
         """Joint covariance of any poses and landmarks.
 
         Inside one local map it is read from the factor's pattern (Takahashi); for others columns are solved for.
@@ -167,9 +182,13 @@ def solved_covariance(factor: SparseCholesky, scalars: IntArray) -> FloatArray:
     return out
 
 
-def pose_scalars(layout: Layout, poses: IntArray | list[int], size: int) -> IntArray:
-    """Scalar unknowns of poses, -1 for fixed ones."""
-    return _runs(layout.pose_offset[np.asarray(poses, dtype=np.int64)], size)
+def variable_scalars(
+    layout: Layout, sizes: tuple[int, int], poses: Sequence[int] | IntArray, landmarks: Sequence[int] | IntArray
+) -> IntArray:
+    """Scalar unknowns of poses and landmarks, in order; -1 for fixed ones. ``sizes`` of a pose and of a landmark."""
+    pose_starts = layout.pose_offset[np.asarray(poses, dtype=np.int64)]
+    landmark_starts = layout.landmark_offset[np.asarray(landmarks, dtype=np.int64)]
+    return np.concatenate([_runs(pose_starts, sizes[0]), _runs(landmark_starts, sizes[1])])
 
 
 def _runs(starts: IntArray, length: int) -> IntArray:

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse
+import scipy.sparse.csgraph
 
 from slam_core.geometry import FloatArray, invert_transform
 from slam_core.sparse_cholesky import IntArray
@@ -64,7 +66,6 @@ class Snapshot:
     links: list[Link]
     poses: FloatArray
     points: FloatArray
-    component_of: IntArray
 
 
 @dataclass
@@ -79,6 +80,7 @@ class MapGraph:
     component_of: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _seen_in: dict[int, set[int]] = field(default_factory=dict)
     _members: dict[int, list[int]] = field(default_factory=dict)
+    _ending_at: dict[int, int] = field(default_factory=dict)
 
     def append(self, submap: Submap, session: int, start: int | None, guess: FloatArray) -> Record:
         """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own."""
@@ -92,6 +94,7 @@ class MapGraph:
         for observation in record.observations.tolist():
             self._seen_in[observation] = {len(self.records)}
             self._members[observation] = [observation]
+        self._ending_at[end] = len(self.records)
         self.records.append(record)
         return record
 
@@ -106,7 +109,16 @@ class MapGraph:
 
     def records_of(self, component: int) -> list[int]:
         """Records of a component, ascending."""
-        return [i for i in range(len(self.records)) if self.component(i) == component]
+        starts = np.array([r.start for r in self.records], dtype=np.int64)
+        return np.nonzero(self.component_of[starts] == component)[0].tolist()
+
+    def size(self, component: int) -> int:
+        """Number of nodes of a component."""
+        return int(np.count_nonzero(self.component_of == component))
+
+    def record_ending_at(self, node: int) -> int:
+        """The record whose end a node is."""
+        return self._ending_at[node]
 
     def add_link(self, link: Link) -> int:
         """Believe a link: fuse the landmarks that its pairs name; the number of pairs that could be fused.
@@ -144,7 +156,8 @@ class MapGraph:
             T_first_second = invert_transform(link.T)
         T_map_moved = self.poses[self.records[anchor].start] @ T_first_second
         self.move(second, T_map_moved @ invert_transform(self.poses[self.records[moved].start]))
-        self.component_of[self.component_of == second] = first
+        members = np.isin(self.component_of, [first, second])
+        self.component_of[members] = min(first, second)
 
     def oldest(self, component: int) -> Record:
         """The record of a component with the least key: its start defines the component's frame."""
@@ -166,15 +179,25 @@ class MapGraph:
         self._seen_in = {o: {i} for i, r in enumerate(self.records) for o in r.observations.tolist()}
         for link in self.links:
             self._fuse(link)
+        self._split_components()
+
+    def _split_components(self) -> None:
+        """Components anew from submaps and links; each is named after its first node."""
+        count = len(self.poses)
+        a = [r.start for r in self.records] + [self.records[k.first].start for k in self.links]
+        b = [r.end for r in self.records] + [self.records[k.second].start for k in self.links]
+        graph = scipy.sparse.coo_matrix((np.ones(len(a)), (a, b)), (count, count))
+        _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        first = np.unique(label, return_index=True)[1]
+        self.component_of = first[label].astype(np.int64)
 
     def snapshot(self) -> Snapshot:
         """The beliefs and the estimate, to come back to."""
-        return Snapshot(list(self.links), self.poses.copy(), self.points.copy(), self.component_of.copy())
+        return Snapshot(list(self.links), self.poses.copy(), self.points.copy())
 
     def restore(self, snapshot: Snapshot) -> None:
         """Back to a snapshot taken since the last submap was added."""
         self.poses, self.points = snapshot.poses.copy(), snapshot.points.copy()
-        self.component_of = snapshot.component_of.copy()
         self.replace_links(snapshot.links)
 
     def shared(self) -> BoolArray:

@@ -99,14 +99,22 @@ class PlaceIndex:
             self._postings[int(word)][place] = int(count)
 
     def query(self, descriptors: Descriptors, excluded: set[int]) -> list[int]:
-        """The places most similar to ``descriptors``, best first; all of them while there is no vocabulary yet."""
-        if self._tree is None:
-            return [place for place, _ in self._waiting if place not in excluded]
+        """The places most similar to ``descriptors``, best first."""
+        scores = self._direct(descriptors) if self._tree is None else self._scores(self._tree.words(descriptors))
+        ranked = sorted((place for place in scores if place not in excluded), key=lambda p: (-scores[p], p))
+        return ranked[: self.config.candidates]
+
+    def _direct(self, descriptors: Descriptors) -> dict[int, float]:
+        """Without a vocabulary yet: how well the descriptors find a counterpart in each place."""
+        found = {place: (held @ descriptors.T).max(axis=0, initial=-1.0) for place, held in self._waiting}
+        return {place: float(np.clip(best - 0.5, 0.0, None).sum()) for place, best in found.items()}
+
+    def _scores(self, words: IntArray) -> dict[int, float]:
+        """tf-idf similarity of every place that shares a word."""
         scores: dict[int, float] = defaultdict(float)
-        for word, count in zip(*np.unique(self._tree.words(descriptors), return_counts=True), strict=True):
+        for word, count in zip(*np.unique(words, return_counts=True), strict=True):
             posting = self._postings.get(int(word), {})
             idf = np.log(1.0 + len(self._sizes) / max(len(posting), 1))
             for place, there in posting.items():
                 scores[place] += idf * min(int(count), there) / np.sqrt(self._sizes[place])
-        ranked = sorted((place for place in scores if place not in excluded), key=lambda p: (-scores[p], p))
-        return ranked[: self.config.candidates]
+        return scores

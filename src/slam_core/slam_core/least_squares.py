@@ -8,10 +8,12 @@ residuals, ``chi2 = sum r^T r`` (no factor one half), so that they compare with 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol, TypeVar
 
 import numpy as np
 import scipy.linalg
+from scipy.special import gammaincinv
 
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
@@ -34,6 +36,12 @@ def whitening(covariance: FloatArray) -> FloatArray:
     except np.linalg.LinAlgError as error:
         raise ValueError(f"covariance {np.shape(covariance)} is not positive definite") from error
     return np.asarray(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True))
+
+
+@lru_cache(maxsize=4096)
+def chi_square_bound(probability: float, dof: int) -> float:
+    """What a chi-square variable of ``dof`` degrees of freedom stays below with this probability."""
+    return float(2.0 * gammaincinv(0.5 * dof, probability))
 
 
 def robust_weight(squared: FloatArray, loss: str, scale: float = 1.0) -> FloatArray:
