@@ -24,6 +24,8 @@ from slam_core.types import Float32Array
 TILE = 16
 NEAR = 0.02
 """Nothing nearer than this (m) is drawn."""
+SEAM = 1e-6
+"""Rectangles reach this share of their size beyond their edges, so that no ray slips between two that touch."""
 
 
 class Rays(NamedTuple):
@@ -141,7 +143,7 @@ def meet(
     z = 1.0 / inverse
     u = z * (planes[q, 3] * x + planes[q, 4] * y + planes[q, 5]) - shifts[q, 0]
     v = z * (planes[q, 6] * x + planes[q, 7] * y + planes[q, 8]) - shifts[q, 1]
-    if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0 or z < NEAR:
+    if u < -SEAM or u > 1.0 + SEAM or v < -SEAM or v > 1.0 + SEAM or z < NEAR:
         return -1.0, u, v
     return z, u, v
 
@@ -204,7 +206,8 @@ def _cull(
             k -= 1
         out[k] = q
         count += 1
-    while count > 0 and near[out[count - 1]] > cover:
+    # A wall seen straight on is as near as it is far: rounding must not let it hide itself.
+    while count > 0 and near[out[count - 1]] > cover * (1.0 + 1e-9):
         count -= 1
     return count
 
