@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereo_frontend.keypoints import Keypoints
-from stereo_frontend.matching import MatchingConfig, disparity_bounds, match_stereo, swapped_share
+from stereo_frontend.matching import MatchingConfig, disparity_bounds, has_company, match_stereo, swapped_share
 
 BOUNDS = (0.5, 60.0)
 
@@ -97,3 +97,21 @@ def test_disparity_bounds_follow_the_depths():
         pytest.approx(0.68),
         pytest.approx(68.0),
     )
+
+
+def test_a_match_that_slipped_by_a_repeat_stands_alone(rng):
+    uv = rng.uniform([0, 0], [600, 400], (200, 2)).astype(np.float32)
+    disparity = 8.0 + uv[:, 0] / 300.0
+    disparity[[3, 70]] = 31.0
+    disparity[5] = np.nan
+    alone = ~has_company(uv, disparity, 16)
+    assert set(np.flatnonzero(alone)) == {3, 5, 70}
+    assert set(np.flatnonzero(~has_company(uv, disparity, 0))) == {5}
+
+
+def test_an_object_with_several_matches_keeps_company(rng):
+    uv = rng.uniform([0, 0], [600, 400], (200, 2)).astype(np.float32)
+    uv[:4] = [[300, 200], [305, 204], [298, 210], [310, 199]]
+    disparity = np.full(200, 8.0)
+    disparity[:4] = 30.0
+    assert has_company(uv, disparity, 16).all()

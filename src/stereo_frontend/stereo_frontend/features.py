@@ -18,9 +18,10 @@ from slam_core.config import Config, group, parameter
 from slam_core.types import ByteArray, Float32Array
 from stereo_frontend.keypoints import Detector, Keypoints, spread_over_grid
 from stereo_frontend.opencv_detectors import OpenCvDetector
+from stereo_frontend.star_detector import StarDetector
 from stereo_frontend.surf import SurfConfig, SurfDetector
 
-DETECTORS = ("surf", "sift", "rootsift", "orb", "akaze")
+DETECTORS = ("surf", "sift", "rootsift", "orb", "akaze", "star")
 _THRESHOLD_RANGE = (0.02, 20.0)
 _MOST_PASSES = 3
 
@@ -50,7 +51,9 @@ def make_detector(config: FeatureConfig) -> Detector:
     ValueError
         If the installed OpenCV lacks it.
     """
-    return SurfDetector(config.surf) if config.detector == "surf" else OpenCvDetector(config.detector)
+    if config.detector == "surf":
+        return SurfDetector(config.surf)
+    return StarDetector() if config.detector == "star" else OpenCvDetector(config.detector)
 
 
 class FeatureExtractor:

@@ -21,7 +21,7 @@ from stereo_frontend.depth_fusion import FusionConfig, MappedDepth, fuse_depth, 
 from stereo_frontend.disparity import DisparityConfig, refine_disparity
 from stereo_frontend.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
-from stereo_frontend.matching import MatchingConfig, disparity_bounds, match_stereo, swapped_share
+from stereo_frontend.matching import MatchingConfig, disparity_bounds, has_company, match_stereo, swapped_share
 from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
 
@@ -131,6 +131,7 @@ class Frontend:
         self._noise.learn_rectification(refined.row_shift[refined.valid], refined.row_sigma[refined.valid])
         sigma = np.hypot(refined.sigma, self._noise.rectification_sigma)
         disparity = np.where(refined.disparity >= bounds[0], refined.disparity, np.nan).astype(np.float64)
+        disparity[~has_company(uv, disparity, self.config.matching.neighbours)] = np.nan
         estimate = DepthEstimate.unknown(len(left))
         estimate.depth[matches.left] = focal_baseline / disparity
         estimate.sigma[matches.left] = focal_baseline / disparity**2 * sigma

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from scipy.spatial import cKDTree
 
 from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray
 from slam_core.types import Float32Array
 from stereo_frontend.keypoints import Keypoints
 
@@ -36,6 +38,9 @@ class MatchingConfig(Config):
         maximum=1.0,
     )
     max_size_ratio: float = parameter(1.5, "most ratio of the two keypoints' sizes", minimum=1.0, maximum=10.0)
+    neighbours: int = parameter(
+        16, "a match must share its disparity with one of so many neighbours; 0 switches it off", minimum=0
+    )
     min_depth: float = parameter(0.3, "nearest depth looked for", unit="m", minimum=0.01)
     max_depth: float = parameter(200.0, "farthest depth looked for", unit="m", minimum=0.1)
 
@@ -113,6 +118,24 @@ def swapped_share(
     proper = len(match_stereo(left, right, config, bounds))
     mirrored = len(match_stereo(right, left, config, bounds))
     return mirrored / max(proper + mirrored, 1), proper + mirrored
+
+
+def has_company(uv: Float32Array, disparity: FloatArray, neighbours: int) -> npt.NDArray[np.bool_]:
+    """Which positions (n, 2) px share their disparity (n,) px, within 20 % or 2 px, with one of their neighbours.
+
+    On brickwork and drawers a match can slip by whole repeats and still look perfect; then it stands alone in its
+    depth. NaN disparities are no neighbours and have no company.
+    """
+    known = np.flatnonzero(np.isfinite(disparity))
+    company = np.zeros(len(uv), bool)
+    if neighbours == 0 or len(known) <= neighbours:
+        company[known] = True
+        return company
+    d = disparity[known]
+    _, nearest = cKDTree(uv[known]).query(uv[known], k=neighbours + 1)
+    difference = np.abs(d[nearest[:, 1:]] - d[:, None])
+    company[known] = np.any(difference <= np.maximum(2.0, 0.2 * d)[:, None], axis=1)
+    return company
 
 
 def _matches(left: npt.ArrayLike, right: npt.ArrayLike, similarity: npt.ArrayLike) -> Matches:
