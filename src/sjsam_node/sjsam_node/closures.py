@@ -130,7 +130,7 @@ class LinkFinder:
 
     def closures(self, graph: MapGraph, chain: list[int], new: int, relative_pose: RelativePose) -> list[Link]:
         """Links of record ``new`` beyond its chain that may be believed now; others may wait for confirmation."""
-        recent = {new, *chain[: self.config.window]}
+        recent = {*range(new, len(graph.records)), *chain[: self.config.window]}
         near = self._near(graph, new, recent)
         looks = self.index.query(graph.records[new].submap.descriptors, recent | set(near))
         believed: list[Link] = []

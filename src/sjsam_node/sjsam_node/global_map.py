@@ -20,7 +20,7 @@ from sjsam_node import map_view, storage
 from sjsam_node.closures import ClosureConfig, LinkFinder
 from sjsam_node.estimator import Assembled
 from sjsam_node.joiner import Joiner, JoinerConfig
-from sjsam_node.map_graph import MapGraph
+from sjsam_node.map_graph import Link, MapGraph
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
 from slam_core.types import Counters, PoseEstimate, Submap
@@ -63,6 +63,10 @@ class JoinReport:
 class GlobalMap:
     """Joins submaps of one or several agents, each as it comes."""
 
+    graph: MapGraph
+    finder: LinkFinder
+    joiner: Joiner
+
     def __init__(self, config: GlobalMapConfig | None = None) -> None:
         self.config = config or GlobalMapConfig()
         self.counters = Counters()
@@ -75,6 +79,8 @@ class GlobalMap:
         self.joiner = Joiner(self.graph, self.config.closure.window, self.config.joining)
         self._sessions: dict[str, int] = {}
         self._lookup: dict[tuple[str, int, int], int] = {}
+        self._unsearched: list[int] = []
+        self._closed_at = 0
 
     def add(self, submap: Submap) -> JoinReport:
         """Join one submap; a faulty one is refused with the reason, counted, and changes nothing."""
@@ -88,7 +94,8 @@ class GlobalMap:
             self.graph.add_link(link)
         joined = self.joiner.absorb(new, chain)
         matched = self._matched(new)
-        closures, dropped = self._close_loops(new, chain)
+        self._unsearched.append(new)
+        closures, dropped = self._close_loops() if self._is_search_due(new) else ([], 0)
         self.finder.index.add(new, submap.descriptors)
         return JoinReport(
             True, "", matched, len(submap.landmarks) - self._matched(new), tuple(closures), dropped, self.components,
@@ -157,15 +164,26 @@ class GlobalMap:
         """Landmarks of a record that another record sees too."""
         return int(self.graph.shared()[self.graph.records[new].observations].sum())
 
-    def _close_loops(self, new: int, chain: list[int]) -> tuple[list[tuple[str, int]], int]:
-        """Believe the closures that the joined map can live with."""
-        links = self.finder.closures(self.graph, chain, new, self.joiner.relative_pose)
-        if links and not self.joiner.try_links(links):
-            links = [link for link in links if len(links) > 1 and self.joiner.try_links([link])]
+    def _is_search_due(self, new: int) -> bool:
+        """A revisit closes again and again at the cost of a batch; the larger the map, the fewer of these at once."""
+        size = self.graph.size(self.graph.component(new))
+        interval = 1 if size <= self.config.joining.incremental_from else 1 + int(np.sqrt(size) / 3.0)
+        return len(self.graph.records) - self._closed_at >= interval
+
+    def _close_loops(self) -> tuple[list[tuple[str, int]], int]:
+        """Look for closures of the submaps not looked at yet; believe those that the joined map can live with."""
+        unsearched, self._unsearched = self._unsearched, []
+        links: list[Link] = []
+        for new in unsearched:
+            links += self.finder.closures(self.graph, self._chain(new), new, self.joiner.relative_pose)
+        newest = unsearched[-1]
+        if links and not self.joiner.try_links(links, newest):
+            links = [link for link in links if len(links) > 1 and self.joiner.try_links([link], newest)]
             self.counters.add("closures refused by the joined map")
         if not links:
             return [], 0
-        dropped = self.joiner.drop_outliers(new)
+        self._closed_at = len(self.graph.records)
+        dropped = self.joiner.drop_outliers(newest)
         if dropped:
             self.counters.add("matches taken back", dropped)
         older = [self.graph.records[link.first].submap for link in links]
@@ -182,12 +200,21 @@ class GlobalMap:
 
         Of every agent by name, or of one.
         """
+        self.settle()
         trajectories = map_view.trajectory(self)
         return trajectories if agent is None else trajectories.get(agent, [])
 
     def landmarks(self) -> map_view.MapLandmarks:
         """Every landmark once, with covariance, descriptor and id."""
+        self.settle()
         return map_view.landmarks(self)
+
+    def settle(self) -> None:
+        """Do now what was put off: look for closures, and join what was added incrementally in batch."""
+        if self._unsearched:
+            self._close_loops()
+        for component in np.unique(self.graph.component_of):
+            self.joiner.assembled(int(component))
 
     def map_to_odom(self, agent: str) -> FloatArray:
         """T_map_odom of an agent: what its newest joined pose adds to its own odometry (chained submap end poses)."""
@@ -225,6 +252,7 @@ class GlobalMap:
 
     def save(self, path: Path | str) -> None:
         """Write the map to a folder (see :mod:`sjsam_node.storage`)."""
+        self.settle()
         storage.write(Path(path), self.graph, self.finder.pending)
 
     @classmethod

@@ -158,9 +158,12 @@ class Joiner:
         T_known, known = relative_pose(graph.poses[start], graph.poses[node], joint)
         return prior_of_pair(T_known @ T, compose_covariance(T_known, known, T, covariance))
 
-    def try_links(self, links: list[Link]) -> bool:
-        """Join with some links; keep them if chi2 rises no more than true matches make it rise."""
-        graph, newest = self.graph, links[0].second
+    def try_links(self, links: list[Link], newest: int) -> bool:
+        """Join with some links; keep them if chi2 rises no more than true matches make it rise.
+
+        ``newest`` is the record whose end the agent goes on from.
+        """
+        graph = self.graph
         parts = {graph.component(i) for link in links for i in (link.first, link.second)}
         cost = sum(self.cost(part) for part in parts)
         dof = sum(3 * len(link.pairs) for link in links) - 6 * (len(parts) - 1)
