@@ -20,6 +20,8 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxplus, skew, transform_points
 
 POSE = 6
+_PIXEL = 0.15
+"""Noise of a corner (px) that a prior is weighed against."""
 
 Views = Sequence[Sequence[Corners]]
 """``views[v][c]``: what camera c saw of the board in view v; empty where it saw nothing."""
@@ -30,6 +32,12 @@ class BundleConfig(Config):
     """Settings of the bundle adjustment."""
 
     huber_px: float = parameter(1.0, "residual beyond which a corner's pull no longer grows", unit="px", minimum=0.01)
+    distortion_prior: float = parameter(
+        1.0,
+        "standard deviation of a distortion coefficient before any picture: without effect on what the pictures show, "
+        "it keeps coefficients that cancel each other (rational_polynomial) from running away together",
+        minimum=1e-3,
+    )
     maximum_iterations: int = parameter(100, "Levenberg-Marquardt steps", minimum=1)
     tolerance: float = parameter(1e-10, "relative decrease of the cost that ends the iteration", minimum=1e-15)
 
@@ -112,7 +120,7 @@ def adjust(board_points: FloatArray, views: Views, start: Rig, config: BundleCon
         candidate = _step(rig, system, damping)
         cost = _cost(board_points, views, candidate, config)
         if np.isfinite(cost) and cost <= system.cost:
-            converged = system.cost - cost <= config.tolerance * system.cost
+            converged = system.cost - cost <= config.tolerance * (system.cost + 1e-3)
             rig, damping = candidate, max(0.1 * damping, 1e-12)
             system = _linearise(board_points, views, rig, config)
         else:
@@ -137,9 +145,9 @@ class _System:
 
 def _linearise(board_points: FloatArray, views: Views, rig: Rig, config: BundleConfig) -> _System:
     n, v = len(rig.names), len(views)
-    A, B, C = np.zeros((n, n)), np.zeros((v, n, POSE)), np.zeros((v, POSE, POSE))
-    g_rig, g_views = np.zeros(n), np.zeros((v, POSE))
-    cost = weighted_squares = weight = 0.0
+    B, C, g_views = np.zeros((v, n, POSE)), np.zeros((v, POSE, POSE)), np.zeros((v, POSE))
+    A, g_rig, cost = _prior(rig, config)
+    weighted_squares = weight = 0.0
     for index, c, corners in _seen(views):
         residual, J_rig, J_pose = _residual_with_jacobians(board_points, corners, rig, index, c)
         w, loss = _huber(residual, config.huber_px)
@@ -220,8 +228,20 @@ def _residuals(board_points: FloatArray, corners: Corners, rig: Rig, view: int, 
     return corners.pixels - project_with_jacobians(state.lens, state.parameters, point)[0]
 
 
+def _prior(rig: Rig, config: BundleConfig) -> tuple[FloatArray, FloatArray, float]:
+    """Information, gradient and cost of the prior on the distortion coefficients."""
+    values = np.concatenate([np.concatenate([np.zeros(4), state.parameters[4:]]) for state in rig.cameras])
+    mask = np.concatenate([np.arange(len(state.parameters)) >= 4 for state in rig.cameras])
+    poses = np.zeros(len(rig.names) - len(values))
+    weight = (_PIXEL / config.distortion_prior) ** 2
+    information = weight * np.concatenate([mask, poses])
+    return np.diag(information), -weight * np.concatenate([values, poses]), 0.5 * weight * float(values @ values)
+
+
 def _cost(board_points: FloatArray, views: Views, rig: Rig, config: BundleConfig) -> float:
-    return sum(_huber(_residuals(board_points, k, rig, v, c), config.huber_px)[1] for v, c, k in _seen(views))
+    return _prior(rig, config)[2] + sum(
+        _huber(_residuals(board_points, k, rig, v, c), config.huber_px)[1] for v, c, k in _seen(views)
+    )
 
 
 def _huber(residual: FloatArray, threshold: float) -> tuple[FloatArray, float]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_core.calibration.bundle import LensState, Views
 from slam_core.calibration.detection import Corners
-from slam_core.calibration.lens import DISTORTION_PARAMETERS
+from slam_core.calibration.lens import parameter_names
 from slam_core.camera import Camera
 from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, make_transform, transform_points
 from slam_core.types import AnyArray
@@ -42,7 +42,7 @@ def initial_lens(board_points: FloatArray, views: Sequence[Corners], width: int,
 
 
 def _undistorted_lens(lens: str, width: int, height: int, focal: float) -> LensState:
-    parameters = np.zeros(4 + len(DISTORTION_PARAMETERS[lens]))
+    parameters = np.zeros(len(parameter_names(lens)))
     parameters[:4] = focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)
     return LensState(lens, width, height, parameters, np.eye(4))
 

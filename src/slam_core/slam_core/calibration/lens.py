@@ -21,7 +21,15 @@ DISTORTION_PARAMETERS: dict[str, tuple[str, ...]] = {
 
 
 def parameter_names(lens: str) -> tuple[str, ...]:
-    """Names of a lens's parameters in the order of its vector."""
+    """Names of a lens's parameters in the order of its vector.
+
+    Raises
+    ------
+    ValueError
+        If there is no such lens model.
+    """
+    if lens not in DISTORTION_PARAMETERS:
+        raise ValueError(f"unknown lens model '{lens}', known: {', '.join(DISTORTION_PARAMETERS)}")
     return ("fx", "fy", "cx", "cy", *DISTORTION_PARAMETERS[lens])
 
 

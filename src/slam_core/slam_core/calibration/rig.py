@@ -13,7 +13,7 @@ import numpy as np
 from slam_core.calibration.bundle import BundleConfig, BundleResult, LensState, Rig, Views, adjust
 from slam_core.calibration.detection import NOTHING, Corners
 from slam_core.calibration.initialisation import board_pose, initial_extrinsics, initial_lens, is_posable
-from slam_core.calibration.lens import DISTORTION_PARAMETERS
+from slam_core.calibration.lens import parameter_names
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, invert_transform
 
@@ -64,8 +64,7 @@ def calibrate(
     """
     config = config or CalibrationConfig()
     for lens in lenses:
-        if lens not in DISTORTION_PARAMETERS:
-            raise ValueError(f"unknown lens model '{lens}', known: {', '.join(DISTORTION_PARAMETERS)}")
+        parameter_names(lens)
     views = [[k if is_posable(board_points, k) else NOTHING for k in view] for view in views]
     alone = [
         _calibrate_alone(board_points, [view[c] for view in views], size, lens, c, config)
