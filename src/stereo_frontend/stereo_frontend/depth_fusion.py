@@ -40,7 +40,7 @@ class FusionConfig(Config):
         minimum=0.0,
     )
     mapping_sigma: float = parameter(
-        0.3, "standard deviation of the mapping into the ToF image", unit="px", minimum=0.0
+        0.1, "standard deviation of the mapping into the ToF image", unit="px", minimum=0.0
     )
     lookup: DepthLookupConfig = group(DepthLookupConfig)
 
