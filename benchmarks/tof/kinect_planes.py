@@ -57,7 +57,7 @@ def main() -> None:
     processor = DepthProcessor(from_mapping(DepthConfig, {"measurement": "depth"}), CAMERA)
     rows = []
     for path in sorted((DATA / "rgbd_tsdf_1000" / "data").glob("*.depth.png"))[::20]:
-        rows += flat_windows(processor.process(0, cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+        rows += flat_windows(processor.process(0, np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))))
     depth, spread, sigma = np.array(rows).T
     print(f"{'depth [m]':>12s} {'windows':>8s} {'spread [mm]':>12s} {'stated [mm]':>12s} {'ratio':>6s}")
     for low in np.arange(0.5, 4.5, 0.5):

@@ -1,0 +1,175 @@
+"""The ``tof_driver`` process over real topics: the same depth as offline, and bad messages survived."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
+from sensor_msgs.srv import SetCameraInfo  # noqa: E402
+
+from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info  # noqa: E402
+from slam_core.camera import Camera  # noqa: E402
+from slam_core.camera import CameraInfo as Calibration  # noqa: E402
+from slam_core.messages import (  # noqa: E402
+    camera_info_from_message,
+    camera_info_message,
+    cloud_from_message,
+    header_message,
+    image_from_message,
+    image_message,
+)
+from slam_core.ros import RosTypes, sensor_qos  # noqa: E402
+from tof_driver.depth import DepthConfig, DepthProcessor  # noqa: E402
+
+pytestmark = pytest.mark.ros
+
+LENS = Camera(64, 48, 90.0, 90.0, 31.0, 24.0, "plumb_bob", (-0.3, 0.1, 0.0, 0.0, 0.0))
+START = "from tof_driver.node import main; main()"
+
+
+class Probe:
+    """A node that sends raw images and collects what the driver makes of them."""
+
+    def __init__(self, context: Any) -> None:
+        self.node = rclpy.create_node("probe", context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
+        self.types = RosTypes()
+        self.received: dict[str, list[Any]] = {}
+        self.senders: dict[str, Any] = {}
+
+    def listen(self, topic: str, message_type: Any) -> None:
+        self.received[topic] = []
+        self.node.create_subscription(message_type, topic, self.received[topic].append, sensor_qos(50))
+
+    def send(self, topic: str, message: Any) -> None:
+        if topic not in self.senders:
+            self.senders[topic] = self.node.create_publisher(type(message), topic, sensor_qos(50))
+            self.wait(lambda: self.senders[topic].get_subscription_count() > 0, f"nobody listens to {topic}")
+        self.senders[topic].publish(message)
+
+    def wait(self, condition: Callable[[], bool], why: str, seconds: float = 30.0) -> None:
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, why
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def send_frame(self, stamp: int, distance: np.ndarray, **pictures: np.ndarray) -> None:
+        for name, image in {"range": distance, **pictures}.items():
+            header = header_message(self.types, stamp, "tof_optical_frame")
+            self.send(f"tof/{name}/image_raw", image_message(self.types, header, image))
+
+
+@pytest.fixture
+def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[Probe]:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(30 + os.getpid() % 60))
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
+    probe = Probe(context)
+    yield probe
+    probe.executor.shutdown(timeout_sec=2.0)
+    probe.node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))
+    running: list[subprocess.Popen[bytes]] = []
+
+    def launch(*parameters: str) -> subprocess.Popen[bytes]:
+        arguments = ["--ros-args", *(part for p in parameters for part in ("-p", p))]
+        running.append(subprocess.Popen([sys.executable, "-c", START, *arguments], stderr=subprocess.PIPE))
+        return running[-1]
+
+    yield launch
+    for process in running:
+        process.kill()
+        process.wait()
+
+
+def scene(stamp: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(stamp)
+    distance = (2.0 + 0.01 * rng.normal(size=(48, 64))).astype(np.float32)
+    return {
+        "distance": distance,
+        "amplitude": (600.0 / distance**2).astype(np.float32),
+        "intensity": rng.uniform(0.0, 900.0, (48, 64)).astype(np.float32),
+    }
+
+
+def test_online_is_offline_and_bad_messages_are_survived(
+    probe: Probe, start: Callable[..., subprocess.Popen[bytes]]
+) -> None:
+    process = start("mask.maximum_range:=6.0")
+    outputs = {
+        "tof/depth/image": Image,
+        "tof/noise/image": Image,
+        "tof/points": PointCloud2,
+        "tof/intensity/image": Image,
+    }
+    for topic, kind in outputs.items():
+        probe.listen(topic, kind)
+    probe.send_frame(1, **scene(1))  # before any camera info: kept until it comes
+    header = header_message(probe.types, 1, "tof_optical_frame")
+    probe.send("tof/camera_info", camera_info_message(probe.types, header, Calibration(LENS)))
+    bad = {name: image[:20] for name, image in scene(2).items()}
+    probe.send_frame(2, **bad)
+    probe.send_frame(3, **scene(3))
+    probe.wait(lambda: all(len(m) == 2 for m in probe.received.values()), "two of three frames should come out")
+    processor = DepthProcessor(DepthConfig(), LENS)
+    for index, stamp in enumerate((1, 3)):
+        raw = scene(stamp)
+        expected = processor.process(stamp, raw["distance"], raw["amplitude"], raw["intensity"])
+        depth, noise, points, intensity = (probe.received[topic][index] for topic in outputs)
+        assert depth.header.stamp.nanosec == stamp
+        assert depth.header.frame_id == "tof_optical_frame"
+        np.testing.assert_array_equal(image_from_message(depth), expected.depth)
+        np.testing.assert_array_equal(image_from_message(noise), expected.sigma)
+        np.testing.assert_array_equal(image_from_message(intensity), expected.intensity)
+        np.testing.assert_array_equal(cloud_from_message(points)["sigma"], expected.sigma)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=10.0) == 0
+
+
+def test_calibration_from_a_file_is_published_and_replaced(
+    probe: Probe, start: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
+) -> None:
+    path = tmp_path / "tof.yaml"
+    CameraInfoFile(Calibration(LENS), "tof").write(path)
+    start(f"info:={path}", "pictures:=none")
+    probe.listen("tof/camera_info", CameraInfo)
+    probe.send_frame(1, scene(1)["distance"])
+    probe.wait(lambda: len(probe.received["tof/camera_info"]) == 1, "the info of the file should be published")
+    assert camera_info_from_message(probe.received["tof/camera_info"][0]).camera == LENS
+    changed = Camera(64, 48, 95.0, 95.0, 31.0, 24.0)
+    client = probe.node.create_client(SetCameraInfo, "tof/set_camera_info")
+    probe.wait(client.service_is_ready, "the service should be offered")
+    message = camera_info_message(probe.types, header_message(probe.types, 0, ""), Calibration(changed))
+    answer = client.call_async(SetCameraInfo.Request(camera_info=message))
+    probe.wait(answer.done, "the service should answer")
+    assert answer.result().success, answer.result().status_message
+    assert read_camera_info(path).info.camera == changed
+    probe.send_frame(2, scene(2)["distance"])
+    probe.wait(lambda: len(probe.received["tof/camera_info"]) == 2, "the new info should be in use")
+    assert camera_info_from_message(probe.received["tof/camera_info"][1]).camera.fx == 95.0
+
+
+def test_a_missing_calibration_file_refuses_to_start(start: Callable[..., subprocess.Popen[bytes]]) -> None:
+    process = start("info:=/nowhere/tof.yaml")
+    _, errors = process.communicate(timeout=30.0)
+    assert process.returncode == 2
+    assert b"/nowhere/tof.yaml" in errors
