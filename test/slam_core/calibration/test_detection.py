@@ -12,70 +12,18 @@ from numpy.typing import NDArray
 
 from slam_core.calibration.board import AprilGrid, Board, Charuco, Chessboard, parse_board
 from slam_core.calibration.detection import find_corners, grey8, load_grey
+from slam_core.calibration.drawing import draw_board
 
 SCALE = 2000.0
 """Texture pixels per metre of board."""
-MARGIN = 80
 
 Picture = NDArray[np.uint8]
-
-
-def texture(board: Board) -> Picture:
-    """The board seen straight on, y upwards for an AprilGrid as Kalibr prints it, downwards for the others."""
-    if isinstance(board, AprilGrid):
-        return april_texture(board)
-    columns, rows = (board.columns, board.rows) if isinstance(board, Charuco) else (board.columns + 1, board.rows + 1)
-    side = round(board.square * SCALE)
-    y, x = np.mgrid[: rows * side, : columns * side] // side
-    picture = np.where((x + y) % 2 == 0, 0, 255).astype(np.uint8)
-    if isinstance(board, Charuco):
-        for number, corners in enumerate(board.marker_corners):
-            place(picture, marker(board.dictionary, number, round(board.marker * SCALE), 1), corners[0, :2])
-    return np.pad(picture, MARGIN, constant_values=255)
-
-
-def april_texture(board: AprilGrid) -> Picture:
-    tag, gap = round(board.tag * SCALE), round(board.tag * board.spacing * SCALE)
-    pitch = tag + gap
-    picture = np.full((board.rows * pitch + gap, board.columns * pitch + gap), 255, dtype=np.uint8)
-    for row in range(board.rows + 1):
-        for column in range(board.columns + 1):
-            picture[row * pitch : row * pitch + gap, column * pitch : column * pitch + gap] = 0
-    for number in range(board.rows * board.columns):
-        row, column = divmod(number, board.columns)
-        # In print the rows run upwards from the bottom, and the family's codes are half a turn from OpenCV's.
-        code = marker("DICT_APRILTAG_36H11", number, tag, 2)[::-1, ::-1]
-        top = picture.shape[0] - (row + 1) * pitch
-        picture[top : top + tag, column * pitch + gap : column * pitch + gap + tag] = code
-    return np.pad(picture, MARGIN, constant_values=255)
-
-
-def marker(dictionary: str, number: int, side: int, border_bits: int) -> Picture:
-    family = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    draw = getattr(cv2.aruco, "generateImageMarker", None) or cv2.aruco.drawMarker
-    return np.asarray(draw(family, number, side, borderBits=border_bits), dtype=np.uint8)
-
-
-def place(picture: Picture, part: Picture, corner_m: NDArray[np.float64]) -> None:
-    x, y = np.rint(corner_m * SCALE).astype(int)
-    picture[y : y + len(part), x : x + len(part)] = part
-
-
-def texture_pixels(board: Board, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Where the board's corners are in its texture (edges lie between pixels)."""
-    points = board.points[:, :2] * SCALE
-    if isinstance(board, Chessboard):
-        points = points + board.square * SCALE
-    if isinstance(board, AprilGrid):
-        gap = board.tag * board.spacing * SCALE
-        points = np.column_stack([points[:, 0] + gap, shape[0] - 2 * MARGIN - gap - points[:, 1]])
-    return points + MARGIN - 0.5
 
 
 def photograph(board: Board, seed: int, size: tuple[int, int] = (640, 480)) -> tuple[Picture, NDArray[np.float64]]:
     """A tilted, blurred, noisy picture of the board, and its corners there."""
     rng = np.random.default_rng(seed)
-    drawn = texture(board)
+    drawn, drawn_corners = draw_board(board, SCALE)
     h, w = drawn.shape
     source = np.array([[0, 0], [w, 0], [w, h], [0, h]], dtype=np.float32)
     scale = 0.85 * min(size[0] / w, size[1] / h)
@@ -84,7 +32,7 @@ def photograph(board: Board, seed: int, size: tuple[int, int] = (640, 480)) -> t
     drawn = cv2.GaussianBlur(drawn, (0, 0), 0.5 / scale)
     picture = cv2.warpPerspective(drawn, H, size, flags=cv2.INTER_AREA, borderValue=255)
     picture = 30.0 + 0.7 * picture.astype(np.float64) + 2.0 * rng.normal(size=picture.shape)
-    corners = cv2.perspectiveTransform(texture_pixels(board, (h, w))[:, None], H)[:, 0]
+    corners = cv2.perspectiveTransform(drawn_corners[:, None], H)[:, 0]
     return np.clip(picture, 0, 255).astype(np.uint8), corners
 
 

@@ -14,6 +14,7 @@ from slam_core.calibration.board import AprilGrid, Board, Charuco, Chessboard
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, ByteArray
 
+APRILTAG_DICTIONARY = "DICT_APRILTAG_36H11"
 KALIBR_BORDER_BITS = 2
 """Kalibr prints its tags with a black border two bits wide."""
 _TAG_CORNER_ORDER = [1, 0, 3, 2]
@@ -106,7 +107,7 @@ def _brightness(image: ByteArray, centre: FloatArray, radius: float) -> float:
 
 
 def _find_aprilgrid(board: AprilGrid, image: ByteArray) -> Corners:
-    tags, quads = _find_markers(image, "DICT_APRILTAG_36H11", KALIBR_BORDER_BITS)
+    tags, quads = _find_markers(image, APRILTAG_DICTIONARY, KALIBR_BORDER_BITS)
     known = tags < board.columns * board.rows
     tags, quads = tags[known], quads[known][:, _TAG_CORNER_ORDER]
     if len(tags) < 4:
