@@ -17,6 +17,7 @@ from typing import Any
 import rclpy
 from rclpy.duration import Duration
 from rclpy.node import Node
+from std_srvs.srv import Trigger
 
 from slam_bringup.bag import BagReader, RawMessage
 from slam_bringup.pacing import FlowControl, ReplayClock, header_stamp_ns
@@ -43,6 +44,7 @@ class PlayerConfig(Config):
     window: int = parameter(4, "messages of a paced topic that may be unprocessed", minimum=1)
     patience: float = parameter(120.0, "longest wait for a paced node that reports nothing", unit="s", minimum=1.0)
     wait_for_subscribers: float = parameter(3.0, "longest wait for subscribers at the start", unit="s", minimum=0.0)
+    wait_for_start: bool = parameter(False, "begin when the service ~/start is called, not when subscribers are there")
 
 
 class BagPlayerNode(Node):
@@ -56,6 +58,7 @@ class BagPlayerNode(Node):
         self._types = RosTypes()
         self._flow = FlowControl(self.config.pace, self.config.window, self.config.patience)
         self._stop = threading.Event()
+        self._start = threading.Event()
         self._sent = 0
         self._reader = BagReader(Path(self.config.bag)).__enter__()
         self._outputs = self._make_publishers()
@@ -65,12 +68,14 @@ class BagPlayerNode(Node):
         self._clock_output = self.create_publisher(self._types.Clock, "/clock", 10) if self.config.clock else None
         self._clock_ns = 0
         self.create_subscription(self._types.Header, PROGRESS_TOPIC, self._on_progress, sensor_qos(1000))
+        self.create_service(Trigger, "~/start", self._on_start)
         self._thread = threading.Thread(target=self._run, name="player")
         self._thread.start()
 
     def on_shutdown(self) -> None:
         """Stop playing and close the bag."""
         self._stop.set()
+        self._start.set()
         self._flow.clear()
         self._thread.join(timeout=10.0)
         self._reader.__exit__()
@@ -78,10 +83,19 @@ class BagPlayerNode(Node):
     def _on_progress(self, header: Any) -> None:
         self._flow.progress(header.frame_id, header.stamp.sec * 1_000_000_000 + header.stamp.nanosec)
 
+    def _on_start(self, _: Any, response: Any) -> Any:
+        self._start.set()
+        response.success = True
+        return response
+
     def _run(self) -> None:
         try:
             self._send_static_transforms()
-            self._wait_for_subscribers()
+            if self.config.wait_for_start:
+                self._start.wait()
+            else:
+                self._wait_for_subscribers()
+            self._static_output.wait_for_all_acked(Duration(seconds=5))
             self._play_once()
             while self.config.loop and not self._stop.is_set():
                 self._flow.clear()
@@ -155,7 +169,6 @@ class BagPlayerNode(Node):
                 counts, stable_since = now, time.monotonic()
             if any(counts) and time.monotonic() - stable_since > _SETTLE_S:
                 break
-        self._static_output.wait_for_all_acked(Duration(seconds=5))
 
 
 def main(args: list[str] | None = None) -> None:

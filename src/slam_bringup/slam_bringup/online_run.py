@@ -109,13 +109,17 @@ class _Choreography:
         """All nodes, then the recorder; returns when every topic has reached whoever listens to it."""
         for command in self._graph.commands:
             self._group.start(command)
-        names = [command.full_name for command in self._graph.commands]
-        ready = self._supervisor.is_ready
-        played = self._graph.played_topics
-        self._supervisor.wait(
-            lambda: all(ready(name, played) for name in names), START_TIMEOUT_S, f"start of {', '.join(names)}"
-        )
+        self._wait_until_ready(from_outside=self._graph.played_topics)
         self._start_recorder()
+
+    def _wait_until_ready(self, from_outside: tuple[str, ...]) -> None:
+        """All nodes have reported themselves with all inputs connected, but those that come ``from_outside``."""
+        names = [command.full_name for command in self._graph.commands]
+        obstacles = self._supervisor.obstacles
+        try:
+            self._supervisor.wait(lambda: not obstacles(names, from_outside), START_TIMEOUT_S, "start of the nodes")
+        except TimeoutError as error:
+            raise ValueError(f"{error}: {'; '.join(obstacles(names, from_outside))}") from None
 
     def _start_recorder(self) -> None:
         parameters = {"bag": str(self._recording), "topics": self._graph.recorded_topics, "header_stamps": True}
@@ -130,10 +134,12 @@ class _Choreography:
         """Play the bag to its end; the player ends when the paced nodes have processed everything."""
         parameters = {
             "bag": str(bag), "rate": rate, "topics": self._graph.played_topics, "pace": self._graph.pace,
-            "window": _WINDOW, "wait_for_subscribers": 10.0,
+            "window": _WINDOW, "wait_for_start": True,
         }  # fmt: skip
         player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
         self._supervisor.count_submaps(f"{name.rpartition('/')[0]}/submap/info" for name in self._graph.filters)
+        self._wait_until_ready(from_outside=())
+        self._supervisor.call("/bag_player/start")
         while player.is_running:
             self._supervisor.listen(0.2)
             on_progress(sum(self._supervisor.progress[name] for name in self._graph.filters))

@@ -29,6 +29,8 @@ class Recording:
         self._feature_counts: dict[str, list[int]] = defaultdict(list)
         self.stage_ms: dict[str, list[float]] = defaultdict(list)
         self.submaps = 0
+        self._events: dict[str, list[str]] = defaultdict(list)
+        self._states: dict[str, str] = defaultdict(lambda: "OK")
         with BagReader(path) as bag:
             for topic, _, message in bag.messages():
                 if topic.endswith("/odom") or topic.endswith("/ndt/odometry"):
@@ -38,7 +40,10 @@ class Recording:
                 elif topic.endswith("/submap/info"):
                     self.submaps += 1
                 elif topic == "/diagnostics":
-                    self._add_latency(message)
+                    for status in message.status:
+                        values = {entry.key: entry.value for entry in status.values}
+                        self._add_latency(status.name, values)
+                        self._add_event(status.name, values)
 
     def odometry(self, agent: str, name: str) -> Trajectory:
         """Poses on ``odom`` or ``ndt/odometry`` of an agent."""
@@ -48,11 +53,20 @@ class Recording:
         """Number of features of each frame."""
         return self._feature_counts[_topic(agent, "features")]
 
-    def _add_latency(self, message: object) -> None:
-        for status in message.status:  # type: ignore[attr-defined]
-            for entry in status.values:
-                if entry.key == "latency_mean_ms":
-                    self.stage_ms[status.name.strip("/")].append(float(entry.value))
+    def events(self, agent: str) -> list[str]:
+        """Changes of state of the agent's filter, as in the offline run."""
+        return self._events[_topic(agent, "ekf_slam")]
+
+    def _add_latency(self, node: str, values: dict[str, str]) -> None:
+        if "latency_mean_ms" in values:
+            self.stage_ms[node.strip("/")].append(float(values["latency_mean_ms"]))
+
+    def _add_event(self, node: str, values: dict[str, str]) -> None:
+        state = values["state"]
+        if state != self._states[node]:
+            reason = f": {values['reason']}" if values["reason"] else ""
+            self._events[node].append(f"{int(values['input_stamp_ns']) / 1e9:.3f} s, {state}{reason}")
+        self._states[node] = state
 
 
 def collect(
@@ -83,7 +97,7 @@ def collect(
         sensor_s=max((s[-1] - s[0]) / 1e9 for s in stamps) if stamps else 0.0,
         wall_s=run.wall_s,
         stage_ms=recording.stage_ms,
-        events=tuple(unclean_ends(run)),
+        events=tuple(_events(agents, recording) + unclean_ends(run)),
     )
     return result, global_map
 
@@ -97,6 +111,10 @@ def _agent_result(agent: str, bag: SensorBag, recording: Recording, global_map: 
         truth=bag.ground_truth(agent) or EMPTY_TRAJECTORY,
         feature_counts=np.array(recording.feature_counts(agent), dtype=np.int64),
     )
+
+
+def _events(agents: tuple[AgentResult, ...], recording: Recording) -> list[str]:
+    return [f"{a.name}: {e}" if a.name else e for a in agents for e in recording.events(a.name)]
 
 
 def _losses(diagnostics: dict[str, dict[str, str]]) -> dict[str, int]:

@@ -78,12 +78,12 @@ class Supervisor:
             )
 
     def wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Listen until ``condition`` holds; ValueError saying ``what`` did not happen after ``timeout_s``."""
+        """Listen until ``condition`` holds; TimeoutError saying ``what`` did not happen after ``timeout_s``."""
         deadline = time.monotonic() + timeout_s
         while not condition():
             self.listen(_SPIN_S)
             if time.monotonic() > deadline:
-                raise ValueError(f"{what} did not happen within {timeout_s:.0f} s")
+                raise TimeoutError(f"{what} did not happen within {timeout_s:.0f} s")
 
     def wait_until_quiet(self, quiet_s: float, timeout_s: float) -> None:
         """Listen until no progress has been reported for ``quiet_s``."""
@@ -100,10 +100,17 @@ class Supervisor:
             self._executor.spin_once(timeout_sec=left)
         self._check()
 
-    def is_ready(self, name: str, from_outside: Iterable[str]) -> bool:
-        """Whether a node has reported itself, with all inputs connected but those ``from_outside``."""
-        values = self.diagnostics.get(name)
-        return values is not None and set(values.get("unconnected", "").split()) <= set(from_outside)
+    def obstacles(self, names: Iterable[str], from_outside: Iterable[str]) -> list[str]:
+        """Nodes that have not reported themselves, or lack a publisher of an input that is not ``from_outside``."""
+        found = []
+        for name in names:
+            values = self.diagnostics.get(name)
+            lacking = set() if values is None else set(values.get("unconnected", "").split()) - set(from_outside)
+            if values is None:
+                found.append(f"{name} has not reported itself")
+            elif lacking:
+                found.append(f"{name} has no publisher of {', '.join(sorted(lacking))}")
+        return found
 
     def subscribers(self, topic: str) -> set[str]:
         """Names of the nodes that subscribe to a topic."""

@@ -107,8 +107,10 @@ class SlamNode(Node, Generic[C]):
         self._paused = False
         self._silent = False
         self._started_at_s = time.monotonic()
+        self._input_stamp_ns = 0
+        self._reported_state = State.OK
         self._progress = self.create_publisher(self.types.Header, PROGRESS_TOPIC, sensor_qos(self.input_config.depth))
-        self._diagnostics = self.create_publisher(self.types.DiagnosticArray, "/diagnostics", sensor_qos(10))
+        self._diagnostics = self.create_publisher(self.types.DiagnosticArray, "/diagnostics", sensor_qos(100))
         self._listen_to_static_transforms()
         self._tf = self._advertise_tf()
         self.create_service(Trigger, "~/reset", self._on_reset_service)
@@ -228,6 +230,8 @@ class SlamNode(Node, Generic[C]):
         except Exception:
             self._reject(f"{source}: message rejected after a fault:\n{traceback.format_exc()}")
         if announce:
+            self._input_stamp_ns = stamp
+            self._report_change()
             self._progress.publish(header_message(self.types, stamp, self.get_fully_qualified_name()))
 
     def _reject(self, why: str) -> None:
@@ -274,10 +278,17 @@ class SlamNode(Node, Generic[C]):
         self._silent = bool(silence)
         self._diagnostics.publish(self._diagnostic_message(silence))
 
+    def _report_change(self) -> None:
+        """A change of state is reported at once, with the stamp of the input that brought it."""
+        if self.health.state != self._reported_state:
+            self._reported_state = self.health.state
+            self._diagnostics.publish(self._diagnostic_message(""))
+
     def _diagnostic_message(self, silence: str) -> Message:
         self.health.counters["unpaired"] = sum(s.unpaired for s in self._synchronizers)
         values = self.health.report(time.monotonic())
         values["unconnected"] = " ".join(self._unconnected())
+        values["input_stamp_ns"] = str(self._input_stamp_ns)
         level = max(int(self.health.state), int(State.DEGRADED) if silence else 0)
         status = self.types.DiagnosticStatus(
             level=bytes([level]),
