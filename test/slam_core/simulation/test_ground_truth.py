@@ -63,9 +63,9 @@ def test_rectified_pair_has_the_disparity_of_the_true_depth(simulator: Simulator
     )
     assert len(residual) > 120
     assert abs(np.median(residual)) < 0.03
-    assert np.median(np.abs(residual)) < 0.1
+    assert np.median(np.abs(residual)) < 0.2
     assert abs(np.median(vertical)) < 0.03
-    assert np.median(np.abs(vertical)) < 0.1
+    assert np.median(np.abs(vertical)) < 0.2
 
 
 def _stereo_residual(simulator: Simulator, frame: SimulatedFrame) -> tuple[FloatArray, FloatArray]:
@@ -75,7 +75,7 @@ def _stereo_residual(simulator: Simulator, frame: SimulatedFrame) -> tuple[Float
     assert frame.truth is not None
     left, right = rectified(simulator, 0, frame.left), rectified(simulator, 1, frame.right)
     mask = np.pad(np.ones((360, 460), np.uint8), ((60, 60), (90, 90)))
-    corners = cv2.goodFeaturesToTrack(left, 400, 0.02, 8, mask=mask)
+    corners = cv2.goodFeaturesToTrack(left, 400, 0.04, 8, mask=mask)
     start, stereo = corners[:, 0], simulator.stereo.stereo
     depth = cv2.remap(frame.truth.depth, start[:, None, 0], start[:, None, 1], cv2.INTER_LINEAR)
     disparity = np.dstack([stereo.camera.fx * stereo.baseline / depth, np.zeros_like(depth)])

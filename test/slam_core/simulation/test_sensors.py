@@ -15,6 +15,7 @@ from slam_core.simulation.stereo_sensor import (
     StereoSensorConfig,
     camera_twist,
     expose,
+    miscalibrated,
     motion_blur,
 )
 from slam_core.simulation.surface_table import SurfaceTable, compile_world
@@ -154,3 +155,12 @@ def test_imu_noise_and_bias_are_as_stated(scenario: Scenario) -> None:
     error = np.array([s.angular_velocity for s in samples]) - ideal
     np.testing.assert_allclose(error.mean(axis=0), sensor.gyro_bias, atol=0.003)
     assert error.std(axis=0) == pytest.approx(0.01, rel=0.2)
+
+
+def test_calibration_is_wrong_by_what_it_says() -> None:
+    camera = StereoSensor(StereoSensorConfig()).infos[0].camera
+    rng = np.random.default_rng(0)
+    wrong = [miscalibrated(camera, 0.1, rng) for _ in range(400)]
+    assert np.std([c.cx - camera.cx for c in wrong]) == pytest.approx(0.1, rel=0.15)
+    border = [c.fx / camera.fx * 320 - 320 for c in wrong]
+    assert np.std(border) == pytest.approx(0.1, rel=0.15)

@@ -52,6 +52,7 @@ class BagOptions:
     truth: bool = False
     rectified: bool = False
     storage: str = "mcap"
+    every: int = 1
 
 
 @click.command()
@@ -59,6 +60,7 @@ class BagOptions:
 @click.option(
     "-o", "--output", required=True, type=click.Path(path_type=Path), help="the bag to write (folder or .mcap)"
 )
+@click.option("--every", type=click.IntRange(1), default=1, show_default=True, help="take only every n-th frame")
 @click.option("--frames", type=click.IntRange(1), help="render only the first frames")
 @click.option("--seed", type=click.IntRange(0), help="another seed than the scenario's: same plan, other building")
 @click.option("--storage", type=click.Choice(("mcap", "sqlite3")), default="mcap", show_default=True, help="bag format")
@@ -70,8 +72,8 @@ class BagOptions:
     "--threads", type=click.IntRange(1), help="threads that draw (all processors); the bag does not depend on it"
 )
 def command(
-    scenario: str, output: Path, frames: int | None, seed: int | None, storage: str, images: str, compact: bool,
-    rectified: bool, truth: bool, threads: int | None,
+    scenario: str, output: Path, every: int, frames: int | None, seed: int | None, storage: str, images: str, compact:
+    bool, rectified: bool, truth: bool, threads: int | None,
 ) -> None:  # fmt: skip
     """Render SCENARIO (a YAML file, or a name of bags/scenarios) to a bag with ground truth."""
     plan = Scenario.load(scenario)
@@ -79,7 +81,7 @@ def command(
         plan = replace(plan, seed=seed)
     if frames is not None:
         plan = plan.shortened(frames)
-    options = BagOptions(images, compact, truth, rectified, storage)
+    options = BagOptions(images, compact, truth, rectified, storage, every)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -88,7 +90,7 @@ def command(
         TimeRemainingColumn(),
     )
     with Progress(*columns) as progress:
-        task = progress.add_task(f"rendering {plan.name}", total=plan.frames * len(plan.agents))
+        task = progress.add_task(f"rendering {plan.name}", total=-(-plan.frames // every) * len(plan.agents))
         write_bag(plan, output, options, threads, lambda: progress.advance(task))
 
 
@@ -110,7 +112,7 @@ def write_bag(
         writers = {s.scenario.agents[s.agent].name: SimulationWriter(bag, s, options) for s in agents}
         for writer in writers.values():
             writer.mountings(min(s.stamp_ns(0) for s in agents))
-        for frame in merge(*(s.run() for s in agents), key=lambda f: f.stamp_ns):
+        for frame in merge(*(s.run(every=options.every) for s in agents), key=lambda f: f.stamp_ns):
             writers[frame.agent].frame(frame)
             advance()
 

@@ -92,7 +92,7 @@ class Simulator:
         self.scenario, self.agent = scenario, agent
         self.world = compile_world(scenario.world()) if world is None else world
         self.path = scenario.path(agent)
-        self.stereo = StereoSensor(scenario.suite.stereo, rectified=rectified)
+        self.stereo = StereoSensor(scenario.suite.stereo, scenario.seed, rectified=rectified)
         self.tof = TofSensor(scenario.suite.tof, scenario.seed)
         self.imu = ImuSensor(scenario.suite.imu, (scenario.seed, 9, agent))
         self.threads = threads or os.cpu_count() or 1
@@ -121,17 +121,19 @@ class Simulator:
         start = self.scenario.suite.start_stamp_s + self.scenario.agents[self.agent].start_s
         return round(start * 1e9) + round(index / self.scenario.rate * 1e9)
 
-    def run(self, frames: int | None = None) -> Iterator[SimulatedFrame]:
-        """The frames in order, the first ``frames`` of them or all."""
-        count = self.frames if frames is None else min(frames, self.frames)
+    def run(self, frames: int | None = None, every: int = 1) -> Iterator[SimulatedFrame]:
+        """Every ``every``-th of the first ``frames`` frames (all by default), in order."""
+        if every < 1:
+            raise ValueError(f"can take every frame or every n-th, got {every}")
+        indices = range(0, self.frames if frames is None else min(frames, self.frames), every)
         if self.threads == 1:
-            yield from (self._frame(k, None) for k in range(count))
+            yield from (self._frame(k, None, every) for k in indices)
             return
         with ThreadPoolExecutor(self.threads) as pool:
-            for k in range(count):
-                yield self._frame(k, pool)
+            for k in indices:
+                yield self._frame(k, pool, every)
 
-    def _frame(self, k: int, pool: ThreadPoolExecutor | None) -> SimulatedFrame:
+    def _frame(self, k: int, pool: ThreadPoolExecutor | None, every: int = 1) -> SimulatedFrame:
         scenario, t = self.scenario, k / self.scenario.rate
         T = self.path.pose(t)
         left, right = self._stereo(k, t, T, pool)
@@ -148,7 +150,7 @@ class Simulator:
             left=left,
             right=right,
             tof=tof,
-            imu=self._imu_samples(k, t),
+            imu=self._imu_samples(t - every / scenario.rate, t),
             truth=None if self._truth_rays is None else self._truth(T, self._truth_rays, pool),
         )
 
@@ -164,10 +166,11 @@ class Simulator:
         pair = self.stereo.capture(self.world, T, rig_twist(self.path, t), rng, pool)
         return (None, None) if rng.random() < self.scenario.suite.stereo.drop_probability else pair
 
-    def _imu_samples(self, k: int, t: float) -> tuple[ImuSample, ...]:
+    def _imu_samples(self, previous: float, t: float) -> tuple[ImuSample, ...]:
         if "imu" not in self.scenario.sensors:
             return ()
-        return self.imu.read(self.path, max(t - 1.0 / self.scenario.rate, -1e-6), t, self.stamp_ns(0))
+        # The first frame brings the sample of its own moment.
+        return self.imu.read(self.path, max(previous, -1e-6), t, self.stamp_ns(0))
 
     def _truth(self, T: FloatArray, rays: Rays, pool: ThreadPoolExecutor | None) -> DepthTruth:
         view = make_view(self.world, T @ self.T_rig_left, rays.bounds)

@@ -8,7 +8,7 @@ stands ``baseline`` to the right of it.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -55,9 +55,12 @@ class StereoSensorConfig(Config):
         0.03, "relative brightness difference of the right camera", minimum=0.0, maximum=0.5
     )
     gain_jitter: float = parameter(0.01, "random brightness change per frame (mains flicker)", minimum=0.0, maximum=0.5)
-    blur_px: float = parameter(0.6, "lens blur, standard deviation", unit="px", minimum=0.0)
-    read_noise: float = parameter(1.0, "noise of a dark pixel, of 255", minimum=0.0)
-    electrons_per_level: float = parameter(30.0, "electrons per grey level: sets the shot noise", minimum=0.1)
+    blur_px: float = parameter(0.7, "lens blur, standard deviation", unit="px", minimum=0.0)
+    read_noise: float = parameter(1.5, "noise of a dark pixel, of 255", minimum=0.0)
+    electrons_per_level: float = parameter(20.0, "electrons per grey level: sets the shot noise", minimum=0.1)
+    calibration_error_px: float = parameter(
+        0.03, "spread of what the calibration is wrong by at the principal point", unit="px", minimum=0.0
+    )
     vignetting: float = parameter(0.8, "strength of the cos^4 darkening towards the corners", minimum=0.0, maximum=1.0)
     drop_probability: float = parameter(0.0, "share of frames lost", minimum=0.0, maximum=0.9)
     stamp_jitter_us: float = parameter(
@@ -68,12 +71,12 @@ class StereoSensorConfig(Config):
 class StereoSensor:
     """Renders raw pairs. Keeps the state of the exposure control, so frames must be taken in order."""
 
-    def __init__(self, config: StereoSensorConfig, *, rectified: bool = False) -> None:
-        self.config = config
-        c = config
+    def __init__(self, config: StereoSensorConfig, seed: int = 0, *, rectified: bool = False) -> None:
+        self.config = c = config
+        rng = np.random.default_rng([seed, 78])
         self.infos = tuple(camera_info(c, side, rectified=rectified) for side in SIDES)
         self.stereo = StereoCamera(self.infos[0].rectified, c.baseline)
-        self.rays = tuple(camera_rays(info.camera) for info in self.infos)
+        self.rays = tuple(camera_rays(miscalibrated(i.camera, c.calibration_error_px, rng)) for i in self.infos)
         self.T_rig_raw = tuple(
             _mounting(info, offset) for info, offset in zip(self.infos, (0.0, c.baseline), strict=True)
         )
@@ -128,6 +131,13 @@ def camera_info(config: StereoSensorConfig, side: str, *, rectified: bool = Fals
     distortion = tuple((1.0 + c.distortion_spread * right) * d for d in c.distortion)
     camera = Camera(c.width, c.height, focal, focal, cx + offset[0], cy + offset[1], "plumb_bob", distortion)
     return CameraInfo(camera, so3_exp(np.radians(c.right_tilt_deg if right else c.left_tilt_deg)), P)
+
+
+def miscalibrated(camera: Camera, error_px: float, rng: np.random.Generator) -> Camera:
+    """The true camera behind a calibration that is wrong by ``error_px`` at the principal point and at the border."""
+    du, dv, df = error_px * rng.standard_normal(3)
+    scale = 1.0 + 2.0 * df / camera.width
+    return replace(camera, fx=camera.fx * scale, fy=camera.fy * scale, cx=camera.cx + du, cy=camera.cy + dv)
 
 
 def _mounting(info: CameraInfo, offset: float) -> FloatArray:
