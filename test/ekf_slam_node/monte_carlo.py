@@ -6,9 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from feature_world import PointWorld, room
+
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.slam import EkfSlam
-from feature_world import PointWorld, room
 from slam_core.evaluation import nees
 from slam_core.geometry import FloatArray, boxminus, invert_transform, skew, transform_points
 from slam_core.types import PoseEstimate, Submap
@@ -72,9 +73,7 @@ def simulate(
     return Run(errors, _pose_nees(submaps[0].path, poses), nis / dof)
 
 
-def _errors(
-    submap: Submap, world: PointWorld, poses: list[FloatArray], names: dict[int, list[int]]
-) -> SubmapErrors:
+def _errors(submap: Submap, world: PointWorld, poses: list[FloatArray], names: dict[int, list[int]]) -> SubmapErrors:
     start, end = poses[submap.start_stamp_ns // STEP_NS], poses[submap.end_stamp_ns // STEP_NS]
     to_submap = invert_transform(start)
     known = np.flatnonzero([int(i) in names for i in submap.landmark_ids])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ def test_handheld_loop_is_accurate_and_chained(world: PointWorld, rng: np.random
     assert [submap.index for submap in submaps] == list(range(len(submaps)))
     assert len(submaps) >= 7
     assert [submap.follows_previous for submap in submaps] == [False] + [True] * (len(submaps) - 1)
-    for before, after in zip(submaps, submaps[1:], strict=False):
+    for before, after in pairwise(submaps):
         assert before.end_stamp_ns == after.start_stamp_ns
         assert len(np.intersect1d(before.landmark_ids, after.landmark_ids)) >= 15
 
@@ -84,7 +85,7 @@ def test_blackout_is_said_at_once_and_the_old_map_is_found_again(world: PointWor
         results.append(slam.process(blank(features) if 20 <= k < 25 else features))
     assert [r.state for r in results[20:25]] == [TrackingState.LOST] * 5
     sizes = [np.trace(r.pose.covariance) for r in results[19:25]]
-    assert all(b > a for a, b in zip(sizes, sizes[1:], strict=False))
+    assert all(b > a for a, b in pairwise(sizes))
     assert all(r.state is TrackingState.OK for r in results[25:])
     assert np.linalg.norm(error_of(results[30], poses, 30)[:3]) < 0.05
     assert all(s.follows_previous for r in results for s in r.submaps[1:])
@@ -117,7 +118,7 @@ def test_large_steps_are_bridged_by_a_motion_guess(world: PointWorld, rng: np.ra
 
 
 def test_moving_crowd_is_not_mapped(world: PointWorld, rng: np.random.Generator) -> None:
-    """A fifth of the points walks sideways at 1 m/s: hardly any may stay a landmark (motion along a distant ray cannot be seen)."""
+    """A fifth of the points walks at 1 m/s: hardly any may stay a landmark (along a distant ray it cannot be seen)."""
     poses, slam = loop(40), EkfSlam(EkfSlamConfig())
     moving = rng.random(len(world.points)) < 0.2
     seen: dict[int, list[bool]] = {}

@@ -84,7 +84,12 @@ class Linker:
         loose = match_descriptors(similarity, config.guess_descriptor_threshold, 1.0)
         for rows, columns in (strict, loose):
             guess = guess_motion(
-                candidates.select(rows), frame.select(columns), self._T_rig_optical, rng, 2 * config.hypotheses, config.gate
+                candidates.select(rows),
+                frame.select(columns),
+                self._T_rig_optical,
+                rng,
+                2 * config.hypotheses,
+                config.gate,
             )
             enough = max(config.min_inliers, config.min_inlier_ratio * len(rows))
             if guess is None or guess.inliers.sum() < enough:
