@@ -27,10 +27,10 @@ class PixelNoiseConfig(Config):
     """
 
     floor: float = parameter(
-        0.13, "standard deviation of the smallest keypoints", unit="px", minimum=0.01, maximum=10.0
+        0.11, "standard deviation of the smallest keypoints", unit="px", minimum=0.01, maximum=10.0
     )
     slope: float = parameter(
-        0.0175, "growth of the standard deviation with the keypoint's diameter", minimum=0.0, maximum=1.0
+        0.015, "growth of the standard deviation with the keypoint's diameter", minimum=0.0, maximum=1.0
     )
     row_floor: float = parameter(
         0.06, "standard deviation of the row of the smallest keypoints in one clean image", unit="px", minimum=0.001

@@ -1,0 +1,75 @@
+"""Time of the whole stereo front end per pair and how it splits; simulated 640x480 pairs, EuRoC and KITTI.
+
+Left and right image are extracted on two threads: "extract both" is what they take together.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from datasets import euroc_pairs, kitti_pairs
+from truth import simulated_frames
+
+from slam_core.types import StereoImages
+from stereo_frontend.disparity import refine_disparity
+from stereo_frontend.features import FeatureExtractor
+from stereo_frontend.frontend import Frontend, FrontendConfig
+from stereo_frontend.matching import disparity_bounds, match_stereo
+
+T = TypeVar("T")
+WARM_UP = 4
+
+
+class Watch:
+    """Collects the times of named calls."""
+
+    def __init__(self) -> None:
+        self.times: dict[str, list[float]] = {}
+
+    def __call__(self, name: str, function: Callable[..., T], *arguments: object) -> T:
+        """Call ``function`` and note the time it took under ``name``."""
+        start = time.perf_counter()
+        result = function(*arguments)
+        self.times.setdefault(name, []).append(1e3 * (time.perf_counter() - start))
+        return result
+
+    def medians(self) -> str:
+        """Median of each name, ms, without the first few."""
+        return "   ".join(f"{name} {np.median(values[WARM_UP:]):.1f}" for name, values in self.times.items())
+
+
+def measure(title: str, pairs: Iterable[StereoImages], config: FrontendConfig) -> None:
+    watch, frontend = Watch(), Frontend(config)
+    more = replace(config.features, target=int(config.right_surplus * config.features.target))
+    left, right = FeatureExtractor(config.features), FeatureExtractor(more)
+    features = 0
+    pairs = list(pairs)
+    for images in pairs:
+        features += len(watch("WHOLE", frontend.process, images))
+        a = watch("left", left, images.left)
+        b = watch("right", right, images.right)
+        camera = images.stereo.camera
+        bounds = disparity_bounds(config.matching, camera.fx * images.stereo.baseline)
+        matches = watch("match", match_stereo, a, b, config.matching, bounds)
+        uv, u_right = a.uv[matches.left], b.uv[matches.right, 0]
+        watch("disparity", refine_disparity, images.left, images.right, uv, u_right, config.disparity)
+    height, width = pairs[0].left.shape
+    print(f"{title} {width}x{height}: {features / len(pairs):.0f} features with depth; ms: {watch.medians()}")
+
+
+def main() -> None:
+    cv2.setNumThreads(1)
+    config = FrontendConfig()
+    simulated = [f.images for f in simulated_frames("workshop_rig", 14, 3)]
+    measure("simulated", simulated, config)
+    measure("EuRoC", euroc_pairs(3), config)
+    measure("KITTI", kitti_pairs(3), config)
+
+
+if __name__ == "__main__":
+    main()
