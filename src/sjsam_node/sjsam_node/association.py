@@ -8,7 +8,7 @@ All ask for similar descriptors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,9 @@ class AssociationConfig(Config):
         0.999, "share of true pairs inside a chi-square gate", minimum=0.5, maximum=0.9999999
     )
     nearest_gate: float = parameter(0.3, "distance below which the nearest neighbour is taken", unit="m", minimum=0.0)
+    max_variance_factor: float = parameter(
+        16.0, "submaps too sure of themselves by up to this factor are matched all the same", minimum=1.0
+    )
     position_noise: float = parameter(
         0.005, "standard deviation added to each landmark when gating: submaps are linearised", unit="m", minimum=0.0
     )
@@ -133,16 +136,26 @@ def jointly_compatible(
     first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig
 ) -> Alignment:
     """The pairs left when the worst is dropped until all agree together with the joint covariance of both submaps."""
+    scale = 1.0
     while True:
         solved = _solve(first, second, pairs, prior, config)
-        bound = chi_square_bound(config.probability, max(solved.dof, 1))
-        outlier = solved.nis > chi_square_bound(config.probability, 3)
+        scale = min(max(scale, variance_factor(solved.nis)), config.max_variance_factor)
+        bound = scale * chi_square_bound(config.probability, max(solved.dof, 1))
+        outlier = solved.nis > scale * chi_square_bound(config.probability, 3)
         if len(pairs) == 0 or (solved.chi2 <= bound and not outlier.any()):
-            return solved.alignment(pairs)
+            return replace(solved.alignment(pairs), covariance=scale * solved.covariance)
         # Those that stand out together are dropped together, but never more than a tenth at once: bad ones spoil
         # good ones.
         count = max(1, min(int(outlier.sum()), len(pairs) // 10))
         pairs = np.delete(pairs, np.argsort(solved.nis)[-count:], axis=0)
+
+
+def variance_factor(nis: FloatArray) -> float:
+    """How much too sure of themselves covariances are, from normalised squared errors of 3 degrees of freedom each.
+
+    The median tells, so that false matches do not: where it is what it should be, or below, the factor is one.
+    """
+    return max(1.0, float(np.median(nis)) / chi_square_bound(0.5, 3)) if len(nis) >= 5 else 1.0
 
 
 def align(first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig) -> Alignment:

@@ -55,6 +55,10 @@ class ClosureConfig(Config):
     informative_sigma: float = parameter(
         0.5, "largest standard deviation of a relative position that can tell two places apart", unit="m", minimum=0.0
     )
+    drift: float = parameter(
+        0.01, "drift of odometry to expect beyond its covariance, per metre of way, one sigma", unit="m/m", minimum=0.0
+    )
+    drift_angle: float = parameter(0.003, "the same for rotation", unit="rad/m", minimum=0.0)
     ratio: float = parameter(
         0.9, "second best to best angle of descriptors, where no prior helps", minimum=0.1, maximum=1.0
     )
@@ -136,9 +140,11 @@ class LinkFinder:
         believed: list[Link] = []
         for old in [*near, *looks]:
             first, second = at_start(graph.records[old]), at_start(graph.records[new])
-            found, certain = self.judge(first, second, relative_pose(old, new), old, new)
+            prior, way = relative_pose(old, new), graph.way_between(old, new)
+            found, certain = self.judge(first, second, prior, way, old, new)
             if found is not None:
-                link = Link(old, new, found.pairs, found.T, found.covariance, True)
+                tension = 0.0 if certain or prior is None else self._tension(found, prior, 0.0)
+                link = Link(old, new, found.pairs, found.T, found.covariance, True, tension)
                 believed += [link] if certain else self._confirmed(graph, link)
         return believed
 
@@ -152,9 +158,12 @@ class LinkFinder:
         ranked = sorted((d, i) for i, d in distance.items() if d < self.config.proximity)
         return [i for _, i in ranked[: self.config.near_candidates]]
 
-    def judge(self, first: PointSet, second: PointSet, prior: Prior | None, *key: int) -> tuple[Alignment | None, bool]:
+    def judge(
+        self, first: PointSet, second: PointSet, prior: Prior | None, way: float, *key: int
+    ) -> tuple[Alignment | None, bool]:
         """The alignment of two submaps if geometry supports it, and whether the prior can vouch for it.
 
+        ``way`` is the length of the path between them, m: what the prior does not know is at least its drift.
         ``key`` seeds the random samples, so that the same pair is always judged alike.
         """
         informative = prior is not None and _sigma(prior.covariance) < self.config.informative_sigma
@@ -165,7 +174,7 @@ class LinkFinder:
         guess = self._by_looks(first, second, key)
         if guess is None or not self._supported(first, second, guess):
             return None, False
-        if prior is not None and not self._agrees(guess, prior):
+        if prior is not None and self._tension(guess, prior, way) > chi_square_bound(self.config.probability, 6):
             return None, False
         return guess, False
 
@@ -210,11 +219,12 @@ class LinkFinder:
         expected = min(_inside(first.points, low, high), _inside(moved, low, high))
         return len(matched) >= self.config.min_overlap * expected
 
-    def _agrees(self, found: Alignment, prior: Prior) -> bool:
+    def _tension(self, found: Alignment, prior: Prior, way: float) -> float:
+        """Normalised squared error of an alignment against the prior, which has drifted along the ``way`` (m)."""
         assert prior.covariance is not None
         error = boxminus(found.T, prior.T)
-        nis = error @ np.linalg.solve(prior.covariance + found.covariance, error)
-        return bool(nis < chi_square_bound(self.config.probability, 6))
+        drift = np.diag([(self.config.drift * way) ** 2] * 3 + [(self.config.drift_angle * way) ** 2] * 3)
+        return float(error @ np.linalg.solve(prior.covariance + found.covariance + drift, error))
 
     def _confirmed(self, graph: MapGraph, link: Link) -> list[Link]:
         """The link with those waiting that say the same, if together they are enough; otherwise it waits too."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sjsam_node.association import Prior
+from sjsam_node.association import Prior, variance_factor
 from sjsam_node.closures import prior_of_pair, relative_pose
 from sjsam_node.estimator import Assembled, Estimator, EstimatorConfig, local_residual, observation_nis
 from sjsam_node.incremental import Front
@@ -171,7 +171,9 @@ class Joiner:
         for link in links:
             graph.add_link(link)
         after = self.batch(newest)
-        excess = self._excess(after.cost - cost, dof, graph.component(newest))
+        # Closures that contradict the covariances, but not the drift to expect, bend the map once for all of them.
+        tension = max(link.tension for link in links)
+        excess = self._excess(after.cost - cost - tension, dof, graph.component(newest))
         if excess <= 0.0:
             return True
         graph.restore(before)
@@ -203,11 +205,19 @@ class Joiner:
 
     def _outliers(self, component: int) -> set[int]:
         """The worst observation of each record, where it is beyond its gate."""
-        assembled, worst = self._joined[component].assembled, set()
-        gate = chi_square_bound(self.config.outlier_probability, 3)
-        for i, reduced in zip(assembled.records, assembled.reduced, strict=True):
-            record = self.graph.records[i]
-            nis = observation_nis(local_residual(self.graph, record, reduced), reduced.information)
-            if len(nis) and nis.max() > gate:
-                worst.add(int(record.observations[reduced.shared[nis.argmax()]]))
-        return worst
+        assembled = self._joined[component].assembled
+        found = [
+            (
+                i,
+                reduced,
+                observation_nis(local_residual(self.graph, self.graph.records[i], reduced), reduced.information),
+            )
+            for i, reduced in zip(assembled.records, assembled.reduced, strict=True)
+        ]
+        factor = variance_factor(np.concatenate([nis for _, _, nis in found]))
+        gate = factor * chi_square_bound(self.config.outlier_probability, 3)
+        return {
+            int(self.graph.records[i].observations[reduced.shared[nis.argmax()]])
+            for i, reduced, nis in found
+            if nis.max(initial=0.0) > gate
+        }

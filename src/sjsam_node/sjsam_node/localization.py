@@ -55,7 +55,7 @@ class Localizer:
         best, most = self._pose, 0
         for record in self._candidates(submap):
             link, certain = self._map.finder.judge(
-                at_start(self._map.graph.records[record]), seen, self._prior(record), record
+                at_start(self._map.graph.records[record]), seen, self._prior(record), 0.0, record
             )
             if link is not None and len(link.pairs) > most and (certain or self._pose is None):
                 anchor = self._map.start_pose(record)

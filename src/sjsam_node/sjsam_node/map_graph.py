@@ -57,6 +57,7 @@ class Link:
     T: FloatArray
     covariance: FloatArray
     is_closure: bool = False
+    tension: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +82,7 @@ class MapGraph:
     _seen_in: dict[int, set[int]] = field(default_factory=dict)
     _members: dict[int, list[int]] = field(default_factory=dict)
     _ending_at: dict[int, int] = field(default_factory=dict)
+    _way: dict[int, float] = field(default_factory=dict)
 
     def append(self, submap: Submap, session: int, start: int | None, guess: FloatArray) -> Record:
         """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own."""
@@ -88,6 +90,7 @@ class MapGraph:
             start = self._new_node(guess, len(self.poses))
         T = self.poses[start]
         end = self._new_node(T @ submap.end_pose, int(self.component_of[start]))
+        self._way[end] = self._way.setdefault(start, 0.0) + float(np.linalg.norm(submap.end_pose[:3, 3]))
         record = Record(submap, session, start, end, len(self.points))
         self.points = np.concatenate([self.points, submap.landmarks @ T[:3, :3].T + T[:3, 3]])
         self.landmark_of = np.concatenate([self.landmark_of, record.observations])
@@ -111,6 +114,12 @@ class MapGraph:
         """Records of a component, ascending."""
         starts = np.array([r.start for r in self.records], dtype=np.int64)
         return np.nonzero(self.component_of[starts] == component)[0].tolist()
+
+    def way_between(self, first: int, second: int) -> float:
+        """Length of the way that an agent went between two records, m; of both ways where they belong to two runs."""
+        a, b = self.records[first], self.records[second]
+        ways = self._way[a.start], self._way[b.start]
+        return abs(ways[1] - ways[0]) if a.key[:2] == b.key[:2] else sum(ways)
 
     def size(self, component: int) -> int:
         """Number of nodes of a component."""

@@ -94,6 +94,7 @@ def _link_arrays(name: str, links: list[Link]) -> Arrays:
             [[k.first, k.second, len(k.pairs), k.is_closure] for k in links], dtype=np.int64
         ).reshape(-1, 4),
         f"{name}/pairs": np.concatenate(pairs) if pairs else np.empty((0, 2), dtype=np.int64),
+        f"{name}/tension": np.array([link.tension for link in links], dtype=np.float64),
         f"{name}/T": np.array([link.T for link in links]).reshape(-1, 4, 4),
         f"{name}/covariance": np.array([link.covariance for link in links]).reshape(-1, 6, 6),
     }
@@ -103,7 +104,15 @@ def _links(name: str, arrays: Arrays) -> list[Link]:
     ends = arrays[f"{name}/ends"]
     pairs = np.split(arrays[f"{name}/pairs"], np.cumsum(ends[:, 2])[:-1]) if len(ends) else []
     return [
-        Link(int(first), int(second), pairs[i], arrays[f"{name}/T"][i], arrays[f"{name}/covariance"][i], bool(closure))
+        Link(
+            int(first),
+            int(second),
+            pairs[i],
+            arrays[f"{name}/T"][i],
+            arrays[f"{name}/covariance"][i],
+            bool(closure),
+            float(arrays[f"{name}/tension"][i]),
+        )
         for i, (first, second, _, closure) in enumerate(ends)
     ]
 

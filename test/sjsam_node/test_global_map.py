@@ -1,0 +1,235 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from judging import ate, chain_error, errors, join
+from submap_world import Agent, Sensor, World, circle, path_through, pose, ring_world, room
+
+from sjsam_node.global_map import GlobalMap, GlobalMapConfig
+from sjsam_node.joiner import JoinerConfig
+from slam_core.geometry import boxminus, invert_transform
+from slam_core.types import Submap
+
+
+def ring_agent(rng: np.random.Generator, turns: float = 1.25, radius: float = 4.0, name: str = "a") -> Agent:
+    return Agent(ring_world(radius, rng, 12.0), circle(radius, turns), rng, name)
+
+
+def test_a_loop_closes_and_the_landmarks_of_the_second_lap_are_those_of_the_first(rng: np.random.Generator) -> None:
+    agent = ring_agent(rng)
+    submaps = agent.submaps()
+    joined, reports = join(submaps)
+    e, _ = errors(joined, agent)
+    assert any(r.closures for r in reports)
+    assert ate(e) < 0.2
+    assert np.linalg.norm(e[-1, :3]) < 0.1 < chain_error(agent, submaps)
+    seen = np.unique(np.concatenate(agent.seen))
+    assert len(joined.landmarks().ids) <= 1.02 * len(seen)
+
+
+def test_landmark_count_stays_bounded_over_laps(rng: np.random.Generator) -> None:
+    agent = ring_agent(rng, turns=3.0, radius=3.0)
+    joined, _ = join(agent.submaps())
+    assert len(joined.landmarks().ids) <= 1.05 * len(np.unique(np.concatenate(agent.seen)))
+
+
+def test_joined_covariances_are_honest() -> None:
+    nees, landmark_nees = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        agent = ring_agent(rng, radius=3.0)
+        joined, _ = join(agent.submaps())
+        _, values = errors(joined, agent)
+        nees.append(values.mean() / 6.0)
+        found = joined.landmarks()
+        world = (agent.world.points - agent.path[0][:3, 3]) @ agent.path[0][:3, :3]
+        e = world[np.argmax(found.descriptors @ agent.world.descriptors.T, axis=1)] - found.positions
+        landmark_nees.append(np.einsum("ni,ni->n", e, np.linalg.solve(found.covariances, e[..., None])[..., 0]).mean() / 3.0)
+    # Poses of one run are correlated: each run's mean is a draw with a spread of about 0.35.
+    assert 0.8 < np.mean(nees) < 1.25
+    assert 0.75 < np.mean(landmark_nees) < 1.3
+
+
+def test_incremental_joining_ends_at_the_batch_optimum(rng: np.random.Generator) -> None:
+    submaps = ring_agent(rng, turns=1.0).submaps()
+    batch, _ = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=10_000))))
+    step_by_step, reports = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5))))
+    assert sum(r.update == "incremental" for r in reports) > 10
+    last = step_by_step.graph.poses[-1]
+    assert np.abs(boxminus(last, batch.graph.poses[-1])).max() < 1e-3  # before anything is joined in batch again
+    a, b = step_by_step.trajectory("a"), batch.trajectory("a")
+    assert max(np.abs(boxminus(p.T, q.T)).max() for p, q in zip(a, b, strict=True)) < 1e-6
+    assert max(np.abs(p.covariance - q.covariance).max() for p, q in zip(a, b, strict=True)) < 1e-6
+
+
+def test_incremental_chi2_follows_the_batch(rng: np.random.Generator) -> None:
+    submaps = ring_agent(rng, turns=0.7).submaps()
+    step_by_step, reports = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5))))
+    assert reports[-1].update == "incremental"
+    incremental = reports[-1].chi2
+    step_by_step.settle()
+    component = int(step_by_step.graph.component_of[0])
+    assert incremental == pytest.approx(step_by_step.joiner.batch(len(submaps) - 1).cost, rel=1e-3)
+    assert step_by_step.graph.size(component) == len(submaps) + 1
+
+
+def building(rng: np.random.Generator, alike: bool) -> tuple[World, list[tuple[float, float]]]:
+    """Two rooms at the ends of a corridor, which look alike to the last descriptor or not, and a walk through both."""
+    first = room((0.0, 0.0), (4.0, 4.0), 90, rng)
+    second = first + [14.0, 0.0, 0.0] if alike else room((14.0, 0.0), (4.0, 4.0), 90, rng)
+    corridor = np.stack([rng.uniform(2, 12, 120), rng.choice([-1.2, 1.2], 120), rng.uniform(-1, 1.5, 120)], axis=1)
+    world = World.random(np.concatenate([first, second, corridor]), rng)
+    if alike:
+        world.descriptors[90:180] = world.descriptors[:90]
+    walk = [(-1.0, -1.0), (1.0, -1.0), (1.0, 0.0), (13.0, 0.0), (13.0, -1.0), (15.0, -1.0), (15.0, 1.0), (13.0, 1.0)]
+    return world, walk
+
+
+def test_two_rooms_that_look_alike_are_not_joined(rng: np.random.Generator) -> None:
+    world, walk = building(rng, alike=True)
+    agent = Agent(world, path_through(walk), rng, "a", Sensor(max_range=3.5))
+    submaps = agent.submaps()
+    joined, reports = join(submaps)
+    e, _ = errors(joined, agent)
+    assert ate(e) < 0.25
+    first, second = joined.landmarks().positions[:, 0] < 5.0, joined.landmarks().positions[:, 0] > 9.0
+    assert first.sum() > 40
+    assert second.sum() > 40
+
+
+def agents_in_one_ring(rng: np.random.Generator) -> tuple[Agent, Agent]:
+    world = ring_world(4.0, rng, 12.0)
+    path = circle(4.0, 1.0)
+    first = Agent(world, path[:61], rng, "a")
+    return first, Agent(world, path[45:], rng, "b", stamp_ns=5_000_000_000)
+
+
+@pytest.mark.parametrize("order", ["ab", "ba", "alternating"])
+def test_agents_are_joined_when_they_share_a_place_in_any_order(order: str, rng: np.random.Generator) -> None:
+    a, b = agents_in_one_ring(rng)
+    A, B = a.submaps(), b.submaps()
+    mixed = [s for pair in zip(A, B, strict=False) for s in pair] + A[len(B) :] + B[len(A) :]
+    joined, _ = join({"ab": A + B, "ba": B + A, "alternating": mixed}[order])
+    assert joined.components == 1
+    for agent in (a, b):
+        e, _ = errors(joined, agent, origin=a)
+        assert ate(e) < 0.15
+
+
+def test_joining_does_not_depend_on_the_order_of_agents(rng: np.random.Generator) -> None:
+    a, b = agents_in_one_ring(rng)
+    A, B = a.submaps(), b.submaps()
+    one, _ = join(A + B)
+    other, _ = join(B + A)
+    assert one.joiner.cost(0) == pytest.approx(other.joiner.cost(0), rel=0.02)
+    for name in "ab":
+        gap = [np.abs(boxminus(p.T, q.T)).max() for p, q in zip(one.trajectory(name), other.trajectory(name), strict=True)]
+        assert max(gap) < 0.02
+
+
+def test_agents_that_never_meet_stay_apart_and_are_flagged(rng: np.random.Generator) -> None:
+    a = Agent(ring_world(4.0, rng, 12.0), circle(4.0, 0.3), rng, "a")
+    b = Agent(ring_world(4.0, rng, 12.0), circle(4.0, 0.3), rng, "b")
+    joined, _ = join(a.submaps() + b.submaps())
+    assert joined.components == 2
+    assert joined.trajectory("b")[-1].covariance[0, 0] > 50.0**2 > joined.trajectory("a")[-1].covariance[0, 0]
+
+
+def test_a_restarted_agent_is_found_again(rng: np.random.Generator) -> None:
+    world = ring_world(4.0, rng, 12.0)
+    path = circle(4.0, 1.0)
+    first, again = Agent(world, path[:49], rng, "a"), Agent(world, path[20:69], rng, "a", stamp_ns=10**11)
+    joined, reports = join(first.submaps() + again.submaps())
+    assert all(r.accepted for r in reports)
+    assert joined.components == 1
+    T = invert_transform(path[0])
+    last = joined.trajectory("a")[-1]
+    assert np.linalg.norm((T @ path[68] - last.T)[:3, 3]) < 0.2
+
+
+def test_after_a_loss_the_new_stretch_is_tied_to_the_map_when_a_place_is_recognised(rng: np.random.Generator) -> None:
+    agent = ring_agent(rng, turns=1.5)
+    submaps = agent.submaps()
+    lost = [replace(s, follows_previous=False) if s.index == 12 else s for s in submaps]
+    joined, reports = join(lost)
+    assert max(r.components for r in reports) == 2
+    assert reports[-1].components == 1
+    e, _ = errors(joined, agent)
+    assert ate(e) < 0.15
+
+
+def test_what_cannot_be_joined_is_refused_and_changes_nothing(rng: np.random.Generator) -> None:
+    submaps = ring_agent(rng, turns=0.2).submaps()
+    joined, _ = join(submaps)
+    before = joined.graph.poses.copy()
+    bad = submaps[0].covariance.copy()
+    bad[0, 0] = -1.0
+    nan = submaps[0].landmarks.copy()
+    nan[0] = np.nan
+    later = 10**12
+    for fault in (
+        replace(submaps[0], covariance=bad, start_stamp_ns=later),
+        replace(submaps[0], landmarks=nan, start_stamp_ns=later),
+        replace(submaps[0], descriptors=submaps[0].descriptors[:, :64], start_stamp_ns=later),
+        submaps[1],
+    ):
+        report = joined.add(fault)
+        assert not report.accepted
+        assert report.reason
+    assert np.array_equal(joined.graph.poses, before)
+    assert sum(joined.counters.counts.values()) == 4
+
+
+def test_false_matches_are_taken_back(rng: np.random.Generator) -> None:
+    """A tenth of the landmarks carry another landmark's descriptor and id."""
+    agent = ring_agent(rng)
+    submaps = agent.submaps()
+    clean, _ = join(submaps)
+    spoiled, _ = join(spoil(submaps, 0.1, rng))
+    e_clean, _ = errors(clean, agent)
+    e_spoiled, _ = errors(spoiled, agent)
+    assert ate(e_spoiled) < 2.0 * ate(e_clean)
+
+
+def spoil(submaps: list[Submap], share: float, rng: np.random.Generator) -> list[Submap]:
+    out = []
+    for submap in submaps:
+        wrong = rng.choice(len(submap.landmarks), int(share * len(submap.landmarks)), replace=False)
+        turned = np.roll(wrong, 1)
+        descriptors, ids = submap.descriptors.copy(), submap.landmark_ids.copy()
+        descriptors[wrong], ids[wrong] = descriptors[turned], ids[turned]
+        out.append(replace(submap, descriptors=descriptors, landmark_ids=ids))
+    return out
+
+
+def test_an_empty_submap_is_joined_by_its_odometry(rng: np.random.Generator) -> None:
+    submaps = ring_agent(rng, turns=0.3).submaps()
+    s = submaps[1]
+    empty = replace(
+        s, landmarks=s.landmarks[:0], covariance=s.covariance[:6, :6], landmark_ids=s.landmark_ids[:0],
+        sightings=s.sightings[:0], descriptors=s.descriptors[:0],
+    )  # fmt: skip
+    joined, reports = join([submaps[0], empty, *submaps[2:]])
+    assert all(r.accepted for r in reports)
+    assert joined.components == 1
+
+
+def test_map_to_odom_carries_the_odometry_onto_the_map(rng: np.random.Generator) -> None:
+    agent = ring_agent(rng)
+    submaps = agent.submaps()
+    joined, _ = join(submaps)
+    T_odom = np.eye(4)
+    for submap in submaps:
+        T_odom = T_odom @ submap.end_pose
+    T_map = invert_transform(agent.path[0]) @ agent.true_start(len(submaps))
+    assert np.linalg.norm((joined.map_to_odom("a") @ T_odom - T_map)[:3, 3]) < 0.1
+
+
+def test_an_empty_map_answers() -> None:
+    empty = GlobalMap()
+    assert empty.trajectory() == {}
+    assert len(empty.landmarks().ids) == 0
+    assert np.array_equal(empty.map_to_odom("a"), np.eye(4))
+    assert pose(0.0, 0.0, 0.0).shape == (4, 4)
