@@ -15,7 +15,7 @@ from slam_bringup.figures import save_png
 from slam_core.calibration.board import Board, parse_board
 from slam_core.calibration.bundle import BundleResult
 from slam_core.calibration.camera_info import CameraInfoFile
-from slam_core.calibration.lens import DISTORTION_PARAMETERS
+from slam_core.calibration.lens import DISTORTION_PARAMETERS, parameter_names
 from slam_core.calibration.pictures import BoardViews, find_views, pair_pictures
 from slam_core.calibration.rectification import stereo_infos
 from slam_core.calibration.report import (
@@ -68,6 +68,8 @@ def _lenses(model: str, cameras: int) -> list[str]:
     lenses = lenses * cameras if len(lenses) == 1 else lenses
     if len(lenses) != cameras:
         raise ValueError(f"--model names {len(lenses)} lens models for {cameras} cameras: '{model}'")
+    for lens in lenses:
+        parameter_names(lens)
     return lenses
 
 
