@@ -62,9 +62,8 @@ def compare(frames: list[TrueFrame], kind: str) -> None:
         good = distance[np.arange(len(a)), best] < 2.0
         right, matched = right + (mutual & good).sum(), matched + mutual.sum()
     n = len(frames) - 1
-    print(
-        f"{kind:10s}{np.mean([len(s[0]) for s in sets]):12.0f}{np.mean(repeated):14.3f}{right / n:15.0f}{right / matched:11.3f}"
-    )
+    found = np.mean([len(s[0]) for s in sets])
+    print(f"{kind:10s}{found:12.0f}{np.mean(repeated):14.3f}{right / n:15.0f}{right / matched:11.3f}")
 
 
 def main() -> None:

@@ -1,0 +1,182 @@
+"""``stereo_driver`` and ``feature_extractor`` as real processes over real topics: the features of the offline front
+end.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from sensor_msgs.msg import CameraInfo as InfoMessage  # noqa: E402
+from sensor_msgs.msg import Image, PointCloud2  # noqa: E402
+from sensor_msgs.srv import SetCameraInfo  # noqa: E402
+
+from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info  # noqa: E402
+from slam_core.camera import Camera, CameraInfo  # noqa: E402
+from slam_core.messages import (  # noqa: E402
+    FEATURE_TOPICS,
+    camera_info_message,
+    features_from_messages,
+    header_message,
+    image_from_message,
+    image_message,
+)
+from slam_core.ros import RosTypes, sensor_qos  # noqa: E402
+from slam_core.types import StereoImages  # noqa: E402
+from stereo_frontend.frontend import Frontend, FrontendConfig  # noqa: E402
+from stereo_frontend.rectify import StereoRectifier  # noqa: E402
+
+pytestmark = pytest.mark.ros
+
+LENS = Camera(320, 240, 198.0, 199.0, 158.0, 123.0, "plumb_bob", (-0.05, 0.01, 1e-4, 0.0, 0.0))
+P = np.array([[200.0, 0, 160, 0], [0, 200.0, 120, 0], [0, 0, 1, 0]])
+INFOS = {"left": CameraInfo(LENS, P=P), "right": CameraInfo(LENS, P=P - np.array([[0, 0, 0, 24.0], [0] * 4, [0] * 4]))}
+SIDES = ("left", "right")
+
+
+class Probe:
+    """A node that sends raw pairs and collects what comes of them."""
+
+    def __init__(self, context: Any) -> None:
+        self.node = rclpy.create_node("probe", context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
+        self.types = RosTypes()
+        self.received: dict[str, list[Any]] = {}
+        self.senders: dict[str, Any] = {}
+
+    def listen(self, topic: str, message_type: Any) -> None:
+        self.received[topic] = []
+        self.node.create_subscription(message_type, topic, self.received[topic].append, sensor_qos(50))
+
+    def send(self, topic: str, message: Any) -> None:
+        if topic not in self.senders:
+            self.senders[topic] = self.node.create_publisher(type(message), topic, sensor_qos(50))
+            self.wait(lambda: self.senders[topic].get_subscription_count() > 0, f"nobody listens to {topic}")
+        self.senders[topic].publish(message)
+
+    def send_pair(self, stamp: int, pair: StereoImages, encoding: str = "mono8", infos: bool = True) -> None:
+        for side, image in zip(SIDES, (pair.left, pair.right), strict=True):
+            header = header_message(self.types, stamp, f"stereo_{side}_optical_frame")
+            if infos:
+                self.send(f"stereo/{side}/camera_info", camera_info_message(self.types, header, INFOS[side]))
+            message = image_message(self.types, header, image)
+            message.encoding = encoding
+            self.send(f"stereo/{side}/image_raw", message)
+
+    def wait(self, condition: Callable[[], bool], why: str, seconds: float = 60.0) -> None:
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, why
+            self.executor.spin_once(timeout_sec=0.05)
+
+
+@pytest.fixture
+def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[Probe]:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(90 + os.getpid() % 60))
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
+    probe = Probe(context)
+    yield probe
+    probe.executor.shutdown()
+    probe.node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+@pytest.fixture
+def start(probe: Probe) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts a node of the package with parameters; all end cleanly."""
+    running: list[subprocess.Popen[str]] = []
+
+    def run(module: str, **parameters: object) -> subprocess.Popen[str]:
+        given = [a for name, value in parameters.items() for a in ("-p", f"{name}:={value}")]
+        code = f"from stereo_frontend.{module} import main; main()"
+        command = [sys.executable, "-c", code, "--ros-args", *given]
+        env = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        running.append(subprocess.Popen(command, env=env, stderr=subprocess.PIPE, text=True))
+        return running[-1]
+
+    yield run
+    for process in running:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        process.communicate(timeout=30)
+
+
+def test_raw_pairs_become_the_features_of_the_offline_front_end(probe, start, stereo_pair):
+    for topic, kind in zip(FEATURE_TOPICS, (PointCloud2, Image, InfoMessage), strict=True):
+        probe.listen(topic, kind)
+    probe.listen("features/image", Image)
+    start("driver_node")
+    start("node")
+    pairs = [stereo_pair(seed=s) for s in (1, 2)]
+    probe.wait(lambda: probe.node.count_subscribers("stereo/left/image_rect") > 0, "no feature extractor")
+    for k, pair in enumerate(pairs):
+        probe.send_pair(1_000_000_000 + k * 100_000_000, pair)
+    probe.send_pair(1_200_000_000, pairs[0], encoding="nonsense")
+    probe.send_pair(1_300_000_000, pairs[0])
+    outputs = [probe.received[t] for t in FEATURE_TOPICS]
+    probe.wait(lambda: all(len(o) == 3 for o in outputs) and bool(probe.received["features/image"]), "no features")
+    rectifier, frontend = StereoRectifier(INFOS["left"], INFOS["right"]), Frontend(FrontendConfig())
+    for k, pair in enumerate([*pairs, pairs[0]]):
+        expected = frontend.process(rectifier(0, pair.left, pair.right))
+        got = features_from_messages(*(o[k] for o in outputs))
+        assert len(got) == len(expected) > 50
+        for field in ("xyz", "uv", "sigma_uv", "sigma_depth", "descriptors", "source"):
+            np.testing.assert_array_equal(getattr(got, field), getattr(expected, field))
+    assert image_from_message(probe.received["features/image"][0]).shape == (240, 320, 3)
+
+
+def test_a_folder_of_images_is_played_with_its_calibration(probe, start, stereo_pair, tmp_path: Path):
+    pair = stereo_pair()
+    for side, image in zip(SIDES, (pair.left, pair.right), strict=True):
+        (tmp_path / side).mkdir()
+        for name in ("1000000000000000000", "1000000000100000000"):
+            cv2.imwrite(str(tmp_path / side / f"{name}.png"), image)
+        CameraInfoFile(INFOS[side], side).write(tmp_path / f"{side}.yaml")
+        probe.listen(f"stereo/{side}/image_rect", Image)
+    probe.listen("stereo/left/camera_info", InfoMessage)
+    files = {f"{side}_info": tmp_path / f"{side}.yaml" for side in SIDES}
+    start("driver_node", source="folder", path=tmp_path, rate=0.5, **files)
+    probe.wait(lambda: all(probe.received[f"stereo/{s}/image_rect"] for s in SIDES), "no rectified images")
+    probe.wait(lambda: bool(probe.received["stereo/left/camera_info"]), "no camera info")
+    rectifier = StereoRectifier(INFOS["left"], INFOS["right"])
+    message = probe.received["stereo/left/image_rect"][0]
+    np.testing.assert_array_equal(image_from_message(message), rectifier(0, pair.left, pair.right).left)
+    assert message.header.stamp.sec == 1_000_000_000
+
+
+def test_a_new_calibration_is_written_and_used(probe, start, tmp_path: Path):
+    paths = {side: tmp_path / f"{side}.yaml" for side in SIDES}
+    for side in SIDES:
+        CameraInfoFile(INFOS[side], side).write(paths[side])
+    start("driver_node", **{f"{side}_info": paths[side] for side in SIDES})
+    client = probe.node.create_client(SetCameraInfo, "stereo/left/set_camera_info")
+    probe.wait(client.service_is_ready, "no set_camera_info service")
+    new = CameraInfo(Camera(320, 240, 190.0, 190.0, 158.0, 123.0), P=P)
+    header = header_message(probe.types, 0, "stereo_left_optical_frame")
+    request = SetCameraInfo.Request(camera_info=camera_info_message(probe.types, header, new))
+    future = client.call_async(request)
+    probe.wait(future.done, "no answer")
+    assert future.result().success, future.result().status_message
+    assert read_camera_info(paths["left"]).info.camera.fx == 190.0
+
+
+def test_a_source_without_calibration_does_not_start(start, tmp_path: Path):
+    process = start("driver_node", source="folder", path=tmp_path)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "left_info" in errors
