@@ -1,15 +1,15 @@
 """EKF-SLAM in 2D on Lost in the Woods (Barfoot, UTIAS): a wheeled robot among 17 tubes, 12 609 steps at 10 Hz.
 
 Prints the RMSE of pose and landmarks against motion capture, for known and unknown association, beside dead reckoning.
-The wheels' motion is 4.5 degrees off the laser's axis, which the data set leaves uncalibrated: "calibrated" takes that
-angle from the first 1000 steps. The filter's noise is twice the published one, which covers white noise only.
+The wheels' motion is 4.5 degrees off the laser's axis, a systematic error that white noise does not cover: the filter's
+measurement noise is twice the published one, and NEES is still far above one.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -56,18 +56,6 @@ def _laser_motion(forward: float, angle: float, d: float) -> np.ndarray:
     return np.array([*step, angle])
 
 
-def calibrated(woods: Woods, steps: int = 1000) -> Woods:
-    """The same with the motions turned by the mean angle between the wheels' direction and the true one."""
-    true = np.array(
-        [turn(-a[2]) @ (b - a)[:2] for a, b in zip(woods.truth[:steps], woods.truth[1:steps], strict=False)]
-    )
-    said = woods.motions[1:steps, :2]
-    angle = np.arctan2(np.sum(said[:, 0] * true[:, 1] - said[:, 1] * true[:, 0]), np.sum(said * true))
-    motions = woods.motions.copy()
-    motions[:, :2] = motions[:, :2] @ turn(float(angle)).T
-    return replace(woods, motions=motions)
-
-
 def dead_reckoning(woods: Woods) -> np.ndarray:
     """Poses (n, 3) from the wheels alone."""
     poses = [woods.truth[0]]
@@ -106,14 +94,13 @@ def landmark_rmse(woods: Woods, ekf: PlanarEkf) -> float:
 
 
 def main() -> None:
-    raw = load(DATA / "utias_aer1513" / "dataset2.mat")
+    woods = load(DATA / "utias_aer1513" / "dataset2.mat")
     print(f"{'filter':36} {'pose m':>7} {'deg':>6} {'tubes':>6} {'RMSE m':>7} {'NEES/3':>7} {'wrong':>7} {'s':>6}")
-    for name, woods in (("raw", raw), ("calibrated", calibrated(raw))):
-        reckoned = dead_reckoning(woods)
-        print(f"{name + ', dead reckoning':36} {_rmse(woods, reckoned):7.3f} {_heading_deg(woods, reckoned):6.2f}")
-        for method in ("known", "mahalanobis", "jcbb"):
-            report(f"{name}, {method}", woods, method, "invariant")
-        report(f"{name}, known, standard error", woods, "known", "standard")
+    reckoned = dead_reckoning(woods)
+    print(f"{'dead reckoning':36} {_rmse(woods, reckoned):7.3f} {_heading_deg(woods, reckoned):6.2f}")
+    for method in ("known", "mahalanobis", "jcbb"):
+        report(method, woods, method, "invariant")
+    report("known, standard error", woods, "known", "standard")
 
 
 def report(name: str, woods: Woods, method: str, error: str) -> None:

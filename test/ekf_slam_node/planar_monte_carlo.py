@@ -11,11 +11,21 @@ from slam_core.geometry import FloatArray
 MOTION_COVARIANCE = np.diag([0.02, 0.01, 0.01]) ** 2
 
 
+def scattered(rng: np.random.Generator, amount: int, spacing: float = 0.8) -> FloatArray:
+    """Landmarks (n, 2) around the loop, no two closer than ``spacing``: closer ones no association could tell apart."""
+    points = np.zeros((0, 2))
+    while len(points) < amount:
+        point = rng.uniform(-6.0, 6.0, 2) + np.array([0.0, 3.0])
+        if not len(points) or np.linalg.norm(points - point, axis=1).min() > spacing:
+            points = np.vstack([points, point])
+    return points
+
+
 def drive(
     rng: np.random.Generator, config: PlanarConfig, steps: int = 50, reach: float = 6.0, landmarks: int = 40
 ) -> tuple[list[FloatArray], list[FloatArray], FloatArray, list[np.ndarray], list[FloatArray]]:
     """Truth (steps, 3), noisy motions, landmarks (n, 2), their indices seen at each step, and the measurements."""
-    world = rng.uniform(-6.0, 6.0, (landmarks, 2)) + [0.0, 3.0]
+    world = scattered(rng, landmarks)
     truth, motions, seen, measured = [np.zeros(3)], [], [], []
     for k in range(steps):
         if k:
@@ -25,7 +35,7 @@ def drive(
         z, _, _ = range_bearing(truth[-1], world)
         visible = np.flatnonzero((z[:, 0] < reach) & (np.abs(z[:, 1]) < np.radians(100)) & (z[:, 0] > 0.3))
         seen.append(visible)
-        noise = rng.standard_normal((len(visible), 2)) * [config.sigma_range, config.sigma_bearing]
+        noise = rng.standard_normal((len(visible), 2)) * np.array([config.sigma_range, config.sigma_bearing])
         measured.append(z[visible] + noise)
     return truth, motions, world, seen, measured
 
