@@ -103,6 +103,10 @@ class BagPlayerNode(Node):
             self._finish()
         except ValueError as error:
             self.get_logger().error(str(error))
+        except Exception:
+            # After SIGINT the context is gone before the executor has told us to stop.
+            if rclpy.ok():
+                raise
         finally:
             if not self._stop.is_set():
                 rclpy.try_shutdown()

@@ -5,18 +5,19 @@ private domain -> nodes ready and connected -> recorder -> player -> input has e
 
 from __future__ import annotations
 
+import importlib
 import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from slam_bringup.configuration import SystemConfig
 from slam_bringup.node_arguments import ros_arguments
 from slam_bringup.node_graph import NodeGraph, plan_nodes
 from slam_bringup.processes import NodeCommand, NodeGroup, PrivateDomain, ament_prefixes, node_environment
 from slam_bringup.sensor_bag import SensorBag
-from slam_bringup.supervisor_node import Supervisor
 
 START_TIMEOUT_S = 180.0
 """A cold start compiles kernels."""
@@ -78,7 +79,7 @@ def run_nodes(
     shutil.rmtree(out / "map", ignore_errors=True)
     with PrivateDomain() as domain:
         environment = node_environment(domain, fastdds_profile())
-        with NodeGroup(environment, out / "logs") as group, Supervisor(environment, group.check) as supervisor:
+        with NodeGroup(environment, out / "logs") as group, _supervisor(environment, group) as supervisor:
             run = _Choreography(group, supervisor, graph, out)
             run.start_nodes()
             started = time.monotonic()
@@ -90,6 +91,15 @@ def run_nodes(
     return OnlineRun(out / "result.mcap", out / "map", diagnostics, group.exit_codes, wall_s)
 
 
+def _supervisor(environment: dict[str, str], group: NodeGroup) -> Any:
+    """The node that watches the others. ROS is imported here and not before, so that all else works without it."""
+    try:
+        module = importlib.import_module("slam_bringup.supervisor_node")
+    except ImportError as error:
+        raise ValueError(f"the nodes need ROS 2 Jazzy ({error}): source an installation, or use ./slam") from error
+    return module.Supervisor(environment, group.check)
+
+
 def fastdds_profile() -> Path | None:
     """The Fast DDS profile of this package: installed, or in the source tree."""
     folders = [Path(p) / "share/slam_bringup" for p in ament_prefixes()] + [Path(__file__).resolve().parent.parent]
@@ -99,7 +109,7 @@ def fastdds_profile() -> Path | None:
 class _Choreography:
     """The steps of a run, in the order of its methods."""
 
-    def __init__(self, group: NodeGroup, supervisor: Supervisor, graph: NodeGraph, out: Path) -> None:
+    def __init__(self, group: NodeGroup, supervisor: Any, graph: NodeGraph, out: Path) -> None:
         self._group = group
         self._supervisor = supervisor
         self._graph = graph
@@ -160,7 +170,8 @@ class _Choreography:
 
     def _all_joined(self) -> bool:
         values = self._supervisor.diagnostics.get(_SJSAM, {})
-        return sum(int(values.get(key, "0")) for key in ("submaps", "rejected")) >= self._supervisor.submaps
+        joined = sum(int(values.get(key, "0")) for key in ("submaps", "rejected"))
+        return joined >= int(self._supervisor.submaps)
 
 
 def unclean_ends(run: OnlineRun) -> list[str]:

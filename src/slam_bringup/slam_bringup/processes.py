@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, NoReturn
 
 _MODULES = {
     ("stereo_frontend", "stereo_driver"): "stereo_frontend.driver_node",
@@ -53,6 +53,13 @@ def find_executable(package: str, executable: str, prefixes: Sequence[str] | Non
         raise ValueError(f"no executable '{executable}' in package '{package}'")
     module = _MODULES[package, executable]
     return [sys.executable, "-c", f"from {module} import main; main()"]
+
+
+def become_node(package: str, executable: str, arguments: Sequence[str]) -> NoReturn:
+    """Replace this process by a node, as ``ros2 run`` does: signals and exit code are the node's own."""
+    command = [*find_executable(package, executable), *arguments]
+    sys.stdout.flush()
+    os.execv(command[0], command)
 
 
 def ament_prefixes() -> list[str]:
@@ -147,7 +154,7 @@ class NodeProcess:
         """Ask the node to end (SIGINT), insist after ten seconds; returns the exit code."""
         self.interrupt()
         try:
-            return self.process.wait(_STOP_AFTER_S)
+            return int(self.process.wait(_STOP_AFTER_S))
         except subprocess.TimeoutExpired:
             self.process.kill()
             return self.process.wait()

@@ -9,7 +9,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from slam_bringup.configuration import MAPPERS, MODES, ODOMETRIES, choose, load_system_config
+from slam_bringup.online_run import run_nodes
 from slam_bringup.output import write_results
+from slam_bringup.recorded_run import collect
 from slam_bringup.sensor_bag import SensorBag
 from slam_bringup.summary_table import summary_table
 
@@ -26,12 +28,6 @@ def command(
     bag: Path, output: Path, rate: float, mode: str | None, mapper: str, odometry: str, config: Path | None
 ) -> None:
     """Map BAG with the nodes of the workspace: starts them, plays the bag, and writes what ``slam run`` does."""
-    try:
-        from slam_bringup.online_run import run_nodes
-    except ImportError as error:
-        raise ValueError(f"the nodes need ROS 2 Jazzy ({error}): source an installation, or use ./slam") from error
-    from slam_bringup.recorded_run import collect
-
     with SensorBag(bag) as opened:
         mode = mode or ("stereo" if opened.count(opened.agents[0], "left") else "tof")
         frames = sum(opened.count(agent, "depth" if mode == "tof" else "left") for agent in opened.agents)

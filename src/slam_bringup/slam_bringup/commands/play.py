@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from slam_bringup.node_arguments import ros_arguments
+from slam_bringup.processes import become_node
 
 
 @click.command()
@@ -17,6 +18,5 @@ from slam_bringup.node_arguments import ros_arguments
 @click.option("--topics", multiple=True, metavar="TOPIC", help="play only this topic (may be repeated)")
 def command(bag: Path, rate: float, loop: bool, clock: bool, topics: tuple[str, ...]) -> None:
     """Publish the topics of BAG over ROS."""
-    from slam_bringup.bag_player_node import main
-
-    main(ros_arguments({"bag": str(bag), "rate": rate, "loop": loop, "clock": clock, "topics": topics}))
+    parameters = {"bag": str(bag), "rate": rate, "loop": loop, "clock": clock, "topics": topics}
+    become_node("slam_bringup", "bag_player", ros_arguments(parameters))

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from slam_bringup.node_arguments import ros_arguments
+from slam_bringup.processes import become_node
 
 
 @click.command()
@@ -15,6 +16,5 @@ from slam_bringup.node_arguments import ros_arguments
 @click.argument("topics", nargs=-1)
 def command(output: Path, storage: str, topics: tuple[str, ...]) -> None:
     """Record TOPICS (all by default) until Ctrl-C."""
-    from slam_bringup.recorder_node import main
-
-    main(ros_arguments({"bag": str(output), "storage": storage, "topics": topics}))
+    parameters = {"bag": str(output), "storage": storage, "topics": topics}
+    become_node("slam_bringup", "recorder", ros_arguments(parameters))
