@@ -74,6 +74,31 @@ def test_an_upside_down_chessboard_keeps_its_corner_numbers() -> None:
     np.testing.assert_allclose(found.pixels, np.array([639, 479]) - truth, atol=0.4)
 
 
+def test_corners_found_in_the_other_order_are_turned(monkeypatch: pytest.MonkeyPatch) -> None:
+    board = BOARDS["chessboard"]
+    picture, truth = photograph(board, 4)
+    search = cv2.findChessboardCorners
+
+    def reversed_search(image: Picture, size: tuple[int, int], flags: int) -> tuple[bool, NDArray[np.float32]]:
+        found, corners = search(image, size, flags=flags)
+        return found, corners[::-1]
+
+    monkeypatch.setattr(cv2, "findChessboardCorners", reversed_search)
+    np.testing.assert_allclose(find_corners(board, picture).pixels, truth, atol=0.4)
+
+
+@pytest.mark.parametrize("name", ["aprilgrid", "charuco"])
+def test_hidden_corners_are_not_invented(name: str) -> None:
+    board = BOARDS[name]
+    picture, truth = photograph(board, 7)
+    hidden = np.arange(0, len(truth), 9)
+    for u, v in np.rint(truth[hidden]).astype(int):
+        picture[v - 7 : v + 8, u - 7 : u + 2] = 10  # a dark edge through where the corner was
+    found = find_corners(board, picture)
+    assert len(found) > 0.2 * len(truth)
+    assert np.linalg.norm(found.pixels - truth[found.ids], axis=1).max() < 0.5
+
+
 @pytest.mark.parametrize("name", ["aprilgrid", "charuco"])
 def test_half_a_board_is_used(name: str) -> None:
     board = BOARDS[name]

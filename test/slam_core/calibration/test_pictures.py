@@ -30,7 +30,7 @@ def test_patterns_pair_by_number_and_leave_out_the_lonely(tmp_path: Path) -> Non
 
 
 def test_camera_numbers_in_the_names_are_understood(tmp_path: Path) -> None:
-    touch(tmp_path, *(f"{n}_{c}.png" for n in (9, 10, 11) for c in (0, 1)))
+    touch(tmp_path, *(f"{n}_{c}.png" for n in (9, 10, 11) for c in (0, 1)), "8_1.png", "12_0.png")
     views = pair_pictures([str(tmp_path / "*_0.png"), str(tmp_path / "*_1.png")], 2)
     assert names(views) == [("9_0.png", "9_1.png"), ("10_0.png", "10_1.png"), ("11_0.png", "11_1.png")]
 
