@@ -1,7 +1,7 @@
 """Joining problems of any size with known association, shared by the benchmarks: submaps of about 60 landmarks each.
 
-An agent walks a ring road lap after lap, so that every lap closes over the one before. The submaps come from the feature-level
-world of the tests, whose covariances are exact.
+An agent walks a ring road lap after lap, so that every lap closes over the one before. The submaps come from the
+feature-level world of the tests, whose covariances are exact.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ class KnownProblem:
     world_index: list[np.ndarray]
 
     def first(self, count: int) -> KnownProblem:
+        """The first ``count`` submaps."""
         return KnownProblem(self.submaps[:count], self.truth[: count + 1], self.world_index[:count])
 
 
@@ -65,7 +66,9 @@ def local_maps(problem: KnownProblem, rows: str, shared_only: bool) -> tuple[lis
                 used[int(world[i])] = len(used)
                 points.append(poses[k][:3, :3] @ submap.landmarks[i] + poses[k][:3, 3])
         index = np.concatenate([np.arange(6), (6 + 3 * kept[:, None] + np.arange(3)).ravel()])
-        mean = np.concatenate([submap.end_pose[:3, 3], so3_log(submap.end_pose[:3, :3]), submap.landmarks[kept].ravel()])
+        mean = np.concatenate(
+            [submap.end_pose[:3, 3], so3_log(submap.end_pose[:3, :3]), submap.landmarks[kept].ravel()]
+        )
         information = np.linalg.inv(submap.covariance[np.ix_(index, index)])
         ids = np.array([used[int(world[i])] for i in kept], dtype=np.int64)
         local = LocalMap(k, np.array([k + 1]), ids, mean, 0.5 * (information + information.T))

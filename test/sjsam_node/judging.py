@@ -18,7 +18,7 @@ def join(submaps: Iterable[Submap], global_map: GlobalMap | None = None) -> tupl
 
 
 def errors(global_map: GlobalMap, agent: Agent, origin: Agent | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Pose errors (n, 6) of an agent in the frame of the first pose of ``origin``, and NEES (n,) of all but the first."""
+    """Pose errors (n, 6) of an agent in the frame of ``origin``'s first pose, and NEES of all but the first."""
     T = invert_transform((origin or agent).path[0])
     truth = {agent.stamp_ns + int(k * 1e8): T @ pose for k, pose in enumerate(agent.path)}
     poses = global_map.trajectory(agent.name)

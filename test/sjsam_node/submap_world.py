@@ -1,13 +1,15 @@
-"""A world of landmarks and the submaps a consistent EKF would build in it: exact Gaussians, so that joining can be judged.
+"""A world of landmarks and the submaps a consistent EKF would build in it: exact Gaussians, to judge joining by.
 
-Every submap is the posterior of a small estimation problem of its own: a few rig poses with odometry between them, landmarks seen
-from each with a stereo camera's noise. Its error is one draw from that posterior's covariance, so that NEES tests are exact.
+Every submap is the posterior of a small estimation problem of its own: a few rig poses with odometry between them,
+landmarks seen from each with a stereo camera's noise. Its error is one draw from that posterior's covariance, so that
+NEES tests are exact.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -178,7 +180,7 @@ def path_through(corners: Sequence[tuple[float, float]], step: float = 0.25, tur
     """Poses along a polyline, ``step`` m apart, turning on the spot at the corners by at most ``turn`` rad each."""
     poses: list[FloatArray] = []
     yaw = None
-    for (x0, y0), (x1, y1) in zip(corners[:-1], corners[1:], strict=True):
+    for (x0, y0), (x1, y1) in pairwise(corners):
         heading = float(np.arctan2(y1 - y0, x1 - x0))
         if yaw is not None:
             change = (heading - yaw + np.pi) % (2 * np.pi) - np.pi
@@ -210,7 +212,9 @@ def room(centre: tuple[float, float], size: tuple[float, float], count: int, rng
     """Landmarks on the four walls of a room."""
     side = rng.integers(0, 4, count)
     u = rng.uniform(-0.5, 0.5, count)
-    xy = np.where((side % 2 == 0)[:, None], np.stack([u, side * 0.5 - 0.5], 1), np.stack([side - 2.0, u], 1) * [0.5, 1.0])
+    xy = np.where(
+        (side % 2 == 0)[:, None], np.stack([u, side * 0.5 - 0.5], 1), np.stack([side - 2.0, u], 1) * [0.5, 1.0]
+    )
     xy = np.where((side % 2 == 1)[:, None], np.stack([(side - 2.0) * 0.5, u], 1), xy)
     xy = np.where((side % 2 == 0)[:, None], np.stack([u, (side - 1.0) * 0.5], 1), xy)
     return np.concatenate([xy * size + np.array(centre), rng.uniform(-1.0, 1.5, (count, 1))], axis=1)

@@ -1,7 +1,7 @@
 """Joining a submap without a closure at a cost that does not depend on the size of the map.
 
 Everything that was joined before acts on a new submap through its *front* only: the newest pose and the landmarks of
-the last few submaps. The front's information matrix is the trailing block of the sparse factor, in which these
+the last few submaps. The front's information matrix comes from the end of the sparse factor, in which these
 variables are eliminated last. A new submap is added to it, solved, and what leaves the window is eliminated: the same
 elimination that a batch factorisation of all submaps would do, one step further (Kaess, Ranganathan and Dellaert
 2008). Older variables learn what changed at the next batch, which a closure or a question for the whole map brings
@@ -43,7 +43,7 @@ class Front:
         scalars = problem.scalars(
             np.searchsorted(assembled.nodes, [node]), np.searchsorted(assembled.landmarks, landmarks)
         )
-        information = problem.trailing_information(assembled.state, scalars)
+        information = problem.marginal_information(assembled.state, scalars)
         return cls(node, landmarks, graph.poses[node], graph.points[landmarks], information, np.zeros(len(scalars)))
 
     def extended(self, graph: MapGraph, record: Record, kept: IntArray, rows: str) -> tuple[Front, float]:

@@ -14,13 +14,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 
 from sjsam_node import kernels
 from sjsam_node.layout import Layout, make_layout
 from sjsam_node.problem import FlatMaps, State
 from slam_core.geometry import FloatArray
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
-from slam_core.sparse_cholesky import IntArray, InverseEntries, SparseCholesky
+from slam_core.sparse_cholesky import IntArray, InverseEntries, SparseCholesky, ancestors
 
 
 class JoiningProblem:
@@ -107,16 +108,22 @@ class JoiningProblem:
         """Scalar unknowns of poses and landmarks, in order; -1 for fixed ones."""
         return variable_scalars(self.layout, self._sizes, poses, landmarks)
 
-    def trailing_information(self, state: State, scalars: IntArray) -> FloatArray:
-        """Marginal information of the variables that are eliminated last: their block of ``L L^T``, at ``state``."""
+    def marginal_information(self, state: State, scalars: IntArray) -> FloatArray:
+        """Marginal information matrix of some variables, at ``state``.
+
+        Only what is eliminated after one of them, because of them, has a say: their ancestors in the elimination tree.
+        """
         self._factorize_at(state)
         factor, order = self.factor.lower()
         position = np.empty_like(order)
         position[order] = np.arange(len(order))
-        at = position[scalars]
-        block = factor[:, np.sort(at)][np.sort(at)].toarray()
-        unsorted = np.argsort(np.argsort(at))
-        return np.asarray((block @ block.T)[np.ix_(unsorted, unsorted)])
+        path = ancestors(factor.indptr, factor.indices, position[scalars])
+        lower = factor[:, path][path].toarray()
+        unit = np.zeros((len(path), len(scalars)))
+        unit[np.searchsorted(path, position[scalars]), np.arange(len(scalars))] = 1.0
+        root = scipy.linalg.solve_triangular(lower, unit, lower=True)
+        information = np.linalg.inv(root.T @ root)
+        return np.asarray(0.5 * (information + information.T))
 
     def marginals(self, state: State) -> Marginals:
         """Exact marginal covariances, linearised at ``state``.

@@ -2,8 +2,8 @@
 inverse.
 
 Two backends, chosen by name: ``cholmod`` (supernodal, from the cvxopt wheel; Chen, Davis, Hager and Rajamanickam
-2008) and ``superlu`` (from SciPy, always there). Both take the matrix as it is ordered: fill is reduced beforehand by
-:func:`elimination_order` on the graph of the *blocks*, which is much smaller than the matrix.
+2008) and ``superlu`` (from SciPy, always there). Fill is reduced beforehand by :func:`elimination_order` on the
+graph of the *blocks*, which is much smaller than the matrix; CHOLMOD may improve on it.
 """
 
 from __future__ import annotations
@@ -235,7 +235,8 @@ def takahashi(indptr, indices, data):  # type: ignore[no-untyped-def]
     """Entries of ``(L L^T)^-1`` at the nonzeros of L (CSC, rows ascending, diagonal first).
 
     From the last columns back, a supernode (columns J of equal pattern, rows I below) at a time: with
-    ``Y = L_IJ L_JJ^-1`` the inverse has ``Z_IJ = -Z_II Y`` and ``Z_JJ = L_JJ^-T L_JJ^-1 - Y^T Z_IJ``; ``Z_II`` is known.
+    ``Y = L_IJ L_JJ^-1`` the inverse has ``Z_IJ = -Z_II Y`` and ``Z_JJ = L_JJ^-T L_JJ^-1 - Y^T Z_IJ``; ``Z_II`` is
+    known.
     """
     n = len(indptr) - 1
     out = np.zeros_like(data)
@@ -274,6 +275,18 @@ def takahashi(indptr, indices, data):  # type: ignore[no-untyped-def]
             slot[rows[k]] = -1
         last = first
     return out
+
+
+def ancestors(indptr: IntArray, indices: IntArray, columns: IntArray) -> IntArray:
+    """These columns of a factor and all above them in its elimination tree, ascending (Liu 1990)."""
+    found: set[int] = set()
+    for column in columns.tolist():
+        while column not in found:
+            found.add(column)
+            if indptr[column + 1] - indptr[column] < 2:
+                break
+            column = int(indices[indptr[column] + 1])
+    return np.array(sorted(found), dtype=np.int64)
 
 
 @numba.njit(cache=True, nogil=True)

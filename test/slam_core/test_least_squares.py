@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from slam_core.least_squares import (
+    LOSSES,
+    LevenbergMarquardtConfig,
+    chi_square_bound,
+    levenberg_marquardt,
+    robust_cost,
+    robust_weight,
+    whitening,
+)
+
+
+def test_whitening_makes_the_covariance_one(rng: np.random.Generator) -> None:
+    A = rng.normal(size=(5, 5))
+    P = A @ A.T + np.eye(5)
+    W = whitening(P)
+    assert np.allclose(W @ P @ W.T, np.eye(5), atol=1e-12)
+
+
+def test_whitening_refuses_what_is_no_covariance() -> None:
+    with pytest.raises(ValueError, match="not positive definite"):
+        whitening(-np.eye(3))
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_weight_is_the_derivative_of_the_loss(loss: str, scale: float) -> None:
+    s = np.linspace(0.01, 30.0, 200)
+    s = s[np.abs(s - scale**2) > 0.1]  # Huber's kink
+    step = 1e-6
+    slope = (robust_cost(s + step, loss, scale) - robust_cost(s - step, loss, scale)) / (2 * step)
+    assert np.allclose(slope, robust_weight(s, loss, scale), rtol=1e-6, atol=1e-8)
+
+
+def test_small_residuals_keep_their_weight() -> None:
+    for loss in LOSSES:
+        assert robust_weight(np.array(1e-12), loss) == pytest.approx(1.0)
+
+
+def test_unknown_loss_is_refused() -> None:
+    with pytest.raises(ValueError, match="tukey"):
+        robust_weight(np.ones(1), "tukey")
+    with pytest.raises(ValueError, match="tukey"):
+        robust_cost(np.ones(1), "tukey")
+
+
+def test_chi_square_bound_agrees_with_scipy() -> None:
+    for dof in (1, 3, 6, 300):
+        assert chi_square_bound(0.999, dof) == pytest.approx(chi2.ppf(0.999, dof), rel=1e-10)
+
+
+class Valley:
+    """Rosenbrock's valley as two residuals; plain Gauss-Newton leaves it on the first step."""
+
+    def _residual(self, x: np.ndarray) -> np.ndarray:
+        return np.array([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]])
+
+    def cost(self, state: np.ndarray) -> float:
+        return float(self._residual(state) @ self._residual(state))
+
+    def linearize(self, state: np.ndarray) -> np.ndarray:
+        J = np.array([[-20.0 * state[0], 10.0], [-1.0, 0.0]])
+        self.H, self.g = J.T @ J, J.T @ self._residual(state)
+        return self.g
+
+    def solve(self, damping: float) -> np.ndarray:
+        return np.linalg.solve(self.H + damping * np.diag(np.diag(self.H)), -self.g)
+
+    def retract(self, state: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return state + step
+
+
+def test_levenberg_marquardt_walks_the_valley_and_never_up() -> None:
+    x, result = levenberg_marquardt(Valley(), np.array([-1.2, 1.0]))
+    assert np.allclose(x, 1.0, atol=1e-8)
+    assert result.converged
+    assert result.cost < 1e-15 < result.initial_cost
+
+
+def test_levenberg_marquardt_says_when_it_was_cut_short() -> None:
+    _, result = levenberg_marquardt(Valley(), np.array([-1.2, 1.0]), LevenbergMarquardtConfig(max_iterations=1))
+    assert not result.converged
+    assert result.reason == "iteration limit"
+
+
+class Unsolvable(Valley):
+    def solve(self, damping: float) -> None:  # type: ignore[override]
+        return None
+
+
+def test_levenberg_marquardt_gives_up_on_a_singular_problem() -> None:
+    x, result = levenberg_marquardt(Unsolvable(), np.array([-1.2, 1.0]))
+    assert not result.converged
+    assert np.array_equal(x, [-1.2, 1.0])
