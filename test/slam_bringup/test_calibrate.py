@@ -35,8 +35,9 @@ def test_stereo_writes_what_the_drivers_read(data_dir: Path, tmp_path: Path) -> 
     assert 0.0 < left.standard_deviations["fx"] < 1.0
     extrinsics = yaml.safe_load((tmp_path / "extrinsics.yaml").read_text())
     T = make_transform(rotation_from_quaternion(np.array(extrinsics["rotation_xyzw"])), extrinsics["translation_m"])
+    np.testing.assert_allclose(T, make_transform(np.eye(3), np.array([right.info.baseline, 0.0, 0.0])), atol=1e-9)
     written = json.loads((tmp_path / "summary.json").read_text())
-    np.testing.assert_allclose(T, written["T_left_right"], atol=1e-12)
+    assert np.linalg.norm(np.array(written["T_left_right"])[:3, 3]) == pytest.approx(right.info.baseline)
     assert written["rms_px"] < 0.45
     expected = {"left.yaml", "right.yaml", "extrinsics.yaml", "report.md", "summary.json", "residuals.png"}
     assert {path.name for path in tmp_path.iterdir()} == {*expected, "board_poses.png"}
@@ -50,10 +51,17 @@ def test_mono_and_tof_pairs(data_dir: Path, tmp_path: Path) -> None:
     run("mono", str(folder / "left0[1-9].jpg"), *board, "-o", str(tmp_path / "mono"), "--model", "plumb_bob4")
     assert read_camera_info(tmp_path / "mono" / "camera.yaml").info.camera.distortion[4] == 0.0
     patterns = [str(folder / f"{side}0[1-9].jpg") for side in ("left", "right")]
-    run("stereo-tof", *patterns, *board, "-o", str(tmp_path / "tof"), "--model", "plumb_bob,plumb_bob4")
+    stereo = ("stereo", *patterns, *board, "-o", str(tmp_path / "stereo"))
+    run(*stereo, "--model", "plumb_bob,plumb_bob4")
+    tof_run = ("stereo-tof", *patterns, *board, "--model", "plumb_bob,plumb_bob4", "-o", str(tmp_path / "tof"))
+    run(*tof_run, "--left-info", str(tmp_path / "stereo" / "left.yaml"))
     tof = read_camera_info(tmp_path / "tof" / "tof.yaml").info
     np.testing.assert_array_equal(tof.P[:, :3], tof.camera.K)
-    assert yaml.safe_load((tmp_path / "tof" / "extrinsics.yaml").read_text())["child_frame"] == "tof_optical_frame"
+    extrinsics = yaml.safe_load((tmp_path / "tof" / "extrinsics.yaml").read_text())
+    assert extrinsics["child_frame"] == "tof_optical_frame"
+    # The second camera stands on the x axis of the rectified left frame.
+    baseline = read_camera_info(tmp_path / "stereo" / "right.yaml").info.baseline
+    np.testing.assert_allclose(extrinsics["translation_m"], [baseline, 0.0, 0.0], atol=1e-9)
 
 
 @pytest.mark.data

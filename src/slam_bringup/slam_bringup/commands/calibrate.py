@@ -14,7 +14,7 @@ from rich.progress import Progress
 from slam_bringup.figures import save_png
 from slam_core.calibration.board import Board, parse_board
 from slam_core.calibration.bundle import BundleResult
-from slam_core.calibration.camera_info import CameraInfoFile
+from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info
 from slam_core.calibration.lens import DISTORTION_PARAMETERS, parameter_names
 from slam_core.calibration.pictures import BoardViews, find_views, pair_pictures
 from slam_core.calibration.rectification import stereo_infos
@@ -29,7 +29,7 @@ from slam_core.calibration.report import (
 from slam_core.calibration.rig import calibrate
 from slam_core.camera import CameraInfo
 from slam_core.files import atomic_text
-from slam_core.geometry import quaternion_from_rotation
+from slam_core.geometry import make_transform, quaternion_from_rotation
 
 CAMERAS = {"mono": ("camera",), "stereo": ("left", "right"), "stereo-tof": ("left", "tof")}
 FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_frame", "tof": "tof_optical_frame"}
@@ -47,8 +47,14 @@ FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_fr
     "--model", default="plumb_bob", show_default=True,
     help=f"lens model, or one per camera with a comma between: {', '.join(DISTORTION_PARAMETERS)}",
 )  # fmt: skip
+@click.option(
+    "--left-info", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="stereo-tof: left.yaml of the stereo calibration, so that the extrinsics are those of its rectified frame",
+)  # fmt: skip
 @click.option("-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path), help="folder to write")
-def command(kind: str, images: tuple[str, ...], board_text: str, model: str, output: Path) -> None:
+def command(
+    kind: str, images: tuple[str, ...], board_text: str, model: str, left_info: Path | None, output: Path
+) -> None:  # fmt: skip
     """Calibrate one camera (mono), a stereo pair, or a stereo camera's left eye with a ToF camera (stereo-tof).
 
     IMAGES are files, folders or quoted patterns; for two cameras one folder or pattern each, or all files of the first
@@ -58,7 +64,8 @@ def command(kind: str, images: tuple[str, ...], board_text: str, model: str, out
     lenses = _lenses(model, len(names))
     views = _find(board, pair_pictures(images, len(names)))
     result = calibrate(board.points, views.corners, views.sizes, lenses)
-    _write(output, kind, result, board, views)
+    rectified_left = read_camera_info(left_info).info if left_info is not None else None
+    _write(output, kind, result, board, views, _infos(kind, result, rectified_left))
     click.echo(tables(result, names))
     click.echo(f"written to {output}")
 
@@ -79,30 +86,37 @@ def _find(board: Board, files: list[list[Path]]) -> BoardViews:
         return find_views(board, files, lambda: bar.advance(task))
 
 
-def _write(output: Path, kind: str, result: BundleResult, board: Board, views: BoardViews) -> None:
+def _write(
+    output: Path, kind: str, result: BundleResult, board: Board, views: BoardViews, infos: Sequence[CameraInfo]
+) -> None:  # fmt: skip
     names = CAMERAS[kind]
-    infos = _infos(kind, result)
     output.mkdir(parents=True, exist_ok=True)
     for c, (name, info) in enumerate(zip(names, infos, strict=True)):
         CameraInfoFile(info, name, camera_deviations(result, c)).write(output / f"{name}.yaml")
     if len(names) > 1:
-        atomic_text(output / "extrinsics.yaml", _extrinsics(result, names))
+        atomic_text(output / "extrinsics.yaml", _extrinsics(result, names, infos))
     save_png(output / "residuals.png", residual_figure(result, names))
     save_png(output / "board_poses.png", board_poses_figure(result, board.points, names))
     atomic_text(output / "report.md", f"# Calibration\n\n{tables(result, names)}\n{_picture_table(result, views)}")
     atomic_text(output / "summary.json", json.dumps(summary(result, names), indent=2) + "\n")
 
 
-def _infos(kind: str, result: BundleResult) -> Sequence[CameraInfo]:
+def _infos(kind: str, result: BundleResult, rectified_left: CameraInfo | None) -> Sequence[CameraInfo]:
     states = result.rig.cameras
     if kind == "stereo":
         return stereo_infos(states[0].camera, states[1].camera, states[1].T)
-    return [CameraInfo(state.camera) for state in states]
+    infos = [CameraInfo(state.camera) for state in states]
+    if rectified_left is not None:
+        infos[0] = CameraInfo(infos[0].camera, rectified_left.R, rectified_left.P)
+    return infos
 
 
-def _extrinsics(result: BundleResult, names: Sequence[str]) -> str:
-    """The second camera's place in the first one's (raw) optical frame, as a static transform needs it."""
+def _extrinsics(result: BundleResult, names: Sequence[str], infos: Sequence[CameraInfo]) -> str:
+    """The static transform between the *rectified* optical frames, those that the nodes' images are in."""
     T, covariance = extrinsics_of(result, 1)
+    rotate = np.kron(np.eye(2), infos[0].R)
+    T = make_transform(infos[0].R, np.zeros(3)) @ T @ make_transform(infos[1].R.T, np.zeros(3))
+    covariance = rotate @ covariance @ rotate.T
     document = {
         "parent_frame": FRAMES[names[0]],
         "child_frame": FRAMES[names[1]],
