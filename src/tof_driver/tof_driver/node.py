@@ -37,7 +37,7 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.ros import run_node
-from slam_core.types import AnyArray
+from slam_core.types import DepthImage
 from tof_driver.depth import DepthConfig, DepthProcessor
 from tof_driver.points import depth_cloud
 
@@ -70,7 +70,7 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
         self._pictures = self._picture_names()
         if self.config.info:
             self._use(_read(self.config.info))
-        self._advertise_outputs()
+        self._topics = self._advertise_outputs()
         self._listen_to_inputs()
         self.create_service(SetCameraInfo, "tof/set_camera_info", self._on_set_info)
 
@@ -86,13 +86,15 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
             chosen = "both" if self.config.measurement == "range" else "none"
         return {"both": ("amplitude", "intensity"), "amplitude": ("amplitude",), "none": ()}[chosen]
 
-    def _advertise_outputs(self) -> None:
+    def _advertise_outputs(self) -> tuple[str, ...]:
+        """Offer the topics that this camera has; a camera info that comes from a topic is there already."""
         unused = {f"tof/{name}/image" for name in ("amplitude", "intensity") if name not in self._pictures}
         if not self.config.info:
             unused.add("tof/camera_info")
-        for topic, kind in DEPTH_TOPICS.items():
-            if topic not in unused:
-                self.advertise(topic, kind)
+        used = tuple(topic for topic in DEPTH_TOPICS if topic not in unused)
+        for topic in used:
+            self.advertise(topic, DEPTH_TOPICS[topic])
+        return used
 
     def _listen_to_inputs(self) -> None:
         if not self.config.info:
@@ -118,24 +120,30 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
 
     def _process_images(self, messages: tuple[Message, ...]) -> None:
         assert self.processor is not None
-        pictures: list[AnyArray | None] = [image_from_message(m) for m in messages]
-        pictures += [None] * (3 - len(pictures))
-        image, amplitude, intensity = pictures
-        assert image is not None
-        depth = self.processor.process(stamp_ns(messages[0]), image, amplitude, intensity)
+        images = dict(zip((self.config.measurement, *self._pictures), map(image_from_message, messages), strict=True))
+        depth = self.processor.process(
+            stamp_ns(messages[0]), images[self.config.measurement], images.get("amplitude"), images.get("intensity")
+        )
+        self._report(depth)
+        self._publish_all(messages[0].header, depth)
+
+    def _report(self, depth: DepthImage) -> None:
+        assert self.processor is not None
         self.health.counters.update(self.processor.counters.counts)
         share = float(np.isfinite(depth.depth).mean())
-        few = share < FEW_PIXELS
-        self.health.set(
-            State.DEGRADED if few else State.OK, f"{100 * share:.1f} % of the pixels have depth" if few else ""
+        if share < FEW_PIXELS:
+            self.health.set(State.DEGRADED, f"{100.0 * share:.1f} % of the pixels have depth")
+        else:
+            self.health.set(State.OK)
+
+    def _publish_all(self, header: Message, depth: DepthImage) -> None:
+        assert self.info is not None
+        outputs = depth_messages(self.types, depth, header.frame_id)._replace(
+            points=cloud_message(self.types, header, depth_cloud(depth)),
+            camera_info=camera_info_message(self.types, header, self.info),
         )
-        header = messages[0].header
-        outputs = depth_messages(self.types, depth, header.frame_id)
-        outputs = outputs._replace(points=cloud_message(self.types, header, depth_cloud(depth)))
-        if self.info is not None and self.config.info:
-            outputs = outputs._replace(camera_info=camera_info_message(self.types, header, self.info))
         for topic, message in zip(DEPTH_TOPICS, outputs, strict=True):
-            if topic in self._outputs and message is not None:
+            if topic in self._topics:
                 self.publish(topic, message)
 
     # -- calibration ---------------------------------------------------------------------------------------------------
