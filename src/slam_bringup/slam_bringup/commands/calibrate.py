@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 import numpy as np
 import yaml
+from rich.console import Console
 from rich.progress import Progress
 
 from slam_bringup.figures import save_png
@@ -81,7 +82,7 @@ def _lenses(model: str, cameras: int) -> list[str]:
 
 
 def _find(board: Board, files: list[list[Path]]) -> BoardViews:
-    with Progress(transient=True) as bar:
+    with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("finding the board", total=sum(len(view) for view in files))
         return find_views(board, files, lambda: bar.advance(task))
 
