@@ -13,7 +13,6 @@ ROOM = {
     "rooms": [{"name": "office", "x": [0, 5], "y": [0, 4], "style": "office"}],
     "doorways": [{"at": [4.0, 0.0], "width": 0.9}],
     "objects": [{"kind": "table", "at": [2.5, 2.0], "size": [0.9, 0.6]}],
-    "stereo": {"calibration_error_px": 0.0},
     "agents": [
         {"motion": "handheld", "height": 1.3, "path": [[1.2, 1.2, 0], [2.2, 1.1, 20], [3.0, 1.4, 60], [1.2, 1.2, 0]]}
     ],

@@ -59,7 +59,10 @@ class StereoSensorConfig(Config):
     read_noise: float = parameter(1.5, "noise of a dark pixel, of 255", minimum=0.0)
     electrons_per_level: float = parameter(20.0, "electrons per grey level: sets the shot noise", minimum=0.1)
     calibration_error_px: float = parameter(
-        0.03, "spread of what the calibration is wrong by at the principal point", unit="px", minimum=0.0
+        0.0,
+        "spread of what the calibration is wrong by, at the principal point and at the border",
+        unit="px",
+        minimum=0.0,
     )
     vignetting: float = parameter(0.8, "strength of the cos^4 darkening towards the corners", minimum=0.0, maximum=1.0)
     drop_probability: float = parameter(0.0, "share of frames lost", minimum=0.0, maximum=0.9)

@@ -1,0 +1,123 @@
+"""Writes bags/scenarios/fifty_rooms.yaml: 50 rooms along two corridors that two passages join to a ring.
+
+    python benchmarks/simulation/fifty_rooms.py
+
+The path goes into every room, round once, and out again; along the first corridor, through the passage, back along
+the second and home. It closes one large loop and fifty small ones.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SCENARIO = Path(__file__).resolve().parents[2] / "bags/scenarios/fifty_rooms.yaml"
+STYLES = ("office", "lab", "conference", "workshop", "store")
+WIDTH, DEPTH, WALL, CORRIDOR = 5.0, 5.0, 0.2, 2.0
+PITCH = WIDTH + WALL
+COLUMNS = 13
+"""Rooms of a row; the fourth and the second row have one less, which makes fifty."""
+SPEED = 0.9
+
+Point = list[float]
+
+
+def rows() -> list[tuple[float, float, int]]:
+    """(y of the near wall, direction away from the corridor, number of rooms) of the four rows."""
+    second = CORRIDOR + 2 * WALL + 2 * (DEPTH + WALL)
+    return [
+        (-WALL, -1.0, COLUMNS),
+        (CORRIDOR + WALL, 1.0, COLUMNS - 1),
+        (second - WALL, -1.0, COLUMNS - 1),
+        (second + CORRIDOR + WALL, 1.0, COLUMNS),
+    ]
+
+
+def plan() -> tuple[list[str], list[str]]:
+    """Lines of the rooms and of the doorways."""
+    length, second = COLUMNS * PITCH, rows()[2][0] + WALL
+    rooms = [
+        f"  - {{name: corridor_1, x: [0, {length:.1f}], y: [0, {CORRIDOR}], height: 2.6, style: corridor}}",
+        f"  - {{name: corridor_2, x: [0, {length:.1f}], y: [{second:.1f}, {second + CORRIDOR:.1f}], height: 2.6, style: corridor}}",
+    ]
+    doors = []
+    for x0, x1 in ((-CORRIDOR - WALL, -WALL), (length + WALL, length + WALL + CORRIDOR)):
+        rooms.append(
+            f"  - {{name: passage, x: [{x0:.1f}, {x1:.1f}], y: [0, {second + CORRIDOR:.1f}], height: 2.6, style: corridor}}"
+        )
+        side = -WALL / 2 if x0 < 0 else length + WALL / 2
+        doors += [f"  - {{at: [{side:.2f}, {y:.2f}], width: 1.4}}" for y in (1.0, second + 1.0)]
+    number = 0
+    for near, direction, count in rows():
+        for column in range(count):
+            x0, far = column * PITCH, near + direction * DEPTH
+            y0, y1 = sorted((near, far))
+            rooms.append(
+                f"  - {{name: room_{number}, x: [{x0:.1f}, {x0 + WIDTH:.1f}], y: [{y0:.1f}, {y1:.1f}], "
+                f"style: {STYLES[number % len(STYLES)]}}}"
+            )
+            doors.append(f"  - {{at: [{x0 + WIDTH / 2:.2f}, {near - direction * WALL / 2:.2f}], width: 1.1}}")
+            number += 1
+    return rooms, doors
+
+
+def visit(column: int, near: float, direction: float, heading: float) -> list[Point]:
+    """Into a room, once round its middle, and out; ``heading`` +1 or -1 along the corridor."""
+    x, h = column * PITCH + WIDTH / 2, heading
+    steps = [(-0.1, -0.1), (0.1, 1.3), (0.9, 2.3), (0.1, 3.3), (-0.9, 2.4), (-0.2, 1.3), (0.1, -0.1)]
+    return [[x + h * across, near + direction * away] for across, away in steps]
+
+
+def walk() -> list[Point]:
+    """Way points of the whole path."""
+    length, second = COLUMNS * PITCH, rows()[2][0] + WALL
+    points: list[Point] = [[0.4, 1.0]]
+    for column in range(COLUMNS):
+        for near, direction, count in rows()[:2]:
+            if column < count:
+                points += [*visit(column, near, direction, 1.0), [column * PITCH + WIDTH / 2 + 0.8, 1.0]]
+        points.append([(column + 1) * PITCH - 0.4, 1.0])
+    east, west = length + WALL + 1.0, -WALL - 1.0
+    points += [[length + 0.1, 1.0], [east, 1.8], [east, second / 2], [east, second + 0.2], [length + 0.1, second + 1.0]]
+    for column in reversed(range(COLUMNS)):
+        for near, direction, count in rows()[2:]:
+            if column < count:
+                points += [*visit(column, near, direction, -1.0), [column * PITCH + WIDTH / 2 - 0.8, second + 1.0]]
+        points.append([column * PITCH + 0.4, second + 1.0])
+    return [
+        *points,
+        [-0.1, second + 1.0],
+        [west, second + 0.2],
+        [west, second / 2],
+        [west, 1.8],
+        [-0.1, 1.0],
+        [0.4, 1.0, 0.0],
+    ]
+
+
+def main() -> None:
+    rooms, doors = plan()
+    points = walk()
+    points[0].append(0.0)
+    length = sum(((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2) ** 0.5 for a, b in zip(points, points[1:], strict=False))
+    lines = [
+        f"description: A building of 50 rooms, every one visited, about {length:.0f} m; for scale, mostly without images",
+        "# Written by benchmarks/simulation/fifty_rooms.py.",
+        "seed: 950",
+        "rate: 10.0",
+        f"frames: {int(length / SPEED * 10)}",
+        "rooms:",
+        *rooms,
+        "doorways:",
+        *doors,
+        "agents:",
+        "  - motion: rig",
+        "    height: 1.2",
+        "    path:",
+        *(f"      - [{', '.join(f'{c:.2f}' for c in p)}]" for p in points),
+    ]
+    SCENARIO.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(f"{SCENARIO}: {len(rooms)} rooms with corridors, {length:.0f} m")
+
+
+if __name__ == "__main__":
+    main()
