@@ -54,5 +54,5 @@ def small_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
             left, right = rng.integers(0, 256, (2, 120, 160), dtype=np.uint8)
             writer.stereo(stamp, left, right, (rectified_info(camera), rectified_info(camera, 0.1)))
             depth = rng.integers(1000, 3000, (120, 160)).astype(np.uint16)
-            writer.depth(stamp, depth, rectified_info(camera), measurement="range", amplitude=left)
+            writer.depth(stamp, depth, rectified_info(camera), measurement="range", amplitude=left, intensity=right)
     return path

@@ -26,12 +26,13 @@ from slam_core.messages import (
     odometry_message,
     path_message,
     pose_with_covariance_message,
+    stamp_ns,
     submap_messages,
     transform_message,
 )
 from slam_core.messages.base import Message
 from slam_core.ros import run_node
-from slam_core.types import PoseEstimate, Submap
+from slam_core.types import Features, ImuSample, PoseEstimate, RelativeMotion, Submap
 
 _STATES = {TrackingState.OK: State.OK, TrackingState.DEGRADED: State.DEGRADED, TrackingState.LOST: State.LOST}
 
@@ -43,6 +44,7 @@ class EkfNodeConfig(EkfSlamConfig):
     odom_frame: str = parameter("odom", "frame of the odometry")
     base_frame: str = parameter("base_link", "frame of the rig; the features' frame is looked up in it")
     path_length: int = parameter(2000, "newest poses shown in ``path``", minimum=1)
+    wait_for_motion: bool = parameter(False, "features wait until ``ndt/motion`` has reached their stamp")
 
 
 class EkfNode(SlamNode[EkfNodeConfig]):
@@ -51,6 +53,9 @@ class EkfNode(SlamNode[EkfNodeConfig]):
     def __init__(self) -> None:
         super().__init__("ekf_slam", EkfNodeConfig)
         self.slam: EkfSlam | None = None
+        self._frames = deque[Features]()
+        self._aids = deque[tuple[int, RelativeMotion | ImuSample]]()
+        self._motion_stamp_ns = -1
         self.path = deque[PoseEstimate](maxlen=self.config.path_length)
         prefix = f"{self.config.agent}/" if self.config.agent else ""
         self.odom_frame = prefix + self.config.odom_frame
@@ -69,10 +74,60 @@ class EkfNode(SlamNode[EkfNodeConfig]):
             self.advertise(topic, kind, latched=True)
 
     def on_features(self, cloud: Message, descriptors: Message, camera_info: Message) -> None:
-        """One frame; the mounting of its camera is looked up at the first."""
-        features = features_from_messages(cloud, descriptors, camera_info)
+        """One frame; it may have to wait for the motion that leads to it."""
+        self._frames.append(features_from_messages(cloud, descriptors, camera_info))
+        self._release()
+
+    def on_motion(self, message: Message) -> None:
+        """A motion measured by scan registration, or word that it is not known."""
+        self._motion_stamp_ns = stamp_ns(message)
+        motion = motion_from_message(message)
+        if motion is not None:
+            self._aids.append((self._motion_stamp_ns, motion))
+        self._release()
+
+    def on_imu(self, message: Message) -> None:
+        """A reading of the IMU, turned into the axes of the rig."""
+        sample = imu_from_message(message)
+        R = self.lookup(self.config.base_frame, message.header.frame_id)[:3, :3]
+        rate, acceleration = R @ sample.angular_velocity, R @ sample.linear_acceleration
+        self._aids.append((sample.stamp_ns, ImuSample(sample.stamp_ns, rate, acceleration)))
+
+    def on_reset(self) -> None:
+        """Forget everything; the mounting is looked up anew."""
+        self.slam = None
+        self._forget_queues()
+        self.path.clear()
+
+    def on_finish(self) -> str:
+        """The input has ended: process what waits and publish the open submap."""
+        while self._frames:
+            self._process_frame(self._frames.popleft())
+        submaps = self.slam.finish() if self.slam is not None else ()
+        self._publish_submaps(submaps)
+        return f"{len(submaps)} open submap published"
+
+    # -- the order of the stamps ---------------------------------------------------------------------------------------
+
+    def _release(self) -> None:
+        """Process the frames that need not wait any more."""
+        while self._frames and not self._must_wait(self._frames[0]):
+            self._process_frame(self._frames.popleft())
+
+    def _must_wait(self, features: Features) -> bool:
+        return self.config.wait_for_motion and self._motion_stamp_ns < features.stamp_ns
+
+    def _forget_queues(self) -> None:
+        self._frames.clear()
+        self._aids.clear()
+        self._motion_stamp_ns = -1
+
+    def _process_frame(self, features: Features) -> None:
+        """One frame, after all that was measured up to its stamp; the camera's mounting is looked up at the first."""
         if self.slam is None:
             self.slam = EkfSlam(self.config, self.lookup(self.config.base_frame, features.frame_id))
+        while self._aids and self._aids[0][0] <= features.stamp_ns:
+            self._give_aid(self.slam, self._aids.popleft()[1])
         result = self.slam.process(features)
         self._publish_result(result)
         self._publish_submaps(result.submaps)
@@ -80,27 +135,12 @@ class EkfNode(SlamNode[EkfNodeConfig]):
         for name, count in self.slam.counters.counts.items():
             self.health.counters[name] = count
 
-    def on_motion(self, message: Message) -> None:
-        """A motion measured by scan registration."""
-        motion = motion_from_message(message)
-        if motion is not None and self.slam is not None:
-            self.slam.process_motion(motion)
-
-    def on_imu(self, message: Message) -> None:
-        """A reading of the IMU."""
-        if self.slam is not None:
-            self.slam.process_imu(imu_from_message(message))
-
-    def on_reset(self) -> None:
-        """Forget everything; the mounting is looked up anew."""
-        self.slam = None
-        self.path.clear()
-
-    def on_finish(self) -> str:
-        """The input has ended: publish the open submap."""
-        submaps = self.slam.finish() if self.slam is not None else ()
-        self._publish_submaps(submaps)
-        return f"{len(submaps)} open submap published"
+    @staticmethod
+    def _give_aid(slam: EkfSlam, aid: RelativeMotion | ImuSample) -> None:
+        if isinstance(aid, RelativeMotion):
+            slam.process_motion(aid)
+        else:
+            slam.process_imu(aid)
 
     # -- outputs -------------------------------------------------------------------------------------------------------
 

@@ -65,7 +65,9 @@ def live_nodes(
         if odometry:
             specs.append(_spec("ndt_registration", "ndt_odometry", config.ndt_odometry, agent, extra))
         specs.append(_spec("stereo_frontend", "feature_extractor", config.feature_extractor, agent, extra))
-        specs.append(_spec("ekf_slam_node", "ekf_slam", config.ekf_slam, agent, extra, agent=agent))
+        specs.append(
+            _spec("ekf_slam_node", "ekf_slam", config.ekf_slam, agent, extra, agent=agent, wait_for_motion=odometry)
+        )
     specs.append(_spec("sjsam_node", "sjsam", config.sjsam, "", extra, agents=agents if any(agents) else ()))
     return specs
 
@@ -74,7 +76,7 @@ def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odomet
     """The nodes of a run over the agents of a bag."""
     mode = config.feature_extractor.mode
     first = next(iter(sensors.values()))
-    specs = live_nodes(config, sensors, odometry=odometry, extra=_bag_parameters(first, odometry, map_path))
+    specs = live_nodes(config, sensors, odometry=odometry, extra=_bag_parameters(first, map_path))
     names = {
         e: tuple(s.command.full_name for s in specs if s.executable == e) for e in ("feature_extractor", "ekf_slam")
     }
@@ -89,7 +91,7 @@ def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odomet
     )
 
 
-def _bag_parameters(sensor: AgentSensors, odometry: bool, map_path: str) -> dict[str, dict[str, Any]]:
+def _bag_parameters(sensor: AgentSensors, map_path: str) -> dict[str, dict[str, Any]]:
     """What the topics of a bag ask of the nodes."""
     pictures = {"amplitude", "intensity"} & sensor.topics.keys()
     chosen = {0: "none", 1: "amplitude", 2: "both"}[len(pictures)]
@@ -130,7 +132,7 @@ def _spec(
     **own: Any,
 ) -> NodeSpec:
     changed = dict(_changed(config)) if config is not None else {}
-    given = {name: value for name, value in own.items() if value not in ("", ())}
+    given = {name: value for name, value in own.items() if value not in ("", (), False)}
     return NodeSpec(package, executable, namespace, changed | given | dict(extra.get(executable, {})))
 
 

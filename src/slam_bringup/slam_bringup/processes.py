@@ -89,7 +89,8 @@ class PrivateDomain:
         folder = Path(tempfile.gettempdir()) / "slam-domains"
         folder.mkdir(mode=0o777, exist_ok=True)
         first = os.getpid() % len(_DOMAINS)
-        for domain in (*_DOMAINS[first:], *_DOMAINS[:first]):
+        domains: list[int] = [*_DOMAINS[first:], *_DOMAINS[:first]]
+        for domain in domains:
             file = (folder / f"{domain}.lock").open("a")
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -154,7 +155,7 @@ class NodeProcess:
         """Ask the node to end (SIGINT), insist after ten seconds; returns the exit code."""
         self.interrupt()
         try:
-            return int(self.process.wait(_STOP_AFTER_S))
+            return self.process.wait(_STOP_AFTER_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             return self.process.wait()

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Self
 
@@ -132,7 +133,15 @@ class SensorBag:
         self.reader.__exit__()
 
     def readings(self) -> Iterator[Reading]:
-        """Every reading in the order of the bag; a pair comes when its last image does."""
+        """Every reading in the order of the bag; of those with one stamp IMU and depth come before the stereo pair.
+
+        What helps a frame thus comes before it, as at the node, which waits for it.
+        """
+        for _, together in groupby(self._in_order_of_arrival(), key=_stamp):
+            yield from sorted(together, key=_rank)
+
+    def _in_order_of_arrival(self) -> Iterator[Reading]:
+        """A pair comes when its last image does."""
         pairing = {agent: _AgentPairing(sensors) for agent, sensors in self.sensors.items()}
         route = {t: (agent, role) for agent, s in self.sensors.items() for role, t in s.topics.items()}
         wanted = [topic for topic, (_, role) in route.items() if role != "ground_truth"]
@@ -252,6 +261,14 @@ class _AgentPairing:
         R = self._sensors.frames.lookup(self._sensors.base_frame, message.header.frame_id)[:3, :3]
         rotated = ImuSample(sample.stamp_ns, R @ sample.angular_velocity, R @ sample.linear_acceleration)
         self._ready.append(ImuReading(self._sensors.agent, rotated))
+
+
+def _stamp(reading: Reading) -> int:
+    return reading.sample.stamp_ns if isinstance(reading, ImuReading) else reading.stamp_ns
+
+
+def _rank(reading: Reading) -> int:
+    return (ImuReading, DepthReading, StereoReading).index(type(reading))
 
 
 def _join(agent: str, name: str) -> str:

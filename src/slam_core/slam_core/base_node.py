@@ -51,8 +51,8 @@ from slam_core.synchronizer import ExactSynchronizer
 C = TypeVar("C", bound=Config)
 
 WATCHDOG_S = 5.0
-_NOT_A_FRAME = ("CameraInfo", "Imu")
-"""Types whose messages accompany a frame: having processed one says nothing of the frame of its stamp."""
+_NOT_A_FRAME = ("CameraInfo", "Imu", "Odometry", "PoseWithCovarianceStamped", "PointStamped")
+"""Types whose messages accompany frames: having processed one says nothing of the frame of its stamp."""
 
 LATCHED_DEPTH = 1000
 PROGRESS_TOPIC = "/progress"
