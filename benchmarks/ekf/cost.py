@@ -2,8 +2,8 @@
 
     python benchmarks/ekf/cost.py
 
-The floor is the time of its three matrix products and triangular solves (potrf, trsm, syrk of the sizes at hand), measured
-here with the same BLAS on exactly sized matrices.
+The floor is the time of its three matrix products and triangular solves (potrf, trsm, syrk of the sizes at hand),
+measured here with the same BLAS on exactly sized matrices.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from ekf_slam_node.ekf import Ekf
-from ekf_slam_node.models import CORE_DIM, observe
 from scipy.linalg import blas, lapack
 
+from ekf_slam_node.ekf import Ekf
+from ekf_slam_node.models import CORE_DIM, observe
 from slam_core.camera import Camera
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, make_transform, transform_points
 
@@ -53,7 +53,7 @@ def update_ms(ekf: Ekf, observations: int, rng: np.random.Generator) -> float:
 
 
 def floor_ms(size: int, rows: int, rng: np.random.Generator) -> float:
-    """potrf of (rows, rows), trsm of (size, rows), syrk to (size, size)."""
+    """Potrf of (rows, rows), trsm of (size, rows), syrk to (size, size)."""
     A = rng.standard_normal((rows, rows))
     S = np.asfortranarray(A @ A.T + rows * np.eye(rows))
     W: FloatArray = np.asfortranarray(rng.standard_normal((size, rows)))
@@ -70,7 +70,16 @@ def floor_ms(size: int, rows: int, rng: np.random.Generator) -> float:
 def main() -> None:
     rng = np.random.default_rng(0)
     print(f"{'landmarks':>10} {'observed':>9} {'update ms':>10} {'floor ms':>9} {'ratio':>6}")
-    for landmarks, observations in ((20, 20), (50, 50), (100, 50), (200, 50), (350, 50), (350, 120), (600, 50), (818, 50)):
+    for landmarks, observations in (
+        (20, 20),
+        (50, 50),
+        (100, 50),
+        (200, 50),
+        (350, 50),
+        (350, 120),
+        (600, 50),
+        (818, 50),
+    ):
         ekf = full_filter(landmarks, rng)
         update_ms(ekf, observations, rng)
         took = update_ms(ekf, observations, rng)

@@ -32,9 +32,12 @@ class MeasurementConfig(Config):
     """Which features are good enough to be measurements."""
 
     max_relative_depth_sigma: float = parameter(
-        0.12, "features with a larger sigma of depth / depth are not used: their position is far from Gaussian",
-        minimum=0.001, maximum=0.5,
-    )  # fmt: skip
+        0.3,
+        "features with a larger sigma of depth / depth are not used; a limit cutting through many features favours those"
+        " whose noise makes them look near and biases the motion",
+        minimum=0.001,
+        maximum=0.5,
+    )
     min_sigma_px: float = parameter(0.05, "floor of the pixel noise", unit="px", minimum=1e-3)
     min_sigma_depth: float = parameter(1e-4, "floor of the depth noise", unit="m", minimum=1e-6)
     noise_memory: float = parameter(
