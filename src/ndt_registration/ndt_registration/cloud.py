@@ -7,8 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ndt_registration.edges import rim_points
+from ndt_registration.visibility import mean_spacing, range_image
 from slam_core.geometry import FloatArray
 
+_COVERAGE_SIZE = 64
+"""Size of the range image from which the part of the sphere that a scan covers is measured."""
+_RIM_STEP = 0.04
+"""Least gap in range at a rim, over the scale."""
 _SEED = 20100610
 """Thinning is random but always the same: two runs on the same cloud give the same bytes."""
 
@@ -17,11 +23,13 @@ _SEED = 20100610
 class Cloud:
     """Points (n, 3) m in random order, so that the first k are a fair sample of any size.
 
+    rims (m, 3): points on the rims of things seen before a farther background.
     scale: median distance from the viewpoint, m, the unit of every length that no one has set. planar: the points came as
     (n, 2) and z is 0.
     """
 
     points: FloatArray
+    rims: FloatArray
     scale: float
     planar: bool
 
@@ -64,7 +72,8 @@ def prepare(points: FloatArray, limit: int, *, planar: bool, centre: FloatArray)
         points = points[((np.arange(limit) + rng.random(limit)) * (n / limit)).astype(np.int64)]
     points = np.ascontiguousarray(points[rng.permutation(len(points))] - centre)
     scale = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
-    return Cloud(points, scale, planar)
+    spacing = mean_spacing(points, range_image(points, _COVERAGE_SIZE), planar)
+    return Cloud(points, rim_points(points, spacing, _RIM_STEP * scale), scale, planar)
 
 
 def viewpoint(points: FloatArray) -> FloatArray:

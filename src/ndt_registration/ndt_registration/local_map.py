@@ -21,6 +21,7 @@ class Keyframe:
     T: FloatArray
     covariance: FloatArray
     points: FloatArray
+    rims: FloatArray
 
 
 class LocalMap:
@@ -50,12 +51,14 @@ class LocalMap:
         """Append a keyframe of finite points (n, 3) and rebuild the target."""
         check_cloud(points, "target", self._config)
         scan = prepare(points, self._config.target_points, planar=False, centre=np.zeros(3))
-        self._keyframes.append(Keyframe(T, covariance, scan.points))
+        self._keyframes.append(Keyframe(T, covariance, scan.points, scan.rims))
         self._target = self._build(scan)
 
     def _build(self, scan: Cloud) -> Target:
         T_newest_odom = invert_transform(self.newest.T)
         older = [transform_points(T_newest_odom @ k.T, k.points) for k in list(self._keyframes)[:-1]]
-        cloud = Cloud(np.ascontiguousarray(np.concatenate([scan.points, *older])), scan.scale, scan.planar)
+        older_rims = [transform_points(T_newest_odom @ k.T, k.rims) for k in list(self._keyframes)[:-1]]
+        points, rims = np.concatenate([scan.points, *older]), np.concatenate([scan.rims, *older_rims])
+        cloud = Cloud(np.ascontiguousarray(points), np.ascontiguousarray(rims), scan.scale, scan.planar)
         image = range_image(scan.points, self._config.image_size)
         return Target(cloud, Pyramid.build(cloud, self._config.grid), image, np.zeros(3))

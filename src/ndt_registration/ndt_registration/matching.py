@@ -12,11 +12,13 @@ from slam_core.geometry import FloatArray
 
 
 class Fit(NamedTuple):
-    """Share of points on the target's surfaces, their root mean square distance (m), gradient of the cost by block (b, 6)."""
+    """Share of points on the target's surfaces, their root mean square distance (m), gradient of the cost by block (b, 6), extent of the inliers."""
 
     overlap: float
     inlier_rmse: float
     pulls: FloatArray
+    centre: FloatArray
+    radius: float
 
 
 @njit(cache=True, nogil=True)
@@ -31,6 +33,7 @@ def fit_to_grid(
     blocks = 0
     inliers = 0
     squares = 0.0
+    centre, second = np.zeros(3), 0.0
     for i in range(n):
         px = R[0, 0] * points[i, 0] + R[0, 1] * points[i, 1] + R[0, 2] * points[i, 2]
         py = R[1, 0] * points[i, 0] + R[1, 1] * points[i, 1] + R[1, 2] * points[i, 2]
@@ -63,6 +66,8 @@ def fit_to_grid(
         if best < 4.5 and distance < max_distance:
             inliers += 1
             squares += distance * distance
+            centre += np.array([px, py, pz])
+            second += px * px + py * py + pz * pz
         if weight == 0.0:
             continue
         c = 1.0 / block_size
@@ -79,4 +84,6 @@ def fit_to_grid(
         pulls[row, 3] += py * vz - pz * vy
         pulls[row, 4] += pz * vx - px * vz
         pulls[row, 5] += px * vy - py * vx
-    return Fit(inliers / max(n, 1), np.sqrt(squares / max(inliers, 1)), pulls[:blocks].copy())
+    centre /= max(inliers, 1)
+    radius = np.sqrt(max(second / max(inliers, 1) - (centre * centre).sum(), 1e-12))
+    return Fit(inliers / max(n, 1), np.sqrt(squares / max(inliers, 1)), pulls[:blocks].copy(), centre, radius)

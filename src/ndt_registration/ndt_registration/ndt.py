@@ -21,6 +21,14 @@ from ndt_registration.voxel_grid import NormalGrid, find_block
 from slam_core.geometry import FloatArray
 
 
+class Layer(NamedTuple):
+    """One kind of points (n, 3) and the grid of the same kind that they are matched with; ``factor`` weighs them."""
+
+    points: FloatArray
+    grid: NormalGrid
+    factor: float
+
+
 class NdtOptimum(NamedTuple):
     """Pose, mean score per point in [0, 1], iterations, whether the step became small; derivatives of the *cost* (-score)."""
 
@@ -31,6 +39,7 @@ class NdtOptimum(NamedTuple):
     converged: bool
     gradient: FloatArray
     hessian: FloatArray
+    majorant: FloatArray
 
 
 @njit(cache=True, nogil=True)
@@ -39,21 +48,18 @@ def ndt_derivatives(
     R: FloatArray,
     t: FloatArray,
     grid: NormalGrid,
+    factor: float,
     gradient: FloatArray,
     hessian: FloatArray,
     majorant: FloatArray,
 ) -> float:
-    """Cost ``-sum exp(...) / 8`` of points (n, 3) at the pose, with its gradient (6,), Hessian (6, 6) and majorant (6, 6).
+    """Cost ``-factor sum exp(...) / 8`` of points (n, 3) at the pose; adds to its gradient (6,), Hessian and majorant (6, 6).
 
     The majorant is the positive semidefinite part (that of iteratively reweighted least squares): a step with it always
     lowers the cost, also where the Hessian is indefinite.
     """
     inverse_size = 1.0 / grid.block_size
     cost = 0.0
-    gradient[:] = 0.0
-    hessian[:] = 0.0
-    majorant[:] = 0.0
-    # Sums over the points; rotations enter through M = sum e B p-terms, assembled per point below.
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
@@ -86,7 +92,7 @@ def ndt_derivatives(
             exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
             if exponent > 20.0:
                 continue
-            e = 0.125 * np.exp(-exponent)
+            e = 0.125 * factor * np.exp(-exponent)
             weight += e
             vx += e * ux
             vy += e * uy
@@ -125,6 +131,23 @@ def ndt_derivatives(
         hessian[3, 4] += 0.5 * (px * vy + py * vx)
         hessian[3, 5] += 0.5 * (px * vz + pz * vx)
         hessian[4, 5] += 0.5 * (py * vz + pz * vy)
+    return cost
+
+
+@njit(cache=True, nogil=True)
+def cost_and_derivatives(
+    layers: tuple[Layer, ...],
+    R: FloatArray,
+    t: FloatArray,
+    gradient: FloatArray,
+    hessian: FloatArray,
+    majorant: FloatArray,
+) -> float:
+    """Cost of all layers at a pose; writes its derivatives."""
+    gradient[:], hessian[:], majorant[:] = 0.0, 0.0, 0.0
+    cost = 0.0
+    for layer in layers:
+        cost += ndt_derivatives(layer.points, R, t, layer.grid, layer.factor, gradient, hessian, majorant)
     for r in range(6):
         for c in range(r):
             hessian[r, c] = hessian[c, r]
@@ -184,10 +207,9 @@ def _rotated(R: FloatArray, w: FloatArray) -> FloatArray:
 
 @njit(cache=True, nogil=True)
 def ndt_align(
-    points: FloatArray,
+    layers: tuple[Layer, ...],
     rotation: FloatArray,
     translation: FloatArray,
-    grid: NormalGrid,
     fixed: FloatArray,
     lever: float,
     max_iterations: int,
@@ -197,8 +219,8 @@ def ndt_align(
 
     Parameters
     ----------
-    points
-        Source points, shape (n, 3), m.
+    layers
+        Surfaces and rims, each with source points and target grid; the first gives scale to steps and score.
     rotation, translation
         Initial T_target_source.
     fixed
@@ -214,11 +236,11 @@ def ndt_align(
     g, H, M = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     g_new, H_new, M_new = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     R, t = rotation.copy(), translation.copy()
-    cost = ndt_derivatives(points, R, t, grid, g, H, M)
+    cost = cost_and_derivatives(layers, R, t, g, H, M)
     step = np.zeros(6)
     scale = np.array([1.0, 1.0, 1.0, lever * lever, lever * lever, lever * lever])
     damping = 1e-6
-    max_step = 2.0 * grid.block_size
+    max_step = 2.0 * layers[0].grid.block_size
     converged = False
     iteration = 0
     while iteration < max_iterations and cost < 0.0:
@@ -236,7 +258,7 @@ def ndt_align(
             step *= max_step / size
         R_new = _rotated(R, step[3:])
         t_new = t + step[:3]
-        cost_new = ndt_derivatives(points, R_new, t_new, grid, g_new, H_new, M_new)
+        cost_new = cost_and_derivatives(layers, R_new, t_new, g_new, H_new, M_new)
         predicted = -(g * step).sum() - 0.5 * (step * ((H if newton else M) @ step)).sum()
         if cost_new < cost or size < tolerance:
             gain = (cost - cost_new) / max(predicted, 1e-300)
@@ -254,4 +276,4 @@ def ndt_align(
             damping = max(damping * 10.0, 1e-4)
             if damping > 1e8:
                 break
-    return NdtOptimum(R, t, -cost / max(points.shape[0], 1), iteration, converged, g, H)
+    return NdtOptimum(R, t, -cost / max(layers[0].points.shape[0], 1), iteration, converged, g, H, M)

@@ -12,11 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare, viewpoint
+from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
 from ndt_registration.matching import fit_to_grid
 from ndt_registration.ndt import NdtOptimum, ndt_align
 from ndt_registration.pyramid import GridConfig, Pyramid
 from ndt_registration.search import Candidate, SearchConfig, distinct, judge, planar_constraint, search
-from ndt_registration.uncertainty import UncertaintyConfig, direction_names, sandwich, unknown
+from ndt_registration.uncertainty import Curvature, Extent, UncertaintyConfig, direction_names, sandwich, unknown
 from ndt_registration.visibility import RangeImage, range_image
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, is_rigid_transform, make_transform, skew
@@ -39,6 +40,8 @@ class RegistrationConfig(Config):
         0.15, "least share of source points on the target's surfaces", minimum=0.0, maximum=1.0
     )
     max_conflict: float = parameter(0.3, "largest visibility cost of a success", minimum=0.0)
+    rim_share: float = parameter(0.2, "weight of all rims over that of all surfaces", minimum=0.0)
+    icp: IcpConfig = group(IcpConfig)
     grid: GridConfig = group(GridConfig)
     search: SearchConfig = group(SearchConfig)
     uncertainty: UncertaintyConfig = group(UncertaintyConfig)
@@ -73,6 +76,13 @@ class Target:
     pyramid: Pyramid
     image: RangeImage
     centre: FloatArray
+    _icp: list[IcpTarget] = field(default_factory=list)
+
+    def icp(self, config: IcpConfig) -> IcpTarget:
+        """The cloud with kd-tree and normals, made when first asked for."""
+        if not self._icp:
+            self._icp.append(IcpTarget(self.cloud.points, config))
+        return self._icp[0]
 
     @staticmethod
     def build(points: npt.ArrayLike, config: RegistrationConfig) -> Target:
@@ -154,7 +164,7 @@ def _register(
         candidates, start = search(source, target.pyramid, target.image, scale, config.search), 1
     else:
         candidates, start = [Candidate(np.eye(4), 0.0)], config.grid.levels - 1
-    refined = [(_descend(source, target, candidate.T, start, scale, config)) for candidate in candidates]
+    refined = [_aligned(source, target, candidate.T, start, scale, config) for candidate in candidates]
     costs = [judge(source, target.image, scale, _pose(optimum), config.search) for optimum, _ in refined]
     best = int(np.argmin(costs))
     ranked = sorted((Candidate(_pose(o), c) for (o, _), c in zip(refined, costs, strict=True)), key=lambda c: c.cost)
@@ -167,6 +177,20 @@ def _pose(optimum: NdtOptimum) -> FloatArray:
     return make_transform(optimum.rotation, optimum.translation)
 
 
+def _aligned(
+    source: Cloud, target: Target, T: FloatArray, start: int, scale: float, config: RegistrationConfig
+) -> tuple[NdtOptimum, int]:
+    """The optimum by the chosen method from a pose, with the derivatives of the NDT cost there, and the iterations."""
+    if config.method == "ndt":
+        return _descend(source, target, T, start, scale, config)
+    plane = config.method == "icp_plane"
+    outcome = icp_align(source.points, target.icp(config.icp), T, scale, config.icp, plane=plane, planar=source.planar)
+    R, t = np.ascontiguousarray(outcome.T[:3, :3]), outcome.T[:3, 3].copy()
+    layers = target.pyramid.layers(source, 0, len(source), config.rim_share)
+    there = ndt_align(layers, R, t, planar_constraint(source.planar), scale, 0, 0.0)
+    return there._replace(converged=outcome.converged), outcome.iterations
+
+
 def _descend(
     source: Cloud, target: Target, T: FloatArray, start: int, scale: float, config: RegistrationConfig
 ) -> tuple[NdtOptimum, int]:
@@ -176,8 +200,9 @@ def _descend(
     fixed = planar_constraint(source.planar)
     R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
     for level in range(min(start, len(grids) - 1), -1, -1):
-        points = source.points if level == 0 else source.sample(config.coarse_points)
-        optimum = ndt_align(points, R, t, grids[level], fixed, scale, config.max_iterations, config.tolerance * scale)
+        count = len(source) if level == 0 else config.coarse_points
+        layers = target.pyramid.layers(source, level, count, config.rim_share)
+        optimum = ndt_align(layers, R, t, fixed, scale, config.max_iterations, config.tolerance * scale)
         R, t = optimum.rotation, optimum.translation
         iterations += optimum.iterations
     return optimum, iterations
@@ -198,7 +223,8 @@ def _result(
         source.points, optimum.rotation, optimum.translation, grid, 3.0 * grid.block_size, 2.0 * grid.block_size
     )
     fixed = planar_constraint(source.planar) > 0.0
-    uncertainty = sandwich(optimum.hessian, fit.pulls, scale, fixed, config.uncertainty)
+    curvature = Curvature(optimum.hessian, optimum.majorant)
+    uncertainty = sandwich(curvature, fit.pulls, Extent(fit.centre, fit.radius), scale, fixed, config.uncertainty)
     reason = _reason_of_failure(optimum, fit.overlap, cost, config)
     names = direction_names(uncertainty.free)
     covariance = uncertainty.covariance if not reason else unknown(scale, config.uncertainty)
@@ -223,7 +249,7 @@ def _reason_of_failure(optimum: NdtOptimum, overlap: float, cost: float, config:
             f"the source lies in space that the target saw as free (cost {cost:.2f}, at most {config.max_conflict:.2f})"
         )
     if not optimum.converged:
-        return f"no convergence within {config.max_iterations} iterations"
+        return "the steps did not become small within the allowed iterations"
     return ""
 
 

@@ -32,14 +32,19 @@ class SearchConfig(Config):
     starts: int = parameter(40, "poses of the lattice that are refined", minimum=1)
     refine_points: int = parameter(200, "points used in the refinement", minimum=16)
     refine_iterations: int = parameter(10, "most iterations per level of the refinement", minimum=1)
+    rim_share: float = parameter(0.2, "weight of all rims over that of all surfaces", minimum=0.0)
     judge_points: int = parameter(500, "points used to judge refined poses", minimum=16)
     judge_tolerance: float = parameter(
         0.02, "deviation along the ray that costs nothing there, over the scale", minimum=0.001
     )
-    candidates: int = parameter(3, "distinct refined poses that are handed on", minimum=1)
+    candidates: int = parameter(4, "distinct refined poses that are handed on", minimum=1)
 
 
 PRICES = Prices(unseen=0.15, hidden=0.5, free=2.0)
+"""Nothing is lost where a scan ends, little where things hide each other, but space that was seen free stays free."""
+REFINEMENT_LEVELS = (3, 2)
+SEPARATION = 0.05
+"""Poses nearer than this (rad, and translation over the scale) are the same candidate."""
 
 
 class Candidate(NamedTuple):
@@ -63,7 +68,7 @@ def search(source: Cloud, pyramid: Pyramid, image: RangeImage, scale: float, con
     """Distinct promising poses, best first."""
     starts = _best_of_lattice(source, image, scale, config)
     refined = [_refine(source, pyramid, image, scale, T, config) for T in starts]
-    return distinct(sorted(refined, key=lambda candidate: candidate.cost), 0.05, scale, config.candidates)
+    return distinct(sorted(refined, key=lambda candidate: candidate.cost), SEPARATION, scale, config.candidates)
 
 
 def distinct(candidates: list[Candidate], separation: float, scale: float, count: int) -> list[Candidate]:
@@ -104,11 +109,11 @@ def _best_of_lattice(source: Cloud, image: RangeImage, scale: float, config: Sea
 def _refine(
     source: Cloud, pyramid: Pyramid, image: RangeImage, scale: float, T: FloatArray, config: SearchConfig
 ) -> Candidate:
-    points = source.sample(config.refine_points)
     fixed = planar_constraint(source.planar)
-    for grid in pyramid.grids[3:1:-1]:
+    for level in REFINEMENT_LEVELS:
+        layers = pyramid.layers(source, level, config.refine_points, config.rim_share)
         optimum = ndt_align(
-            points, np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), grid, fixed, scale,
+            layers, np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), fixed, scale,
             config.refine_iterations, 1e-3 * scale,
         )  # fmt: skip
         T = make_transform(optimum.rotation, optimum.translation)

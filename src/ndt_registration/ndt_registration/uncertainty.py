@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.config import Config, parameter
-from slam_core.geometry import FloatArray
+from slam_core.geometry import FloatArray, skew
 
 
 @dataclass(frozen=True)
@@ -23,19 +23,38 @@ class UncertaintyConfig(Config):
         maximum=1.0,
     )
     free_sigma: float = parameter(1.0, "standard deviation given to a free direction, over the scale", minimum=0.0)
-    inflation: float = parameter(1.0, "factor on the covariance of determined directions", minimum=0.01)
+    inflation: float = parameter(1.5, "factor on the covariance of determined directions", minimum=0.01)
     sigma_floor: float = parameter(1e-4, "least standard deviation of any direction, over the scale", minimum=0.0)
 
 
 class Uncertainty(NamedTuple):
-    """Covariance (6, 6) of the pose error and the unit directions (k, 6), angles times the scale, that are not determined."""
+    """Covariance (6, 6) of the pose error; unit directions (k, 6) that are not determined, rotations about the matched points."""
 
     covariance: FloatArray
     free: FloatArray
 
 
+class Curvature(NamedTuple):
+    """Second derivatives of the cost at the optimum (6, 6): exact, and its positive semidefinite majorant."""
+
+    hessian: FloatArray
+    majorant: FloatArray
+
+
+class Extent(NamedTuple):
+    """Where the points are that were matched: centroid (3,) and root mean square distance from it, m."""
+
+    centre: FloatArray
+    radius: float
+
+
 def sandwich(
-    hessian: FloatArray, pulls: FloatArray, scale: float, fixed: npt.NDArray[np.bool_], config: UncertaintyConfig
+    curvature: Curvature,
+    pulls: FloatArray,
+    extent: Extent,
+    scale: float,
+    fixed: npt.NDArray[np.bool_],
+    config: UncertaintyConfig,
 ) -> Uncertainty:
     """Covariance ``H^-1 (sum g g') H^-1`` of an M-estimate whose errors are independent between blocks only (White 1982).
 
@@ -45,30 +64,45 @@ def sandwich(
 
     Parameters
     ----------
-    hessian
-        Of the cost at the optimum, shape (6, 6).
+    curvature
+        Of the cost at the optimum.
     pulls
         Gradient of the cost of each block, shape (b, 6).
+    extent
+        Rotations are taken about the centre of what was matched, and angles times its radius: only there can the curvatures
+        of translations and rotations be compared (Zhang and Singh 2016 on degeneracy).
     scale
-        Makes angles comparable with lengths, m.
+        Free directions get ``free_sigma`` times this, m.
     fixed
         Components of the pose error that were held, shape (6,); their variance is that of the floor.
     """
-    units = np.array([1.0, 1.0, 1.0, 1 / scale, 1 / scale, 1 / scale])
-    H = hessian * np.outer(units, units)
-    G = pulls * units
-    H[fixed], H[:, fixed], G[:, fixed] = 0.0, 0.0, 0.0
-    values, vectors = np.linalg.eigh(H)
+    to_pose = np.eye(6)
+    to_pose[:3, 3:] = skew(extent.centre) / extent.radius
+    to_pose[3:, 3:] /= extent.radius
+    H, M = to_pose.T @ curvature.hessian @ to_pose, to_pose.T @ curvature.majorant @ to_pose
+    G = pulls @ to_pose
+    H[fixed], H[:, fixed], M[fixed], M[:, fixed], G[:, fixed] = 0.0, 0.0, 0.0, 0.0, 0.0
+    values, vectors = np.linalg.eigh(M)
     held = np.abs(vectors[fixed]).sum(axis=0) > 0.5
     free = (values < config.degeneracy * max(values[-1], 1e-300)) & ~held
-    inverse = (vectors * np.where(free | held, 0.0, 1.0 / np.where(free | held, 1.0, values))) @ vectors.T
-    blocks = len(pulls)
-    scatter = G.T @ G * (blocks / max(blocks - 6, 1))
-    covariance = config.inflation * inverse @ scatter @ inverse
-    covariance += (config.sigma_floor * scale) ** 2 * np.eye(6)
+    known = vectors[:, ~free & ~held]
+    covariance = (config.sigma_floor * scale) ** 2 * np.eye(6)
+    if known.shape[1]:
+        inverse = _inverse(known.T @ H @ known, known.T @ M @ known)
+        scatter = known.T @ G.T @ G @ known * (len(pulls) / max(len(pulls) - 6, 1))
+        covariance += config.inflation * known @ inverse @ scatter @ inverse @ known.T
     covariance += (vectors[:, free] * (config.free_sigma * scale) ** 2) @ vectors[:, free].T
-    covariance = covariance * np.outer(units, units)
+    covariance = to_pose @ covariance @ to_pose.T
     return Uncertainty(0.5 * (covariance + covariance.T), vectors[:, free].T)
+
+
+def _inverse(hessian: FloatArray, majorant: FloatArray) -> FloatArray:
+    """Inverse of the exact curvature, or of the majorant where the exact one is (nearly) indefinite."""
+    relative = np.linalg.eigvals(np.linalg.solve(majorant, hessian)).real
+    return np.asarray(np.linalg.inv(hessian if relative.min() > _LEAST_RELATIVE_CURVATURE else majorant))
+
+
+_LEAST_RELATIVE_CURVATURE = 0.05
 
 
 def unknown(scale: float, config: UncertaintyConfig) -> FloatArray:

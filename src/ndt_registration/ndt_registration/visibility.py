@@ -31,8 +31,15 @@ class Prices(NamedTuple):
     free: float
 
 
+LEAST_MATCH = 0.15
+"""Share of the points that must match a surface for a pose to be credible."""
+MEAN_BIN = 3.545
+"""Mean angle (rad) that a bin of the octahedral map covers, times the size of the map: the root of 4 pi."""
+
+
 @njit(cache=True, nogil=True, inline="always")
-def _bin(x: float, y: float, z: float, size: int) -> int:
+def direction_bin(x: float, y: float, z: float, size: int) -> int:
+    """Bin of a direction."""
     s = abs(x) + abs(y) + abs(z)
     if s == 0.0:
         return 0
@@ -50,7 +57,7 @@ def range_image(points: FloatArray, size: int) -> RangeImage:
     near, far = np.zeros(size * size), np.zeros(size * size)
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        k = _bin(x, y, z, size)
+        k = direction_bin(x, y, z, size)
         r = np.sqrt(x * x + y * y + z * z)
         far[k] = max(far[k], r)
         near[k] = r if near[k] == 0.0 else min(near[k], r)
@@ -59,11 +66,15 @@ def range_image(points: FloatArray, size: int) -> RangeImage:
 
 @njit(cache=True, nogil=True)
 def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolerance: float, prices: Prices) -> float:
-    """Mean cost of points (n, 3), moved by ``t`` (3,); deviations grow from 0 to the full price between 1 and 2 tolerances."""
+    """Mean cost of points (n, 3), moved by ``t`` (3,); deviations grow from 0 to the full price between 1 and 2 tolerances.
+
+    Where hardly anything matches nothing can be said: below a share ``LEAST_MATCH`` of matches the cost rises towards 1.
+    """
     cost = 0.0
+    matches = 0
     for i in range(points.shape[0]):
         x, y, z = points[i, 0] + t[0], points[i, 1] + t[1], points[i, 2] + t[2]
-        k = _bin(x, y, z, image.size)
+        k = direction_bin(x, y, z, image.size)
         far = image.far[k]
         if far == 0.0:
             cost += prices.unseen
@@ -73,7 +84,10 @@ def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolera
             cost += prices.hidden * min((r - far) / tolerance - 1.0, 1.0)
         elif r < image.near[k] - tolerance:
             cost += prices.free * min((image.near[k] - r) / tolerance - 1.0, 1.0)
-    return cost / points.shape[0]
+        else:
+            matches += 1
+    share = matches / points.shape[0]
+    return cost / points.shape[0] + max(1.0 - share / LEAST_MATCH, 0.0)
 
 
 @njit(cache=True, nogil=True)
@@ -92,3 +106,15 @@ def lattice_costs(
         for b in range(translations.shape[0]):
             costs[a, b] = visibility_cost(turned, translations[b], image, tolerance, prices)
     return costs
+
+
+@njit(cache=True, nogil=True)
+def mean_spacing(points: FloatArray, image: RangeImage, planar: bool) -> float:
+    """Mean angle (rad) between neighbouring points (n, 3), from the part of the sphere, or circle, that they cover."""
+    occupied = 0
+    for k in range(image.far.shape[0]):
+        if image.far[k] > 0.0:
+            occupied += 1
+    if planar:
+        return np.pi / image.size * occupied / points.shape[0]
+    return MEAN_BIN / image.size * np.sqrt(occupied / points.shape[0])

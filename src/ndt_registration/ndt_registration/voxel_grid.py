@@ -26,12 +26,12 @@ MAX_CELLS_PER_AXIS = _OFFSET - 4
 
 
 class Moments(NamedTuple):
-    """Sums over the points of each block: corner (m, 3) in blocks, count (m,), sum (m, 3), outer (m, 6) xx xy xz yy yz zz."""
+    """Sums over the points of each block: corner (m, 3) in blocks, counts (m,), sums (m, 3), outers (m, 6) xx xy xz yy yz zz."""
 
     corner: IntArray
-    count: FloatArray
-    sum: FloatArray
-    outer: FloatArray
+    counts: FloatArray
+    sums: FloatArray
+    outers: FloatArray
 
 
 class NormalGrid(NamedTuple):
@@ -39,7 +39,7 @@ class NormalGrid(NamedTuple):
 
     ``keys`` and ``rows`` are the hash table of blocks; ``cells`` (m, 8) holds the cells that cover a block, -1 where there is
     none; ``mean`` (k, 3), ``information`` (k, 6) upper triangle of the inverse covariance, ``normal`` (k, 3) direction of least
-    variance, ``variance`` (k, 3) raw ascending eigenvalues, ``count`` (k,) points.
+    variance, ``variance`` (k, 3) raw ascending eigenvalues, ``counts`` (k,) points.
     """
 
     block_size: float
@@ -50,7 +50,7 @@ class NormalGrid(NamedTuple):
     information: FloatArray
     normal: FloatArray
     variance: FloatArray
-    count: FloatArray
+    counts: FloatArray
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -155,9 +155,14 @@ def _point_moments(points: FloatArray, block_size: float) -> tuple[IntArray, Flo
 
 @njit(cache=True, nogil=True)
 def _distributions(
-    count: FloatArray, first: FloatArray, outer: FloatArray, relative_floor: float, variance_floor: float
+    count: FloatArray,
+    first: FloatArray,
+    outer: FloatArray,
+    relative_floor: float,
+    variance_floor: float,
+    slack: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Mean, information, normal and raw eigenvalues of each cell; eigenvalues are raised to the floor before inversion."""
+    """Mean, information, normal and raw eigenvalues of each cell; see :func:`normal_grid` for floor and slack."""
     n = count.shape[0]
     mean = np.empty((n, 3))
     information = np.empty((n, 6))
@@ -177,6 +182,7 @@ def _distributions(
                 m += 1
         symmetric_eigen3(a, vectors, values)
         floor = max(relative_floor * values[2], variance_floor)
+        free = slack / max(values[2], floor)
         m = 0
         for r in range(3):
             normal[i, r] = vectors[r, 0]
@@ -184,7 +190,7 @@ def _distributions(
             for c in range(r, 3):
                 s = 0.0
                 for k in range(3):
-                    s += vectors[r, k] * vectors[c, k] / max(values[k], floor)
+                    s += vectors[r, k] * vectors[c, k] * max(1.0 / max(values[k], floor) - free, 0.0)
                 information[i, m] = s
                 m += 1
     return mean, information, normal, variance
@@ -226,21 +232,21 @@ def block_moments(points: FloatArray, block_size: float) -> Moments:
 
 def coarser(moments: Moments) -> Moments:
     """Moments in blocks of twice the edge."""
-    return Moments(*_accumulate(moments.corner >> 1, moments.count, moments.sum, moments.outer, 1))
+    return Moments(*_accumulate(moments.corner >> 1, moments.counts, moments.sums, moments.outers, 1))
 
 
 def normal_grid(
-    moments: Moments, block_size: float, *, min_points: int, relative_floor: float, variance_floor: float
+    moments: Moments, block_size: float, *, min_points: int, relative_floor: float, variance_floor: float, slack: float
 ) -> NormalGrid:
     """Cells of edge ``2 * block_size`` m with at least ``min_points`` points.
 
     Each eigenvalue of a cell's covariance is at least ``relative_floor`` times the largest (8.2.1) and ``variance_floor`` m2.
     """
-    corner, count, first, outer = _accumulate(moments.corner, moments.count, moments.sum, moments.outer, 8)
+    corner, count, first, outer = _accumulate(moments.corner, moments.counts, moments.sums, moments.outers, 8)
     keep = count >= max(min_points, 2)
     count = count[keep]
     mean, information, normal, variance = _distributions(
-        count, first[keep], outer[keep], relative_floor, variance_floor
+        count, first[keep], outer[keep], relative_floor, variance_floor, slack
     )
     keys, rows, cells = _cover(corner[keep])
     return NormalGrid(block_size, keys, rows, cells, mean, information, normal, variance, count)

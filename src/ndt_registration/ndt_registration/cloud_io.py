@@ -1,0 +1,163 @@
+"""Point clouds from files: PCD (ascii, binary, binary_compressed), PLY and legacy VTK (ascii and binary)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ndt_registration.lzf import lzf_decompress
+from slam_core.geometry import FloatArray
+
+PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+VTK_TYPES = {"float": ">f4", "double": ">f8"}
+
+
+def read_cloud(path: Path) -> FloatArray:
+    """Points (n, 3) m of a ``.pcd``, ``.ply`` or ``.vtk`` file, NaN points included.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is unknown or the file is empty, truncated or contradicts itself.
+    OSError
+        If it cannot be read.
+    """
+    readers = {".pcd": read_pcd, ".ply": read_ply, ".vtk": read_vtk}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise ValueError(f"{path}: unknown kind of cloud '{path.suffix}', known: {', '.join(readers)}")
+    content = path.read_bytes()
+    if not content.strip():
+        raise ValueError(f"{path}: the file is empty")
+    try:
+        return reader(content)
+    except (ValueError, KeyError, IndexError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not a valid {path.suffix[1:]} cloud: {error}") from error
+
+
+def read_pcd(content: bytes) -> FloatArray:
+    """Points of a PCD file (version 0.7)."""
+    header, body = _pcd_header(content)
+    names = header["FIELDS"]
+    count = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
+    _require_xyz(names)
+    counts = [int(c) for c in header.get("COUNT", ["1"] * len(names))]
+    kinds = [f"<{_pcd_kind(t)}{s}" for t, s in zip(header["TYPE"], header["SIZE"], strict=True)]
+    encoding = header["DATA"][0]
+    if encoding == "ascii":
+        first = np.concatenate([[0], np.cumsum(counts)])
+        return _ascii_columns(body, count, int(first[-1]), [int(first[names.index(axis)]) for axis in "xyz"])
+    layout = np.dtype([(f"{n}{i}", k, (c,)) for i, (n, k, c) in enumerate(zip(names, kinds, counts, strict=True))])
+    if encoding == "binary":
+        records = np.frombuffer(_exactly(body, count * layout.itemsize), dtype=layout)
+        return np.column_stack([records[f"{a}{names.index(a)}"][:, 0] for a in "xyz"]).astype(np.float64)
+    if encoding == "binary_compressed":
+        return _pcd_compressed(body, count, names, layout)
+    raise ValueError(f"unknown DATA '{encoding}'")
+
+
+def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], bytes]:
+    header: dict[str, list[str]] = {}
+    position = 0
+    while "DATA" not in header:
+        end = content.find(b"\n", position)
+        if end < 0:
+            raise ValueError("the header has no DATA line")
+        words = content[position:end].decode("ascii").split()
+        position = end + 1
+        if words and not words[0].startswith("#"):
+            header[words[0]] = words[1:]
+    return header, content[position:]
+
+
+def _pcd_kind(letter: str) -> str:
+    return {"F": "f", "I": "i", "U": "u"}[letter]
+
+
+def _pcd_compressed(body: bytes, count: int, names: list[str], layout: np.dtype[np.void]) -> FloatArray:
+    """The fields one after the other, compressed as a whole by LZF."""
+    packed, size = (int(v) for v in np.frombuffer(_exactly(body, 8), "<u4"))
+    if size != count * layout.itemsize:
+        raise ValueError(f"{size} bytes of points announced, {count * layout.itemsize} needed")
+    data = lzf_decompress(np.frombuffer(_exactly(body[8:], packed), np.uint8), size)
+    columns = []
+    for axis in "xyz":
+        field = layout.fields[f"{axis}{names.index(axis)}"] if layout.fields else None
+        assert field is not None
+        start = field[1] * count
+        columns.append(np.frombuffer(data[start : start + count * field[0].itemsize].tobytes(), field[0].base))
+    return np.column_stack(columns).astype(np.float64)
+
+
+def read_ply(content: bytes) -> FloatArray:
+    """Vertices of a PLY file, ascii or binary of either byte order; the vertices must be the first element."""
+    end = content.find(b"end_header")
+    if not content.startswith(b"ply") or end < 0:
+        raise ValueError("no PLY header")
+    body = content[content.index(b"\n", end) + 1 :]
+    encoding, count, properties = _ply_vertices(content[:end].decode("ascii", errors="replace").splitlines())
+    names = [name for name, _ in properties]
+    _require_xyz(names)
+    if encoding == "ascii":
+        return _ascii_columns(body, count, len(names), [names.index(axis) for axis in "xyz"])
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
+    layout = np.dtype([(name, order + kind) for name, kind in properties])
+    records = np.frombuffer(_exactly(body, count * layout.itemsize), dtype=layout)
+    return np.column_stack([records[axis] for axis in "xyz"]).astype(np.float64)
+
+
+def _ply_vertices(lines: list[str]) -> tuple[str, int, list[tuple[str, str]]]:
+    encoding, count, properties, elements = "", -1, [], 0
+    for words in (line.split() for line in lines):
+        if words[:1] == ["format"]:
+            encoding = words[1]
+        elif words[:1] == ["element"]:
+            elements += 1
+            if elements == 1 and words[1] != "vertex":
+                raise ValueError(f"the first element is '{words[1]}', not 'vertex'")
+            count = int(words[2]) if elements == 1 else count
+        elif words[:1] == ["property"] and elements == 1:
+            if words[1] == "list":
+                raise ValueError("vertices with lists are not supported")
+            properties.append((words[2], PLY_TYPES[words[1]]))
+    if count < 0:
+        raise ValueError("no vertices")
+    return encoding, count, properties
+
+
+def read_vtk(content: bytes) -> FloatArray:
+    """Points of a legacy VTK file (POLYDATA or UNSTRUCTURED_GRID), ascii or big-endian binary."""
+    if not content.startswith(b"# vtk DataFile"):
+        raise ValueError("no legacy VTK header")
+    encoding = content.split(b"\n", 3)[2].strip().upper()
+    start = content.index(b"POINTS ")
+    end = content.index(b"\n", start)
+    _, number, kind = content[start:end].decode("ascii").split()
+    count, body = int(number), content[end + 1 :]
+    if encoding == b"BINARY":
+        dtype = np.dtype(VTK_TYPES[kind])
+        return np.frombuffer(_exactly(body, 3 * count * dtype.itemsize), dtype).reshape(-1, 3).astype(np.float64)
+    return _ascii_columns(body, count, 3, [0, 1, 2])
+
+
+def _ascii_columns(body: bytes, rows: int, width: int, columns: list[int]) -> FloatArray:
+    words = body.split(maxsplit=rows * width)[: rows * width]
+    if len(words) < rows * width:
+        raise ValueError(f"{rows * width} numbers announced, {len(words)} found")
+    table = np.array(words, dtype="S").astype(np.float64).reshape(rows, width) if words else np.empty((0, width))
+    return table[:, columns]
+
+
+def _require_xyz(names: list[str]) -> None:
+    if not {"x", "y", "z"} <= set(names):
+        raise ValueError(f"no fields x, y and z among {', '.join(names)}")
+
+
+def _exactly(body: bytes, size: int) -> bytes:
+    if len(body) < size:
+        raise ValueError(f"{size} bytes of points announced, {len(body)} found")
+    return body[:size]

@@ -1,0 +1,129 @@
+"""Iterative closest points, point to point and point to plane: kd-tree, trimmed, with a rejection limit that shrinks.
+
+Kept as the baseline that the thesis compares with (10.2) and for clouds too thin for cells of points. One setting serves
+large motions because the limit starts at a fraction of the cloud's scale and shrinks to a few point spacings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray, boxplus, make_transform, transform_points
+from slam_core.rigid_alignment import umeyama
+
+
+@dataclass(frozen=True)
+class IcpConfig(Config):
+    """Iterative closest points."""
+
+    max_distance: float = parameter(0.0, "first rejection limit, 0: from the cloud's scale", unit="m", minimum=0.0)
+    relative_max_distance: float = parameter(0.2, "first rejection limit over the scale", minimum=0.001)
+    final_spacings: float = parameter(3.0, "last rejection limit over the median spacing of the target", minimum=0.5)
+    shrinkage: float = parameter(0.6, "factor of the limit from stage to stage", minimum=0.1, maximum=0.95)
+    trimmed: float = parameter(0.9, "share of the pairs within the limit that is used, nearest first", minimum=0.1, maximum=1.0)
+    iterations: int = parameter(20, "most iterations per stage", minimum=1)
+    tolerance: float = parameter(1e-4, "length of the last step, over the scale", minimum=0.0)
+    neighbours: int = parameter(12, "neighbours from which a normal is computed", minimum=3)
+
+
+class IcpOutcome(NamedTuple):
+    """Pose T_target_source, iterations, whether the last stage's steps became small."""
+
+    T: FloatArray
+    iterations: int
+    converged: bool
+
+
+class IcpTarget:
+    """kd-tree, spacing and normals of a cloud (n, 3)."""
+
+    def __init__(self, points: FloatArray, config: IcpConfig) -> None:
+        self.points = points
+        self.tree = cKDTree(points)
+        distances, self._neighbours = self.tree.query(points, k=min(config.neighbours, len(points)))
+        self.spacing = float(np.median(distances[:, 1]))
+        self._normals: FloatArray | None = None
+
+    @property
+    def normals(self) -> FloatArray:
+        """Unit normal of each point (n, 3): direction of least variance among its neighbours."""
+        if self._normals is None:
+            patches = self.points[self._neighbours]
+            patches = patches - patches.mean(axis=1, keepdims=True)
+            self._normals = np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))[1][:, :, 0]
+        return self._normals
+
+
+def icp_align(
+    source: FloatArray, target: IcpTarget, T: FloatArray, scale: float, config: IcpConfig, *, plane: bool, planar: bool
+) -> IcpOutcome:
+    """Move ``source`` (n, 3) onto ``target`` from the pose ``T``; ``planar`` allows x, y and yaw only."""
+    limit = config.max_distance or config.relative_max_distance * scale
+    last = min(config.final_spacings * target.spacing, limit)
+    iterations, converged = 0, False
+    while True:
+        T, used, converged = _stage(source, target, T, limit, scale, config, plane, planar)
+        iterations += used
+        if limit <= last:
+            return IcpOutcome(T, iterations, converged)
+        limit = max(limit * config.shrinkage, last)
+
+
+def _stage(
+    source: FloatArray,
+    target: IcpTarget,
+    T: FloatArray,
+    limit: float,
+    scale: float,
+    config: IcpConfig,
+    plane: bool,
+    planar: bool,
+) -> tuple[FloatArray, int, bool]:
+    """Iterations with one rejection limit: pose, number, whether it settled."""
+    for iteration in range(1, config.iterations + 1):
+        moved = transform_points(T, source)
+        distance, nearest = target.tree.query(moved, distance_upper_bound=limit)
+        pairs = np.flatnonzero(np.isfinite(distance))
+        if len(pairs) < 6:
+            return T, iteration, False
+        keep = max(int(config.trimmed * len(pairs)), 6)
+        pairs = pairs[np.argpartition(distance[pairs], keep - 1)[:keep]]
+        points, matches = moved[pairs], nearest[pairs]
+        if plane:
+            step = _plane_step(points, T[:3, 3], target.points[matches], target.normals[matches], planar)
+            T_new = boxplus(T, step)
+        else:
+            T_new = _point_step(points, target.points[matches], planar) @ T
+        change = np.linalg.norm(T_new[:3, 3] - T[:3, 3]) + scale * np.linalg.norm(T_new[:3, :3] - T[:3, :3])
+        T = T_new
+        if change < config.tolerance * scale:
+            return T, iteration, True
+    return T, config.iterations, False
+
+
+def _point_step(points: FloatArray, matches: FloatArray, planar: bool) -> FloatArray:
+    """Rigid motion that brings the points nearest to their matches."""
+    if not planar:
+        return umeyama(points, matches)
+    a, b = points - points.mean(axis=0), matches - matches.mean(axis=0)
+    angle = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum())
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return make_transform(R, matches.mean(axis=0) - R @ points.mean(axis=0))
+
+
+def _plane_step(
+    points: FloatArray, translation: FloatArray, matches: FloatArray, normals: FloatArray, planar: bool
+) -> FloatArray:
+    """Gauss-Newton step (6,) of the distances along the normals."""
+    residual = np.einsum("ni,ni->n", points - matches, normals)
+    J = np.hstack([normals, np.cross(points - translation, normals)])
+    if planar:
+        J[:, 2:5] = 0.0
+    A = J.T @ J
+    return -np.linalg.solve(A + 1e-9 * np.trace(A) * np.eye(6), J.T @ residual)

@@ -1,0 +1,91 @@
+"""The ``ndt_odometry`` node: point clouds of one sensor in, the rig's odometry and motions out."""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from ndt_registration.odometry import OdometryConfig, OdometryResult, OdometryStatus, ScanOdometry
+from slam_core.base_node import SlamNode
+from slam_core.config import parameter
+from slam_core.geometry import FloatArray
+from slam_core.health import State
+from slam_core.messages import (
+    header_message,
+    motion_message,
+    odometry_message,
+    path_message,
+    points_from_message,
+    points_message,
+    stamp_ns,
+)
+from slam_core.messages.base import Message
+from slam_core.motion import motion_of_rig, pose_of_rig
+from slam_core.ros import run_node
+from slam_core.types import PoseEstimate, RelativeMotion
+
+
+@dataclass(frozen=True)
+class NdtNodeConfig(OdometryConfig):
+    """Scan odometry's parameters and the node's own."""
+
+    odom_frame: str = parameter("odom", "frame of the odometry")
+    base_frame: str = parameter("base_link", "frame of the rig; the cloud's frame is looked up in it")
+    path_length: int = parameter(2000, "newest poses shown in ``ndt/path``", minimum=1)
+
+
+class NdtNode(SlamNode[NdtNodeConfig]):
+    """Publishes ``ndt/odometry``, ``ndt/motion`` (one for every scan, unknown ones too) and pictures of both."""
+
+    def __init__(self) -> None:
+        super().__init__("ndt_odometry", NdtNodeConfig)
+        self.odometry = ScanOdometry(self.config)
+        self.path = deque[PoseEstimate](maxlen=self.config.path_length)
+        self.advertise("ndt/odometry", "Odometry")
+        self.advertise("ndt/motion", "PoseWithCovarianceStamped")
+        self.advertise("ndt/path", "Path")
+        self.advertise("ndt/points_aligned", "PointCloud2")
+        self.listen("tof/points", "PointCloud2", self.on_points)
+
+    def on_points(self, cloud: Message) -> None:
+        """One scan."""
+        T_base_sensor = self.lookup(self.config.base_frame, cloud.header.frame_id)
+        points = points_from_message(cloud)
+        result = self.odometry.process(stamp_ns(cloud), points)
+        pose = pose_of_rig(PoseEstimate(result.stamp_ns, result.T, result.covariance), T_base_sensor)
+        motion = None if result.motion is None else motion_of_rig(result.motion, T_base_sensor)
+        self._publish(pose, motion)
+        if self.has_listeners("ndt/points_aligned"):
+            self._publish_aligned(points, pose.T @ T_base_sensor, pose.stamp_ns)
+        self._report(result)
+
+    def on_reset(self) -> None:
+        """Forget everything: the next scan is the origin."""
+        self.odometry.reset()
+        self.path.clear()
+
+    def _publish(self, pose: PoseEstimate, motion: RelativeMotion | None) -> None:
+        odom, base = self.config.odom_frame, self.config.base_frame
+        self.path.append(pose)
+        self.publish("ndt/motion", motion_message(self.types, base, pose.stamp_ns, motion))
+        self.publish("ndt/odometry", odometry_message(self.types, odom, base, pose))
+        if self.has_listeners("ndt/path"):
+            self.publish("ndt/path", path_message(self.types, pose.stamp_ns, odom, self.path))
+
+    def _publish_aligned(self, points: FloatArray, T_odom_sensor: FloatArray, stamp: int) -> None:
+        aligned = points @ T_odom_sensor[:3, :3].T + T_odom_sensor[:3, 3]
+        header = header_message(self.types, stamp, self.config.odom_frame)
+        self.publish("ndt/points_aligned", points_message(self.types, header, aligned))
+
+    def _report(self, result: OdometryResult) -> None:
+        self.health.count(result.status.value.lower())
+        failed = result.status is OdometryStatus.FAILED
+        self.health.set(State.DEGRADED if failed else State.OK, result.reason)
+
+
+def main() -> None:
+    """Entry point of ``ros2 run ndt_registration ndt_odometry``."""
+    run_node(NdtNode)

@@ -1,0 +1,118 @@
+"""``slam register``: align two clouds and print one JSON object; with ``-o``, a picture before and after."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import click
+import numpy as np
+import yaml
+
+from ndt_registration.cloud import finite_points
+from ndt_registration.cloud_io import read_cloud
+from ndt_registration.registration import RegistrationConfig, RegistrationResult, register
+from slam_core.config import from_mapping
+from slam_core.files import atomic_path
+from slam_core.geometry import FloatArray, make_transform, rotation_from_euler, transform_from_pose7, transform_points
+
+PICTURE_POINTS = 8000
+
+
+@click.command()
+@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("target", type=click.Path(path_type=Path))
+@click.option("--method", type=click.Choice(["ndt", "icp", "icp_plane"]), default="ndt", show_default=True)
+@click.option(
+    "--initial-guess",
+    help="T_target_source: 'x y z', 'x y z yaw pitch roll' (m, deg), 'x y z qx qy qz qw', 16 numbers, or a text file of them",
+)
+@click.option("--config", "config_file", type=click.Path(path_type=Path), help="YAML with RegistrationConfig values")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="folder for result.json and registration.png")
+def command(
+    source: Path, target: Path, method: str, initial_guess: str | None, config_file: Path | None, output: Path | None
+) -> None:
+    """Align SOURCE to TARGET (pcd, ply, vtk)."""
+    values = yaml.safe_load(config_file.read_text(encoding="utf-8")) or {} if config_file else {}
+    config = from_mapping(RegistrationConfig, {**values, "method": method})
+    source_points, target_points = (_read(path) for path in (source, target))
+    result = register(source_points, target_points, parse_guess(initial_guess) if initial_guess else None, config)
+    text = json.dumps(result_as_json(result), indent=2)
+    click.echo(text)
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+        with atomic_path(output / "result.json") as temporary:
+            temporary.write_text(text + "\n", encoding="utf-8")
+        with atomic_path(output / "registration.png") as temporary:
+            draw_before_after(temporary, source_points, target_points, result)
+
+
+def _read(path: Path) -> FloatArray:
+    points = finite_points(read_cloud(path))
+    if len(points) == 0:
+        raise ValueError(f"{path}: no finite points")
+    return points
+
+
+def result_as_json(result: RegistrationResult) -> dict[str, object]:
+    """The result as plain values."""
+    return {
+        "T_target_source": result.T_target_source.tolist(),
+        "covariance": result.covariance.tolist(),
+        "converged": result.converged,
+        "iterations": result.iterations,
+        "score": result.score,
+        "overlap": result.overlap,
+        "inlier_rmse": result.inlier_rmse,
+        "degenerate": list(result.degenerate),
+        "reason": result.reason,
+    }
+
+
+def parse_guess(text: str) -> FloatArray:
+    """T (4, 4) of the numbers in ``text``, or in the file of that name.
+
+    Raises
+    ------
+    ValueError
+        If there are not 3, 6, 7 or 16 finite numbers.
+    """
+    path = Path(text)
+    content = path.read_text(encoding="utf-8") if len(text) < 255 and path.is_file() else text
+    try:
+        values = np.array([float(word) for word in content.replace(",", " ").split()])
+    except ValueError as error:
+        raise ValueError(f"initial guess '{text}' is neither numbers nor a file of numbers") from error
+    if not all(math.isfinite(v) for v in values):
+        raise ValueError(f"initial guess '{text}' must be finite")
+    if len(values) == 16:
+        return values.reshape(4, 4)
+    if len(values) == 7:
+        return transform_from_pose7(values)
+    if len(values) in (3, 6):
+        angles = np.deg2rad(values[3:]) if len(values) == 6 else np.zeros(3)
+        return make_transform(rotation_from_euler(*angles), values[:3])
+    raise ValueError(f"initial guess must be 3, 6, 7 or 16 numbers, got {len(values)}")
+
+
+def draw_before_after(path: Path, source: FloatArray, target: FloatArray, result: RegistrationResult) -> None:
+    """Picture of both clouds as given and registered, along the two axes in which the target is widest."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(14, 7))
+    FigureCanvasAgg(figure)
+    axes = sorted(np.argsort(np.ptp(target, axis=0))[-2:])
+    moved = transform_points(result.T_target_source, source)
+    titles = ("before", f"after: {'converged' if result.converged else 'not converged'}")
+    for k, (title, cloud) in enumerate(zip(titles, (source, moved), strict=True)):
+        panel = figure.add_subplot(1, 2, k + 1, aspect="equal", title=title)
+        for points, colour, name in ((target, "tab:blue", "target"), (cloud, "tab:red", "source")):
+            shown = points[:: max(1, len(points) // PICTURE_POINTS)]
+            panel.plot(shown[:, axes[0]], shown[:, axes[1]], ".", color=colour, markersize=1.0, label=name)
+        panel.set_xlabel(f"{'xyz'[axes[0]]} [m]")
+        panel.set_ylabel(f"{'xyz'[axes[1]]} [m]")
+        panel.legend(markerscale=8)
+    figure.tight_layout()
+    figure.savefig(path, format="png", dpi=110)
