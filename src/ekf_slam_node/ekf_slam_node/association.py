@@ -13,6 +13,7 @@ from numba import njit
 
 from ekf_slam_node.candidates import Candidates, innovation_covariance, predict
 from ekf_slam_node.config import AssociationConfig
+from ekf_slam_node.jcbb import JointPrediction, jcbb
 from ekf_slam_node.models import Frame, rig_points
 from slam_core.geometry import FloatArray, transform_points
 
@@ -105,3 +106,32 @@ def match_descriptors(similarity: FloatArray, threshold: float, ratio: float) ->
     distinct = (1.0 - value) <= ratio**2 * (1.0 - second)
     rows = rows[mutual & distinct]
     return rows, best[rows]
+
+
+def associate_jcbb(
+    candidates: Candidates, frame: Frame, similarity: FloatArray, T_previous_now: FloatArray,
+    motion_covariance: FloatArray, T_rig_optical: FloatArray, config: AssociationConfig,
+) -> tuple[IndexArray, IndexArray]:  # fmt: skip
+    """Pairs that are jointly compatible: the features with the fewest candidates, as many as a search can handle.
+
+    They fix the motion; the others follow by their gates around it (:class:`ekf_slam_node.linking.Linker`).
+    """
+    seen = predict(candidates, T_previous_now, T_rig_optical, frame)
+    S = innovation_covariance(seen, candidates, motion_covariance)
+    costs = np.full(similarity.shape, np.inf)
+    _gated_costs(
+        frame.z, frame.variance, seen.z, S, seen.in_image(frame.camera), similarity, config.descriptor_threshold,
+        config.gate, 0.0, costs,
+    )  # fmt: skip
+    choices = np.isfinite(costs).sum(axis=0)
+    columns = np.argsort(np.where(choices > 0, choices, np.iinfo(np.int64).max), kind="stable")
+    columns = columns[: min(config.joint_features, int((choices > 0).sum()))]
+    rows = np.flatnonzero(np.isfinite(costs[:, columns]).any(axis=1))
+    J = seen.J_pose[rows].reshape(-1, 6)
+    joint = J @ motion_covariance @ J.T
+    own = innovation_covariance(seen, candidates, None)[rows]
+    for k in range(len(rows)):
+        joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own[k]
+    noise = frame.variance[columns][:, :, None] * np.eye(3)
+    found = jcbb(frame.z[columns], noise, JointPrediction(seen.z[rows], joint), confidence=0.999)
+    return rows[found[found >= 0]], columns[found >= 0]

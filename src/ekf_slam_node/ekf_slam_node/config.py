@@ -33,7 +33,7 @@ class MeasurementConfig(Config):
 
     max_relative_depth_sigma: float = parameter(
         0.3,
-        "features with a larger sigma of depth / depth are not used; a limit cutting through many features favours those"
+        "features of a larger sigma of depth / depth are not used; a limit that cuts through many favours those"
         " whose noise makes them look near and biases the motion",
         minimum=0.001,
         maximum=0.5,
@@ -71,6 +71,7 @@ class AssociationConfig(Config):
         minimum=0.0,
     )
     nearest_associate: float = parameter(0.15, "gate g_A of Algorithm 1", unit="m", minimum=0.0)
+    joint_features: int = parameter(20, "features that the search for joint compatibility takes in", minimum=4)
     min_inliers: int = parameter(8, "associations below which the rig is lost", minimum=3)
     min_inlier_ratio: float = parameter(
         0.2, "inliers among the descriptor matches below which a motion guess is not trusted", minimum=0.0, maximum=1.0

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekf_slam_node.association import IndexArray, associate_mahalanobis, associate_nearest, match_descriptors
+from ekf_slam_node.association import (
+    IndexArray,
+    associate_jcbb,
+    associate_mahalanobis,
+    associate_nearest,
+    match_descriptors,
+)  # fmt: skip
 from ekf_slam_node.candidates import Candidates, MotionPrior
 from ekf_slam_node.config import AssociationConfig
 from ekf_slam_node.models import Frame
@@ -105,16 +111,17 @@ class Linker:
         config = self._config
         if config.method == "nearest":
             return associate_nearest(candidates, frame, prior.T, self._T_rig_optical, config.nearest_associate)
-        return associate_mahalanobis(
-            candidates, frame, similarity, prior.T, prior.covariance, self._T_rig_optical, config
-        )
+        associate = associate_jcbb if config.method == "jcbb" else associate_mahalanobis
+        return associate(candidates, frame, similarity, prior.T, prior.covariance, self._T_rig_optical, config)
 
     def _settle(
         self, candidates: Candidates, frame: Frame, similarity: FloatArray, guess: MotionGuess, least: int
     ) -> Link | None:
         """Associate once more around the motion found, where the gates are as small as they can be."""
         noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))
-        rows, columns = self._associate(candidates, noisier, similarity, MotionPrior(guess.T, guess.covariance))
+        rows, columns = associate_mahalanobis(
+            candidates, noisier, similarity, guess.T, guess.covariance, self._T_rig_optical, self._config
+        )
         final = refine_motion(
             candidates.select(rows), frame.select(columns), self._T_rig_optical, guess.T, self._config.gate
         )
