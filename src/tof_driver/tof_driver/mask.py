@@ -42,7 +42,7 @@ class MaskConfig(Config):
         1000.0, "amplitude of a white surface at 1 m, seen straight on", unit="digits", minimum=1e-6
     )
     minimum_reflectivity: float = parameter(
-        0.02,
+        0.07,
         "apparent reflectivity (amplitude x range^2, white wall = 1) below which a range is taken to have wrapped "
         "round the ambiguity range; 0 switches the test off",
         minimum=0.0,
