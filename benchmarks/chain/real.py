@@ -15,6 +15,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+
 from slam_bringup.cli import slam
 from slam_bringup.configuration import choose, load_system_config
 from slam_bringup.output import write_results
