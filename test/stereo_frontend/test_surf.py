@@ -34,22 +34,34 @@ def twin_hessian(image: np.ndarray, size: int) -> np.ndarray:
     return xx * yy - (0.9 * xy) ** 2
 
 
-def twin_descriptor(image: np.ndarray, u: float, v: float, scale: float, angle: float = 0.0) -> np.ndarray:
-    """Haar wavelets by summing pixel areas, sample by sample."""
+def twin_descriptor(image: np.ndarray, u: float, v: float, scale: float, angle: float | None = None) -> np.ndarray:
+    """Haar wavelets by summing pixel areas, sample by sample; turned ones are interpolated between whole steps of s."""
     weights = region_weights()
-    c, s = np.cos(angle), np.sin(angle)
     out = np.zeros((4, 4, 8))
     for j in range(20):
         for i in range(20):
-            a, b = (i - 9.5) * scale, (j - 9.5) * scale
-            x, y = u + 0.5 + c * a - s * b, v + 0.5 + s * a + c * b
-            gx, gy = twin_wavelet(image, x, y, scale)
-            dx, dy = c * gx + s * gy, c * gy - s * gx
+            if angle is None:
+                dx, dy = twin_wavelet(image, u + 0.5 + (i - 9.5) * scale, v + 0.5 + (j - 9.5) * scale, scale)
+            else:
+                dx, dy = twin_turned(image, u + 0.5, v + 0.5, scale, angle, i - 9.5, j - 9.5)
             terms = np.zeros(8)
             terms[[0, 1] if dy >= 0 else [2, 3]] = dx, abs(dx)
             terms[[4, 5] if dx >= 0 else [6, 7]] = dy, abs(dy)
             out += weights[:, j, None, None] * weights[None, :, i, None] * terms
     return out.ravel() / np.linalg.norm(out)
+
+
+def twin_turned(image, x, y, scale, angle, along, across) -> np.ndarray:
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    place = R @ [along, across]
+    corner = np.floor(place)
+    f = place - corner
+    total = np.zeros(2)
+    for dj, wy in ((0, 1 - f[1]), (1, f[1])):
+        for di, wx in ((0, 1 - f[0]), (1, f[0])):
+            node = corner + np.array([di, dj])
+            total += wx * wy * np.array(twin_wavelet(image, x + node[0] * scale, y + node[1] * scale, scale))
+    return R.T @ total
 
 
 def twin_wavelet(image: np.ndarray, x: float, y: float, half: float) -> tuple[float, float]:
