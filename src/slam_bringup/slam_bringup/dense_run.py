@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
 from slam_bringup.configuration import SystemConfig
 from slam_bringup.dense_map import ColouredCloud, DenseMap
+from slam_bringup.eyes import depth_processor
 from slam_bringup.sensor_bag import AgentSensors, DepthReading, Reading, SensorBag, StereoReading
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
 from stereo_frontend.rectify import StereoRectifier
-from tof_driver.depth import DepthProcessor
 
 
 def dense_model(bag: SensorBag, config: SystemConfig, trajectories: Mapping[str, Trajectory]) -> ColouredCloud:
@@ -38,9 +37,7 @@ class _AgentModel:
         self._trajectory = trajectory
         self._depth = self._rectifier = None
         if sensors.tof is not None:
-            self._depth = DepthProcessor(
-                replace(config.tof_driver, measurement=sensors.measurement), sensors.tof.camera
-            )
+            self._depth = depth_processor(config, sensors)
             self._T_base_optical = sensors.transform("base", "tof")
         elif sensors.left is not None and sensors.right is not None:
             self._rectifier = StereoRectifier(sensors.left, sensors.right)

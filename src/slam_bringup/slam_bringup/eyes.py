@@ -50,9 +50,7 @@ class AgentEyes:
         if self._mode != "tof" and sensors.left is not None and sensors.right is not None:
             self._rectifier = StereoRectifier(sensors.left, sensors.right)
         if self._uses_depth and sensors.tof is not None:
-            self._depth = DepthProcessor(
-                replace(config.tof_driver, measurement=sensors.measurement), sensors.tof.camera
-            )
+            self._depth = depth_processor(config, sensors)
             self._T_base_tof = sensors.transform("base", "tof")
         if self._mode in ("replace", "fuse"):
             self._T_left_tof = sensors.transform("left", "tof")
@@ -109,3 +107,10 @@ class AgentEyes:
             raise ValueError(
                 f"mode '{self._mode}' or scan odometry needs ToF images, and {who} has none: try --mode stereo"
             )
+
+
+def depth_processor(config: SystemConfig, sensors: AgentSensors) -> DepthProcessor:
+    """The ToF driver's own processing, for what the agent's depth camera measures."""
+    assert sensors.tof is not None
+    measured = replace(config.tof_driver, measurement=sensors.measurement)
+    return DepthProcessor(measured, sensors.tof.camera, sensors.tof.rectified)
