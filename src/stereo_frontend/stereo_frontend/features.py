@@ -23,6 +23,8 @@ from stereo_frontend.surf import SurfConfig, SurfDetector
 
 DETECTORS = ("surf", "sift", "rootsift", "orb", "akaze", "star")
 _THRESHOLD_RANGE = (0.02, 20.0)
+_FIRST_THRESHOLD = 0.3
+"""Of the customary one: the first image rather gives too many candidates than too few."""
 _MOST_PASSES = 3
 
 
@@ -64,7 +66,7 @@ class FeatureExtractor:
 
     def __init__(self, config: FeatureConfig | None = None) -> None:
         self.config = config or FeatureConfig()
-        self.threshold = 1.0
+        self.threshold = _FIRST_THRESHOLD
         self._detect = make_detector(self.config)
 
     def __call__(self, image: ByteArray) -> Keypoints:
@@ -87,7 +89,7 @@ class FeatureExtractor:
 
     def reset(self) -> None:
         """Forget the threshold."""
-        self.threshold = 1.0
+        self.threshold = _FIRST_THRESHOLD
 
     def _one_pass(self, image: ByteArray) -> tuple[Keypoints, int]:
         candidates = 0

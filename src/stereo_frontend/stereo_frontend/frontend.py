@@ -26,9 +26,9 @@ from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
 
 MODES = ("stereo", "tof", "replace", "fuse")
-_FEW_MATCHES = 0.25
-"""Share of matched keypoints below which the sign of the disparities is questioned."""
-_SWAPPED_SHARE = 0.7
+_FEW_TRUSTED = 0.1
+"""Share of keypoints with a trusted disparity below which the sign of the disparities is questioned."""
+_SWAPPED_SHARE = 0.6
 _SWAPPED_MATCHES = 30
 
 
@@ -122,11 +122,11 @@ class Frontend:
         focal_baseline = images.stereo.camera.fx * images.stereo.baseline
         bounds = disparity_bounds(self.config.matching, focal_baseline)
         matches = match_stereo(left, right, self.config.matching, bounds)
-        if len(matches) < _FEW_MATCHES * len(left):
-            self._reject_swapped(left, right, bounds)
         uv = left.uv[matches.left]
         partner = right.uv[matches.right]
         refined = refine_disparity(images.left, images.right, uv, partner[:, 0], self.config.disparity)
+        if refined.valid.sum() < _FEW_TRUSTED * len(left):
+            self._reject_swapped(left, right, bounds)
         self._noise.learn((uv - partner)[refined.valid, 1], left.size[matches.left][refined.valid])
         self._noise.learn_rectification(refined.row_shift[refined.valid], refined.row_sigma[refined.valid])
         sigma = np.hypot(refined.sigma, self._noise.rectification_sigma)
