@@ -25,7 +25,9 @@ class IcpConfig(Config):
     relative_max_distance: float = parameter(0.2, "first rejection limit over the scale", minimum=0.001)
     final_spacings: float = parameter(3.0, "last rejection limit over the median spacing of the target", minimum=0.5)
     shrinkage: float = parameter(0.6, "factor of the limit from stage to stage", minimum=0.1, maximum=0.95)
-    trimmed: float = parameter(0.9, "share of the pairs within the limit that is used, nearest first", minimum=0.1, maximum=1.0)
+    trimmed: float = parameter(
+        0.9, "share of the pairs within the limit that is used, nearest first", minimum=0.1, maximum=1.0
+    )
     iterations: int = parameter(20, "most iterations per stage", minimum=1)
     tolerance: float = parameter(1e-4, "length of the last step, over the scale", minimum=0.0)
     neighbours: int = parameter(12, "neighbours from which a normal is computed", minimum=3)

@@ -12,13 +12,42 @@ from slam_core.geometry import FloatArray
 
 
 class Fit(NamedTuple):
-    """Share of points on the target's surfaces, their root mean square distance (m), gradient of the cost by block (b, 6), extent of the inliers."""
+    """Share of points on the target's surfaces, their root mean square distance (m), gradient of the cost by block (b, 6), extent of the inliers.
+
+    friction (6, 6): expected curvature of the cost from errors of the cells' normals alone. A normal from ``n`` points is off by
+    ``sqrt(variance / (n spread))``, so that a plane seems to hold points along itself with an information of ``1 / (n spread)``.
+    """
 
     overlap: float
     inlier_rmse: float
     pulls: FloatArray
     centre: FloatArray
     radius: float
+    friction: FloatArray
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_friction(px, py, pz, drag, F):  # type: ignore[no-untyped-def]
+    """Add ``drag J' J`` with ``J = [I, -[p]x]``."""
+    for k in range(3):
+        F[k, k] += drag
+    F[0, 4] += drag * pz
+    F[4, 0] += drag * pz
+    F[0, 5] -= drag * py
+    F[5, 0] -= drag * py
+    F[1, 3] -= drag * pz
+    F[3, 1] -= drag * pz
+    F[1, 5] += drag * px
+    F[5, 1] += drag * px
+    F[2, 3] += drag * py
+    F[3, 2] += drag * py
+    F[2, 4] -= drag * px
+    F[4, 2] -= drag * px
+    p, square = (px, py, pz), px * px + py * py + pz * pz
+    for r in range(3):
+        F[3 + r, 3 + r] += drag * square
+        for c in range(3):
+            F[3 + r, 3 + c] -= drag * p[r] * p[c]
 
 
 @njit(cache=True, nogil=True)
@@ -30,6 +59,7 @@ def fit_to_grid(
     keys = hash_table(n)
     rows = np.empty(keys.shape[0], np.int32)
     pulls = np.zeros((n, 6))
+    friction = np.zeros((6, 6))
     blocks = 0
     inliers = 0
     squares = 0.0
@@ -43,7 +73,7 @@ def fit_to_grid(
         row = find_block(grid.keys, grid.rows, int(np.floor(mx * s)), int(np.floor(my * s)), int(np.floor(mz * s)))
         if row < 0:
             continue
-        vx = vy = vz = weight = 0.0
+        vx = vy = vz = weight = drag = 0.0
         best, distance = 4.5, 0.0
         for k in range(8):
             cell = grid.cells[row, k]
@@ -57,6 +87,7 @@ def fit_to_grid(
             exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
             e = 0.125 * np.exp(-min(exponent, 30.0))
             weight += e
+            drag += e / (grid.counts[cell] * max(grid.variance[cell, 1], 1e-300))
             vx += e * ux
             vy += e * uy
             vz += e * uz
@@ -70,6 +101,7 @@ def fit_to_grid(
             second += px * px + py * py + pz * pz
         if weight == 0.0:
             continue
+        _add_friction(px, py, pz, drag, friction)
         c = 1.0 / block_size
         key = pack_key(int(np.floor(mx * c)), int(np.floor(my * c)), int(np.floor(mz * c)))
         slot = slot_of(keys, key)
@@ -86,4 +118,4 @@ def fit_to_grid(
         pulls[row, 5] += px * vy - py * vx
     centre /= max(inliers, 1)
     radius = np.sqrt(max(second / max(inliers, 1) - (centre * centre).sum(), 1e-12))
-    return Fit(inliers / max(n, 1), np.sqrt(squares / max(inliers, 1)), pulls[:blocks].copy(), centre, radius)
+    return Fit(inliers / max(n, 1), np.sqrt(squares / max(inliers, 1)), pulls[:blocks].copy(), centre, radius, friction)

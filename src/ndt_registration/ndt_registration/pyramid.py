@@ -19,11 +19,15 @@ class GridConfig(Config):
         1 / 32, "edge of the finest cells over the scale", minimum=0.002, maximum=0.5
     )
     levels: int = parameter(5, "number of grids, each with cells twice as large", minimum=1, maximum=8)
-    block_points: float = parameter(1.2, "mean points per eighth of a cell; sparser clouds get larger cells", minimum=0.0)
+    block_points: float = parameter(
+        1.2, "mean points per eighth of a cell; sparser clouds get larger cells", minimum=0.0
+    )
     min_points: int = parameter(6, "fewest points of a cell", minimum=3)
     eigenvalue_floor: float = parameter(1e-3, "least eigenvalue over the largest (8.2.1)", minimum=1e-6, maximum=1.0)
     surface_levels: int = parameter(2, "finest grids whose cells are surfaces that points may slide along", minimum=0)
-    slack: float = parameter(10.0, "information taken off the cells of a surface, over that of its widest direction", minimum=0.0)
+    slack: float = parameter(
+        10.0, "information taken off the cells of a surface, over that of its widest direction", minimum=0.0
+    )
     surface_smoothing: float = parameter(0.03, "like smoothing, on the surface levels", minimum=0.0)
     rim_ratio: float = parameter(2.0, "edge of the cells of rims over that of surfaces", minimum=0.1)
     rim_min_points: int = parameter(3, "fewest rim points of a cell", minimum=3)

@@ -223,7 +223,7 @@ def _result(
         source.points, optimum.rotation, optimum.translation, grid, 3.0 * grid.block_size, 2.0 * grid.block_size
     )
     fixed = planar_constraint(source.planar) > 0.0
-    curvature = Curvature(optimum.hessian, optimum.majorant)
+    curvature = Curvature(optimum.hessian, optimum.majorant, fit.friction)
     uncertainty = sandwich(curvature, fit.pulls, Extent(fit.centre, fit.radius), scale, fixed, config.uncertainty)
     reason = _reason_of_failure(optimum, fit.overlap, cost, config)
     names = direction_names(uncertainty.free)

@@ -22,6 +22,9 @@ class UncertaintyConfig(Config):
         minimum=0.0,
         maximum=1.0,
     )
+    friction: float = parameter(
+        2.0, "share of the curvature expected from errors of the normals alone that counts as none", minimum=0.0
+    )
     free_sigma: float = parameter(1.0, "standard deviation given to a free direction, over the scale", minimum=0.0)
     inflation: float = parameter(1.5, "factor on the covariance of determined directions", minimum=0.01)
     sigma_floor: float = parameter(1e-4, "least standard deviation of any direction, over the scale", minimum=0.0)
@@ -35,10 +38,11 @@ class Uncertainty(NamedTuple):
 
 
 class Curvature(NamedTuple):
-    """Second derivatives of the cost at the optimum (6, 6): exact, and its positive semidefinite majorant."""
+    """Second derivatives of the cost at the optimum (6, 6): exact, its semidefinite majorant, and what errors of normals feign."""
 
     hessian: FloatArray
     majorant: FloatArray
+    friction: FloatArray
 
 
 class Extent(NamedTuple):
@@ -82,7 +86,9 @@ def sandwich(
     H, M = to_pose.T @ curvature.hessian @ to_pose, to_pose.T @ curvature.majorant @ to_pose
     G = pulls @ to_pose
     H[fixed], H[:, fixed], M[fixed], M[:, fixed], G[:, fixed] = 0.0, 0.0, 0.0, 0.0, 0.0
-    values, vectors = np.linalg.eigh(M)
+    feigned = to_pose.T @ curvature.friction @ to_pose
+    feigned[fixed], feigned[:, fixed] = 0.0, 0.0
+    values, vectors = np.linalg.eigh(M - config.friction * feigned)
     held = np.abs(vectors[fixed]).sum(axis=0) > 0.5
     free = (values < config.degeneracy * max(values[-1], 1e-300)) & ~held
     known = vectors[:, ~free & ~held]

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ndt_registration.odometry import OdometryConfig, OdometryStatus, ScanOdometry
+from slam_core.geometry import FloatArray, boxminus, invert_transform
+
+STEP_NS = 40_000_000
+
+
+def path(at: Callable[..., FloatArray], k: int) -> FloatArray:
+    a = k / 40.0
+    return at(0.8 * a, 0.3 * np.sin(4 * a), 0.03 * np.sin(5 * a), 15 * np.sin(5 * a), 3 * np.sin(4 * a), 2 * a)
+
+
+@pytest.fixture(scope="module")
+def scans(room: Any, start: FloatArray, at: Callable[..., FloatArray]) -> list[FloatArray]:
+    rng = np.random.default_rng(5)
+    return [room.scan(start @ path(at, k), rng, 60) for k in range(20)]
+
+
+def test_follows_a_hand_held_motion(scans: list[FloatArray], at: Callable[..., FloatArray]) -> None:
+    odometry = ScanOdometry()
+    for k, scan in enumerate(scans):
+        result = odometry.process(1 + k * STEP_NS, scan)
+        assert result.status is (OdometryStatus.TRACKING if k else OdometryStatus.STARTED)
+        if k:
+            assert result.motion is not None
+            truth = invert_transform(path(at, k - 1)) @ path(at, k)
+            assert np.linalg.norm(boxminus(result.motion.T, truth)[:3]) < 0.03
+            assert (result.motion.start_stamp_ns, result.motion.end_stamp_ns) == (
+                1 + (k - 1) * STEP_NS,
+                1 + k * STEP_NS,
+            )
+            assert np.linalg.eigvalsh(result.motion.covariance).min() > 0.0
+    error = boxminus(result.T, invert_transform(path(at, 0)) @ path(at, 19))
+    assert np.linalg.norm(error[:3]) < 0.03
+
+
+@pytest.mark.parametrize(
+    "bad", [np.empty((0, 3)), np.full((500, 3), np.nan), np.random.default_rng(1).normal(size=(800, 3))]
+)
+def test_a_bad_scan_is_not_integrated_and_the_next_recovers(
+    scans: list[FloatArray], at: Callable[..., FloatArray], bad: FloatArray
+) -> None:
+    odometry = ScanOdometry()
+    for k in range(6):
+        before = odometry.process(1 + k * STEP_NS, scans[k])
+    failed = odometry.process(1 + 6 * STEP_NS, bad)
+    assert failed.status is OdometryStatus.FAILED
+    assert failed.motion is None
+    assert failed.reason
+    assert np.linalg.eigvalsh(failed.covariance - before.covariance).min() > 0.0
+    after = odometry.process(1 + 7 * STEP_NS, scans[7])
+    assert after.status is OdometryStatus.TRACKING
+    assert after.motion is None
+    error = boxminus(after.T, path(at, 7))
+    assert np.linalg.norm(error[:3]) < 0.03
+    assert odometry.process(1 + 8 * STEP_NS, scans[8]).motion is not None
+
+
+def test_starts_anew_when_it_stays_lost(scans: list[FloatArray]) -> None:
+    odometry = ScanOdometry(OdometryConfig(restart_after=2))
+    rng = np.random.default_rng(2)
+    odometry.process(1, scans[0])
+    results = [odometry.process(1 + k * STEP_NS, rng.normal(size=(800, 3)) + [3.0, 0.0, 0.0]) for k in (1, 2)]
+    assert [r.status for r in results] == [OdometryStatus.FAILED, OdometryStatus.RESTARTED]
+    assert results[1].covariance[0, 0] > results[0].covariance[0, 0]
+
+
+def test_reset_makes_the_next_scan_the_origin(scans: list[FloatArray]) -> None:
+    odometry = ScanOdometry()
+    for k in range(3):
+        odometry.process(1 + k * STEP_NS, scans[k])
+    odometry.reset()
+    result = odometry.process(5, scans[9])
+    assert result.status is OdometryStatus.STARTED
+    np.testing.assert_array_equal(result.T, np.eye(4))
+
+
+def test_stamps_out_of_order_are_refused(scans: list[FloatArray]) -> None:
+    odometry = ScanOdometry()
+    odometry.process(100, scans[0])
+    with pytest.raises(ValueError, match="order"):
+        odometry.process(100, scans[1])

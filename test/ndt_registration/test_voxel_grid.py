@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ndt_registration.eigen import cholesky_solve6, symmetric_eigen3
+from ndt_registration.voxel_grid import block_moments, coarser, find_block, normal_grid
+
+
+def test_eigenvalues_agree_with_lapack(rng: np.random.Generator) -> None:
+    for scale in (1e-6, 1.0, 1e6):
+        A = rng.normal(size=(3, 3))
+        A = scale * (A @ A.T)
+        vectors, values = np.empty((3, 3)), np.empty(3)
+        symmetric_eigen3(A.copy(), vectors, values)
+        np.testing.assert_allclose(values, np.linalg.eigvalsh(A), rtol=1e-9, atol=1e-12 * scale)
+        np.testing.assert_allclose(vectors @ np.diag(values) @ vectors.T, A, atol=1e-10 * scale)
+
+
+def test_eigenvectors_of_a_plane_with_equal_eigenvalues() -> None:
+    vectors, values = np.empty((3, 3)), np.empty(3)
+    symmetric_eigen3(np.diag([2.0, 0.0, 2.0]), vectors, values)
+    np.testing.assert_allclose(values, [0.0, 2.0, 2.0])
+    np.testing.assert_allclose(np.abs(vectors[:, 0]), [0.0, 1.0, 0.0])
+
+
+def test_cholesky_solves_and_refuses_indefinite_matrices(rng: np.random.Generator) -> None:
+    A = rng.normal(size=(6, 6))
+    A, g, x = A @ A.T + np.eye(6), rng.normal(size=6), np.empty(6)
+    assert cholesky_solve6(A, np.full(6, 0.5), g, x)
+    np.testing.assert_allclose(x, -np.linalg.solve(A + 0.5 * np.eye(6), g))
+    A[2, 2] = -1.0
+    assert not cholesky_solve6(A, np.zeros(6), g, x)
+
+
+def test_cells_have_the_moments_of_the_points_in_them(rng: np.random.Generator) -> None:
+    points = rng.uniform(-1.0, 1.0, (3000, 3)) * [1.0, 1.0, 0.2]
+    block = 0.25
+    moments = coarser(block_moments(points, 0.5 * block))
+    grid = normal_grid(moments, block, min_points=6, relative_floor=1e-3, variance_floor=0.0, slack=0.0)
+    for point in points[:50]:
+        corner = np.floor(point / block).astype(int)
+        row = find_block(grid.keys, grid.rows, *(int(c) for c in corner))
+        for k in range(8):
+            low = (corner - [k & 1, (k >> 1) & 1, k >> 2]) * block
+            inside = points[((points >= low) & (points < low + 2 * block)).all(axis=1)]
+            cell = grid.cells[row, k]
+            assert (cell >= 0) == (len(inside) >= 6)
+            if cell >= 0:
+                assert grid.counts[cell] == len(inside)
+                np.testing.assert_allclose(grid.mean[cell], inside.mean(axis=0), atol=1e-12)
+                B = np.zeros((3, 3))
+                B[np.triu_indices(3)] = grid.information[cell]
+                B = B + np.triu(B, 1).T
+                np.testing.assert_allclose(B @ np.cov(inside.T), np.eye(3), atol=1e-8)
+
+
+def test_eigenvalue_floor_bounds_the_information_of_a_plane(rng: np.random.Generator) -> None:
+    points = rng.uniform(0.0, 1.0, (500, 3)) * [1.0, 1.0, 0.0]
+    grid = normal_grid(
+        block_moments(points, 0.5), 0.5, min_points=6, relative_floor=1e-3, variance_floor=0.0, slack=0.0
+    )
+    whole = int(np.argmax(grid.counts))
+    np.testing.assert_allclose(grid.information[whole][5], 1e3 / grid.variance[whole, 2], rtol=1e-9)
+
+
+def test_points_slide_along_the_surface_of_cells_with_slack(rng: np.random.Generator) -> None:
+    points = rng.uniform(0.0, 1.0, (500, 3)) * [1.0, 1.0, 0.001]
+    grid = normal_grid(
+        block_moments(points, 0.5), 0.5, min_points=6, relative_floor=1e-3, variance_floor=0.0, slack=10.0
+    )
+    whole = int(np.argmax(grid.counts))
+    xx, _, _, yy, _, zz = grid.information[whole]
+    assert zz > 1000.0
+    assert max(xx, yy) < 1e-3 * zz
+
+
+def test_blocks_too_small_for_the_cloud_are_refused() -> None:
+    with pytest.raises(ValueError, match="too small"):
+        block_moments(np.array([[1e6, 0.0, 0.0]]), 0.01)
