@@ -8,6 +8,8 @@ the second and home. It closes one large loop and fifty small ones.
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
 from pathlib import Path
 
 SCENARIO = Path(__file__).resolve().parents[2] / "bags/scenarios/fifty_rooms.yaml"
@@ -32,18 +34,22 @@ def rows() -> list[tuple[float, float, int]]:
     ]
 
 
+def corridor(name: str, x: tuple[float, float], y: tuple[float, float]) -> str:
+    """Line of a corridor."""
+    extent = f"x: [{x[0]:.1f}, {x[1]:.1f}], y: [{y[0]:.1f}, {y[1]:.1f}]"
+    return f"  - {{name: {name}, {extent}, height: 2.6, style: corridor}}"
+
+
 def plan() -> tuple[list[str], list[str]]:
     """Lines of the rooms and of the doorways."""
     length, second = COLUMNS * PITCH, rows()[2][0] + WALL
     rooms = [
-        f"  - {{name: corridor_1, x: [0, {length:.1f}], y: [0, {CORRIDOR}], height: 2.6, style: corridor}}",
-        f"  - {{name: corridor_2, x: [0, {length:.1f}], y: [{second:.1f}, {second + CORRIDOR:.1f}], height: 2.6, style: corridor}}",
+        corridor("corridor_1", (0.0, length), (0.0, CORRIDOR)),
+        corridor("corridor_2", (0.0, length), (second, second + CORRIDOR)),
     ]
     doors = []
     for x0, x1 in ((-CORRIDOR - WALL, -WALL), (length + WALL, length + WALL + CORRIDOR)):
-        rooms.append(
-            f"  - {{name: passage, x: [{x0:.1f}, {x1:.1f}], y: [0, {second + CORRIDOR:.1f}], height: 2.6, style: corridor}}"
-        )
+        rooms.append(corridor("passage", (x0, x1), (0.0, second + CORRIDOR)))
         side = -WALL / 2 if x0 < 0 else length + WALL / 2
         doors += [f"  - {{at: [{side:.2f}, {y:.2f}], width: 1.4}}" for y in (1.0, second + 1.0)]
     number = 0
@@ -98,9 +104,9 @@ def main() -> None:
     rooms, doors = plan()
     points = walk()
     points[0].append(0.0)
-    length = sum(((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2) ** 0.5 for a, b in zip(points, points[1:], strict=False))
+    length = sum(math.dist(a[:2], b[:2]) for a, b in pairwise(points))
     lines = [
-        f"description: A building of 50 rooms, every one visited, about {length:.0f} m; for scale, mostly without images",
+        f"description: A building of 50 rooms, every one visited, about {length:.0f} m; for scale",
         "# Written by benchmarks/simulation/fifty_rooms.py.",
         "seed: 950",
         "rate: 10.0",

@@ -93,7 +93,8 @@ def match(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def detect(image: ByteArray) -> tuple[FloatArray, np.ndarray]:
     """SIFT with OpenCV's own thresholds."""
-    keypoints, descriptors = cv2.SIFT_create().detectAndCompute(image, None)
+    sift = cv2.SIFT_create()  # type: ignore[attr-defined]
+    keypoints, descriptors = sift.detectAndCompute(image, None)
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), np.float32)
     return np.array([k.pt for k in keypoints]), descriptors

@@ -121,11 +121,11 @@ class Simulator:
         start = self.scenario.suite.start_stamp_s + self.scenario.agents[self.agent].start_s
         return round(start * 1e9) + round(index / self.scenario.rate * 1e9)
 
-    def run(self, frames: int | None = None, every: int = 1) -> Iterator[SimulatedFrame]:
-        """Every ``every``-th of the first ``frames`` frames (all by default), in order."""
+    def run(self, frames: int | None = None, every: int = 1, first: int = 0) -> Iterator[SimulatedFrame]:
+        """Every ``every``-th frame from ``first`` up to frame ``frames`` (all by default), in order."""
         if every < 1:
             raise ValueError(f"can take every frame or every n-th, got {every}")
-        indices = range(0, self.frames if frames is None else min(frames, self.frames), every)
+        indices = range(first, self.frames if frames is None else min(frames, self.frames), every)
         if self.threads == 1:
             yield from (self._frame(k, None, every) for k in indices)
             return
