@@ -18,6 +18,7 @@ sys.path[:0] = [str(p) for p in sorted((ROOT / "src").iterdir())] + [str(ROOT / 
 from submap_world import Agent, circle, ring_world  # noqa: E402
 
 from sjsam_node import kernels  # noqa: E402
+from sjsam_node.block_problem import BlockProblem  # noqa: E402
 from sjsam_node.joining import JoiningProblem  # noqa: E402
 from sjsam_node.problem import LocalMap, State, block_rows, flatten  # noqa: E402
 from slam_core.geometry import so3_log  # noqa: E402
@@ -77,5 +78,9 @@ def local_maps(problem: KnownProblem, rows: str, shared_only: bool) -> tuple[lis
     return maps, state
 
 
-def joining_problem(maps: list[LocalMap], state: State, backend: str = "auto") -> JoiningProblem:
+def joining_problem(
+    maps: list[LocalMap], state: State, rows: str, backend: str = "auto"
+) -> JoiningProblem | BlockProblem:
+    if rows == "block":
+        return BlockProblem(maps, state, np.array([0]), kernels.TANGENT, backend)
     return JoiningProblem(flatten(maps), state, np.array([0]), kernels.TANGENT, backend)

@@ -59,22 +59,30 @@ def test_incremental_joining_ends_at_the_batch_optimum(rng: np.random.Generator)
     batch, _ = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=10_000))))
     step_by_step, reports = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5))))
     assert sum(r.update == "incremental" for r in reports) > 10
-    last = step_by_step.graph.poses[-1]
-    assert np.abs(boxminus(last, batch.graph.poses[-1])).max() < 1e-3  # before anything is joined in batch again
     a, b = step_by_step.trajectory("a"), batch.trajectory("a")
     assert max(np.abs(boxminus(p.T, q.T)).max() for p, q in zip(a, b, strict=True)) < 1e-6
     assert max(np.abs(p.covariance - q.covariance).max() for p, q in zip(a, b, strict=True)) < 1e-6
 
 
-def test_incremental_chi2_follows_the_batch(rng: np.random.Generator) -> None:
-    submaps = ring_agent(rng, turns=0.7).submaps()
-    step_by_step, reports = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5))))
-    assert reports[-1].update == "incremental"
-    incremental = reports[-1].chi2
-    step_by_step.settle()
-    component = int(step_by_step.graph.component_of[0])
-    assert incremental == pytest.approx(step_by_step.joiner.batch(len(submaps) - 1).cost, rel=1e-3)
-    assert step_by_step.graph.size(component) == len(submaps) + 1
+def incremental_gap(scale: float) -> float:
+    """Distance of the incremental estimate from the optimum after 17 submaps, in units of the noise."""
+    agent = ring_agent(np.random.default_rng(5), turns=0.7)
+    agent.sensor = Sensor(
+        odometry=(0.02 * scale, 0.005 * scale), sigma_bearing=0.003 * scale, sigma_depth=0.004 * scale
+    )
+    submaps = agent.submaps()
+    joined, reports = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(5, relinearize_turn=10.0))))
+    assert [r.update for r in reports[4:]] == ["incremental"] * (len(submaps) - 4)
+    last = joined.graph.poses[-1].copy()
+    batch = joined.joiner.batch(len(submaps) - 1)
+    assert reports[-1].chi2 == pytest.approx(batch.cost, rel=1e-2 * scale)
+    return float(np.abs(boxminus(joined.graph.poses[-1], last)).max()) / scale
+
+
+def test_incremental_joining_differs_from_batch_by_linearisation_only() -> None:
+    """Then the gap falls with the square of the noise; any forgotten constraint would leave a constant share."""
+    assert incremental_gap(0.03) < 0.15 * incremental_gap(0.3)
+    assert incremental_gap(0.003) < 1e-3
 
 
 def building(rng: np.random.Generator, alike: bool) -> tuple[World, list[tuple[float, float]]]:

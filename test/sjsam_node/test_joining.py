@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sjsam_node import kernels
+from sjsam_node.block_problem import BlockProblem
 from sjsam_node.joining import JoiningProblem
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
 from slam_core.geometry import boxminus, euler_from_rotation, make_transform, so3_exp
@@ -155,3 +156,23 @@ def test_a_problem_that_hangs_on_nothing_is_refused() -> None:
     problem = JoiningProblem(flatten([loose]), s, np.empty(0, np.int64), kernels.TANGENT)
     with pytest.raises(ValueError, match="singular"):
         problem.marginals(s)
+
+
+def test_the_landmark_schur_complement_reaches_the_same_optimum_by_the_same_steps(
+    model: int, rng: np.random.Generator
+) -> None:
+    maps, s = random_problem(model, rng, maps=8, landmarks=12)
+    size, d = s.model_dimensions
+    uncorrelated = [block_rows(m, size, d) for m in maps]
+    whole = JoiningProblem(flatten(uncorrelated), s, np.array([0]), model)
+    reduced = BlockProblem(uncorrelated, s, np.array([0]), model)
+    start = perturbed(whole, s, rng)
+    assert reduced.cost(start) == pytest.approx(whole.cost(start), rel=1e-12)
+    for damping in (0.0, 0.3):
+        whole.linearize(start)
+        reduced.linearize(start)
+        a, b = whole.retract(start, whole.solve(damping)), reduced.retract(start, reduced.solve(damping))
+        assert np.allclose(a.landmarks, b.landmarks, atol=1e-8)
+        assert np.allclose(a.translations, b.translations, atol=1e-8)
+        assert np.allclose(a.rotations, b.rotations, atol=1e-8)
+    assert reduced.optimize(start)[1].cost == pytest.approx(whole.optimize(start)[1].cost, rel=1e-10)

@@ -46,15 +46,40 @@ class Front:
         information = problem.marginal_information(assembled.state, scalars)
         return cls(node, landmarks, graph.poses[node], graph.points[landmarks], information, np.zeros(len(scalars)))
 
-    def extended(self, graph: MapGraph, record: Record, kept: IntArray, rows: str) -> tuple[Front, float]:
-        """The front after one more submap that starts at its node, of the landmarks ``kept``; and the rise of chi2.
+    def fused(self, landmark_of: IntArray) -> tuple[Front, float]:
+        """The front after some of its landmarks turned out to be the same; and the rise of chi2 that this costs.
+
+        Of such landmarks the oldest stays; the others are where it is: ``x_gone = x_kept``.
+        """
+        now = landmark_of[self.landmarks]
+        if np.array_equal(now, self.landmarks):
+            return self, 0.0
+        kept = np.nonzero(now == self.landmarks)[0]
+        home = kept[np.searchsorted(self.landmarks[kept], now)]
+        shift = np.concatenate([np.zeros(6), (self.points[home] - self.points).ravel()])
+        M = np.zeros((len(shift), 6 + 3 * len(kept)))
+        M[np.arange(6), np.arange(6)] = 1.0
+        column = np.searchsorted(kept, home)
+        for axis in range(3):
+            M[6 + 3 * np.arange(len(home)) + axis, 6 + 3 * column + axis] = 1.0
+        pull = self.information @ shift
+        front = Front(
+            self.node, self.landmarks[kept], self.T, self.points[kept],
+            M.T @ self.information @ M, M.T @ (self.gradient + pull),
+        )  # fmt: skip
+        return front, float(shift @ (2.0 * self.gradient + pull))
+
+    def extended(self, graph: MapGraph, record: Record, kept: IntArray, rows: str) -> tuple[Front, float, float]:
+        """The front after one more submap that starts at its node, of the landmarks ``kept``; the rise of chi2; and by
+        how much (rad) the node turned against where everything older was linearised.
 
         The graph's estimate of the front and of the new submap is updated.
         """
         step = _Step(self, graph, record, rows)
         cost = step.solve()
         step.write(graph, record)
-        return step.reduced(graph, record, kept), cost
+        turn = float(np.linalg.norm(boxminus(step.poses[0], self.T)[3:]))
+        return step.reduced(graph, record, kept), cost, turn
 
 
 class _Step:

@@ -28,6 +28,9 @@ class JoinerConfig(Config):
     incremental_from: int = parameter(
         40, "submaps of a component from which on they are joined incrementally; below, batch costs no more", minimum=2
     )
+    relinearize_turn: float = parameter(
+        0.02, "turn of the newest poses, since all was linearised, that calls for a batch", unit="rad", minimum=0.0
+    )
     outlier_probability: float = parameter(
         0.99999, "share of true matches that a joined map keeps", minimum=0.9, maximum=0.99999999
     )
@@ -59,6 +62,7 @@ class _Joined:
     window: IntArray
     front: Front | None = None
     added: int = 0
+    turned: float = 0.0
 
 
 @dataclass
@@ -81,16 +85,24 @@ class Joiner:
         window = self._window_landmarks([new, *chain[: self.window - 1]])
         if joined is None or self.graph.size(component) <= self.config.incremental_from:
             return self.batch(new, window)
-        front = joined.front or self._front(joined)
+        front, fusion = (joined.front or self._front(joined)).fused(self.graph.landmark_of)
         seen = self.graph.landmark_of[record.observations]
         if front.node != record.start or not np.all(
             np.isin(seen, front.landmarks) | (seen >= record.first_observation)
         ):
             return self.batch(new, window)
-        front, rise = front.extended(self.graph, record, window, self.config.estimator.rows)
-        result = replace(joined.result, cost=joined.result.cost + rise, iterations=1, update="incremental")
+        front, rise, turn = front.extended(self.graph, record, window, self.config.estimator.rows)
+        if joined.turned + turn > self.config.relinearize_turn:
+            return self.batch(new, window)
+        result = replace(joined.result, cost=joined.result.cost + fusion + rise, iterations=1, update="incremental")
         self._joined[component] = replace(
-            joined, result=result, newest=new, window=window, front=front, added=joined.added + 1
+            joined,
+            result=result,
+            newest=new,
+            window=window,
+            front=front,
+            added=joined.added + 1,
+            turned=joined.turned + turn,
         )
         return result
 

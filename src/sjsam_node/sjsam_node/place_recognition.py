@@ -27,11 +27,12 @@ class PlaceRecognitionConfig(Config):
     branching: int = parameter(10, "children of a node of the vocabulary tree", minimum=2)
     depth: int = parameter(3, "levels of the vocabulary tree", minimum=1, maximum=6)
     training_descriptors: int = parameter(1500, "descriptors from which the tree is grown", minimum=10)
+    proposals: int = parameter(5, "times as many places as are checked that the vocabulary proposes", minimum=1)
     candidates: int = parameter(6, "best ranked submaps that are checked by geometry", minimum=1)
 
 
 class VocabularyTree:
-    """Hierarchical k-means over unit descriptors; a word is a leaf."""
+    """Hierarchical k-means over unit descriptors; every node below the root is a word."""
 
     def __init__(self, descriptors: Descriptors, config: PlaceRecognitionConfig) -> None:
         self.branching, self.depth = config.branching, config.depth
@@ -48,15 +49,16 @@ class VocabularyTree:
             self._grow(node * self.branching + child + 1, members[nearest == child], level + 1)
 
     def words(self, descriptors: Descriptors) -> IntArray:
-        """Word of each descriptor (n, d), shape (n,)."""
-        node = np.zeros(len(descriptors), dtype=np.int64)
+        """Words of each descriptor (n, d): the nodes on its way from the root to a leaf, shape (n, depth)."""
+        node, way = np.zeros(len(descriptors), dtype=np.int64), []
         for _ in range(self.depth):
             for parent in np.unique(node):
                 centres = self._centres.get(int(parent))
                 if centres is not None:
                     here = np.nonzero(node == parent)[0]
                     node[here] = parent * self.branching + np.argmax(descriptors[here] @ centres.T, axis=1) + 1
-        return node
+            way.append(node.copy())
+        return np.stack(way, axis=1)
 
 
 def _kmeans(members: Descriptors, count: int, iterations: int = 8) -> Descriptors:
@@ -81,9 +83,11 @@ class PlaceIndex:
     _waiting: list[tuple[int, Descriptors]] = field(default_factory=list)
     _postings: dict[int, dict[int, int]] = field(default_factory=lambda: defaultdict(dict))
     _sizes: dict[int, int] = field(default_factory=dict)
+    _descriptors: dict[int, Descriptors] = field(default_factory=dict)
 
     def add(self, place: int, descriptors: Descriptors) -> None:
         """Index the descriptors of ``place``; the tree grows as soon as there are enough to grow it from."""
+        self._descriptors[place] = descriptors
         self._waiting.append((place, descriptors))
         if self._tree is None:
             if sum(len(d) for _, d in self._waiting) < self.config.training_descriptors:
@@ -99,15 +103,17 @@ class PlaceIndex:
             self._postings[int(word)][place] = int(count)
 
     def query(self, descriptors: Descriptors, excluded: set[int]) -> list[int]:
-        """The places most similar to ``descriptors``, best first."""
-        scores = self._direct(descriptors) if self._tree is None else self._scores(self._tree.words(descriptors))
-        ranked = sorted((place for place in scores if place not in excluded), key=lambda p: (-scores[p], p))
-        return ranked[: self.config.candidates]
+        """The places most similar to ``descriptors``, best first.
 
-    def _direct(self, descriptors: Descriptors) -> dict[int, float]:
-        """Without a vocabulary yet: how well the descriptors find a counterpart in each place."""
-        found = {place: (held @ descriptors.T).max(axis=0, initial=-1.0) for place, held in self._waiting}
-        return {place: float(np.clip(best - 0.5, 0.0, None).sum()) for place, best in found.items()}
+        The vocabulary proposes a few times as many as are asked for; the descriptors themselves decide among them.
+        """
+        known = [place for place in self._descriptors if place not in excluded]
+        if self._tree is not None:
+            scores = self._scores(self._tree.words(descriptors))
+            ranked = sorted((place for place in known if place in scores), key=lambda p: (-scores[p], p))
+            known = ranked[: self.config.proposals * self.config.candidates]
+        direct = {place: _likeness(self._descriptors[place], descriptors) for place in known}
+        return sorted(known, key=lambda p: (-direct[p], p))[: self.config.candidates]
 
     def _scores(self, words: IntArray) -> dict[int, float]:
         """tf-idf similarity of every place that shares a word."""
@@ -118,3 +124,10 @@ class PlaceIndex:
             for place, there in posting.items():
                 scores[place] += idf * min(int(count), there) / np.sqrt(self._sizes[place])
         return scores
+
+
+def _likeness(first: Descriptors, second: Descriptors) -> float:
+    """How well the descriptors of the second place find a counterpart in the first."""
+    if not len(first) or not len(second):
+        return 0.0
+    return float(np.clip((first @ second.T).max(axis=0) - 0.5, 0.0, None).sum())

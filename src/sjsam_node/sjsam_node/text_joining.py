@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sjsam_node import kernels
+from sjsam_node.block_problem import BlockProblem
 from sjsam_node.joining import JoiningProblem
 from sjsam_node.linear_slam_text import Progress, TextMap
-from sjsam_node.problem import FlatMaps, LocalMap, State, block_rows, flatten
+from sjsam_node.problem import LocalMap, State, block_rows, flatten
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, euler_from_rotation, rotation_from_euler
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
@@ -126,9 +127,9 @@ class TextJoiner:
         self.index, self.config = index, config
         self.model = kernels.PLANAR if index.dimension == 2 else kernels.EULER
         size = 3 if index.dimension == 2 else 6
-        self.flat = flatten(
-            [block_rows(m, size, index.dimension) for m in index.maps] if config.rows == "block" else index.maps
-        )
+        block = config.rows == "block"
+        self.maps = [block_rows(m, size, index.dimension) for m in index.maps] if block else index.maps
+        self.flat = flatten(self.maps)
         self.solver, self.start, self.start_cost = "", "", np.nan
 
     def best(self, progress: Progress | None) -> tuple[State, LeastSquaresResult]:
@@ -144,12 +145,15 @@ class TextJoiner:
         return state, result
 
     def _optimize(self, state: State) -> tuple[State, LeastSquaresResult]:
-        problem = self._problem(self.flat, state)
+        problem = self._problem(len(self.maps), state)
         self.solver = problem.backend
         return problem.optimize(state, self.config.optimizer)
 
-    def _problem(self, flat: FlatMaps, state: State) -> JoiningProblem:
-        return JoiningProblem(flat, state, np.array([0]), self.model, self.config.solver)
+    def _problem(self, count: int, state: State) -> JoiningProblem | BlockProblem:
+        fixed = np.array([0])
+        if self.config.rows == "block":
+            return BlockProblem(self.maps[:count], state, fixed, self.model, self.config.solver)
+        return JoiningProblem(self.flat.first(count), state, fixed, self.model, self.config.solver)
 
     def _incremental(self, progress: Progress | None) -> State:
         """Place and join a growing share of the maps, so that each part starts near its optimum."""
@@ -159,7 +163,7 @@ class TextJoiner:
             added = min(total, max(done + 1, int(done * (1.0 + self.config.growth))))
             self._place(state, done, added, known)
             done = added
-            state, _ = self._problem(self.flat.first(done), state).optimize(state, few)
+            state, _ = self._problem(done, state).optimize(state, few)
             if progress is not None:
                 progress(done, total)
         return state
