@@ -149,7 +149,8 @@ class _Choreography:
         player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
         self._supervisor.count_submaps(f"{name.rpartition('/')[0]}/submap/info" for name in self._graph.filters)
         self._wait_until_ready(from_outside=())
-        self._supervisor.call("/bag_player/start")
+        heard = self._supervisor.progress.total
+        self._supervisor.call("/bag_player/start", has_effect=lambda: heard() > 0 or not player.is_running)
         while player.is_running:
             self._supervisor.listen(0.2)
             on_progress(sum(self._supervisor.progress[name] for name in self._graph.filters))

@@ -23,6 +23,8 @@ from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.ros import RosTypes, sensor_qos
 
 _SPIN_S = 0.1
+_MATCHING_S = 0.3
+_ASK_AGAIN_S = 10.0
 
 
 class Supervisor:
@@ -120,14 +122,26 @@ class Supervisor:
         """Whether anybody publishes a topic."""
         return bool(self._node.get_publishers_info_by_topic(topic))
 
-    def call(self, service: str, timeout_s: float = 60.0) -> str:
-        """Call a std_srvs/Trigger service; returns its text, ValueError if it fails or does not answer."""
+    def call(self, service: str, timeout_s: float = 60.0, has_effect: Callable[[], bool] = lambda: False) -> str:
+        """Call a std_srvs/Trigger service; returns its text. ValueError if it fails, TimeoutError if it is silent.
+
+        The server may not have discovered our end when it answers, and then the answer is lost: we ask again, unless
+        the call ``has_effect`` already.
+        """
         client = self._node.create_client(Trigger, service)
         self.wait(client.service_is_ready, timeout_s, f"service {service}")
-        future = client.call_async(Trigger.Request())
-        self.wait(future.done, timeout_s, f"answer of {service}")
+        self.listen(_MATCHING_S)
+        futures: list[Any] = []
+
+        def answered() -> bool:
+            if time.monotonic() > started + len(futures) * _ASK_AGAIN_S:
+                futures.append(client.call_async(Trigger.Request()))
+            return has_effect() or any(future.done() for future in futures)
+
+        started = time.monotonic()
+        self.wait(answered, timeout_s, f"answer of {service}")
+        response = next((future.result() for future in futures if future.done()), Trigger.Response(success=True))
         self._node.destroy_client(client)
-        response = future.result()
         if not response.success:
             raise ValueError(f"{service}: {response.message}")
         return str(response.message)
