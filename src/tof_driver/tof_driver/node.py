@@ -129,7 +129,8 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
 
     def _report(self, depth: DepthImage) -> None:
         assert self.processor is not None
-        self.health.counters.update(self.processor.counters.counts)
+        for name, number in self.processor.counters.counts.items():
+            self.health.counters[name] = number
         share = float(np.isfinite(depth.depth).mean())
         if share < FEW_PIXELS:
             self.health.set(State.DEGRADED, f"{100.0 * share:.1f} % of the pixels have depth")
