@@ -42,6 +42,13 @@ def test_errors_are_as_large_as_claimed() -> None:
     assert 0.97 < nis < 1.03
 
 
+def test_one_filter_over_rough_rounds_is_honest_only_in_the_invariant_error() -> None:
+    _, invariant, _ = planar_nees(10, "invariant", rough=True)
+    _, standard, _ = planar_nees(10, "standard", rough=True)
+    assert invariant < 1.5
+    assert standard > 2.0
+
+
 @pytest.mark.parametrize("method", ["mahalanobis", "jcbb"])
 def test_unknown_association_closes_the_loop(rng: np.random.Generator, method: str) -> None:
     config = PlanarConfig(method=method)

@@ -188,3 +188,25 @@ def test_configuration_by_name() -> None:
     assert config.submap.start == "conditional"
     with pytest.raises(ValueError, match="did you mean"):
         from_mapping(EkfSlamConfig, {"submap.max_distence": 2.0})
+
+
+@pytest.mark.parametrize("gap_s", [30, 7200])
+def test_a_long_silence_at_one_place_is_bridged(world: PointWorld, rng: np.random.Generator, gap_s: int) -> None:
+    """The old map is found again, and no variance that grew in the meantime has eaten the digits."""
+    poses, slam = loop(24), EkfSlam(EkfSlamConfig())
+    for k, T in enumerate(poses):
+        stamp = k * STEP_NS + (gap_s * 10**9 if k >= 12 else 0)
+        result = slam.process(world.features(T, stamp, rng)[0])
+        assert result.state is TrackingState.OK
+    assert np.linalg.norm(error_of(result, poses, 23)[:3]) < 0.06
+    for submap in slam.finish():
+        assert np.linalg.eigvalsh(submap.covariance)[0] > 0.0
+
+
+def test_a_rig_at_rest_stays_where_it_is(world: PointWorld, rng: np.random.Generator) -> None:
+    pose, slam = loop(2)[0], EkfSlam(EkfSlamConfig())
+    for k in range(40):
+        result = slam.process(world.features(pose, k * STEP_NS, rng)[0])
+    assert result.state is TrackingState.OK
+    assert np.linalg.norm(result.pose.T[:3, 3]) < 0.01
+    assert len(slam.finish()) == 1

@@ -26,6 +26,9 @@ from slam_core.types import Counters, Features, ImuSample, PoseEstimate, Relativ
 _MOTION_GATE = 22.46
 """99.9 % of chi-square with 6 degrees of freedom: a motion beyond it contradicts the prediction."""
 
+_LONGEST_STEP_S = 10.0
+"""A gap counts as no longer than this: the model says nothing about it any more, and larger variances cost digits."""
+
 _NO_UPDATE = UpdateReport(0.0, 0, False)
 
 
@@ -117,7 +120,7 @@ class EkfSlam:
 
     # --------------------------------------------------------------------------------------------------- frame by frame
     def _advance(self, local: LocalMap, frame: Frame) -> EkfResult:
-        dt = (frame.stamp_ns - self._stamp_ns) * 1e-9
+        dt = _seconds(self._stamp_ns, frame.stamp_ns)
         aid = self._aids.between(self._stamp_ns, frame.stamp_ns)
         expected = self._expected_motion(local, dt)
         link = self._linker.link(local.candidates(), frame, _aided(expected, aid))
@@ -217,7 +220,7 @@ class EkfSlam:
         missed = self._missed
         if missed is None:
             return False
-        dt = (frame.stamp_ns - missed.stamp_ns) * 1e-9
+        dt = _seconds(missed.stamp_ns, frame.stamp_ns)
         prior = motion_prior(np.zeros(6), np.diag(self._first_variance()), self._sigma, dt)
         return self._linker.link(pending_of(missed, self._T_rig_optical).candidates, frame, prior) is not None
 
@@ -290,7 +293,7 @@ class EkfSlam:
         """
         assert self._map is not None
         ekf = self._map.ekf
-        dt = (stamp_ns - self._stamp_ns) * 1e-9
+        dt = _seconds(self._stamp_ns, stamp_ns)
         if dt <= 0.0:
             return self._odometry.pose(stamp_ns, ekf.T, ekf.pose_covariance())
         T = ekf.T @ relative_motion(ekf.velocity, min(dt, self.config.motion.coast_time))
@@ -314,6 +317,10 @@ class EkfSlam:
         blocks = ekf.covariance.blocks(CORE_DIM + 3 * np.arange(len(ekf.landmarks)))
         positions, covariances = self._odometry.points(ekf.landmarks, blocks)
         return LandmarkView(book.ids.copy(), positions, covariances, book.sightings.copy(), book.descriptors.copy())
+
+
+def _seconds(start_stamp_ns: int, end_stamp_ns: int) -> float:
+    return min((end_stamp_ns - start_stamp_ns) * 1e-9, _LONGEST_STEP_S)
 
 
 def _is_surprising(link: Link, expected: MotionPrior) -> bool:
