@@ -210,3 +210,28 @@ def test_a_rig_at_rest_stays_where_it_is(world: PointWorld, rng: np.random.Gener
     assert result.state is TrackingState.OK
     assert np.linalg.norm(result.pose.T[:3, 3]) < 0.01
     assert len(slam.finish()) == 1
+
+
+def test_finish_closes_once_and_the_next_frame_begins_anew(world: PointWorld, rng: np.random.Generator) -> None:
+    poses, slam = loop(200), EkfSlam(EkfSlamConfig())
+    last = run(slam, world, poses[:10], rng)[-1]
+    assert len(slam.finish()) == 1
+    assert slam.finish() == ()
+    stale = slam.process(world.features(poses[3], 3 * STEP_NS, rng)[0])
+    assert stale.state is TrackingState.DEGRADED
+    np.testing.assert_array_equal(stale.pose.T, last.pose.T)
+    for k in range(10, 20):
+        result = slam.process(world.features(poses[k], k * STEP_NS, rng)[0])
+    assert result.state is TrackingState.OK
+    (submap,) = slam.finish()
+    assert (submap.index, submap.follows_previous) == (1, False)
+
+
+def test_descriptors_of_another_size_are_refused(world: PointWorld, rng: np.random.Generator) -> None:
+    poses, slam = loop(60), EkfSlam(EkfSlamConfig())
+    run(slam, world, poses[:6], rng)
+    features, _ = world.features(poses[6], 6 * STEP_NS, rng)
+    odd = slam.process(dataclasses.replace(features, descriptors=features.descriptors[:, :32]))
+    assert odd.state is TrackingState.DEGRADED
+    assert "32" in odd.reason
+    assert slam.process(features).state is TrackingState.OK

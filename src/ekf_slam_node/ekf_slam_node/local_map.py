@@ -56,6 +56,12 @@ class LocalMap:
         self._T_rig_optical = T_rig_optical
         self._frames = 0
 
+    @property
+    def descriptor_size(self) -> int:
+        """Columns of the descriptors, 0 while none is known."""
+        known = len(self.book) or len(self.pending.ids)
+        return int(self.pending.candidates.descriptors.shape[1]) if known else 0
+
     def candidates(self) -> Candidates:
         """Everything a frame can be linked to: landmarks first, then the pending features."""
         points, covariances = self.ekf.landmarks_in_rig()

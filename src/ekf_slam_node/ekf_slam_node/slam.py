@@ -68,7 +68,8 @@ class EkfSlam:
         self._next_submap = 0
         self._next_id = 0
         self._stamp_ns = 0
-        self._newest_stamp_ns: int | None = None
+        self._newest_stamp_ns = 0
+        self._is_finished = False
         self._missed: Frame | None = None
         self._lost_frames = 0
 
@@ -80,12 +81,25 @@ class EkfSlam:
         """
         if motion is not None:
             self.process_motion(motion)
-        if self._newest_stamp_ns is not None and features.stamp_ns <= self._newest_stamp_ns:
-            self.counters.add("stamp_not_newer")
-            return self._report(self._newest_stamp_ns, TrackingState.DEGRADED, "frame is not newer than the last")
+        problem = self._problem_with(features)
+        if problem:
+            return self._report(self._newest_stamp_ns, TrackingState.DEGRADED, problem)
         self._newest_stamp_ns = features.stamp_ns
         frame = self._noise.corrected(self._usable(features))
-        return self._begin(frame) if self._map is None else self._advance(self._map, frame)
+        return self._begin(frame) if self._map is None or self._is_finished else self._advance(self._map, frame)
+
+    def _problem_with(self, features: Features) -> str:
+        """Why a frame cannot be used at all, or ""."""
+        if self._map is None:
+            return ""
+        if features.stamp_ns <= self._newest_stamp_ns:
+            self.counters.add("stamp_not_newer")
+            return "frame is not newer than the last"
+        size, known = features.descriptors.shape[1], self._map.descriptor_size
+        if len(features) and known not in (0, size):
+            self.counters.add("descriptors_of_another_size")
+            return f"descriptors have {size} columns, the map's have {known}"
+        return ""
 
     def process_motion(self, motion: RelativeMotion) -> None:
         """A motion of the rig, as scan registration measures it; stamps need not be those of the frames."""
@@ -99,11 +113,10 @@ class EkfSlam:
 
     def finish(self) -> tuple[Submap, ...]:
         """Close the open submap; the next frame begins a new one that does not follow it."""
-        submaps = self._closed()
-        if self._map is not None:
-            self._odometry.advance(self._pose(self._stamp_ns))
-        self._map = None
-        return submaps
+        if self._map is None or self._is_finished:
+            return ()
+        self._is_finished = True
+        return self._closed()
 
     def _usable(self, features: Features) -> Frame:
         limits = self.config.measurement
@@ -236,6 +249,9 @@ class EkfSlam:
 
     # ------------------------------------------------------------------------------------------------------- submaps
     def _begin(self, frame: Frame) -> EkfResult:
+        if self._map is not None:
+            self._odometry.advance(self._pose(self._stamp_ns))
+            self._is_finished = False
         self._start(frame)
         if len(frame) < self.config.association.min_inliers:
             return self._report(frame.stamp_ns, TrackingState.DEGRADED, f"only {len(frame)} features to begin with")
