@@ -12,6 +12,7 @@ import numpy as np
 from ndt_registration.odometry import OdometryConfig, OdometryStatus, ScanOdometry
 from slam_core.config import from_mapping
 from slam_core.geometry import FloatArray, boxminus, invert_transform
+from slam_core.rigid_alignment import umeyama
 
 FOCAL_PX, CENTRE_PX = 585.0, (320.0, 240.0)
 PERIOD_NS = 33_333_333
@@ -32,7 +33,9 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--set", nargs="*", default=[], help="odometry parameters, name=value")
     arguments = parser.parse_args()
-    values = {name: float(value) if "." in value else int(value) for name, value in (s.split("=") for s in arguments.set)}
+    values = {
+        name: float(value) if "." in value else int(value) for name, value in (s.split("=") for s in arguments.set)
+    }
     odometry = ScanOdometry(from_mapping(OdometryConfig, values))
     estimates, truths, milliseconds, failures = [], [], [], 0
     for k in range(arguments.frames):
@@ -48,14 +51,25 @@ def main() -> None:
     errors = np.array([boxminus(T, start @ G) for T, G in zip(estimates, truths, strict=True)])
     length = sum(np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in zip(truths[:-1], truths[1:], strict=True))
     distance, angle = np.linalg.norm(errors[:, :3], axis=1), np.rad2deg(np.linalg.norm(errors[:, 3:], axis=1))
+    fit = umeyama(np.array([T[:3, 3] for T in estimates]), np.array([T[:3, 3] for T in truths]))
+    apart = [
+        np.linalg.norm(fit[:3, :3] @ T[:3, 3] + fit[:3, 3] - G[:3, 3]) for T, G in zip(estimates, truths, strict=True)
+    ]
     steps = np.array([
         boxminus(invert_transform(a) @ b, invert_transform(g) @ h)
         for a, b, g, h in zip(estimates[:-1], estimates[1:], truths[:-1], truths[1:], strict=True)
     ])  # fmt: skip
     print(f"path {length:.2f} m, {len(estimates)} frames, {failures} failed")
-    print(f"error from the start: rmse {np.sqrt((distance**2).mean()):.4f} m, end {distance[-1]:.4f} m ({100 * distance[-1] / length:.2f} %), {angle[-1]:.2f} deg")
-    print(f"between frames: median {1e3 * np.median(np.linalg.norm(steps[:, :3], axis=1)):.2f} mm, {np.rad2deg(np.median(np.linalg.norm(steps[:, 3:], axis=1))):.3f} deg")
-    print(f"time per frame: median {np.median(milliseconds[1:]):.1f} ms, 95 % below {np.percentile(milliseconds[1:], 95):.1f} ms")
+    print(f"ATE (aligned): rmse {np.sqrt(np.mean(np.square(apart))):.4f} m")
+    print(
+        f"error from the start: rmse {np.sqrt((distance**2).mean()):.4f} m, end {distance[-1]:.4f} m ({100 * distance[-1] / length:.2f} %), {angle[-1]:.2f} deg"
+    )
+    print(
+        f"between frames: median {1e3 * np.median(np.linalg.norm(steps[:, :3], axis=1)):.2f} mm, {np.rad2deg(np.median(np.linalg.norm(steps[:, 3:], axis=1))):.3f} deg"
+    )
+    print(
+        f"time per frame: median {np.median(milliseconds[1:]):.1f} ms, 95 % below {np.percentile(milliseconds[1:], 95):.1f} ms"
+    )
 
 
 if __name__ == "__main__":

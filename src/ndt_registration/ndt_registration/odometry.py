@@ -6,7 +6,7 @@ handed out, and when the scans keep failing the map starts anew where the guess 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from ndt_registration.cloud import finite_points
 from ndt_registration.local_map import LocalMap
 from ndt_registration.registration import RegistrationConfig, RegistrationResult, register
-from slam_core.config import Config, group, parameter
+from slam_core.config import Config, parameter
 from slam_core.geometry import (
     FloatArray,
     boxminus,
@@ -23,6 +23,8 @@ from slam_core.geometry import (
     compose_covariance,
     inverse_jacobian,
     invert_transform,
+    pose7_from_transform,
+    transform_from_pose7,
 )
 from slam_core.types import RelativeMotion
 
@@ -31,7 +33,7 @@ from slam_core.types import RelativeMotion
 class OdometryConfig(Config):
     """Scan odometry."""
 
-    keyframes: int = parameter(5, "keyframes in the local map", minimum=1)
+    keyframes: int = parameter(10, "keyframes in the local map", minimum=1)
     keyframe_overlap: float = parameter(0.75, "overlap below which a scan becomes a keyframe", minimum=0.0, maximum=1.0)
     keyframe_distance: float = parameter(
         0.3, "distance from the last keyframe above which a scan becomes one", unit="m", minimum=0.0
@@ -44,7 +46,9 @@ class OdometryConfig(Config):
     restart_after: int = parameter(5, "failures after which the map starts anew", minimum=1)
     acceleration_sigma: float = parameter(1.0, "acceleration while registrations fail", unit="m/s2", minimum=0.0)
     angular_acceleration_sigma: float = parameter(2.0, "likewise", unit="rad/s2", minimum=0.0)
-    registration: RegistrationConfig = group(RegistrationConfig)
+    registration: RegistrationConfig = field(
+        default_factory=lambda: RegistrationConfig(source_points=4000, target_points=8000, start_level=1)
+    )
 
 
 class OdometryStatus(Enum):
@@ -146,7 +150,8 @@ class ScanOdometry:
 
     def _track(self, stamp_ns: int, scan: FloatArray, result: RegistrationResult) -> OdometryResult:
         keyframe = self._map.newest
-        T = keyframe.T @ result.T_target_source
+        # Rounding in a product of rotations doubles with every transposition: a chain must be made orthonormal again.
+        T = transform_from_pose7(pose7_from_transform(keyframe.T @ result.T_target_source))
         covariance = compose_covariance(keyframe.T, keyframe.covariance, result.T_target_source, result.covariance)
         motion = self._motion(stamp_ns, result) if self._tracked else None
         self._step = boxminus(invert_transform(self._T) @ T, np.eye(4)) if self._tracked else np.zeros(6)

@@ -20,7 +20,14 @@ from ndt_registration.search import Candidate, SearchConfig, distinct, judge, pl
 from ndt_registration.uncertainty import Curvature, Extent, UncertaintyConfig, direction_names, sandwich, unknown
 from ndt_registration.visibility import RangeImage, range_image
 from slam_core.config import Config, group, parameter
-from slam_core.geometry import FloatArray, is_rigid_transform, make_transform, skew
+from slam_core.geometry import (
+    FloatArray,
+    is_rigid_transform,
+    make_transform,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    skew,
+)
 
 
 @dataclass(frozen=True)
@@ -174,7 +181,8 @@ def _register(
 
 
 def _pose(optimum: NdtOptimum) -> FloatArray:
-    return make_transform(optimum.rotation, optimum.translation)
+    """The optimum's pose, its rotation exactly orthonormal again."""
+    return make_transform(rotation_from_quaternion(quaternion_from_rotation(optimum.rotation)), optimum.translation)
 
 
 def _aligned(

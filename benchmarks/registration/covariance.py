@@ -1,0 +1,42 @@
+"""NEES of many noisy registrations per motion: a mean of 6 is exact, far above 6 is a promise not kept."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+from grid import ROOM
+from scans import THESIS_MOTIONS, TofRoom, rig_motion, rig_pose, thinned
+from scipy.stats import chi2
+
+from ndt_registration.registration import register
+from slam_core.geometry import boxminus
+
+MOTIONS = ("forward 25 cm", "sideways 25 cm", "(25, 25) cm", "yaw +10 deg")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--scenario", default=str(ROOM))
+    arguments = parser.parse_args()
+    room, rng, start = TofRoom(arguments.scenario), np.random.default_rng(2), rig_pose(0.7, 1.9)
+    low, high = (chi2.ppf(p, 6 * arguments.runs) / arguments.runs for p in (0.025, 0.975))
+    print(
+        f"{arguments.runs} runs; 95 % bounds of the mean {low:.2f} ... {high:.2f}\n{'motion':20s} mean   median  below 99 % gate"
+    )
+    for name in MOTIONS:
+        truth, nees = room.motion(THESIS_MOTIONS[name]), []
+        for _ in range(arguments.runs):
+            source, target = (
+                thinned(room.scan(T, rng), 0.2, rng) for T in (start @ rig_motion(THESIS_MOTIONS[name]), start)
+            )
+            result = register(source, target, truth)
+            d = boxminus(result.T_target_source, truth)
+            nees.append(d @ np.linalg.solve(result.covariance, d))
+        inside = np.mean(np.array(nees) < chi2.ppf(0.99, 6))
+        print(f"{name:20s} {np.mean(nees):6.2f} {np.median(nees):6.2f} {100 * inside:8.1f} %")
+
+
+if __name__ == "__main__":
+    main()
