@@ -80,9 +80,9 @@ def incremental_gap(scale: float) -> float:
 
 
 def test_incremental_joining_differs_from_batch_by_linearisation_only() -> None:
-    """Then the gap falls with the square of the noise; any forgotten constraint would leave a constant share."""
-    assert incremental_gap(0.03) < 0.15 * incremental_gap(0.3)
-    assert incremental_gap(0.003) < 1e-3
+    """Then the gap, in units of the noise, falls with the noise; a forgotten constraint would leave a constant one."""
+    assert incremental_gap(0.03) < 0.5 * incremental_gap(0.3)
+    assert incremental_gap(0.03) < 0.01
 
 
 def building(rng: np.random.Generator, alike: bool) -> tuple[World, list[tuple[float, float]]]:

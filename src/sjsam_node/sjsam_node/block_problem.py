@@ -167,8 +167,8 @@ def _sightings_cost(sightings, R, t, points):
 def _linearize_sightings(sightings, R, t, points, pose_offset, n, pose_block, cross, landmark_block, gradient):
     """Blocks of J^T information J of every sighting: pose, pose x landmark, landmark; and the gradient.
 
-    With the residual turned to map axes, ``e = (l - t) - R z``, the Jacobian is [-I, [l - t]x] for the pose and I for the
-    landmark, and the information is ``R information R^T``.
+    With the residual turned to map axes, ``e = (l - t) - R z``, the Jacobian is [-I, [l - t]x] for the pose and I for
+    the landmark, and the information is ``R information R^T``.
     """
     landmark_ptr, pose, mean, information = sightings
     d = t.shape[1]

@@ -138,8 +138,11 @@ class LinkFinder:
         near = self._near(graph, new, recent)
         looks = self.index.query(graph.records[new].submap.descriptors, recent | set(near))
         believed: list[Link] = []
+        second = at_start(graph.records[new])
         for old in [*near, *looks]:
-            first, second = at_start(graph.records[old]), at_start(graph.records[new])
+            first = at_start(graph.records[old])
+            if old not in near and not self._is_alike(first, second):
+                continue
             prior, way = relative_pose(old, new), graph.way_between(old, new)
             found, certain = self.judge(first, second, prior, way, old, new)
             if found is not None:
@@ -154,8 +157,10 @@ class LinkFinder:
 
     def around(self, graph: MapGraph, middle: FloatArray, records: Iterable[int], excluded: set[int]) -> list[int]:
         """Those of ``records`` whose landmarks are around a point (3,) of the map, nearest first."""
-        distance = {i: float(np.linalg.norm(_middle(graph, i) - middle)) for i in records if i not in excluded}
-        ranked = sorted((d, i) for i, d in distance.items() if d < self.config.proximity)
+        candidates = np.array([i for i in records if i not in excluded], dtype=np.int64)
+        distance = np.linalg.norm(graph.middles(candidates) - middle, axis=1)
+        ranked = sorted((d, i) for d, i in zip(distance.tolist(), candidates.tolist(), strict=True)
+                        if d < self.config.proximity)  # fmt: skip
         return [i for _, i in ranked[: self.config.near_candidates]]
 
     def judge(
@@ -181,12 +186,12 @@ class LinkFinder:
     def _by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
         """Alignment from descriptors alone, refined with all landmarks around it."""
         pairs = self._distinct_pairs(first, second)
-        if len(pairs) <= self.config.min_inliers // 2:
+        if len(pairs) < self._few_pairs:
             return None
         rng = np.random.default_rng([self.config.seed, *key])
         coarse = ransac_rigid_transform(
             second.points[pairs[:, 1]], first.points[pairs[:, 0]], self.config.ransac_distance, rng,
-            min_inliers=max(3, self.config.min_inliers // 2),
+            min_inliers=self._few_pairs,
         )  # fmt: skip
         if not coarse.success:
             return None
@@ -195,6 +200,14 @@ class LinkFinder:
         # The guess came from the same landmarks: without its weight the covariance is that of the landmarks alone.
         free = Prior(found.T, 1e4 * np.eye(6))
         return jointly_compatible(first, second, found.pairs, free, self.config.association)
+
+    @property
+    def _few_pairs(self) -> int:
+        return max(3, self.config.min_inliers // 2)
+
+    def _is_alike(self, first: PointSet, second: PointSet) -> bool:
+        """Whether descriptors alone leave a chance, before anything dearer is asked."""
+        return len(self._distinct_pairs(first, second)) >= self._few_pairs
 
     def _distinct_pairs(self, first: PointSet, second: PointSet) -> IntArray:
         """Mutually best descriptor pairs, clearly better than the second best."""
@@ -277,9 +290,7 @@ def relative_pose(T_map_a: FloatArray, T_map_b: FloatArray, joint: FloatArray) -
 
 
 def _middle(graph: MapGraph, record: int) -> FloatArray:
-    r = graph.records[record]
-    points = graph.points[r.observations]
-    return np.median(points, axis=0) if len(points) else graph.poses[r.start][:3, 3]
+    return np.asarray(graph.middles(np.array([record]))[0])
 
 
 def _sigma(covariance: FloatArray | None) -> float:

@@ -150,11 +150,13 @@ class GlobalMap:
         return self.graph.poses[own[-1].end] if own else np.eye(4)
 
     def _chain(self, new: int) -> list[int]:
-        """Records before ``new`` along its agent's odometry, newest first."""
-        chain, record = [], self.graph.records[new]
-        agent, session, index = record.key
-        while (previous := self._lookup.get((agent, session, index - 1))) is not None and (
-            self.graph.records[previous].end == self.graph.records[self._lookup[agent, session, index]].start
+        """The last records before ``new`` along its agent's odometry, newest first, as many as it may be linked to."""
+        chain: list[int] = []
+        agent, session, index = self.graph.records[new].key
+        while (
+            len(chain) < self.config.closure.window
+            and (previous := self._lookup.get((agent, session, index - 1))) is not None
+            and (self.graph.records[previous].end == self.graph.records[self._lookup[agent, session, index]].start)
         ):
             chain.append(previous)
             index -= 1

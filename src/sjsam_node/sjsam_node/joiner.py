@@ -29,7 +29,7 @@ class JoinerConfig(Config):
         40, "submaps of a component from which on they are joined incrementally; below, batch costs no more", minimum=2
     )
     relinearize_turn: float = parameter(
-        0.02, "turn of the newest poses, since all was linearised, that calls for a batch", unit="rad", minimum=0.0
+        0.02, "turn of a pose, since it was linearised, that calls for a batch", unit="rad", minimum=0.0
     )
     outlier_probability: float = parameter(
         0.99999, "share of true matches that a joined map keeps", minimum=0.9, maximum=0.99999999
@@ -62,7 +62,6 @@ class _Joined:
     window: IntArray
     front: Front | None = None
     added: int = 0
-    turned: float = 0.0
 
 
 @dataclass
@@ -92,7 +91,7 @@ class Joiner:
         ):
             return self.batch(new, window)
         front, rise, turn = front.extended(self.graph, record, window, self.config.estimator.rows)
-        if joined.turned + turn > self.config.relinearize_turn:
+        if turn > self.config.relinearize_turn:
             return self.batch(new, window)
         result = replace(joined.result, cost=joined.result.cost + fusion + rise, iterations=1, update="incremental")
         self._joined[component] = replace(
@@ -102,7 +101,6 @@ class Joiner:
             window=window,
             front=front,
             added=joined.added + 1,
-            turned=joined.turned + turn,
         )
         return result
 

@@ -83,6 +83,8 @@ class MapGraph:
     _members: dict[int, list[int]] = field(default_factory=dict)
     _ending_at: dict[int, int] = field(default_factory=dict)
     _way: dict[int, float] = field(default_factory=dict)
+    _middles: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    _starts: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def append(self, submap: Submap, session: int, start: int | None, guess: FloatArray) -> Record:
         """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own."""
@@ -98,6 +100,8 @@ class MapGraph:
             self._seen_in[observation] = {len(self.records)}
             self._members[observation] = [observation]
         self._ending_at[end] = len(self.records)
+        middle = np.median(submap.landmarks, axis=0) if len(submap.landmarks) else np.zeros(3)
+        self._middles, self._starts = np.concatenate([self._middles, middle[None]]), np.append(self._starts, start)
         self.records.append(record)
         return record
 
@@ -112,14 +116,18 @@ class MapGraph:
 
     def records_of(self, component: int) -> list[int]:
         """Records of a component, ascending."""
-        starts = np.array([r.start for r in self.records], dtype=np.int64)
-        return np.nonzero(self.component_of[starts] == component)[0].tolist()
+        return np.nonzero(self.component_of[self._starts] == component)[0].tolist()
 
     def way_between(self, first: int, second: int) -> float:
         """Length of the way that an agent went between two records, m; of both ways where they belong to two runs."""
         a, b = self.records[first], self.records[second]
         ways = self._way[a.start], self._way[b.start]
         return abs(ways[1] - ways[0]) if a.key[:2] == b.key[:2] else sum(ways)
+
+    def middles(self, records: IntArray) -> FloatArray:
+        """Middle of the landmarks of some records in the map frame, (n, 3); the start pose where there are none."""
+        T = self.poses[self._starts[records]]
+        return np.asarray((T[:, :3, :3] @ self._middles[records][..., None])[..., 0] + T[:, :3, 3])
 
     def size(self, component: int) -> int:
         """Number of nodes of a component."""

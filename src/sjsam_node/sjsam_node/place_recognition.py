@@ -32,7 +32,7 @@ class PlaceRecognitionConfig(Config):
 
 
 class VocabularyTree:
-    """Hierarchical k-means over unit descriptors; every node below the root is a word."""
+    """Hierarchical k-means over unit descriptors; a word is a leaf."""
 
     def __init__(self, descriptors: Descriptors, config: PlaceRecognitionConfig) -> None:
         self.branching, self.depth = config.branching, config.depth
@@ -49,16 +49,15 @@ class VocabularyTree:
             self._grow(node * self.branching + child + 1, members[nearest == child], level + 1)
 
     def words(self, descriptors: Descriptors) -> IntArray:
-        """Words of each descriptor (n, d): the nodes on its way from the root to a leaf, shape (n, depth)."""
-        node, way = np.zeros(len(descriptors), dtype=np.int64), []
+        """Word of each descriptor (n, d), shape (n,)."""
+        node = np.zeros(len(descriptors), dtype=np.int64)
         for _ in range(self.depth):
             for parent in np.unique(node):
                 centres = self._centres.get(int(parent))
                 if centres is not None:
                     here = np.nonzero(node == parent)[0]
                     node[here] = parent * self.branching + np.argmax(descriptors[here] @ centres.T, axis=1) + 1
-            way.append(node.copy())
-        return np.stack(way, axis=1)
+        return node
 
 
 def _kmeans(members: Descriptors, count: int, iterations: int = 8) -> Descriptors:
@@ -81,7 +80,7 @@ class PlaceIndex:
     config: PlaceRecognitionConfig = field(default_factory=PlaceRecognitionConfig)
     _tree: VocabularyTree | None = None
     _waiting: list[tuple[int, Descriptors]] = field(default_factory=list)
-    _postings: dict[int, dict[int, int]] = field(default_factory=lambda: defaultdict(dict))
+    _postings: dict[int, list[int]] = field(default_factory=lambda: defaultdict(list))
     _sizes: dict[int, int] = field(default_factory=dict)
     _descriptors: dict[int, Descriptors] = field(default_factory=dict)
 
@@ -99,8 +98,8 @@ class PlaceIndex:
 
     def _post(self, place: int, words: IntArray) -> None:
         self._sizes[place] = max(len(words), 1)
-        for word, count in zip(*np.unique(words, return_counts=True), strict=True):
-            self._postings[int(word)][place] = int(count)
+        for word in np.unique(words).tolist():
+            self._postings[word].append(place)
 
     def query(self, descriptors: Descriptors, excluded: set[int]) -> list[int]:
         """The places most similar to ``descriptors``, best first.
@@ -116,14 +115,15 @@ class PlaceIndex:
         return sorted(known, key=lambda p: (-direct[p], p))[: self.config.candidates]
 
     def _scores(self, words: IntArray) -> dict[int, float]:
-        """tf-idf similarity of every place that shares a word."""
-        scores: dict[int, float] = defaultdict(float)
-        for word, count in zip(*np.unique(words, return_counts=True), strict=True):
-            posting = self._postings.get(int(word), {})
-            idf = np.log(1.0 + len(self._sizes) / max(len(posting), 1))
-            for place, there in posting.items():
-                scores[place] += idf * min(int(count), there) / np.sqrt(self._sizes[place])
-        return scores
+        """Similarity of every place that shares a word: rare words weigh more (inverse document frequency)."""
+        shared = [self._postings[word] for word in np.unique(words).tolist() if word in self._postings]
+        if not shared:
+            return {}
+        lengths = np.array([len(posting) for posting in shared])
+        places = np.concatenate([np.asarray(posting, dtype=np.int64) for posting in shared])
+        idf = np.log(1.0 + len(self._sizes) / lengths)
+        total = np.bincount(places, weights=np.repeat(idf, lengths))
+        return {place: float(total[place]) / self._sizes[place] ** 0.5 for place in np.nonzero(total)[0].tolist()}
 
 
 def _likeness(first: Descriptors, second: Descriptors) -> float:
