@@ -12,7 +12,7 @@ from ekf_slam_node.config import AssociationConfig
 from ekf_slam_node.linking import Linker
 from ekf_slam_node.models import Frame, frame_from_features, relative_motion, rig_points
 from ekf_slam_node.motion_guess import guess_motion
-from slam_core.geometry import FloatArray, boxminus, boxplus
+from slam_core.geometry import FloatArray, boxminus
 
 
 @pytest.fixture
@@ -139,4 +139,3 @@ def test_few_features_are_not_linked(world: PointWorld, rng: np.random.Generator
     candidates, _, now, _ = two_views(world, SMALL_STEP, rng)
     prior = MotionPrior(SMALL_STEP, 1e-4 * np.eye(6))
     assert Linker(AssociationConfig(), T_RIG_OPTICAL).link(candidates, now.select(np.arange(5)), prior) is None
-    assert boxplus(np.eye(4), np.zeros(6)).shape == (4, 4)
