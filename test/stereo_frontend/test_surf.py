@@ -8,7 +8,14 @@ import pytest
 
 from stereo_frontend.surf import SurfConfig, SurfDetector
 from stereo_frontend.surf_descriptor import describe_oriented, describe_upright, orientation, region_weights
-from stereo_frontend.surf_detector import filter_sizes, find_maxima, hessian_layer, hessian_octaves, integral_image
+from stereo_frontend.surf_detector import (
+    allocate_octaves,
+    filter_sizes,
+    find_maxima,
+    hessian_layer,
+    hessian_octaves,
+    integral_image,
+)
 
 
 @pytest.fixture(scope="module")
@@ -16,6 +23,12 @@ def image() -> np.ndarray:
     noise = np.random.default_rng(3).uniform(0, 255, (130, 170)).astype(np.float32)
     smooth = cv2.GaussianBlur(noise, (0, 0), 2.5)
     return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def octaves(image: np.ndarray, number: int) -> list[np.ndarray]:
+    out = allocate_octaves(*image.shape, number)
+    hessian_octaves(integral_image(image), out)
+    return out
 
 
 def keep_all(uv, response):
@@ -105,7 +118,7 @@ def test_hessian_equals_its_twin(image, size, step):
 
 
 def test_octaves_share_layers(image):
-    first, second, third = hessian_octaves(integral_image(image), 3)
+    first, second, third = octaves(image, 3)
     separate = np.zeros_like(second[1])
     hessian_layer(integral_image(image), 27, 2, separate)
     border = 14
@@ -117,7 +130,7 @@ def test_octaves_share_layers(image):
 
 
 def test_maxima_are_those_of_an_exhaustive_search(image):
-    layers = hessian_octaves(integral_image(image), 1)[0]
+    layers = octaves(image, 1)[0]
     found = np.empty((5000, 4), np.float32)
     n = find_maxima(layers, 0, np.float32(5.0), found)
     expected = set()

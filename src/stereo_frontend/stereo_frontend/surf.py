@@ -22,7 +22,14 @@ from slam_core.config import Config, parameter
 from slam_core.types import ByteArray, Float32Array
 from stereo_frontend.keypoints import Keypoints, Selector
 from stereo_frontend.surf_descriptor import DIMENSION, describe_oriented, describe_upright, region_weights
-from stereo_frontend.surf_detector import MAX_PIXELS, IntegralImage, find_maxima, hessian_octaves, integral_image
+from stereo_frontend.surf_detector import (
+    MAX_PIXELS,
+    IntegralImage,
+    allocate_octaves,
+    find_maxima,
+    hessian_octaves,
+    integral_image,
+)
 
 _MOST_KEYPOINTS = 20000
 _DIAMETER = 9.0 / 1.2
@@ -47,6 +54,10 @@ class SurfDetector:
     def __init__(self, config: SurfConfig | None = None) -> None:
         self.config = config or SurfConfig()
         self._weights = region_weights()
+        # Kept from image to image: fresh pages for 20 MB cost as much as the filters.
+        self._shape = (0, 0)
+        self._octaves: list[Float32Array] = []
+        self._found = np.empty((_MOST_KEYPOINTS, 4), np.float32)
 
     def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
         """Keypoints above ``threshold`` times the configured one, thinned out by ``select`` before they are described.
@@ -78,8 +89,12 @@ class SurfDetector:
 
     def _find(self, integral: IntegralImage, threshold: float) -> Float32Array:
         """Rows of u, v, scale, response."""
-        buffer = np.empty((_MOST_KEYPOINTS, 4), np.float32)
+        shape = (integral.shape[0] - 1, integral.shape[1] - 1)
+        if self._shape != shape:
+            self._octaves, self._shape = allocate_octaves(*shape, self.config.octaves), shape
+        hessian_octaves(integral, self._octaves)
         parts = []
-        for octave, layers in enumerate(hessian_octaves(integral, self.config.octaves)):
-            parts.append(buffer[: find_maxima(layers, octave, np.float32(threshold), buffer)].copy())
-        return np.concatenate(parts) if parts else buffer[:0]
+        for octave, layers in enumerate(self._octaves):
+            number = find_maxima(layers, octave, np.float32(threshold), self._found)
+            parts.append(self._found[:number].copy())
+        return np.concatenate(parts) if parts else self._found[:0].copy()

@@ -27,25 +27,25 @@ def filter_sizes(octave: int) -> list[int]:
     return [step + 3 + step * layer for layer in range(LAYERS)]
 
 
-def hessian_octaves(integral: IntegralImage, octaves: int) -> list[Float32Array]:
-    """Determinants of the Hessian, one array (4, rows, columns) per octave, sampled every 2^octave pixels.
+def allocate_octaves(height: int, width: int, octaves: int) -> list[Float32Array]:
+    """Room for :func:`hessian_octaves`, one array (4, rows, columns) per octave, sampled every 2^octave pixels.
 
-    Octaves whose smallest filter does not fit the image are left out.
+    Octaves whose filters do not fit the image are left out.
     """
-    height, width = integral.shape[0] - 1, integral.shape[1] - 1
-    found: list[Float32Array] = []
-    for octave in range(octaves):
-        sizes, step = filter_sizes(octave), 2**octave
-        if sizes[2] + 2 * step >= min(height, width):
-            break
-        layers = np.zeros((LAYERS, -(-height // step), -(-width // step)), np.float32)
-        for layer, size in enumerate(sizes):
-            if found and layer < 2:
-                layers[layer] = found[-1][2 * layer + 1, ::2, ::2]
+    fitting = [o for o in range(octaves) if filter_sizes(o)[2] + 2 ** (o + 1) < min(height, width)]
+    return [np.zeros((LAYERS, -(-height // 2**o), -(-width // 2**o)), np.float32) for o in fitting]
+
+
+def hessian_octaves(integral: IntegralImage, out: list[Float32Array]) -> None:
+    """Fill ``out``, made by :func:`allocate_octaves` for this size, with determinants of the Hessian; borders stay
+    zero.
+    """
+    for octave, layers in enumerate(out):
+        for layer, size in enumerate(filter_sizes(octave)):
+            if octave > 0 and layer < 2:
+                layers[layer] = out[octave - 1][2 * layer + 1, ::2, ::2]
             else:
-                hessian_layer(integral, size, step, layers[layer])
-        found.append(layers)
-    return found
+                hessian_layer(integral, size, 2**octave, layers[layer])
 
 
 @njit(cache=True, nogil=True)
