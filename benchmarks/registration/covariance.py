@@ -21,10 +21,10 @@ def main() -> None:
     parser.add_argument("--scenario", default=str(ROOM))
     arguments = parser.parse_args()
     room, rng, start = TofRoom(arguments.scenario), np.random.default_rng(2), rig_pose(0.7, 1.9)
-    low, high = (chi2.ppf(p, 6 * arguments.runs) / arguments.runs for p in (0.025, 0.975))
-    print(
-        f"{arguments.runs} runs; 95 % bounds of the mean {low:.2f} ... {high:.2f}\n{'motion':20s} mean   median  below 99 % gate"
-    )
+    runs = arguments.runs
+    low, high = (chi2.ppf(p, 6 * runs) / runs for p in (0.025, 0.975))
+    print(f"{runs} runs; 95 % bounds of the mean {low:.2f} ... {high:.2f}")
+    print("motion               mean   median  below 99 % gate")
     for name in MOTIONS:
         truth, nees = room.motion(THESIS_MOTIONS[name]), []
         for _ in range(arguments.runs):

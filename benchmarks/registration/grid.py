@@ -1,4 +1,6 @@
-"""Tables 10.1 and 10.2 and beyond: 15 scans per motion, one setting, no initial guess; share of points, time, iterations."""
+"""Tables 10.1 and 10.2 and beyond: 15 scans per motion, one setting, no initial guess; share of points, time,
+iterations.
+"""
 
 from __future__ import annotations
 
@@ -54,9 +56,10 @@ def main() -> None:
                     )
                 )
             e, a, claimed, iterations, seconds = np.array(rows, dtype=float).T
+            success, good = np.sum((e < 0.05) & (a < 1)), np.sum((e < 0.01) & (a < 0.3))
             print(
-                f"{name:24s} {np.sum((e < 0.05) & (a < 1)):5d} {np.sum((e < 0.01) & (a < 0.3)):7d} {int(claimed.sum()):7d} "
-                f"{1e3 * np.median(e):7.1f} {np.median(a):6.2f} {np.median(iterations):8.0f} {1e3 * np.median(seconds):9.1f}"
+                f"{name:24s} {success:5d} {good:7d} {int(claimed.sum()):7d} {1e3 * np.median(e):7.1f} "
+                f"{np.median(a):6.2f} {np.median(iterations):8.0f} {1e3 * np.median(seconds):9.1f}"
             )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import bz2
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def pose2(x: float, y: float, yaw: float) -> FloatArray:
 def read_log(path: Path, every: int) -> list[tuple[float, FloatArray, FloatArray]]:
     """Time s, odometry T_odom_laser and points (n, 2) m of every scan."""
     scans = []
-    for line in bz2.open(path, "rt"):
+    for line in bz2.decompress(path.read_bytes()).decode("ascii").splitlines():
         words = line.split()
         if words and words[0] == "FLASER":
             n = int(words[1])
@@ -46,7 +47,7 @@ def track(scans: list[tuple[float, FloatArray, FloatArray]]) -> tuple[list[Float
     config = RegistrationConfig(min_points=30, start_level=1)
     poses, failures = [scans[0][1]], 0
     key_pose, target = scans[0][1], Target.build(scans[0][2], config)
-    for (_, before, _), (_, now, points) in zip(scans[:-1], scans[1:], strict=True):
+    for (_, before, _), (_, now, points) in pairwise(scans):
         guess = poses[-1] @ np.linalg.inv(before) @ now
         local = invert_transform(key_pose) @ guess
         result = register(points, target, local, config)

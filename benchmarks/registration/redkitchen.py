@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -25,6 +26,10 @@ def depth_points(path: Path) -> FloatArray:
     valid = (depth > 0.3) & (depth < 6.0)
     z = depth[valid]
     return np.column_stack([(u[valid] - CENTRE_PX[0]) / FOCAL_PX * z, (v[valid] - CENTRE_PX[1]) / FOCAL_PX * z, z])
+
+
+def rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def main() -> None:
@@ -49,7 +54,7 @@ def main() -> None:
         truths.append(np.loadtxt(frame.with_suffix(".pose.txt")))
     start = invert_transform(truths[0])
     errors = np.array([boxminus(T, start @ G) for T, G in zip(estimates, truths, strict=True)])
-    length = sum(np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in zip(truths[:-1], truths[1:], strict=True))
+    length = sum(np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in pairwise(truths))
     distance, angle = np.linalg.norm(errors[:, :3], axis=1), np.rad2deg(np.linalg.norm(errors[:, 3:], axis=1))
     fit = umeyama(np.array([T[:3, 3] for T in estimates]), np.array([T[:3, 3] for T in truths]))
     apart = [
@@ -60,16 +65,13 @@ def main() -> None:
         for a, b, g, h in zip(estimates[:-1], estimates[1:], truths[:-1], truths[1:], strict=True)
     ])  # fmt: skip
     print(f"path {length:.2f} m, {len(estimates)} frames, {failures} failed")
-    print(f"ATE (aligned): rmse {np.sqrt(np.mean(np.square(apart))):.4f} m")
-    print(
-        f"error from the start: rmse {np.sqrt((distance**2).mean()):.4f} m, end {distance[-1]:.4f} m ({100 * distance[-1] / length:.2f} %), {angle[-1]:.2f} deg"
-    )
-    print(
-        f"between frames: median {1e3 * np.median(np.linalg.norm(steps[:, :3], axis=1)):.2f} mm, {np.rad2deg(np.median(np.linalg.norm(steps[:, 3:], axis=1))):.3f} deg"
-    )
-    print(
-        f"time per frame: median {np.median(milliseconds[1:]):.1f} ms, 95 % below {np.percentile(milliseconds[1:], 95):.1f} ms"
-    )
+    print(f"ATE (aligned): rmse {rms(np.array(apart)):.4f} m")
+    end = 100 * distance[-1] / length
+    print(f"from the start: rmse {rms(distance):.4f} m, end {distance[-1]:.4f} m ({end:.2f} %), {angle[-1]:.2f} deg")
+    moved, turned = (np.median(np.linalg.norm(part, axis=1)) for part in (steps[:, :3], steps[:, 3:]))
+    print(f"between frames: median {1e3 * moved:.2f} mm, {np.rad2deg(turned):.3f} deg")
+    ms = np.array(milliseconds[1:])
+    print(f"time per frame: median {np.median(ms):.1f} ms, 95 % below {np.percentile(ms, 95):.1f} ms")
 
 
 if __name__ == "__main__":

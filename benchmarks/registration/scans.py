@@ -1,4 +1,4 @@
-"""Simulated time-of-flight scans at chosen poses in a scenario's building, and the motions of the thesis' experiments."""
+"""Simulated time-of-flight scans at chosen poses in a scenario's building, and the motions of the thesis."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ THESIS_MOTIONS: dict[str, Motion] = {
     "yaw -10 deg": (0.0, 0.0, -10.0),
     "yaw 10 deg, 25 cm": (0.25, 0.0, 10.0),
 }
-"""Forward m, left m, yaw deg of the source scan in the target scan's rig frame (Tables 10.1 and 10.2, Figs. 10.1-10.17)."""
+"""Forward m, left m, yaw deg of the source scan in the target scan's rig frame (Tables 10.1 and 10.2, Figs.
+10.1-10.17).
+"""
 
 HARDER_MOTIONS: dict[str, Motion] = {
     "yaw 20 deg": (0.0, 0.0, 20.0),

@@ -29,7 +29,7 @@ class Room:
         return nearest
 
     def scan(self, T: FloatArray, rng: np.random.Generator, size: int = 90, sigma: float = 0.003) -> FloatArray:
-        """Points (size * size, 3) of a camera of 40 degrees at T_room_rig, X forward; noise grows with range squared."""
+        """Points (size * size, 3) of a 40 degree camera at T_room_rig, X forward; noise grows with range squared."""
         c = (np.arange(size) - 0.5 * (size - 1)) / (0.5 * size) * np.tan(np.deg2rad(20.0))
         v, u = np.meshgrid(c, c, indexing="ij")
         rays = np.stack([np.ones_like(u), -u, -v], axis=-1).reshape(-1, 3)

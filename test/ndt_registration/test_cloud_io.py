@@ -60,7 +60,8 @@ def vtk(encoding: str) -> bytes:
 
 FILES = {
     "a.pcd": pcd("ascii"), "b.pcd": pcd("binary"), "c.pcd": pcd("binary_compressed"), "a.ply": ply("ascii"),
-    "b.ply": ply("binary_little_endian"), "c.ply": ply("binary_big_endian"), "a.vtk": vtk("ASCII"), "b.vtk": vtk("BINARY"),
+    "b.ply": ply("binary_little_endian"), "c.ply": ply("binary_big_endian"), "a.vtk": vtk("ASCII"), "b.vtk":
+    vtk("BINARY"),
 }  # fmt: skip
 
 

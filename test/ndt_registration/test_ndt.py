@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ndt_registration.ndt import Layer, cost_and_derivatives, ndt_align
-from ndt_registration.voxel_grid import NormalGrid, block_moments, find_block, normal_grid
+from ndt_registration.voxel_grid import block_moments, find_block, normal_grid
 from slam_core.geometry import FloatArray, boxminus, boxplus, make_transform, transform_points
 
 STATES = [np.zeros(6), np.array([0.03, -0.02, 0.01, 0.02, -0.05, 0.03]), np.array([-0.1, 0.05, 0.02, -0.3, 0.2, 0.6])]
@@ -58,8 +58,8 @@ def test_gradient_and_hessian_agree_with_central_differences(layer: Layer, state
     numeric = np.array([(cost(e * u) - cost(-e * u)) / (2 * e) for u in np.eye(6)])
     np.testing.assert_allclose(g, numeric, atol=1e-5 * np.abs(g).max())
     second = np.array([
-        [(cost(h * (u + v)) - cost(h * (u - v)) - cost(h * (v - u)) + cost(-h * (u + v))) / (4 * h * h) for v in np.eye(6)]
-        for u in np.eye(6)
+        [(cost(h * (u + v)) - cost(h * (u - v)) - cost(h * (v - u)) + cost(-h * (u + v))) / (4 * h * h) for v in
+        np.eye(6)] for u in np.eye(6)
     ])  # fmt: skip
     np.testing.assert_allclose(H, second, atol=1e-4 * np.abs(second).max())
 

@@ -67,7 +67,7 @@ def test_starts_anew_when_it_stays_lost(scans: list[FloatArray]) -> None:
     odometry = ScanOdometry(OdometryConfig(restart_after=2))
     rng = np.random.default_rng(2)
     odometry.process(1, scans[0])
-    results = [odometry.process(1 + k * STEP_NS, rng.normal(size=(800, 3)) + [3.0, 0.0, 0.0]) for k in (1, 2)]
+    results = [odometry.process(1 + k * STEP_NS, rng.normal((3.0, 0.0, 0.0), 1.0, (800, 3))) for k in (1, 2)]
     assert [r.status for r in results] == [OdometryStatus.FAILED, OdometryStatus.RESTARTED]
     assert results[1].covariance[0, 0] > results[0].covariance[0, 0]
 

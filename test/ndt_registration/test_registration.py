@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -125,7 +126,7 @@ def test_bad_clouds_give_a_reason(room: Any, start: FloatArray, cloud: FloatArra
 def test_coplanar_points_are_no_plain_success(method: str) -> None:
     rng = np.random.default_rng(5)
     sheet = np.column_stack([np.full(2000, 2.0), rng.uniform(-1, 1, (2000, 2))])
-    result = register(sheet, sheet + [0.1, 0.0, 0.0], config=RegistrationConfig(method=method))
+    result = register(sheet, sheet + np.array([0.1, 0.0, 0.0]), config=RegistrationConfig(method=method))
     assert result.degenerate or not result.converged
 
 
@@ -149,7 +150,7 @@ def test_plane_motion_from_laser_scans(at: Callable[..., FloatArray]) -> None:
     rng = np.random.default_rng(5)
     corners = np.array([[-3, -2], [4, -2], [4, 1], [2, 1], [2, 3], [-1, 3], [-1, 2], [-3, 2], [-3, -2]], dtype=float)
     walls = np.concatenate([
-        a + np.linspace(0, 1, 150)[:, None] * (b - a) for a, b in zip(corners[:-1], corners[1:], strict=True)
+        a + np.linspace(0, 1, 150)[:, None] * (b - a) for a, b in pairwise(corners)
     ])  # fmt: skip
     truth = at(0.3, -0.2, 0.0, 12.0)
     cloud = np.column_stack([walls, np.zeros(len(walls))])

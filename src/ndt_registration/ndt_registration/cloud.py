@@ -1,4 +1,4 @@
-"""A cloud made ready for registration: finite, thinned, shuffled, in coordinates near its sensor, with its own scale."""
+"""A cloud made ready for registration: finite, thinned, shuffled, near its sensor, with its own scale."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Cloud:
     """Points (n, 3) m in random order, so that the first k are a fair sample of any size.
 
     rims (m, 3): points on the rims of things seen before a farther background.
-    scale: median distance from the viewpoint, m, the unit of every length that no one has set. planar: the points came as
-    (n, 2) and z is 0.
+    scale: median distance from the viewpoint, m, the unit of every length that no one has set. planar: the points came
+    as (n, 2) and z is 0.
     """
 
     points: FloatArray

@@ -1,8 +1,8 @@
 """Rims of things that stand before a farther background: the features that fix a scan of walls along the walls.
 
-A point is on a rim where, in the direction of view, the surface ends beside it and the view goes on behind. Where the view
-itself ends, and where a nearer thing hides what is behind, the surface ends for the viewer only: no rim is found there
-(compare the edge features of Zhang and Singh 2014; these need no scan lines).
+A point is on a rim where, in the direction of view, the surface ends beside it and the view goes on behind. Where the
+view itself ends, and where a nearer thing hides what is behind, the surface ends for the viewer only: no rim is found
+there (compare the edge features of Zhang and Singh 2014; these need no scan lines).
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ MAX_IMAGE_SIZE = 512
 
 @njit(cache=True, nogil=True)
 def _sorted_by_bin(points: FloatArray, size: int) -> tuple[FloatArray, FloatArray, Int32Array, Int32Array]:
-    """Unit directions (n, 3) and ranges (n,) in the order of their bins, bin of each, and first of each bin (size^2 + 1,)."""
+    """Unit directions (n, 3) and ranges (n,) in the order of their bins, bin of each, and first of each bin (size^2 +
+    1,).
+    """
     n = points.shape[0]
     bins = np.empty(n, np.int32)
     first = np.zeros(size * size + 1, np.int32)
@@ -48,7 +50,9 @@ def _sorted_by_bin(points: FloatArray, size: int) -> tuple[FloatArray, FloatArra
 def _nearest_behind(
     i: int, size: int, reach: float, step: float, d: FloatArray, r: FloatArray, bins: Int32Array, first: Int32Array
 ) -> int:
-    """The point nearest in direction to point ``i`` that is more than ``step`` farther away, -1 if none is within reach."""
+    """The point nearest in direction to point ``i`` that is more than ``step`` farther away, -1 if none is within
+    reach.
+    """
     row, column = bins[i] // size, bins[i] % size
     best, nearest = -1, reach * reach
     for a in range(max(row - 1, 0), min(row + 2, size)):
@@ -104,6 +108,8 @@ def rim_points(points: FloatArray, spacing: float, step: float) -> FloatArray:
 
     Parameters
     ----------
+    points
+        The scan, m.
     spacing
         Mean angle between neighbouring points, rad.
     step

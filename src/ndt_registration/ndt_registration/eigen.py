@@ -1,4 +1,6 @@
-"""Small dense linear algebra for the compiled kernels: symmetric 3x3 eigenvalues and 6x6 Cholesky, without LAPACK's overhead."""
+"""Small dense linear algebra for the compiled kernels: symmetric 3x3 eigenvalues and 6x6 Cholesky, without LAPACK's
+overhead.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from slam_core.geometry import FloatArray
 
 @njit(cache=True, nogil=True)
 def symmetric_eigen3(a: FloatArray, vectors: FloatArray, values: FloatArray) -> None:
-    """Eigenvalues (ascending) and eigenvectors (columns) of a symmetric matrix, shape (3, 3), by cyclic Jacobi rotations.
+    """Eigenvalues (ascending) and eigenvectors (columns) of a symmetric matrix, shape (3, 3), by cyclic Jacobi
+    rotations.
 
     ``a`` is destroyed, ``vectors`` (3, 3) and ``values`` (3,) are written.
     """
@@ -65,7 +68,9 @@ def _sort3(vectors: FloatArray, values: FloatArray) -> None:
 
 @njit(cache=True, nogil=True)
 def cholesky_solve6(H: FloatArray, damping: FloatArray, g: FloatArray, x: FloatArray) -> bool:
-    """Write the solution of ``(H + diag(damping)) x = -g`` (6 unknowns); False where that matrix is not positive definite."""
+    """Write the solution of ``(H + diag(damping)) x = -g`` (6 unknowns); False where that matrix is not positive
+    definite.
+    """
     L = np.empty((6, 6))
     for i in range(6):
         for j in range(i + 1):

@@ -1,7 +1,7 @@
 """Iterative closest points, point to point and point to plane: kd-tree, trimmed, with a rejection limit that shrinks.
 
-Kept as the baseline that the thesis compares with (10.2) and for clouds too thin for cells of points. One setting serves
-large motions because the limit starts at a fraction of the cloud's scale and shrinks to a few point spacings.
+Kept as the baseline that the thesis compares with (10.2) and for clouds too thin for cells of points. One setting
+serves large motions because the limit starts at a fraction of the cloud's scale and shrinks to a few point spacings.
 """
 
 from __future__ import annotations

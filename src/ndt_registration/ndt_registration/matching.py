@@ -12,10 +12,13 @@ from slam_core.geometry import FloatArray
 
 
 class Fit(NamedTuple):
-    """Share of points on the target's surfaces, their root mean square distance (m), gradient of the cost by block (b, 6), extent of the inliers.
+    """Share of points on the target's surfaces, their root mean square distance (m), gradient of the cost by block (b,
+    6), extent of the inliers.
 
-    friction (6, 6): expected curvature of the cost from errors of the cells' normals alone. A normal from ``n`` points is off by
-    ``sqrt(variance / (n spread))``, so that a plane seems to hold points along itself with an information of ``1 / (n spread)``.
+    friction (6, 6): expected curvature of the cost from errors of the cells' normals alone. A normal from ``n`` points
+    is off by
+    ``sqrt(variance / (n spread))``, so that a plane seems to hold points along itself with an information of ``1 / (n
+    spread)``.
     """
 
     overlap: float
@@ -54,7 +57,9 @@ def _add_friction(px, py, pz, drag, F):  # type: ignore[no-untyped-def]
 def fit_to_grid(
     points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGrid, max_distance: float, block_size: float
 ) -> Fit:
-    """Fit of points (n, 3) at a pose; a point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m of its plane."""
+    """Fit of points (n, 3) at a pose; a point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m
+    of its plane.
+    """
     n = points.shape[0]
     keys = hash_table(n)
     rows = np.empty(keys.shape[0], np.int32)

@@ -30,7 +30,9 @@ class Layer(NamedTuple):
 
 
 class NdtOptimum(NamedTuple):
-    """Pose, mean score per point in [0, 1], iterations, whether the step became small; derivatives of the *cost* (-score)."""
+    """Pose, mean score per point in [0, 1], iterations, whether the step became small; derivatives of the *cost*
+    (-score).
+    """
 
     rotation: FloatArray
     translation: FloatArray
@@ -53,7 +55,8 @@ def ndt_derivatives(
     hessian: FloatArray,
     majorant: FloatArray,
 ) -> float:
-    """Cost ``-factor sum exp(...) / 8`` of points (n, 3) at the pose; adds to its gradient (6,), Hessian and majorant (6, 6).
+    """Cost ``-factor sum exp(...) / 8`` of points (n, 3) at the pose; adds to its gradient (6,), Hessian and majorant
+    (6, 6).
 
     The majorant is the positive semidefinite part (that of iteratively reweighted least squares): a step with it always
     lowers the cost, also where the Hessian is indefinite.

@@ -1,7 +1,7 @@
 """Scan odometry: each scan is registered to a local map of the last keyframes, starting from constant velocity.
 
-A failed registration is never integrated: the pose moves on by the guess alone, its covariance grows, no relative motion is
-handed out, and when the scans keep failing the map starts anew where the guess has brought us.
+A failed registration is never integrated: the pose moves on by the guess alone, its covariance grows, no relative
+motion is handed out, and when the scans keep failing the map starts anew where the guess has brought us.
 """
 
 from __future__ import annotations
@@ -62,7 +62,9 @@ class OdometryStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class OdometryResult:
-    """Pose T_odom_sensor with covariance (6, 6); motion since the previous scan, None if either of the two failed; status."""
+    """Pose T_odom_sensor with covariance (6, 6); motion since the previous scan, None if either of the two failed;
+    status.
+    """
 
     stamp_ns: int
     T: FloatArray
@@ -96,8 +98,8 @@ class ScanOdometry:
     def process(self, stamp_ns: int, points: npt.ArrayLike, prior: RelativeMotion | None = None) -> OdometryResult:
         """Register a scan, shape (..., 3) m in the sensor's frame, NaN where invalid.
 
-        ``prior`` is the motion of the sensor since the previous scan from another source, such as an IMU; without it constant
-        velocity is assumed.
+        ``prior`` is the motion of the sensor since the previous scan from another source, such as an IMU; without it
+        constant velocity is assumed.
         """
         scan = finite_points(points)
         if self._map.target is None:

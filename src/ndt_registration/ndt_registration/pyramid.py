@@ -60,7 +60,9 @@ class Pyramid:
         return Pyramid(tuple(surface_grids), tuple(rim_grids))
 
     def layers(self, source: Cloud, level: int, count: int, rim_share: float) -> tuple[Layer, Layer]:
-        """What NDT needs on a level: at most ``count`` source points and their rims, which together weigh ``rim_share``."""
+        """What NDT needs on a level: at most ``count`` source points and their rims, which together weigh
+        ``rim_share``.
+        """
         points = source.sample(count)
         factor = rim_share * len(points) / max(len(source.rims), _FEW_RIMS)
         return Layer(points, self.grids[level], 1.0), Layer(source.rims, self.rims[level], factor)

@@ -1,7 +1,8 @@
-"""Registration of one cloud to another: ``register(source, target) -> RegistrationResult``, one setting for every motion.
+"""Registration of one cloud to another: ``register(source, target) -> RegistrationResult``, one setting for every
+motion.
 
-Without an initial guess the pose is searched globally (:mod:`ndt_registration.search`), each promising pose is refined by NDT
-from coarse to fine, and the one that respects best what the target has seen, surfaces and free space, wins.
+Without an initial guess the pose is searched globally (:mod:`ndt_registration.search`), each promising pose is refined
+by NDT from coarse to fine, and the one that respects best what the target has seen, surfaces and free space, wins.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class RegistrationConfig(Config):
     coarse_points: int = parameter(2000, "most points of the source on all but the finest level", minimum=10)
     min_points: int = parameter(50, "fewest finite points of a cloud", minimum=10)
     max_iterations: int = parameter(30, "most iterations per level", minimum=1)
-    tolerance: float = parameter(1e-5, "length of the last step, over the scale", minimum=0.0)
+    tolerance: float = parameter(1e-4, "length of the last step, over the scale", minimum=0.0)
     start_level: int = parameter(2, "coarsest level used from a given initial guess", minimum=0, maximum=7)
     image_size: int = parameter(64, "edge of the range image that holds free space", unit="px", minimum=8)
     min_overlap: float = parameter(
@@ -58,10 +59,10 @@ class RegistrationConfig(Config):
 class RegistrationResult:
     """Outcome of a registration; ``T_target_source`` must only be used where ``converged``.
 
-    covariance: (6, 6) of the pose error of ``slam_core.geometry``, very large along ``degenerate`` directions, which are named.
-    score: mean over the points that overlap of how well they fit, 0 to 1. overlap: share of the source's points that lie on
-    surfaces of the target. inlier_rmse: their distance from those surfaces, m. reason: why it failed or what to mind; empty
-    for a plain success.
+    covariance: (6, 6) of the pose error of ``slam_core.geometry``, very large along ``degenerate`` directions, which
+    are named. score: mean over the points that overlap of how well they fit, 0 to 1. overlap: share of the source's
+    points that lie on surfaces of the target. inlier_rmse: their distance from those surfaces, m. reason: why it failed
+    or what to mind; empty for a plain success.
     """
 
     T_target_source: FloatArray
@@ -77,7 +78,9 @@ class RegistrationResult:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A cloud that others are registered to, with everything that can be computed beforehand; ``centre`` is its origin."""
+    """A cloud that others are registered to, with everything that can be computed beforehand; ``centre`` is its
+    origin.
+    """
 
     cloud: Cloud
     pyramid: Pyramid
@@ -118,7 +121,8 @@ def register(
     Parameters
     ----------
     source, target
-        Points, shape (..., 3) or, in the plane, (..., 2), m; NaN points are skipped. The target may be prepared beforehand.
+        Points, shape (..., 3) or, in the plane, (..., 2), m; NaN points are skipped. The target may be prepared
+        beforehand.
     initial_guess
         T_target_source to start from, shape (4, 4); None searches.
     config
@@ -153,6 +157,7 @@ class DegenerateCloudError(ValueError):
 
 
 def check_cloud(points: FloatArray, name: str, config: RegistrationConfig) -> None:
+    """Raise :class:`DegenerateCloudError` for points (n, 3) that cannot be registered."""
     if len(points) < config.min_points:
         raise DegenerateCloudError(
             f"the {name} has {len(points)} finite points, at least {config.min_points} are needed"
@@ -251,7 +256,8 @@ def _result(
 
 def _reason_of_failure(optimum: NdtOptimum, overlap: float, cost: float, config: RegistrationConfig) -> str:
     if overlap < config.min_overlap:
-        return f"only {100 * overlap:.0f} % of the source lie on the target, at least {100 * config.min_overlap:.0f} % are needed"
+        needed = 100 * config.min_overlap
+        return f"only {100 * overlap:.0f} % of the source lie on the target, at least {needed:.0f} % are needed"
     if cost > config.max_conflict:
         return (
             f"the source lies in space that the target saw as free (cost {cost:.2f}, at most {config.max_conflict:.2f})"

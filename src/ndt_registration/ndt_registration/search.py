@@ -1,4 +1,6 @@
-"""Global search for a pose: a coarse lattice of motions judged by free space, each promising one refined on coarse cells."""
+"""Global search for a pose: a coarse lattice of motions judged by free space, each promising one refined on coarse
+cells.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""How well a registration determines the pose: covariance from the scatter of the cells' pulls, and directions left free."""
+"""How well a registration determines the pose: covariance from the scatter of the cells' pulls, and directions left
+free.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +33,18 @@ class UncertaintyConfig(Config):
 
 
 class Uncertainty(NamedTuple):
-    """Covariance (6, 6) of the pose error; unit directions (k, 6) that are not determined, rotations about the matched points."""
+    """Covariance (6, 6) of the pose error; unit directions (k, 6) that are not determined, rotations about the matched
+    points.
+    """
 
     covariance: FloatArray
     free: FloatArray
 
 
 class Curvature(NamedTuple):
-    """Second derivatives of the cost at the optimum (6, 6): exact, its semidefinite majorant, and what errors of normals feign."""
+    """Second derivatives of the cost at the optimum (6, 6): exact, its semidefinite majorant, and what errors of
+    normals feign.
+    """
 
     hessian: FloatArray
     majorant: FloatArray
@@ -60,11 +66,12 @@ def sandwich(
     fixed: npt.NDArray[np.bool_],
     config: UncertaintyConfig,
 ) -> Uncertainty:
-    """Covariance ``H^-1 (sum g g') H^-1`` of an M-estimate whose errors are independent between blocks only (White 1982).
+    """Covariance ``H^-1 (sum g g') H^-1`` of an M-estimate whose errors are independent between blocks only (White
+    1982).
 
-    Neighbouring points share the errors of the cell they are matched with, so taking points as independent promises far too
-    much. The gradients ``g`` of the blocks vanish in sum at the optimum; their scatter contains noise, discretisation and
-    wrong matches alike.
+    Neighbouring points share the errors of the cell they are matched with, so taking points as independent promises far
+    too much. The gradients ``g`` of the blocks vanish in sum at the optimum; their scatter contains noise,
+    discretisation and wrong matches alike.
 
     Parameters
     ----------
@@ -73,10 +80,12 @@ def sandwich(
     pulls
         Gradient of the cost of each block, shape (b, 6).
     extent
-        Rotations are taken about the centre of what was matched, and angles times its radius: only there can the curvatures
-        of translations and rotations be compared (Zhang and Singh 2016 on degeneracy).
+        Rotations are taken about the centre of what was matched, and angles times its radius: only there can the
+        curvatures of translations and rotations be compared (Zhang and Singh 2016 on degeneracy).
     scale
         Free directions get ``free_sigma`` times this, m.
+    config
+        Settings.
     fixed
         Components of the pose error that were held, shape (6,); their variance is that of the floor.
     """
@@ -90,7 +99,7 @@ def sandwich(
     feigned[fixed], feigned[:, fixed] = 0.0, 0.0
     values, vectors = np.linalg.eigh(M - config.friction * feigned)
     held = np.abs(vectors[fixed]).sum(axis=0) > 0.5
-    free = (values < config.degeneracy * max(values[-1], 1e-300)) & ~held
+    free = (values <= config.degeneracy * max(values[-1], 0.0)) & ~held
     known = vectors[:, ~free & ~held]
     covariance = (config.sigma_floor * scale) ** 2 * np.eye(6)
     if known.shape[1]:

@@ -1,8 +1,8 @@
 """What a scan says about the space along its rays: surface, free space in front of it, nothing known behind or beside.
 
-A scan that sees only part of a room fits its neighbour best, point for point, where the two overlap most, which is not where
-they belong. Free space decides: a point of one scan may lie outside the other's view or hidden behind its surfaces, at a
-small price, but not in space the other has looked through.
+A scan that sees only part of a room fits its neighbour best, point for point, where the two overlap most, which is not
+where they belong. Free space decides: a point of one scan may lie outside the other's view or hidden behind its
+surfaces, at a small price, but not in space the other has looked through.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from slam_core.geometry import FloatArray
 
 
 class RangeImage(NamedTuple):
-    """Nearest and farthest range (size * size,) m by direction, in the octahedral map (Meyer et al. 2010); 0 where unseen."""
+    """Nearest and farthest range (size * size,) m by direction, in the octahedral map (Meyer et al. 2010); 0 where
+    unseen.
+    """
 
     size: int
     near: FloatArray
@@ -66,9 +68,11 @@ def range_image(points: FloatArray, size: int) -> RangeImage:
 
 @njit(cache=True, nogil=True)
 def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolerance: float, prices: Prices) -> float:
-    """Mean cost of points (n, 3), moved by ``t`` (3,); deviations grow from 0 to the full price between 1 and 2 tolerances.
+    """Mean cost of points (n, 3), moved by ``t`` (3,); deviations grow from 0 to the full price between 1 and 2
+    tolerances.
 
-    Where hardly anything matches nothing can be said: below a share ``LEAST_MATCH`` of matches the cost rises towards 1.
+    Where hardly anything matches nothing can be said: below a share ``LEAST_MATCH`` of matches the cost rises towards
+    1.
     """
     cost = 0.0
     matches = 0
@@ -87,7 +91,7 @@ def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolera
         else:
             matches += 1
     share = matches / points.shape[0]
-    return cost / points.shape[0] + max(1.0 - share / LEAST_MATCH, 0.0)
+    return float(cost / points.shape[0] + max(1.0 - share / LEAST_MATCH, 0.0))
 
 
 @njit(cache=True, nogil=True)
@@ -116,5 +120,5 @@ def mean_spacing(points: FloatArray, image: RangeImage, planar: bool) -> float:
         if image.far[k] > 0.0:
             occupied += 1
     if planar:
-        return np.pi / image.size * occupied / points.shape[0]
-    return MEAN_BIN / image.size * np.sqrt(occupied / points.shape[0])
+        return float(np.pi / image.size * occupied / points.shape[0])
+    return float(MEAN_BIN / image.size * np.sqrt(occupied / points.shape[0]))

@@ -1,9 +1,9 @@
 """Overlapping cells of normal distributions over a point cloud, found through a hash table.
 
-The eight grids of the thesis (8.2.2), shifted by half a cell, are together all cubes of edge ``h`` whose corner lies on a
-lattice of spacing ``h / 2``. So the moments are summed once in blocks of edge ``h / 2``, and each cell is the sum of eight
-blocks: the eight overlapping grids cost one pass over the points. A point lies in exactly eight cells, and all points of one
-block lie in the same eight: one look-up finds them.
+The eight grids of the thesis (8.2.2), shifted by half a cell, are together all cubes of edge ``h`` whose corner lies on
+a lattice of spacing ``h / 2``. So the moments are summed once in blocks of edge ``h / 2``, and each cell is the sum of
+eight blocks: the eight overlapping grids cost one pass over the points. A point lies in exactly eight cells, and all
+points of one block lie in the same eight: one look-up finds them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ MAX_CELLS_PER_AXIS = _OFFSET - 4
 
 
 class Moments(NamedTuple):
-    """Sums over the points of each block: corner (m, 3) in blocks, counts (m,), sums (m, 3), outers (m, 6) xx xy xz yy yz zz."""
+    """Sums over the points of each block: corner (m, 3) in blocks, counts (m,), sums (m, 3), outers (m, 6) xx xy xz yy
+    yz zz.
+    """
 
     corner: IntArray
     counts: FloatArray
@@ -37,9 +39,9 @@ class Moments(NamedTuple):
 class NormalGrid(NamedTuple):
     """Normal distributions in overlapping cells of edge ``2 * block_size``, as flat arrays for the kernels.
 
-    ``keys`` and ``rows`` are the hash table of blocks; ``cells`` (m, 8) holds the cells that cover a block, -1 where there is
-    none; ``mean`` (k, 3), ``information`` (k, 6) upper triangle of the inverse covariance, ``normal`` (k, 3) direction of least
-    variance, ``variance`` (k, 3) raw ascending eigenvalues, ``counts`` (k,) points.
+    ``keys`` and ``rows`` are the hash table of blocks; ``cells`` (m, 8) holds the cells that cover a block, -1 where
+    there is none; ``mean`` (k, 3), ``information`` (k, 6) upper triangle of the inverse covariance, ``normal`` (k, 3)
+    direction of least variance, ``variance`` (k, 3) raw ascending eigenvalues, ``counts`` (k,) points.
     """
 
     block_size: float
@@ -55,6 +57,7 @@ class NormalGrid(NamedTuple):
 
 @njit(cache=True, nogil=True, inline="always")
 def pack_key(ix: int, iy: int, iz: int) -> int:
+    """Key of a block; the table's empty slots hold -1, which no key is."""
     return ((ix + _OFFSET) << 42) | ((iy + _OFFSET) << 21) | (iz + _OFFSET)
 
 
@@ -66,18 +69,19 @@ def slot_of(keys: IntArray, key: int) -> int:
     slot = ((mixed >> 32) ^ mixed) & mask
     while keys[slot] != -1 and keys[slot] != key:
         slot = (slot + 1) & mask
-    return slot
+    return int(slot)
 
 
 @njit(cache=True, nogil=True)
 def find_block(keys: IntArray, rows: Int32Array, ix: int, iy: int, iz: int) -> int:
     """Row of the block at integer coordinates, -1 where there is none."""
     slot = slot_of(keys, pack_key(ix, iy, iz))
-    return rows[slot] if keys[slot] != -1 else -1
+    return int(rows[slot]) if keys[slot] != -1 else -1
 
 
 @njit(cache=True, nogil=True)
 def hash_table(entries: int) -> IntArray:
+    """Empty table, at most half full with so many entries."""
     size = 16
     while size < 2 * entries:
         size *= 2
@@ -240,7 +244,8 @@ def normal_grid(
 ) -> NormalGrid:
     """Cells of edge ``2 * block_size`` m with at least ``min_points`` points.
 
-    Each eigenvalue of a cell's covariance is at least ``relative_floor`` times the largest (8.2.1) and ``variance_floor`` m2.
+    Each eigenvalue of a cell's covariance is at least ``relative_floor`` times the largest (8.2.1) and
+    ``variance_floor`` m2.
     """
     corner, count, first, outer = _accumulate(moments.corner, moments.counts, moments.sums, moments.outers, 8)
     keep = count >= max(min_points, 2)

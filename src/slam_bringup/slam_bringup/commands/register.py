@@ -26,7 +26,7 @@ PICTURE_POINTS = 8000
 @click.option("--method", type=click.Choice(["ndt", "icp", "icp_plane"]), default="ndt", show_default=True)
 @click.option(
     "--initial-guess",
-    help="T_target_source: 'x y z', 'x y z yaw pitch roll' (m, deg), 'x y z qx qy qz qw', 16 numbers, or a text file of them",
+    help="T_target_source: x y z, x y z yaw pitch roll (m, deg), x y z qx qy qz qw, 16 numbers, or a file of them",
 )
 @click.option("--config", "config_file", type=click.Path(path_type=Path), help="YAML with RegistrationConfig values")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="folder for result.json and registration.png")
