@@ -57,7 +57,7 @@ def trilinear(
     return float(value * (1.0 / 255.0))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def sample_texture(
     texels: ByteArray,
     index: npt.NDArray[np.int64],
