@@ -249,31 +249,33 @@ class LinkFinder:
         self.pending = [p for p in self.pending if not any(p is g for g in group_)]
         return group_
 
-    def _same_loop(self, graph: MapGraph, a: Link, b: Link) -> bool:
-        """Whether two links between the same two stretches imply the same transform, within what both claim."""
-        paths = []
-        for link in (a, b):
-            T_first, T_second = (
-                graph.poses[graph.records[link.first].start],
-                graph.poses[graph.records[link.second].start],
-            )
-            paths.append((link, T_first, T_second))
-        if graph.component(a.first) != graph.component(b.first) or graph.component(a.second) != graph.component(
-            b.second
+    @staticmethod
+    def _same_loop(graph: MapGraph, a: Link, b: Link) -> bool:
+        """Whether two links between the same parts of the map move the second part alike, within what both claim."""
+        if (graph.component(a.first), graph.component(a.second)) != (
+            graph.component(b.first),
+            graph.component(b.second),
         ):
+            b = b.inverted()
+            if (graph.component(a.first), graph.component(a.second)) != (
+                graph.component(b.first), graph.component(b.second),
+            ):  # fmt: skip
+                return False
+        if {a.first, a.second} == {b.first, b.second}:
             return False
-        if a.first == b.first and a.second == b.second:
-            return False
-        T_a = paths[0][1] @ a.T @ invert_transform(paths[0][2])
-        T_b = paths[1][1] @ b.T @ invert_transform(paths[1][2])
-        # Both move the second stretch; they must put its landmarks in the same place, up to the drift in between.
-        middle = _middle(graph, b.second)
-        gap = np.linalg.norm((T_a @ np.append(middle, 1.0) - T_b @ np.append(middle, 1.0))[:3])
-        turn = np.linalg.norm(boxminus(T_a, T_b)[3:])
-        travelled = np.linalg.norm(_middle(graph, a.second) - middle) + np.linalg.norm(
-            _middle(graph, a.first) - _middle(graph, b.first)
-        )
-        return bool(gap < 0.1 + 0.05 * travelled + 3.0 * (_sigma(a.covariance) + _sigma(b.covariance)) and turn < 0.15)
+        T_a, T_b = _movement(graph, a), _movement(graph, b)
+        here, there = _middle(graph, b.second), _middle(graph, a.second)
+        gap = np.linalg.norm((T_a[:3, :3] - T_b[:3, :3]) @ here + T_a[:3, 3] - T_b[:3, 3])
+        # Between the two the odometry has drifted on both stretches.
+        way = np.linalg.norm(there - here) + np.linalg.norm(_middle(graph, a.first) - _middle(graph, b.first))
+        allowed = 0.1 + 0.05 * way + 3.0 * (_sigma(a.covariance) + _sigma(b.covariance))
+        return bool(gap < allowed and np.linalg.norm(boxminus(T_a, T_b)[3:]) < 0.15)
+
+
+def _movement(graph: MapGraph, link: Link) -> FloatArray:
+    """How a link would move the part of the map that its second record is in."""
+    T_first, T_second = (graph.poses[graph.records[i].start] for i in (link.first, link.second))
+    return np.asarray(T_first @ link.T @ invert_transform(T_second))
 
 
 def prior_of_pair(T_a_b: FloatArray, covariance: FloatArray) -> Prior:

@@ -79,30 +79,33 @@ class Joiner:
 
     def absorb(self, new: int, chain: list[int]) -> JoinResult:
         """Join record ``new``, whose links to its ``chain`` have been added to the graph."""
-        component = self.graph.component(new)
-        joined, record = self._joined.get(component), self.graph.records[new]
         window = self._window_landmarks([new, *chain[: self.window - 1]])
+        extended = self._extended(new, window)
+        if extended is None:
+            return self.batch(new, window)
+        self._joined[self.graph.component(new)] = extended
+        return extended.result
+
+    def _extended(self, new: int, window: IntArray) -> _Joined | None:
+        """The component with one more submap joined through the front; None where that is not possible."""
+        component, record = self.graph.component(new), self.graph.records[new]
+        joined = self._joined.get(component)
         if joined is None or self.graph.size(component) <= self.config.incremental_from:
-            return self.batch(new, window)
-        front, fusion = (joined.front or self._front(joined)).fused(self.graph.landmark_of)
-        seen = self.graph.landmark_of[record.observations]
-        if front.node != record.start or not np.all(
-            np.isin(seen, front.landmarks) | (seen >= record.first_observation)
-        ):
-            return self.batch(new, window)
-        front, rise, turn = front.extended(self.graph, record, window, self.config.estimator.rows)
+            return None
+        if self.graph.records[joined.newest].end != record.start:
+            return None
+        try:
+            front, fusion = (joined.front or self._front(joined)).fused(self.graph.landmark_of)
+            seen = self.graph.landmark_of[record.observations]
+            if not np.all(np.isin(seen, front.landmarks) | (seen >= record.first_observation)):
+                return None
+            front, rise, turn = front.extended(self.graph, record, window, self.config.estimator.rows)
+        except (ValueError, np.linalg.LinAlgError):  # badly conditioned: batch damps
+            return None
         if turn > self.config.relinearize_turn:
-            return self.batch(new, window)
+            return None
         result = replace(joined.result, cost=joined.result.cost + fusion + rise, iterations=1, update="incremental")
-        self._joined[component] = replace(
-            joined,
-            result=result,
-            newest=new,
-            window=window,
-            front=front,
-            added=joined.added + 1,
-        )
-        return result
+        return replace(joined, result=result, newest=new, window=window, front=front, added=joined.added + 1)
 
     def batch(self, newest: int, window: IntArray | None = None) -> JoinResult:
         """Join the whole component of a record, whose end is where it will go on."""
@@ -185,6 +188,8 @@ class Joiner:
         tension = max(link.tension for link in links)
         excess = self._excess(after.cost - cost - tension, dof, graph.component(newest))
         if excess <= 0.0:
+            for part in parts - {graph.component(newest)}:
+                self._joined.pop(part, None)
             return True
         graph.restore(before)
         self._joined = known

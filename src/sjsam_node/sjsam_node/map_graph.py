@@ -17,7 +17,7 @@ import numpy.typing as npt
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from slam_core.geometry import FloatArray, invert_transform
+from slam_core.geometry import FloatArray, inverse_jacobian, invert_transform
 from slam_core.sparse_cholesky import IntArray
 from slam_core.types import Submap
 
@@ -47,8 +47,10 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """Matched landmarks of two records: index pairs (k, 2) and the alignment T_first_second they imply (6x6
-    covariance).
+    """Matched landmarks of two records: index pairs (k, 2) and the alignment T_first_second they imply.
+
+    covariance: (6, 6) of T. tension: squared error of the alignment against what the map knew, normalised by the map's
+    covariance.
     """
 
     first: int
@@ -58,6 +60,15 @@ class Link:
     covariance: FloatArray
     is_closure: bool = False
     tension: float = 0.0
+
+    def inverted(self) -> Link:
+        """The same link from the second record to the first."""
+        T = invert_transform(self.T)
+        J = inverse_jacobian(self.T)
+        covariance = J @ self.covariance @ J.T
+        return replace(
+            self, first=self.second, second=self.first, pairs=self.pairs[:, ::-1], T=T, covariance=covariance
+        )
 
 
 @dataclass(frozen=True, eq=False)
