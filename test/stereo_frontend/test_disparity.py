@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -63,3 +64,15 @@ def test_flat_patches_are_refused(positions):
     flat = np.full((240, 320), 90, np.uint8)
     refined = refine_disparity(flat, flat, positions, positions[:, 0], DisparityConfig())
     assert not refined.valid.any()
+
+
+def test_sigma_knows_that_interpolated_images_share_their_noise(stereo_pair, positions):
+    """Rectification averages neighbours: less residual, but not less error. Without the correlation sigma is half too
+    small.
+    """
+    pair = stereo_pair(9.4, noise=6.0)
+    left, right = (cv2.blur(image, (2, 2)) for image in (pair.left, pair.right))
+    refined = refine_disparity(left, right, positions, positions[:, 0] - np.float32(9.0), DisparityConfig())
+    error = ((refined.disparity - 9.4) / refined.sigma)[refined.valid]
+    assert refined.valid.mean() > 0.8
+    assert 0.7 < 1.4826 * np.median(np.abs(error)) < 1.3
