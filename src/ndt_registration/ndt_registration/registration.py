@@ -237,7 +237,14 @@ def _result(
     )
     fixed = planar_constraint(source.planar) > 0.0
     curvature = Curvature(optimum.hessian, optimum.majorant, fit.friction)
-    uncertainty = sandwich(curvature, fit.pulls, Extent(fit.centre, fit.radius), scale, fixed, config.uncertainty)
+    uncertainty = sandwich(
+        curvature,
+        fit.pulls,
+        Extent(fit.centre, max(fit.radius, _LEAST_RADIUS * scale)),
+        scale,
+        fixed,
+        config.uncertainty,
+    )
     reason = _reason_of_failure(optimum, fit.overlap, cost, config)
     names = direction_names(uncertainty.free)
     covariance = uncertainty.covariance if not reason else unknown(scale, config.uncertainty)
@@ -252,6 +259,10 @@ def _result(
         reason=reason or ("not determined: " + "; ".join(names) if names else ""),
         degenerate=names,
     )
+
+
+_LEAST_RADIUS = 0.05
+"""Spread of the matched points, over the scale, below which rotations would be measured against nothing."""
 
 
 def _reason_of_failure(optimum: NdtOptimum, overlap: float, cost: float, config: RegistrationConfig) -> str:

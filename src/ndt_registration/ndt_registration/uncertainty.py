@@ -113,6 +113,7 @@ def sandwich(
 
 def _inverse(hessian: FloatArray, majorant: FloatArray) -> FloatArray:
     """Inverse of the exact curvature, or of the majorant where the exact one is (nearly) indefinite."""
+    majorant = majorant + 1e-12 * np.trace(majorant) * np.eye(len(majorant))
     relative = np.linalg.eigvals(np.linalg.solve(majorant, hessian)).real
     return np.asarray(np.linalg.inv(hessian if relative.min() > _LEAST_RELATIVE_CURVATURE else majorant))
 
