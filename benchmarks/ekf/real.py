@@ -83,9 +83,10 @@ def report(name: str, pairs: list[StereoImages], truth: FloatArray) -> None:
     end = boxminus(invert_transform(truth[0]) @ truth[-1], invert_transform(poses[0]) @ poses[-1])
     submaps = sum(len(result.submaps) for result in results) + 1
     print(f"{name}: {len(pairs)} frames, path {length:.1f} m, {submaps} submaps, frames lost: {lost or 'none'}")
-    print(f"  bridged {len(linked)} of {len(steps)} gaps, median error of a step "
-          f"{1e3 * np.median(np.linalg.norm(steps[linked, :3], axis=1)):.1f} mm, "
-          f"{np.degrees(np.median(np.linalg.norm(steps[linked, 3:], axis=1))):.3f} deg")  # fmt: skip
+    shift = 1e3 * np.linalg.norm(steps[linked, :3], axis=1)
+    turn = np.degrees(np.linalg.norm(steps[linked, 3:], axis=1))
+    print(f"  bridged {len(linked)} of {len(steps)} gaps, error of a step: median {np.median(shift):.1f} mm, "
+          f"{np.median(turn):.3f} deg, worst {shift.max():.1f} mm, {turn.max():.2f} deg")  # fmt: skip
     if not lost:
         print(f"  end error {np.linalg.norm(end[:3]):.2f} m = {100 * np.linalg.norm(end[:3]) / length:.2f} %")
     nis = np.array([result.nis / result.nis_dof for result in results if result.nis_dof])
