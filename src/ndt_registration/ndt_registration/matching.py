@@ -92,7 +92,7 @@ def fit_to_grid(
             exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
             e = 0.125 * np.exp(-min(exponent, 30.0))
             weight += e
-            drag += e / (grid.counts[cell] * max(grid.variance[cell, 1], 1e-300))
+            drag += e / (grid.counts[cell] * max(grid.variance[cell, 2], 1e-12 * grid.block_size**2))
             vx += e * ux
             vy += e * uy
             vz += e * uz

@@ -28,7 +28,7 @@ class UncertaintyConfig(Config):
         2.0, "share of the curvature expected from errors of the normals alone that counts as none", minimum=0.0
     )
     free_sigma: float = parameter(1.0, "standard deviation given to a free direction, over the scale", minimum=0.0)
-    inflation: float = parameter(1.5, "factor on the covariance of determined directions", minimum=0.01)
+    inflation: float = parameter(2.5, "factor on the covariance of determined directions", minimum=0.01)
     sigma_floor: float = parameter(1e-4, "least standard deviation of any direction, over the scale", minimum=0.0)
 
 
