@@ -19,8 +19,13 @@ from problems import joining_problem, local_maps, ring
 
 from sjsam_node.problem import LocalMap, State
 from slam_core.geometry import make_transform, so3_exp
+from slam_core.least_squares import LevenbergMarquardtConfig
 
 X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
+
+
+STOP = LevenbergMarquardtConfig(relative_tolerance=1e-6)
+"""GTSAM stops when the cost falls by less than 1e-5 of itself; ours a little later."""
 
 
 def graph_of(maps: list[LocalMap], state: State) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -79,7 +84,7 @@ def timed(action):  # type: ignore[no-untyped-def]
 
 def ours(maps: list[LocalMap], state: State, rows: str) -> tuple[float, State, float]:
     def run():  # type: ignore[no-untyped-def]
-        return joining_problem(maps, state, rows).optimize(state)
+        return joining_problem(maps, state, rows).optimize(state, STOP)
 
     seconds, (optimum, result) = timed(run)
     return seconds, optimum, result.cost
