@@ -77,6 +77,10 @@ class Probe:
             message.encoding = encoding
             self.send(f"stereo/{side}/image_raw", message)
 
+    def spin(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        self.wait(lambda: time.monotonic() > end, "the clock stands still")
+
     def wait(self, condition: Callable[[], bool], why: str, seconds: float = 60.0) -> None:
         end = time.monotonic() + seconds
         while not condition():
@@ -123,7 +127,11 @@ def test_raw_pairs_become_the_features_of_the_offline_front_end(probe, start, st
     start("driver_node")
     start("node")
     pairs = [stereo_pair(seed=s) for s in (1, 2)]
-    probe.wait(lambda: probe.node.count_subscribers("stereo/left/image_rect") > 0, "no feature extractor")
+    for side in SIDES:
+        for topic in (f"stereo/{side}/image_rect", f"stereo/{side}/camera_info"):
+            probe.wait(lambda t=topic: probe.node.count_subscribers(t) > 0, f"no subscriber to {topic}")
+        probe.wait(lambda s=side: probe.node.count_publishers(f"stereo/{s}/image_rect") > 0, "no driver")
+    probe.spin(2.0)  # the two nodes find each other a little after the probe has found both
     for k, pair in enumerate(pairs):
         probe.send_pair(1_000_000_000 + k * 100_000_000, pair)
     probe.send_pair(1_200_000_000, pairs[0], encoding="nonsense")
