@@ -92,7 +92,10 @@ def fit_to_grid(
             exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
             e = 0.125 * np.exp(-min(exponent, 30.0))
             weight += e
-            drag += e / (grid.counts[cell] * max(grid.variance[cell, 2], 1e-12 * grid.block_size**2))
+            # In the plane the least variance is that of z, which is zero, and the second is across the wall.
+            flat = grid.variance[cell, 0] <= 1e-9 * grid.variance[cell, 2]
+            spread = grid.variance[cell, 2] if flat else grid.variance[cell, 1]
+            drag += e / (grid.counts[cell] * max(spread, 1e-12 * grid.block_size**2))
             vx += e * ux
             vy += e * uy
             vz += e * uz

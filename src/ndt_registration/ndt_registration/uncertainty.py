@@ -99,7 +99,7 @@ def sandwich(
     feigned[fixed], feigned[:, fixed] = 0.0, 0.0
     values, vectors = np.linalg.eigh(M - config.friction * feigned)
     held = np.abs(vectors[fixed]).sum(axis=0) > 0.5
-    free = (values <= config.degeneracy * max(values[-1], 0.0)) & ~held
+    free = (values <= max(config.degeneracy * values[-1], 1e-6 * np.trace(feigned), 0.0)) & ~held
     known = vectors[:, ~free & ~held]
     covariance = (config.sigma_floor * scale) ** 2 * np.eye(6)
     if known.shape[1]:
