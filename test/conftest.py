@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in slam_bringup.cli: the same bytes, and no spinning
+
 import numpy as np
 import pytest
 

@@ -1,11 +1,17 @@
-"""The ``slam`` command line: a table of names, each command loaded when it is called so that ``slam --help`` is instant."""
+"""The ``slam`` command line: a table of names; a command is loaded when it is called, so ``slam --help`` is instant."""
 
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
 import click
+
+# Images and filter already run on two threads: BLAS threads beside them only wait for each other, spinning. NumPy and
+# SciPy read this when they are loaded, here and in the nodes that are started from here; one number of threads also means
+# one order of summation, hence the same bytes.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 COMMANDS = {
     "run": "offline pipeline: a bag to a map and a trajectory",
