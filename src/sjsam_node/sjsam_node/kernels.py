@@ -272,7 +272,8 @@ def normal_equations(J, JB, start, width, info, r, work, H, g):
             turned[j, i] = half[i, j]
     _left_multiply(JB, start, width, turned, half)
     weighted = info @ J
-    whitened = (info @ r).reshape((m, 1))
+    flat = info @ r
+    whitened = flat.reshape((m, 1))
     mixed, moved = np.empty((m, dp)), np.empty((m, 1))
     _left_multiply(JB, start, width, weighted, mixed)
     _left_multiply(JB, start, width, whitened, moved)
@@ -280,7 +281,7 @@ def normal_equations(J, JB, start, width, info, r, work, H, g):
     H[dp:, :dp] = mixed
     H[:dp, dp:] = mixed.T
     H[dp:, dp:] = half
-    g[:dp] = J.T @ whitened[:, 0]
+    g[:dp] = J.T @ flat
     g[dp:] = moved[:, 0]
 
 

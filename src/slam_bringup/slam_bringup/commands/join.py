@@ -19,7 +19,7 @@ from slam_core.config import from_mapping
 @click.argument("folder", metavar="DIR", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("-o", "--output", metavar="OUT", required=True, type=click.Path(file_okay=False, path_type=Path))
 @click.option("--rows", type=click.Choice(ROWS), default=TextJoiningConfig().rows, show_default=True,
-              help="joint: each submap's full information; block: each landmark and pose alone (Algorithm 4)")  # fmt: skip
+              help="joint: each submap's full information; block: each landmark alone (Algorithm 4)")  # fmt: skip
 @click.option("--config", "config_file", metavar="FILE", type=click.Path(exists=True, dir_okay=False, path_type=Path),
               help="YAML with parameters of the joining")  # fmt: skip
 def command(folder: Path, output: Path, rows: str, config_file: Path | None) -> None:
