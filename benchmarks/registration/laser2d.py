@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ndt_registration.pyramid import GridConfig
 from ndt_registration.registration import RegistrationConfig, Target, register
 from slam_core.geometry import (
     FloatArray,
@@ -44,7 +45,9 @@ def read_log(path: Path, every: int) -> list[tuple[float, FloatArray, FloatArray
 
 def track(scans: list[tuple[float, FloatArray, FloatArray]]) -> tuple[list[FloatArray], int]:
     """Poses by registration to keyframes, from the log's odometry; where a registration fails, the odometry goes on."""
-    config = RegistrationConfig(min_points=30, start_level=1)
+    # 180 beams a degree apart: cells of walls need width, and a beam's neighbour may see past the wall's end.
+    grid = GridConfig(voxel_size=0.3, min_points=4, surface_smoothing=0.1)
+    config = RegistrationConfig(min_points=30, start_level=1, max_conflict=1.0, grid=grid)
     poses, failures = [scans[0][1]], 0
     key_pose, target = scans[0][1], Target.build(scans[0][2], config)
     for (_, before, _), (_, now, points) in pairwise(scans):
