@@ -8,7 +8,7 @@ import slam_core.sparse_cholesky as sparse_cholesky
 from slam_core.sparse_cholesky import Pattern, SparseCholesky, available_backend, elimination_order, takahashi
 
 
-@pytest.fixture(params=["cholmod", "superlu"])
+@pytest.fixture(params=["cholmod", "superlu", "lapack"])
 def backend(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -65,11 +65,19 @@ def test_what_is_not_positive_definite_is_said_so(backend: str) -> None:
     assert factor.factorize(values)
 
 
+@pytest.mark.parametrize("backend", ["cholmod", "superlu"])
 def test_entries_outside_the_pattern_raise(backend: str) -> None:
     factor = SparseCholesky(Pattern(3, np.array([0, 1, 2, 3]), np.array([0, 1, 2])), backend)
     factor.factorize(np.array([1.0, 2.0, 4.0]))
     with pytest.raises(KeyError):
         factor.inverse_entries().block(np.array([0, 2]))
+
+
+def test_a_nearly_full_matrix_is_factored_densely() -> None:
+    full = Pattern(3, np.array([0, 3, 5, 6]), np.array([0, 1, 2, 1, 2, 2]))
+    assert SparseCholesky(full).backend == "lapack"
+    sparse = Pattern(20, np.arange(21), np.arange(20))
+    assert SparseCholesky(sparse).backend != "lapack"
 
 
 def test_takahashi_over_a_dense_factor_is_the_inverse() -> None:

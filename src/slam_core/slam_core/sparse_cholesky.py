@@ -1,19 +1,22 @@
 """Sparse Cholesky factors of symmetric positive definite matrices: order, factor, solve, and exact entries of the
 inverse.
 
-Two backends, chosen by name: ``cholmod`` (supernodal, from the cvxopt wheel; Chen, Davis, Hager and Rajamanickam
-2008) and ``superlu`` (from SciPy, always there). Fill is reduced beforehand by :func:`elimination_order` on the
-graph of the *blocks*, which is much smaller than the matrix; CHOLMOD may improve on it.
+Backends, chosen by name: ``cholmod`` (supernodal, from the cvxopt wheel; Chen, Davis, Hager and Rajamanickam 2008),
+``superlu`` (from SciPy, always there) and ``lapack`` (dense); ``auto`` takes LAPACK for a matrix that is nearly full,
+as small maps are, and else the first of the others that is there. Fill is reduced beforehand by
+:func:`elimination_order` on the graph of the *blocks*, which is much smaller than the matrix; CHOLMOD may improve on it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numba
 import numpy as np
 import numpy.typing as npt
+import scipy.linalg
 import scipy.sparse
 import scipy.sparse.csgraph
 import scipy.sparse.linalg
@@ -28,7 +31,9 @@ except ImportError:  # pragma: no cover - the wheel is a requirement; a distribu
     cvxopt = None
 
 IntArray = npt.NDArray[np.int64]
-BACKENDS = ("auto", "cholmod", "superlu")
+BACKENDS = ("auto", "cholmod", "superlu", "lapack")
+_FULL = 0.25
+"""Share of stored entries from which a dense factor takes less time than a sparse one."""
 
 
 def available_backend(name: str) -> str:
@@ -169,6 +174,30 @@ class _SuperLu:
         return factor, order
 
 
+class _Lapack:
+    """Dense factor in place; only the lower triangle is read and written."""
+
+    def __init__(self, pattern: Pattern) -> None:
+        self._pattern = pattern
+        self._matrix = np.zeros((pattern.n, pattern.n), order="F")
+        self._at = pattern.columns * pattern.n + pattern.indices
+
+    def factorize(self, values: FloatArray) -> bool:
+        self._matrix[...] = 0.0
+        self._matrix.ravel(order="K")[self._at] = values
+        _, fault = scipy.linalg.lapack.dpotrf(self._matrix, lower=True, clean=False, overwrite_a=True)
+        return bool(fault == 0)
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        return np.asarray(scipy.linalg.cho_solve((self._matrix, True), rhs, check_finite=False))
+
+    def lower(self) -> tuple[scipy.sparse.csc_matrix, IntArray]:
+        n = self._pattern.n
+        columns, rows = np.triu_indices(n)
+        indptr = np.concatenate([[0], np.cumsum(np.arange(n, 0, -1))])
+        return scipy.sparse.csc_matrix((self._matrix[rows, columns], rows, indptr), (n, n)), np.arange(n)
+
+
 class SparseCholesky:
     """Factor of matrices that share one sparsity pattern: the symbolic work is done once.
 
@@ -183,7 +212,9 @@ class SparseCholesky:
     def __init__(self, pattern: Pattern, backend: str = "auto") -> None:
         self.pattern = pattern
         self.backend = available_backend(backend)
-        self._impl: _Backend = _Cholmod(pattern) if self.backend == "cholmod" else _SuperLu(pattern)
+        if backend == "auto" and len(pattern.indices) > _FULL * pattern.n**2:
+            self.backend = "lapack"
+        self._impl = _IMPLEMENTATIONS[self.backend](pattern)
 
     def factorize(self, values: FloatArray) -> bool:
         """Factor the matrix with these entries (in the order of the pattern); False if not positive definite."""
@@ -205,6 +236,11 @@ class SparseCholesky:
         position = np.empty_like(order)
         position[order] = np.arange(len(order))
         return InverseEntries(indptr, indices, values, position)
+
+
+_IMPLEMENTATIONS: dict[str, Callable[[Pattern], _Backend]] = {
+    "cholmod": _Cholmod, "superlu": _SuperLu, "lapack": _Lapack,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
