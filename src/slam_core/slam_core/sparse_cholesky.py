@@ -4,7 +4,8 @@ inverse.
 Backends, chosen by name: ``cholmod`` (supernodal, from the cvxopt wheel; Chen, Davis, Hager and Rajamanickam 2008),
 ``superlu`` (from SciPy, always there) and ``lapack`` (dense); ``auto`` takes LAPACK for a matrix that is nearly full,
 as small maps are, and else the first of the others that is there. Fill is reduced beforehand by
-:func:`elimination_order` on the graph of the *blocks*, which is much smaller than the matrix; CHOLMOD may improve on it.
+:func:`elimination_order` on the graph of the *blocks*, which is much smaller than the matrix; CHOLMOD may improve on
+it.
 """
 
 from __future__ import annotations
