@@ -104,7 +104,7 @@ class BagPlayerNode(Node):
         except ValueError as error:
             self.get_logger().error(str(error))
         except Exception:
-            # After SIGINT the context is gone before the executor has told us to stop.
+            # Whoever shut the context down wants no more of the bag.
             if rclpy.ok():
                 raise
         finally:

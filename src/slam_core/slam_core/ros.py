@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
@@ -23,6 +24,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 
 from slam_core.config import Config, ParameterInfo, from_mapping, iterate_parameters
 from slam_core.messages import MessageTypes
@@ -30,6 +32,9 @@ from slam_core.messages.base import Message
 from slam_core.types import AnyArray
 
 C = TypeVar("C", bound=Config)
+
+_SIGNAL_PERIOD_S = 0.1
+"""Longest time that a node without traffic takes to notice a signal."""
 
 
 class RosTypes(MessageTypes):
@@ -140,37 +145,37 @@ class RunnableNode(Protocol):
 
 
 def run_node(node_type: Callable[[], RunnableNode], args: list[str] | None = None) -> None:
-    """Run a node until SIGINT, SIGTERM or shutdown: exit code 0; a bad parameter ends it with one line and 2."""
-    rclpy.init(args=args)
+    """Run a node until SIGINT, SIGTERM or shutdown: exit code 0; a bad parameter ends it with one line and 2.
+
+    A signal only asks for the end: rclpy's own handlers would shut the context down under a callback that still
+    publishes. The message in hand is finished first.
+    """
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    stopped = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.set())
     executor = SingleThreadedExecutor()
     node: RunnableNode | None = None
     try:
         node = node_type()
         executor.add_node(node)
         node.get_logger().info("ready")
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
+        while rclpy.ok() and not stopped.is_set():
+            executor.spin_once(timeout_sec=_SIGNAL_PERIOD_S)
+    except ExternalShutdownException:
         pass
     except ValueError as error:
         if node is not None:
             raise
         print(f"cannot start: {error}", file=sys.stderr)
         sys.exit(2)
+    except Exception:
+        # A node may shut its context down itself, from another thread: what then fails is no fault.
+        if rclpy.ok():
+            raise
     finally:
-        _end(executor, node)
-
-
-def _end(executor: SingleThreadedExecutor, node: RunnableNode | None) -> None:
-    _ignore_signals()
-    executor.shutdown(timeout_sec=2.0)
-    if node is not None:
-        node.on_shutdown()
-        node.destroy_node()
-    rclpy.try_shutdown()
-    _ignore_signals()
-
-
-def _ignore_signals() -> None:
-    """A second Ctrl-C must not interrupt the end; rclpy's shutdown puts Python's handlers back."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+        executor.shutdown(timeout_sec=2.0)
+        if node is not None:
+            node.on_shutdown()
+            node.destroy_node()
+        rclpy.try_shutdown()
