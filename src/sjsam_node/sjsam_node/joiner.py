@@ -54,12 +54,16 @@ class JoinResult:
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
-    """A component: the last batch, what was added since, and the front that it is added to."""
+    """A component: the last batch, what was added since, and the front that it is added to.
+
+    ``extensible``: the batch kept what a front needs.
+    """
 
     assembled: Assembled
     result: JoinResult
     newest: int
     window: IntArray
+    extensible: bool = False
     front: Front | None = None
     added: int = 0
 
@@ -82,7 +86,8 @@ class Joiner:
         window = self._window_landmarks([new, *chain[: self.window - 1]])
         extended = self._extended(new, window)
         if extended is None:
-            return self.batch(new, window)
+            going_on = self.graph.size(self.graph.component(new)) >= self.config.incremental_from
+            return self.batch(new, window, extensible=going_on)
         self._joined[self.graph.component(new)] = extended
         return extended.result
 
@@ -90,7 +95,7 @@ class Joiner:
         """The component with one more submap joined through the front; None where that is not possible."""
         component, record = self.graph.component(new), self.graph.records[new]
         joined = self._joined.get(component)
-        if joined is None or self.graph.size(component) <= self.config.incremental_from:
+        if joined is None or not joined.extensible:
             return None
         if self.graph.records[joined.newest].end != record.start:
             return None
@@ -107,17 +112,21 @@ class Joiner:
         result = replace(joined.result, cost=joined.result.cost + fusion + rise, iterations=1, update="incremental")
         return replace(joined, result=result, newest=new, window=window, front=front, added=joined.added + 1)
 
-    def batch(self, newest: int, window: IntArray | None = None) -> JoinResult:
-        """Join the whole component of a record, whose end is where it will go on."""
+    def batch(self, newest: int, window: IntArray | None = None, *, extensible: bool = False) -> JoinResult:
+        """Join the whole component of a record, whose end is where it will go on.
+
+        ``extensible`` keeps the landmarks of the window even where one submap alone saw them, so that the next submap
+        can be joined through a front; it makes the problem larger, so trials do without.
+        """
         component = self.graph.component(newest)
         if window is None:
             known = self._joined.get(component)
             window = known.window if known is not None and known.newest == newest else self._window_landmarks([newest])
             window = np.unique(self.graph.landmark_of[window])
-        front = (self.graph.records[newest].end, window)
+        front = (self.graph.records[newest].end, window) if extensible else None
         assembled, result = self.estimator.optimize(self.graph, component, front)
         report = JoinResult(result.cost, result.iterations, result.converged, assembled.problem.backend, "batch")
-        self._joined[component] = _Joined(assembled, report, newest, window)
+        self._joined[component] = _Joined(assembled, report, newest, window, extensible)
         return report
 
     def _front(self, joined: _Joined) -> Front:
@@ -131,11 +140,11 @@ class Joiner:
         joined = self._joined.get(component)
         if joined is None:  # a map that was just loaded is at its optimum already
             newest = int(self.graph.records_of(component)[-1])
-            front = (self.graph.records[newest].end, self._window_landmarks([newest]))
-            assembled = self.estimator.assemble(self.graph, component, front)
+            window = self._window_landmarks([newest])
+            assembled = self.estimator.assemble(self.graph, component)
             cost = assembled.problem.cost(assembled.state)
             report = JoinResult(cost, 0, True, assembled.problem.backend, "batch")
-            self._joined[component] = joined = _Joined(assembled, report, newest, front[1])
+            self._joined[component] = joined = _Joined(assembled, report, newest, window)
         if joined.added:
             self.batch(joined.newest)
         return self._joined[component].assembled
