@@ -107,9 +107,10 @@ def relative_errors(estimate: FloatArray, truth: FloatArray, delta: int = 1) -> 
     return np.linalg.norm(error[:, :3, 3], axis=1), np.linalg.norm(so3_log(error[:, :3, :3]), axis=1)
 
 
-def end_error(estimate: FloatArray, truth: FloatArray) -> float:
-    """Distance (m) of the last pose from the truth when the first poses agree."""
-    return float(absolute_errors(align(estimate, truth, "origin")[-1:], truth[-1:])[0][0])
+def end_error(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
+    """Distance (m) and angle (rad) of the last pose from the truth when the first poses agree."""
+    distance, angle = absolute_errors(align(estimate, truth, "origin")[-1:], truth[-1:])
+    return float(distance[0]), float(angle[0])
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -148,6 +149,7 @@ class Evaluation:
     rpe: ErrorStatistics
     rpe_rotation_deg: ErrorStatistics
     end_error_m: float
+    end_error_deg: float
     drift_percent: float
     truth_length_m: float
     anees: float | None
@@ -174,7 +176,7 @@ def evaluate(
     distance, angle = absolute_errors(aligned, true_poses)
     step, turn = relative_errors(matched.poses, true_poses, min(delta, len(matched) - 1))
     length = Trajectory(matched.stamps_ns, true_poses).length_m
-    end = end_error(matched.poses, true_poses)
+    end, end_angle = end_error(matched.poses, true_poses)
     values = None if matched.covariances is None else pose_nees(matched, true_poses)
     anees = low = high = None
     if values is not None and len(values):
@@ -185,6 +187,7 @@ def evaluate(
         rpe=ErrorStatistics.of(step),
         rpe_rotation_deg=ErrorStatistics.of(np.rad2deg(turn)),
         end_error_m=end,
+        end_error_deg=float(np.rad2deg(end_angle)),
         drift_percent=100.0 * end / length if length > 0 else 0.0,
         truth_length_m=length,
         anees=anees,
