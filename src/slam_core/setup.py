@@ -17,6 +17,6 @@ setup(
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",
     maintainer_email="maintainers@indoor-slam.org",
-    description="Geometry, cameras, data types, least squares, evaluation, simulation and message conversion shared by the indoor SLAM packages.",
+    description="Geometry, data types, least squares, evaluation, simulation and messages of the SLAM packages.",
     license="Apache-2.0",
 )

@@ -17,7 +17,7 @@ setup(
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",
     maintainer_email="maintainers@indoor-slam.org",
-    description="Stereo camera driver, feature extraction (SURF-128, SIFT and others), stereo matching and depth fusion.",
+    description="Stereo camera driver, feature extraction, stereo matching and depth fusion.",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [

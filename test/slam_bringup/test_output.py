@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+
 from slam_bringup.output import write_results
 from slam_bringup.results import AgentResult, LandmarkMap, RunResult
 from slam_core.geometry import boxplus
@@ -32,7 +33,8 @@ def result(rng) -> RunResult:
         agents=(AgentResult("", noisy, truth=truth, feature_counts=np.full(80, 250)),),
         landmarks=LandmarkMap(positions, covariances, np.full(200, 5)),
         dense_points=rng.uniform(-3, 3, (500, 3)).astype(np.float32), dense_grey=np.full(500, 128, dtype=np.uint8),
-        submaps=4, loop_closures=1, frames=80, dropped={"features without depth": 2}, rejections={"outlier": 3}, sensor_s=8.0, wall_s=2.0,
+        submaps=4, loop_closures=1, frames=80, dropped={"features without depth": 2}, rejections={"outlier": 3},
+        sensor_s=8.0, wall_s=2.0,
         stage_ms={"features": [40.0] * 80, "ekf": [8.0] * 80}, events=("12.3 s: <lost>",),
     )  # fmt: skip
 
@@ -41,8 +43,8 @@ def test_all_files_are_written_and_agree(result, tmp_path):
     summary = write_results(tmp_path, result, save_map=lambda path: path.mkdir())
     names = {p.name for p in tmp_path.iterdir()}
     assert {
-        "summary.json", "trajectory.tum", "trajectory_covariance.csv", "ground_truth.tum", "landmarks.ply", "map.ply", "map",
-        "map.png", "report.html",
+        "summary.json", "trajectory.tum", "trajectory_covariance.csv", "ground_truth.tum", "landmarks.ply", "map.ply",
+        "map", "map.png", "report.html",
     } == names  # fmt: skip
     assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
     assert summary["real_time_factor"] == 4.0

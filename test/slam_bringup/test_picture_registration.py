@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+
 from slam_bringup.datasets.picture_registration import ColourCamera, register_picture
 from slam_core.camera import Camera
 

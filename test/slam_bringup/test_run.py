@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+
 from slam_bringup.cli import slam
 from slam_core.trajectory import read_covariance_csv, read_trajectory
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from slam_core.geometry import boxminus, boxplus, invert_transform
 from slam_core.motion import motion_of_rig
 from slam_core.types import RelativeMotion

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,11 +18,11 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import CameraInfo as InfoMessage  # noqa: E402
 from sensor_msgs.msg import Image, PointCloud2  # noqa: E402
 from sensor_msgs.srv import SetCameraInfo  # noqa: E402
 
+from ros_probe import Probe  # noqa: E402
 from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info  # noqa: E402
 from slam_core.camera import Camera, CameraInfo  # noqa: E402
 from slam_core.messages import (  # noqa: E402
@@ -34,7 +33,6 @@ from slam_core.messages import (  # noqa: E402
     image_from_message,
     image_message,
 )
-from slam_core.ros import RosTypes, sensor_qos  # noqa: E402
 from slam_core.types import StereoImages  # noqa: E402
 from stereo_frontend.frontend import Frontend, FrontendConfig  # noqa: E402
 from stereo_frontend.rectify import StereoRectifier  # noqa: E402
@@ -47,26 +45,8 @@ INFOS = {"left": CameraInfo(LENS, P=P), "right": CameraInfo(LENS, P=P - np.array
 SIDES = ("left", "right")
 
 
-class Probe:
-    """A node that sends raw pairs and collects what comes of them."""
-
-    def __init__(self, context: Any) -> None:
-        self.node = rclpy.create_node("probe", context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
-        self.types = RosTypes()
-        self.received: dict[str, list[Any]] = {}
-        self.senders: dict[str, Any] = {}
-
-    def listen(self, topic: str, message_type: Any) -> None:
-        self.received[topic] = []
-        self.node.create_subscription(message_type, topic, self.received[topic].append, sensor_qos(50))
-
-    def send(self, topic: str, message: Any) -> None:
-        if topic not in self.senders:
-            self.senders[topic] = self.node.create_publisher(type(message), topic, sensor_qos(50))
-            self.wait(lambda: self.senders[topic].get_subscription_count() > 0, f"nobody listens to {topic}")
-        self.senders[topic].publish(message)
+class PairProbe(Probe):
+    """Sends raw pairs."""
 
     def send_pair(self, stamp: int, pair: StereoImages, encoding: str = "mono8", infos: bool = True) -> None:
         for side, image in zip(SIDES, (pair.left, pair.right), strict=True):
@@ -81,19 +61,13 @@ class Probe:
         end = time.monotonic() + seconds
         self.wait(lambda: time.monotonic() > end, "the clock stands still")
 
-    def wait(self, condition: Callable[[], bool], why: str, seconds: float = 60.0) -> None:
-        end = time.monotonic() + seconds
-        while not condition():
-            assert time.monotonic() < end, why
-            self.executor.spin_once(timeout_sec=0.05)
-
 
 @pytest.fixture
-def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[Probe]:
+def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[PairProbe]:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(90 + os.getpid() % 60))
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
-    probe = Probe(context)
+    probe = PairProbe(context)
     yield probe
     probe.executor.shutdown()
     probe.node.destroy_node()
@@ -101,7 +75,7 @@ def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[Probe]:
 
 
 @pytest.fixture
-def start(probe: Probe) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+def start(probe: PairProbe) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Starts a node of the package with parameters; all end cleanly."""
     running: list[subprocess.Popen[str]] = []
 

@@ -6,20 +6,18 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from sensor_msgs.srv import SetCameraInfo  # noqa: E402
 
+from ros_probe import Probe  # noqa: E402
 from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info  # noqa: E402
 from slam_core.camera import Camera  # noqa: E402
 from slam_core.camera import CameraInfo as Calibration  # noqa: E402
@@ -31,7 +29,6 @@ from slam_core.messages import (  # noqa: E402
     image_from_message,
     image_message,
 )
-from slam_core.ros import RosTypes, sensor_qos  # noqa: E402
 from tof_driver.depth import DepthConfig, DepthProcessor  # noqa: E402
 
 pytestmark = pytest.mark.ros
@@ -40,32 +37,8 @@ LENS = Camera(64, 48, 90.0, 90.0, 31.0, 24.0, "plumb_bob", (-0.3, 0.1, 0.0, 0.0,
 START = "from tof_driver.node import main; main()"
 
 
-class Probe:
-    """A node that sends raw images and collects what the driver makes of them."""
-
-    def __init__(self, context: Any) -> None:
-        self.node = rclpy.create_node("probe", context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
-        self.types = RosTypes()
-        self.received: dict[str, list[Any]] = {}
-        self.senders: dict[str, Any] = {}
-
-    def listen(self, topic: str, message_type: Any) -> None:
-        self.received[topic] = []
-        self.node.create_subscription(message_type, topic, self.received[topic].append, sensor_qos(50))
-
-    def send(self, topic: str, message: Any) -> None:
-        if topic not in self.senders:
-            self.senders[topic] = self.node.create_publisher(type(message), topic, sensor_qos(50))
-            self.wait(lambda: self.senders[topic].get_subscription_count() > 0, f"nobody listens to {topic}")
-        self.senders[topic].publish(message)
-
-    def wait(self, condition: Callable[[], bool], why: str, seconds: float = 30.0) -> None:
-        end = time.monotonic() + seconds
-        while not condition():
-            assert time.monotonic() < end, why
-            self.executor.spin_once(timeout_sec=0.05)
+class DriverProbe(Probe):
+    """Sends raw images."""
 
     def send_frame(self, stamp: int, distance: np.ndarray, **pictures: np.ndarray) -> None:
         for name, image in {"range": distance, **pictures}.items():
@@ -74,11 +47,11 @@ class Probe:
 
 
 @pytest.fixture
-def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[Probe]:
+def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[DriverProbe]:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(30 + os.getpid() % 60))
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
-    probe = Probe(context)
+    probe = DriverProbe(context)
     yield probe
     probe.executor.shutdown(timeout_sec=2.0)
     probe.node.destroy_node()
@@ -112,7 +85,7 @@ def scene(stamp: int) -> dict[str, np.ndarray]:
 
 
 def test_online_is_offline_and_bad_messages_are_survived(
-    probe: Probe, start: Callable[..., subprocess.Popen[bytes]]
+    probe: DriverProbe, start: Callable[..., subprocess.Popen[bytes]]
 ) -> None:
     process = start("mask.maximum_range:=6.0")
     outputs = {
@@ -146,7 +119,7 @@ def test_online_is_offline_and_bad_messages_are_survived(
 
 
 def test_calibration_from_a_file_is_published_and_replaced(
-    probe: Probe, start: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
+    probe: DriverProbe, start: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
 ) -> None:
     path = tmp_path / "tof.yaml"
     CameraInfoFile(Calibration(LENS), "tof").write(path)

@@ -15,7 +15,7 @@ def motion_of_rig(motion: RelativeMotion, T_rig_sensor: FloatArray) -> RelativeM
 
 
 def pose_of_rig(pose: PoseEstimate, T_rig_sensor: FloatArray) -> PoseEstimate:
-    """``T_odom_rig`` of the sensor's pose in the frame of its own first scan; the rig's first pose is the new origin."""
+    """``T_odom_rig`` of the sensor's pose in the frame of its first scan; the rig's first pose is the new origin."""
     return PoseEstimate(pose.stamp_ns, *_conjugate(pose.T, pose.covariance, T_rig_sensor))
 
 

@@ -1,4 +1,4 @@
-"""Closed-form and robust alignment of point sets with known correspondences (Umeyama 1991; Fischler and Bolles 1981)."""
+"""Closed-form and robust alignment of corresponding point sets (Umeyama 1991; Fischler and Bolles 1981)."""
 
 from __future__ import annotations
 
@@ -66,6 +66,10 @@ def ransac_rigid_transform(
         Largest distance of an inlier, m; a scalar or one per correspondence (n,).
     rng
         Source of the samples: the same generator state gives the same result.
+    hypotheses
+        Number of samples of three points.
+    min_inliers
+        Fewer inliers than this are no success.
     """
     n = len(source)
     failure = AlignmentResult(np.eye(4), np.zeros(n, dtype=bool), False)

@@ -1,7 +1,7 @@
 """The data that crosses package borders. Every array's shape, unit and frame stands here and nowhere else.
 
-All objects are immutable by convention: arrays are handed over, never changed afterwards. Times are header stamps in integer
-nanoseconds, the only time an estimator knows.
+All objects are immutable by convention: arrays are handed over, never changed afterwards. Times are header stamps in
+integer nanoseconds, the only time an estimator knows.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class StereoImages:
 class DepthImage:
     """A rectified depth image with its uncertainty.
 
-    depth: float32 (height, width), m along z, NaN where there is none. sigma: float32, standard deviation of depth, m, NaN
-    likewise. amplitude, intensity: float32 or None.
+    depth: float32 (height, width), m along z, NaN where there is none. sigma: float32, standard deviation of depth, m,
+    NaN likewise. amplitude, intensity: float32 or None.
     """
 
     stamp_ns: int
@@ -64,11 +64,11 @@ class DepthImage:
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Features of one instant in one optical frame, as on the ``features`` topic; float32 so that a topic loses nothing.
+    """Features of one instant in one optical frame, as on the ``features`` topic; float32, so a topic loses nothing.
 
-    xyz (n, 3) m in the optical frame ``frame_id``; uv (n, 2) px in the rectified image of ``camera``; depth (n,) m along z;
-    sigma_uv (n, 2) px; sigma_depth (n,) m; response (n,); source (n,) uint8, see :class:`FeatureSource`; descriptors
-    (n, d), unit norm, d = 128 for SURF-128 and SIFT.
+    xyz (n, 3) m in the optical frame ``frame_id``; uv (n, 2) px in the rectified image of ``camera``; depth (n,) m
+    along z; sigma_uv (n, 2) px; sigma_depth (n,) m; response (n,); source (n,) uint8, see :class:`FeatureSource`;
+    descriptors (n, d), unit norm, d = 128 for SURF-128 and SIFT.
     """
 
     stamp_ns: int
@@ -97,7 +97,7 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """A pose ``T`` = T_parent_child (4, 4) at a stamp with covariance (6, 6), tangent order of ``slam_core.geometry``."""
+    """A pose ``T`` = T_parent_child (4, 4) at a stamp, covariance (6, 6) in the order of ``slam_core.geometry``."""
 
     stamp_ns: int
     T: FloatArray
@@ -116,7 +116,7 @@ class RelativeMotion:
 
 @dataclass(frozen=True, eq=False)
 class ImuSample:
-    """One reading of an IMU: angular_velocity (3,) rad/s and linear_acceleration (3,) m/s2 (gravity included), rig frame."""
+    """An IMU reading, rig frame: angular_velocity (3,) rad/s, linear_acceleration (3,) m/s2 with gravity."""
 
     stamp_ns: int
     angular_velocity: FloatArray
@@ -128,12 +128,12 @@ class Submap:
     """A local map as one joint Gaussian, in the frame of its own first rig pose, ``<agent>/submap_<index>``.
 
     end_pose: T_start_end (4, 4), the rig pose at which the submap was closed. landmarks: (n, 3) m, in the start frame.
-    covariance: (6 + 3n, 6 + 3n) of (end pose error, landmarks), positive definite. landmark_ids: (n,) int64, unique within
-    the agent and kept when a landmark is carried into the next submap, so that equal ids of neighbours are a known
-    association (a hint, not proof). sightings: (n,) int32. descriptors: (n, d) float32, unit norm. path: the rig poses inside,
-    T_start_rig, each with the marginal covariance (6, 6) at that time; the first is identity, the last is ``end_pose``.
-    follows_previous: the start pose is the end pose of submap ``index - 1`` of the agent (odometry chains); False after the
-    rig was lost.
+    covariance: (6 + 3n, 6 + 3n) of (end pose error, landmarks), positive definite. landmark_ids: (n,) int64, unique
+    within the agent and kept when a landmark is carried into the next submap, so that equal ids of neighbours are a
+    known association (a hint, not proof). sightings: (n,) int32. descriptors: (n, d) float32, unit norm. path: the rig
+    poses inside, T_start_rig, each with the marginal covariance (6, 6) at that time; the first is identity, the last is
+    ``end_pose``. follows_previous: the start pose is the end pose of submap ``index - 1`` of the agent (odometry
+    chains); False after the rig was lost.
     """
 
     agent: str
