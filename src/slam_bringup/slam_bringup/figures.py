@@ -114,7 +114,7 @@ def _limit_to_content(axes: Axes, result: RunResult) -> None:
     axes.set_ylim(path[:, 1].min() - margin, path[:, 1].max() + margin)
 
 
-def matched_poses(agent: AgentResult) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+def matched_poses(agent: AgentResult, alignment: str = "se3") -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Times (n,) s, true poses in the map frame (n, 4, 4) and estimated poses (n, 4, 4); None without ground truth."""
     if len(agent.truth) < 2 or len(agent.trajectory) < 2:
         return None
@@ -122,12 +122,19 @@ def matched_poses(agent: AgentResult) -> tuple[FloatArray, FloatArray, FloatArra
         matched, truth = associate(agent.trajectory, agent.truth)
     except ValueError:
         return None
-    return (matched.stamps_ns - agent.trajectory.stamps_ns[0]) / 1e9, align(truth, matched.poses), matched.poses
+    return (
+        (matched.stamps_ns - agent.trajectory.stamps_ns[0]) / 1e9,
+        align(truth, matched.poses, alignment),
+        matched.poses,
+    )
 
 
 def error_figure(agent: AgentResult) -> Figure | None:
-    """Position and rotation error over time inside the 99.5 % bounds that the covariance states."""
-    pair = matched_poses(agent)
+    """Position and rotation error over time inside the 99.5 % bounds that the covariance states.
+
+    The first poses are made to agree: the map's frame is its first pose.
+    """
+    pair = matched_poses(agent, "origin")
     if pair is None or agent.trajectory.covariances is None:
         return None
     times, truth, _ = pair
