@@ -7,17 +7,18 @@ by NDT from coarse to fine, and the one that respects best what the target has s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from ndt_registration.ambiguity import AmbiguityConfig, Explanation, reason_of_doubt
 from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare, viewpoint
 from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
 from ndt_registration.matching import fit_to_grid
 from ndt_registration.ndt import NdtOptimum, ndt_align
 from ndt_registration.pyramid import GridConfig, Pyramid
-from ndt_registration.search import Candidate, SearchConfig, distinct, judge, planar_constraint, search
+from ndt_registration.search import Candidate, SearchConfig, judge, planar_constraint, search
 from ndt_registration.uncertainty import Curvature, Extent, UncertaintyConfig, direction_names, sandwich, unknown
 from ndt_registration.visibility import RangeImage, range_image
 from slam_core.config import Config, group, parameter
@@ -52,6 +53,7 @@ class RegistrationConfig(Config):
     icp: IcpConfig = group(IcpConfig)
     grid: GridConfig = group(GridConfig)
     search: SearchConfig = group(SearchConfig)
+    ambiguity: AmbiguityConfig = group(AmbiguityConfig)
     uncertainty: UncertaintyConfig = group(UncertaintyConfig)
 
 
@@ -177,12 +179,29 @@ def _register(
     else:
         candidates, start = [Candidate(np.eye(4), 0.0)], config.grid.levels - 1
     refined = [_aligned(source, target, candidate.T, start, scale, config) for candidate in candidates]
-    costs = [judge(source, target.image, scale, _pose(optimum), config.search) for optimum, _ in refined]
-    best = int(np.argmin(costs))
-    ranked = sorted((Candidate(_pose(o), c) for (o, _), c in zip(refined, costs, strict=True)), key=lambda c: c.cost)
-    rivals = distinct(ranked, 0.05, scale, 2)[1:]
+    found = [
+        Explanation(_pose(o), judge(source, target.image, scale, _pose(o), config.search), o.score) for o, _ in refined
+    ]
+    best = int(np.argmin([explanation.cost for explanation in found]))
     optimum, iterations = refined[best]
-    return _result(source, target, optimum, iterations, costs[best], rivals, config)
+    result = _result(source, target, optimum, iterations, found[best].cost, config)
+    if guess is None and result.converged:
+        others = found[:best] + found[best + 1 :]
+        return _doubted(result, found[best], others, target, config)
+    return result
+
+
+def _doubted(
+    result: RegistrationResult, best: Explanation, others: list[Explanation], target: Target, config: RegistrationConfig
+) -> RegistrationResult:
+    """The result of a search, as a failure where it is not the only answer."""
+    scale = max(target.cloud.scale, 1e-6)
+    centred = _shifted_covariance(result.covariance, -best.T[:3, :3] @ target.centre)
+    reason = reason_of_doubt(best, others, centred, scale, config.ambiguity)
+    if not reason:
+        return result
+    covariance = _shifted_covariance(unknown(scale, config.uncertainty), best.T[:3, :3] @ target.centre)
+    return replace(result, covariance=covariance, converged=False, reason=reason)
 
 
 def _pose(optimum: NdtOptimum) -> FloatArray:
@@ -227,7 +246,6 @@ def _result(
     optimum: NdtOptimum,
     iterations: int,
     cost: float,
-    rivals: list[Candidate],
     config: RegistrationConfig,
 ) -> RegistrationResult:
     scale = max(target.cloud.scale, 1e-6)

@@ -1,0 +1,79 @@
+"""Whether the answer of a global search is the only one: the other poses that the search refined are its witnesses.
+
+Where two scans share little, a wrong pose can look as good as the true one. An answer is doubted where another pose
+costs hardly more, or fits the surfaces about as well: visibility cost and score are two opinions, and must agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ndt_registration.search import SEPARATION, pose_distance
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray, boxminus
+
+
+@dataclass(frozen=True)
+class AmbiguityConfig(Config):
+    """When the answer of a search is called ambiguous; a given initial guess is never doubted in this way."""
+
+    cost_margin: float = parameter(0.01, "visibility cost by which the answer must beat every rival", minimum=0.0)
+    score_share: float = parameter(
+        0.9, "share of the answer's score that no rival may reach", minimum=0.0, maximum=10.0
+    )
+    gate: float = parameter(
+        22.5, "squared Mahalanobis distance within which a pose is no rival: the covariance covers it", minimum=0.0
+    )
+
+
+class Explanation(NamedTuple):
+    """A refined pose T_target_source, its visibility cost (lower is better) and its score over all points (higher)."""
+
+    T: FloatArray
+    cost: float
+    score: float
+
+
+def reason_of_doubt(
+    best: Explanation,
+    others: list[Explanation],
+    covariance: FloatArray,
+    scale: float,
+    config: AmbiguityConfig,
+) -> str:
+    """Why the best of a search's poses cannot be trusted, empty if it can.
+
+    Parameters
+    ----------
+    best, others
+        The answer and the other poses that were refined.
+    covariance
+        Shape (6, 6), of the answer; poses that it covers, such as those along a corridor, are no rivals.
+    scale
+        Scale of the target, m.
+    config
+        Settings.
+    """
+    for other in others:
+        if _is_rival(best, other, config) and _differs(best, other, covariance, scale, config):
+            return f"ambiguous: a pose {_difference(best.T, other.T)} away explains the scan about equally well"
+    return ""
+
+
+def _is_rival(best: Explanation, other: Explanation, config: AmbiguityConfig) -> bool:
+    return other.cost < best.cost + config.cost_margin or other.score > config.score_share * best.score
+
+
+def _differs(
+    best: Explanation, other: Explanation, covariance: FloatArray, scale: float, config: AmbiguityConfig
+) -> bool:
+    d = boxminus(other.T, best.T)
+    return bool(pose_distance(other.T, best.T, scale) > SEPARATION and d @ np.linalg.solve(covariance, d) > config.gate)
+
+
+def _difference(T: FloatArray, other: FloatArray) -> str:
+    d = boxminus(other, T)
+    return f"{np.linalg.norm(d[:3]):.2f} m and {np.rad2deg(np.linalg.norm(d[3:])):.1f} deg"
