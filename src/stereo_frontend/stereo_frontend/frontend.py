@@ -38,7 +38,7 @@ class FrontendConfig(Config):
 
     mode: str = parameter("stereo", "where depth comes from", choices=MODES)
     max_relative_sigma: float = parameter(
-        0.2, "features whose depth sigma exceeds this share of their depth are dropped", minimum=0.001, maximum=1.0
+        0.35, "features whose depth sigma exceeds this share of their depth are dropped", minimum=0.001, maximum=1.0
     )
     right_surplus: float = parameter(
         1.6, "features wanted in the right image per feature of the left, so that few partners are missing", minimum=1.0
