@@ -18,7 +18,7 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
     table.add_row("path", f"{summary['path_length_m']:.2f} m")
     table.add_row("map", f"{summary['landmarks']} landmarks, {summary['submaps']} submaps")
     table.add_row("loop closures", str(summary["loop_closures"]))
-    for name, part in (("", summary), *summary.get("agents", {}).items()):
+    for name, part in summary.get("agents", {"": summary}).items():
         table.add_row(f"accuracy {name}".strip(), _accuracy(part))
     if "scan_odometry" in summary:
         table.add_row("scan odometry", _accuracy(summary["scan_odometry"]))
