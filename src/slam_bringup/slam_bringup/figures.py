@@ -46,8 +46,9 @@ def map_figure(result: RunResult) -> Figure:
     )
     axes.grid(color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper right", framealpha=0.9)
+    named = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # ground truth of several agents: once
+    if named:
+        axes.legend(named.values(), named.keys(), loc="upper right", framealpha=0.9)
     _limit_to_content(axes, result)
     return figure
 
