@@ -87,3 +87,20 @@ def test_stamps_out_of_order_are_refused(scans: list[FloatArray]) -> None:
     odometry.process(100, scans[0])
     with pytest.raises(ValueError, match="order"):
         odometry.process(100, scans[1])
+
+
+def test_before_a_single_wall_the_uncertainty_is_that_of_the_plausible_corrections(
+    empty_room: Any, at: Callable[..., FloatArray]
+) -> None:
+    rng, wall = np.random.default_rng(5), empty_room(60.0, 60.0, 60.0)
+    odometry, config = ScanOdometry(), OdometryConfig()
+    odometry.process(1, wall.scan(at(57.0, 30.0, 30.0), rng, 60))
+    result = odometry.process(1 + STEP_NS, wall.scan(at(57.02, 30.0, 30.0), rng, 60))
+    assert result.registration is not None
+    assert result.registration.degenerate
+    assert result.motion is not None
+    sigma = np.sqrt(np.diag(result.motion.covariance))
+    limit = config.max_correction / np.sqrt(3.0)
+    assert sigma[0] < 0.01
+    assert sigma[1] == pytest.approx(limit, rel=0.1)
+    assert sigma[2] == pytest.approx(limit, rel=0.1)

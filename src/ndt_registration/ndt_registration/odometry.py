@@ -148,7 +148,18 @@ class ScanOdometry:
         if result.converged and (distance > self._config.max_correction or angle > self._config.max_correction_deg):
             reason = f"implausible: {distance:.2f} m and {angle:.1f} deg from the guess"
             return replace(result, converged=False, reason=reason)
-        return result
+        return replace(result, covariance=self._bounded(result.covariance)) if result.converged else result
+
+    def _bounded(self, covariance: FloatArray) -> FloatArray:
+        """Covariance of a pose that also lies near the guess, as the limits of corrections assume: a uniform
+        distribution between the limits has a third of their square as variance.
+
+        Without it each scan of a single wall would let metres of uncertainty into the trajectory.
+        """
+        limits = np.repeat([self._config.max_correction, np.deg2rad(self._config.max_correction_deg)], 3)
+        prior = np.diag(limits**2 / 3.0)
+        bounded = prior @ np.linalg.solve(covariance + prior, covariance)  # the sum of both informations, inverted
+        return np.asarray(0.5 * (bounded + bounded.T))
 
     def _track(self, stamp_ns: int, scan: FloatArray, result: RegistrationResult) -> OdometryResult:
         keyframe = self._map.newest
