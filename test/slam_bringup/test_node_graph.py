@@ -53,6 +53,16 @@ def test_parameters_follow_from_the_choice_and_the_bag() -> None:
     assert "/one/tof/camera_info" in graph.played_topics
 
 
+def test_the_frames_of_an_agent_are_those_of_its_bag_or_lie_below_its_name() -> None:
+    config = choose(load_system_config(None), "fuse", "sjsam", "ndt")
+    live = {s.executable: s.parameters for s in live_nodes(config, ["one"], odometry=True)}
+    assert live["ekf_slam"]["base_frame"] == live["ndt_odometry"]["base_frame"] == "one/base_link"
+    assert live["ndt_odometry"]["odom_frame"] == "one/odom"
+    graph = plan_nodes(config, {"one": sensors("one")}, True, "map")  # this bag's frames have no prefix
+    arguments = {c.executable: " ".join(c.arguments) for c in graph.commands}
+    assert 'base_frame:="base_link"' in arguments["ekf_slam"]
+
+
 def test_the_stereo_mode_leaves_the_depth_camera_alone() -> None:
     graph = plan_nodes(choose(load_system_config(None), "stereo", "sjsam", "none"), {"": sensors()}, False, "map")
     assert not [topic for topic in graph.played_topics if "tof" in topic]

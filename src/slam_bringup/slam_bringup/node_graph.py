@@ -52,21 +52,42 @@ class NodeGraph:
 
 
 def live_nodes(
-    config: SystemConfig, agents: Iterable[str], *, odometry: bool, extra: Mapping[str, Mapping[str, Any]] | None = None
+    config: SystemConfig,
+    agents: Iterable[str],
+    *,
+    odometry: bool,
+    extra: Mapping[str, Mapping[str, Any]] | None = None,
+    base_frames: Mapping[str, str] | None = None,
 ) -> list[NodeSpec]:
-    """Nodes for rigs with the sensors that the mode of ``config`` needs; ``extra``: parameters by executable."""
+    """Nodes for rigs with the sensors that the mode of ``config`` needs.
+
+    ``extra``: parameters by executable. ``base_frames``: frame of each agent's rig, by default ``base_link`` below the
+    agent's name.
+    """
+    base_frames = base_frames or {}
     mode, extra, agents = config.feature_extractor.mode, extra or {}, tuple(agents)
     specs = []
     for agent in agents:
+        base = {"base_frame": base_frames[agent]} if agent in base_frames else _below(agent, base_frame="base_link")
         if mode != "tof":
             specs.append(_spec("stereo_frontend", "stereo_driver", None, agent, extra))
         if mode != "stereo" or odometry:
             specs.append(_spec("tof_driver", "tof_driver", config.tof_driver, agent, extra))
         if odometry:
-            specs.append(_spec("ndt_registration", "ndt_odometry", config.ndt_odometry, agent, extra))
+            frames = base | _below(agent, odom_frame="odom")
+            specs.append(_spec("ndt_registration", "ndt_odometry", config.ndt_odometry, agent, extra, **frames))
         specs.append(_spec("stereo_frontend", "feature_extractor", config.feature_extractor, agent, extra))
         specs.append(
-            _spec("ekf_slam_node", "ekf_slam", config.ekf_slam, agent, extra, agent=agent, wait_for_motion=odometry)
+            _spec(
+                "ekf_slam_node",
+                "ekf_slam",
+                config.ekf_slam,
+                agent,
+                extra,
+                agent=agent,
+                wait_for_motion=odometry,
+                **base,
+            )
         )
     specs.append(_spec("sjsam_node", "sjsam", config.sjsam, "", extra, agents=agents if any(agents) else ()))
     return specs
@@ -76,7 +97,10 @@ def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odomet
     """The nodes of a run over the agents of a bag."""
     mode = config.feature_extractor.mode
     first = next(iter(sensors.values()))
-    specs = live_nodes(config, sensors, odometry=odometry, extra=_bag_parameters(first, map_path))
+    base_frames = {agent: sensor.base_frame for agent, sensor in sensors.items()}
+    specs = live_nodes(
+        config, sensors, odometry=odometry, extra=_bag_parameters(first, map_path), base_frames=base_frames
+    )
     names = {
         e: tuple(s.command.full_name for s in specs if s.executable == e) for e in ("feature_extractor", "ekf_slam")
     }
@@ -134,6 +158,11 @@ def _spec(
     changed = dict(_changed(config)) if config is not None else {}
     given = {name: value for name, value in own.items() if value not in ("", (), False)}
     return NodeSpec(package, executable, namespace, changed | given | dict(extra.get(executable, {})))
+
+
+def _below(agent: str, **frames: str) -> dict[str, str]:
+    """Frames below an agent's name; those of a single rig keep the nodes' defaults."""
+    return {parameter: f"{agent}/{frame}" for parameter, frame in frames.items()} if agent else {}
 
 
 def _changed(config: Config) -> Iterable[tuple[str, Any]]:
