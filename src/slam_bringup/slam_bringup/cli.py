@@ -27,12 +27,6 @@ COMMANDS = {
 }
 
 
-class SlamError(click.ClickException):
-    """Bad input or configuration: one clear line for the user, exit code 2."""
-
-    exit_code = 2
-
-
 class _LazyGroup(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
