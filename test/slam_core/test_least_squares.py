@@ -5,12 +5,9 @@ import pytest
 from scipy.stats import chi2
 
 from slam_core.least_squares import (
-    LOSSES,
     LevenbergMarquardtConfig,
     chi_square_bound,
     levenberg_marquardt,
-    robust_cost,
-    robust_weight,
     whitening,
 )
 
@@ -25,28 +22,6 @@ def test_whitening_makes_the_covariance_one(rng: np.random.Generator) -> None:
 def test_whitening_refuses_what_is_no_covariance() -> None:
     with pytest.raises(ValueError, match="not positive definite"):
         whitening(-np.eye(3))
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("scale", [0.5, 2.0])
-def test_weight_is_the_derivative_of_the_loss(loss: str, scale: float) -> None:
-    s = np.linspace(0.01, 30.0, 200)
-    s = s[np.abs(s - scale**2) > 0.1]  # Huber's kink
-    step = 1e-6
-    slope = (robust_cost(s + step, loss, scale) - robust_cost(s - step, loss, scale)) / (2 * step)
-    assert np.allclose(slope, robust_weight(s, loss, scale), rtol=1e-6, atol=1e-8)
-
-
-def test_small_residuals_keep_their_weight() -> None:
-    for loss in LOSSES:
-        assert robust_weight(np.array(1e-12), loss) == pytest.approx(1.0)
-
-
-def test_unknown_loss_is_refused() -> None:
-    with pytest.raises(ValueError, match="tukey"):
-        robust_weight(np.ones(1), "tukey")
-    with pytest.raises(ValueError, match="tukey"):
-        robust_cost(np.ones(1), "tukey")
 
 
 def test_chi_square_bound_agrees_with_scipy() -> None:

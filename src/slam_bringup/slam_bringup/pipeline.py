@@ -12,6 +12,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -114,6 +115,9 @@ def _ahead(items: Iterable[T]) -> Iterator[T]:
             yield item
     finally:
         stopped.set()
+        while thread.is_alive():  # it may wait for room; the bag must not be closed under it
+            with suppress(queue.Empty):
+                made.get(timeout=0.05)
 
 
 def _agent_results(bag: SensorBag, mapping: Mapper) -> tuple[AgentResult, ...]:

@@ -1,5 +1,4 @@
-"""Nonlinear least squares: whitening, robust losses, and Levenberg-Marquardt over any problem that can linearise
-itself.
+"""Nonlinear least squares: whitening and Levenberg-Marquardt over any problem that can linearise itself.
 
 The sparse factors and their marginals are in :mod:`slam_core.sparse_cholesky`. Costs are plain sums of squared
 residuals, ``chi2 = sum r^T r`` (no factor one half), so that they compare with the chi-square distribution.
@@ -19,8 +18,6 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 
 State = TypeVar("State")
-
-LOSSES = ("none", "huber", "cauchy", "geman_mcclure")
 
 
 def whitening(covariance: FloatArray) -> FloatArray:
@@ -42,44 +39,6 @@ def whitening(covariance: FloatArray) -> FloatArray:
 def chi_square_bound(probability: float, dof: int) -> float:
     """What a chi-square variable of ``dof`` degrees of freedom stays below with this probability."""
     return float(2.0 * gammaincinv(0.5 * dof, probability))
-
-
-def robust_weight(squared: FloatArray, loss: str, scale: float = 1.0) -> FloatArray:
-    """Weight of a residual in iteratively reweighted least squares (Holland and Welsch 1977).
-
-    Parameters
-    ----------
-    squared
-        Squared norm of the whitened residual, any shape.
-    loss
-        ``none``, ``huber``, ``cauchy`` or ``geman_mcclure``.
-    scale
-        Norm at which the loss leaves the quadratic, in standard deviations.
-    """
-    u = np.asarray(squared, dtype=np.float64) / scale**2
-    if loss == "none":
-        return np.ones_like(u)
-    if loss == "huber":
-        return 1.0 / np.sqrt(np.maximum(u, 1.0))
-    if loss == "cauchy":
-        return 1.0 / (1.0 + u)
-    if loss == "geman_mcclure":
-        return 1.0 / (1.0 + u) ** 2
-    raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}")
-
-
-def robust_cost(squared: FloatArray, loss: str, scale: float = 1.0) -> FloatArray:
-    """Loss whose derivative with respect to ``squared`` is :func:`robust_weight`; same arguments."""
-    u = np.asarray(squared, dtype=np.float64) / scale**2
-    if loss == "none":
-        return scale**2 * u
-    if loss == "huber":
-        return scale**2 * np.where(u <= 1.0, u, 2.0 * np.sqrt(np.maximum(u, 1.0)) - 1.0)
-    if loss == "cauchy":
-        return scale**2 * np.log1p(u)
-    if loss == "geman_mcclure":
-        return scale**2 * u / (1.0 + u)
-    raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}")
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ class Frontend:
         disparity = np.where(refined.disparity >= bounds[0], refined.disparity, np.nan).astype(np.float64)
         disparity[~has_company(uv, disparity, self.config.matching.neighbours)] = np.nan
         estimate = DepthEstimate.unknown(len(left))
-        estimate.depth[matches.left] = focal_baseline / disparity
+        estimate.depth[matches.left] = images.stereo.depth_from_disparity(disparity)
         estimate.sigma[matches.left] = focal_baseline / disparity**2 * sigma
         self._count(left, right, len(matches), int(np.isfinite(disparity).sum()))
         return estimate

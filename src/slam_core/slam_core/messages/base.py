@@ -28,11 +28,6 @@ _PACKAGE_OF = {name: package for package, names in MESSAGE_PACKAGES.items() for 
 Message = Any
 
 
-def full_type_name(name: str) -> str:
-    """``Image`` to ``sensor_msgs/msg/Image``."""
-    return f"{_PACKAGE_OF[name]}/msg/{name}"
-
-
 class MessageTypes(ABC):
     """Makes messages by name: ``types.Image(height=480, ...)``; fields that are not given keep the type's default."""
 
