@@ -163,8 +163,9 @@ def test_upright_descriptor_equals_its_twin(image, keypoint):
     np.testing.assert_allclose(out[0], twin_descriptor(image, *keypoint), atol=2e-6)
 
 
-def test_oriented_descriptor_equals_its_twin(image):
-    keypoint = np.array([80.3, 61.7, 2.1])
+@pytest.mark.parametrize("place", [(80.3, 61.7, 2.1), (14.2, 98.9, 2.3), (150.0, 9.0, 1.4)])
+def test_oriented_descriptor_equals_its_twin(image, place):
+    keypoint = np.array(place)
     out = np.empty((1, 128), np.float32)
     describe_oriented(integral_image(image), keypoint[None], region_weights(), out)
     angle = orientation(integral_image(image), keypoint)

@@ -2,7 +2,7 @@
 
 A filter of size S stands for a Gaussian of scale ``1.2 S / 9``. An octave has four sizes; the next octave starts at the
 second of them, with twice the step between sizes and twice the sampling distance, so two of its four layers are the
-previous octave's, thinned out. The sums that the boxes of one row share are built once per row, which leaves 20 loads
+previous octave's, thinned out. The sums that the boxes of one row share are built once per row, which leaves 23 loads
 per pixel and layer instead of 32, all along the row, so that the compiler vectorises them.
 """
 
@@ -17,6 +17,9 @@ from slam_core.types import ByteArray, Float32Array
 LAYERS = 4
 MAX_PIXELS = 2**31 // 255
 """A larger image would overflow the 32-bit integral image."""
+
+_BLOCK = 64
+"""Pixels of a row that are looked at together for any candidate."""
 
 IntegralImage = npt.NDArray[np.int32]
 
@@ -69,44 +72,56 @@ def hessian_layer(integral, size, step, out):  # type: ignore[no-untyped-def]
     lobe, half = size // 3, size // 2
     middle = lobe // 2
     scale = np.float32(1.0 / (size * size))
-    n = width - 2 * half
-    first = -(-half // step)
-    last = (height - 1 - half) // step
-    band = np.empty(width + 1, np.int32)
-    stack = np.empty(width + 1, np.int32)
-    cross = np.empty(width + 1, np.int32)
-    line = np.empty(max(n, 0), np.float32)
+    n = max(width - 2 * half, 0)
+    first, last = -(-half // step), (height - 1 - half) // step
+    band, stack, cross = np.empty(width + 1, np.int32), np.empty(width + 1, np.int32), np.empty(width + 1, np.int32)
+    xx, yy, xy = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
+    line = np.empty(n, np.float32)
     for row in range(first, last + 1):
         y = row * step
-        _row_sums(integral, y, lobe, half, middle, band, stack, cross)
-        a3, a0 = band[2 * half + 1 :], band
-        a2, a1 = band[half + middle + 1 :], band[half - middle :]
-        b1, b0 = stack[half + lobe :], stack[half - lobe + 1 :]
-        c3, c2, c1, c0 = cross[half + lobe + 1 :], cross[half + 1 :], cross[half:], cross[half - lobe :]
-        for x in range(n):
-            dxx = np.float32(a3[x] - a0[x] - 3 * (a2[x] - a1[x])) * scale
-            dyy = np.float32(b1[x] - b0[x]) * scale
-            dxy = np.float32(c1[x] - c0[x] - c3[x] + c2[x]) * scale
-            line[x] = dxx * dyy - np.float32(0.81) * dxy * dxy
-        target = out[row]
-        for column in range(-(-half // step), (width - 1 - half) // step + 1):
-            target[column] = line[column * step - half]
+        # Column sums of Dxx's band, of Dyy's weighted stack, of Dxy's upper minus lower boxes.
+        _difference(integral[y + lobe], integral[y - lobe + 1], band)
+        _outer_less_inner(
+            integral[y + half + 1], integral[y - half], integral[y + middle + 1], integral[y - middle], stack
+        )
+        _crossed(integral[y], integral[y - lobe], integral[y + lobe + 1], integral[y + 1], cross)
+        _outer_less_inner(band[2 * half + 1 :], band, band[half + middle + 1 :], band[half - middle :], xx)
+        _difference(stack[half + lobe :], stack[half - lobe + 1 :], yy)
+        _crossed(cross[half + 1 :], cross[half - lobe :], cross[half + lobe + 1 :], cross[half:], xy)
+        if step == 1:
+            _determinants(xx, yy, xy, scale, out[row][half : half + n])
+            continue
+        _determinants(xx, yy, xy, scale, line)
+        for column in range(first, (width - 1 - half) // step + 1):
+            out[row, column] = line[column * step - half]
+
+
+# Each of these loops has one array to write and few to read: with more of them the compiler gives up proving that they
+# do not overlap, and vectorises nothing.
+@njit(cache=True, nogil=True)
+def _difference(plus, minus, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        out[x] = plus[x] - minus[x]
 
 
 @njit(cache=True, nogil=True)
-def _row_sums(integral, y, lobe, half, middle, band, stack, cross):  # type: ignore[no-untyped-def]
-    """Column sums of the boxes around row ``y``: of Dxx's band, of Dyy's weighted stack, of Dxy's upper minus lower
-    boxes.
-    """
-    band_top, band_bottom = integral[y - lobe + 1], integral[y + lobe]
-    stack_top, stack_bottom = integral[y - half], integral[y + half + 1]
-    inner_top, inner_bottom = integral[y - middle], integral[y + middle + 1]
-    upper_top, upper_bottom = integral[y - lobe], integral[y]
-    lower_top, lower_bottom = integral[y + 1], integral[y + lobe + 1]
-    for x in range(band.shape[0]):
-        band[x] = band_bottom[x] - band_top[x]
-        stack[x] = stack_bottom[x] - stack_top[x] - 3 * (inner_bottom[x] - inner_top[x])
-        cross[x] = upper_bottom[x] - upper_top[x] - lower_bottom[x] + lower_top[x]
+def _outer_less_inner(plus, minus, inner_plus, inner_minus, out):  # type: ignore[no-untyped-def]
+    """Sums of a box less three times those of its middle third."""
+    for x in range(len(out)):
+        out[x] = plus[x] - minus[x] - 3 * (inner_plus[x] - inner_minus[x])
+
+
+@njit(cache=True, nogil=True)
+def _crossed(first, second, third, fourth, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        out[x] = first[x] - second[x] - third[x] + fourth[x]
+
+
+@njit(cache=True, nogil=True)
+def _determinants(xx, yy, xy, scale, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        dxx, dyy, dxy = np.float32(xx[x]) * scale, np.float32(yy[x]) * scale, np.float32(xy[x]) * scale
+        out[x] = dxx * dyy - np.float32(0.81) * dxy * dxy
 
 
 @njit(cache=True, nogil=True)
@@ -124,18 +139,31 @@ def find_maxima(layers, octave, threshold, found):  # type: ignore[no-untyped-de
         size = increment + 3 + increment * layer
         border = (size + increment) // 2 // step + 2
         for y in range(border, layers.shape[1] - border):
-            row = layers[layer, y]
-            for x in range(border, layers.shape[2] - border):
-                value = row[x]
-                if value <= threshold or not _is_maximum(layers, layer, y, x, value):
+            row, end = layers[layer, y], layers.shape[2] - border
+            for begin in range(border, end, _BLOCK):
+                block = row[begin : min(begin + _BLOCK, end)]
+                if not _any_above(block, threshold):
                     continue
-                if count < found.shape[0] and _vertex(layers, layer, y, x, offset):
-                    found[count, 0] = (x + offset[0]) * step
-                    found[count, 1] = (y + offset[1]) * step
-                    found[count, 2] = 1.2 / 9.0 * (size + offset[2] * increment)
-                    found[count, 3] = value
-                    count += 1
+                for x in range(begin, begin + len(block)):
+                    value = row[x]
+                    if value <= threshold or not _is_maximum(layers, layer, y, x, value):
+                        continue
+                    if count < found.shape[0] and _vertex(layers, layer, y, x, offset):
+                        found[count, 0] = (x + offset[0]) * step
+                        found[count, 1] = (y + offset[1]) * step
+                        found[count, 2] = 1.2 / 9.0 * (size + offset[2] * increment)
+                        found[count, 3] = value
+                        count += 1
     return count
+
+
+@njit(cache=True, nogil=True)
+def _any_above(values, threshold):  # type: ignore[no-untyped-def]
+    """Whether any value is above; counting them all is one vector operation per eight."""
+    count = np.int32(0)
+    for i in range(len(values)):
+        count += np.int32(values[i] > threshold)
+    return count > 0
 
 
 @njit(cache=True, nogil=True)
