@@ -240,8 +240,12 @@ class GlobalMap:
     def start_pose(self, record: int) -> PoseEstimate:
         """Start pose of a record in the map frame, with covariance."""
         r = self.graph.records[record]
-        covariance = self.assembled(self.graph.component(record)).covariance([r.start])
-        return PoseEstimate(r.submap.start_stamp_ns, self.graph.poses[r.start], covariance)
+        return PoseEstimate(r.submap.start_stamp_ns, self.graph.poses[r.start], self._covariance(r.start))
+
+    def _covariance(self, node: int) -> FloatArray:
+        """Covariance (6, 6) of a node, honest as :mod:`sjsam_node.map_view` says."""
+        component = int(self.graph.component_of[node])
+        return self.joiner.variance_factor(component) * self.assembled(component).covariance([node])
 
     def end_pose(self, agent: str) -> PoseEstimate | None:
         """Where an agent's newest submap ends in the map frame; None for one not heard of."""
@@ -249,8 +253,7 @@ class GlobalMap:
         if not own:
             return None
         r = self.graph.records[own[-1]]
-        covariance = self.assembled(self.graph.component(own[-1])).covariance([r.end])
-        return PoseEstimate(r.submap.end_stamp_ns, self.graph.poses[r.end], covariance)
+        return PoseEstimate(r.submap.end_stamp_ns, self.graph.poses[r.end], self._covariance(r.end))
 
     def save(self, path: Path | str) -> None:
         """Write the map to a folder (see :mod:`sjsam_node.storage`)."""

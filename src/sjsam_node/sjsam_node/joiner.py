@@ -155,6 +155,15 @@ class Joiner:
             self.assembled(component)
         return self._joined[component].result.cost
 
+    def variance_factor(self, component: int) -> float:
+        """chi2 per degree of freedom: how much larger the errors of a component's submaps are than they claim.
+
+        Never below one: submaps that agree better than they should are not made surer.
+        """
+        problem = self.assembled(component).problem
+        redundancy = problem.rows - problem.layout.pattern.n
+        return max(1.0, self.cost(component) / redundancy) if redundancy > 0 else 1.0
+
     # -- closures ------------------------------------------------------------------------------------------------------
 
     def relative_pose(self, first: int, second: int) -> Prior | None:

@@ -3,6 +3,10 @@
 The poses inside a submap hang on the joined skeleton: what joining changed at the submap's end is handed to each pose
 by the gain with which the end, once known better, corrects it (a Rauch-Tung-Striebel step with the submap's own
 covariances).
+
+Submaps that contradict one another more than they claim possible are too sure of themselves, each as much as the
+others as far as the map can tell: every covariance that goes out is multiplied by the component's variance factor, chi2
+per degree of freedom (the "variance of unit weight"; Baarda 1968), never below one.
 """
 
 from __future__ import annotations
@@ -25,7 +29,7 @@ from slam_core.geometry import (
     skew,
 )  # fmt: skip
 from slam_core.sparse_cholesky import IntArray
-from slam_core.types import Float32Array, PoseEstimate
+from slam_core.types import Float32Array, PoseEstimate, Submap
 
 if TYPE_CHECKING:
     from sjsam_node.global_map import GlobalMap
@@ -54,26 +58,38 @@ def trajectory(global_map: GlobalMap) -> dict[str, list[PoseEstimate]]:
     covariances are widened by ``unlinked_sigma``: a receiver sees that these poses mean nothing in the map frame.
     """
     out: dict[str, list[PoseEstimate]] = {}
-    for assembled, marginals, widening in _components(global_map):
-        for i in assembled.records:
+    for part in _components(global_map):
+        for i in part.assembled.records:
             record = global_map.graph.records[i]
-            nodes = np.searchsorted(assembled.nodes, [record.start, record.end])
-            joint = marginals.covariance(nodes)
-            poses = _hung(global_map.graph, record, joint, widening)
-            out.setdefault(record.submap.agent, []).extend(poses)
+            joint = part.marginals.covariance(np.searchsorted(part.assembled.nodes, [record.start, record.end]))
+            poses = _hung(global_map.graph, record, joint)
+            out.setdefault(record.submap.agent, []).extend(
+                PoseEstimate(p.stamp_ns, p.T, part.factor * p.covariance + part.widening) for p in poses
+            )
     return {agent: _unique_stamps(poses) for agent, poses in sorted(out.items())}
 
 
-def _components(global_map: GlobalMap) -> list[tuple[Assembled, Marginals, FloatArray]]:
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A component with what its covariances are multiplied by, and what is added (6, 6) where its frame is unknown."""
+
+    assembled: Assembled
+    marginals: Marginals
+    factor: float
+    widening: FloatArray
+
+
+def _components(global_map: GlobalMap) -> list[_Part]:
     graph = global_map.graph
     if not graph.records:
         return []
     main = int(graph.component_of[graph.records[0].start])
     out = []
-    for component in np.unique(graph.component_of):
-        assembled = global_map.assembled(int(component))
+    for component in np.unique(graph.component_of).tolist():
+        assembled = global_map.assembled(component)
         widening = np.zeros((6, 6)) if component == main else _unknown(global_map.config.unlinked_sigma)
-        out.append((assembled, assembled.problem.marginals(assembled.state), widening))
+        marginals = assembled.problem.marginals(assembled.state)
+        out.append(_Part(assembled, marginals, global_map.joiner.variance_factor(component), widening))
     return out
 
 
@@ -87,38 +103,41 @@ def _unique_stamps(poses: list[PoseEstimate]) -> list[PoseEstimate]:
     return [poses[i] for i in np.unique([p.stamp_ns for p in poses], return_index=True)[1]]
 
 
-def _hung(graph: MapGraph, record: Record, joint: FloatArray, widening: FloatArray) -> list[PoseEstimate]:
+def _hung(graph: MapGraph, record: Record, joint: FloatArray) -> list[PoseEstimate]:
     """The poses inside a submap on the joined skeleton; ``joint`` (12, 12) of its start and end node."""
     T_start, T_end = graph.poses[record.start], graph.poses[record.end]
     T_inverse = invert_transform(T_start)
     correction = boxminus(T_inverse @ T_end, record.submap.end_pose)
     J_inverse, J_end = compose_jacobians(T_inverse, T_end)
     D = np.concatenate([J_inverse @ inverse_jacobian(T_start), J_end], axis=1)
-    end_covariance = record.submap.covariance[:6, :6]
-    return [_hang(pose, record, T_start, correction, D, end_covariance, joint, widening) for pose in record.submap.path]
+    out = []
+    for pose in record.submap.path:
+        gain, remaining = _smoothing(record.submap, pose)
+        T = boxplus(pose.T, gain @ correction)
+        J_start, J_pose = compose_jacobians(T_start, T)
+        J = J_pose @ gain @ D
+        J[:, :6] += J_start
+        covariance = J @ joint @ J.T + J_pose @ remaining @ J_pose.T
+        out.append(PoseEstimate(pose.stamp_ns, T_start @ T, 0.5 * (covariance + covariance.T)))
+    return out
 
 
-def _hang(
-    pose: PoseEstimate,
-    record: Record,
-    T_start: FloatArray,
-    correction: FloatArray,
-    D: FloatArray,
-    end_covariance: FloatArray,
-    joint: FloatArray,
-    widening: FloatArray,
-) -> PoseEstimate:
-    # The rest of the way to the end adds noise of its own: cov(pose, end) = P A^T with A the lever arm of what is left.
-    A = np.eye(6)
-    A[:3, 3:] = -skew(record.submap.end_pose[:3, 3] - pose.T[:3, 3])
-    gain = np.linalg.solve(end_covariance, A @ pose.covariance).T
-    T = boxplus(pose.T, gain @ correction)
-    remaining = _positive(pose.covariance - gain @ end_covariance @ gain.T)
-    J_start, J_pose = compose_jacobians(T_start, T)
-    J = J_pose @ gain @ D
-    J[:, :6] += J_start
-    covariance = J @ joint @ J.T + J_pose @ remaining @ J_pose.T + widening
-    return PoseEstimate(pose.stamp_ns, T_start @ T, 0.5 * (covariance + covariance.T))
+def _smoothing(submap: Submap, pose: PoseEstimate) -> tuple[FloatArray, FloatArray]:
+    """Gain (6, 6) by which a better end corrects a pose of the path, and the covariance (6, 6) of what it leaves.
+
+    A pose errs by what it hands on to the end, and by the noise of its own frame's measurement, which the end does not
+    share. The first pose after the start shows the size of the latter: its covariance is that of two frames.
+    """
+    end_covariance = submap.covariance[:6, :6]
+    if pose.stamp_ns == submap.end_stamp_ns:
+        return np.eye(6), np.zeros((6, 6))
+    if pose.stamp_ns == submap.start_stamp_ns:
+        return np.zeros((6, 6)), np.zeros((6, 6))
+    handed_on = _positive(pose.covariance - 0.5 * submap.path[1].covariance)
+    A = np.eye(6)  # the lever arm of what is left of the way
+    A[:3, 3:] = -skew(submap.end_pose[:3, 3] - pose.T[:3, 3])
+    gain: FloatArray = np.linalg.solve(end_covariance, A @ handed_on).T
+    return gain, _positive(pose.covariance - gain @ end_covariance @ gain.T)
 
 
 def _positive(covariance: FloatArray) -> FloatArray:
@@ -132,14 +151,13 @@ def landmarks(global_map: GlobalMap) -> MapLandmarks:
     graph = global_map.graph
     covariances = np.zeros((len(graph.points), 3, 3))
     linked = np.zeros(len(graph.points), dtype=bool)
-    for assembled, marginals, widening in _components(global_map):
-        for i, reduced in zip(assembled.records, assembled.reduced, strict=True):
+    for part in _components(global_map):
+        for i, reduced in zip(part.assembled.records, part.assembled.reduced, strict=True):
             record = graph.records[i]
             rows = record.observations
-            covariances[rows] = (
-                _observation_covariances(graph, record, reduced, assembled, marginals) + widening[:3, :3]
-            )
-            linked[rows] = widening[0, 0] == 0.0
+            own = _observation_covariances(graph, record, reduced, part.assembled, part.marginals)
+            covariances[rows] = part.factor * own + part.widening[:3, :3]
+            linked[rows] = part.widening[0, 0] == 0.0
     ids, counts = np.unique(graph.landmark_of, return_counts=True)
     newest = np.empty(len(graph.points), dtype=np.int64)
     newest[graph.landmark_of] = np.arange(len(graph.points))

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from judging import errors, join
+from submap_world import Agent, circle, ring_world
+
+from sjsam_node.map_view import _smoothing
+from slam_core.geometry import FloatArray, make_transform
+from slam_core.types import PoseEstimate, Submap
+
+
+def mean_nees(claim: float) -> float:
+    """Mean NEES per degree of freedom of joined poses whose submaps claim ``claim`` times their true covariance."""
+    values = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        agent = Agent(ring_world(3.0, rng, 12.0), circle(3.0, 1.25), rng, "a")
+        submaps = [
+            replace(s, covariance=claim * s.covariance, path=tuple(replace(p, covariance=claim * p.covariance)
+                    for p in s.path)) for s in agent.submaps()
+        ]  # fmt: skip
+        joined, _ = join(submaps)
+        values.append(errors(joined, agent)[1].mean() / 6.0)
+    return float(np.mean(values))
+
+
+def test_submaps_that_are_too_sure_of_themselves_give_a_map_that_is_not() -> None:
+    assert mean_nees(0.25) == pytest.approx(mean_nees(1.0), rel=0.35)
+
+
+def walk(steps: int, frame_noise: FloatArray, step_noise: FloatArray) -> Submap:
+    """A submap on the spot: each pose errs by its own frame's noise, the first frame's, and a random walk."""
+    covariances = [np.zeros((6, 6))] + [2.0 * frame_noise + k * step_noise for k in range(1, steps + 1)]
+    path = tuple(PoseEstimate(k, np.eye(4), P) for k, P in enumerate(covariances))
+    return Submap(
+        "a", 0, 0, steps, np.eye(4), np.empty((0, 3)), covariances[-1], np.empty(0, np.int64), np.empty(0, np.int32),
+        np.empty((0, 8), np.float32), path,
+    )  # fmt: skip
+
+
+def test_a_pose_is_corrected_by_the_end_only_as_far_as_the_two_share_errors(rng: np.random.Generator) -> None:
+    A = rng.normal(size=(6, 6))
+    frame_noise, step_noise = A @ A.T + np.eye(6), np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    submap = walk(5, frame_noise, step_noise)
+    for k in (1, 3):
+        gain, remaining = _smoothing(submap, submap.path[k])
+        shared = frame_noise + (k - 0.5) * step_noise  # half of the first step counts as noise of its frame
+        expected = shared @ np.linalg.inv(submap.covariance[:6, :6])
+        assert np.allclose(gain, expected)
+        assert np.allclose(remaining, submap.path[k].covariance - expected @ shared.T)
+
+
+def test_the_ends_of_a_submap_are_the_skeleton_itself() -> None:
+    submap = walk(4, np.eye(6), 0.1 * np.eye(6))
+    for pose, gain in ((submap.path[0], np.zeros((6, 6))), (submap.path[-1], np.eye(6))):
+        found, remaining = _smoothing(submap, pose)
+        assert np.array_equal(found, gain)
+        assert not remaining.any()
+
+
+def test_a_correction_turns_about_the_lever_arm_of_what_is_left_of_the_way() -> None:
+    submap = walk(4, 1e-9 * np.eye(6), np.eye(6))
+    moved = make_transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    submap = replace(submap, end_pose=moved, path=(*submap.path[:-1], replace(submap.path[-1], T=moved)))
+    gain, _ = _smoothing(submap, submap.path[2])
+    lever = np.eye(6)
+    lever[1, 5], lever[2, 4] = 1.0, -1.0  # turns about z and y move a point 1 m ahead
+    assert gain @ submap.covariance[:6, :6] == pytest.approx(1.5 * lever.T)
