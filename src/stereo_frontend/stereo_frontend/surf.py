@@ -95,6 +95,6 @@ class SurfDetector:
         hessian_octaves(integral, self._octaves)
         parts = []
         for octave, layers in enumerate(self._octaves):
-            number = find_maxima(layers, octave, np.float32(threshold), self._found)
+            number = find_maxima(integral, layers, octave, np.float32(threshold), self._found)
             parts.append(self._found[:number].copy())
         return np.concatenate(parts) if parts else self._found[:0].copy()

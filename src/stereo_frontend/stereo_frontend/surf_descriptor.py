@@ -120,7 +120,7 @@ def _dominant_direction(lattice, inside, line):  # type: ignore[no-untyped-def]
             x += bins[i, 0]
             y += bins[i, 1]
         if x * x + y * y > best:
-            best, best_x, best_y = x * x + y * y, x, y
+            best, best_x, best_y = float(x * x + y * y), float(x), float(y)
     return np.arctan2(best_y, best_x)
 
 
