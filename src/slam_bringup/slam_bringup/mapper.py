@@ -1,9 +1,13 @@
-"""The filters of all agents and the one map that their submaps are joined into."""
+"""The filters of all agents and the one map that their submaps are joined into.
+
+Joining runs on a thread of its own, submap after submap: no filter waits for the map, which it does not need.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 from ekf_slam_node.results import EkfResult, TrackingState
@@ -50,7 +54,10 @@ class Mapper:
         self._filters = {agent: EkfSlam(replace(config.ekf_slam, agent=agent), T) for agent, T in T_rig_optical.items()}
         self.records = {agent: AgentRecord() for agent in T_rig_optical}
         self.reports: list[JoinReport] = []
+        """One per submap joined, complete after :meth:`finish`."""
         self.global_map = GlobalMap(config.sjsam)
+        self._joiner = ThreadPoolExecutor(1, thread_name_prefix="joining")
+        self._joins: list[Future[JoinReport]] = []
 
     def process(self, item: FilterInput) -> None:
         """One step of one agent's filter, and of the map where that finished a submap."""
@@ -68,9 +75,14 @@ class Mapper:
             self._join(result.submaps)
 
     def finish(self) -> None:
-        """Close the open submaps."""
+        """Close the open submaps and wait until all are joined."""
         for ekf in self._filters.values():
             self._join(ekf.finish())
+        self.reports += [join.result() for join in self._joins]
+
+    def stop(self) -> None:
+        """End the thread that joins, at the latest after the submap it is at."""
+        self._joiner.shutdown(cancel_futures=True)
 
     def rejections(self) -> dict[str, int]:
         """What all filters and the map rejected, by reason."""
@@ -80,6 +92,8 @@ class Mapper:
         return dict(sorted(total.items()))
 
     def _join(self, submaps: Iterable[Submap]) -> None:
-        for submap in submaps:
-            with self._times.measure("sjsam"):
-                self.reports.append(self.global_map.add(submap))
+        self._joins += [self._joiner.submit(self._add, submap) for submap in submaps]
+
+    def _add(self, submap: Submap) -> JoinReport:
+        with self._times.measure("sjsam"):
+            return self.global_map.add(submap)

@@ -3,7 +3,7 @@ r"""The chain of the launch file without ROS: the same classes, called frame by 
     readings of a bag -> depth -> features ----------> EKF-SLAM -> submaps -> SJSAM -> trajectory and map
                            \-> scan odometry (optional) --^
 
-Images and filter run on two threads; each stage keeps its own order, so the result does not depend on that.
+Images, filter and joining run on three threads; each stage keeps its own order, so the result does not depend on that.
 """
 
 from __future__ import annotations
@@ -64,9 +64,12 @@ def run_bag(
     with SensorBag(path) as bag:
         eyes = {agent: AgentEyes(config, bag.sensors[agent], odometry != "none", times) for agent in bag.agents}
         mapping = Mapper(config, {agent: e.T_rig_optical for agent, e in eyes.items()}, times)
-        for item in _ahead(_filter_inputs(bag, eyes, on_reading)):
-            mapping.process(item)
-        mapping.finish()
+        try:
+            for item in _ahead(_filter_inputs(bag, eyes, on_reading)):
+                mapping.process(item)
+            mapping.finish()
+        finally:
+            mapping.stop()
         wall_s = time.perf_counter() - start
         agents = _agent_results(bag, mapping)
         with times.measure("dense model"):
