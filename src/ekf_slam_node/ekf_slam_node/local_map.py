@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ekf_slam_node.candidates import Candidates
+from ekf_slam_node.candidates import Candidates, squared_distances
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.covariance import IndexArray
 from ekf_slam_node.ekf import Ekf, UpdateReport
@@ -110,7 +110,7 @@ class LocalMap:
         z, variance = frame.z[sight.columns], frame.variance[sight.columns]
         S = self.ekf.innovation_blocks(seen, sight.slots, variance)
         innovation = self.ekf.innovation(z, seen)
-        distance = np.einsum("ni,ni->n", innovation, np.linalg.solve(S, innovation[:, :, None])[:, :, 0])
+        distance = squared_distances(innovation, S)
         good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > 0.05))
         report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good])
         return report, sight.select(good)

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from ekf_slam_node.candidates import Candidates, innovation_covariance, predict, squared_distances
+from ekf_slam_node.candidates import Candidates
 from ekf_slam_node.models import Frame, rig_points
+from ekf_slam_node.pair_kernels import PairErrors, gated, normal_equations, pair_errors
 from slam_core.geometry import FloatArray, boxplus, invert_transform
 from slam_core.rigid_alignment import umeyama
 
@@ -119,23 +120,24 @@ def refine_motion(
     """
     covariance, excess, trusted = np.eye(6), np.ones(3), np.ones(3)
     inliers = np.zeros(len(candidates), dtype=bool)
+    c = frame.camera
+    lens = np.array([c.fx, c.fy, c.cx, c.cy])
+    pairs = PairErrors.room(len(candidates))
     for step in range(iterations):
-        seen = predict(candidates, T, T_rig_optical, frame)
-        S = innovation_covariance(seen, candidates, None)
-        S[:, np.arange(3), np.arange(3)] += frame.variance
-        error = frame.z - seen.z
-        scaled = S * np.sqrt(np.outer(trusted, trusted))
-        updated = (squared_distances(error, scaled) < gate * max(1.0, 4.0 - step)) & (seen.depth > 0.05)
+        pair_errors(
+            candidates.points, candidates.covariances, frame.z, frame.variance, T @ T_rig_optical, T[:3, 3], lens,
+            pairs.error, pairs.S, pairs.J, pairs.depth,
+        )  # fmt: skip
+        root = np.sqrt(trusted)
+        updated = gated(pairs.error, pairs.S, pairs.depth, root, gate * max(1.0, 4.0 - step))
         if updated.sum() < 4:
             return None
         if step > 3 and np.array_equal(updated, inliers):
             break
         inliers = updated
-        excess = _excess(error[inliers], S[inliers])
+        excess = _excess(pairs.error[inliers], pairs.S[inliers])
         trusted = np.maximum(excess, 1.0)
-        weighted = np.linalg.solve(S[inliers] * np.sqrt(np.outer(trusted, trusted)), seen.J_pose[inliers])
-        information = np.einsum("nki,nkj->ij", seen.J_pose[inliers], weighted)
-        gradient = np.einsum("nki,nk->i", weighted, error[inliers])
+        information, gradient = normal_equations(pairs.error, pairs.S, pairs.J, inliers, np.sqrt(trusted))
         try:
             covariance = np.linalg.inv(information)
         except np.linalg.LinAlgError:

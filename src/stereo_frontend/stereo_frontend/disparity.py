@@ -80,6 +80,12 @@ class RefinedDisparity:
         """Which alignments are trusted."""
         return np.isfinite(self.disparity)
 
+    @staticmethod
+    def joined(first: RefinedDisparity, second: RefinedDisparity) -> RefinedDisparity:
+        """The alignments of both, one after the other."""
+        names = [field.name for field in dataclasses.fields(first)]
+        return RefinedDisparity(*(np.concatenate([getattr(first, n), getattr(second, n)]) for n in names))
+
 
 def refine_disparity(
     left: ByteArray, right: ByteArray, uv_left: Float32Array, u_right: Float32Array, config: DisparityConfig

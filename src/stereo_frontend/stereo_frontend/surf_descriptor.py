@@ -115,12 +115,12 @@ def _dominant_direction(lattice, inside, line):  # type: ignore[no-untyped-def]
     bins[DIRECTIONS:] = bins[:_WINDOW]
     best, best_x, best_y = -1.0, 1.0, 0.0
     for start in range(DIRECTIONS):
-        x, y = 0.0, 0.0
+        sum_x, sum_y = 0.0, 0.0
         for i in range(start, start + _WINDOW):
-            x += bins[i, 0]
-            y += bins[i, 1]
-        if x * x + y * y > best:
-            best, best_x, best_y = float(x * x + y * y), float(x), float(y)
+            sum_x += bins[i, 0]
+            sum_y += bins[i, 1]
+        if sum_x * sum_x + sum_y * sum_y > best:
+            best, best_x, best_y = sum_x * sum_x + sum_y * sum_y, sum_x, sum_y
     return np.arctan2(best_y, best_x)
 
 
