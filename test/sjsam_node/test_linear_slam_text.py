@@ -17,7 +17,7 @@ from slam_core.geometry import euler_from_rotation, rotation_from_euler
 @pytest.mark.parametrize(
     ("name", "optimum"), [("DLR_200_local_maps", 11163.643405947), ("8240_data_50_local_maps", 458.154366004)]
 )
-@pytest.mark.parametrize("solver", ["cholmod", "superlu"])
+@pytest.mark.parametrize("solver", ["multifrontal", "cholmod", "superlu"])
 def test_public_sets_reach_their_optimum_from_the_chained_start(
     data_dir: Path, name: str, optimum: float, solver: str
 ) -> None:

@@ -14,14 +14,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from sjsam_node import kernels
 from sjsam_node.layout import Layout, make_layout
 from sjsam_node.problem import FlatMaps, State
+from slam_core.block_pattern import IntArray
 from slam_core.geometry import FloatArray
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
-from slam_core.sparse_cholesky import IntArray, InverseEntries, SparseCholesky, ancestors
+from slam_core.sparse_cholesky import Entries, SparseCholesky
 
 
 class JoiningProblem:
@@ -59,9 +59,7 @@ class JoiningProblem:
         self.factor = SparseCholesky(self.layout.pattern, backend)
         self._sizes = state.model_dimensions
         pattern = self.layout.pattern
-        self._diagonal = np.nonzero(pattern.indices == pattern.columns)[0]
-        self._values = np.zeros(len(pattern.indices))
-        self._gradient = np.zeros(pattern.n)
+        self._values, self._gradient = np.zeros(int(pattern.value_ptr[-1])), np.zeros(pattern.n)
         self._factorized: State | None = None
 
     @property
@@ -86,8 +84,18 @@ class JoiningProblem:
         """Damped step, or None where the matrix is not positive definite."""
         self._factorized = None
         values = self._values.copy()
-        values[self._diagonal] *= 1.0 + damping
+        values[self.layout.pattern.diagonal] *= 1.0 + damping
         return self.factor.solve(-self._gradient) if self.factor.factorize(values) else None
+
+    def gradient(self, state: State) -> FloatArray:
+        """Gradient alone at ``state``."""
+        self._gradient[:] = 0.0
+        kernels.joint_gradient(self.model, self.maps, *_arrays(state), self.layout.scatter, self._gradient)
+        return self._gradient.copy()
+
+    def resolve(self, gradient: FloatArray) -> FloatArray:
+        """Step for this gradient with the last factor."""
+        return self.factor.solve(-gradient)
 
     def retract(self, state: State, step: FloatArray) -> State:
         """The state moved by ``step``."""
@@ -100,7 +108,7 @@ class JoiningProblem:
         return levenberg_marquardt(self, state, config)
 
     def columns(self, state: State, poses: IntArray) -> FloatArray:
-        """Joint covariance of a few poses, linearised at ``state``, by solving for their columns."""
+        """Joint covariance of a few poses, linearised at ``state``."""
         self._factorize_at(state)
         return solved_covariance(self.factor, self.scalars(poses, np.empty(0, dtype=np.int64)))
 
@@ -109,20 +117,9 @@ class JoiningProblem:
         return variable_scalars(self.layout, self._sizes, poses, landmarks)
 
     def marginal_information(self, state: State, scalars: IntArray) -> FloatArray:
-        """Marginal information matrix of some variables, at ``state``.
-
-        Only what is eliminated after one of them, because of them, has a say: their ancestors in the elimination tree.
-        """
+        """Marginal information matrix of some variables, at ``state``."""
         self._factorize_at(state)
-        factor, order = self.factor.lower()
-        position = np.empty_like(order)
-        position[order] = np.arange(len(order))
-        path = ancestors(factor.indptr, factor.indices, position[scalars])
-        lower = factor[:, path][path].toarray()
-        unit = np.zeros((len(path), len(scalars)))
-        unit[np.searchsorted(path, position[scalars]), np.arange(len(scalars))] = 1.0
-        root = scipy.linalg.solve_triangular(lower, unit, lower=True)
-        information = np.linalg.inv(root.T @ root)
+        information = np.linalg.inv(self.factor.inverse_block(scalars))
         return np.asarray(0.5 * (information + information.T))
 
     def marginals(self, state: State) -> Marginals:
@@ -156,7 +153,7 @@ class Marginals:
     layout: Layout
     dimensions: tuple[int, int]
     factor: SparseCholesky
-    entries: InverseEntries
+    entries: Entries
 
     def scalars(self, poses: Sequence[int] | IntArray, landmarks: Sequence[int] | IntArray) -> IntArray:
         """Scalar unknowns of these poses and landmarks, in order; -1 for what is fixed."""
@@ -165,7 +162,7 @@ class Marginals:
     def covariance(self, poses: Sequence[int] | IntArray, landmarks: Sequence[int] | IntArray = ()) -> FloatArray:
         """Joint covariance of any poses and landmarks.
 
-        Inside one local map it is read from the factor's pattern (Takahashi); for others columns are solved for.
+        Inside one local map it is read from the factor's pattern (Takahashi); for others from the factor.
         """
         scalars = self.scalars(poses, landmarks)
         free = np.nonzero(scalars >= 0)[0]
@@ -179,13 +176,10 @@ class Marginals:
 
 
 def solved_covariance(factor: SparseCholesky, scalars: IntArray) -> FloatArray:
-    """Covariance of any unknowns by solving for their columns; zero where ``scalars`` is -1 (fixed)."""
+    """Covariance of any unknowns from the factor; zero where ``scalars`` is -1 (fixed)."""
     free = np.nonzero(scalars >= 0)[0]
-    unit = np.zeros((factor.pattern.n, len(free)))
-    unit[scalars[free], np.arange(len(free))] = 1.0
-    block = factor.solve(unit)[scalars[free]]
     out = np.zeros((len(scalars), len(scalars)))
-    out[np.ix_(free, free)] = 0.5 * (block + block.T)
+    out[np.ix_(free, free)] = factor.inverse_block(scalars[free])
     return out
 
 

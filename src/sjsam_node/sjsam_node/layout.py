@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sjsam_node.problem import FlatMaps, pointers
-from slam_core.sparse_cholesky import IntArray, Pattern, elimination_order
+from sjsam_node.problem import FlatMaps
+from slam_core.block_pattern import BlockPattern, IntArray, pointers
+from slam_core.sparse_cholesky import elimination_order
 
 
 class Scatter(NamedTuple):
@@ -46,7 +47,7 @@ class Layout:
 
     pose_offset: IntArray
     landmark_offset: IntArray
-    pattern: Pattern
+    pattern: BlockPattern
     scatter: Scatter
 
 
@@ -171,7 +172,7 @@ def _order(of_node: IntArray, widths: IntArray, a: IntArray, b: IntArray, last: 
     return _Groups(of_node, width, start, rank)
 
 
-def _pattern(groups: _Groups, a: IntArray, b: IntArray) -> tuple[Pattern, IntArray, IntArray]:
+def _pattern(groups: _Groups, a: IntArray, b: IntArray) -> tuple[BlockPattern, IntArray, IntArray]:
     """Block pattern of all pairs; for each pair the position of its first entry and the distance of its columns."""
     count = len(groups.width)
     free = (groups.width[a] > 0) & (groups.width[b] > 0)
@@ -179,21 +180,10 @@ def _pattern(groups: _Groups, a: IntArray, b: IntArray) -> tuple[Pattern, IntArr
     key, inverse = np.unique((column * count + row)[free], return_inverse=True)
     width = np.empty(count, dtype=np.int64)
     width[groups.rank] = groups.width
-    start = pointers(width)
-    block_column, block_row = key // count, key % count
-    heights = width[block_row]
-    above = pointers(heights)
-    column_ptr = np.searchsorted(block_column, np.arange(count + 1))
-    height = above[column_ptr[1:]] - above[column_ptr[:-1]]
-    base = pointers(height * width)
+    pattern = BlockPattern(width, np.searchsorted(key // count, np.arange(count + 1)), key % count)
     position = np.full(len(a), -1, dtype=np.int64)
-    position[free] = (base[block_column] + above[:-1] - above[column_ptr[block_column]])[inverse.ravel()]
-    rows = np.repeat(start[block_row] - above[:-1], heights) + np.arange(above[-1])
-    # Every scalar column of a block column repeats the rows of that block column.
-    scalar_height, scalar_first = np.repeat(height, width), np.repeat(above[column_ptr[:-1]], width)
-    indptr = pointers(scalar_height)
-    indices = rows[np.arange(indptr[-1]) - np.repeat(indptr[:-1] - scalar_first, scalar_height)]
-    return Pattern(int(start[-1]), indptr, indices), position, height[column]
+    position[free] = (pattern.value_ptr[key // count] + pattern.row_offset)[inverse.ravel()]
+    return pattern, position, pattern.height[column]
 
 
 def _offset_in_group(of_node: IntArray, widths: IntArray) -> IntArray:

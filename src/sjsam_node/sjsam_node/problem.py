@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sjsam_node import kernels
+from slam_core.block_pattern import IntArray, pointers
 from slam_core.geometry import FloatArray
-from slam_core.sparse_cholesky import IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +77,6 @@ def flatten(maps: Sequence[LocalMap]) -> FlatMaps:
         pointers([m.information.size for m in maps]),
         _joined([m.information.ravel() for m in maps], np.float64),
     )
-
-
-def pointers(counts: Sequence[int] | IntArray) -> IntArray:
-    """Where each of consecutive runs starts: 0 and the running sums of ``counts``, shape (n + 1,)."""
-    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64)
 
 
 def _joined(parts: Sequence[Any], dtype: type) -> Any:

@@ -19,7 +19,7 @@ from sjsam_node.problem import LocalMap, State, block_rows, flatten
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, euler_from_rotation, rotation_from_euler
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
-from slam_core.sparse_cholesky import IntArray
+from slam_core.sparse_cholesky import BACKENDS, IntArray
 
 ROWS = ("joint", "block")
 
@@ -29,7 +29,7 @@ class TextJoiningConfig(Config):
     """How text submaps are joined."""
 
     rows: str = parameter("joint", "a submap as one Gaussian, or pose and landmarks each on their own", choices=ROWS)
-    solver: str = parameter("auto", "sparse solver", choices=("auto", "cholmod", "superlu"))
+    solver: str = parameter("auto", "sparse solver", choices=BACKENDS)
     growth: float = parameter(0.08, "share of maps added per step of incremental joining", minimum=0.001, maximum=1.0)
     step_iterations: int = parameter(4, "iterations per step of incremental joining", minimum=1)
     optimizer: LevenbergMarquardtConfig = group(LevenbergMarquardtConfig)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import scipy.linalg
@@ -18,6 +18,11 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 
 State = TypeVar("State")
+
+_NEAR = 0.2
+"""A factor is used again from where a step promised less than this share of the cost: close to the optimum."""
+_REUSE_RATE = 0.25
+"""And as long as each step promises less than this share of what the one before did."""
 
 
 def whitening(covariance: FloatArray) -> FloatArray:
@@ -70,6 +75,19 @@ class LeastSquaresProblem(Protocol[State]):
         """``state`` moved by ``step``."""
 
 
+@runtime_checkable
+class ReusableProblem(LeastSquaresProblem[State], Protocol[State]):
+    """A problem whose last factor can be used at other states: what is left of a step once the factor is there costs
+    a fraction of a new one.
+    """
+
+    def gradient(self, state: State) -> FloatArray:
+        """``J^T r`` at ``state``, exactly, with the factor left as it is."""
+
+    def resolve(self, gradient: FloatArray) -> FloatArray:
+        """Step for this gradient with the last factor."""
+
+
 @dataclass(frozen=True, eq=False)
 class LeastSquaresResult:
     """Cost before and after, linearisations done, whether the tolerance was reached, and why it stopped otherwise."""
@@ -88,12 +106,18 @@ def levenberg_marquardt(
 
     A step is taken only if it lowers the cost; the damping follows the ratio of true to promised decrease
     (Nielsen 1999). The Newton decrement ``-g^T step`` tells how far the optimum still is, which is what the tolerance
-    is on.
+    is on. Near the optimum steps with the last factor are tried first (simplified Newton).
     """
     config = config or LevenbergMarquardtConfig()
     initial = cost = problem.cost(state)
-    damping, growth = config.initial_damping, 2.0
+    damping, growth, decrement = config.initial_damping, 2.0, np.inf
     for iteration in range(1, config.max_iterations + 1):
+        reused = _reuse(problem, state, cost, decrement) if decrement < _NEAR * cost else None
+        if reused is not None:
+            state, cost, decrement = reused
+            if decrement <= config.relative_tolerance * max(cost, 1e-9):
+                return state, LeastSquaresResult(initial, cost, iteration, True, "")
+            continue
         gradient = problem.linearize(state)
         while True:
             step = problem.solve(damping)
@@ -114,3 +138,19 @@ def levenberg_marquardt(
             return state, LeastSquaresResult(initial, cost, iteration, True, "")
         damping, growth = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), config.initial_damping), 2.0
     return state, LeastSquaresResult(initial, cost, config.max_iterations, False, "iteration limit")
+
+
+def _reuse(
+    problem: LeastSquaresProblem[State], state: State, cost: float, last_decrement: float
+) -> tuple[State, float, float] | None:
+    """State, cost and decrement after a step with the last factor; None where that is no quick way any more."""
+    if not isinstance(problem, ReusableProblem):
+        return None
+    gradient = problem.gradient(state)
+    step = problem.resolve(gradient)
+    decrement = float(-gradient @ step)
+    if not decrement <= _REUSE_RATE * last_decrement:
+        return None
+    candidate = problem.retract(state, step)
+    candidate_cost = problem.cost(candidate)
+    return (candidate, candidate_cost, decrement) if candidate_cost <= cost else None

@@ -1,11 +1,10 @@
-"""Sparse Cholesky factors of symmetric positive definite matrices: order, factor, solve, and exact entries of the
-inverse.
+"""Sparse Cholesky factors of symmetric positive definite block matrices: order, factor, solve, entries of the inverse.
 
-Backends, chosen by name: ``cholmod`` (supernodal, from the cvxopt wheel; Chen, Davis, Hager and Rajamanickam 2008),
-``superlu`` (from SciPy, always there) and ``lapack`` (dense); ``auto`` takes LAPACK for a matrix that is nearly full,
-as small maps are, and else the first of the others that is there. Fill is reduced beforehand by
-:func:`elimination_order` on the graph of the *blocks*, which is much smaller than the matrix; CHOLMOD may improve on
-it.
+Backends, chosen by name: ``multifrontal`` (:mod:`slam_core.multifrontal`, which ``auto`` takes), ``cholmod``
+(supernodal, from the cvxopt wheel; Chen, Davis, Hager and Rajamanickam 2008) and ``superlu`` (from SciPy). The general
+libraries spend as long on the analysis of single unknowns as on the factor, which the blocks spare; they stay as
+oracles and for comparison. Fill is reduced beforehand by :func:`elimination_order` on the graph of the blocks; CHOLMOD
+may improve on it.
 """
 
 from __future__ import annotations
@@ -16,13 +15,12 @@ from typing import Any, Protocol
 
 import numba
 import numpy as np
-import numpy.typing as npt
-import scipy.linalg
 import scipy.sparse
-import scipy.sparse.csgraph
 import scipy.sparse.linalg
 
+from slam_core.block_pattern import BlockPattern, IntArray
 from slam_core.geometry import FloatArray
+from slam_core.multifrontal import Multifrontal
 
 try:
     import cvxopt
@@ -31,14 +29,13 @@ try:
 except ImportError:  # pragma: no cover - the wheel is a requirement; a distribution without it still runs
     cvxopt = None
 
-IntArray = npt.NDArray[np.int64]
-BACKENDS = ("auto", "cholmod", "superlu", "lapack")
-_FULL = 0.25
-"""Share of stored entries from which a dense factor takes less time than a sparse one."""
+__all__ = ["BACKENDS", "Entries", "IntArray", "SparseCholesky", "available_backend", "elimination_order", "takahashi"]
+
+BACKENDS = ("auto", "multifrontal", "cholmod", "superlu")
 
 
 def available_backend(name: str) -> str:
-    """The backend that ``name`` stands for here: ``auto`` takes CHOLMOD where cvxopt is installed.
+    """The backend that ``name`` stands for here.
 
     Raises
     ------
@@ -49,21 +46,23 @@ def available_backend(name: str) -> str:
         raise ValueError(f"solver backend must be one of {', '.join(BACKENDS)}, got {name!r}")
     if name == "cholmod" and cvxopt is None:
         raise ValueError("solver backend 'cholmod' needs the package cvxopt")
-    return name if name != "auto" else ("superlu" if cvxopt is None else "cholmod")
+    return "multifrontal" if name == "auto" else name
 
 
 def elimination_order(count: int, rows: IntArray, columns: IntArray) -> IntArray:
     """Fill-reducing order of the ``count`` nodes of an undirected graph with edges (rows[i], columns[i]).
 
-    Approximate minimum degree (Amestoy, Davis and Duff 1996) where cvxopt is there, reverse Cuthill-McKee otherwise.
-    Entry ``k`` of the result is the node that is eliminated k-th.
+    Approximate minimum degree (Amestoy, Davis and Duff 1996) where cvxopt is there, SuperLU's multiple minimum degree
+    otherwise. Entry ``k`` of the result is the node that is eliminated k-th.
     """
-    if cvxopt is None:
-        graph = scipy.sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), (count, count)).tocsr()
-        return np.asarray(scipy.sparse.csgraph.reverse_cuthill_mckee(graph + graph.T, True), dtype=np.int64)
     low, high = np.minimum(rows, columns), np.maximum(rows, columns)
     # Sorted and unique: cvxopt inserts entries that come otherwise one by one.
     edges = np.unique(np.concatenate([low * count + high, np.arange(count, dtype=np.int64) * (count + 1)]))
+    if cvxopt is None:
+        half = scipy.sparse.coo_matrix((np.ones(len(edges)), (edges % count, edges // count)), (count, count))
+        graph = (half + half.T + 2 * count * scipy.sparse.eye(count)).tocsc()
+        place = scipy.sparse.linalg.splu(graph, "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True}).perm_c
+        return np.argsort(place).astype(np.int64)
     pattern = _spmatrix(count, edges % count, edges // count)
     return np.array(cvxopt.amd.order(pattern), dtype=np.int64).ravel()
 
@@ -72,22 +71,11 @@ def _spmatrix(n: int, rows: IntArray, columns: IntArray) -> Any:
     return cvxopt.spmatrix(1.0, cvxopt.matrix(rows), cvxopt.matrix(columns), (n, n))
 
 
-@dataclass(frozen=True, eq=False)
-class Pattern:
-    """Lower triangle of a symmetric matrix in compressed columns: ``indptr`` (n + 1,), ``indices`` (nnz,) rows
-    ascending.
+class Entries(Protocol):
+    """Entries of an inverse inside a factor's pattern."""
 
-    Entries above the diagonal may be stored (whole diagonal blocks are simpler to fill); they are ignored.
-    """
-
-    n: int
-    indptr: IntArray
-    indices: IntArray
-
-    @property
-    def columns(self) -> IntArray:
-        """Column of every stored entry, shape (nnz,)."""
-        return np.repeat(np.arange(self.n, dtype=np.int64), np.diff(self.indptr))
+    def block(self, variables: IntArray) -> FloatArray:
+        """Dense block (k, k) of the inverse for ``variables``; ``KeyError`` where a pair is outside the pattern."""
 
 
 class _Backend(Protocol):
@@ -95,18 +83,51 @@ class _Backend(Protocol):
 
     def solve(self, rhs: FloatArray) -> FloatArray: ...
 
-    def lower(self) -> tuple[scipy.sparse.csc_matrix, IntArray]: ...
+    def inverse_block(self, variables: IntArray) -> FloatArray: ...
+
+    def inverse_entries(self) -> Entries: ...
 
 
-class _Cholmod:
-    def __init__(self, pattern: Pattern) -> None:
-        self._matrix = _spmatrix(pattern.n, pattern.indices, pattern.columns)
+class _Library:
+    """What the backends from libraries have in common: they know single unknowns only."""
+
+    def __init__(self, pattern: BlockPattern) -> None:
+        self._n = pattern.n
+        rows, columns = pattern.scalar_entries()
+        self._kept = np.nonzero(rows >= columns)[0]
+        self._rows, self._columns = rows[self._kept], columns[self._kept]
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        raise NotImplementedError
+
+    def lower(self) -> tuple[scipy.sparse.csc_matrix, IntArray]:
+        """``L`` and ``p`` with ``A[p][:, p] = L L^T`` of the last factor."""
+        raise NotImplementedError
+
+    def inverse_block(self, variables: IntArray) -> FloatArray:
+        unit = np.zeros((self._n, len(variables)))
+        unit[variables, np.arange(len(variables))] = 1.0
+        return self.solve(unit)[variables]
+
+    def inverse_entries(self) -> Entries:
+        factor, order = self.lower()
+        indptr, indices = factor.indptr.astype(np.int64), factor.indices.astype(np.int64)
+        values = takahashi(indptr, indices, factor.data)
+        position = np.empty_like(order)
+        position[order] = np.arange(len(order))
+        return InverseEntries(indptr, indices, values, position)
+
+
+class _Cholmod(_Library):
+    def __init__(self, pattern: BlockPattern) -> None:
+        super().__init__(pattern)
+        self._matrix = _spmatrix(pattern.n, self._rows, self._columns)
         self._natural = cvxopt.matrix(np.arange(pattern.n, dtype=np.int64))
         self._factor = cvxopt.cholmod.symbolic(self._matrix, self._natural)
         self._exported = False
 
     def factorize(self, values: FloatArray) -> bool:
-        self._matrix.V = cvxopt.matrix(values)
+        self._matrix.V = cvxopt.matrix(values[self._kept])
         return self._refactorize()
 
     def _refactorize(self) -> bool:
@@ -129,25 +150,22 @@ class _Cholmod:
     def lower(self) -> tuple[scipy.sparse.csc_matrix, IntArray]:
         if self._exported:
             self._refactorize()
-        n = self._matrix.size[0]
-        permutation = cvxopt.matrix(np.arange(n, dtype=np.float64))
+        permutation = cvxopt.matrix(np.arange(self._n, dtype=np.float64))
         cvxopt.cholmod.solve(self._factor, permutation, sys=7)
         order = np.array(permutation).ravel().astype(np.int64)
         factor = cvxopt.cholmod.getfactor(self._factor)
         self._exported = True
         indptr, indices, data = (np.array(part).ravel() for part in factor.CCS)
-        return scipy.sparse.csc_matrix((data, indices, indptr), (n, n)), order
+        return scipy.sparse.csc_matrix((data, indices, indptr), (self._n, self._n)), order
 
 
-class _SuperLu:
-    def __init__(self, pattern: Pattern) -> None:
-        rows, columns = pattern.indices, pattern.columns
-        self._kept = np.nonzero(rows >= columns)[0]
-        rows, columns = rows[self._kept], columns[self._kept]
+class _SuperLu(_Library):
+    def __init__(self, pattern: BlockPattern) -> None:
+        super().__init__(pattern)
+        rows, columns = self._rows, self._columns
         self._mirrored = np.nonzero(rows > columns)[0]
         self._rows = np.concatenate([rows, columns[self._mirrored]])
         self._columns = np.concatenate([columns, rows[self._mirrored]])
-        self._n = pattern.n
         self._factor: Any = None
 
     def factorize(self, values: FloatArray) -> bool:
@@ -175,30 +193,6 @@ class _SuperLu:
         return factor, order
 
 
-class _Lapack:
-    """Dense factor in place; only the lower triangle is read and written."""
-
-    def __init__(self, pattern: Pattern) -> None:
-        self._pattern = pattern
-        self._matrix = np.zeros((pattern.n, pattern.n), order="F")
-        self._at = pattern.columns * pattern.n + pattern.indices
-
-    def factorize(self, values: FloatArray) -> bool:
-        self._matrix[...] = 0.0
-        self._matrix.ravel(order="K")[self._at] = values
-        _, fault = scipy.linalg.lapack.dpotrf(self._matrix, lower=True, clean=False, overwrite_a=True)
-        return bool(fault == 0)
-
-    def solve(self, rhs: FloatArray) -> FloatArray:
-        return np.asarray(scipy.linalg.cho_solve((self._matrix, True), rhs, check_finite=False))
-
-    def lower(self) -> tuple[scipy.sparse.csc_matrix, IntArray]:
-        n = self._pattern.n
-        columns, rows = np.triu_indices(n)
-        indptr = np.concatenate([[0], np.cumsum(np.arange(n, 0, -1))])
-        return scipy.sparse.csc_matrix((self._matrix[rows, columns], rows, indptr), (n, n)), np.arange(n)
-
-
 class SparseCholesky:
     """Factor of matrices that share one sparsity pattern: the symbolic work is done once.
 
@@ -210,11 +204,9 @@ class SparseCholesky:
         One of :data:`BACKENDS`.
     """
 
-    def __init__(self, pattern: Pattern, backend: str = "auto") -> None:
+    def __init__(self, pattern: BlockPattern, backend: str = "auto") -> None:
         self.pattern = pattern
         self.backend = available_backend(backend)
-        if backend == "auto" and len(pattern.indices) > _FULL * pattern.n**2:
-            self.backend = "lapack"
         self._impl = _IMPLEMENTATIONS[self.backend](pattern)
 
     def factorize(self, values: FloatArray) -> bool:
@@ -225,22 +217,18 @@ class SparseCholesky:
         """``A^-1 rhs`` with the last factor; rhs (n,) or (n, k)."""
         return self._impl.solve(np.asarray(rhs, dtype=np.float64))
 
-    def lower(self) -> tuple[scipy.sparse.csc_matrix, IntArray]:
-        """``L`` and ``p`` with ``A[p][:, p] = L L^T`` of the last factor."""
-        return self._impl.lower()
+    def inverse_block(self, variables: IntArray) -> FloatArray:
+        """Dense block (k, k) of ``A^-1`` for any variables, with the last factor."""
+        block = self._impl.inverse_block(np.asarray(variables, dtype=np.int64))
+        return 0.5 * (block + block.T)
 
-    def inverse_entries(self) -> InverseEntries:
+    def inverse_entries(self) -> Entries:
         """Exact entries of ``A^-1`` inside the factor's pattern (Takahashi, Fagan and Chin 1973)."""
-        factor, order = self.lower()
-        indptr, indices = factor.indptr.astype(np.int64), factor.indices.astype(np.int64)
-        values = takahashi(indptr, indices, factor.data)
-        position = np.empty_like(order)
-        position[order] = np.arange(len(order))
-        return InverseEntries(indptr, indices, values, position)
+        return self._impl.inverse_entries()
 
 
-_IMPLEMENTATIONS: dict[str, Callable[[Pattern], _Backend]] = {
-    "cholmod": _Cholmod, "superlu": _SuperLu, "lapack": _Lapack,
+_IMPLEMENTATIONS: dict[str, Callable[[BlockPattern], _Backend]] = {
+    "multifrontal": Multifrontal, "cholmod": _Cholmod, "superlu": _SuperLu,
 }  # fmt: skip
 
 
@@ -312,18 +300,6 @@ def takahashi(indptr, indices, data):  # type: ignore[no-untyped-def]
             slot[rows[k]] = -1
         last = first
     return out
-
-
-def ancestors(indptr: IntArray, indices: IntArray, columns: IntArray) -> IntArray:
-    """These columns of a factor and all above them in its elimination tree, ascending (Liu 1990)."""
-    found: set[int] = set()
-    for column in columns.tolist():
-        while column not in found:
-            found.add(column)
-            if indptr[column + 1] - indptr[column] < 2:
-                break
-            column = int(indices[indptr[column] + 1])
-    return np.array(sorted(found), dtype=np.int64)
 
 
 @numba.njit(cache=True, nogil=True)
