@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from feature_world import PointWorld, room
+from scipy.stats import chi2
 
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.slam import EkfSlam
-from slam_core.evaluation import nees
+from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray, boxminus, invert_transform, skew, transform_points
 from slam_core.types import PoseEstimate, Submap
 
@@ -44,33 +45,58 @@ class SubmapErrors:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One run: errors of its submaps, NEES (k,) of the poses inside the first submap, NIS per degree of freedom."""
+    """One run: errors of its submaps, NEES (k,) of the poses inside the first submap, the sum of all NIS, its degrees
+    of freedom and the number of updates, error (6,) of the last pose of all and its covariance (6, 6).
+    """
 
     submaps: list[SubmapErrors]
     pose_nees: FloatArray
     nis: float
+    nis_dof: int
+    updates: int
+    end_error: FloatArray
+    end_covariance: FloatArray
+
+
+def mean_nis(runs: list[Run], gate: float, own_motion: bool) -> tuple[float, float, float]:
+    """Mean NIS per degree of freedom of all runs and its bounds (95 %).
+
+    What a gate lets through is a truncated chi-square: ``E[x | x < g] = n F_n+2(g) / F_n(g)`` for n degrees of
+    freedom. And in the six directions in which the motion since the last frame moves an update's innovations, those of
+    a rig that moves more smoothly than the filter's model may be as small as zero; of one that follows the model
+    (``own_motion``) they are not.
+    """
+    dof, updates = sum(run.nis_dof for run in runs), sum(run.updates for run in runs)
+    passed = float(chi2.cdf(gate, 5) / chi2.cdf(gate, 3))
+    low, high = anees_bounds(1, dof)
+    smooth = 0.0 if own_motion else 6.0 * updates / dof
+    return sum(run.nis for run in runs) / dof, low * passed * (1.0 - smooth), high * passed
 
 
 def simulate(
-    seed: int, config: EkfSlamConfig, make_poses: Callable[[np.random.Generator], list[FloatArray]], points: int = 1200
+    seed: int,
+    config: EkfSlamConfig,
+    make_poses: Callable[[np.random.Generator], list[FloatArray]],
+    make_world: Callable[[np.random.Generator], PointWorld] = room,
 ) -> Run:
-    """Run the estimator through a random room along the poses T_world_rig, 10 frames per second."""
+    """Run the estimator through a random world along the poses T_world_rig, 10 frames per second."""
     rng = np.random.default_rng(seed)
-    world, poses = room(rng, points), make_poses(rng)
+    world, poses = make_world(rng), make_poses(rng)
     slam = EkfSlam(config)
     names: dict[int, list[int]] = {}
     submaps: list[Submap] = []
-    nis, dof = 0.0, 0
+    nis, dof, updates = 0.0, 0, 0
     for k, T in enumerate(poses):
         features, index = world.features(T, k * STEP_NS, rng)
         result = slam.process(features)
         submaps += result.submaps
-        nis, dof = nis + result.nis, dof + result.nis_dof
+        nis, dof, updates = nis + result.nis, dof + result.nis_dof, updates + (result.nis_dof > 0)
         for landmark, feature in zip(result.landmark_ids, result.feature_index, strict=True):
             names.setdefault(int(landmark), []).append(int(index[feature]))
     submaps += slam.finish()
     errors = [_errors(submap, world, poses, names) for submap in submaps]
-    return Run(errors, _pose_nees(submaps[0].path, poses), nis / dof)
+    end = boxminus(invert_transform(poses[0]) @ poses[-1], result.pose.T)
+    return Run(errors, _pose_nees(submaps[0].path, poses), nis, dof, updates, end, result.pose.covariance)
 
 
 def _errors(submap: Submap, world: PointWorld, poses: list[FloatArray], names: dict[int, list[int]]) -> SubmapErrors:

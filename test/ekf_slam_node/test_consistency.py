@@ -9,8 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from feature_world import loop
-from monte_carlo import Run, seam_nees, simulate
+from feature_world import loop, wander
+from monte_carlo import Run, mean_nis, seam_nees, simulate
 
 from ekf_slam_node.config import EkfSlamConfig
 from slam_core.config import from_mapping
@@ -54,9 +54,22 @@ def test_submaps_are_as_wrong_as_they_say(independent: list[Run]) -> None:
     assert 0.9 < np.mean([s.landmark_nees for s in submaps]) / 3 < 1.1
 
 
-def test_innovations_are_not_larger_than_claimed(independent: list[Run]) -> None:
-    """Below one by what the gates cut off and by a rig that is smoother than its motion model."""
-    assert 0.9 < np.mean([run.nis for run in independent]) < 1.01
+def test_innovations_of_a_smooth_rig_are_as_large_as_claimed(independent: list[Run]) -> None:
+    value, low, high = mean_nis(independent, EkfSlamConfig().association.gate, own_motion=False)
+    assert low < value < high
+
+
+def test_innovations_of_a_rig_that_moves_as_the_model_says_are_as_large_as_claimed() -> None:
+    """Also tells whether pairs were chosen for their small errors: then it falls below the bounds."""
+    acceleration, first = np.repeat([0.5, 0.4], 3), np.repeat([0.3, 0.2], 3)
+    motion = {
+        "motion.sigma_acceleration": 0.5, "motion.sigma_angular_acceleration": 0.4,
+        "motion.sigma_initial_velocity": 0.3, "motion.sigma_initial_turn_rate": 0.2, "submap.max_distance": 1e6,
+    }  # fmt: skip
+    config = from_mapping(EkfSlamConfig, motion)
+    done = [simulate(seed, config, lambda rng: wander(26, 0.1, acceleration, first, rng, 3.0)) for seed in range(RUNS)]
+    value, low, high = mean_nis(done, config.association.gate, own_motion=True)
+    assert low < value < high
 
 
 def test_independent_submaps_share_no_information_and_conditional_ones_do(independent: list[Run]) -> None:

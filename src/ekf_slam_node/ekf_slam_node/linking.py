@@ -127,7 +127,10 @@ class Linker:
         )
         if final is None or final.inliers.sum() < least:
             return None
-        return Link(final.T, final.covariance, final.excess, rows[final.inliers], columns[final.inliers])
+        # In the order of the features, not of their errors: to measure the best-fitting first would choose by noise.
+        inliers = np.flatnonzero(final.inliers)
+        inliers = inliers[np.argsort(columns[inliers], kind="stable")]
+        return Link(final.T, final.covariance, final.excess, rows[inliers], columns[inliers])
 
 
 def _image_spread(prior: MotionPrior, frame: Frame) -> float:
