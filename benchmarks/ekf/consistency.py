@@ -1,30 +1,33 @@
 """Are the covariances true? Monte-Carlo over simulated features: NEES of poses, landmarks and whole submaps, NIS.
 
-    python benchmarks/ekf/consistency.py [RUNS]
+    python benchmarks/ekf/consistency.py [RUNS [PART OF A CASE'S NAME]]
 
 Every figure is per degree of freedom and should be one; the interval is where the mean of that many independent runs
 lies in 95 % of the cases. "seam" is the disagreement of consecutive submaps about the landmarks they share: below one,
-the two share information that joining would count twice.
+the two share information that joining would count twice. NIS: the interval is that of a gated chi-square, widened for
+rigs that move more smoothly than their model says. "end": of the last pose against the first, and what the run says of
+its heading (root mean square of the standard deviations) beside how wrong it is.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from rich.progress import track
 
-from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.config import AssociationConfig, EkfSlamConfig
 from slam_core.config import from_mapping
-from slam_core.evaluation import anees_bounds
+from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test" / "ekf_slam_node"))
-from feature_world import loop, wander
-from monte_carlo import Run, seam_nees, simulate
+from feature_world import PointWorld, loop, room, tour_of_two_rooms, two_rooms, wander
+from monte_carlo import Run, mean_nis, seam_nees, simulate
 from planar_monte_carlo import planar_nees
 
 WALK_SIGMA = np.repeat([0.5, 0.4], 3)
@@ -53,29 +56,61 @@ def long_tour(rng: np.random.Generator) -> list[FloatArray]:
     return loop(150, 10.0, 1.5, 2.0, handheld=0.02)
 
 
-CASES: dict[str, tuple[Callable[[np.random.Generator], list[FloatArray]], dict[str, object]]] = {
-    "3D, the filter's own motion": (walk, WALK | ENDLESS),
-    "rig, independent start": (rig, {}),
-    "handheld, independent start": (handheld, {}),
-    "handheld, conditional start": (handheld, {"submap.start": "conditional"}),
-    "handheld, standard error": (handheld, {"error": "standard"}),
-    "two rounds, one EKF, invariant": (long_tour, ENDLESS | SPARSE),
-    "two rounds, one EKF, standard": (long_tour, ENDLESS | SPARSE | {"error": "standard"}),
+def tour(rng: np.random.Generator) -> list[FloatArray]:
+    return tour_of_two_rooms()
+
+
+@dataclass(frozen=True)
+class Case:
+    """A course, what it changes of the configuration, and the world."""
+
+    make_poses: Callable[[np.random.Generator], list[FloatArray]]
+    overrides: dict[str, object]
+    make_world: Callable[[np.random.Generator], PointWorld] = room
+
+
+CASES = {
+    "3D, the filter's own motion": Case(walk, WALK | ENDLESS),
+    "rig, independent start": Case(rig, {}),
+    "handheld, independent start": Case(handheld, {}),
+    "handheld, conditional start": Case(handheld, {"submap.start": "conditional"}),
+    "handheld, standard error": Case(handheld, {"error": "standard"}),
+    "two rounds, one EKF, invariant": Case(long_tour, ENDLESS | SPARSE),
+    "two rounds, one EKF, standard": Case(long_tour, ENDLESS | SPARSE | {"error": "standard"}),
+    "two rooms, submaps": Case(tour, SPARSE, two_rooms),
+    "two rooms, one EKF, invariant": Case(tour, ENDLESS | SPARSE, two_rooms),
+    "two rooms, one EKF, standard": Case(tour, ENDLESS | SPARSE | {"error": "standard"}, two_rooms),
 }
 
 
-def line(name: str, runs: list[Run]) -> str:
+def line(name: str, case: Case, runs: list[Run]) -> str:
     submaps = [s for run in runs for s in run.submaps]
     seams = [
         seam_nees(a.submap, b.submap) for run in runs for a, b in pairwise(run.submaps) if b.submap.follows_previous
     ]
-    low, high = anees_bounds(6, len(runs))
+    bounds = "[{:.2f} {:.2f}]".format(*anees_bounds(6, len(runs)))
     first = np.mean([run.submaps[0].pose_nees for run in runs]) / 6
+    end = np.mean([nees(run.end_error, run.end_covariance) for run in runs]) / 6
+    nis, low, high = mean_nis(runs, AssociationConfig().gate, case.make_poses is walk)
+    claimed, wrong = ([value(r) for r in runs] for value in (_heading_variance, _squared_heading_error))
     cells = (
-        f"{first:6.3f} [{low:.2f} {high:.2f}]", _mean([s.landmark_nees / 3 for s in submaps]),
-        _mean([s.joint_nees for s in submaps]), _mean(seams), _mean([run.nis for run in runs]),
+        f"{first:6.3f} {bounds}", _mean([s.landmark_nees / 3 for s in submaps]),
+        _mean([s.joint_nees for s in submaps]), _mean(seams), f"{nis:.3f} [{low:.3f} {high:.3f}]",
+        f"{end:6.3f} {bounds}", f"{_rms_degrees(claimed):.2f}, wrong {_rms_degrees(wrong):.2f}",
     )  # fmt: skip
-    return f"{name:32}" + "".join(f"{cell:>20}" for cell in cells)
+    return f"{name:32}" + "".join(f"{cell:>21}" for cell in cells)
+
+
+def _heading_variance(run: Run) -> float:
+    return float(run.end_covariance[5, 5])
+
+
+def _squared_heading_error(run: Run) -> float:
+    return float(run.end_error[5] ** 2)
+
+
+def _rms_degrees(squares: list[float]) -> float:
+    return float(np.degrees(np.sqrt(np.mean(squares))))
 
 
 def _mean(values: list[float]) -> str:
@@ -85,11 +120,20 @@ def _mean(values: list[float]) -> str:
 
 def main() -> None:
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else 50
-    print(f"{runs} runs\n{'':32}{'first pose':>20}{'landmarks':>20}{'joint':>20}{'seam':>20}{'NIS':>20}")
-    for name, (make_poses, overrides) in CASES.items():
-        config = from_mapping(EkfSlamConfig, overrides)
-        done = [simulate(1000 + seed, config, make_poses) for seed in track(range(runs), name, transient=True)]
-        print(line(name, done), flush=True)
+    wanted = sys.argv[2] if len(sys.argv) > 2 else ""
+    headings = ("first pose", "landmarks", "joint", "seam", "NIS", "end pose", "end heading, deg")
+    print(f"{runs} runs\n{'':32}" + "".join(f"{heading:>21}" for heading in headings))
+    for name, case in CASES.items():
+        if wanted in name:
+            config = from_mapping(EkfSlamConfig, case.overrides)
+            seeds = track(range(1000, 1000 + runs), name, transient=True)
+            done = [simulate(seed, config, case.make_poses, case.make_world) for seed in seeds]
+            print(line(name, case, done), flush=True)
+    if wanted in "2D":
+        print_planar(runs)
+
+
+def print_planar(runs: int) -> None:
     for rough, course in ((False, "2D, one round"), (True, "2D, four rough rounds, one EKF")):
         for error in ("invariant", "standard"):
             pose, landmarks, nis = planar_nees(runs, error, rough)

@@ -32,10 +32,11 @@ T_RIG_OPTICAL = make_transform(OPTICAL_FROM_RIG.T, np.zeros(3))
 
 @dataclass(frozen=True, eq=False)
 class PointWorld:
-    """Points (n, 3) in the world frame with unit descriptors (n, 64)."""
+    """Points (n, 3) in the world frame with unit descriptors (n, 64), seen from no farther than ``reach`` (m)."""
 
     points: FloatArray
     descriptors: np.ndarray
+    reach: float = np.inf
 
     def features(
         self, T_world_rig: FloatArray, stamp_ns: int, rng: np.random.Generator, *, detection: float = 0.8,
@@ -48,7 +49,7 @@ class PointWorld:
         uv = CAMERA.project(np.where(optical[:, 2:] > 0.3, optical, [0, 0, -1.0]))
         with np.errstate(invalid="ignore"):
             visible = (uv[:, 0] > 0) & (uv[:, 0] < CAMERA.width) & (uv[:, 1] > 0) & (uv[:, 1] < CAMERA.height)
-        visible &= rng.random(len(uv)) < detection
+        visible &= (optical[:, 2] < self.reach) & (rng.random(len(uv)) < detection)
         index = np.flatnonzero(visible)
         index = rng.permutation(index)[:max_features]
         return self._measured(index, uv[index], optical[index, 2], stamp_ns, rng, noise), index
@@ -89,6 +90,27 @@ def room(
     points[:, 2] += half[2] - 1.2
     descriptors = rng.standard_normal((amount, 64))
     return PointWorld(points, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
+
+
+def two_rooms(rng: np.random.Generator) -> PointWorld:
+    """Two rooms, centres 9 m apart along x; from one, little is seen of the other."""
+    near, far = room(rng), room(rng)
+    points = np.concatenate([near.points, far.points + np.array([9.0, 0.0, 0.0])])
+    return PointWorld(points, np.concatenate([near.descriptors, far.descriptors]), reach=6.0)
+
+
+def tour_of_two_rooms(steps: int = 150, handheld: float = 0.02, rate: float = 10.0) -> list[FloatArray]:
+    """Poses T_world_rig along a figure of eight through both rooms and back to the start, 27 m, looking ahead."""
+    poses = []
+    for k in range(steps):
+        angle = 2.0 * np.pi * k / (steps - 1)
+        place = np.array([4.5 - 5.5 * np.cos(angle), 1.6 * np.sin(2.0 * angle), 0.0])
+        ahead = np.array([5.5 * np.sin(angle), 3.2 * np.cos(2.0 * angle)])
+        sway = handheld * np.array([np.sin(5.1 * k / rate), np.cos(6.3 * k / rate), np.sin(9.7 * k / rate)])
+        tilt = 2.0 * handheld * np.array([np.sin(4.3 * k / rate), np.sin(7.1 * k / rate), 0.0])
+        heading = float(np.arctan2(ahead[1], ahead[0]))
+        poses.append(make_transform(rotation_from_euler(heading) @ so3_exp(tilt), place + sway))
+    return poses
 
 
 def loop(
