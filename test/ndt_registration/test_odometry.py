@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from ndt_registration.odometry import OdometryConfig, OdometryStatus, ScanOdometry
-from slam_core.geometry import FloatArray, boxminus, invert_transform
+from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform
+from slam_core.types import RelativeMotion
 
 STEP_NS = 40_000_000
+PLANE = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
 
 
 def path(at: Callable[..., FloatArray], k: int) -> FloatArray:
@@ -89,18 +91,44 @@ def test_stamps_out_of_order_are_refused(scans: list[FloatArray]) -> None:
         odometry.process(100, scans[1])
 
 
-def test_before_a_single_wall_the_uncertainty_is_that_of_the_plausible_corrections(
+def test_before_a_single_wall_the_uncertainty_is_that_of_the_prediction(
     empty_room: Any, at: Callable[..., FloatArray]
 ) -> None:
     rng, wall = np.random.default_rng(5), empty_room(60.0, 60.0, 60.0)
-    odometry, config = ScanOdometry(), OdometryConfig()
+    odometry, config = ScanOdometry(), OdometryConfig().motion
     odometry.process(1, wall.scan(at(57.0, 30.0, 30.0), rng, 60))
     result = odometry.process(1 + STEP_NS, wall.scan(at(57.02, 30.0, 30.0), rng, 60))
     assert result.registration is not None
     assert result.registration.degenerate
     assert result.motion is not None
-    sigma = np.sqrt(np.diag(result.motion.covariance))
-    limit = config.max_correction / np.sqrt(3.0)
+    sigma, dt = np.sqrt(np.diag(result.motion.covariance)), 1e-9 * STEP_NS
+    predicted = np.hypot(config.speed_sigma * dt, 0.5 * config.acceleration_sigma * dt**2)
     assert sigma[0] < 0.01
-    assert sigma[1] == pytest.approx(limit, rel=0.1)
-    assert sigma[2] == pytest.approx(limit, rel=0.1)
+    assert sigma[1] == pytest.approx(predicted, rel=0.1)
+    assert sigma[2] == pytest.approx(predicted, rel=0.1)
+
+
+def corridor_scan(T: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Points (n, 2) that a planar scanner sees of two long walls, 2 m apart, within 5 m."""
+    angles = np.linspace(-np.pi, np.pi, 360, endpoint=False) + 0.004
+    yaw = np.arctan2(T[1, 0], T[0, 0])
+    slope = np.sin(angles + yaw)
+    ranges = np.where(slope > 0, 1.0 - T[1, 3], 1.0 + T[1, 3]) / np.abs(slope) + 0.01 * rng.normal(size=360)
+    points = ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    return np.asarray(points[ranges < 5.0])
+
+
+def test_wheels_carry_scans_along_a_corridor(at: Callable[..., FloatArray]) -> None:
+    rng, odometry = np.random.default_rng(7), ScanOdometry()
+    poses = [at(0.1 * k, 0.05 * np.sin(0.5 * k), 0.0, 3.0 * np.sin(0.4 * k)) for k in range(15)]
+    sigma = np.array([0.002, 0.02, 1e-4, 1e-4, 1e-4, 0.02])
+    for k, T in enumerate(poses):
+        wheels = invert_transform(poses[max(k - 1, 0)]) @ T @ boxplus(np.eye(4), sigma * rng.normal(size=6) * PLANE)
+        prior = RelativeMotion(1 + (k - 1) * STEP_NS, 1 + k * STEP_NS, wheels, np.diag(sigma**2))
+        result = odometry.process(1 + k * STEP_NS, corridor_scan(T, rng), prior if k else None)
+        assert result.status is (OdometryStatus.TRACKING if k else OdometryStatus.STARTED)
+    error = boxminus(result.T, invert_transform(poses[0]) @ poses[-1])
+    assert abs(error[0]) < 0.05
+    assert abs(error[1]) < 0.02
+    assert abs(error[5]) < 0.01
+    np.testing.assert_allclose(error[2:5], 0.0, atol=1e-9)

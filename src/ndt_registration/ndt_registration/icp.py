@@ -33,6 +33,10 @@ class IcpConfig(Config):
     neighbours: int = parameter(12, "neighbours from which a normal is computed", minimum=3)
 
 
+_FLAT = 1e-9
+"""Height of a cloud over its extent below which it lies in the plane."""
+
+
 class IcpOutcome(NamedTuple):
     """Pose T_target_source, iterations, whether the last stage's steps became small."""
 
@@ -57,7 +61,12 @@ class IcpTarget:
         if self._normals is None:
             patches = self.points[self._neighbours]
             patches = patches - patches.mean(axis=1, keepdims=True)
-            self._normals = np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))[1][:, :, 0]
+            # In the plane every normal lies in it: without z, whose variance is the least of all, as it is zero.
+            extent = np.ptp(self.points, axis=0)
+            axes = 3 if extent[2] > _FLAT * extent.max() else 2
+            moments = np.einsum("nki,nkj->nij", patches[:, :, :axes], patches[:, :, :axes])
+            self._normals = np.zeros_like(self.points)
+            self._normals[:, :axes] = np.linalg.eigh(moments)[1][:, :, 0]
         return self._normals
 
 

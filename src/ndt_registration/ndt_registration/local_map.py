@@ -5,15 +5,29 @@ by scan.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from ndt_registration.cloud import Cloud, prepare
+from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare
 from ndt_registration.pyramid import Pyramid
 from ndt_registration.registration import RegistrationConfig, Target, check_cloud
 from ndt_registration.visibility import range_image
 from slam_core.geometry import FloatArray, invert_transform, transform_points
+
+
+class Scan(NamedTuple):
+    """Finite points (n, 3) m of a scan, and whether they came as (n, 2)."""
+
+    points: FloatArray
+    planar: bool
+
+    @staticmethod
+    def of(points: npt.ArrayLike) -> Scan:
+        """The scan of an array (..., 3) or (..., 2), NaN where invalid."""
+        return Scan(finite_points(points), is_planar(points))
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,11 +40,23 @@ class Keyframe:
     rims: FloatArray
 
 
+def for_the_plane(config: RegistrationConfig) -> RegistrationConfig:
+    """The configuration for scans (n, 2): a laser scanner's few hundred points need wide cells, and few in each."""
+    wide = max(config.grid.relative_voxel_size, _PLANAR_VOXEL_SIZE)
+    grid = replace(config.grid, relative_voxel_size=wide, min_points=min(config.grid.min_points, _PLANAR_CELL_POINTS))
+    return replace(config, grid=grid, min_points=min(config.min_points, _PLANAR_SCAN_POINTS))
+
+
+_PLANAR_VOXEL_SIZE = 0.18
+"""Edge of the finest cells over the scan's scale."""
+_PLANAR_CELL_POINTS = 4
+_PLANAR_SCAN_POINTS = 30
+
+
 class LocalMap:
     """A sliding window of keyframes, as a registration target in the frame of the newest."""
 
-    def __init__(self, keyframes: int, config: RegistrationConfig) -> None:
-        self._config = config
+    def __init__(self, keyframes: int) -> None:
         self._keyframes: deque[Keyframe] = deque(maxlen=keyframes)
         self._target: Target | None = None
 
@@ -49,18 +75,18 @@ class LocalMap:
         self._keyframes.clear()
         self._target = None
 
-    def add(self, T: FloatArray, covariance: FloatArray, points: FloatArray) -> None:
-        """Append a keyframe of finite points (n, 3) and rebuild the target."""
-        check_cloud(points, "target", self._config)
-        scan = prepare(points, self._config.target_points, planar=False, centre=np.zeros(3))
-        self._keyframes.append(Keyframe(T, covariance, scan.points, scan.rims))
-        self._target = self._build(scan)
+    def add(self, T: FloatArray, covariance: FloatArray, scan: Scan, config: RegistrationConfig) -> None:
+        """Append a keyframe and rebuild the target."""
+        check_cloud(scan.points, "target", config)
+        cloud = prepare(scan.points, config.target_points, planar=scan.planar, centre=np.zeros(3))
+        self._keyframes.append(Keyframe(T, covariance, cloud.points, cloud.rims))
+        self._target = self._build(cloud, config)
 
-    def _build(self, scan: Cloud) -> Target:
+    def _build(self, scan: Cloud, config: RegistrationConfig) -> Target:
         T_newest_odom = invert_transform(self.newest.T)
         older = [transform_points(T_newest_odom @ k.T, k.points) for k in list(self._keyframes)[:-1]]
         older_rims = [transform_points(T_newest_odom @ k.T, k.rims) for k in list(self._keyframes)[:-1]]
         points, rims = np.concatenate([scan.points, *older]), np.concatenate([scan.rims, *older_rims])
         cloud = Cloud(np.ascontiguousarray(points), np.ascontiguousarray(rims), scan.scale, scan.planar)
-        image = range_image(scan.points, self._config.image_size)
-        return Target(cloud, Pyramid.build(cloud, self._config.grid), image, np.zeros(3))
+        image = range_image(scan.points, config.image_size)
+        return Target(cloud, Pyramid.build(cloud, config.grid), image, np.zeros(3))

@@ -1,0 +1,153 @@
+"""Pose and velocity of a sensor by white acceleration (thesis Eq. 5.6), with the pose before kept beside them.
+
+Each registration is joined with what the motion so far lets expect, each by its covariance: along a corridor, where a
+registration says nothing, the prediction's own doubt of a few centimetres remains instead of metres. The pose before
+stays in the state, so that the motion between two scans comes with the covariance of both together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_core.config import Config, parameter
+from slam_core.geometry import (
+    FloatArray,
+    boxminus,
+    boxplus,
+    compose_jacobians,
+    inverse_jacobian,
+    invert_transform,
+    pose7_from_transform,
+    transform_from_pose7,
+)
+
+BEFORE, NOW, VELOCITY = slice(0, 6), slice(6, 12), slice(12, 18)
+_START_SIGMA = 1e-6
+"""Standard deviation of the first pose (m, rad): it is the origin by definition, but no covariance may be singular."""
+_LOST_SIGMA = 100.0
+"""Standard deviation (m, rad) of a pose of which nothing is known."""
+
+
+@dataclass(frozen=True)
+class MotionConfig(Config):
+    """How a sensor moves between scans."""
+
+    acceleration_sigma: float = parameter(2.0, "acceleration between scans", unit="m/s2", minimum=1e-3)
+    angular_acceleration_sigma: float = parameter(4.0, "likewise", unit="rad/s2", minimum=1e-3)
+    speed_sigma: float = parameter(1.0, "speed where nothing is known of it", unit="m/s", minimum=1e-3)
+    angular_speed_sigma: float = parameter(1.0, "likewise", unit="rad/s", minimum=1e-3)
+
+
+class MotionFilter:
+    """Kalman filter of the errors of (pose before, pose, velocity): poses along the axes of the odometry's frame, the
+    velocity along the sensor's, in which one who walks and turns moves steadily.
+    """
+
+    def __init__(self, config: MotionConfig) -> None:
+        self._acceleration = np.repeat([config.acceleration_sigma, config.angular_acceleration_sigma], 3)
+        self._speed = np.repeat([config.speed_sigma, config.angular_speed_sigma], 3)
+        self.start(np.eye(4))
+
+    def start(self, T: FloatArray) -> None:
+        """Be at ``T`` (4, 4), with a velocity of which nothing is known."""
+        self.T_before, self.T = T, T
+        self._velocity = np.zeros(6)
+        self._dt = 0.0
+        self._P = np.diag(np.r_[np.full(12, _START_SIGMA), self._speed] ** 2)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (6, 6) of the error of ``T``."""
+        return self._P[NOW, NOW].copy()
+
+    def forget_velocity(self) -> None:
+        """Know nothing of the velocity any more, as after a gap between scans."""
+        self._velocity = np.zeros(6)
+        self._P[VELOCITY], self._P[:, VELOCITY] = 0.0, 0.0
+        self._P[VELOCITY, VELOCITY] = np.diag(self._speed**2)
+
+    def lose(self) -> None:
+        """Know nothing of pose and velocity any more: the next observed pose is taken as it is."""
+        self.forget_velocity()
+        self._P[NOW], self._P[:, NOW] = 0.0, 0.0
+        self._P[NOW, NOW] = _LOST_SIGMA**2 * np.eye(6)
+
+    def predict(self, dt: float) -> None:
+        """Move on by ``dt`` s (Eq. 5.6); the pose so far becomes the pose before."""
+        R = both_halves(self.T)
+        F = np.zeros((18, 18))
+        F[BEFORE, NOW] = F[NOW, NOW] = F[VELOCITY, VELOCITY] = np.eye(6)
+        F[NOW, VELOCITY] = dt * R
+        G = np.zeros((18, 6))
+        G[NOW], G[VELOCITY] = R @ np.diag(0.5 * dt**2 * self._acceleration), np.diag(dt * self._acceleration)
+        self._P = F @ self._P @ F.T + G @ G.T
+        self.T_before, self.T = self.T, self.T @ boxplus(np.eye(4), dt * self._velocity)
+        self._dt = dt
+
+    def move(self, T: FloatArray, covariance: FloatArray, dt: float) -> None:
+        """Move on by a known motion (4, 4), in the axes of the pose so far, with covariance (6, 6), in ``dt`` s."""
+        self.forget_velocity()
+        self._P[BEFORE, BEFORE] = self._P[BEFORE, NOW] = self._P[NOW, BEFORE] = self._P[NOW, NOW]
+        self._P[NOW, NOW] = self._P[BEFORE, BEFORE] + rotated(self.T, covariance)
+        self.T_before, self.T = self.T, self.T @ T
+        self._dt = dt
+
+    def fuse(self, T: FloatArray, covariance: FloatArray) -> None:
+        """Fuse a pose (4, 4), measured independently of the prediction, with covariance (6, 6)."""
+        step = self._update(covariance) @ boxminus(T, self.T)
+        self.T_before = _moved(self.T_before, step[BEFORE])
+        self._arrive(_moved(self.T, step[NOW]))
+
+    def settle(self, T: FloatArray, covariance: FloatArray) -> None:
+        """Be at a pose (4, 4) that was found from the prediction.
+
+        A registration goes as far from where it starts as the scan demands, and hardly moves where the scan says
+        little: prediction and scan are in its result already. So the pose is taken whole, but with the covariance of
+        both together.
+        """
+        self._update(covariance)
+        self._arrive(_moved(T, np.zeros(6)))
+
+    def motion(self) -> tuple[FloatArray, FloatArray]:
+        """Motion (4, 4) from the pose before to this one, in the axes of the former, and its covariance (6, 6)."""
+        inverse = invert_transform(self.T_before)
+        J_inverse, J_now = compose_jacobians(inverse, self.T)
+        J = np.hstack([J_inverse @ inverse_jacobian(self.T_before), J_now])
+        covariance = J @ self._P[:12, :12] @ J.T
+        return inverse @ self.T, 0.5 * (covariance + covariance.T)
+
+    def _arrive(self, T: FloatArray) -> None:
+        self.T = T
+        self._velocity = boxminus(invert_transform(self.T_before) @ T, np.eye(4)) / self._dt
+
+    def _update(self, R: FloatArray) -> FloatArray:
+        """Gain (18, 6) of a measured pose with covariance R (6, 6); the covariance in Joseph's form, which stays
+        positive definite whatever the range of R's eigenvalues.
+        """
+        H = np.zeros((6, 18))
+        H[:, NOW] = np.eye(6)
+        K = np.linalg.solve(self._P[NOW, NOW] + R, self._P[NOW]).T
+        A = np.eye(18) - K @ H
+        P = A @ self._P @ A.T + K @ R @ K.T
+        self._P = 0.5 * (P + P.T)
+        return np.asarray(K)
+
+
+def _moved(T: FloatArray, step: FloatArray) -> FloatArray:
+    """``boxplus``, made exactly orthonormal: rounding in a chain of rotations doubles with every transposition."""
+    return transform_from_pose7(pose7_from_transform(boxplus(T, step)))
+
+
+def rotated(T: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of an error along the axes of ``T``'s child frame, along those of its parent."""
+    R = both_halves(T)
+    return np.asarray(R @ covariance @ R.T)
+
+
+def both_halves(T: FloatArray) -> FloatArray:
+    """(6, 6) that turns both halves of an error from the axes of ``T``'s child frame to those of its parent."""
+    R = np.zeros((6, 6))
+    R[:3, :3] = R[3:, 3:] = T[:3, :3]
+    return R
