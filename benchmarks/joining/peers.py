@@ -1,145 +1,160 @@
-"""Our joining against GTSAM on the same problems, in one run: time to the optimum, chi2, memory, incremental joining.
+"""Our joining against GTSAM and Ceres on the same problems, in one run: time, chi2, covariances, memory.
 
-    python benchmarks/joining/peers.py [--sizes 34 500] [--isam2]
+    python benchmarks/joining/peers.py [--sizes 34 500 2000] [--repeat 3] [--incremental]
 
-Needs gtsam beside the run-time requirements (a separate environment is best). Block rows (each landmark with its own
-3x3) are what both can express with their own factors; GTSAM's chi2 is our cost function at its solution, so that both
-are measured alike.
+Every solver runs in a process of its own on the same submaps. Block rows (each landmark with its own 3x3) are what all
+of them can express with their own factors; chi2 is our cost function at their solution, so that all are measured
+alike. Times are medians; memory is what the process grew by while it solved. "batch" is from chained odometry to the
+optimum with everything symbolic; "covariances" is the joint covariance of eight
+poses along the way at the optimum, linearised and factored there.
+``--incremental`` adds one submap after the other: iSAM2 with known association, ours as the node does it, finding its
+associations and closures itself.
+
+Needs gtsam beside the run-time requirements (a separate environment is best), and for Ceres pyceres 2.4 with pycolmap
+3.11, whose compiled residuals it borrows; what is not there is left out.
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
+import importlib.util
+import json
+import pickle
+import statistics
+import subprocess
+import sys
+import tempfile
 import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
 
-import gtsam
 import numpy as np
-from problems import joining_problem, local_maps, ring
+from memory import PeakMemory
+from problems import KnownProblem, joining_problem, local_maps, ring
 
+from sjsam_node.block_problem import BlockProblem
+from sjsam_node.joining import JoiningProblem
 from sjsam_node.problem import LocalMap, State
-from slam_core.geometry import make_transform, so3_exp
 from slam_core.least_squares import LevenbergMarquardtConfig
 
-X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
-
-
 STOP = LevenbergMarquardtConfig(relative_tolerance=1e-6)
-"""GTSAM stops when the cost falls by less than 1e-5 of itself; ours a little later."""
+"""GTSAM stops when the cost falls by less than 1e-5 of itself, Ceres at 1e-6; ours when a step promises less."""
+
+BATCH, INCREMENTAL = ("ours", "gtsam", "ceres", "ours joint"), ("isam2", "ours incremental")
 
 
-def graph_of(maps: list[LocalMap], state: State) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """The same block rows as GTSAM's own factors. Its poses move in the body frame, rotation first."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(gtsam.PriorFactorPose3(X(0), _pose(state, 0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
-    for i in range(len(state.translations)):
-        values.insert(X(i), _pose(state, i))
-    for i, point in enumerate(state.landmarks):
-        values.insert(L(i), point)
-    for m in maps:
-        for factor in factors_of(m):
-            graph.add(factor)
-    return graph, values
-
-
-def factors_of(m: LocalMap) -> list[gtsam.NonlinearFactor]:
-    R = so3_exp(m.mean[3:6])
-    turn = np.zeros((6, 6))
-    turn[:3, 3:] = turn[3:, :3] = R
-    noise = gtsam.noiseModel.Gaussian.Information(turn.T @ m.information[[*range(6)]][:, [*range(6)]] @ turn)
-    out = [
-        gtsam.BetweenFactorPose3(X(m.reference), X(int(m.poses[0])), gtsam.Pose3(make_transform(R, m.mean[:3])), noise)
-    ]
-    for k, landmark in enumerate(m.landmarks):
-        rows = slice(6 + 3 * k, 9 + 3 * k)
-        out.append(_sighting(m.reference, int(landmark), m.mean[rows], m.information[rows, rows]))
-    return out
-
-
-def _sighting(pose: int, landmark: int, point: np.ndarray, information: np.ndarray) -> gtsam.NonlinearFactor:
-    """A point in the pose's frame. GTSAM's Python has no such factor: as bearing and range, the same to first order."""
-    distance = float(np.linalg.norm(point))
-    bearing = gtsam.Unit3(point)
-    J = np.vstack([bearing.basis().T / distance, point / distance])
-    noise = gtsam.noiseModel.Gaussian.Covariance(J @ np.linalg.inv(information) @ J.T)
-    return gtsam.BearingRangeFactor3D(X(pose), L(landmark), bearing, distance, noise)
-
-
-def _pose(state: State, i: int) -> gtsam.Pose3:
-    return gtsam.Pose3(make_transform(state.rotations[i], state.translations[i]))
-
-
-def state_of(values: gtsam.Values, like: State) -> State:
-    poses = [values.atPose3(X(i)).matrix() for i in range(len(like.translations))]
-    points = [values.atPoint3(L(i)) for i in range(len(like.landmarks))]
-    stacked = np.array(poses)
-    return State(np.ascontiguousarray(stacked[:, :3, :3]), np.ascontiguousarray(stacked[:, :3, 3]), np.array(points))
-
-
-def timed(action):  # type: ignore[no-untyped-def]
+def timed(action: Callable[[], Any]) -> tuple[float, Any]:
     began = time.perf_counter()
     result = action()
     return time.perf_counter() - began, result
 
 
-def ours(maps: list[LocalMap], state: State, rows: str) -> tuple[float, State, float]:
-    def run():  # type: ignore[no-untyped-def]
-        return joining_problem(maps, state, rows).optimize(state, STOP)
+def solve_ours(maps: list[LocalMap], state: State, rows: str, repeat: int) -> dict[str, Any]:
+    def run() -> tuple[JoiningProblem | BlockProblem, State]:
+        problem = joining_problem(maps, state, rows)
+        return problem, problem.optimize(state, STOP)[0]
 
-    seconds, (optimum, result) = timed(run)
-    return seconds, optimum, result.cost
-
-
-def compare(count: int, incremental: bool) -> None:
-    problem = ring(count)
-    maps, state = local_maps(problem, "block", shared_only=False)
-    ours(maps[:2], *[local_maps(problem.first(2), "block", False)[1]], "block")  # compile
-    mine, _, chi2 = min(ours(maps, state, "block") for _ in range(3))
-    judge = joining_problem(maps, state, "block")
-    graph, values = graph_of(maps, state)
-    theirs, solution = timed(gtsam.LevenbergMarquardtOptimizer(graph, values).optimize)
-    their_chi2 = judge.cost(state_of(solution, state))
-    print(f"{count:6d} block  ours {mine:8.3f} s  chi2 {chi2:14.4f}   GTSAM LM {theirs:8.3f} s  chi2 {their_chi2:14.4f}"
-          f"   ratio {mine / theirs:6.3f}")  # fmt: skip
-    joint_maps, joint_state = local_maps(problem, "joint", shared_only=True)
-    joint, optimum, joint_chi2 = ours(joint_maps, joint_state, "joint")
-    marginals, _ = timed(lambda: joining_problem(joint_maps, optimum, "joint").marginals(optimum))
-    print(f"{count:6d} joint  ours {joint:8.3f} s  chi2 {joint_chi2:14.4f}   all marginals {marginals:8.3f} s")
-    if incremental:
-        seconds, last = timed(lambda: isam2(maps, state))
-        reached = judge.cost(state_of(last, state))
-        print(f"{count:6d} iSAM2 {seconds:8.3f} s  chi2 {reached:14.4f}   {1e3 * seconds / count:8.2f} ms per submap")
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"       peak memory so far {peak:.0f} MiB")
+    small = [m for m in maps if m.reference < 3]
+    few = joining_problem(small, state, rows)  # compiles
+    few.columns(few.optimize(state, LevenbergMarquardtConfig(max_iterations=3))[0], np.array([1]))
+    memory = PeakMemory()
+    runs = [timed(run) for _ in range(repeat)]
+    grown, (problem, optimum) = memory.grown(), runs[0][1]
+    poses = np.linspace(1, len(state.translations) - 1, 8).astype(np.int64)
+    # A copy of the optimum, so that nothing is taken from the last factor.
+    states = [replace(optimum) for _ in range(repeat)]
+    covariances = [timed(partial(problem.columns, at, poses))[0] for at in states]
+    return {"batch": [t for t, _ in runs], "covariances": covariances, "memory": grown, "state": optimum}
 
 
-def isam2(maps: list[LocalMap], state: State) -> gtsam.Values:
-    solver = gtsam.ISAM2(gtsam.ISAM2Params())
-    known: set[int] = set()
-    estimate = gtsam.Values()
-    for m in maps:
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        if m.reference == 0:
-            graph.add(gtsam.PriorFactorPose3(X(0), _pose(state, 0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
-            values.insert(X(0), _pose(state, 0))
-        start = _pose(state, 0) if m.reference == 0 else estimate.atPose3(X(m.reference))
-        step = gtsam.Pose3(make_transform(so3_exp(m.mean[3:6]), m.mean[:3]))
-        values.insert(X(int(m.poses[0])), start.compose(step))
-        for k, landmark in enumerate(m.landmarks.tolist()):
-            if landmark not in known:
-                known.add(landmark)
-                values.insert(L(landmark), start.transformFrom(m.mean[6 + 3 * k : 9 + 3 * k]))
-        for factor in factors_of(m):
-            graph.add(factor)
-        solver.update(graph, values)
-        estimate = solver.calculateEstimate()
-    return estimate
+def child(solver: str, path: Path, repeat: int) -> dict[str, Any]:
+    """One solver on one problem; the result without its state, judged by our cost."""
+    problem: KnownProblem = pickle.loads(path.read_bytes())
+    if solver == "ours incremental":
+        return incremental(problem)
+    rows = "joint" if solver == "ours joint" else "block"
+    maps, state = local_maps(problem, rows, shared_only=rows == "joint")
+    if solver.startswith("ours"):
+        result = solve_ours(maps, state, rows, repeat)
+    elif solver == "ceres":
+        import ceres_peer
+
+        result = ceres_peer.solve(maps, state, repeat)
+    else:
+        import gtsam_peer
+
+        result = (gtsam_peer.isam2 if solver == "isam2" else gtsam_peer.solve)(maps, state, repeat)
+    result["chi2"] = joining_problem(maps, state, rows).cost(result.pop("state"))
+    return result
+
+
+def incremental(problem: KnownProblem) -> dict[str, Any]:
+    """Through GlobalMap, association and closures included; its chi2 is over its own associations."""
+    from sjsam_node.global_map import GlobalMap
+
+    warm = GlobalMap()
+    for submap in problem.submaps[:20]:
+        warm.add(submap)
+    memory, global_map = PeakMemory(), GlobalMap()
+
+    def run() -> None:
+        for submap in problem.submaps:
+            global_map.add(submap)
+        global_map.settle()
+
+    seconds, _ = timed(run)
+    return {"batch": [seconds], "memory": memory.grown(), "chi2": float("nan")}
+
+
+def run_child(solver: str, path: Path, repeat: int) -> dict[str, Any] | None:
+    command = [sys.executable, __file__, "--child", solver, "--problem", str(path), "--repeat", str(repeat)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        print(f"  {solver}: {done.stderr.strip().splitlines()[-1]}")
+        return None
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def compare(count: int, solvers: list[str], repeat: int, folder: Path) -> None:
+    path = folder / f"{count}.pkl"
+    path.write_bytes(pickle.dumps(ring(count)))
+    results = {solver: run_child(solver, path, repeat) for solver in solvers}
+    print(f"{count} submaps: batch s, chi2, covariances s, MiB; then ours / theirs: time, covariances, memory")
+    for solver, result in results.items():
+        if result is None:
+            continue
+        ours = results.get("ours incremental" if solver in INCREMENTAL else "ours")
+        shown = [statistics.median(result[key]) if key in result else float("nan") for key in ("batch", "covariances")]
+        ratios = "" if ours is None or solver.startswith("ours") else _ratios(ours, result)
+        print(f"  {solver:18s} {shown[0]:10.4f} {result['chi2']:14.3f} {shown[1]:10.4f}"
+              f" {result['memory']:8.0f}   {ratios}", flush=True)  # fmt: skip
+
+
+def _ratios(ours: dict[str, Any], theirs: dict[str, Any]) -> str:
+    keys = [key for key in ("batch", "covariances") if key in ours and key in theirs]
+    values = [statistics.median(ours[key]) / statistics.median(theirs[key]) for key in keys]
+    values.append(ours["memory"] / max(theirs["memory"], 1.0))
+    return "  ".join(f"{value:7.3f}" for value in values)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[34, 500])
-    parser.add_argument("--isam2", action="store_true", help="GTSAM's incremental solver too (minutes at 2000)")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[34, 500, 2000])
+    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--incremental", action="store_true", help="one submap after the other (minutes at 2000)")
+    parser.add_argument("--child", help=argparse.SUPPRESS)
+    parser.add_argument("--problem", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    for size in arguments.sizes:
-        compare(size, arguments.isam2)
+    if arguments.child:
+        print(json.dumps(child(arguments.child, arguments.problem, arguments.repeat)))
+        sys.exit()
+    needed = {"gtsam": "gtsam", "isam2": "gtsam", "ceres": "pycolmap"}
+    wanted = [*BATCH, *(INCREMENTAL if arguments.incremental else ())]
+    present = [s for s in wanted if s not in needed or importlib.util.find_spec(needed[s]) is not None]
+    print("left out, not installed:", ", ".join(s for s in wanted if s not in present) or "none")
+    with tempfile.TemporaryDirectory() as temporary:
+        for size in arguments.sizes:
+            compare(size, present, arguments.repeat, Path(temporary))

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from text_world import city, write
 
 from sjsam_node.linear_slam_text import TextMap, find_maps, read_maps
 from sjsam_node.text_joining import TextJoiningConfig, join_text_maps
@@ -52,17 +53,6 @@ def walk(dimension: int, count: int, rng: np.random.Generator, noise: float) -> 
             )
         )  # fmt: skip
     return maps, (t - t[0]) @ R[0]
-
-
-def write(maps: list[TextMap], folder: Path) -> None:
-    for k, m in enumerate(maps):
-        ids = np.concatenate([np.repeat(m.pose_ids, m.poses.shape[1]), np.repeat(m.feature_ids, m.features.shape[1])])
-        values = np.concatenate([m.poses.ravel(), m.features.ravel()])
-        rows = [str(abs(m.reference)), str(len(ids))] + [
-            f"{i} {v!r}" for i, v in zip(ids, values.tolist(), strict=True)
-        ]
-        rows += [" ".join(map(repr, row)) for row in m.information.tolist()]
-        (folder / f"localmap_{k + 1}.txt").write_text("\n".join(rows))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -118,6 +108,9 @@ def test_a_pose_graph_with_rising_ids_is_read(tmp_path: Path) -> None:
         ("0\n3\n-1 1\n-1 2\n-1 3\n1 0 0 0 1 0 0 0 -1\n", "not positive definite"),
         ("0\n3\n-1 1\n-1 nan\n-1 3\n1 0 0 0 1 0 0 0 1\n", "not finite"),
         ("0\n1\n-1 1\n1\n", "an id has 1 values"),
+        ("0\n3\n-1 1\n-1 2\n-1 3\n1 9 0 0 1 0 0 0 1\n", "not symmetric"),
+        ("0\n3\n-1.5 1\n-1.5 2\n-1.5 3\n1 0 0 0 1 0 0 0 1\n", "id -1.5 is not a whole number"),
+        ("0\n3\n-1 1\n5 2\n-1 3\n1 0 0 0 1 0 0 0 1\n", "values of id -1 do not stand together"),
     ],
 )
 def test_other_files_are_refused_by_name(text: str, why: str, tmp_path: Path) -> None:
@@ -125,6 +118,30 @@ def test_other_files_are_refused_by_name(text: str, why: str, tmp_path: Path) ->
     with pytest.raises(ValueError, match=why) as error:
         read_maps(find_maps(tmp_path))
     assert "localmap_1.txt" in str(error.value)
+
+
+def test_a_planar_map_among_spatial_ones_is_refused(rng: np.random.Generator, tmp_path: Path) -> None:
+    spatial, _ = walk(3, 3, rng, 0.01)
+    write(spatial, tmp_path)
+    (tmp_path / "localmap_2.txt").write_text("1\n3\n-2 1\n-2 2\n-2 3\n1 0 0 0 1 0 0 0 1\n")
+    with pytest.raises(ValueError, match=r"localmap_2.txt: feature id -2 .* 2D map among 3D"):
+        read_maps(find_maps(tmp_path))
+
+
+def test_a_missing_file_is_said_so(rng: np.random.Generator, tmp_path: Path) -> None:
+    maps, _ = walk(2, 6, rng, 0.01)
+    write(maps, tmp_path)
+    (tmp_path / "localmap_3.txt").unlink()
+    with pytest.raises(ValueError, match=r"3 submaps share no pose .* file missing"):
+        join_text_maps(*read_maps(find_maps(tmp_path)))
+
+
+def test_a_start_that_has_collapsed_still_leads_to_the_optimum() -> None:
+    maps = city(1500, seed=2, noise=3.0, extent=12)
+    freedom = sum(m.poses.size for m in maps) - 3 * 1500
+    result = join_text_maps(maps, 2)
+    assert abs(result.chi2 - freedom) < 5.0 * np.sqrt(2.0 * freedom)
+    assert result.start.startswith("incremental")  # batch from the chained start ends elsewhere
 
 
 def test_maps_that_do_not_hang_together_are_refused(rng: np.random.Generator) -> None:

@@ -82,8 +82,20 @@ def _read(path: Path) -> tuple[int, IntArray, IntArray, FloatArray, FloatArray]:
     state = numbers[2 : 2 + 2 * count].reshape(count, 2)
     starts = np.concatenate([[0], np.nonzero(np.diff(state[:, 0]))[0] + 1])
     sizes = np.diff(np.concatenate([starts, [count]]))
+    _check_ids(path, numbers[0], state[starts, 0])
     information = numbers[2 + 2 * count :].reshape(count, count)
+    if np.abs(information - information.T).max() > 1e-3 * np.abs(information).max():
+        raise ValueError(f"{path}: the information matrix is not symmetric")
     return int(numbers[0]), np.stack([state[starts, 0].astype(np.int64), sizes]), sizes, state[:, 1], information
+
+
+def _check_ids(path: Path, reference: float, ids: FloatArray) -> None:
+    for value in (reference, *ids.tolist()):
+        if value != int(value):
+            raise ValueError(f"{path}: id {value} is not a whole number")
+    unique, count = np.unique(ids, return_counts=True)
+    if count.max() > 1:
+        raise ValueError(f"{path}: the values of id {int(unique[count.argmax()])} do not stand together")
 
 
 def _interpret(
@@ -100,6 +112,8 @@ def _interpret(
     if not np.all(is_pose | (sizes == dimension)):
         wrong = sizes[~is_pose & (sizes != dimension)][0]
         raise ValueError(f"{path}: an id has {wrong} values, {dimension}D poses have {pose_size}, features {dimension}")
+    if np.any(ids[0, ~is_pose] <= 0):
+        raise ValueError(f"{path}: feature id {ids[0, ~is_pose].min()} is not positive (a 2D map among 3D ones?)")
     of_pose = np.repeat(is_pose, sizes)
     order = np.argsort(~of_pose, kind="stable")  # poses first
     information = 0.5 * (information + information.T)[np.ix_(order, order)]
