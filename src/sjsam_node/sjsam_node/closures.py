@@ -9,7 +9,9 @@ third.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from enum import Enum, auto
+from typing import NamedTuple
 
 import numpy as np
 
@@ -105,6 +107,21 @@ def at_end(record: Record) -> PointSet:
     return PointSet((submap.landmarks - t) @ R, rows @ submap.covariance @ rows.T, submap.descriptors)
 
 
+class Standing(Enum):
+    """What the map says of an alignment: it vouches for it, it cannot judge, or it knows otherwise."""
+
+    CERTAIN = auto()
+    LIKELY = auto()
+    CONTRADICTED = auto()
+
+
+class Findings(NamedTuple):
+    """Closures that may be believed, and those that look right but contradict the map, which may itself be wrong."""
+
+    believed: list[Link]
+    contradicted: list[Link]
+
+
 @dataclass
 class LinkFinder:
     """Finds and judges the links of a new record."""
@@ -132,24 +149,31 @@ class LinkFinder:
             T = record.submap.end_pose @ T
         return links
 
-    def closures(self, graph: MapGraph, chain: list[int], new: int, relative_pose: RelativePose) -> list[Link]:
-        """Links of record ``new`` beyond its chain that may be believed now; others may wait for confirmation."""
+    def closures(self, graph: MapGraph, chain: list[int], new: int, relative_pose: RelativePose) -> Findings:
+        """Links of record ``new`` beyond its chain; some may wait for confirmation."""
         recent = {*range(new, len(graph.records)), *chain[: self.config.window]}
         near = self._near(graph, new, recent)
         looks = self.index.query(graph.records[new].submap.descriptors, recent | set(near))
         believed: list[Link] = []
+        contradicted: list[Link] = []
         second = at_start(graph.records[new])
         for old in [*near, *looks]:
             first = at_start(graph.records[old])
             if old not in near and not self._is_alike(first, second):
                 continue
             prior, way = relative_pose(old, new), graph.way_between(old, new)
-            found, certain = self.judge(first, second, prior, way, old, new)
-            if found is not None:
-                tension = 0.0 if certain or prior is None else self._tension(found, prior, 0.0)
-                link = Link(old, new, found.pairs, found.T, found.covariance, True, tension)
-                believed += [link] if certain else self._confirmed(graph, link)
-        return believed
+            found, standing = self.judge(first, second, prior, way, old, new)
+            if found is None:
+                continue
+            link = Link(old, new, found.pairs, found.T, found.covariance, True)
+            if standing is Standing.CERTAIN:
+                believed.append(link)
+            elif standing is Standing.CONTRADICTED:
+                contradicted.append(link)
+            else:
+                tension = 0.0 if prior is None else self._tension(found, prior, 0.0)
+                believed += self._confirmed(graph, replace(link, tension=tension))
+        return Findings(believed, contradicted)
 
     def _near(self, graph: MapGraph, new: int, recent: set[int]) -> list[int]:
         """Older records of the same component whose landmarks are around those of ``new``, nearest first."""
@@ -165,8 +189,8 @@ class LinkFinder:
 
     def judge(
         self, first: PointSet, second: PointSet, prior: Prior | None, way: float, *key: int
-    ) -> tuple[Alignment | None, bool]:
-        """The alignment of two submaps if geometry supports it, and whether the prior can vouch for it.
+    ) -> tuple[Alignment | None, Standing]:
+        """The alignment of two submaps if geometry supports it, and what the prior says of it.
 
         ``way`` is the length of the path between them, m: what the prior does not know is at least its drift.
         ``key`` seeds the random samples, so that the same pair is always judged alike.
@@ -175,13 +199,13 @@ class LinkFinder:
         if informative and prior is not None:
             found = match(first, second, prior, self.config.association)
             if len(found.pairs) >= self.config.min_near_inliers and self._overlaps(first, second, found):
-                return found, True
+                return found, Standing.CERTAIN
         guess = self._by_looks(first, second, key)
         if guess is None or not self._supported(first, second, guess):
-            return None, False
+            return None, Standing.LIKELY
         if prior is not None and self._tension(guess, prior, way) > chi_square_bound(self.config.probability, 6):
-            return None, False
-        return guess, False
+            return guess, Standing.CONTRADICTED
+        return guess, Standing.LIKELY
 
     def _by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
         """Alignment from descriptors alone, refined with all landmarks around it."""

@@ -21,6 +21,7 @@ from sjsam_node.closures import ClosureConfig, LinkFinder
 from sjsam_node.estimator import Assembled
 from sjsam_node.joiner import Joiner, JoinerConfig
 from sjsam_node.map_graph import Link, MapGraph
+from sjsam_node.trial import TrialConfig, Trials, Verdict
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
 from slam_core.types import Counters, PoseEstimate, Submap
@@ -35,6 +36,7 @@ class GlobalMapConfig(Config):
     )
     joining: JoinerConfig = group(JoinerConfig)
     closure: ClosureConfig = group(ClosureConfig)
+    trial: TrialConfig = group(TrialConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +68,7 @@ class GlobalMap:
     graph: MapGraph
     finder: LinkFinder
     joiner: Joiner
+    trials: Trials
 
     def __init__(self, config: GlobalMapConfig | None = None) -> None:
         self.config = config or GlobalMapConfig()
@@ -77,6 +80,7 @@ class GlobalMap:
         self.graph = MapGraph()
         self.finder = LinkFinder(self.config.closure)
         self.joiner = Joiner(self.graph, self.config.closure.window, self.config.joining)
+        self.trials = Trials(self.joiner, self.config.trial, self.config.closure)
         self._sessions: dict[str, int] = {}
         self._lookup: dict[tuple[str, int, int], int] = {}
         self._unsearched: list[int] = []
@@ -176,20 +180,23 @@ class GlobalMap:
         """Look for closures of the submaps not looked at yet; believe those that the joined map can live with."""
         unsearched, self._unsearched = self._unsearched, []
         links: list[Link] = []
+        contradicted: list[Link] = []
         for new in unsearched:
-            links += self.finder.closures(self.graph, self._chain(new), new, self.joiner.relative_pose)
-        newest = unsearched[-1]
-        if links and not self.joiner.try_links(links, newest):
-            links = [link for link in links if len(links) > 1 and self.joiner.try_links([link], newest)]
-            self.counters.add("closures refused by the joined map")
-        if not links:
-            return [], 0
-        self._closed_at = len(self.graph.records)
-        dropped = self.joiner.drop_outliers(newest)
-        if dropped:
-            self.counters.add("matches taken back", dropped)
-        older = [self.graph.records[link.first].submap for link in links]
-        return [(submap.agent, submap.index) for submap in older], dropped
+            found = self.finder.closures(self.graph, self._chain(new), new, self.joiner.relative_pose)
+            links += found.believed
+            contradicted += found.contradicted
+        verdict = self.trials.hear(links, contradicted, unsearched[-1]) if links or contradicted else Verdict()
+        for name, amount in (
+            ("closures refused by the joined map", len(links) if not verdict.believed else 0),
+            ("matches taken back", verdict.dropped),
+            ("closures taken back", len(verdict.revoked)),
+        ):
+            if amount:
+                self.counters.add(name, amount)
+        if verdict.believed:
+            self._closed_at = len(self.graph.records)
+        older = [self.graph.records[link.first].submap for link in verdict.believed]
+        return [(submap.agent, submap.index) for submap in older], verdict.dropped
 
     @overload
     def trajectory(self) -> dict[str, list[PoseEstimate]]: ...
@@ -267,6 +274,7 @@ class GlobalMap:
         loaded = cls(config)
         loaded.graph, loaded.finder.pending = graph, pending
         loaded.joiner = Joiner(graph, loaded.config.closure.window, loaded.config.joining)
+        loaded.trials = Trials(loaded.joiner, loaded.config.trial, loaded.config.closure)
         for i, record in enumerate(graph.records):
             agent, session, _ = record.key
             loaded._lookup[record.key] = i

@@ -10,14 +10,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sjsam_node.association import Prior, variance_factor
+from sjsam_node.association import Prior
 from sjsam_node.closures import prior_of_pair, relative_pose
-from sjsam_node.estimator import Assembled, Estimator, EstimatorConfig, local_residual, observation_nis
+from sjsam_node.estimator import Assembled, Estimator, EstimatorConfig
 from sjsam_node.incremental import Front
-from sjsam_node.map_graph import Link, MapGraph, without
+from sjsam_node.map_graph import MapGraph, Snapshot
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import compose_covariance
-from slam_core.least_squares import chi_square_bound
 from slam_core.sparse_cholesky import IntArray
 
 
@@ -30,13 +29,6 @@ class JoinerConfig(Config):
     )
     relinearize_turn: float = parameter(
         0.02, "turn of a pose, since it was linearised, that calls for a batch", unit="rad", minimum=0.0
-    )
-    outlier_probability: float = parameter(
-        0.99999, "share of true matches that a joined map keeps", minimum=0.9, maximum=0.99999999
-    )
-    outlier_rounds: int = parameter(5, "times a joined map is searched for false matches", minimum=0)
-    closure_probability: float = parameter(
-        0.9999, "share of true closures whose rise of chi2 is accepted", minimum=0.9, maximum=0.9999999
     )
     estimator: EstimatorConfig = group(EstimatorConfig)
 
@@ -66,6 +58,14 @@ class _Joined:
     extensible: bool = False
     front: Front | None = None
     added: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """Beliefs, estimate and what was joined at one time."""
+
+    graph: Snapshot
+    joined: dict[int, _Joined]
 
 
 @dataclass
@@ -155,14 +155,23 @@ class Joiner:
             self.assembled(component)
         return self._joined[component].result.cost
 
+    def total_cost(self) -> float:
+        """chi2 of all components."""
+        return sum(self.cost(component) for component in np.unique(self.graph.component_of).tolist())
+
     def variance_factor(self, component: int) -> float:
         """chi2 per degree of freedom: how much larger the errors of a component's submaps are than they claim.
 
         Never below one: submaps that agree better than they should are not made surer.
         """
-        problem = self.assembled(component).problem
-        redundancy = problem.rows - problem.layout.pattern.n
+        self.assembled(component)
+        redundancy = self.redundancy(component)
         return max(1.0, self.cost(component) / redundancy) if redundancy > 0 else 1.0
+
+    def redundancy(self, component: int) -> int:
+        """Rows of a component's joining problem beyond its unknowns."""
+        problem = self._joined[component].assembled.problem
+        return problem.rows - problem.layout.pattern.n
 
     # -- closures ------------------------------------------------------------------------------------------------------
 
@@ -189,68 +198,24 @@ class Joiner:
         T_known, known = relative_pose(graph.poses[start], graph.poses[node], joint)
         return prior_of_pair(T_known @ T, compose_covariance(T_known, known, T, covariance))
 
-    def try_links(self, links: list[Link], newest: int) -> bool:
-        """Join with some links; keep them if chi2 rises no more than true matches make it rise.
+    # -- trials --------------------------------------------------------------------------------------------------------
 
-        ``newest`` is the record whose end the agent goes on from.
-        """
-        graph = self.graph
-        parts = {graph.component(i) for link in links for i in (link.first, link.second)}
-        cost = sum(self.cost(part) for part in parts)
-        dof = sum(3 * len(link.pairs) for link in links) - 6 * (len(parts) - 1)
-        before, known = graph.snapshot(), dict(self._joined)
-        for link in links:
-            graph.add_link(link)
-        after = self.batch(newest)
-        # Closures that contradict the covariances, but not the drift to expect, bend the map once for all of them.
-        tension = max(link.tension for link in links)
-        excess = self._excess(after.cost - cost - tension, dof, graph.component(newest))
-        if excess <= 0.0:
-            for part in parts - {graph.component(newest)}:
-                self._joined.pop(part, None)
-            return True
-        graph.restore(before)
-        self._joined = known
-        return False
+    def checkpoint(self) -> Checkpoint:
+        """Everything a trial may change, to come back to."""
+        return Checkpoint(self.graph.snapshot(), dict(self._joined))
 
-    def _excess(self, rise: float, dof: int, component: int) -> float:
-        """How far chi2 rose above what true matches explain. Submaps that are too sure of themselves make every
-        closure look bad: the bound is in units of the map's own variance factor (Baarda 1968), never below one.
-        """
-        problem = self._joined[component].assembled.problem
-        free = max(problem.rows - problem.layout.pattern.n, 1)
-        factor = max(1.0, (self._joined[component].result.cost - max(rise, 0.0)) / free)
-        return float(rise - factor * chi_square_bound(self.config.closure_probability, max(dof, 1)))
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Back to a checkpoint taken since the last submap was added."""
+        self.graph.restore(checkpoint.graph)
+        self._joined = dict(checkpoint.joined)
 
-    def drop_outliers(self, newest: int) -> int:
-        """Take back matches that the joined map contradicts, worst first; the number taken back."""
-        dropped = 0
-        for _ in range(self.config.outlier_rounds):
-            outliers = self._outliers(self.graph.component(newest))
-            if not outliers:
-                break
-            dropped += len(outliers)
-            kept = [without(self.graph, link, outliers) for link in self.graph.links]
-            self.graph.replace_links([link for link in kept if link is not None])
-            self._joined = {c: j for c, j in self._joined.items() if c == self.graph.component(j.newest)}
-            self.batch(newest)
-        return dropped
-
-    def _outliers(self, component: int) -> set[int]:
-        """The worst observation of each record, where it is beyond its gate."""
-        assembled = self._joined[component].assembled
-        found = [
-            (
-                i,
-                reduced,
-                observation_nis(local_residual(self.graph, self.graph.records[i], reduced), reduced.information),
-            )
-            for i, reduced in zip(assembled.records, assembled.reduced, strict=True)
-        ]
-        factor = variance_factor(np.concatenate([nis for _, _, nis in found]))
-        gate = factor * chi_square_bound(self.config.outlier_probability, 3)
-        return {
-            int(self.graph.records[i].observations[reduced.shared[nis.argmax()]])
-            for i, reduced, nis in found
-            if nis.max(initial=0.0) > gate
-        }
+    def forget_stale(self, newest: int) -> None:
+        """After links were believed, with the component of ``newest`` joined: the other parts as they are now."""
+        own = self.graph.component(newest)
+        components = np.unique(self.graph.component_of).tolist()
+        for component in self._joined.keys() - {own}:
+            records = self.graph.records_of(component) if component in components else []
+            if len(records) != len(self._joined[component].assembled.records):
+                del self._joined[component]
+                if records:
+                    self.batch(records[-1])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sjsam_node.association import PointSet, Prior
-from sjsam_node.closures import at_start, prior_of_pair
+from sjsam_node.closures import Standing, at_start, prior_of_pair
 from slam_core.geometry import FloatArray, compose_covariance, inverse_jacobian, invert_transform
 from slam_core.types import PoseEstimate, Submap
 
@@ -54,10 +54,11 @@ class Localizer:
         seen = PointSet(submap.landmarks, submap.covariance[6:, 6:], submap.descriptors)
         best, most = self._pose, 0
         for record in self._candidates(submap):
-            link, certain = self._map.finder.judge(
+            link, standing = self._map.finder.judge(
                 at_start(self._map.graph.records[record]), seen, self._prior(record), 0.0, record
             )
-            if link is not None and len(link.pairs) > most and (certain or self._pose is None):
+            trusted = standing is Standing.CERTAIN or self._pose is None
+            if link is not None and len(link.pairs) > most and trusted:
                 anchor = self._map.start_pose(record)
                 covariance = compose_covariance(anchor.T, anchor.covariance, link.T, link.covariance)
                 best, most = PoseEstimate(submap.start_stamp_ns, anchor.T @ link.T, covariance), len(link.pairs)

@@ -94,6 +94,8 @@ class MapGraph:
     _members: dict[int, list[int]] = field(default_factory=dict)
     _ending_at: dict[int, int] = field(default_factory=dict)
     _way: dict[int, float] = field(default_factory=dict)
+    _chained: dict[int, FloatArray] = field(default_factory=dict)
+    _stretch: dict[int, int] = field(default_factory=dict)
     _middles: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     _starts: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
@@ -103,6 +105,8 @@ class MapGraph:
             start = self._new_node(guess, len(self.poses))
         T = self.poses[start]
         end = self._new_node(T @ submap.end_pose, int(self.component_of[start]))
+        self._stretch[end] = self._stretch.setdefault(start, start)
+        self._chained[end] = self._chained.setdefault(start, np.eye(4)) @ submap.end_pose
         self._way[end] = self._way.setdefault(start, 0.0) + float(np.linalg.norm(submap.end_pose[:3, 3]))
         record = Record(submap, session, start, end, len(self.points))
         self.points = np.concatenate([self.points, submap.landmarks @ T[:3, :3].T + T[:3, 3]])
@@ -134,6 +138,13 @@ class MapGraph:
         a, b = self.records[first], self.records[second]
         ways = self._way[a.start], self._way[b.start]
         return abs(ways[1] - ways[0]) if a.key[:2] == b.key[:2] else sum(ways)
+
+    def odometry_between(self, first: int, second: int) -> FloatArray | None:
+        """T_first_second of two records' starts by the end poses between them; None where nothing chains them."""
+        a, b = self.records[first].start, self.records[second].start
+        if self._stretch[a] != self._stretch[b]:
+            return None
+        return np.asarray(invert_transform(self._chained[a]) @ self._chained[b])
 
     def middles(self, records: IntArray) -> FloatArray:
         """Middle of the landmarks of some records in the map frame, (n, 3); the start pose where there are none."""

@@ -136,7 +136,7 @@ def _smoothing(submap: Submap, pose: PoseEstimate) -> tuple[FloatArray, FloatArr
     handed_on = _positive(pose.covariance - 0.5 * submap.path[1].covariance)
     A = np.eye(6)  # the lever arm of what is left of the way
     A[:3, 3:] = -skew(submap.end_pose[:3, 3] - pose.T[:3, 3])
-    gain: FloatArray = np.linalg.solve(end_covariance, A @ handed_on).T
+    gain = np.asarray(np.linalg.solve(end_covariance, A @ handed_on).T, dtype=np.float64)
     return gain, _positive(pose.covariance - gain @ end_covariance @ gain.T)
 
 
