@@ -7,34 +7,34 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ndt_registration.ambiguity import AmbiguityConfig, Explanation, reason_of_doubt
+from ndt_registration.ambiguity import AmbiguityConfig, reason_of_doubt
 from ndt_registration.registration import register
+from ndt_registration.search import Candidate
 from slam_core.geometry import FloatArray, boxminus, make_transform
 
 CERTAIN = 1e-6 * np.eye(6)
 
 
-def at_x(x: float, cost: float, score: float) -> Explanation:
-    return Explanation(make_transform(np.eye(3), np.array([x, 0.0, 0.0])), cost, score)
+def at_x(x: float, cost: float) -> Candidate:
+    return Candidate(make_transform(np.eye(3), np.array([x, 0.0, 0.0])), cost, 0.0, 0.5, np.eye(6))
 
 
 @pytest.mark.parametrize(
     ("other", "doubted"),
     [
-        pytest.param(at_x(1.0, 0.055, 0.1), True, id="costs hardly more"),
-        pytest.param(at_x(1.0, 0.2, 0.58), True, id="fits about as well"),
-        pytest.param(at_x(1.0, 0.2, 0.1), False, id="worse in both"),
-        pytest.param(at_x(0.02, 0.05, 0.6), False, id="the same pose"),
+        pytest.param(at_x(1.0, -0.11), True, id="costs hardly more"),
+        pytest.param(at_x(1.0, 0.1), False, id="costs much more"),
+        pytest.param(at_x(0.02, -0.12), False, id="the same pose"),
     ],
 )
-def test_only_a_close_rival_elsewhere_makes_a_doubt(other: Explanation, doubted: bool) -> None:
-    reason = reason_of_doubt(at_x(0.0, 0.05, 0.6), [other], CERTAIN, 2.0, AmbiguityConfig())
+def test_only_a_close_rival_elsewhere_makes_a_doubt(other: Candidate, doubted: bool) -> None:
+    reason = reason_of_doubt(at_x(0.0, -0.12), [other], CERTAIN, 2.0, AmbiguityConfig())
     assert reason.startswith("ambiguous: a pose 1.00 m and 0.0 deg away") if doubted else reason == ""
 
 
 def test_a_rival_that_the_covariance_covers_is_none() -> None:
     corridor = np.diag([4.0, *np.full(5, 1e-6)])
-    assert reason_of_doubt(at_x(0.0, 0.05, 0.6), [at_x(1.0, 0.05, 0.6)], corridor, 2.0, AmbiguityConfig()) == ""
+    assert reason_of_doubt(at_x(0.0, -0.12), [at_x(1.0, -0.12)], corridor, 2.0, AmbiguityConfig()) == ""
 
 
 @pytest.mark.parametrize("step", [0.3, -0.3])
@@ -44,7 +44,7 @@ def test_a_row_of_equal_pillars_is_ambiguous_without_a_guess(
     rng = np.random.default_rng(5)
     pillars = np.array([[(4.5, y, 0.0), (4.8, y + 0.2, 30.0)] for y in np.arange(0.5, 39.0, 0.6)])
     room = replace(empty_room(6.0, 40.0, 30.0), boxes=pillars)
-    start, truth = at(1.0, 20.0, 15.0), at(0.0, step)
+    start, truth = at(1.0, 20.1, 15.0), at(0.0, step)  # midway between two pillars, then before either
     source, target = room.scan(start @ truth, rng), room.scan(start, rng)
     searched, guessed = register(source, target), register(source, target, at(0.0, 0.9 * step))
     assert not searched.converged

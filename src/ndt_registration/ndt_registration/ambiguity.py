@@ -1,17 +1,16 @@
 """Whether the answer of a global search is the only one: the other poses that the search refined are its witnesses.
 
 Where two scans share little, a wrong pose can look as good as the true one. An answer is doubted where another pose
-costs hardly more, or fits the surfaces about as well: visibility cost and score are two opinions, and must agree.
+costs hardly more.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from ndt_registration.search import SEPARATION, pose_distance
+from ndt_registration.search import SEPARATION, Candidate, pose_distance
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus
 
@@ -20,26 +19,15 @@ from slam_core.geometry import FloatArray, boxminus
 class AmbiguityConfig(Config):
     """When the answer of a search is called ambiguous; a given initial guess is never doubted in this way."""
 
-    cost_margin: float = parameter(0.01, "visibility cost by which the answer must beat every rival", minimum=0.0)
-    score_share: float = parameter(
-        0.9, "share of the answer's score that no rival may reach", minimum=0.0, maximum=10.0
-    )
+    margin: float = parameter(0.03, "cost by which the answer must beat every rival", minimum=0.0)
     gate: float = parameter(
         22.5, "squared Mahalanobis distance within which a pose is no rival: the covariance covers it", minimum=0.0
     )
 
 
-class Explanation(NamedTuple):
-    """A refined pose T_target_source, its visibility cost (lower is better) and its score over all points (higher)."""
-
-    T: FloatArray
-    cost: float
-    score: float
-
-
 def reason_of_doubt(
-    best: Explanation,
-    others: list[Explanation],
+    best: Candidate,
+    others: list[Candidate],
     covariance: FloatArray,
     scale: float,
     config: AmbiguityConfig,
@@ -58,18 +46,12 @@ def reason_of_doubt(
         Settings.
     """
     for other in others:
-        if _is_rival(best, other, config) and _differs(best, other, covariance, scale, config):
+        if other.cost < best.cost + config.margin and _differs(best, other, covariance, scale, config):
             return f"ambiguous: a pose {_difference(best.T, other.T)} away explains the scan about equally well"
     return ""
 
 
-def _is_rival(best: Explanation, other: Explanation, config: AmbiguityConfig) -> bool:
-    return other.cost < best.cost + config.cost_margin or other.score > config.score_share * best.score
-
-
-def _differs(
-    best: Explanation, other: Explanation, covariance: FloatArray, scale: float, config: AmbiguityConfig
-) -> bool:
+def _differs(best: Candidate, other: Candidate, covariance: FloatArray, scale: float, config: AmbiguityConfig) -> bool:
     d = boxminus(other.T, best.T)
     return bool(pose_distance(other.T, best.T, scale) > SEPARATION and d @ np.linalg.solve(covariance, d) > config.gate)
 

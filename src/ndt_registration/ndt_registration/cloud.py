@@ -20,6 +20,7 @@ _EVEN_SIZE = 0.01
 """Edge of the blocks of a crowded cloud, over the range that holds 90 % of its points."""
 _CROWDED = 8.0
 """A cloud is crowded where a typical point's block has this many times the points of a typical block."""
+_FEWEST_RIMS = 60
 _SEED = 20100610
 """Thinning is random but always the same: two runs on the same cloud give the same bytes."""
 
@@ -41,6 +42,10 @@ class Cloud:
     def sample(self, count: int) -> FloatArray:
         """A fair sample of at most ``count`` points."""
         return self.points[:count]
+
+    def sample_rims(self, count: int) -> FloatArray:
+        """The rims that go with a sample of ``count`` points: at least so many as make rims of use."""
+        return self.rims[: max(count // 3, _FEWEST_RIMS)]
 
     def __len__(self) -> int:
         return len(self.points)
@@ -79,7 +84,8 @@ def prepare(points: FloatArray, limit: int, *, planar: bool, centre: FloatArray)
     points = np.ascontiguousarray(points[rng.permutation(len(points))])
     scale = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
     spacing = mean_spacing(points, range_image(points, _COVERAGE_SIZE), planar)
-    return Cloud(points, rim_points(points, spacing, _RIM_STEP * scale), scale, planar)
+    rims = rim_points(points, spacing, _RIM_STEP * scale)
+    return Cloud(points, rims[rng.permutation(len(rims))], scale, planar)
 
 
 def _evened(points: FloatArray) -> FloatArray:

@@ -31,7 +31,7 @@ class Layer(NamedTuple):
 
 class NdtOptimum(NamedTuple):
     """Pose, mean score per point in [0, 1], iterations, whether the step became small; derivatives of the *cost*
-    (-score).
+    (-score, summed over the points), and how many points.
     """
 
     rotation: FloatArray
@@ -42,6 +42,7 @@ class NdtOptimum(NamedTuple):
     gradient: FloatArray
     hessian: FloatArray
     majorant: FloatArray
+    points: int
 
 
 @njit(cache=True, nogil=True)
@@ -279,4 +280,6 @@ def ndt_align(
             damping = max(damping * 10.0, 1e-4)
             if damping > 1e8:
                 break
-    return NdtOptimum(R, t, -cost / max(layers[0].points.shape[0], 1), iteration, converged, g, H, M)
+    return NdtOptimum(
+        R, t, -cost / max(layers[0].points.shape[0], 1), iteration, converged, g, H, M, layers[0].points.shape[0]
+    )

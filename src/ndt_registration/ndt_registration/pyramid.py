@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ndt_registration.cloud import Cloud
 from ndt_registration.ndt import Layer
-from ndt_registration.voxel_grid import Moments, NormalGrid, block_moments, coarser, normal_grid
+from ndt_registration.voxel_grid import Moments, NormalGrid, adopt_planes, block_moments, coarser, normal_grid
 from slam_core.config import Config, parameter
 
 
@@ -27,6 +27,11 @@ class GridConfig(Config):
     surface_levels: int = parameter(2, "finest grids whose cells are surfaces that points may slide along", minimum=0)
     slack: float = parameter(
         10.0, "information taken off the cells of a surface, over that of its widest direction", minimum=0.0
+    )
+    flatness: float = parameter(
+        2.0,
+        "a cell takes the plane of the wider one whose variance across is at most so many times its own",
+        minimum=0.0,
     )
     surface_smoothing: float = parameter(0.03, "like smoothing, on the surface levels", minimum=0.0)
     rim_ratio: float = parameter(2.0, "edge of the cells of rims over that of surfaces", minimum=0.1)
@@ -57,15 +62,19 @@ class Pyramid:
             surface_grids.append(_surface_grid(surfaces, size, level, config))
             rim_grids.append(_rim_grid(rims, config.rim_ratio * size, level, config))
             surfaces, rims = coarser(surfaces), coarser(rims)
+        for level in range(config.levels - 2, -1, -1):
+            slack = config.slack if level < config.surface_levels else -1.0
+            floor = (config.surface_smoothing * edge * 2**level) ** 2
+            adopt_planes(surface_grids[level], surface_grids[level + 1], config.flatness, floor, slack)
         return Pyramid(tuple(surface_grids), tuple(rim_grids))
 
     def layers(self, source: Cloud, level: int, count: int, rim_share: float) -> tuple[Layer, Layer]:
         """What NDT needs on a level: at most ``count`` source points and their rims, which together weigh
         ``rim_share``.
         """
-        points = source.sample(count)
-        factor = rim_share * len(points) / max(len(source.rims), _FEW_RIMS)
-        return Layer(points, self.grids[level], 1.0), Layer(source.rims, self.rims[level], factor)
+        points, rims = source.sample(count), source.sample_rims(count)
+        factor = rim_share * len(points) / max(len(rims), _FEW_RIMS)
+        return Layer(points, self.grids[level], 1.0), Layer(rims, self.rims[level], factor)
 
 
 _FEW_RIMS = 30

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from ndt_registration.ambiguity import AmbiguityConfig, Explanation, reason_of_doubt
+from ndt_registration.ambiguity import AmbiguityConfig, reason_of_doubt
 from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare, viewpoint
 from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
 from ndt_registration.matching import fit_to_grid
 from ndt_registration.ndt import NdtOptimum, ndt_align
 from ndt_registration.pyramid import GridConfig, Pyramid
-from ndt_registration.search import Candidate, SearchConfig, judge, planar_constraint, search
+from ndt_registration.search import Candidate, SearchConfig, Views, judge, planar_constraint, search
 from ndt_registration.uncertainty import Curvature, Extent, UncertaintyConfig, direction_names, sandwich, unknown
 from ndt_registration.visibility import RangeImage, range_image
 from slam_core.config import Config, group, parameter
@@ -49,7 +49,7 @@ class RegistrationConfig(Config):
         0.15, "least share of source points on the target's surfaces", minimum=0.0, maximum=1.0
     )
     max_conflict: float = parameter(0.3, "largest visibility cost of a success", minimum=0.0)
-    rim_share: float = parameter(0.2, "weight of all rims over that of all surfaces", minimum=0.0)
+    rim_share: float = parameter(0.1, "weight of all rims over that of all surfaces", minimum=0.0)
     icp: IcpConfig = group(IcpConfig)
     grid: GridConfig = group(GridConfig)
     search: SearchConfig = group(SearchConfig)
@@ -172,27 +172,25 @@ def _register(
     source: Cloud, target: Target, guess: FloatArray | None, config: RegistrationConfig
 ) -> RegistrationResult:
     scale = max(target.cloud.scale, 1e-6)
+    views = Views(source, range_image(source.points, config.image_size), target.cloud, target.image)
+    candidates: list[Candidate] = []
     if guess is not None:
-        candidates, start = [Candidate(guess, 0.0)], config.start_level
+        T, start = guess, config.start_level
     elif config.search.enabled:
-        candidates, start = search(source, target.pyramid, target.image, scale, config.search), 1
+        candidates = search(views, target.pyramid, config.rim_share, config.search)
+        T, start = candidates[0].T, 1
     else:
-        candidates, start = [Candidate(np.eye(4), 0.0)], config.grid.levels - 1
-    refined = [_aligned(source, target, candidate.T, start, scale, config) for candidate in candidates]
-    found = [
-        Explanation(_pose(o), judge(source, target.image, scale, _pose(o), config.search), o.score) for o, _ in refined
-    ]
-    best = int(np.argmin([explanation.cost for explanation in found]))
-    optimum, iterations = refined[best]
-    result = _result(source, target, optimum, iterations, found[best].cost, config)
-    if guess is None and result.converged:
-        others = found[:best] + found[best + 1 :]
-        return _doubted(result, found[best], others, target, config)
+        T, start = np.eye(4), config.grid.levels - 1
+    optimum, iterations = _aligned(source, target, T, start, scale, config)
+    conflict = judge(views, optimum, config.search).conflict
+    result = _result(source, target, optimum, iterations, conflict, config)
+    if candidates and result.converged:
+        return _doubted(result, candidates[0], candidates[1:], target, config)
     return result
 
 
 def _doubted(
-    result: RegistrationResult, best: Explanation, others: list[Explanation], target: Target, config: RegistrationConfig
+    result: RegistrationResult, best: Candidate, others: list[Candidate], target: Target, config: RegistrationConfig
 ) -> RegistrationResult:
     """The result of a search, as a failure where it is not the only answer."""
     scale = max(target.cloud.scale, 1e-6)

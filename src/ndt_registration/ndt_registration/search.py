@@ -1,21 +1,26 @@
-"""Global search for a pose: a coarse lattice of motions judged by free space, each promising one refined on coarse
-cells.
+"""Global search for a pose: rotations from the normals, translations from a lattice, then NDT in rounds that keep ever
+fewer poses.
+
+What makes a pose good is the same throughout: the scans' points must not lie in space that the other has looked
+through, and must lie on its surfaces. Free space alone is blind where little is shared, and fit alone pulls a scan over
+its neighbour; the cost of a pose is the conflict less a share of the score.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from ndt_registration.cloud import Cloud
-from ndt_registration.ndt import ndt_align
+from ndt_registration.ndt import NdtOptimum, ndt_align
+from ndt_registration.near_field import lattice_costs, near_field
+from ndt_registration.orientation import ball_lattice, best_rotations, facing_normals, rotation_lattice
 from ndt_registration.pyramid import Pyramid
-from ndt_registration.visibility import Prices, RangeImage, lattice_costs, visibility_cost
+from ndt_registration.visibility import Prices, RangeImage, visibility_cost
 from slam_core.config import Config, parameter
-from slam_core.geometry import FloatArray, make_transform, so3_exp, so3_log
+from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform, so3_log
 
 
 @dataclass(frozen=True)
@@ -24,64 +29,112 @@ class SearchConfig(Config):
 
     enabled: bool = parameter(True, "search globally where no initial guess is given")
     max_rotation_deg: float = parameter(37.0, "largest rotation looked for", unit="deg", minimum=0.0, maximum=180.0)
-    rotation_step_deg: float = parameter(18.0, "spacing of the rotations", unit="deg", minimum=1.0)
+    rotation_step_deg: float = parameter(7.0, "spacing of the rotations", unit="deg", minimum=1.0)
+    rotations: int = parameter(4, "rotations that are combined with every translation", minimum=1)
     max_translation: float = parameter(0.6, "largest translation looked for, over the scale", minimum=0.0)
-    translation_step: float = parameter(0.2, "spacing of the translations, over the scale", minimum=0.01)
+    translation_step: float = parameter(0.07, "spacing of the translations, over the scale", minimum=0.01)
     tolerance: float = parameter(
-        0.08, "deviation along the ray that costs nothing in the lattice, over the scale", minimum=0.001
+        0.03, "deviation along the ray that costs nothing in the lattice, over the scale", minimum=0.001
     )
-    lattice_points: int = parameter(64, "points judged at each pose of the lattice", minimum=8)
-    starts: int = parameter(40, "poses of the lattice that are refined", minimum=1)
-    refine_points: int = parameter(200, "points used in the refinement", minimum=16)
-    refine_iterations: int = parameter(10, "most iterations per level of the refinement", minimum=1)
-    rim_share: float = parameter(0.2, "weight of all rims over that of all surfaces", minimum=0.0)
+    lattice_points: int = parameter(40, "points judged at each pose of the lattice", minimum=8)
+    shortlist: int = parameter(200, "poses of the lattice that are looked at with more points", minimum=1)
+    starts: int = parameter(16, "poses of the lattice that are refined", minimum=1)
     judge_points: int = parameter(500, "points used to judge refined poses", minimum=16)
     judge_tolerance: float = parameter(
         0.02, "deviation along the ray that costs nothing there, over the scale", minimum=0.001
     )
+    score_gain: float = parameter(0.3, "what a full score takes off the cost of a pose", minimum=0.0)
     candidates: int = parameter(4, "distinct refined poses that are handed on", minimum=1)
 
 
 PRICES = Prices(unseen=0.15, hidden=0.5, free=2.0)
 """Nothing is lost where a scan ends, little where things hide each other, but space that was seen free stays free."""
-REFINEMENT_LEVELS = (3, 2)
 SEPARATION = 0.05
 """Poses nearer than this (rad, and translation over the scale) are the same candidate."""
+_SLIGHT_LOSS = 0.1
+"""Share of the score: poses are the same if the way between them is expected to cost no more."""
+_START_SEPARATION = 0.1
+"""Like it, between starts of the same rotation."""
+_PATCH = 1 / 16
+"""Edge of the patches that have normals, over the scale."""
+_FIELD_EDGE = 0.05
+_FIELD_REACH = 2.0
+"""Voxels and half-edge of the map of nearness, over the scale."""
+_FIELD_POINTS = 8000
+
+
+class Round(NamedTuple):
+    """One round of refinement: level of the pyramid, points used, most iterations, most poses that stay."""
+
+    level: int
+    points: int
+    iterations: int
+    keep: int
+
+
+ROUNDS = (Round(2, 300, 8, 6), Round(1, 1000, 10, 4))
 
 
 class Candidate(NamedTuple):
-    """A pose T_target_source and its visibility cost, lower is better."""
+    """A pose T_target_source, its cost (lower is better), and what that is made of: visibility conflict and score.
+
+    curvature (6, 6): by how much per point the score bends down around the pose.
+    """
 
     T: FloatArray
     cost: float
+    conflict: float
+    score: float
+    curvature: FloatArray
 
 
-@lru_cache(maxsize=8)
-def _lattice(radius: float, step: float, axes: tuple[int, ...]) -> FloatArray:
-    """Points of a cubic lattice inside a ball, shape (k, 3); only the given axes are used."""
-    reach = int(np.floor(radius / step + 1e-9))
-    line = np.arange(-reach, reach + 1) * step
-    grids = np.meshgrid(*[line if axis in axes else np.zeros(1) for axis in range(3)], indexing="ij")
-    points = np.stack(grids, axis=-1).reshape(-1, 3)
-    return np.asarray(points[np.linalg.norm(points, axis=1) <= radius * (1.0 + 1e-9)])
+class Views(NamedTuple):
+    """Two scans with what each has seen."""
+
+    source: Cloud
+    source_image: RangeImage
+    target: Cloud
+    target_image: RangeImage
+
+    @property
+    def scale(self) -> float:
+        """Median range of the target, m."""
+        return max(self.target.scale, 1e-6)
 
 
-def search(source: Cloud, pyramid: Pyramid, image: RangeImage, scale: float, config: SearchConfig) -> list[Candidate]:
-    """Distinct promising poses, best first."""
-    starts = _best_of_lattice(source, image, scale, config)
-    refined = [_refine(source, pyramid, image, scale, T, config) for T in starts]
-    return distinct(sorted(refined, key=lambda candidate: candidate.cost), SEPARATION, scale, config.candidates)
+def search(views: Views, pyramid: Pyramid, rim_share: float, config: SearchConfig) -> list[Candidate]:
+    """Distinct refined poses, best first."""
+    poses = _starts(views, config)
+    fixed = planar_constraint(views.source.planar)
+    for step in ROUNDS:
+        layers = pyramid.layers(views.source, step.level, step.points, rim_share)
+        refined = []
+        for T in poses:
+            R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+            optimum = ndt_align(layers, R, t, fixed, views.scale, step.iterations, 1e-3 * views.scale)
+            refined.append(judge(views, optimum, config))
+        candidates = distinct(sorted(refined, key=lambda candidate: candidate.cost), views.scale, step.keep)
+        poses = [candidate.T for candidate in candidates]
+    return candidates
 
 
-def distinct(candidates: list[Candidate], separation: float, scale: float, count: int) -> list[Candidate]:
-    """The first ``count`` candidates that differ by more than ``separation`` (rad, and translation over the scale)."""
+def distinct(candidates: list[Candidate], scale: float, count: int) -> list[Candidate]:
+    """The first ``count`` candidates that are not the same as one before them."""
     kept: list[Candidate] = []
     for candidate in candidates:
-        if all(pose_distance(candidate.T, other.T, scale) > separation for other in kept):
+        if not any(is_same(other, candidate, scale) for other in kept):
             kept.append(candidate)
         if len(kept) == count:
             break
     return kept
+
+
+def is_same(candidate: Candidate, other: Candidate, scale: float) -> bool:
+    """Whether two poses are one answer: near each other, or apart only where the scan leaves the pose free."""
+    if pose_distance(candidate.T, other.T, scale) < SEPARATION:
+        return True
+    d = boxminus(other.T, candidate.T)
+    return bool(0.5 * d @ candidate.curvature @ d < _SLIGHT_LOSS * candidate.score)
 
 
 def pose_distance(T: FloatArray, other: FloatArray, scale: float) -> float:
@@ -90,36 +143,51 @@ def pose_distance(T: FloatArray, other: FloatArray, scale: float) -> float:
     return float(angle + np.linalg.norm(T[:3, 3] - other[:3, 3]) / scale)
 
 
-def judge(source: Cloud, image: RangeImage, scale: float, T: FloatArray, config: SearchConfig) -> float:
-    """Visibility cost of the source at a pose."""
-    turned = np.ascontiguousarray(source.sample(config.judge_points) @ T[:3, :3].T)
-    return float(visibility_cost(turned, T[:3, 3].copy(), image, config.judge_tolerance * scale, PRICES))
+def judge(views: Views, optimum: NdtOptimum, config: SearchConfig) -> Candidate:
+    """An optimum with its cost; each scan's points are held against what the other has seen."""
+    T, score = make_transform(optimum.rotation, optimum.translation), optimum.score
+    tolerance = config.judge_tolerance * views.scale
+    conflict = 0.0
+    for points, image, pose in (
+        (views.source.sample(config.judge_points), views.target_image, T),
+        (views.target.sample(config.judge_points), views.source_image, invert_transform(T)),
+    ):
+        turned = np.ascontiguousarray(points @ pose[:3, :3].T)
+        conflict += 0.5 * visibility_cost(turned, pose[:3, 3].copy(), image, tolerance, PRICES)
+    curvature = optimum.majorant / max(optimum.points, 1)
+    return Candidate(T, conflict - config.score_gain * score, conflict, score, curvature)
 
 
-def _best_of_lattice(source: Cloud, image: RangeImage, scale: float, config: SearchConfig) -> list[FloatArray]:
-    rotation_axes, translation_axes = ((2,), (0, 1)) if source.planar else ((0, 1, 2), (0, 1, 2))
-    vectors = _lattice(np.deg2rad(config.max_rotation_deg), np.deg2rad(config.rotation_step_deg), rotation_axes)
-    translations = scale * _lattice(config.max_translation, config.translation_step, translation_axes)
-    rotations = so3_exp(vectors)
-    points = source.sample(config.lattice_points)
-    costs = lattice_costs(points, rotations, translations, image, config.tolerance * scale, PRICES).ravel()
-    best = np.argsort(costs, kind="stable")[: config.starts]
-    chosen = [make_transform(rotations[k // len(translations)], translations[k % len(translations)]) for k in best]
-    return [np.eye(4), *chosen]
-
-
-def _refine(
-    source: Cloud, pyramid: Pyramid, image: RangeImage, scale: float, T: FloatArray, config: SearchConfig
-) -> Candidate:
-    fixed = planar_constraint(source.planar)
-    for level in REFINEMENT_LEVELS:
-        layers = pyramid.layers(source, level, config.refine_points, config.rim_share)
-        optimum = ndt_align(
-            layers, np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), fixed, scale,
-            config.refine_iterations, 1e-3 * scale,
-        )  # fmt: skip
-        T = make_transform(optimum.rotation, optimum.translation)
-    return Candidate(T, judge(source, image, scale, T, config))
+def _starts(views: Views, config: SearchConfig) -> list[FloatArray]:
+    """The most promising poses of the lattice, and the sensor at rest."""
+    source, target, scale = views.source, views.target, views.scale
+    largest, step = np.deg2rad(config.max_rotation_deg), np.deg2rad(config.rotation_step_deg)
+    if source.planar:
+        rotations = rotation_lattice(largest, step, (2,))
+    else:
+        a, b = (facing_normals(cloud.points, _PATCH * scale) for cloud in (source, target))
+        rotations = best_rotations(a, b, largest, step, config.rotations)
+    axes = (0, 1) if source.planar else (0, 1, 2)
+    translations = scale * ball_lattice(config.max_translation, config.translation_step, axes)
+    field = near_field(target.sample(_FIELD_POINTS), _FIELD_EDGE * scale, _FIELD_REACH * scale)
+    seen = (views.target_image, config.tolerance * scale, PRICES, field, config.score_gain)
+    costs = lattice_costs(source.sample(config.lattice_points), rotations, translations, *seen).ravel()
+    shortlist = np.argsort(costs, kind="stable")[: config.shortlist]
+    turns, shifts = np.divmod(shortlist, len(translations))
+    points = source.sample(config.judge_points)
+    again = np.empty(len(shortlist))
+    for turn in np.unique(turns):
+        of_turn = turns == turn
+        again[of_turn] = lattice_costs(points, rotations[turn, None], translations[shifts[of_turn]], *seen)[0]
+    chosen: list[int] = []
+    for k in np.argsort(again, kind="stable"):
+        same = [j for j in chosen if turns[j] == turns[k]]
+        gaps = np.linalg.norm(translations[shifts[same]] - translations[shifts[k]], axis=1)
+        if (gaps > _START_SEPARATION * scale).all():
+            chosen.append(int(k))
+        if len(chosen) == config.starts:
+            break
+    return [np.eye(4), *(make_transform(rotations[turns[k]], translations[shifts[k]]) for k in chosen)]
 
 
 def planar_constraint(planar: bool) -> FloatArray:

@@ -95,24 +95,6 @@ def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolera
 
 
 @njit(cache=True, nogil=True)
-def lattice_costs(
-    points: FloatArray,
-    rotations: FloatArray,
-    translations: FloatArray,
-    image: RangeImage,
-    tolerance: float,
-    prices: Prices,
-) -> FloatArray:
-    """Cost (k, l) of points (n, 3) at every pair of rotations (k, 3, 3) and translations (l, 3)."""
-    costs = np.empty((rotations.shape[0], translations.shape[0]))
-    for a in range(rotations.shape[0]):
-        turned = points @ rotations[a].T
-        for b in range(translations.shape[0]):
-            costs[a, b] = visibility_cost(turned, translations[b], image, tolerance, prices)
-    return costs
-
-
-@njit(cache=True, nogil=True)
 def mean_spacing(points: FloatArray, image: RangeImage, planar: bool) -> float:
     """Mean angle (rad) between neighbouring points (n, 3), from the part of the sphere, or circle, that they cover."""
     occupied = 0

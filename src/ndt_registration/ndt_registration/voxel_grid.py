@@ -255,3 +255,64 @@ def normal_grid(
     )
     keys, rows, cells = _cover(corner[keep])
     return NormalGrid(block_size, keys, rows, cells, mean, information, normal, variance, count)
+
+
+def plane_fits(moments: Moments, min_points: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean (k, 3), direction of least variance (k, 3) and ascending variances (k, 3) of blocks with enough points."""
+    keep = moments.counts >= max(min_points, 2)
+    mean, _, normal, variance = _distributions(
+        moments.counts[keep], moments.sums[keep], moments.outers[keep], 0.0, _TINY, 0.0
+    )
+    return mean, normal, variance
+
+
+_TINY = 1e-12
+
+
+@njit(cache=True, nogil=True)
+def adopt_planes(grid: NormalGrid, wider: NormalGrid, flatness: float, floor: float, slack: float) -> None:
+    """Give each cell the plane of the cell of twice its edge around it, where that is as flat as the cell itself.
+
+    The direction of a cell's normal errs by its thickness over its width and the root of its points, for a small piece
+    of a noisy wall by degrees: enough to hold points that should slide along. The wider plane errs sixteen times less
+    in variance. Cells are changed in place; with ``slack`` >= 0 their information becomes that of the plane alone.
+
+    Parameters
+    ----------
+    grid, wider
+        The grid to change, and the next coarser one, changed before.
+    flatness
+        Largest ratio of the wider cell's thickness to the cell's own, as variances.
+    floor
+        Least variance across the plane, m2.
+    slack
+        See :func:`normal_grid`; below 0 the information stays.
+    """
+    for i in range(grid.mean.shape[0]):
+        x, y, z = grid.mean[i] / wider.block_size
+        ix, iy, iz = np.floor(x), np.floor(y), np.floor(z)
+        row = find_block(wider.keys, wider.rows, int(ix), int(iy), int(iz))
+        if row < 0:
+            continue
+        # Of the eight cells, that whose centre is nearest.
+        child = int(x - ix < 0.5) + 2 * int(y - iy < 0.5) + 4 * int(z - iz < 0.5)
+        cell = wider.cells[row, child]
+        if cell < 0 or wider.variance[cell, 0] > flatness * max(grid.variance[i, 0], floor):
+            continue
+        n = wider.normal[cell]
+        offset = 0.0
+        for k in range(3):
+            offset += n[k] * (grid.mean[i, k] - wider.mean[cell, k])
+        for k in range(3):
+            grid.mean[i, k] -= offset * n[k]
+            grid.normal[i, k] = n[k]
+            grid.variance[i, k] = wider.variance[cell, k]
+        grid.counts[i] = wider.counts[cell]
+        if slack >= 0.0:
+            thickness = max(grid.variance[i, 0], floor)
+            information = max(1.0 / thickness - slack / max(grid.variance[i, 2], thickness), 0.0)
+            m = 0
+            for r in range(3):
+                for c in range(r, 3):
+                    grid.information[i, m] = information * n[r] * n[c]
+                    m += 1

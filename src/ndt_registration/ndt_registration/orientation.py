@@ -1,0 +1,141 @@
+"""Which rotations turn the surfaces of one scan into those of another: the normals alone say it, wherever the scan is.
+
+Two scans of one place show much the same set of surface directions, and a rotation matches the sets however far the
+sensor has moved. So rotations are found first, apart from translations (compare Makadia et al. 2006 on extended
+Gaussian images): three unknowns instead of six.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numba import njit
+
+from ndt_registration.visibility import direction_bin
+from ndt_registration.voxel_grid import block_moments, plane_fits
+from slam_core.geometry import FloatArray, so3_exp
+
+_IMAGE_SIZE = 48
+"""Edge of the octahedral map of directions: bins of about 4 degrees."""
+_COARSE_WIDTH = np.deg2rad(6.0)
+_FINE_WIDTH = np.deg2rad(3.0)
+"""Standard deviations of a normal, rad: for the lattice of rotations, and for that around its best."""
+_FINE_RADIUS = np.deg2rad(6.0)
+_FINE_STEP = np.deg2rad(2.5)
+_SEPARATION = np.deg2rad(10.0)
+"""Rotations nearer than this are the same hypothesis."""
+_PREFERENCE = 0.05
+"""Share of the score that the largest rotation loses: normals that all agree say nothing of turns about themselves."""
+_FLAT = 0.35
+"""Largest ratio of the standard deviations across and along a patch that has a normal."""
+_FEWEST = 6
+"""Fewest points of a patch."""
+
+
+@lru_cache(maxsize=16)
+def ball_lattice(radius: float, step: float, axes: tuple[int, ...]) -> FloatArray:
+    """Points of a cubic lattice inside a ball, shape (k, 3); only the given axes are used."""
+    reach = int(np.floor(radius / step + 1e-9))
+    line = np.arange(-reach, reach + 1) * step
+    grids = np.meshgrid(*[line if axis in axes else np.zeros(1) for axis in range(3)], indexing="ij")
+    points = np.stack(grids, axis=-1).reshape(-1, 3)
+    return np.asarray(points[np.linalg.norm(points, axis=1) <= radius * (1.0 + 1e-9)])
+
+
+@lru_cache(maxsize=16)
+def rotation_lattice(radius: float, step: float, axes: tuple[int, ...]) -> FloatArray:
+    """Rotations (k, 3, 3) whose vectors, rad, form a lattice in a ball."""
+    return so3_exp(ball_lattice(radius, step, axes))
+
+
+def facing_normals(points: FloatArray, edge: float) -> FloatArray:
+    """Normals (k, 3), towards the viewer at the origin, of the flat ones among a scan's patches of ``edge`` m."""
+    mean, normal, variance = plane_fits(block_moments(points, edge), _FEWEST)
+    flat = variance[:, 0] < _FLAT**2 * variance[:, 1]
+    normal = normal[flat]
+    return normal * np.where((normal * mean[flat]).sum(axis=1) > 0.0, -1.0, 1.0)[:, None]
+
+
+def best_rotations(source: FloatArray, target: FloatArray, largest: float, step: float, count: int) -> FloatArray:
+    """The ``count`` best of all rotations up to ``largest`` rad, best first, shape (k, 3, 3).
+
+    Parameters
+    ----------
+    source, target
+        Unit normals (n, 3) and (m, 3).
+    largest, step
+        Greatest angle and spacing of the lattice, rad.
+    count
+        Most rotations, each well apart from the others.
+
+    A wall has many normals and a chair few; both are told by their directions alike. So a direction counts with the
+    root of how many point there.
+    """
+    if len(source) == 0 or len(target) == 0:
+        return np.eye(3)[None]
+    weights = 1.0 / np.sqrt(direction_density(source, source, _COARSE_WIDTH))
+    weights /= weights.sum()
+    vectors, rotations = ball_lattice(largest, step, (0, 1, 2)), rotation_lattice(largest, step, (0, 1, 2))
+    scores = rotation_scores(rotations, source, weights, _direction_image(target, _COARSE_WIDTH), _IMAGE_SIZE)
+    scores -= _PREFERENCE * scores.max() * np.linalg.norm(vectors, axis=1) / max(largest, step)
+    kept: list[int] = []
+    for k in np.argsort(-scores, kind="stable"):
+        if all(np.linalg.norm(vectors[k] - vectors[j]) > _SEPARATION for j in kept):
+            kept.append(int(k))
+        if len(kept) == count:
+            break
+    around, fine = rotation_lattice(_FINE_RADIUS, _FINE_STEP, (0, 1, 2)), _direction_image(target, _FINE_WIDTH)
+    turned = [around @ rotations[k] for k in kept]
+    return np.array([R[rotation_scores(R, source, weights, fine, _IMAGE_SIZE).argmax()] for R in turned])
+
+
+@lru_cache(maxsize=1)
+def _bin_directions() -> FloatArray:
+    """Unit directions (n, 3) of the centres of the octahedral map's bins; see ``direction_bin``."""
+    line = (np.arange(_IMAGE_SIZE) + 0.5) / _IMAGE_SIZE * 2.0 - 1.0
+    u, v = (a.ravel() for a in np.meshgrid(line, line, indexing="ij"))
+    z = 1.0 - np.abs(u) - np.abs(v)
+    x = np.where(z < 0.0, (1.0 - np.abs(v)) * np.where(u >= 0.0, 1.0, -1.0), u)
+    y = np.where(z < 0.0, (1.0 - np.abs(u)) * np.where(v >= 0.0, 1.0, -1.0), v)
+    directions = np.column_stack([x, y, z])
+    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def _direction_image(normals: FloatArray, width: float) -> FloatArray:
+    """Root of the density of normals in every bin, at most 1."""
+    image = np.sqrt(direction_density(_bin_directions(), normals, width))
+    return np.asarray(image / max(image.max(), 1e-300))
+
+
+@njit(cache=True, nogil=True)
+def direction_density(directions: FloatArray, normals: FloatArray, width: float) -> FloatArray:
+    """Mean over normals (n, 3) of a bell of standard deviation ``width`` rad, at unit directions (k, 3)."""
+    out = np.zeros(directions.shape[0])
+    least = 1.0 - 8.0 * width * width
+    for i in range(directions.shape[0]):
+        for j in range(normals.shape[0]):
+            cosine = (
+                directions[i, 0] * normals[j, 0] + directions[i, 1] * normals[j, 1] + directions[i, 2] * normals[j, 2]
+            )
+            if cosine > least:
+                out[i] += np.exp((cosine - 1.0) / (width * width))
+        out[i] /= normals.shape[0]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def rotation_scores(
+    rotations: FloatArray, normals: FloatArray, weights: FloatArray, image: FloatArray, size: int
+) -> FloatArray:
+    """Weighted mean of an image of directions at the normals (n, 3) turned by each rotation (k, 3, 3)."""
+    out = np.zeros(rotations.shape[0])
+    for k in range(rotations.shape[0]):
+        R = rotations[k]
+        for i in range(normals.shape[0]):
+            a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
+            x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+            y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+            z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+            out[k] += weights[i] * image[direction_bin(x, y, z, size)]
+    return out
