@@ -32,12 +32,12 @@ from planar_monte_carlo import planar_nees
 
 WALK_SIGMA = np.repeat([0.5, 0.4], 3)
 WALK_START = np.repeat([0.3, 0.2], 3)
-WALK = {
+WALK: dict[str, object] = {
     "motion.sigma_acceleration": 0.5, "motion.sigma_angular_acceleration": 0.4,
     "motion.sigma_initial_velocity": 0.3, "motion.sigma_initial_turn_rate": 0.2,
 }  # fmt: skip
-ENDLESS = {"submap.max_distance": 1e6, "submap.max_landmarks": 10**6, "submap.max_frames": 10**6}
-SPARSE = {"landmark.target_in_view": 25}
+ENDLESS: dict[str, object] = {"submap.max_distance": 1e6, "submap.max_landmarks": 10**6, "submap.max_frames": 10**6}
+SPARSE: dict[str, object] = {"landmark.target_in_view": 25}
 
 
 def walk(rng: np.random.Generator) -> list[FloatArray]:
@@ -86,7 +86,10 @@ CASES = {
 def line(name: str, case: Case, runs: list[Run]) -> str:
     submaps = [s for run in runs for s in run.submaps]
     seams = [
-        seam_nees(a.submap, b.submap) for run in runs for a, b in pairwise(run.submaps) if b.submap.follows_previous
+        seam_nees(a.submap, b.submap)
+        for run in runs
+        for a, b in pairwise(run.submaps)
+        if b.submap.follows_previous and np.isin(a.submap.landmark_ids, b.submap.landmark_ids).any()
     ]
     bounds = "[{:.2f} {:.2f}]".format(*anees_bounds(6, len(runs)))
     first = np.mean([run.submaps[0].pose_nees for run in runs]) / 6

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ekf_slam_node.calibration import CalibrationConfig
 from slam_core.config import Config, group, parameter
 
 
@@ -147,3 +148,4 @@ class EkfSlamConfig(Config):
     association: AssociationConfig = group(AssociationConfig)
     landmark: LandmarkConfig = group(LandmarkConfig)
     submap: SubmapConfig = group(SubmapConfig)
+    calibration: CalibrationConfig = group(CalibrationConfig)

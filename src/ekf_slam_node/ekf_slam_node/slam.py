@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ekf_slam_node.aids import ALL, Aid, MotionAids, aid_error
+from ekf_slam_node.calibration import in_doubt, submap_in_doubt
 from ekf_slam_node.candidates import MotionPrior, motion_prior
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import Ekf, TimeUpdate, UpdateReport
@@ -300,7 +301,7 @@ class EkfSlam:
         if self._map is None or self._builder.is_empty:
             return ()
         self._next_submap += 1
-        return (self._builder.close(self._map.ekf, self._map.book),)
+        return (submap_in_doubt(self._builder.close(self._map.ekf, self._map.book), self.config.calibration),)
 
     # -------------------------------------------------------------------------------------------------------- output
     def _pose(self, stamp_ns: int) -> PoseEstimate:
@@ -322,9 +323,9 @@ class EkfSlam:
         assert self._map is not None
         ekf, nobody = self._map.ekf, np.zeros(0, dtype=np.int64)
         return EkfResult(
-            stamp_ns, self._pose(stamp_ns), ekf.velocity, ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:], state, reason,
-            submaps, self._landmark_view(), update.nis, update.dof, nobody if ids is None else ids, nobody if index is
-            None else index,
+            stamp_ns, in_doubt(self._pose(stamp_ns), self.config.calibration), ekf.velocity,
+            ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:], state, reason, submaps, self._landmark_view(), update.nis,
+            update.dof, nobody if ids is None else ids, nobody if index is None else index,
         )  # fmt: skip
 
     def _landmark_view(self) -> LandmarkView:

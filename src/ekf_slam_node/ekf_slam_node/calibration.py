@@ -1,0 +1,74 @@
+"""What the calibration leaves unknown: errors that stay the same over a run and so never average out.
+
+A filter takes its noise as fresh in every frame. A wrong baseline (or range scale of a ToF camera) instead stretches
+all lengths alike, ``t -> (1 + s) t``, and a camera mounted a little turned turns the whole trajectory about the start,
+``T -> E T E^-1``. Neither shows in any innovation, so neither can be estimated; their effect on a pose or a landmark is
+known exactly, and with it what they add to the covariance (a consider parameter, Schmidt 1966). Along the odometry
+chain the errors of all submaps are one and the same; submaps that are joined count as independent, which makes the
+scale of a long joined map look better than it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray, skew
+from slam_core.types import PoseEstimate, Submap
+
+
+@dataclass(frozen=True)
+class CalibrationConfig(Config):
+    """Standard deviations of a calibration, as the calibration itself reports them."""
+
+    sigma_scale: float = parameter(
+        0.0,
+        "relative error of all lengths: of the baseline, or of a ToF camera's range",
+        minimum=0.0,
+        maximum=0.2,
+    )
+    sigma_mounting: float = parameter(
+        0.0, "error of the camera's direction in the rig, each axis", unit="rad", minimum=0.0, maximum=0.5
+    )
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether nothing is in doubt."""
+        return self.sigma_scale == 0.0 and self.sigma_mounting == 0.0
+
+
+def pose_sensitivity(T: FloatArray) -> FloatArray:
+    """Change (6, 4) of a pose (4, 4) in the frame of the start, per unit of scale and of the mounting's three turns."""
+    J = np.zeros((6, 4))
+    J[:3] = point_sensitivity(T[:3, 3])
+    J[3:, 1:] = np.eye(3) - T[:3, :3]
+    return J
+
+
+def point_sensitivity(points: FloatArray) -> FloatArray:
+    """The same (..., 3, 4) of points (..., 3)."""
+    return np.concatenate([points[..., None], -skew(points)], axis=-1)
+
+
+def in_doubt(pose: PoseEstimate, config: CalibrationConfig) -> PoseEstimate:
+    """A pose relative to the start of everything, its covariance widened."""
+    if config.is_exact:
+        return pose
+    J = pose_sensitivity(pose.T) * _sigmas(config)
+    return replace(pose, covariance=pose.covariance + J @ J.T)
+
+
+def submap_in_doubt(submap: Submap, config: CalibrationConfig) -> Submap:
+    """A submap with its joint covariance, and those of its path, widened."""
+    if config.is_exact:
+        return submap
+    J = np.vstack([pose_sensitivity(submap.end_pose), point_sensitivity(submap.landmarks).reshape(-1, 4)])
+    J = J * _sigmas(config)
+    path = tuple(in_doubt(pose, config) for pose in submap.path)
+    return replace(submap, covariance=submap.covariance + J @ J.T, path=path)
+
+
+def _sigmas(config: CalibrationConfig) -> FloatArray:
+    return np.array([config.sigma_scale, *[config.sigma_mounting] * 3])

@@ -1,0 +1,76 @@
+"""What the calibration leaves unknown: its effect on poses and points, and covariances that own up to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from feature_world import T_RIG_OPTICAL, loop, room
+
+from ekf_slam_node.calibration import CalibrationConfig, point_sensitivity, pose_sensitivity
+from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.results import EkfResult
+from ekf_slam_node.slam import EkfSlam
+from slam_core.evaluation import anees_bounds, nees
+from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, make_transform, so3_exp
+from slam_core.types import Submap
+
+RUNS = 12
+DOUBT = CalibrationConfig(sigma_scale=0.02, sigma_mounting=0.01)
+
+
+def distorted(T: FloatArray, error: FloatArray) -> FloatArray:
+    """A pose as a rig sees it whose calibration is wrong by (scale, turn)."""
+    E = make_transform(so3_exp(error[1:]), np.zeros(3))
+    moved = E @ T @ invert_transform(E)
+    return make_transform(moved[:3, :3], (1.0 + error[0]) * moved[:3, 3])
+
+
+def test_sensitivities_are_the_derivatives(rng: np.random.Generator) -> None:
+    T, point = boxplus(np.eye(4), rng.standard_normal(6)), rng.standard_normal(3)
+    step = 1e-6
+    for k, unit in enumerate(np.eye(4)):
+        change = boxminus(distorted(T, step * unit), distorted(T, -step * unit)) / (2.0 * step)
+        np.testing.assert_allclose(pose_sensitivity(T)[:, k], change, atol=1e-8)
+        ends = [(1.0 + s * unit[0]) * so3_exp(s * unit[1:]) @ point for s in (step, -step)]
+        np.testing.assert_allclose(point_sensitivity(point)[:, k], (ends[0] - ends[1]) / (2.0 * step), atol=1e-8)
+
+
+def badly_calibrated(seed: int, calibration: CalibrationConfig) -> tuple[EkfResult, list[Submap], FloatArray]:
+    """A run with a scale and a mounting that are wrong by DOUBT's standard deviations; the true last pose."""
+    rng = np.random.default_rng(seed)
+    world, poses = room(rng), loop(30, 10.0, 1.5, 0.3, handheld=0.02)
+    stretch = 1.0 + DOUBT.sigma_scale * rng.standard_normal()
+    turned = make_transform(so3_exp(DOUBT.sigma_mounting * rng.standard_normal(3)), np.zeros(3)) @ T_RIG_OPTICAL
+    slam, submaps = EkfSlam(EkfSlamConfig(calibration=calibration), turned), []
+    for k, T in enumerate(poses):
+        seen, _ = world.features(T, k * 100_000_000, rng)
+        wrong = replace(
+            seen, xyz=seen.xyz * np.float32(stretch), depth=seen.depth * np.float32(stretch),
+            sigma_depth=seen.sigma_depth * np.float32(stretch),
+        )  # fmt: skip
+        result = slam.process(wrong)
+        submaps += result.submaps
+    return result, submaps, invert_transform(poses[0]) @ poses[-1]
+
+
+@pytest.mark.parametrize(("calibration", "honest"), [(DOUBT, True), (CalibrationConfig(), False)])
+def test_poses_of_a_badly_calibrated_rig(calibration: CalibrationConfig, honest: bool) -> None:
+    values = []
+    for seed in range(RUNS):
+        result, submaps, truth = badly_calibrated(seed, calibration)
+        assert submaps
+        assert all(np.linalg.eigvalsh(submap.covariance)[0] > 0.0 for submap in submaps)
+        values.append(nees(boxminus(truth, result.pose.T), result.pose.covariance))
+    low, high = anees_bounds(6, RUNS)
+    assert (low < np.mean(values) / 6 < high) == honest
+
+
+def test_a_submap_says_so_too() -> None:
+    exact, doubted = (badly_calibrated(0, c)[1][0] for c in (CalibrationConfig(), DOUBT))
+    np.testing.assert_array_equal(doubted.landmarks, exact.landmarks)
+    added = doubted.covariance - exact.covariance
+    assert np.linalg.matrix_rank(added, tol=1e-9) == 4
+    np.testing.assert_allclose(added[:6, :6], doubted.path[-1].covariance - exact.path[-1].covariance, atol=1e-12)
+    np.testing.assert_array_equal(doubted.path[0].covariance, np.zeros((6, 6)))
