@@ -6,15 +6,17 @@ Gaussian's rows are dropped) and recovered afterwards from its correlation with 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from sjsam_node import kernels
-from sjsam_node.joining import JoiningProblem
+from sjsam_node.joining import JoiningProblem, map_residual
 from sjsam_node.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
-from slam_core.config import Config, parameter
+from sjsam_node.robust import RobustConfig, RobustJoining, closing_rows, predicted
+from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, boxminus, make_transform, so3_log
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
 from slam_core.sparse_cholesky import BACKENDS, IntArray
@@ -32,6 +34,7 @@ class EstimatorConfig(Config):
     relative_tolerance: float = parameter(
         1e-9, "stop when a step promises to lower chi2 by less than this share", minimum=0.0
     )
+    robust: RobustConfig = group(RobustConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,14 +77,19 @@ def reduce_map(record: Record, is_shared: BoolArray, rows: str) -> ReducedMap:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """One component as a joining problem: which nodes, landmarks and records it is made of."""
+    """One component as a joining problem: which nodes, landmarks and records it is made of.
+
+    maps: the reduced submaps as they are joined. dropped: scalar rows of each that a robust loss left out.
+    """
 
     records: list[int]
     nodes: IntArray
     landmarks: IntArray
     reduced: list[ReducedMap]
+    maps: list[LocalMap]
     problem: JoiningProblem
     state: State
+    dropped: list[IntArray]
 
     def covariance(self, nodes: list[int]) -> FloatArray:
         """Joint covariance (6k, 6k) of nodes."""
@@ -125,7 +133,8 @@ class Estimator:
         if front is not None:
             last = np.append(len(nodes) + np.searchsorted(landmarks, front[1]), np.searchsorted(nodes, front[0]))
         problem = JoiningProblem(flatten(maps), state, anchor, kernels.TANGENT, self.config.solver, last)
-        return Assembled(records, nodes, landmarks, reduced, problem, state)
+        nothing = [np.empty(0, dtype=np.int64)] * len(maps)
+        return Assembled(records, nodes, landmarks, reduced, maps, problem, state, nothing)
 
     def _reduced(self, graph: MapGraph, record: int, is_shared: BoolArray) -> ReducedMap:
         mask = is_shared[graph.records[record].observations]
@@ -142,20 +151,37 @@ class Estimator:
         assembled = self.assemble(graph, component, front)
         optimizer = LevenbergMarquardtConfig(self.config.iterations, self.config.relative_tolerance)
         state, result = assembled.problem.optimize(assembled.state, optimizer)
+        if self.config.robust.loss != "none":
+            state, result, assembled = self._robust(assembled, state, optimizer)
         graph.poses[assembled.nodes] = make_transform(state.rotations, state.translations)
         graph.points[assembled.landmarks] = state.landmarks
-        for i, reduced in zip(assembled.records, assembled.reduced, strict=True):
-            self._recover(graph, graph.records[i], reduced)
-        return Assembled(
-            assembled.records, assembled.nodes, assembled.landmarks, assembled.reduced, assembled.problem, state
-        ), result
+        for i, reduced, dropped in zip(assembled.records, assembled.reduced, assembled.dropped, strict=True):
+            self._recover(graph, graph.records[i], reduced, dropped)
+        return replace(assembled, state=state), result
+
+    def _robust(
+        self, assembled: Assembled, state: State, optimizer: LevenbergMarquardtConfig
+    ) -> tuple[State, LeastSquaresResult, Assembled]:
+        """Without the rows that the others contradict; the order of the variables stays."""
+        problem, maps = assembled.problem, assembled.maps
+
+        def solve(weighted: list[LocalMap], start: State) -> State:
+            problem.maps = flatten(weighted)
+            return problem.optimize(start, optimizer)[0]
+
+        rows = closing_rows(maps, *state.model_dimensions)
+        joining = RobustJoining(maps, rows, partial(map_residual, problem.model), solve, self.config.robust)
+        found = joining.run(state)
+        problem.maps = flatten(found.maps)
+        state, result = problem.optimize(found.state, optimizer)
+        return state, result, replace(assembled, maps=found.maps, dropped=found.dropped)
 
     @staticmethod
-    def _recover(graph: MapGraph, record: Record, reduced: ReducedMap) -> None:
+    def _recover(graph: MapGraph, record: Record, reduced: ReducedMap, dropped: IntArray) -> None:
         """Private landmarks of a record given what was joined."""
         T = graph.poses[record.start]
-        shift = (reduced.gain @ local_residual(graph, record, reduced)).reshape(-1, 3)
-        private = record.submap.landmarks[reduced.private] + shift
+        residual = predicted(reduced.information, local_residual(graph, record, reduced), dropped)
+        private = record.submap.landmarks[reduced.private] + (reduced.gain @ residual).reshape(-1, 3)
         graph.points[record.observations[reduced.private]] = private @ T[:3, :3].T + T[:3, 3]
 
 

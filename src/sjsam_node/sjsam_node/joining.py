@@ -17,7 +17,7 @@ import numpy as np
 
 from sjsam_node import kernels
 from sjsam_node.layout import Layout, make_layout
-from sjsam_node.problem import FlatMaps, State
+from sjsam_node.problem import FlatMaps, LocalMap, State
 from slam_core.block_pattern import IntArray
 from slam_core.geometry import FloatArray
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
@@ -140,6 +140,18 @@ class JoiningProblem:
         if not self.factor.factorize(self._values):
             raise ValueError("the normal equations are singular: part of the map hangs on nothing")
         self._factorized = state
+
+
+def map_residual(model: int, m: LocalMap, state: State) -> FloatArray:
+    """Error ``h [-] z`` (m,) of one local map at a state."""
+    d = state.translations.shape[1]
+    angles = 1 if d == 2 else 3
+    residual, jacobians = np.empty(len(m.mean)), np.empty((len(m.poses), angles, angles))
+    R, t, points = _arrays(state)
+    kernels.local_residual(
+        model, R[m.reference], t[m.reference], m.poses, m.landmarks, m.mean, R, t, points, residual, jacobians
+    )
+    return residual
 
 
 def _arrays(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -8,14 +8,16 @@ is joined so far, in ever smaller parts. The lowest chi2 is believed once two wa
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from sjsam_node import kernels
 from sjsam_node.block_problem import BlockProblem
-from sjsam_node.joining import JoiningProblem
+from sjsam_node.joining import JoiningProblem, map_residual
 from sjsam_node.linear_slam_text import Progress, TextMap
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
+from sjsam_node.robust import RobustConfig, RobustJoining, closing_rows
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, euler_from_rotation, rotation_from_euler
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
@@ -38,11 +40,15 @@ class TextJoiningConfig(Config):
     )
     step_iterations: int = parameter(4, "iterations per step of incremental joining", minimum=1)
     optimizer: LevenbergMarquardtConfig = group(LevenbergMarquardtConfig)
+    robust: RobustConfig = group(RobustConfig)
 
 
 @dataclass(frozen=True, eq=False)
 class TextJoiningResult:
-    """The joined map in the frame of the first map's reference pose, and how it came about."""
+    """The joined map in the frame of the first map's reference pose, and how it came about.
+
+    dropped: poses and features of single maps that a robust loss left out; chi2 is then that of the others.
+    """
 
     chi2: float
     start_chi2: float
@@ -54,6 +60,7 @@ class TextJoiningResult:
     iterations: int
     converged: bool
     start: str
+    dropped: int
 
 
 def join_text_maps(
@@ -72,7 +79,7 @@ def join_text_maps(
     best, optimum = joiner.best(progress)
     return TextJoiningResult(
         optimum.cost, joiner.start_cost, index.pose_ids, _pose_values(best), index.feature_ids, best.landmarks,
-        joiner.solver, optimum.iterations, optimum.converged, joiner.start,
+        joiner.solver, optimum.iterations, optimum.converged, joiner.start, joiner.dropped,
     )  # fmt: skip
 
 
@@ -136,10 +143,10 @@ class TextJoiner:
         block = config.rows == "block"
         self.maps = [block_rows(m, size, index.dimension) for m in index.maps] if block else index.maps
         self.flat = flatten(self.maps)
-        self.solver, self.start, self.start_cost = "", "", np.nan
+        self.solver, self.start, self.start_cost, self.dropped = "", "", np.nan, 0
 
     def best(self, progress: Progress | None) -> tuple[State, LeastSquaresResult]:
-        """The lowest optimum, once two ways have led there or none is left."""
+        """The lowest optimum, once two ways have led there or none is left; from there robustly, if so configured."""
         chained = self._blank()
         self._place(chained, 0, len(self.index.maps), set())
         self.start, (state, result) = "chained", self._optimize(chained)
@@ -152,11 +159,27 @@ class TextJoiner:
                 self.start, state, result = f"incremental by {growth:.3g}", found, other
             if agree:
                 break
-        return state, result
+        return (state, result) if self.config.robust.loss == "none" else self._robust(state)
+
+    def _robust(self, state: State) -> tuple[State, LeastSquaresResult]:
+        """Without the closing rows that the others contradict."""
+        sizes = state.model_dimensions
+        joining = RobustJoining(
+            self.maps, closing_rows(self.maps, *sizes), partial(map_residual, self.model),
+            lambda maps, start: self._optimize_maps(maps, start)[0], self.config.robust,
+        )  # fmt: skip
+        found = joining.run(state)
+        self.maps, self.dropped = found.maps, found.count
+        return self._optimize_maps(found.maps, found.state)
 
     def _optimize(self, state: State) -> tuple[State, LeastSquaresResult]:
         problem = self._problem(len(self.maps), state)
         self.solver = problem.backend
+        return problem.optimize(state, self.config.optimizer)
+
+    def _optimize_maps(self, maps: list[LocalMap], state: State) -> tuple[State, LeastSquaresResult]:
+        """The same maps with other information matrices."""
+        problem = JoiningProblem(flatten(maps), state, np.array([0]), self.model, self.config.solver)
         return problem.optimize(state, self.config.optimizer)
 
     def _problem(self, count: int, state: State) -> JoiningProblem | BlockProblem:

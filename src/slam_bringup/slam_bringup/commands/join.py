@@ -11,6 +11,7 @@ import click
 from rich.progress import Progress
 
 from sjsam_node.linear_slam_text import find_maps, read_maps, write_values
+from sjsam_node.robust import LOSSES
 from sjsam_node.text_joining import ROWS, TextJoiningConfig, TextJoiningResult, join_text_maps
 from slam_core.config import from_mapping
 
@@ -20,11 +21,15 @@ from slam_core.config import from_mapping
 @click.option("-o", "--output", metavar="OUT", required=True, type=click.Path(file_okay=False, path_type=Path))
 @click.option("--rows", type=click.Choice(ROWS), default=TextJoiningConfig().rows, show_default=True,
               help="joint: each submap's full information; block: each landmark alone (Algorithm 4)")  # fmt: skip
+@click.option(
+    "--robust", type=click.Choice(LOSSES), help="loss of what closes a loop: what the rest contradicts is left out"
+)
 @click.option("--config", "config_file", metavar="FILE", type=click.Path(exists=True, dir_okay=False, path_type=Path),
               help="YAML with parameters of the joining")  # fmt: skip
-def command(folder: Path, output: Path, rows: str, config_file: Path | None) -> None:
+def command(folder: Path, output: Path, rows: str, robust: str | None, config_file: Path | None) -> None:
     """Join the submaps localmap_<k>.txt in DIR; writes summary.json, poses.txt and features.txt to OUT."""
-    config = from_mapping(TextJoiningConfig, {**_yaml(config_file), "rows": rows})
+    values = {**_yaml(config_file), "rows": rows}
+    config = from_mapping(TextJoiningConfig, values if robust is None else {**values, "robust.loss": robust})
     began = time.perf_counter()
     maps, dimension = read_maps(find_maps(folder))
     with Progress(transient=True) as bar:
@@ -53,6 +58,7 @@ def _summary(result: TextJoiningResult, submaps: int, dimension: int, rows: str,
         "chi2": result.chi2, "submaps": submaps, "features": len(result.feature_ids), "wall_s": round(wall_s, 3),
         "poses": len(result.pose_ids), "dimension": dimension, "rows": rows, "chi2_chained_start": result.start_chi2,
         "start": result.start, "iterations": result.iterations, "converged": result.converged, "solver": result.solver,
+        "dropped": result.dropped,
     }  # fmt: skip
 
 
