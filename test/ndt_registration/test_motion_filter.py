@@ -54,10 +54,19 @@ def test_a_settled_pose_is_taken_whole_and_its_blind_direction_is_as_sure_as_the
         filtered.predict(DT)
         predicted = np.sqrt(filtered.covariance[0, 0])
         T_measured, covariance = measured(T, rng, 3.0)
+        T_measured[0, 3] = filtered.T[0, 3] + 0.5 * predicted
         filtered.settle(T_measured, covariance)
         np.testing.assert_allclose(filtered.T, T_measured, atol=1e-12)
         assert np.sqrt(filtered.covariance[0, 0]) == pytest.approx(predicted, rel=0.01)
         assert np.sqrt(filtered.covariance[1, 1]) <= SIGMA[1]
+
+
+def test_a_settled_pose_does_not_wander_where_nothing_was_measured() -> None:
+    filtered = MotionFilter(CONFIG)
+    filtered.predict(DT)
+    predicted = np.sqrt(filtered.covariance[0, 0])
+    filtered.settle(boxplus(np.eye(4), np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])), np.diag([9.0, *SIGMA[1:] ** 2]))
+    np.testing.assert_allclose(filtered.T[:2, 3], [1.5 * predicted, 1.0], atol=1e-9)
 
 
 def test_moves_by_a_known_motion() -> None:

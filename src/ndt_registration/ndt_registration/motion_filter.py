@@ -104,11 +104,12 @@ class MotionFilter:
         """Be at a pose (4, 4) that was found from the prediction.
 
         A registration goes as far from where it starts as the scan demands, and hardly moves where the scan says
-        little: prediction and scan are in its result already. So the pose is taken whole, but with the covariance of
-        both together.
+        little: prediction and scan are in its result already. So the pose is taken whole, with the covariance of both
+        together; only before a blank wall may it wander, and there no farther than the prediction makes likely.
         """
+        step = _credible(boxminus(T, self.T), self.covariance, covariance)
         self._update(covariance)
-        self._arrive(_moved(T, np.zeros(6)))
+        self._arrive(_moved(self.T, step))
 
     def motion(self) -> tuple[FloatArray, FloatArray]:
         """Motion (4, 4) from the pose before to this one, in the axes of the former, and its covariance (6, 6)."""
@@ -133,6 +134,20 @@ class MotionFilter:
         P = A @ self._P @ A.T + K @ R @ K.T
         self._P = 0.5 * (P + P.T)
         return np.asarray(K)
+
+
+def _credible(step: FloatArray, predicted: FloatArray, measured: FloatArray) -> FloatArray:
+    """The step (6,) from the prediction, cut along directions that the prediction knows better than the measurement."""
+    root = np.linalg.cholesky(predicted)
+    white = np.linalg.solve(root, np.linalg.solve(root, measured).T)
+    variance, axes = np.linalg.eigh(0.5 * (white + white.T))
+    along = axes.T @ np.linalg.solve(root, step)
+    cut = np.where(variance > 1.0, np.clip(along, -_LIKELY, _LIKELY), along)
+    return np.asarray(root @ axes @ cut)
+
+
+_LIKELY = 1.5
+"""Standard deviations of the prediction within which a pose is likely."""
 
 
 def _moved(T: FloatArray, step: FloatArray) -> FloatArray:

@@ -15,10 +15,18 @@ import numpy.typing as npt
 
 from ndt_registration.local_map import LocalMap, Scan, for_the_plane
 from ndt_registration.motion_filter import MotionConfig, MotionFilter, rotated
+from ndt_registration.pyramid import GridConfig
 from ndt_registration.registration import RegistrationConfig, RegistrationResult, register
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, boxminus, compose_jacobians, invert_transform
 from slam_core.types import RelativeMotion
+
+ODOMETRY_REGISTRATION = RegistrationConfig(
+    source_points=4000, target_points=8000, start_level=1, rim_share=0.2, grid=GridConfig(flatness=0.0)
+)
+"""From a near guess. Cells keep their own normals: what is rough in them holds a scan of a wall where it started, while
+on perfect planes it would slide.
+"""
 
 
 @dataclass(frozen=True)
@@ -41,9 +49,7 @@ class OdometryConfig(Config):
     )
     restart_after: int = parameter(5, "failures after which the map starts anew", minimum=1)
     motion: MotionConfig = group(MotionConfig)
-    registration: RegistrationConfig = field(
-        default_factory=lambda: RegistrationConfig(source_points=4000, target_points=8000, start_level=1)
-    )
+    registration: RegistrationConfig = field(default_factory=lambda: ODOMETRY_REGISTRATION)
 
 
 class OdometryStatus(Enum):
