@@ -29,8 +29,8 @@ from slam_bringup.stage_times import StageTimes
 from slam_core.trajectory import Trajectory
 
 T = TypeVar("T")
-_AHEAD = 4
-"""Frames that the images may be ahead of the filter."""
+_AHEAD = 64
+"""Inputs of the filter that the images may be ahead: several frames, also where an IMU adds ten readings to each."""
 
 
 def run_bag(
