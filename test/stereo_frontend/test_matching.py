@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from stereo_frontend.keypoints import Keypoints
-from stereo_frontend.matching import MatchingConfig, disparity_bounds, has_company, match_stereo, swapped_share
+from stereo_frontend.matching import (
+    MatchingConfig,
+    disparity_bounds,
+    has_candidate,
+    has_company,
+    match_stereo,
+    swapped_share,
+)
 
 BOUNDS = (0.5, 60.0)
 
@@ -36,6 +43,19 @@ def test_all_partners_are_found(pair):
     np.testing.assert_array_equal(matches.left, np.arange(80))
     np.testing.assert_array_equal(matches.right, partner)
     assert np.all(matches.similarity > 0.9)
+
+
+def test_what_no_left_keypoint_could_match_may_be_left_out(pair, rng):
+    left, right, _ = pair
+    left, config = left.select(np.arange(30)), MatchingConfig(epipolar_band=1.0)
+    right.size[:40] *= rng.uniform(0.5, 2.0, 40).astype(np.float32)
+    reachable = has_candidate(left, right.uv, right.size, config, BOUNDS)
+    assert 20 < reachable.sum() < 60
+    whole, part = (match_stereo(left, r, config, BOUNDS) for r in (right, right.select(reachable)))
+    assert len(whole) > 15
+    np.testing.assert_array_equal(part.left, whole.left)
+    np.testing.assert_array_equal(np.flatnonzero(reachable)[part.right], whole.right)
+    np.testing.assert_array_equal(part.similarity, whole.similarity)
 
 
 def test_partners_off_the_row_or_beyond_the_disparities_are_not(pair):

@@ -31,7 +31,7 @@ def octaves(image: np.ndarray, number: int) -> list[np.ndarray]:
     return out
 
 
-def keep_all(uv, response):
+def keep_all(uv, size, response):
     return np.arange(len(uv))
 
 

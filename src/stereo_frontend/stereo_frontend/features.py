@@ -9,6 +9,7 @@ so that features cover the image (thesis section 3.2); the threshold follows the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,9 @@ _THRESHOLD_RANGE = (0.02, 20.0)
 _FIRST_THRESHOLD = 0.3
 """Of the customary one: the first image rather gives too many candidates than too few."""
 _MOST_PASSES = 3
+
+Wanted = Callable[[Float32Array, Float32Array], npt.NDArray[np.bool_]]
+"""Mask (n,) of the keypoints at uv (n, 2) px, of size (n,) px, that are of any use."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +73,10 @@ class FeatureExtractor:
         self.threshold = _FIRST_THRESHOLD
         self._detect = make_detector(self.config)
 
-    def __call__(self, image: ByteArray) -> Keypoints:
+    def __call__(self, image: ByteArray, wanted: Wanted | None = None) -> Keypoints:
         """At most ``target`` keypoints of an image, uint8 (height, width), best of each grid cell first.
+
+        Those that are not ``wanted`` are left out before they are described, which is what costs most.
 
         Raises
         ------
@@ -80,7 +86,7 @@ class FeatureExtractor:
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f"features need a uint8 grey image (height, width), got {image.dtype} {image.shape}")
         for _ in range(_MOST_PASSES):
-            keypoints, candidates = self._one_pass(image)
+            keypoints, candidates = self._one_pass(image, wanted)
             enough = candidates >= self.config.target or self.threshold <= _THRESHOLD_RANGE[0]
             self._adapt(candidates)
             if enough or self.config.adaptation == 0.0:
@@ -91,16 +97,17 @@ class FeatureExtractor:
         """Forget the threshold."""
         self.threshold = _FIRST_THRESHOLD
 
-    def _one_pass(self, image: ByteArray) -> tuple[Keypoints, int]:
+    def _one_pass(self, image: ByteArray, wanted: Wanted | None) -> tuple[Keypoints, int]:
         candidates = 0
 
-        def select(uv: Float32Array, response: Float32Array) -> npt.NDArray[np.intp]:
+        def select(uv: Float32Array, size: Float32Array, response: Float32Array) -> npt.NDArray[np.intp]:
             nonlocal candidates
             candidates = len(uv)
             c = self.config
-            return spread_over_grid(
+            kept = spread_over_grid(
                 uv, response, (image.shape[0], image.shape[1]), (c.grid_rows, c.grid_columns), c.target
             )
+            return kept if wanted is None else kept[wanted(uv[kept], size[kept])]
 
         keypoints = self._detect(image, self.threshold, select)
         return keypoints, candidates

@@ -21,7 +21,14 @@ from stereo_frontend.depth_fusion import FusionConfig, MappedDepth, fuse_depth, 
 from stereo_frontend.disparity import DisparityConfig, RefinedDisparity, refine_disparity
 from stereo_frontend.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
-from stereo_frontend.matching import MatchingConfig, disparity_bounds, has_company, match_stereo, swapped_share
+from stereo_frontend.matching import (
+    MatchingConfig,
+    disparity_bounds,
+    has_candidate,
+    has_company,
+    match_stereo,
+    swapped_share,
+)
 from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
 
@@ -114,9 +121,12 @@ class Frontend:
         self.counters = Counters()
 
     def _extract(self, images: StereoImages) -> tuple[Keypoints, Keypoints]:
-        future = self._pool.submit(self._right, images.right)
-        left = self._left(images.left)
-        return left, future.result()
+        """Left and right image on a thread each; of the right one's keypoints those that a left one could match."""
+        matching = self.config.matching
+        bounds = disparity_bounds(matching, images.stereo.camera.fx * images.stereo.baseline)
+        left = self._pool.submit(self._left, images.left)
+        right = self._right(images.right, lambda uv, size: has_candidate(left.result(), uv, size, matching, bounds))
+        return left.result(), right
 
     def _stereo_depth(self, images: StereoImages, left: Keypoints, right: Keypoints) -> DepthEstimate:
         focal_baseline = images.stereo.camera.fx * images.stereo.baseline

@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from slam_core.types import AnyArray, ByteArray, Float32Array
 
-Selector = Callable[[Float32Array, Float32Array], npt.NDArray[np.intp]]
-"""Chooses keypoints: (uv (n, 2) px, response (n,)) to the indices kept, in their final order."""
+Selector = Callable[[Float32Array, Float32Array, Float32Array], npt.NDArray[np.intp]]
+"""Chooses keypoints: (uv (n, 2) px, size (n,) px, response (n,)) to the indices kept, in their final order."""
 
 
 @dataclass(frozen=True, eq=False)

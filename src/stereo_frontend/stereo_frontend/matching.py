@@ -68,7 +68,7 @@ def match_stereo(left: Keypoints, right: Keypoints, config: MatchingConfig, boun
         return _matches([], [], [])
     by_row = np.argsort(right.uv[:, 1], kind="stable")
     ordered = right.select(by_row)
-    limits = np.array([config.epipolar_band, bounds[0], bounds[1], np.log(config.max_size_ratio)])
+    limits = _limits(config, bounds)
     best, value, second, best_of_right = _best_in_band(
         left.uv, np.log(left.size), left.descriptors, ordered.uv, np.log(ordered.size), ordered.descriptors, limits
     )
@@ -107,6 +107,36 @@ def _best_in_band(uv, log_size, descriptors, uv_right, log_size_right, descripto
             if product > value_of_right[j]:
                 best_of_right[j], value_of_right[j] = i, product
     return best, value, second, best_of_right
+
+
+def has_candidate(
+    left: Keypoints, uv_right: Float32Array, size: Float32Array, config: MatchingConfig, bounds: tuple[float, float]
+) -> npt.NDArray[np.bool_]:
+    """Mask (n,) of the places (n, 2) px in the right image, of size (n,) px, that any left keypoint could match."""
+    by_row = np.argsort(left.uv[:, 1], kind="stable")
+    return np.asarray(
+        _any_in_band(uv_right, np.log(size), left.uv[by_row], np.log(left.size[by_row]), _limits(config, bounds))
+    )
+
+
+@njit(cache=True, nogil=True)
+def _any_in_band(uv_right, log_size_right, uv, log_size, limits):  # type: ignore[no-untyped-def]
+    out = np.zeros(len(uv_right), np.bool_)
+    rows = uv[:, 1].copy()
+    for j in range(len(uv_right)):
+        for i in range(np.searchsorted(rows, uv_right[j, 1] - limits[0]), len(rows)):
+            if rows[i] > uv_right[j, 1] + limits[0]:
+                break
+            disparity = uv[i, 0] - uv_right[j, 0]
+            if limits[1] <= disparity <= limits[2] and abs(log_size[i] - log_size_right[j]) <= limits[3]:
+                out[j] = True
+                break
+    return out
+
+
+def _limits(config: MatchingConfig, bounds: tuple[float, float]) -> FloatArray:
+    """Row difference, least and greatest disparity (px), logarithm of the ratio of sizes."""
+    return np.array([config.epipolar_band, bounds[0], bounds[1], np.log(config.max_size_ratio)])
 
 
 def swapped_share(

@@ -45,9 +45,9 @@ class OpenCvDetector:
             return Keypoints.none()
         uv = np.array([k.pt for k in found], np.float32)
         response = np.array([k.response for k in found], np.float32)
-        kept = _without_repeats(uv, select(uv, response))
-        size = np.array([found[i].size for i in kept], np.float32)
-        return Keypoints(uv[kept], size, response[kept], self._normalise(raw[kept]))
+        size = np.array([k.size for k in found], np.float32)
+        kept = _without_repeats(uv, select(uv, size, response))
+        return Keypoints(uv[kept], size[kept], response[kept], self._normalise(raw[kept]))
 
 
 def create_from_opencv(name: str, *arguments: Any, **options: Any) -> Any:

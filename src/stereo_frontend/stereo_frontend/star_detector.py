@@ -35,7 +35,7 @@ class StarDetector:
         uv = np.array([k.pt for k in found], np.float32)
         size = np.array([k.size for k in found], np.float32)
         response = np.abs(np.array([k.response for k in found], np.float32))
-        kept = select(uv, response)
+        kept = select(uv, size, response)
         descriptors = np.empty((len(kept), DIMENSION), np.float32)
         places = np.column_stack([uv[kept], _SCALE_PER_SIZE * size[kept]]).astype(np.float64)
         describe_upright(integral_image(np.ascontiguousarray(image)), places, self._weights, descriptors)

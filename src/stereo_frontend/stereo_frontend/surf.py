@@ -71,7 +71,7 @@ class SurfDetector:
             raise ValueError(f"SURF takes images of at most {MAX_PIXELS} px, got {image.shape[1]} x {image.shape[0]}")
         integral = integral_image(np.ascontiguousarray(image))
         found = self._find_all(image, integral, threshold * self.config.threshold)
-        found = found[select(found[:, :2], found[:, 3])]
+        found = found[select(found[:, :2], _DIAMETER * found[:, 2], found[:, 3])]
         descriptors = np.empty((len(found), DIMENSION), np.float32)
         describe = describe_upright if self.config.upright else describe_oriented
         describe(integral, found[:, :3].astype(np.float64), self._weights, descriptors)
