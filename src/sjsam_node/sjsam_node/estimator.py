@@ -17,7 +17,7 @@ from sjsam_node.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
 from sjsam_node.robust import RobustConfig, RobustJoining, closing_rows, predicted
 from slam_core.config import Config, group, parameter
-from slam_core.geometry import FloatArray, boxminus, make_transform, so3_log
+from slam_core.geometry import FloatArray, make_transform, so3_log
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
 from slam_core.sparse_cholesky import BACKENDS, IntArray
 
@@ -187,13 +187,11 @@ class Estimator:
 
 def local_residual(graph: MapGraph, record: Record, reduced: ReducedMap) -> FloatArray:
     """Residual ``h [-] z`` (m,) of a record at the graph's estimate."""
-    T = graph.poses[record.start]
-    R, t = T[:3, :3], T[:3, 3]
-    end = graph.poses[record.end]
-    relative = make_transform(R.T @ end[:3, :3], R.T @ (end[:3, 3] - t))
+    poses = graph.poses[[record.start, record.end]]
     points = graph.points[graph.landmark_of[record.observations[reduced.shared]]]
-    landmarks = (points - t) @ R - record.submap.landmarks[reduced.shared]
-    return np.concatenate([boxminus(relative, record.submap.end_pose), landmarks.ravel()])
+    state = State(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), points)
+    local = LocalMap(0, np.array([1]), np.arange(len(points)), reduced.mean, reduced.information)
+    return map_residual(kernels.TANGENT, local, state)
 
 
 def observation_nis(residual: FloatArray, information: FloatArray) -> FloatArray:

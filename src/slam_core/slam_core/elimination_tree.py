@@ -41,13 +41,17 @@ def analyze(pattern: BlockPattern) -> Symbolic:
     parent, ptr, rows = _fill(pattern.column_ptr, pattern.rows)
     weight = np.concatenate([[0], np.cumsum(pattern.width[rows])])
     below = weight[ptr[1:]] - weight[ptr[:-1]]
-    given = _postorder(parent, below + pattern.width)
+    given = _postorder(parent, np.argsort(-(below + pattern.width), kind="stable"))
     label = np.empty_like(given)
     label[given] = np.arange(len(given))
     width = pattern.width[given]
     parent = np.where(parent[given] >= 0, label[parent[given]], -1)
     column_ptr = _supernodes(parent, width, below[given])
-    row_ptr, front_rows = _front_rows(column_ptr, given, label, ptr, rows)
+    last = given[column_ptr[1:] - 1]
+    row_ptr = pointers(ptr[last + 1] - ptr[last])
+    supernode = np.repeat(np.arange(len(last)), np.diff(row_ptr))
+    below_last = label[rows[np.arange(row_ptr[-1]) + (ptr[last] - row_ptr[:-1])[supernode]]]
+    front_rows = np.sort(supernode * len(label) + below_last) % max(len(label), 1)
     start = pointers(width)
     eliminated = np.diff(start[column_ptr])
     size = eliminated + np.diff(pointers(width[front_rows])[row_ptr])
@@ -96,9 +100,7 @@ def _fill(column_ptr, rows):
     for j in range(n):
         first = count = ptr[j]
         if len(out) < first + n:
-            larger = np.empty(2 * len(out) + n, np.int64)
-            larger[:first] = out[:first]
-            out = larger
+            out = np.concatenate((out, np.empty(len(out) + n, np.int64)))
         mark[j] = j
         for p in range(column_ptr[j], column_ptr[j + 1]):
             if mark[rows[p]] != j:
@@ -115,7 +117,9 @@ def _fill(column_ptr, rows):
             c = sibling[c]
         ptr[j + 1] = count
         if count > first:
-            up = out[first:count].min()
+            up = out[first]
+            for p in range(first + 1, count):
+                up = min(up, out[p])
             parent[j] = up
             sibling[j] = child[up]
             child[up] = j
@@ -123,11 +127,11 @@ def _fill(column_ptr, rows):
 
 
 @njit(cache=True, nogil=True)
-def _postorder(parent, size):
+def _postorder(parent, largest_first):
     """Blocks in postorder; of several children that with the largest front comes last, next to its parent."""
     n = len(parent)
     head, following = np.full(n + 1, -1, np.int64), np.full(n, -1, np.int64)
-    for j in np.argsort(-size, kind="mergesort"):
+    for j in largest_first:
         up = parent[j] if parent[j] >= 0 else n
         following[j] = head[up]
         head[up] = j
@@ -188,18 +192,3 @@ def _supernodes(parent, width, below):
     if n == 0:
         found = 0
     return kept[: found + 1][::-1].copy()
-
-
-@njit(cache=True, nogil=True)
-def _front_rows(column_ptr, given, label, ptr, rows):
-    """Block rows below every supernode, ascending: those of its last column."""
-    count = len(column_ptr) - 1
-    row_ptr = np.zeros(count + 1, np.int64)
-    for s in range(count):
-        j = given[column_ptr[s + 1] - 1]
-        row_ptr[s + 1] = row_ptr[s] + ptr[j + 1] - ptr[j]
-    out = np.empty(row_ptr[count], np.int64)
-    for s in range(count):
-        j = given[column_ptr[s + 1] - 1]
-        out[row_ptr[s] : row_ptr[s + 1]] = np.sort(label[rows[ptr[j] : ptr[j + 1]]])
-    return row_ptr, out
