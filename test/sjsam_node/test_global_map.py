@@ -7,6 +7,7 @@ import pytest
 from judging import ate, chain_error, errors, join
 from submap_world import Agent, Sensor, World, circle, path_through, pose, ring_world, room
 
+from sjsam_node.closures import Findings
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.joiner import JoinerConfig
 from slam_core.geometry import boxminus, invert_transform
@@ -126,6 +127,19 @@ def test_agents_are_joined_when_they_share_a_place_in_any_order(order: str, rng:
     for agent in (a, b):
         e, _ = errors(joined, agent, origin=a)
         assert ate(e) < 0.15
+
+
+def test_agents_that_take_turns_do_not_call_for_a_batch_each_time(rng: np.random.Generator) -> None:
+    a, b = agents_in_one_ring(rng)
+    A, B = a.submaps(), b.submaps()
+    turns, _ = join(A[:12] + B[:4], GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5))))
+    assert turns.components == 1
+    turns.finder.closures = lambda *_: Findings([], [])  # type: ignore[method-assign]
+    _, reports = join([s for pair in zip(B[4:], A[12:], strict=False) for s in pair], turns)
+    assert [r.update for r in reports].count("batch") <= 1
+    assert {"incremental", "odometry"} <= {r.update for r in reports}
+    turns.settle()
+    assert len(turns.assembled(0).records) == len(turns.graph.records)
 
 
 def test_joining_does_not_depend_on_the_order_of_agents(rng: np.random.Generator) -> None:

@@ -45,7 +45,8 @@ class JoinReport:
 
     accepted with reason otherwise; matched: its landmarks already in the map; new_landmarks; closures: links believed
     now, as (agent, index) of the older submap; dropped_links: links taken back; components: parts of the map that
-    hang together; chi2, iterations, converged and solver of the joining; update: ``batch`` or ``incremental``.
+    hang together; chi2, iterations, converged and solver of the joining; update: ``batch``, ``incremental`` or
+    ``odometry``.
     """
 
     accepted: bool

@@ -1,7 +1,8 @@
 """Keeps every component of a map graph at its optimum as submaps, links and doubts come in.
 
 A submap that only continues its agent's path is joined through the front (:mod:`sjsam_node.incremental`); everything
-else, closures above all, is joined in batch, warm from the estimate.
+else, closures above all, is joined in batch, warm from the estimate. There is one front: where several agents take
+turns, the submaps of the others follow their odometry until the next batch.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class JoinerConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class JoinResult:
-    """chi2 of the component, iterations, whether it converged, solver, and ``batch`` or ``incremental``."""
+    """chi2 of the component, iterations, whether it converged, solver; ``batch``, ``incremental`` or ``odometry``."""
 
     cost: float
     iterations: int
@@ -84,12 +85,24 @@ class Joiner:
     def absorb(self, new: int, chain: list[int]) -> JoinResult:
         """Join record ``new``, whose links to its ``chain`` have been added to the graph."""
         window = self._window_landmarks([new, *chain[: self.window - 1]])
-        extended = self._extended(new, window)
+        extended = self._put_off(new) or self._extended(new, window)
         if extended is None:
-            going_on = self.graph.size(self.graph.component(new)) >= self.config.incremental_from
+            going_on = self.graph.size(self.graph.component(new)) + 1 >= self.config.incremental_from
             return self.batch(new, window, extensible=going_on)
         self._joined[self.graph.component(new)] = extended
         return extended.result
+
+    def _put_off(self, new: int) -> _Joined | None:
+        """The component with a submap of an agent whose end is not the front: its odometry places it until the next
+        batch. Agents that take turns would otherwise call for a batch each time.
+        """
+        joined = self._joined.get(self.graph.component(new))
+        if joined is None or not joined.extensible:
+            return None
+        if self.graph.records[joined.newest].end == self.graph.records[new].start:
+            return None
+        result = replace(joined.result, iterations=0, update="odometry")
+        return replace(joined, result=result, added=joined.added + 1)
 
     def _extended(self, new: int, window: IntArray) -> _Joined | None:
         """The component with one more submap joined through the front; None where that is not possible."""
@@ -155,9 +168,10 @@ class Joiner:
             self.assembled(component)
         return self._joined[component].result.cost
 
-    def total_cost(self) -> float:
-        """chi2 of all components."""
-        return sum(self.cost(component) for component in np.unique(self.graph.component_of).tolist())
+    def totals(self) -> tuple[float, int]:
+        """chi2 and redundancy of all components, as far as they have been joined."""
+        components = np.unique(self.graph.component_of).tolist()
+        return sum(self.cost(c) for c in components), sum(self.redundancy(c) for c in components)
 
     def variance_factor(self, component: int) -> float:
         """chi2 per degree of freedom: how much larger the errors of a component's submaps are than they claim.
@@ -169,7 +183,7 @@ class Joiner:
         return max(1.0, self.cost(component) / redundancy) if redundancy > 0 else 1.0
 
     def redundancy(self, component: int) -> int:
-        """Rows of a component's joining problem beyond its unknowns."""
+        """Rows beyond the unknowns of the problem that was last joined in batch."""
         problem = self._joined[component].assembled.problem
         return problem.rows - problem.layout.pattern.n
 

@@ -37,6 +37,9 @@ class TrialConfig(Config):
     closure_probability: float = parameter(
         0.9999, "share of true closures whose rise of chi2 is accepted", minimum=0.9, maximum=0.9999999
     )
+    view_change: float = parameter(
+        2.0, "how much larger squared errors of matches from another view are than those in a whole map", minimum=1.0
+    )
     max_variance_factor: float = parameter(
         16.0,
         "a map whose submaps seem too sure of themselves by more than this factor holds false closures",
@@ -74,16 +77,22 @@ class Trials:
         verdict = self._tried(links, [], newest) if links else None
         refused = [*contradicted, *([] if verdict else links)]
         self.contested = [*self.contested, *refused][-self.config.waiting :]
-        return verdict or (self._overturned(newest) if refused else None) or self._reconsidered(newest)
+        return verdict or self._overturned(refused, newest) or self._reconsidered(newest)
 
-    def _overturned(self, newest: int) -> Verdict | None:
-        """Believe the links that wait, and none that contradicts them, once there is more to say for them."""
-        rivals = [k for k in self._closures() if any(self._contradict(k, link) for link in self.contested)]
-        if self._support(rivals) > self._support(self.contested):
+    def _overturned(self, refused: list[Link], newest: int) -> Verdict | None:
+        """Believe the best refused link and those waiting that say the same, and none that contradicts them, once
+        there is more to say for them.
+        """
+        if not refused:
             return None
-        verdict = self._tried(self.contested, rivals, newest)
+        best = max(refused, key=lambda k: len(k.pairs))
+        group = [k for k in self.contested if k is best or not self._contradict(k, best)]
+        rivals = [k for k in self._closures() if any(self._contradict(k, link) for link in group)]
+        if (len(group) == len(refused) and not rivals) or self._support(rivals) > self._support(group):
+            return None
+        verdict = self._tried(group, rivals, newest)
         if verdict is not None:
-            self.contested = []
+            self.contested = [k for k in self.contested if not any(k is link for link in group)]
         return verdict
 
     def _support(self, links: Sequence[Link]) -> int:
@@ -130,7 +139,7 @@ class Trials:
         """Join with some links and without their rivals; None, and all as it was, if that makes no better map."""
         joiner, graph = self.joiner, self.joiner.graph
         checkpoint = joiner.checkpoint()
-        cost, parts = joiner.total_cost(), len(np.unique(graph.component_of))
+        before = joiner.totals()
         offered = [*graph.links, *links]
         if rivals:
             graph.replace_links([link for link in graph.links if not any(link is k for k in rivals)])
@@ -139,24 +148,23 @@ class Trials:
         joiner.batch(newest)
         self._clean(newest)
         verdict = self._verdict(links, offered, newest)
-        if not self._is_better(verdict, cost, parts, newest) or (links and not verdict.believed):
+        if not self._is_better(verdict, before, newest) or (links and not verdict.believed):
             joiner.restore(checkpoint)
             return None
         return verdict
 
-    def _is_better(self, verdict: Verdict, cost: float, parts: int, newest: int) -> bool:
-        """Whether chi2, which was ``cost`` of ``parts`` components in all, has risen no more than true matches make it
-        rise, or fallen by more than the loss of true matches makes it fall.
+    def _is_better(self, verdict: Verdict, before: tuple[float, int], newest: int) -> bool:
+        """Whether chi2 has risen no more than true matches make it rise, or fallen by more than the loss of true
+        matches makes it fall. ``before``: chi2 and redundancy.
         """
-        gained, lost = _matches(verdict.believed), _matches(verdict.revoked)
+        cost, redundancy = self.joiner.totals()
+        rise, dof = cost - before[0], redundancy - before[1]
+        if not verdict.believed:
+            return self._excess(-rise, -dof, newest) > 0.0
         # Closures that contradict the covariances, but not the drift to expect, bend the map once for all of them.
-        tension = max((k.tension for k in verdict.believed), default=0.0)
-        rise = self.joiner.total_cost() - cost - tension
-        if not gained:
-            return self._excess(-rise, 3 * lost, newest) > 0.0
-        merged = parts - len(np.unique(self.joiner.graph.component_of))
+        tension = max(k.tension for k in verdict.believed)
         outweighed = self._support(verdict.revoked) <= self._support(verdict.believed)
-        return outweighed and self._excess(rise, 3 * gained - 6 * merged, newest) <= 0.0
+        return outweighed and self._excess((rise - tension) / self.config.view_change, dof, newest) <= 0.0
 
     def _clean(self, newest: int) -> None:
         """Take back what the joined map contradicts, until nothing is left or it has been asked often enough."""
