@@ -61,13 +61,16 @@ def solve_ours(maps: list[LocalMap], state: State, rows: str, repeat: int) -> di
     few = joining_problem(small, state, rows)  # compiles
     few.columns(few.optimize(state, LevenbergMarquardtConfig(max_iterations=3))[0], np.array([1]))
     memory = PeakMemory()
-    runs = [timed(run) for _ in range(repeat)]
-    grown, (problem, optimum) = memory.grown(), runs[0][1]
+    seconds, (problem, optimum) = timed(run)
+    grown, times = memory.grown(), [seconds]
+    for _ in range(repeat - 1):
+        seconds, (problem, optimum) = timed(run)
+        times.append(seconds)
     poses = np.linspace(1, len(state.translations) - 1, 8).astype(np.int64)
     # A copy of the optimum, so that nothing is taken from the last factor.
     states = [replace(optimum) for _ in range(repeat)]
     covariances = [timed(partial(problem.columns, at, poses))[0] for at in states]
-    return {"batch": [t for t, _ in runs], "covariances": covariances, "memory": grown, "state": optimum}
+    return {"batch": times, "covariances": covariances, "memory": grown, "state": optimum}
 
 
 def child(solver: str, path: Path, repeat: int) -> dict[str, Any]:

@@ -72,3 +72,47 @@ def test_levenberg_marquardt_gives_up_on_a_singular_problem() -> None:
     x, result = levenberg_marquardt(Unsolvable(), np.array([-1.2, 1.0]))
     assert not result.converged
     assert np.array_equal(x, [-1.2, 1.0])
+
+
+class Reusable(Valley):
+    """Says how often it was linearised and how often its factor was used again."""
+
+    def __init__(self) -> None:
+        self.linearized = self.reused = 0
+
+    def linearize(self, state: np.ndarray) -> np.ndarray:
+        self.linearized += 1
+        return super().linearize(state)
+
+    def gradient(self, state: np.ndarray) -> np.ndarray:
+        J = np.array([[-20.0 * state[0], 10.0], [-1.0, 0.0], [0.0, 0.0]])
+        return J.T @ np.append(self._residual(state), 1.0)
+
+    def resolve(self, gradient: np.ndarray) -> np.ndarray:
+        self.reused += 1
+        return np.linalg.solve(self.H, -gradient)
+
+    def cost(self, state: np.ndarray) -> float:
+        return super().cost(state) + 1.0  # a rest that no step can lower, as measurements have
+
+
+def test_near_the_optimum_the_last_factor_is_used_again() -> None:
+    problem, whole = Reusable(), Valley()
+    start = np.array([1.02, 1.03])
+    x, result = levenberg_marquardt(problem, start)
+    assert result.converged
+    assert np.allclose(x, levenberg_marquardt(whole, start)[0], atol=1e-6)
+    assert problem.reused >= 2
+    assert problem.linearized <= 3
+
+
+def test_a_factor_that_leads_nowhere_is_not_used_again() -> None:
+    class Stale(Reusable):
+        def resolve(self, gradient: np.ndarray) -> np.ndarray:
+            self.reused += 1
+            return 5.0 * super().resolve(gradient)
+
+    problem = Stale()
+    x, result = levenberg_marquardt(problem, np.array([1.02, 1.03]))
+    assert result.converged
+    assert np.allclose(x, 1.0, atol=1e-5)
