@@ -17,3 +17,10 @@ def test_rate_and_latency_are_of_the_last_period_counters_of_all() -> None:
     assert second["rate_hz"] == "0.00"
     assert "latency_mean_ms" not in second
     assert second["processed"] == "2"
+
+
+def test_values_of_the_newest_input_are_reported() -> None:
+    health = Health()
+    health.show("score", 0.5)
+    health.show("score", "0.7")
+    assert health.report(1.0)["score"] == "0.7"

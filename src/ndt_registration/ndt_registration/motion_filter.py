@@ -19,6 +19,7 @@ from slam_core.geometry import (
     compose_jacobians,
     inverse_jacobian,
     invert_transform,
+    make_transform,
     pose7_from_transform,
     transform_from_pose7,
 )
@@ -93,6 +94,18 @@ class MotionFilter:
         self._P[NOW, NOW] = self._P[BEFORE, BEFORE] + rotated(self.T, covariance)
         self.T_before, self.T = self.T, self.T @ T
         self._dt = dt
+
+    def turn(self, R: FloatArray, sigma: float) -> None:
+        """Replace the predicted turn by a known one (3, 3), in the axes of the pose before, ``sigma`` rad per axis."""
+        before, now = slice(3, 6), slice(9, 12)
+        self._P[now], self._P[:, now] = self._P[before], self._P[:, before]
+        self._P[now, now] = self._P[before, before] + sigma**2 * np.eye(3)
+        self.T = make_transform(self.T_before[:3, :3] @ R, self.T[:3, 3])
+
+    def correction(self, T: FloatArray, covariance: FloatArray) -> FloatArray:
+        """How far (6,) a measured pose (4, 4) would move this one, each by its covariance."""
+        predicted = self.covariance
+        return np.asarray(predicted @ np.linalg.solve(predicted + covariance, boxminus(T, self.T)))
 
     def fuse(self, T: FloatArray, covariance: FloatArray) -> None:
         """Fuse a pose (4, 4), measured independently of the prediction, with covariance (6, 6)."""

@@ -1,4 +1,6 @@
-"""The ``ndt_odometry`` node: point clouds of one sensor in, the rig's odometry and motions out."""
+"""The ``ndt_odometry`` node: point clouds of one sensor, and an IMU where there is one, in, the rig's odometry and
+motions out.
+"""
 
 # rclpy is annotated in part only.
 # mypy: allow-untyped-calls
@@ -15,6 +17,7 @@ from slam_core.geometry import FloatArray
 from slam_core.health import State
 from slam_core.messages import (
     header_message,
+    imu_from_message,
     motion_message,
     odometry_message,
     path_message,
@@ -25,7 +28,10 @@ from slam_core.messages import (
 from slam_core.messages.base import Message
 from slam_core.motion import motion_of_rig, pose_of_rig
 from slam_core.ros import run_node
-from slam_core.types import PoseEstimate, RelativeMotion
+from slam_core.types import ImuSample, PoseEstimate, RelativeMotion
+
+RATES_KEPT = 10_000
+"""IMU readings kept while no scan comes."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +54,18 @@ class NdtNode(SlamNode[NdtNodeConfig]):
         self.advertise("ndt/motion", "PoseWithCovarianceStamped")
         self.advertise("ndt/path", "Path")
         self.advertise("ndt/points_aligned", "PointCloud2")
+        self._rates = deque[tuple[str, ImuSample]](maxlen=RATES_KEPT)
         self.listen("tof/points", "PointCloud2", self.on_points)
+        self.listen("imu", "Imu", self.on_imu, required=False)
 
     def on_points(self, cloud: Message) -> None:
         """One scan."""
         T_base_sensor = self.lookup(self.config.base_frame, cloud.header.frame_id)
         points = points_from_message(cloud)
+        while self._rates:
+            frame, sample = self._rates.popleft()
+            R_sensor_imu = self.lookup(cloud.header.frame_id, frame)[:3, :3]
+            self.odometry.add_angular_velocity(sample.stamp_ns, R_sensor_imu @ sample.angular_velocity)
         result = self.odometry.process(stamp_ns(cloud), points)
         pose = pose_of_rig(PoseEstimate(result.stamp_ns, result.T, result.covariance), T_base_sensor)
         motion = None if result.motion is None else motion_of_rig(result.motion, T_base_sensor)
@@ -62,9 +74,14 @@ class NdtNode(SlamNode[NdtNodeConfig]):
             self._publish_aligned(points, pose.T @ T_base_sensor, pose.stamp_ns)
         self._report(result)
 
+    def on_imu(self, message: Message) -> None:
+        """A reading of the IMU, kept until the scan says in which frame it is wanted."""
+        self._rates.append((message.header.frame_id, imu_from_message(message)))
+
     def on_reset(self) -> None:
         """Forget everything: the next scan is the origin."""
         self.odometry.reset()
+        self._rates.clear()
         self.path.clear()
 
     def _publish(self, pose: PoseEstimate, motion: RelativeMotion | None) -> None:
@@ -82,8 +99,21 @@ class NdtNode(SlamNode[NdtNodeConfig]):
 
     def _report(self, result: OdometryResult) -> None:
         self.health.count(result.status.value.lower())
+        self._show(result)
         failed = result.status is OdometryStatus.FAILED
         self.health.set(State.DEGRADED if failed else State.OK, result.reason)
+
+    def _show(self, result: OdometryResult) -> None:
+        """What the newest registration says of itself, in ``/diagnostics``."""
+        registration = result.registration
+        if registration is None:
+            return
+        self.health.show("iterations", registration.iterations)
+        self.health.show("nearest_voxel_likelihood", f"{registration.score:.3f}")
+        self.health.show("transform_probability", f"{registration.score * registration.overlap:.3f}")
+        self.health.show("overlap", f"{registration.overlap:.3f}")
+        self.health.show("inlier_rmse_m", f"{registration.inlier_rmse:.4f}")
+        self.health.show("not_determined", "; ".join(registration.degenerate) or "none")
 
 
 def main() -> None:

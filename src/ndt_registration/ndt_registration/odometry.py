@@ -13,6 +13,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
+from ndt_registration.gyro import Gyro, GyroConfig
 from ndt_registration.local_map import LocalMap, Scan, for_the_plane
 from ndt_registration.motion_filter import MotionConfig, MotionFilter, rotated
 from ndt_registration.pyramid import GridConfig
@@ -49,6 +50,7 @@ class OdometryConfig(Config):
     )
     restart_after: int = parameter(5, "failures after which the map starts anew", minimum=1)
     motion: MotionConfig = group(MotionConfig)
+    gyro: GyroConfig = group(GyroConfig)
     registration: RegistrationConfig = field(default_factory=lambda: ODOMETRY_REGISTRATION)
 
 
@@ -85,12 +87,14 @@ class ScanOdometry:
         self._in_plane = for_the_plane(self._in_space)
         self._map = LocalMap(self._config.keyframes)
         self._filter = MotionFilter(self._config.motion)
+        self._gyro = Gyro(self._config.gyro)
         self.reset()
 
     def reset(self) -> None:
         """Forget everything: the next scan is the origin."""
         self._map.clear()
         self._filter.start(np.eye(4))
+        self._gyro.clear()
         self._stamp_ns = self._last_stamp_ns = 0
         self._failures = 0
         self._best_overlap = 0.0
@@ -99,7 +103,7 @@ class ScanOdometry:
         """Register a scan, shape (..., 3) or (..., 2) m in the sensor's frame, NaN where invalid.
 
         ``prior`` is the motion of the sensor since the previous scan from another source, such as wheels; without it
-        constant velocity is assumed.
+        constant velocity is assumed, with the turn of an IMU where there is one.
         """
         scan = Scan.of(points)
         if self._map.target is None:
@@ -109,6 +113,10 @@ class ScanOdometry:
         self._predict(stamp_ns, prior)
         result = self._register(scan, lost=prior is None and self._failures >= self._config.search_after)
         return self._track(scan, result, prior) if result.converged else self._fail(scan, result)
+
+    def add_angular_velocity(self, stamp_ns: int, rate: FloatArray) -> None:
+        """Take an IMU's angular velocity (3,) rad/s, along the axes of the scanning sensor, ahead of later scans."""
+        self._gyro.add(stamp_ns, rate)
 
     def _start(self, stamp_ns: int, scan: Scan, covariance: FloatArray) -> OdometryResult:
         """Begin a map with a scan that is where the filter is, known so well."""
@@ -128,6 +136,9 @@ class ScanOdometry:
         if seconds > self._config.max_gap:
             self._filter.forget_velocity()
         self._filter.predict(seconds)
+        turn = self._gyro.turn(self._last_stamp_ns, stamp_ns)
+        if turn is not None:
+            self._filter.turn(turn, self._gyro.sigma(seconds))
 
     def _registration(self, scan: Scan) -> RegistrationConfig:
         return self._in_plane if scan.planar else self._in_space
@@ -138,24 +149,28 @@ class ScanOdometry:
         assert target is not None
         config = self._registration(scan)
         guess = invert_transform(self._map.newest.T) @ self._filter.T
-        result = self._plausible(register(scan.points, target, guess, config), guess)
+        result = self._plausible(register(scan.points, target, guess, config))
         if not result.converged and lost:
             self._filter.lose()
             return register(scan.points, target, None, config)
         return result
 
-    def _plausible(self, result: RegistrationResult, guess: FloatArray) -> RegistrationResult:
-        """The result, as a failure where it lies too far from the guess."""
-        correction = boxminus(result.T_target_source, guess)
+    def _plausible(self, result: RegistrationResult) -> RegistrationResult:
+        """The result, as a failure where it would move the pose too far; where it may slide it does not count."""
+        correction = self._filter.correction(*self._in_odometry(result))
         distance, angle = np.linalg.norm(correction[:3]), np.rad2deg(np.linalg.norm(correction[3:]))
         if result.converged and (distance > self._config.max_correction or angle > self._config.max_correction_deg):
             reason = f"implausible: {distance:.2f} m and {angle:.1f} deg from the guess"
             return replace(result, converged=False, reason=reason)
         return result
 
+    def _in_odometry(self, result: RegistrationResult) -> tuple[FloatArray, FloatArray]:
+        """Pose and covariance of a registration in the odometry's frame."""
+        T_odom_key = self._map.newest.T
+        return T_odom_key @ result.T_target_source, rotated(T_odom_key, result.covariance)
+
     def _track(self, scan: Scan, result: RegistrationResult, prior: RelativeMotion | None) -> OdometryResult:
-        keyframe = self._map.newest
-        T, covariance = keyframe.T @ result.T_target_source, rotated(keyframe.T, result.covariance)
+        T, covariance = self._in_odometry(result)
         if prior is None:
             self._filter.settle(T, covariance)
         else:

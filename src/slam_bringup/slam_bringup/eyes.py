@@ -60,6 +60,9 @@ class AgentEyes:
     def process(self, reading: Reading) -> list[FilterInput]:
         """What a reading leads to; a stereo pair that waits for its ToF image comes out with a later reading."""
         if isinstance(reading, ImuReading):
+            if self._odometry is not None:
+                rate = self._T_base_tof[:3, :3].T @ reading.sample.angular_velocity
+                self._odometry.add_angular_velocity(reading.sample.stamp_ns, rate)
             return [FilterInput(self._agent, imu=reading.sample)]
         if isinstance(reading, StereoReading):
             return self._on_stereo(reading) if self._mode != "tof" else []

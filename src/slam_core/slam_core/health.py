@@ -15,12 +15,15 @@ class State(IntEnum):
 
 
 class Health:
-    """State with reason, counters since the start, and rate and duration since the last report."""
+    """State with reason, counters since the start, values of the newest input, rate and duration since the last
+    report.
+    """
 
     def __init__(self) -> None:
         self.state = State.OK
         self.reason = "waiting for input"
         self.counters: Counter[str] = Counter()
+        self.values: dict[str, str] = {}
         self._durations: list[float] = []
         self._reported_at: float | None = None
 
@@ -31,6 +34,10 @@ class Health:
     def count(self, what: str, number: int = 1) -> None:
         """Add to a counter, for instance "rejected"."""
         self.counters[what] += number
+
+    def show(self, what: str, value: object) -> None:
+        """Set a value of the newest input, for instance "score"."""
+        self.values[what] = str(value)
 
     def processed(self, duration_s: float) -> None:
         """One input was processed in ``duration_s``."""
@@ -46,4 +53,4 @@ class Health:
         if durations:
             values["latency_mean_ms"] = f"{1e3 * sum(durations) / len(durations):.2f}"
             values["latency_max_ms"] = f"{1e3 * max(durations):.2f}"
-        return values | {name: str(number) for name, number in sorted(self.counters.items())}
+        return values | self.values | {name: str(number) for name, number in sorted(self.counters.items())}
