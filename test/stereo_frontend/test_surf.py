@@ -13,7 +13,7 @@ from stereo_frontend.surf_detector import (
     filter_sizes,
     find_maxima,
     hessian_layer,
-    hessian_octaves,
+    hessian_octave,
     integral_image,
 )
 
@@ -25,9 +25,10 @@ def image() -> np.ndarray:
     return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
-def octaves(image: np.ndarray, number: int) -> list[np.ndarray]:
+def octaves(image: np.ndarray, number: int) -> tuple[np.ndarray, ...]:
     out = allocate_octaves(*image.shape, number)
-    hessian_octaves(integral_image(image), out)
+    for octave, layers in enumerate(out):
+        hessian_octave(integral_image(image), octave, layers)
     return out
 
 

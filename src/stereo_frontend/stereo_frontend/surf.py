@@ -24,10 +24,8 @@ from stereo_frontend.keypoints import Keypoints, Selector
 from stereo_frontend.surf_descriptor import DIMENSION, describe_oriented, describe_upright, region_weights
 from stereo_frontend.surf_detector import (
     MAX_PIXELS,
-    IntegralImage,
     allocate_octaves,
-    find_maxima,
-    hessian_octaves,
+    find_keypoints,
     integral_image,
 )
 
@@ -55,8 +53,8 @@ class SurfDetector:
         self.config = config or SurfConfig()
         self._weights = region_weights()
         # Kept from image to image: fresh pages for 20 MB cost as much as the filters.
-        self._shape = (0, 0)
-        self._octaves: list[Float32Array] = []
+        self._shape: tuple[int, ...] = (0, 0)
+        self._octaves: tuple[Float32Array, ...] = ()
         self._found = np.empty((_MOST_KEYPOINTS, 4), np.float32)
 
     def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
@@ -69,32 +67,30 @@ class SurfDetector:
         """
         if image.size > MAX_PIXELS:
             raise ValueError(f"SURF takes images of at most {MAX_PIXELS} px, got {image.shape[1]} x {image.shape[0]}")
-        integral = integral_image(np.ascontiguousarray(image))
-        found = self._find_all(image, integral, threshold * self.config.threshold)
+        image = np.ascontiguousarray(image)
+        found = self._find_all(image, threshold * self.config.threshold)
         found = found[select(found[:, :2], _DIAMETER * found[:, 2], found[:, 3])]
         descriptors = np.empty((len(found), DIMENSION), np.float32)
         describe = describe_upright if self.config.upright else describe_oriented
-        describe(integral, found[:, :3].astype(np.float64), self._weights, descriptors)
+        describe(integral_image(image), found[:, :3].astype(np.float64), self._weights, descriptors)
         return Keypoints(found[:, :2].copy(), _DIAMETER * found[:, 2], found[:, 3].copy(), descriptors)
 
-    def _find_all(self, image: ByteArray, integral: IntegralImage, threshold: float) -> Float32Array:
+    def _find_all(self, image: ByteArray, threshold: float) -> Float32Array:
         """Rows of u, v, scale, response, in pixels of ``image``."""
         if not self.config.doubled:
-            return self._find(integral, threshold)
+            return self._find(image, threshold)
         large = np.asarray(cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_LINEAR), np.uint8)
-        found = self._find(integral_image(large), threshold)
+        found = self._find(large, threshold)
         found[:, :2] = 0.5 * found[:, :2] - 0.25
         found[:, 2] *= 0.5
         return found
 
-    def _find(self, integral: IntegralImage, threshold: float) -> Float32Array:
+    def _find(self, image: ByteArray, threshold: float) -> Float32Array:
         """Rows of u, v, scale, response."""
-        shape = (integral.shape[0] - 1, integral.shape[1] - 1)
-        if self._shape != shape:
-            self._octaves, self._shape = allocate_octaves(*shape, self.config.octaves), shape
-        hessian_octaves(integral, self._octaves)
-        parts = []
-        for octave, layers in enumerate(self._octaves):
-            number = find_maxima(integral, layers, octave, np.float32(threshold), self._found)
-            parts.append(self._found[:number].copy())
-        return np.concatenate(parts) if parts else self._found[:0].copy()
+        if self._shape != image.shape:
+            self._octaves = allocate_octaves(image.shape[0], image.shape[1], self.config.octaves)
+            self._shape = image.shape
+        if not self._octaves:
+            return self._found[:0].copy()
+        number = find_keypoints(image, self._octaves, np.float32(threshold), self._found)
+        return self._found[:number].copy()

@@ -33,22 +33,36 @@ def filter_sizes(octave: int) -> list[int]:
     return [step + 3 + step * layer for layer in range(LAYERS)]
 
 
-def allocate_octaves(height: int, width: int, octaves: int) -> list[Float32Array]:
-    """Room for :func:`hessian_octaves`, one array (2, rows, columns) per octave, sampled every 2^octave pixels.
+def allocate_octaves(height: int, width: int, octaves: int) -> tuple[Float32Array, ...]:
+    """Room for :func:`find_keypoints`, one array (2, rows, columns) per octave, sampled every 2^octave pixels.
 
     Octaves whose filters do not fit the image are left out.
     """
     fitting = [o for o in range(octaves) if filter_sizes(o)[2] + 2 ** (o + 1) < min(height, width)]
-    return [np.zeros((len(_MIDDLE), -(-height // 2**o), -(-width // 2**o)), np.float32) for o in fitting]
+    return tuple(np.zeros((len(_MIDDLE), -(-height // 2**o), -(-width // 2**o)), np.float32) for o in fitting)
 
 
-def hessian_octaves(integral: IntegralImage, out: list[Float32Array]) -> None:
-    """Fill ``out``, made by :func:`allocate_octaves` for this size, with determinants of the Hessian at the middle
-    sizes of each octave; borders stay zero.
+@njit(cache=True, nogil=True)
+def find_keypoints(image, octaves, threshold, found):  # type: ignore[no-untyped-def]
+    """Write keypoints above ``threshold`` to ``found`` rows u, v, scale, response; return their number.
+
+    ``octaves``, made by :func:`allocate_octaves` for this size of image, is room for determinants. All in one call, so
+    that no step waits for the interpreter.
     """
-    for octave, layers in enumerate(out):
-        for place, layer in enumerate(_MIDDLE):
-            hessian_layer(integral, filter_sizes(octave)[layer], 2**octave, layers[place])
+    integral = integral_image(image)
+    count = 0
+    for octave in range(len(octaves)):
+        hessian_octave(integral, octave, octaves[octave])
+        count += find_maxima(integral, octaves[octave], octave, threshold, found[count:])
+    return count
+
+
+@njit(cache=True, nogil=True)
+def hessian_octave(integral, octave, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (2, rows, columns) with determinants of the Hessian at the middle sizes; borders stay zero."""
+    step = 3 * 2 ** (octave + 1)
+    for place, layer in enumerate(_MIDDLE):
+        hessian_layer(integral, step + 3 + step * layer, 2**octave, out[place])
 
 
 @njit(cache=True, nogil=True)
