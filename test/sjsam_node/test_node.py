@@ -99,7 +99,7 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
     assert bench.call("mark_here").success
     click = bench.publisher("clicked_point", "PointStamped")
     click.publish(bench.types.PointStamped(header=bench.types.Header(frame_id="map"), point=bench.types.Point(x=1.0)))
-    assert bench.spin_until(lambda: len(bench.node.marks.marks) == 2, 5.0)
+    assert bench.spin_until(lambda: len(bench.node.global_map.marks.marks) == 2, 5.0)
     assert bench.call("reset").success
     assert len(bench.node.global_map.graph.records) == 0
     assert bench.call("load_map").success

@@ -32,17 +32,33 @@ def test_a_map_comes_back_to_the_last_bit(agent: Agent, tmp_path: Path) -> None:
         assert np.allclose(p.covariance, q.covariance, rtol=1e-6, atol=1e-12)
 
 
-def test_saved_killed_loaded_and_continued_gives_the_same_map(agent: Agent, tmp_path: Path) -> None:
+@pytest.mark.parametrize("stop", [3, 14, 20])
+def test_saved_killed_loaded_and_continued_gives_the_same_map(stop: int, agent: Agent, tmp_path: Path) -> None:
     submaps = agent.submaps()
-    whole, _ = join(submaps)
-    half, _ = join(submaps[:14])
-    half.save(tmp_path / "map")
-    continued, _ = join(submaps[14:], GlobalMap.load(tmp_path / "map"))
-    assert len(continued.landmarks().ids) == len(whole.landmarks().ids)
-    gap = [
-        np.abs(boxminus(p.T, q.T)).max() for p, q in zip(continued.trajectory("a"), whole.trajectory("a"), strict=True)
-    ]
-    assert max(gap) < 1e-6
+    whole, _ = join(submaps[:stop])
+    whole.marks.add(whole.graph, np.array([1.0, 2.0, 0.5]), "a find")
+    whole.save(tmp_path / "map")
+    continued, reports = join(submaps[stop:], GlobalMap.load(tmp_path / "map"))
+    _, expected = join(submaps[stop:], whole)
+    assert [r.closures for r in reports] == [r.closures for r in expected]
+    assert np.array_equal(continued.graph.landmark_of, whole.graph.landmark_of)
+    assert np.abs(continued.graph.points - whole.graph.points).max() < 1e-9
+    for p, q in zip(continued.trajectory("a"), whole.trajectory("a"), strict=True):
+        assert np.abs(boxminus(p.T, q.T)).max() < 1e-9
+        assert np.allclose(p.covariance, q.covariance, rtol=1e-6, atol=1e-12)
+    assert np.allclose(continued.marks.positions(continued.graph), whole.marks.positions(whole.graph), atol=1e-9)
+    assert [m.name for m in continued.marks.marks] == ["a find"]
+
+
+def test_saving_in_between_does_not_matter(agent: Agent, tmp_path: Path) -> None:
+    submaps = agent.submaps()
+    plain, _ = join(submaps)
+    saving, _ = join(submaps[:14])
+    saving.save(tmp_path / "map")
+    join(submaps[14:], saving)
+    assert len(saving.landmarks().ids) == len(plain.landmarks().ids)
+    for p, q in zip(saving.trajectory("a"), plain.trajectory("a"), strict=True):
+        assert np.abs(boxminus(p.T, q.T)).max() < 1e-6
 
 
 def test_saving_replaces_and_leaves_nothing_else(agent: Agent, tmp_path: Path) -> None:

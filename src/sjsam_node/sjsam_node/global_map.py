@@ -21,6 +21,8 @@ from sjsam_node.closures import ClosureConfig, LinkFinder
 from sjsam_node.estimator import Assembled
 from sjsam_node.joiner import Joiner, JoinerConfig
 from sjsam_node.map_graph import Link, MapGraph
+from sjsam_node.marks import Marks
+from sjsam_node.storage import StoredMap
 from sjsam_node.trial import TrialConfig, Trials, Verdict
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
@@ -70,6 +72,7 @@ class GlobalMap:
     finder: LinkFinder
     joiner: Joiner
     trials: Trials
+    marks: Marks
 
     def __init__(self, config: GlobalMapConfig | None = None) -> None:
         self.config = config or GlobalMapConfig()
@@ -79,6 +82,7 @@ class GlobalMap:
     def reset(self) -> None:
         """Forget everything."""
         self.graph = MapGraph()
+        self.marks = Marks()
         self.finder = LinkFinder(self.config.closure)
         self.joiner = Joiner(self.graph, self.config.closure.window, self.config.joining)
         self.trials = Trials(self.joiner, self.config.trial, self.config.closure)
@@ -264,18 +268,21 @@ class GlobalMap:
         return PoseEstimate(r.submap.end_stamp_ns, self.graph.poses[r.end], self._covariance(r.end))
 
     def save(self, path: Path | str) -> None:
-        """Write the map to a folder (see :mod:`sjsam_node.storage`)."""
+        """Write the map to a folder (see :mod:`sjsam_node.storage`), and go on from it as a map that is loaded does."""
         self.settle()
-        storage.write(Path(path), self.graph, self.finder.pending)
+        stored = StoredMap(self.graph, self.finder.pending, self.trials.contested, self.marks, self._closed_at)
+        storage.write(Path(path), stored)
+        self.joiner.forget()
 
     @classmethod
     def load(cls, path: Path | str, config: GlobalMapConfig | None = None) -> GlobalMap:
         """The map that :meth:`save` wrote; ``ValueError`` if the folder is no such map."""
-        graph, pending = storage.read(Path(path))
-        loaded = cls(config)
-        loaded.graph, loaded.finder.pending = graph, pending
+        stored = storage.read(Path(path))
+        loaded, graph = cls(config), stored.graph
+        loaded.graph, loaded.marks, loaded._closed_at = graph, stored.marks, stored.closed_at
         loaded.joiner = Joiner(graph, loaded.config.closure.window, loaded.config.joining)
-        loaded.trials = Trials(loaded.joiner, loaded.config.trial, loaded.config.closure)
+        loaded.trials = Trials(loaded.joiner, loaded.config.trial, loaded.config.closure, stored.contested)
+        loaded.finder.pending = stored.pending
         for i, record in enumerate(graph.records):
             agent, session, _ = record.key
             loaded._lookup[record.key] = i

@@ -223,6 +223,10 @@ class Joiner:
         self.graph.restore(checkpoint.graph)
         self._joined = dict(checkpoint.joined)
 
+    def forget(self) -> None:
+        """Keep nothing but the graph and its estimate, which must be at the optimum, as after loading a map."""
+        self._joined.clear()
+
     def forget_stale(self, newest: int) -> None:
         """After links were believed, with the component of ``newest`` joined: the other parts as they are now."""
         own = self.graph.component(newest)

@@ -7,7 +7,7 @@ import numpy as np
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.map_view import MapLandmarks
 from slam_core.geometry import FloatArray
-from slam_core.messages import ellipsoid_markers, landmark_cloud, path_marker
+from slam_core.messages import ellipsoid_markers, landmark_cloud, path_marker, points_message
 from slam_core.messages.base import Message, MessageTypes
 
 _SKELETON = (0.1, 0.4, 1.0, 1.0)
@@ -21,6 +21,11 @@ def landmarks_message(types: MessageTypes, header: Message, landmarks: MapLandma
     return landmark_cloud(
         types, header, landmarks.positions, landmarks.covariances, landmarks.ids, landmarks.sightings.astype(np.int32)
     )
+
+
+def cloud_message(types: MessageTypes, header: Message, landmarks: MapLandmarks) -> Message:
+    """``map/cloud``: bare points, for any tool that takes a cloud, of the landmarks whose place in the map is known."""
+    return points_message(types, header, landmarks.positions[landmarks.linked].astype(np.float32))
 
 
 def ellipsoids_message(types: MessageTypes, header: Message, landmarks: MapLandmarks) -> Message:

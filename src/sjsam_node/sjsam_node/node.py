@@ -16,8 +16,13 @@ from std_srvs.srv import Trigger
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
 from sjsam_node.localization import Localizer
-from sjsam_node.map_messages import ellipsoids_message, graph_message, landmarks_message, marks_message
-from sjsam_node.marks import Marks
+from sjsam_node.map_messages import (
+    cloud_message,
+    ellipsoids_message,
+    graph_message,
+    landmarks_message,
+    marks_message,
+)  # fmt: skip
 from slam_core.base_node import SlamNode
 from slam_core.config import parameter
 from slam_core.geometry import FloatArray, invert_transform
@@ -59,7 +64,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def __init__(self) -> None:
         super().__init__("sjsam", SjsamNodeConfig)
-        self.global_map, self.marks = GlobalMap(self.config), Marks()
+        self.global_map = GlobalMap(self.config)
         self.localizers: dict[str, Localizer] = {}
         self.odometry: dict[str, dict[int, FloatArray]] = {agent: {} for agent in self.config.agents}
         self._stamp_ns = 0
@@ -76,7 +81,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self.get_logger().info(self.load_map())
 
     def _advertise_outputs(self) -> None:
-        self.advertise("map/landmarks", "PointCloud2", latched=True, depth=1)
+        for name in ("map/landmarks", "map/cloud"):
+            self.advertise(name, "PointCloud2", latched=True, depth=1)
         for name in ("map/ellipsoids", "map/graph", "map/marks"):
             self.advertise(name, "MarkerArray", latched=True, depth=1)
         for agent in self.config.agents:
@@ -129,7 +135,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         """Mark a find at a point of the map frame."""
         if message.header.frame_id not in ("", self.config.map_frame):
             raise ValueError(f"clicked_point must be in frame {self.config.map_frame}, got {message.header.frame_id}")
-        self.marks.add(self.global_map.graph, np.array([message.point.x, message.point.y, message.point.z]))
+        self.global_map.marks.add(self.global_map.graph, np.array([message.point.x, message.point.y, message.point.z]))
         self._publish_marks()
 
     def on_initial_pose(self, message: Message) -> None:
@@ -145,7 +151,6 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             kept.clear()
         if not self.config.localize_only:
             self.global_map.reset()
-            self.marks = Marks()
 
     def _localizer(self, agent: str) -> Localizer:
         return self.localizers.setdefault(agent, Localizer(self.global_map))
@@ -193,7 +198,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         records = self.global_map.graph.records
         if not records:
             raise ValueError("nothing can be marked in an empty map")
-        mark = self.marks.add(self.global_map.graph, self.global_map.graph.poses[records[-1].end][:3, 3])
+        mark = self.global_map.marks.add(self.global_map.graph, self.global_map.graph.poses[records[-1].end][:3, 3])
         self._publish_marks()
         return mark.name
 
@@ -205,6 +210,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self.global_map.landmarks(),
         )
         self.publish("map/landmarks", landmarks_message(self.types, header, landmarks))
+        self.publish("map/cloud", cloud_message(self.types, header, landmarks))
         if self.has_listeners("map/ellipsoids"):
             self.publish("map/ellipsoids", ellipsoids_message(self.types, header, landmarks))
         self.publish("map/graph", graph_message(self.types, header, self.global_map))
@@ -216,7 +222,9 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def _publish_marks(self) -> None:
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
-        self.publish("map/marks", marks_message(self.types, header, self.marks.positions(self.global_map.graph)))
+        self.publish(
+            "map/marks", marks_message(self.types, header, self.global_map.marks.positions(self.global_map.graph))
+        )
 
     def _publish_pose(self, agent: str, pose: PoseEstimate, submap: Submap) -> None:
         self.publish(_below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, pose))

@@ -9,24 +9,43 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sjsam_node.map_graph import Link, MapGraph
+from sjsam_node.marks import Mark, Marks
 from slam_core.files import atomic_path
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
-FORMAT, VERSION = "indoor-slam-map", 1
+FORMAT, VERSION = "indoor-slam-map", 2
 Arrays = dict[str, AnyArray]
 
 
-def write(folder: Path, graph: MapGraph, pending: list[Link]) -> None:
-    """Write submaps, links and estimate to ``folder``, which is replaced if it is there."""
+@dataclass(frozen=True, eq=False)
+class StoredMap:
+    """All that a map needs to go on as if it had never been put away.
+
+    pending, contested: links that wait for confirmation and for support; closed_at: number of submaps at the last
+    closure.
+    """
+
+    graph: MapGraph
+    pending: list[Link]
+    contested: list[Link]
+    marks: Marks
+    closed_at: int
+
+
+def write(folder: Path, stored: StoredMap) -> None:
+    """Write a map to ``folder``, which is replaced if it is there."""
+    graph = stored.graph
     arrays = _graph_arrays(graph)
     arrays.update(_link_arrays("links", graph.links))
-    arrays.update(_link_arrays("pending", pending))
+    arrays.update(_link_arrays("pending", stored.pending))
+    arrays.update(_link_arrays("contested", stored.contested))
     for i, record in enumerate(graph.records):
         arrays.update({f"submap_{i}/{name}": value for name, value in _submap_arrays(record.submap).items()})
     buffer = io.BytesIO()
@@ -38,6 +57,8 @@ def write(folder: Path, graph: MapGraph, pending: list[Link]) -> None:
         "records": [
             [r.submap.agent, r.submap.index, r.session, r.start, r.submap.follows_previous] for r in graph.records
         ],
+        "marks": [[m.name, m.node, *m.point.tolist()] for m in stored.marks.marks],
+        "closed_at": stored.closed_at,
         "sha256": hashlib.sha256(data).hexdigest(),
     }  # fmt: skip
     with atomic_path(folder) as temporary:
@@ -46,8 +67,8 @@ def write(folder: Path, graph: MapGraph, pending: list[Link]) -> None:
         (temporary / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
 
 
-def read(folder: Path) -> tuple[MapGraph, list[Link]]:
-    """The map graph and the pending links of a folder that :func:`write` made.
+def read(folder: Path) -> StoredMap:
+    """The map of a folder that :func:`write` made.
 
     Raises
     ------
@@ -64,7 +85,10 @@ def read(folder: Path) -> tuple[MapGraph, list[Link]]:
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     try:
-        return _graph(manifest["records"], arrays), _links("pending", arrays)
+        graph = _graph(manifest["records"], arrays)
+        marks = Marks([Mark(str(name), int(node), np.array(point)) for name, node, *point in manifest["marks"]])
+        pending, contested = _links("pending", arrays), _links("contested", arrays)
+        return StoredMap(graph, pending, contested, marks, int(manifest["closed_at"]))
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(f"{folder}: the map is incomplete: {error}") from error
 
