@@ -1,14 +1,15 @@
 """Our joining against GTSAM and Ceres on the same problems, in one run: time, chi2, covariances, memory.
 
-    python benchmarks/joining/peers.py [--sizes 34 500 2000] [--repeat 3] [--incremental]
+    python benchmarks/joining/peers.py [--sizes 34 500 2000] [--repeat 3] [--incremental] [--node]
 
 Every solver runs in a process of its own on the same submaps. Block rows (each landmark with its own 3x3) are what all
 of them can express with their own factors; chi2 is our cost function at their solution, so that all are measured
 alike. Times are medians; memory is what the process grew by while it solved. "batch" is from chained odometry to the
 optimum with everything symbolic; "covariances" is the joint covariance of eight
 poses along the way at the optimum, linearised and factored there.
-``--incremental`` adds one submap after the other: iSAM2 with known association, ours as the node does it, finding its
-associations and closures itself.
+``--incremental`` adds one submap after the other, with known association: iSAM2 with the estimate after each; ours
+placing each on the map at once and joining all of it every 1 + sqrt(n) / 3 submaps, as often as the node looks for
+closures. ``--node`` does it as the node does, finding associations and closures itself, of joint rows.
 
 Needs gtsam beside the run-time requirements (a separate environment is best), and for Ceres pyceres 2.4 with pycolmap
 3.11, whose compiled residuals it borrows; what is not there is left out.
@@ -38,12 +39,13 @@ from problems import KnownProblem, joining_problem, local_maps, ring
 from sjsam_node.block_problem import BlockProblem
 from sjsam_node.joining import JoiningProblem
 from sjsam_node.problem import LocalMap, State
+from slam_core.geometry import so3_exp
 from slam_core.least_squares import LevenbergMarquardtConfig
 
 STOP = LevenbergMarquardtConfig(relative_tolerance=1e-6)
 """GTSAM stops when the cost falls by less than 1e-5 of itself, Ceres at 1e-6; ours when a step promises less."""
 
-BATCH, INCREMENTAL = ("ours", "gtsam", "ceres", "ours joint"), ("isam2", "ours incremental")
+BATCH, INCREMENTAL = ("ours", "gtsam", "ceres", "ours joint"), ("isam2", "ours in turn")
 
 
 def timed(action: Callable[[], Any]) -> tuple[float, Any]:
@@ -76,11 +78,13 @@ def solve_ours(maps: list[LocalMap], state: State, rows: str, repeat: int) -> di
 def child(solver: str, path: Path, repeat: int) -> dict[str, Any]:
     """One solver on one problem; the result without its state, judged by our cost."""
     problem: KnownProblem = pickle.loads(path.read_bytes())
-    if solver == "ours incremental":
-        return incremental(problem)
+    if solver == "ours node":
+        return as_node(problem)
     rows = "joint" if solver == "ours joint" else "block"
     maps, state = local_maps(problem, rows, shared_only=rows == "joint")
-    if solver.startswith("ours"):
+    if solver == "ours in turn":
+        result = in_turn(maps, state)
+    elif solver.startswith("ours"):
         result = solve_ours(maps, state, rows, repeat)
     elif solver == "ceres":
         import ceres_peer
@@ -94,7 +98,26 @@ def child(solver: str, path: Path, repeat: int) -> dict[str, Any]:
     return result
 
 
-def incremental(problem: KnownProblem) -> dict[str, Any]:
+def in_turn(maps: list[LocalMap], state: State) -> dict[str, Any]:
+    """One submap after the other; poses and landmarks are numbered by first sight, so that a prefix is a problem."""
+    joining_problem(maps[:3], state, "block").optimize(state, LevenbergMarquardtConfig(max_iterations=3))  # compile
+    memory, began = PeakMemory(), time.perf_counter()
+    R, t, points, seen, due = state.rotations.copy(), state.translations.copy(), state.landmarks.copy(), 0, 0.0
+    for k, m in enumerate(maps):
+        R[k + 1], t[k + 1] = R[k] @ so3_exp(m.mean[3:6]), R[k] @ m.mean[:3] + t[k]
+        new = m.landmarks >= seen
+        points[m.landmarks[new]] = m.mean[6:].reshape(-1, 3)[new] @ R[k].T + t[k]
+        seen = max(seen, int(m.landmarks.max()) + 1)
+        due += 1.0 / (1.0 + np.sqrt(k) / 3.0)
+        if due >= 1.0 or k == len(maps) - 1:
+            known, due = State(R[: k + 2], t[: k + 2], points[:seen]), 0.0
+            known = joining_problem(maps[: k + 1], known, "block").optimize(known, STOP)[0]
+            R[: k + 2], t[: k + 2], points[:seen] = known.rotations, known.translations, known.landmarks
+    seconds = time.perf_counter() - began
+    return {"batch": [seconds], "memory": memory.grown(), "state": State(R, t, points)}
+
+
+def as_node(problem: KnownProblem) -> dict[str, Any]:
     """Through GlobalMap, association and closures included; its chi2 is over its own associations."""
     from sjsam_node.global_map import GlobalMap
 
@@ -129,7 +152,7 @@ def compare(count: int, solvers: list[str], repeat: int, folder: Path) -> None:
     for solver, result in results.items():
         if result is None:
             continue
-        ours = results.get("ours incremental" if solver in INCREMENTAL else "ours")
+        ours = results.get("ours in turn" if solver in INCREMENTAL else "ours")
         shown = [statistics.median(result[key]) if key in result else float("nan") for key in ("batch", "covariances")]
         ratios = "" if ours is None or solver.startswith("ours") else _ratios(ours, result)
         print(f"  {solver:18s} {shown[0]:10.4f} {result['chi2']:14.3f} {shown[1]:10.4f}"
@@ -148,6 +171,8 @@ if __name__ == "__main__":
     parser.add_argument("--sizes", type=int, nargs="+", default=[34, 500, 2000])
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--incremental", action="store_true", help="one submap after the other (minutes at 2000)")
+    parser.add_argument("--node", action="store_true", help="one after the other as the node does (minutes at 500)")
+    parser.add_argument("--only", nargs="+", help="these solvers alone")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     parser.add_argument("--problem", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -155,7 +180,8 @@ if __name__ == "__main__":
         print(json.dumps(child(arguments.child, arguments.problem, arguments.repeat)))
         sys.exit()
     needed = {"gtsam": "gtsam", "isam2": "gtsam", "ceres": "pycolmap"}
-    wanted = [*BATCH, *(INCREMENTAL if arguments.incremental else ())]
+    wanted = [*BATCH, *(INCREMENTAL if arguments.incremental else ()), *(("ours node",) if arguments.node else ())]
+    wanted = arguments.only or wanted
     present = [s for s in wanted if s not in needed or importlib.util.find_spec(needed[s]) is not None]
     print("left out, not installed:", ", ".join(s for s in wanted if s not in present) or "none")
     with tempfile.TemporaryDirectory() as temporary:

@@ -86,7 +86,7 @@ class Reusable(Valley):
 
     def gradient(self, state: np.ndarray) -> np.ndarray:
         J = np.array([[-20.0 * state[0], 10.0], [-1.0, 0.0], [0.0, 0.0]])
-        return J.T @ np.append(self._residual(state), 1.0)
+        return np.asarray(J.T @ np.append(self._residual(state), 1.0))
 
     def resolve(self, gradient: np.ndarray) -> np.ndarray:
         self.reused += 1
