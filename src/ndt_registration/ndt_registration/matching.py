@@ -1,4 +1,4 @@
-"""How a moved cloud lies on the cells of another: the share that fits, how closely, and the pull of every block."""
+"""How a moved cloud lies on the cells of another: the share that fits, how closely, and how each block pulls."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from ndt_registration.ndt import Layer
 from ndt_registration.voxel_grid import NormalGrid, find_block, hash_table, pack_key, slot_of
 from slam_core.geometry import FloatArray
 
 
 class Fit(NamedTuple):
-    """Share of points on the target's surfaces, their root mean square distance (m), gradient of the cost by block (b,
-    6), extent of the inliers.
+    """Share of points on the target's surfaces, their root mean square distance (m), their centroid (3,) about the
+    target's axes and their root mean square distance from it.
 
     friction (6, 6): expected curvature of the cost from errors of the cells' normals alone. A normal from ``n`` points
     is off by
@@ -23,7 +24,6 @@ class Fit(NamedTuple):
 
     overlap: float
     inlier_rmse: float
-    pulls: FloatArray
     centre: FloatArray
     radius: float
     friction: FloatArray
@@ -54,18 +54,12 @@ def _add_friction(px, py, pz, drag, F):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def fit_to_grid(
-    points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGrid, max_distance: float, block_size: float
-) -> Fit:
+def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGrid, max_distance: float) -> Fit:
     """Fit of points (n, 3) at a pose; a point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m
     of its plane.
     """
     n = points.shape[0]
-    keys = hash_table(n)
-    rows = np.empty(keys.shape[0], np.int32)
-    pulls = np.zeros((n, 6))
     friction = np.zeros((6, 6))
-    blocks = 0
     inliers = 0
     squares = 0.0
     centre, second = np.zeros(3), 0.0
@@ -78,7 +72,7 @@ def fit_to_grid(
         row = find_block(grid.keys, grid.rows, int(np.floor(mx * s)), int(np.floor(my * s)), int(np.floor(mz * s)))
         if row < 0:
             continue
-        vx = vy = vz = weight = drag = 0.0
+        weight = drag = 0.0
         best, distance = 4.5, 0.0
         for k in range(8):
             cell = grid.cells[row, k]
@@ -96,9 +90,6 @@ def fit_to_grid(
             flat = grid.variance[cell, 0] <= 1e-9 * grid.variance[cell, 2]
             spread = grid.variance[cell, 2] if flat else grid.variance[cell, 1]
             drag += e / (grid.counts[cell] * max(spread, 1e-12 * grid.block_size**2))
-            vx += e * ux
-            vy += e * uy
-            vz += e * uz
             if exponent < best:
                 best = exponent
                 distance = abs(qx * grid.normal[cell, 0] + qy * grid.normal[cell, 1] + qz * grid.normal[cell, 2])
@@ -110,7 +101,43 @@ def fit_to_grid(
         if weight == 0.0:
             continue
         _add_friction(px, py, pz, drag, friction)
-        c = 1.0 / block_size
+    centre /= max(inliers, 1)
+    radius = np.sqrt(max(second / max(inliers, 1) - (centre * centre).sum(), 1e-12))
+    return Fit(inliers / max(n, 1), np.sqrt(squares / max(inliers, 1)), centre, radius, friction)
+
+
+@njit(cache=True, nogil=True)
+def block_pulls(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
+    """Gradient (b, 6) of the cost of one layer at a pose, summed over each block of two cell edges."""
+    grid, n = layer.grid, layer.points.shape[0]
+    keys = hash_table(n)
+    rows = np.empty(keys.shape[0], np.int32)
+    pulls = np.zeros((n, 6))
+    blocks = 0
+    s, c = 1.0 / grid.block_size, 0.25 / grid.block_size
+    for i in range(n):
+        x, y, z = layer.points[i, 0], layer.points[i, 1], layer.points[i, 2]
+        px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+        py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+        pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+        mx, my, mz = px + t[0], py + t[1], pz + t[2]
+        row = find_block(grid.keys, grid.rows, int(np.floor(mx * s)), int(np.floor(my * s)), int(np.floor(mz * s)))
+        if row < 0:
+            continue
+        vx = vy = vz = 0.0
+        for k in range(8):
+            cell = grid.cells[row, k]
+            if cell < 0:
+                continue
+            qx, qy, qz = mx - grid.mean[cell, 0], my - grid.mean[cell, 1], mz - grid.mean[cell, 2]
+            b = grid.information[cell]
+            ux = b[0] * qx + b[1] * qy + b[2] * qz
+            uy = b[1] * qx + b[3] * qy + b[4] * qz
+            uz = b[2] * qx + b[4] * qy + b[5] * qz
+            e = 0.125 * layer.factor * np.exp(-min(0.5 * (qx * ux + qy * uy + qz * uz), 30.0))
+            vx += e * ux
+            vy += e * uy
+            vz += e * uz
         key = pack_key(int(np.floor(mx * c)), int(np.floor(my * c)), int(np.floor(mz * c)))
         slot = slot_of(keys, key)
         if keys[slot] == -1:
@@ -124,6 +151,4 @@ def fit_to_grid(
         pulls[row, 3] += py * vz - pz * vy
         pulls[row, 4] += pz * vx - px * vz
         pulls[row, 5] += px * vy - py * vx
-    centre /= max(inliers, 1)
-    radius = np.sqrt(max(second / max(inliers, 1) - (centre * centre).sum(), 1e-12))
-    return Fit(inliers / max(n, 1), np.sqrt(squares / max(inliers, 1)), pulls[:blocks].copy(), centre, radius, friction)
+    return pulls[:blocks].copy()

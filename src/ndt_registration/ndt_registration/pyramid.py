@@ -62,10 +62,11 @@ class Pyramid:
             surface_grids.append(_surface_grid(surfaces, size, level, config))
             rim_grids.append(_rim_grid(rims, config.rim_ratio * size, level, config))
             surfaces, rims = coarser(surfaces), coarser(rims)
-        for level in range(config.levels - 2, -1, -1):
-            slack = config.slack if level < config.surface_levels else -1.0
-            floor = (config.surface_smoothing * edge * 2**level) ** 2
-            adopt_planes(surface_grids[level], surface_grids[level + 1], config.flatness, floor, slack)
+        if not cloud.planar:  # where all lies in the plane, its normal is every cell's
+            for level in range(config.levels - 2, -1, -1):
+                slack = config.slack if level < config.surface_levels else -1.0
+                floor = (config.surface_smoothing * edge * 2**level) ** 2
+                adopt_planes(surface_grids[level], surface_grids[level + 1], config.flatness, floor, slack)
         return Pyramid(tuple(surface_grids), tuple(rim_grids))
 
     def layers(self, source: Cloud, level: int, count: int, rim_share: float) -> tuple[Layer, Layer]:

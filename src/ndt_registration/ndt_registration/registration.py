@@ -7,6 +7,7 @@ by NDT from coarse to fine, and the one that respects best what the target has s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,15 +16,24 @@ import numpy.typing as npt
 from ndt_registration.ambiguity import AmbiguityConfig, reason_of_doubt
 from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare, viewpoint
 from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
-from ndt_registration.matching import fit_to_grid
-from ndt_registration.ndt import NdtOptimum, ndt_align
+from ndt_registration.matching import block_pulls, fit_to_grid
+from ndt_registration.ndt import NdtOptimum, ndt_align, score_at
 from ndt_registration.pyramid import GridConfig, Pyramid
 from ndt_registration.search import Candidate, SearchConfig, Views, judge, planar_constraint, search
-from ndt_registration.uncertainty import Curvature, Extent, UncertaintyConfig, direction_names, sandwich, unknown
+from ndt_registration.uncertainty import (
+    Curvature,
+    Extent,
+    UncertaintyConfig,
+    direction_names,
+    gradient_scatter,
+    sandwich,
+    unknown,
+)
 from ndt_registration.visibility import RangeImage, range_image
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import (
     FloatArray,
+    boxplus,
     is_rigid_transform,
     make_transform,
     quaternion_from_rotation,
@@ -196,6 +206,8 @@ def _doubted(
     scale = max(target.cloud.scale, 1e-6)
     centred = _shifted_covariance(result.covariance, -best.T[:3, :3] @ target.centre)
     reason = reason_of_doubt(best, others, centred, scale, config.ambiguity)
+    if not reason and result.degenerate:
+        return replace(result, converged=False, reason=f"without a guess {result.reason}")
     if not reason:
         return result
     covariance = _shifted_covariance(unknown(scale, config.uncertainty), best.T[:3, :3] @ target.centre)
@@ -248,17 +260,16 @@ def _result(
 ) -> RegistrationResult:
     scale = max(target.cloud.scale, 1e-6)
     grid = target.pyramid.grids[0]
-    fit = fit_to_grid(
-        source.points, optimum.rotation, optimum.translation, grid, 3.0 * grid.block_size, 2.0 * grid.block_size
-    )
-    fixed = planar_constraint(source.planar) > 0.0
-    curvature = Curvature(optimum.hessian, optimum.majorant, fit.friction)
+    fit = fit_to_grid(source.points, optimum.rotation, optimum.translation, grid, 3.0 * grid.block_size)
+    layers = target.pyramid.layers(source, 0, len(source), config.rim_share)
+    pulls = [block_pulls(layer, optimum.rotation, optimum.translation) for layer in layers]
     uncertainty = sandwich(
-        curvature,
-        fit.pulls,
+        Curvature(optimum.hessian, optimum.majorant, fit.friction),
+        gradient_scatter(pulls, len(source) / len(target.cloud)),
         Extent(fit.centre, max(fit.radius, _LEAST_RADIUS * scale)),
+        _loss(source, target, optimum, config),
         scale,
-        fixed,
+        planar_constraint(source.planar) > 0.0,
         config.uncertainty,
     )
     reason = _reason_of_failure(optimum, fit.overlap, cost, config)
@@ -275,6 +286,16 @@ def _result(
         reason=reason or ("not determined: " + "; ".join(names) if names else ""),
         degenerate=names,
     )
+
+
+def _loss(
+    source: Cloud, target: Target, optimum: NdtOptimum, config: RegistrationConfig
+) -> Callable[[FloatArray], float]:
+    """Share of the score that is lost when the optimum is moved by a vector (6,)."""
+    layers = target.pyramid.layers(source, 0, config.coarse_points, config.rim_share)
+    best = _pose(optimum)
+    score = score_at(layers, best)
+    return lambda step: 1.0 - score_at(layers, boxplus(best, step)) / max(score, 1e-300)
 
 
 _LEAST_RADIUS = 0.05

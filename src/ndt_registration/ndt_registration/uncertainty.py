@@ -1,9 +1,10 @@
-"""How well a registration determines the pose: covariance from the scatter of the cells' pulls, and directions left
-free.
+"""How well a registration determines the pose: covariance from the scatter of the blocks' pulls, and directions
+left free.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,18 +19,14 @@ from slam_core.geometry import FloatArray, skew
 class UncertaintyConfig(Config):
     """Covariance and degeneracy of a registration."""
 
-    degeneracy: float = parameter(
-        0.004,
-        "least curvature of a determined direction over the largest, angles times the scale",
-        minimum=0.0,
-        maximum=1.0,
+    probe: float = parameter(
+        0.03, "how far the pose is moved to see whether it is determined, over the scale", minimum=0.001
     )
-    friction: float = parameter(
-        2.0, "share of the curvature expected from errors of the normals alone that counts as none", minimum=0.0
+    least_loss: float = parameter(
+        0.03, "share of its score that a determined pose loses by that", minimum=0.0, maximum=1.0
     )
     free_sigma: float = parameter(1.0, "standard deviation given to a free direction, over the scale", minimum=0.0)
-    inflation: float = parameter(2.5, "factor on the covariance of determined directions", minimum=0.01)
-    sigma_floor: float = parameter(1e-4, "least standard deviation of any direction, over the scale", minimum=0.0)
+    sigma_floor: float = parameter(1e-5, "least standard deviation of any direction, over the scale", minimum=0.0)
 
 
 class Uncertainty(NamedTuple):
@@ -60,65 +57,91 @@ class Extent(NamedTuple):
 
 def sandwich(
     curvature: Curvature,
-    pulls: FloatArray,
+    scatter: FloatArray,
     extent: Extent,
+    loss: Callable[[FloatArray], float],
     scale: float,
     fixed: npt.NDArray[np.bool_],
     config: UncertaintyConfig,
 ) -> Uncertainty:
-    """Covariance ``H^-1 (sum g g') H^-1`` of an M-estimate whose errors are independent between blocks only (White
-    1982).
+    """Covariance ``A^-1 C A^-1`` of an M-estimate: curvature ``A``, covariance ``C`` of its gradient (White 1982).
 
-    Neighbouring points share the errors of the cell they are matched with, so taking points as independent promises far
-    too much. The gradients ``g`` of the blocks vanish in sum at the optimum; their scatter contains noise,
-    discretisation and wrong matches alike.
+    A direction is free where the score hardly falls when the pose is moved along it by much more than the noise; no
+    curvature shows that alone, because the small errors of many normals feign one. What they feign in the mean is taken
+    off the curvature, else the directions that little determines would seem far better known than they are.
 
     Parameters
     ----------
     curvature
         Of the cost at the optimum.
-    pulls
-        Gradient of the cost of each block, shape (b, 6).
+    scatter
+        Covariance of the cost's gradient, shape (6, 6); see :func:`gradient_scatter`.
     extent
         Rotations are taken about the centre of what was matched, and angles times its radius: only there can the
         curvatures of translations and rotations be compared (Zhang and Singh 2016 on degeneracy).
+    loss
+        Share of the score that is lost when the pose is moved by a vector (6,).
     scale
         Free directions get ``free_sigma`` times this, m.
-    config
-        Settings.
     fixed
         Components of the pose error that were held, shape (6,); their variance is that of the floor.
+    config
+        Settings.
     """
     to_pose = np.eye(6)
     to_pose[:3, 3:] = skew(extent.centre) / extent.radius
     to_pose[3:, 3:] /= extent.radius
-    H, M = to_pose.T @ curvature.hessian @ to_pose, to_pose.T @ curvature.majorant @ to_pose
-    G = pulls @ to_pose
-    H[fixed], H[:, fixed], M[fixed], M[:, fixed], G[:, fixed] = 0.0, 0.0, 0.0, 0.0, 0.0
-    feigned = to_pose.T @ curvature.friction @ to_pose
-    feigned[fixed], feigned[:, fixed] = 0.0, 0.0
-    values, vectors = np.linalg.eigh(M - config.friction * feigned)
+    H, M, F, C = (to_pose.T @ A @ to_pose for A in (curvature.hessian, curvature.majorant, curvature.friction, scatter))
+    for A in (H, M, F, C):
+        A[fixed], A[:, fixed] = 0.0, 0.0
+    vectors = np.linalg.eigh(M)[1]
     held = np.abs(vectors[fixed]).sum(axis=0) > 0.5
-    free = (values <= max(config.degeneracy * values[-1], 1e-6 * np.trace(feigned), 0.0)) & ~held
+    free = np.zeros(6, dtype=bool)
+    for k in np.flatnonzero(~held):
+        v = vectors[:, k]
+        step = config.probe * scale * (to_pose @ v)
+        least = config.least_loss * (_FEIGNED_FACTOR if v @ H @ v < v @ F @ v else 1.0)
+        free[k] = v @ M @ v <= v @ F @ v or min(loss(step), loss(-step)) < least
+        if not free[k]:
+            break
     known = vectors[:, ~free & ~held]
     covariance = (config.sigma_floor * scale) ** 2 * np.eye(6)
     if known.shape[1]:
-        inverse = _inverse(known.T @ H @ known, known.T @ M @ known)
-        scatter = known.T @ G.T @ G @ known * (len(pulls) / max(len(pulls) - 6, 1))
-        covariance += config.inflation * known @ inverse @ scatter @ inverse @ known.T
+        inverse = _inverse(known.T @ (H - F) @ known, known.T @ M @ known)
+        covariance += known @ inverse @ (known.T @ C @ known) @ inverse @ known.T
     covariance += (vectors[:, free] * (config.free_sigma * scale) ** 2) @ vectors[:, free].T
     covariance = to_pose @ covariance @ to_pose.T
     return Uncertainty(0.5 * (covariance + covariance.T), vectors[:, free].T)
 
 
+def gradient_scatter(pulls: Iterable[FloatArray], density_ratio: float) -> FloatArray:
+    """Covariance (6, 6) of the cost's gradient from the pulls (b, 6) of the blocks of each layer.
+
+    The pulls vanish in sum at the optimum, and their scatter contains noise, discretisation and wrong matches of the
+    source's points alike; points of one block share much of their errors, blocks little. The target's points are as
+    noisy, but each cell's error is shared by all that is matched with it and shows in no scatter. By symmetry it pulls
+    as much, where the target is as dense: ``density_ratio`` is the source's number of points over the target's.
+    """
+    total = np.zeros((6, 6))
+    for layer in pulls:
+        total += layer.T @ layer * (len(layer) / max(len(layer) - 6, 1))
+    return (1.0 + density_ratio) * total
+
+
 def _inverse(hessian: FloatArray, majorant: FloatArray) -> FloatArray:
-    """Inverse of the exact curvature, or of the majorant where the exact one is (nearly) indefinite."""
-    majorant = majorant + 1e-12 * np.trace(majorant) * np.eye(len(majorant))
-    relative = np.linalg.eigvals(np.linalg.solve(majorant, hessian)).real
-    return np.asarray(np.linalg.inv(hessian if relative.min() > _LEAST_RELATIVE_CURVATURE else majorant))
+    """Inverse of the exact curvature, in directions where that is (nearly) none or less that of a share of the
+    majorant.
+    """
+    root = np.linalg.cholesky(majorant + 1e-9 * np.trace(majorant) * np.eye(len(majorant)))
+    whitened = np.linalg.solve(root, np.linalg.solve(root, hessian).T)
+    values, vectors = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    back = np.linalg.solve(root.T, vectors)
+    return np.asarray(back / np.maximum(values, _LEAST_RELATIVE_CURVATURE) @ back.T)
 
 
 _LEAST_RELATIVE_CURVATURE = 0.05
+_FEIGNED_FACTOR = 2.0
+"""So many times the loss is asked for where the curvature is no more than what the normals' errors feign."""
 
 
 def unknown(scale: float, config: UncertaintyConfig) -> FloatArray:
