@@ -24,7 +24,7 @@ def main() -> None:
         "--start", type=float, nargs=3, default=(0.7, 1.9, 0.0), help="x y yaw of the target scan (m, deg)"
     )
     parser.add_argument(
-        "--share", type=float, nargs="+", default=[0.2], help="shares of the points, for instance 1 0.2 0.1 0.05 0.02"
+        "--share", type=float, nargs="+", default=[0.2], help="shares of the points; the thesis': 1 0.2 0.1 0.05 0.02"
     )
     parser.add_argument("--scans", type=int, default=SCANS)
     parser.add_argument("--method", default="ndt", choices=("ndt", "icp", "icp_plane"))

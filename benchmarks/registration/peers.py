@@ -1,6 +1,7 @@
-"""The same scans by PCL's NDT and ICP, small_gicp, and ours: successes (5 cm, 1 deg) and milliseconds, build and align.
+"""The same scans by PCL's NDT and ICP, small_gicp, Open3D, and ours: successes (5 cm, 1 deg) and milliseconds, build
+and align.
 
-PCL is built here from pcl.cpp (Debian: libpcl-dev); small_gicp is imported where it is installed.
+PCL is built here from pcl.cpp (Debian: libpcl-dev); small_gicp and Open3D are imported where they are installed.
 """
 
 from __future__ import annotations
@@ -66,10 +67,36 @@ def small_gicp(kind: str, threads: int) -> Method:
     return run
 
 
+def open3d(kind: str) -> Method:
+    import open3d as library
+
+    def run(source: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
+        began = time.perf_counter()
+        clouds = []
+        for points in (source, target):
+            cloud = library.geometry.PointCloud(library.utility.Vector3dVector(points))
+            cloud = cloud.voxel_down_sample(0.02)
+            cloud.estimate_normals(library.geometry.KDTreeSearchParamKNN(20))
+            clouds.append(cloud)
+        registration = library.pipelines.registration
+        estimation = (
+            registration.TransformationEstimationForGeneralizedICP()
+            if kind == "gicp"
+            else registration.TransformationEstimationPointToPlane()
+        )
+        align = registration.registration_generalized_icp if kind == "gicp" else registration.registration_icp
+        criteria = registration.ICPConvergenceCriteria(max_iteration=100)
+        result = align(clouds[0], clouds[1], 1.0, np.eye(4), estimation, criteria)
+        return np.asarray(result.transformation), 1e3 * (time.perf_counter() - began)
+
+    return run
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=SCANS)
     parser.add_argument("--scenario", default=str(ROOM))
+    parser.add_argument("--share", type=float, default=0.2, help="share of the points")
     arguments = parser.parse_args()
     methods: dict[str, Method] = {"ours": ours}
     folder = Path(tempfile.mkdtemp())
@@ -79,15 +106,21 @@ def main() -> None:
     except (subprocess.CalledProcessError, FileNotFoundError) as error:
         print(f"without PCL: {error}")
     try:
-        methods |= {"small_gicp GICP": small_gicp("GICP", 2), "small_gicp plane": small_gicp("PLANE_ICP", 2)}
+        for threads in (1, 2):
+            methods |= {f"small_gicp {kind}, {threads}": small_gicp(kind, threads) for kind in ("GICP", "PLANE_ICP")}
     except ImportError as error:
         print(f"without small_gicp: {error}")
+    try:
+        methods |= {"Open3D plane": open3d("plane"), "Open3D GICP": open3d("gicp")}
+    except ImportError as error:
+        print(f"without Open3D: {error}")
+    share = arguments.share
     room, rng, start = TofRoom(arguments.scenario), np.random.default_rng(1), rig_pose(0.7, 1.9)
     ours(room.scan(start, rng)[:8000], room.scan(start, rng)[:8000])  # compiles
-    print(f"{'method':18s} successes of {arguments.scans} per motion, median ms\n{'':18s} {', '.join(THESIS_MOTIONS)}")
+    print(f"{'method':24s} successes of {arguments.scans} per motion, median ms\n{'':24s} {', '.join(THESIS_MOTIONS)}")
     pairs = {
         name: [
-            (thinned(room.scan(start @ rig_motion(m), rng), 0.2, rng), thinned(room.scan(start, rng), 0.2, rng))
+            (thinned(room.scan(start @ rig_motion(m), rng), share, rng), thinned(room.scan(start, rng), share, rng))
             for _ in range(arguments.scans)
         ]
         for name, m in THESIS_MOTIONS.items()
@@ -102,7 +135,7 @@ def main() -> None:
                 count += bool(np.linalg.norm(d[:3]) < 0.05 and np.linalg.norm(d[3:]) < np.deg2rad(1.0))
                 times.append(ms)
             successes.append(count)
-        print(f"{name:18s} {'/'.join(map(str, successes))}  {np.median(times):.0f} ms", flush=True)
+        print(f"{name:24s} {'/'.join(map(str, successes))}  {np.median(times):.0f} ms", flush=True)
 
 
 if __name__ == "__main__":

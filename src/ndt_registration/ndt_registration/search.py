@@ -20,7 +20,7 @@ from ndt_registration.orientation import ball_lattice, best_rotations, facing_no
 from ndt_registration.pyramid import Pyramid
 from ndt_registration.visibility import Prices, RangeImage, visibility_cost
 from slam_core.config import Config, parameter
-from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform, so3_log
+from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,9 @@ def is_same(candidate: Candidate, other: Candidate, scale: float) -> bool:
 
 def pose_distance(T: FloatArray, other: FloatArray, scale: float) -> float:
     """Rotation angle (rad) plus translation over the scale between two poses."""
-    angle = np.linalg.norm(so3_log(T[:3, :3] @ other[:3, :3].T))
-    return float(angle + np.linalg.norm(T[:3, 3] - other[:3, 3]) / scale)
+    # The chord of the rotation: exact also where the angle is small, which the trace is not.
+    chord = np.linalg.norm(T[:3, :3] - other[:3, :3]) / np.sqrt(8.0)
+    return float(2.0 * np.arcsin(min(chord, 1.0)) + np.linalg.norm(T[:3, 3] - other[:3, 3]) / scale)
 
 
 def judge(views: Views, optimum: NdtOptimum, config: SearchConfig) -> Candidate:
