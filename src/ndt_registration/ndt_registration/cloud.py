@@ -21,6 +21,7 @@ _EVEN_SIZE = 0.01
 _CROWDED = 8.0
 """A cloud is crowded where a typical point's block has this many times the points of a typical block."""
 _FEWEST_RIMS = 60
+"""Rims that go with even the smallest sample of points."""
 _SEED = 20100610
 """Thinning is random but always the same: two runs on the same cloud give the same bytes."""
 
