@@ -2,13 +2,16 @@
 
     python benchmarks/chain/simulated.py [SCENARIO[/EVERY][:MODE] ...] [--keep FOLDER]
 
-EVERY keeps each n-th frame, MODE is stereo, tof, replace or fuse. Bags are kept in FOLDER and used again.
+EVERY keeps each n-th frame, MODE is stereo, tof, replace or fuse. Bags are kept in FOLDER and used again. The second
+table has one row per agent of the runs with several: what it sends (bytes of its submap messages per metre of way), and
+how the map compares with a central one, to which all submaps are given at the end, agent after agent.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,21 +19,30 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from sjsam_node.estimator import EstimatorConfig
+from sjsam_node.global_map import GlobalMap, GlobalMapConfig
+from sjsam_node.joiner import JoinerConfig
+from slam_bringup.bag_types import BagTypes, typestore
 from slam_bringup.cli import slam
 from slam_bringup.configuration import choose, load_system_config
 from slam_bringup.pipeline import run_bag
-from slam_bringup.results import summarise
+from slam_bringup.results import RunResult, summarise
 from slam_core.evaluation import Evaluation
+from slam_core.messages import submap_messages
+from slam_core.trajectory import Trajectory
+from slam_core.types import Submap
 
 DEFAULT = (
     "workshop_rig", "workshop_handheld", "fireman_10hz", "fireman_5hz", "sweep", "conference", "two_rooms/2",
     "figure_eight/4", "five_rooms/4", "small_room/3:stereo", "small_room/3:tof", "small_room/3:replace",
-    "small_room/3:fuse",
+    "small_room/3:fuse", "firemen_2", "firemen_3/2",
 )  # fmt: skip
 HEADINGS = (
     "run", "frames", "path m", "submaps", "closures", "lost", "landmarks", "ATE mm", "end mm", "end deg", "ANEES",
-    "filter: ATE mm", "ANEES", "ms features", "ms ekf", "ms sjsam", "x real time",
+    "ANEES block", "filter: ATE mm", "ANEES", "ms features", "ms ekf", "merge ms/submap", "max", "x real time",
 )  # fmt: skip
+AGENT_HEADINGS = ("run", "agent", "path m", "submaps", "sent kB/m", "ATE mm", "end mm", "ANEES",
+                  "central: ATE mm", "largest difference mm")  # fmt: skip
 
 
 def main() -> None:
@@ -38,32 +50,72 @@ def main() -> None:
     parser.add_argument("runs", nargs="*", default=DEFAULT, metavar="RUN")
     parser.add_argument("--keep", type=Path, help="folder for the bags")
     arguments = parser.parse_args()
-    table = Table(title="simulated experiments, against the truth")
+    table, agents = Table(title="simulated experiments, against the truth"), Table(title="several agents in one map")
     for heading in HEADINGS:
         table.add_column(heading, justify="right")
+    for heading in AGENT_HEADINGS:
+        agents.add_column(heading, justify="right")
     with tempfile.TemporaryDirectory() as scratch:
         for run in track(arguments.runs, description="mapping", console=Console(stderr=True)):
-            table.add_row(run, *row(run, arguments.keep or Path(scratch)))
-    Console(width=210).print(table)
+            name, _, mode = run.partition(":")
+            bag = bag_of(name, arguments.keep or Path(scratch))
+            result, mapping = run_bag(bag, choose(load_system_config(None), mode or "stereo", "sjsam", "none"))
+            submaps = [record.submap for record in mapping.global_map.graph.records]
+            table.add_row(run, *row(result, submaps))
+            if len(result.agents) > 1:
+                for cells in agent_rows(result, submaps):
+                    agents.add_row(run, *cells)
+    Console(width=220).print(table)
+    if agents.rows:
+        Console(width=220).print(agents)
 
 
-def row(run: str, folder: Path) -> list[str]:
-    name, _, mode = run.partition(":")
-    mode = mode or "stereo"
-    bag = bag_of(name, folder)
-    result, _ = run_bag(bag, choose(load_system_config(None), mode, "sjsam", "none"))
+def row(result: RunResult, submaps: list[Submap]) -> list[str]:
     summary, agent = summarise(result), result.agents[0]
     joined, filtered = agent.evaluation(), agent.evaluation(agent.filtered)
     assert joined is not None
     assert filtered is not None
+    block = GlobalMapConfig(joining=JoinerConfig(estimator=EstimatorConfig(rows="block")))
+    by_blocks = agent.evaluation(joined_again(submaps, agent.name, block))
+    assert by_blocks is not None
     counts = [summary[key] for key in ("submaps", "loop_closures")]
     lost = sum("LOST" in event for event in result.events)
     times = [np.median(result.stage_ms.get(stage, [0.0])) for stage in ("features", "ekf", "sjsam")]
+    times.append(np.max(result.stage_ms.get("sjsam", [0.0])))
     return [
         str(summary["frames"]), f"{joined.truth_length_m:.1f}", *map(str, counts), str(lost), str(summary["landmarks"]),
-        *accuracy(joined), f"{1e3 * filtered.ate.rmse:.1f}", f"{filtered.anees:.2f}", *(f"{t:.0f}" for t in times),
-        f"{summary['real_time_factor']:.1f}",
+        *accuracy(joined), f"{by_blocks.anees:.2f}", f"{1e3 * filtered.ate.rmse:.1f}", f"{filtered.anees:.2f}",
+        *(f"{t:.0f}" for t in times), f"{summary['real_time_factor']:.1f}",
     ]  # fmt: skip
+
+
+def joined_again(submaps: list[Submap], agent: str, config: GlobalMapConfig | None = None) -> Trajectory:
+    """An agent's trajectory in a map to which the submaps are given agent after agent."""
+    joined = GlobalMap(config)
+    for submap in sorted(submaps, key=lambda s: (s.agent, s.index)):
+        joined.add(submap)
+    return Trajectory.from_estimates(joined.trajectory(agent))
+
+
+def agent_rows(result: RunResult, submaps: list[Submap]) -> Iterator[list[str]]:
+    for agent in result.agents:
+        own, central = [s for s in submaps if s.agent == agent.name], joined_again(submaps, agent.name)
+        joined, centrally = agent.evaluation(), agent.evaluation(central)
+        assert joined is not None
+        assert centrally is not None
+        gap = np.linalg.norm(agent.trajectory.poses[:, :3, 3] - central.poses[:, :3, 3], axis=1).max()
+        sent = sum(size_of(submap) for submap in own) / joined.truth_length_m
+        yield [
+            agent.name, f"{joined.truth_length_m:.1f}", str(len(own)), f"{1e-3 * sent:.0f}",
+            f"{1e3 * joined.ate.rmse:.1f}", f"{1e3 * joined.end_error_m:.1f}", f"{joined.anees:.2f}",
+            f"{1e3 * centrally.ate.rmse:.1f}", f"{1e3 * gap:.1f}",
+        ]  # fmt: skip
+
+
+def size_of(submap: Submap) -> int:
+    """Bytes of a submap's messages on the wire (CDR)."""
+    messages = submap_messages(BagTypes(), submap)
+    return sum(len(typestore().serialize_cdr(message, message.__msgtype__)) for message in messages)
 
 
 def accuracy(e: Evaluation) -> list[str]:
