@@ -177,6 +177,20 @@ def test_a_restarted_agent_is_found_again(rng: np.random.Generator) -> None:
     assert sum(bool(r.closures) for r in reports) > 3
 
 
+def test_an_agent_that_falls_silent_does_no_harm(rng: np.random.Generator) -> None:
+    a, b = agents_in_one_ring(rng)
+    A, B = a.submaps(), b.submaps()
+    joined, _ = join(A[:3] + B[:6])
+    last = joined.trajectory("a")[-1]
+    _, reports = join(B[6:], joined)
+    assert all(r.accepted for r in reports)
+    assert ate(errors(joined, b)[0]) < 0.15
+    known = joined.trajectory("a")[-1]
+    assert known.stamp_ns == last.stamp_ns
+    assert np.all(np.isfinite(known.covariance))
+    assert np.linalg.norm((invert_transform(a.path[0]) @ a.true_start(3) - known.T)[:3, 3]) < 0.1
+
+
 def test_after_a_loss_the_new_stretch_is_tied_to_the_map_when_a_place_is_recognised(rng: np.random.Generator) -> None:
     agent = ring_agent(rng, turns=1.5)
     submaps = agent.submaps()
