@@ -108,6 +108,9 @@ class LoopCloser:
             rotation_step_deg=9.0,
         )
         result = register(points, target, None, replace(self._config, search=search))
+        if not result.converged and result.degenerate:
+            # A search stands by no pose that may slide, but along a corridor the other directions still tie the graph.
+            result = register(points, target, result.T_target_source, self._config)
         if not result.converged or result.overlap < LEAST_OVERLAP:
             return None
         loop = Loop(earlier, later, planar(result.T_target_source @ guess))
