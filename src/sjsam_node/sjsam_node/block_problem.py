@@ -58,8 +58,8 @@ class BlockProblem:
         self.sightings = Sightings(landmark_ptr, pose[order], mean[order], information[order], landmark[order])
         pose_ptr, by_pose = counting_order(self.sightings.pose, poses)
         self._pair_ptr, self._pair = pair_positions(
-            landmark_ptr, self.sightings.landmark, self.sightings.pose, pose_ptr, by_pose, block, pattern.column_ptr, pattern.rows,
-            pattern.row_offset + np.repeat(pattern.value_ptr[:-1], np.diff(pattern.column_ptr)),
+            landmark_ptr, self.sightings.landmark, self.sightings.pose, pose_ptr, by_pose, block, pattern.column_ptr,
+            pattern.rows, pattern.row_offset + np.repeat(pattern.value_ptr[:-1], np.diff(pattern.column_ptr)),
         )  # fmt: skip
         self._position, self._stride = pattern.value_ptr[block], pattern.height[block]
         self._landmark_offset = pattern.n + d * np.arange(landmarks, dtype=np.int64)
