@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from numba import njit
-from scipy.linalg import blas, lapack
+from scipy.linalg import lapack
 
+from slam_core import blas
 from slam_core.geometry import FloatArray
 
 IndexArray = npt.NDArray[np.int64]
@@ -112,11 +113,11 @@ class Covariance:
 
     def subtract_square(self, W: FloatArray) -> None:
         """``P <- P - W W'`` (Eq. 6.20) for W (capacity, k), rows beyond the state zero."""
-        blas.dsyrk(-1.0, W, beta=1.0, c=self._P, lower=1, overwrite_c=1)
+        blas.subtract_square(self._P, W)
 
     def add_product(self, A: FloatArray, B: FloatArray) -> None:
         """``P <- P + A B' + B A'`` for A, B (capacity, k), rows beyond the state zero."""
-        blas.dsyr2k(1.0, A, B, beta=1.0, c=self._P, lower=1, overwrite_c=1)
+        blas.add_product(self._P, np.asfortranarray(A), np.asfortranarray(B))
 
     def append(self, cross: FloatArray, block: FloatArray) -> None:
         """Add rows: their covariance with the state, ``cross`` (k, n), and among themselves, ``block`` (k, k) (Eq.
@@ -167,9 +168,9 @@ def whiten(S: FloatArray, cross: FloatArray, innovation: FloatArray) -> tuple[Fl
     W = P H' L^-T and y = L^-1 innovation with S = L L'; the gain is applied as ``x += W y``, ``P -= W W'`` and y'y is
     the NIS. None if S is not positive definite.
     """
-    L, failed = lapack.dpotrf(S, lower=1, clean=0)
-    if failed:
+    L = np.array(S, order="F")
+    if not blas.cholesky(L):
         return None
     y, _ = lapack.dtrtrs(L, innovation, lower=1)
-    W = blas.dtrsm(1.0, L, cross, side=1, lower=1, trans_a=1, overwrite_b=1)
-    return W, np.asarray(y).ravel()
+    blas.solve_right(L, cross)
+    return cross, np.asarray(y).ravel()

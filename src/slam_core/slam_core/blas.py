@@ -1,0 +1,78 @@
+"""BLAS and LAPACK routines that let other threads run meanwhile.
+
+``scipy.linalg.blas`` holds the global interpreter lock while it computes, which stops every other thread of the process
+for the length of a matrix product. The same routines, of the same library, are called here by their addresses
+(``scipy.linalg.cython_blas`` exports them), and ``ctypes`` gives the lock away. All matrices are float64 in Fortran
+order; only lower triangles are read and written.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import byref, c_char, c_double, c_int, c_void_p
+from typing import Any
+
+import numpy as np
+from scipy.linalg import cython_blas, cython_lapack
+
+from slam_core.geometry import FloatArray
+
+_LOWER, _PLAIN, _TRANSPOSED, _RIGHT = c_char(b"L"), c_char(b"N"), c_char(b"T"), c_char(b"R")
+
+
+def _routine(module: Any, name: str, arguments: int) -> Any:
+    """A routine all of whose arguments are pointers, as in Fortran."""
+    capsule = module.__pyx_capi__[name]
+    get_name, get_pointer = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
+    get_name.restype, get_name.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    get_pointer.restype, get_pointer.argtypes = c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    return ctypes.CFUNCTYPE(None, *[c_void_p] * arguments)(get_pointer(capsule, get_name(capsule)))
+
+
+_dsyrk = _routine(cython_blas, "dsyrk", 10)
+_dsyr2k = _routine(cython_blas, "dsyr2k", 12)
+_dtrsm = _routine(cython_blas, "dtrsm", 11)
+_dpotrf = _routine(cython_lapack, "dpotrf", 5)
+
+
+def _pointer(matrix: FloatArray) -> c_void_p:
+    if matrix.dtype != np.float64 or not matrix.flags.f_contiguous:
+        raise ValueError(f"BLAS needs float64 in Fortran order, got {matrix.dtype} with strides {matrix.strides}")
+    return c_void_p(matrix.ctypes.data)
+
+
+def subtract_square(C: FloatArray, A: FloatArray) -> None:
+    """``C <- C - A A'`` for C (n, n), A (n, k)."""
+    n, k = A.shape
+    size, alpha, beta = c_int(n), c_double(-1.0), c_double(1.0)
+    _dsyrk(
+        byref(_LOWER), byref(_PLAIN), byref(size), byref(c_int(k)), byref(alpha), _pointer(A), byref(size),
+        byref(beta), _pointer(C), byref(size),
+    )  # fmt: skip
+
+
+def add_product(C: FloatArray, A: FloatArray, B: FloatArray) -> None:
+    """``C <- C + A B' + B A'`` for C (n, n), A and B (n, k)."""
+    n, k = A.shape
+    size, one = c_int(n), c_double(1.0)
+    _dsyr2k(
+        byref(_LOWER), byref(_PLAIN), byref(size), byref(c_int(k)), byref(one), _pointer(A), byref(size),
+        _pointer(B), byref(size), byref(one), _pointer(C), byref(size),
+    )  # fmt: skip
+
+
+def solve_right(L: FloatArray, B: FloatArray) -> None:
+    """``B <- B L^-T`` for L (k, k) lower triangular, B (n, k)."""
+    n, k = B.shape
+    one = c_double(1.0)
+    _dtrsm(
+        byref(_RIGHT), byref(_LOWER), byref(_TRANSPOSED), byref(_PLAIN), byref(c_int(n)), byref(c_int(k)), byref(one),
+        _pointer(L), byref(c_int(k)), _pointer(B), byref(c_int(n)),
+    )  # fmt: skip
+
+
+def cholesky(S: FloatArray) -> bool:
+    """``S <- L`` with S = L L' in the lower triangle; False, with S spoilt, if S is not positive definite."""
+    n, failed = c_int(len(S)), c_int(0)
+    _dpotrf(byref(_LOWER), byref(n), _pointer(S), byref(n), byref(failed))
+    return failed.value == 0
