@@ -13,6 +13,7 @@ from slam_core.motion import motion_of_rig, pose_of_rig
 from slam_core.types import DepthImage, Features, ImuSample, PoseEstimate, RelativeMotion, StereoImages
 from stereo_frontend.depth_pairing import DepthPairing
 from stereo_frontend.frontend import Frontend
+from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.rectify import StereoRectifier
 from tof_driver.depth import DepthProcessor
 
@@ -26,6 +27,16 @@ class FilterInput:
     imu: ImuSample | None = None
     motion: RelativeMotion | None = None
     scan_pose: PoseEstimate | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Glimpse:
+    """One instant of ``agent``: features are found but not yet measured, :meth:`AgentEyes.complete` does that."""
+
+    agent: str
+    images: StereoImages | None
+    depth: DepthImage | None
+    keypoints: tuple[Keypoints, Keypoints] | None
 
 
 class AgentEyes:
@@ -57,7 +68,7 @@ class AgentEyes:
         self.T_rig_optical = sensors.transform("base", "tof" if self._mode == "tof" else "left")
         """Mounting of the optical frame in which the features are."""
 
-    def process(self, reading: Reading) -> list[FilterInput]:
+    def process(self, reading: Reading) -> list[FilterInput | Glimpse]:
         """What a reading leads to; a stereo pair that waits for its ToF image comes out with a later reading."""
         if isinstance(reading, ImuReading):
             if self._odometry is not None:
@@ -68,31 +79,39 @@ class AgentEyes:
             return self._on_stereo(reading) if self._mode != "tof" else []
         return self._on_depth(reading) if self._uses_depth else []
 
-    def finish(self) -> list[FilterInput]:
+    def finish(self) -> list[FilterInput | Glimpse]:
         """The pairs that still wait."""
-        return [self._features(images, depth) for images, depth in self._pairing.flush()]
+        return [self._glimpse(images, depth) for images, depth in self._pairing.flush()]
 
-    def _on_stereo(self, reading: StereoReading) -> list[FilterInput]:
+    def complete(self, item: FilterInput | Glimpse) -> FilterInput:
+        """The filter input of a glimpse; may run in another thread than ``process``, in the same order."""
+        if isinstance(item, FilterInput):
+            return item
+        with self._times.measure("depth of features"):
+            features = self.frontend.measure(item.keypoints, item.images, item.depth, self._T_left_tof)
+        return FilterInput(self._agent, features=features)
+
+    def _on_stereo(self, reading: StereoReading) -> list[FilterInput | Glimpse]:
         with self._times.measure("rectification"):
             images = self._rectifier(reading.stamp_ns, reading.left, reading.right)
         if self._mode == "stereo":
-            return [self._features(images, None)]
-        return [self._features(*pair) for pair in self._pairing.add_pair(images)]
+            return [self._glimpse(images, None)]
+        return [self._glimpse(*pair) for pair in self._pairing.add_pair(images)]
 
-    def _on_depth(self, reading: DepthReading) -> list[FilterInput]:
+    def _on_depth(self, reading: DepthReading) -> list[FilterInput | Glimpse]:
         with self._times.measure("depth"):
             depth = self._depth.process(reading.stamp_ns, reading.image, reading.amplitude, reading.intensity)
-        out = [] if self._odometry is None else [self._registered(self._odometry, depth)]
+        out: list[FilterInput | Glimpse] = [] if self._odometry is None else [self._registered(self._odometry, depth)]
         if self._mode == "tof":
-            out.append(self._features(None, depth))
+            out.append(self._glimpse(None, depth))
         elif self._mode != "stereo":
-            out += [self._features(*pair) for pair in self._pairing.add_depth(depth)]
+            out += [self._glimpse(*pair) for pair in self._pairing.add_depth(depth)]
         return out
 
-    def _features(self, images: StereoImages | None, depth: DepthImage | None) -> FilterInput:
+    def _glimpse(self, images: StereoImages | None, depth: DepthImage | None) -> Glimpse:
         with self._times.measure("features"):
-            features = self.frontend.process(images, depth, self._T_left_tof)
-        return FilterInput(self._agent, features=features)
+            keypoints = self.frontend.extract(images)
+        return Glimpse(self._agent, images, depth, keypoints)
 
     def _registered(self, odometry: ScanOdometry, depth: DepthImage) -> FilterInput:
         with self._times.measure("scan odometry"):

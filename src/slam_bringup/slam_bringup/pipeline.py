@@ -3,7 +3,8 @@ r"""The chain of the launch file without ROS: the same classes, called frame by 
     readings of a bag -> depth -> features ----------> EKF-SLAM -> submaps -> SJSAM -> trajectory and map
                            \-> scan odometry (optional) --^
 
-Images, filter and joining run on three threads; each stage keeps its own order, so the result does not depend on that.
+Reading, features, their depth, filter and joining run on a thread each. Every stage keeps its own order, so the result
+does not depend on that.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Generator
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,7 +22,7 @@ import numpy as np
 from slam_bringup.configuration import SystemConfig
 from slam_bringup.dense_map import ColouredCloud
 from slam_bringup.dense_run import dense_model
-from slam_bringup.eyes import AgentEyes, FilterInput
+from slam_bringup.eyes import AgentEyes, FilterInput, Glimpse
 from slam_bringup.mapper import Mapper
 from slam_bringup.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
 from slam_bringup.sensor_bag import SensorBag
@@ -29,8 +30,8 @@ from slam_bringup.stage_times import StageTimes
 from slam_core.trajectory import Trajectory
 
 T = TypeVar("T")
-_AHEAD = 64
-"""Inputs of the filter that the images may be ahead: several frames, also where an IMU adds ten readings to each."""
+_AHEAD = 32
+"""Items that a stage may be ahead of the next: a few frames, also where an IMU adds ten readings to each."""
 
 
 def run_bag(
@@ -81,29 +82,41 @@ def run_bag(
     return _run_result(path, choice, mapping, agents, dense, dropped, times, wall_s), mapping
 
 
-def _filter_inputs(bag: SensorBag, eyes: dict[str, AgentEyes], on_reading: Callable[[], None]) -> Iterator[FilterInput]:
-    for reading in bag.readings():
-        agent = reading.agent
-        yield from eyes[agent].process(reading)
-        on_reading()
+def _filter_inputs(
+    bag: SensorBag, eyes: dict[str, AgentEyes], on_reading: Callable[[], None]
+) -> Generator[FilterInput, None, None]:
+    """Reading, finding features and measuring their depth, each on a thread of its own."""
+    with closing(_ahead(_glimpses(bag, eyes, on_reading))) as glimpses:
+        for item in glimpses:
+            yield eyes[item.agent].complete(item)
+
+
+def _glimpses(
+    bag: SensorBag, eyes: dict[str, AgentEyes], on_reading: Callable[[], None]
+) -> Generator[FilterInput | Glimpse, None, None]:
+    with closing(_ahead(bag.readings())) as readings:
+        for reading in readings:
+            yield from eyes[reading.agent].process(reading)
+            on_reading()
     for agent_eyes in eyes.values():
         yield from agent_eyes.finish()
 
 
-def _ahead(items: Iterable[T]) -> Iterator[T]:
+def _ahead(items: Generator[T, None, None]) -> Generator[T, None, None]:
     """The same items, made by another thread a few ahead of their use."""
     made: queue.Queue[tuple[T | None, BaseException | None]] = queue.Queue(_AHEAD)
     stopped = threading.Event()
 
     def make() -> None:
         error: BaseException | None = None
-        try:
-            for item in items:
-                made.put((item, None))
-                if stopped.is_set():
-                    return
-        except BaseException as caught:  # handed to the consumer, who raises it
-            error = caught
+        with closing(items):
+            try:
+                for item in items:
+                    made.put((item, None))
+                    if stopped.is_set():
+                        return
+            except BaseException as caught:  # handed to the consumer, who raises it
+                error = caught
         made.put((None, error))
 
     thread = threading.Thread(target=make, name="images", daemon=True)

@@ -16,7 +16,7 @@ Extrinsics come from ``tf_static``. The calibration of a bag is constant: the fi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -132,7 +132,7 @@ class SensorBag:
     def __exit__(self, *_: object) -> None:
         self.reader.__exit__()
 
-    def readings(self) -> Iterator[Reading]:
+    def readings(self) -> Generator[Reading, None, None]:
         """Every reading in the order of the bag; of those with one stamp IMU and depth come before the stereo pair.
 
         What helps a frame thus comes before it, as at the node, which waits for it.

@@ -81,10 +81,38 @@ class Frontend:
     def process(
         self, images: StereoImages | None, depth: DepthImage | None = None, T_left_tof: FloatArray | None = None
     ) -> Features:
-        """Features of one instant.
+        """Features of one instant: :meth:`extract`, then :meth:`measure`, of the same arguments."""
+        return self.measure(self.extract(images), images, depth, T_left_tof)
+
+    def extract(self, images: StereoImages | None) -> tuple[Keypoints, Keypoints] | None:
+        """Keypoints of the left image, and of the right image those that a left one could match.
+
+        Both images have a thread each. None in mode ``tof``, whose keypoints need the depth image. A caller may extract
+        from one frame while :meth:`measure` is at the one before.
+        """
+        if self.config.mode == "tof":
+            return None
+        if images is None:
+            raise ValueError(f"mode '{self.config.mode}' needs a stereo pair, got none")
+        matching = self.config.matching
+        bounds = disparity_bounds(matching, images.stereo.camera.fx * images.stereo.baseline)
+        left = self._pool.submit(self._left, images.left)
+        right = self._right(images.right, lambda uv, size: has_candidate(left.result(), uv, size, matching, bounds))
+        return left.result(), right
+
+    def measure(
+        self,
+        keypoints: tuple[Keypoints, Keypoints] | None,
+        images: StereoImages | None,
+        depth: DepthImage | None = None,
+        T_left_tof: FloatArray | None = None,
+    ) -> Features:
+        """Keypoints become features: matched, with depth and standard deviations.
 
         Parameters
         ----------
+        keypoints
+            What :meth:`extract` found in ``images``.
         images
             Rectified pair; required in every mode but ``tof``.
         depth
@@ -103,9 +131,9 @@ class Frontend:
             if depth is None:
                 raise ValueError("mode 'tof' needs a depth image, got none")
             return self._tof(depth, self.config.max_relative_sigma)
-        if images is None:
+        if images is None or keypoints is None:
             raise ValueError(f"mode '{self.config.mode}' needs a stereo pair, got none")
-        left, right = self._extract(images)
+        left, right = keypoints
         estimate = self._stereo_depth(images, left, right)
         if self.config.mode != "stereo":
             estimate = self._with_tof(images, left, estimate, depth, T_left_tof)
@@ -119,14 +147,6 @@ class Frontend:
         for part in (self._left, self._right, self._noise, self._tof):
             part.reset()
         self.counters = Counters()
-
-    def _extract(self, images: StereoImages) -> tuple[Keypoints, Keypoints]:
-        """Left and right image on a thread each; of the right one's keypoints those that a left one could match."""
-        matching = self.config.matching
-        bounds = disparity_bounds(matching, images.stereo.camera.fx * images.stereo.baseline)
-        left = self._pool.submit(self._left, images.left)
-        right = self._right(images.right, lambda uv, size: has_candidate(left.result(), uv, size, matching, bounds))
-        return left.result(), right
 
     def _stereo_depth(self, images: StereoImages, left: Keypoints, right: Keypoints) -> DepthEstimate:
         focal_baseline = images.stereo.camera.fx * images.stereo.baseline
