@@ -118,7 +118,7 @@ def _hung(graph: MapGraph, record: Record, joint: FloatArray) -> list[PoseEstima
         J = J_pose @ gain @ D
         J[:, :6] += J_start
         covariance = J @ joint @ J.T + J_pose @ remaining @ J_pose.T
-        out.append(PoseEstimate(pose.stamp_ns, T_start @ T, 0.5 * (covariance + covariance.T)))
+        out.append(PoseEstimate(pose.stamp_ns, T_start @ T, _positive(covariance)))  # the map's first pose has none
     return out
 
 
@@ -130,9 +130,9 @@ def _smoothing(submap: Submap, pose: PoseEstimate) -> tuple[FloatArray, FloatArr
     """
     end_covariance = submap.covariance[:6, :6]
     if pose.stamp_ns == submap.end_stamp_ns:
-        return np.eye(6), _positive(np.zeros((6, 6)))
+        return np.eye(6), np.zeros((6, 6))
     if pose.stamp_ns == submap.start_stamp_ns:
-        return np.zeros((6, 6)), _positive(np.zeros((6, 6)))
+        return np.zeros((6, 6)), np.zeros((6, 6))
     handed_on = _positive(pose.covariance - 0.5 * submap.path[1].covariance)
     A = np.eye(6)  # the lever arm of what is left of the way
     A[:3, 3:] = -skew(submap.end_pose[:3, 3] - pose.T[:3, 3])
