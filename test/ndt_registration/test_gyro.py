@@ -17,7 +17,7 @@ RATE = np.array([0.3, -0.2, 0.5])
 
 
 def fed(stamps_ms: range | list[int], config: GyroConfig | None = None) -> Gyro:
-    gyro = Gyro(config or GyroConfig())
+    gyro = Gyro(config or GyroConfig(enabled=True))
     for stamp in stamps_ms:
         gyro.add(stamp * MS, RATE)
     return gyro
@@ -32,7 +32,7 @@ def test_a_steady_turn_is_exact_between_stamps_that_no_sample_has() -> None:
 
 
 def test_a_changing_turn_multiplies_in_order() -> None:
-    gyro = Gyro(GyroConfig())
+    gyro = Gyro(GyroConfig(enabled=True))
     first, second = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 2.0])
     gyro.add(0, first)
     gyro.add(20 * MS, second)

@@ -15,7 +15,7 @@ from slam_core.geometry import FloatArray, so3_exp
 class GyroConfig(Config):
     """How an IMU helps scan odometry."""
 
-    enabled: bool = parameter(True, "predict the turn between scans from an IMU, where there is one")
+    enabled: bool = parameter(False, "predict the turn between scans from an IMU: for rigs that turn abruptly")
     bias_sigma: float = parameter(
         0.01, "error of its angular velocity, constant over a scan", unit="rad/s", minimum=0.0
     )
