@@ -35,7 +35,8 @@ ARGUMENTS = (
 def generate_launch_description() -> LaunchDescription:
     """Entry point of ``ros2 launch``."""
     profile = SetEnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", str(SHARE / "config" / "fastdds.xml"))
-    return LaunchDescription([*ARGUMENTS, profile, OpaqueFunction(function=_nodes)])
+    threads = SetEnvironmentVariable("OPENBLAS_NUM_THREADS", "1")  # every node has its core; more fight for it
+    return LaunchDescription([*ARGUMENTS, profile, threads, OpaqueFunction(function=_nodes)])
 
 
 def _nodes(context: LaunchContext) -> list[Node]:
