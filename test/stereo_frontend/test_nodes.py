@@ -105,7 +105,16 @@ def test_raw_pairs_become_the_features_of_the_offline_front_end(probe, start, st
         for topic in (f"stereo/{side}/image_rect", f"stereo/{side}/camera_info"):
             probe.wait(lambda t=topic: probe.node.count_subscribers(t) > 0, f"no subscriber to {topic}")
         probe.wait(lambda s=side: probe.node.count_publishers(f"stereo/{s}/image_rect") > 0, "no driver")
-    probe.spin(2.0)  # the two nodes find each other a little after the probe has found both
+    stamp = 10_000_000_000
+    while not all(probe.received[t] for t in (*FEATURE_TOPICS, "features/image")):  # until all have found each other
+        assert stamp < 16_000_000_000, "no features"
+        probe.send_pair(stamp, pairs[0])
+        probe.spin(1.0)
+        stamp += 100_000_000
+    probe.spin(1.0)
+    for messages in probe.received.values():
+        messages.clear()
+    # The stamps now jump back: both nodes start anew.
     for k, pair in enumerate(pairs):
         probe.send_pair(1_000_000_000 + k * 100_000_000, pair)
     probe.send_pair(1_200_000_000, pairs[0], encoding="nonsense")

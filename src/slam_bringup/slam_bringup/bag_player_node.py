@@ -93,8 +93,7 @@ class BagPlayerNode(Node):
             self._send_static_transforms()
             if self.config.wait_for_start:
                 self._start.wait()
-            else:
-                self._wait_for_subscribers()
+            self._wait_for_subscribers()
             self._static_output.wait_for_all_acked(Duration(seconds=5))
             self._play_once()
             while self.config.loop and not self._stop.is_set():
@@ -168,7 +167,7 @@ class BagPlayerNode(Node):
         counts: list[int] = []
         stable_since = time.monotonic()
         while time.monotonic() < deadline and not self._stop.wait(0.05):
-            now = [p.get_subscription_count() for p in self._outputs.values()]
+            now = [p.get_subscription_count() for p in (*self._outputs.values(), self._static_output)]
             if now != counts:
                 counts, stable_since = now, time.monotonic()
             if any(counts) and time.monotonic() - stable_since > _SETTLE_S:
