@@ -80,8 +80,9 @@ def row(result: RunResult, submaps: list[Submap]) -> list[str]:
     assert by_blocks is not None
     counts = [summary[key] for key in ("submaps", "loop_closures")]
     lost = sum("LOST" in event for event in result.events)
-    times = [np.median(result.stage_ms.get(stage, [0.0])) for stage in ("features", "ekf", "sjsam")]
-    times.append(np.max(result.stage_ms.get("sjsam", [0.0])))
+    ms = result.stage_ms
+    front_end = np.add(ms["keypoints"], ms["features"])
+    times = [np.median(front_end), np.median(ms["ekf"]), np.median(ms["sjsam"]), np.max(ms["sjsam"])]
     return [
         str(summary["frames"]), f"{joined.truth_length_m:.1f}", *map(str, counts), str(lost), str(summary["landmarks"]),
         *accuracy(joined), f"{by_blocks.anees:.2f}", f"{1e3 * filtered.ate.rmse:.1f}", f"{filtered.anees:.2f}",

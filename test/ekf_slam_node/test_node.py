@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -19,13 +19,14 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from feature_world import T_RIG_OPTICAL, loop, room  # noqa: E402
 from geometry_msgs.msg import TransformStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from ekf_slam_node.config import EkfSlamConfig  # noqa: E402
 from ekf_slam_node.slam import EkfSlam  # noqa: E402
+from ros_probe import Probe  # noqa: E402
 from slam_core.messages import (  # noqa: E402
     FEATURE_TOPICS,
+    STATIC_TRANSFORMS_TOPIC,
     SUBMAP_TOPICS,
     SubmapMessages,
     estimate_from_message,
@@ -33,7 +34,7 @@ from slam_core.messages import (  # noqa: E402
     submap_from_messages,
     transform_message,
 )
-from slam_core.ros import RosTypes, sensor_qos  # noqa: E402
+from slam_core.ros import sensor_qos  # noqa: E402
 from slam_core.types import Features  # noqa: E402
 
 pytestmark = pytest.mark.ros
@@ -41,51 +42,37 @@ pytestmark = pytest.mark.ros
 STEP_NS = 100_000_000
 
 
-class Probe:
-    """A node that sends features and collects what the filter says."""
+class FeatureProbe(Probe):
+    """Sends features and collects what the filter says."""
 
     def __init__(self, context: Any) -> None:
-        self.node = rclpy.create_node("probe", context=context)
-        self.executor = SingleThreadedExecutor(context=context)
-        self.executor.add_node(self.node)
-        self.types = RosTypes()
-        self.received: dict[str, list[Any]] = {}
-        kinds = {"odom": Odometry, "/diagnostics": DiagnosticArray}
-        kinds |= {topic: getattr(self.types, kind) for topic, kind in SUBMAP_TOPICS.items()}
-        for topic, kind in kinds.items():
-            self.received[topic] = []
-            latched = topic.startswith("submap")
-            self.node.create_subscription(kind, topic, self.received[topic].append, sensor_qos(100, latched))
-        self._senders = {
-            topic: self.node.create_publisher(getattr(self.types, kind), topic, sensor_qos(100))
-            for topic, kind in FEATURE_TOPICS.items()
-        }
+        super().__init__(context)
+        for topic, kind in SUBMAP_TOPICS.items():
+            self.listen(topic, getattr(self.types, kind), latched=True)
+        self.listen("odom", Odometry)
+        self.listen("/diagnostics", DiagnosticArray)
+        for topic, kind in FEATURE_TOPICS.items():
+            self.senders[topic] = self.node.create_publisher(getattr(self.types, kind), topic, sensor_qos(100))
 
     def send_mounting(self, frame_id: str) -> None:
-        sender = self.node.create_publisher(TransformStamped, "/static_transforms", sensor_qos(10, latched=True))
+        sender = self.node.create_publisher(TransformStamped, STATIC_TRANSFORMS_TOPIC, sensor_qos(10, latched=True))
         sender.publish(transform_message(self.types, 0, "base_link", frame_id, T_RIG_OPTICAL))
 
-    def send(self, features: Features) -> None:
-        for sender, message in zip(self._senders.values(), features_messages(self.types, features), strict=True):
-            sender.publish(message)
-
-    def wait(self, condition: Callable[[], bool], why: str, seconds: float = 90.0) -> None:
-        end = time.monotonic() + seconds
-        while not condition():
-            assert time.monotonic() < end, why
-            self.executor.spin_once(timeout_sec=0.05)
+    def send_features(self, features: Features) -> None:
+        for topic, message in zip(FEATURE_TOPICS, features_messages(self.types, features), strict=True):
+            self.send(topic, message)
 
     def is_heard(self) -> bool:
-        return all(sender.get_subscription_count() for sender in self._senders.values())
+        return all(sender.get_subscription_count() for sender in self.senders.values())
 
 
 @pytest.fixture
-def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[Probe]:
+def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[FeatureProbe]:
     domain = 90 + os.getpid() % 60
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
-    probe = Probe(context)
+    probe = FeatureProbe(context)
     yield probe
     probe.executor.shutdown()
     probe.node.destroy_node()
@@ -93,7 +80,7 @@ def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[Probe]:
 
 
 @pytest.fixture
-def filter_process(probe: Probe) -> Iterator[subprocess.Popen[str]]:
+def filter_process(probe: FeatureProbe) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, "-c", "from ekf_slam_node.node import main; main()", "--ros-args", "-p", "agent:=a"]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     process = subprocess.Popen(command, env=env, stderr=subprocess.PIPE, text=True)
@@ -102,12 +89,12 @@ def filter_process(probe: Probe) -> Iterator[subprocess.Popen[str]]:
     process.communicate(timeout=30)
 
 
-def test_poses_and_submaps_are_those_of_the_offline_filter(probe: Probe, filter_process: object) -> None:
+def test_poses_and_submaps_are_those_of_the_offline_filter(probe: FeatureProbe, filter_process: object) -> None:
     rng = np.random.default_rng(4)
     world, poses = room(rng), loop(25)
     frames = [world.features(T, (k + 1) * STEP_NS, rng)[0] for k, T in enumerate(poses)]
     probe.wait(probe.is_heard, "the filter does not listen")
-    probe.send(frames[0])
+    probe.send_features(frames[0])
     probe.wait(lambda: "rejected" in _diagnostics(probe), "a frame without known mounting was not rejected")
     probe.send_mounting(frames[0].frame_id)
     frames = frames[1:]
@@ -117,7 +104,7 @@ def test_poses_and_submaps_are_those_of_the_offline_filter(probe: Probe, filter_
     probe.wait(lambda: _counter(probe, "rejected") >= 1, "no count")
     time.sleep(1.0)
     for frame in frames:
-        probe.send(frame)
+        probe.send_features(frame)
     probe.wait(lambda: len(probe.received["odom"]) == len(frames), "poses are missing")
     client = probe.node.create_client(Trigger, "/ekf_slam/finish")
     probe.wait(client.service_is_ready, "no finish service")
@@ -135,7 +122,7 @@ def test_poses_and_submaps_are_those_of_the_offline_filter(probe: Probe, filter_
         assert got.follows_previous == submap.follows_previous
 
 
-def test_loss_is_on_diagnostics(probe: Probe, filter_process: object) -> None:
+def test_loss_is_on_diagnostics(probe: FeatureProbe, filter_process: object) -> None:
     rng = np.random.default_rng(5)
     world, poses = room(rng), loop(8)
     probe.wait(probe.is_heard, "the filter does not listen")
@@ -145,11 +132,11 @@ def test_loss_is_on_diagnostics(probe: Probe, filter_process: object) -> None:
     time.sleep(1.0)
     for k, T in enumerate(poses):
         features, _ = world.features(T, (k + 1) * STEP_NS, rng)
-        probe.send(features if k < 6 else features.select(np.zeros(0, dtype=np.int64)))
+        probe.send_features(features if k < 6 else features.select(np.zeros(0, dtype=np.int64)))
     probe.wait(lambda: "LOST" in _diagnostics(probe), "loss was not reported")
 
 
-def _diagnostics(probe: Probe) -> str:
+def _diagnostics(probe: FeatureProbe) -> str:
     return " ".join(
         f"{value.key} {value.value}"
         for array in probe.received["/diagnostics"][-3:]
@@ -158,7 +145,7 @@ def _diagnostics(probe: Probe) -> str:
     )
 
 
-def _counter(probe: Probe, key: str) -> int:
+def _counter(probe: FeatureProbe, key: str) -> int:
     values = [
         int(value.value)
         for array in probe.received["/diagnostics"]

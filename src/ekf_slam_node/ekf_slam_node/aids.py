@@ -9,6 +9,7 @@ import numpy as np
 from ekf_slam_node.config import MotionConfig
 from slam_core.geometry import (
     FloatArray,
+    both_halves,
     compose_covariance,
     interpolate_transform,
     make_transform,
@@ -126,7 +127,7 @@ class MotionAids:
 def aid_error(aid: Aid, T_previous_now: FloatArray, rotation_map_previous: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Error (k,) of a motion as an aid sees it, along the map's axes, and its covariance (k, k)."""
     error = np.concatenate([aid.T[:3, 3] - T_previous_now[:3, 3], so3_log(aid.T[:3, :3] @ T_previous_now[:3, :3].T)])
-    turn = np.kron(np.eye(2), rotation_map_previous)
+    turn = both_halves(rotation_map_previous)
     rows = turn[aid.rows, aid.rows]
     return (turn @ error)[aid.rows], rows @ aid.covariance @ rows.T
 

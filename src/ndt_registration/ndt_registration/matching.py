@@ -53,6 +53,17 @@ def _add_friction(px, py, pz, drag, F):  # type: ignore[no-untyped-def]
             F[3 + r, 3 + c] -= drag * p[r] * p[c]
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _offset(grid, cell, x, y, z):  # type: ignore[no-untyped-def]
+    """Offset q of a point from a cell's mean, and the cell's information times q."""
+    qx, qy, qz = x - grid.mean[cell, 0], y - grid.mean[cell, 1], z - grid.mean[cell, 2]
+    b = grid.information[cell]
+    ux = b[0] * qx + b[1] * qy + b[2] * qz
+    uy = b[1] * qx + b[3] * qy + b[4] * qz
+    uz = b[2] * qx + b[4] * qy + b[5] * qz
+    return qx, qy, qz, ux, uy, uz
+
+
 @njit(cache=True, nogil=True)
 def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGrid, max_distance: float) -> Fit:
     """Fit of points (n, 3) at a pose; a point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m
@@ -78,11 +89,7 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
             cell = grid.cells[row, k]
             if cell < 0:
                 continue
-            qx, qy, qz = mx - grid.mean[cell, 0], my - grid.mean[cell, 1], mz - grid.mean[cell, 2]
-            b = grid.information[cell]
-            ux = b[0] * qx + b[1] * qy + b[2] * qz
-            uy = b[1] * qx + b[3] * qy + b[4] * qz
-            uz = b[2] * qx + b[4] * qy + b[5] * qz
+            qx, qy, qz, ux, uy, uz = _offset(grid, cell, mx, my, mz)
             exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
             e = 0.125 * np.exp(-min(exponent, 30.0))
             weight += e
@@ -129,11 +136,7 @@ def block_pulls(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
             cell = grid.cells[row, k]
             if cell < 0:
                 continue
-            qx, qy, qz = mx - grid.mean[cell, 0], my - grid.mean[cell, 1], mz - grid.mean[cell, 2]
-            b = grid.information[cell]
-            ux = b[0] * qx + b[1] * qy + b[2] * qz
-            uy = b[1] * qx + b[3] * qy + b[4] * qz
-            uz = b[2] * qx + b[4] * qy + b[5] * qz
+            qx, qy, qz, ux, uy, uz = _offset(grid, cell, mx, my, mz)
             e = 0.125 * layer.factor * np.exp(-min(0.5 * (qx * ux + qy * uy + qz * uz), 30.0))
             vx += e * ux
             vy += e * uy

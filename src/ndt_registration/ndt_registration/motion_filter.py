@@ -14,6 +14,7 @@ import numpy as np
 from slam_core.config import Config, parameter
 from slam_core.geometry import (
     FloatArray,
+    both_halves,
     boxminus,
     boxplus,
     compose_jacobians,
@@ -29,6 +30,8 @@ _START_SIGMA = 1e-6
 """Standard deviation of the first pose (m, rad): it is the origin by definition, but no covariance may be singular."""
 _LOST_SIGMA = 100.0
 """Standard deviation (m, rad) of a pose of which nothing is known."""
+_LIKELY = 1.5
+"""Standard deviations of the prediction within which a pose is likely."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ class MotionFilter:
 
     def predict(self, dt: float) -> None:
         """Move on by ``dt`` s (Eq. 5.6); the pose so far becomes the pose before."""
-        R = both_halves(self.T)
+        R = both_halves(self.T[:3, :3])
         F = np.zeros((18, 18))
         F[BEFORE, NOW] = F[NOW, NOW] = F[VELOCITY, VELOCITY] = np.eye(6)
         F[NOW, VELOCITY] = dt * R
@@ -159,10 +162,6 @@ def _credible(step: FloatArray, predicted: FloatArray, measured: FloatArray) -> 
     return np.asarray(root @ axes @ cut)
 
 
-_LIKELY = 1.5
-"""Standard deviations of the prediction within which a pose is likely."""
-
-
 def _moved(T: FloatArray, step: FloatArray) -> FloatArray:
     """``boxplus``, made exactly orthonormal: rounding in a chain of rotations doubles with every transposition."""
     return transform_from_pose7(pose7_from_transform(boxplus(T, step)))
@@ -170,12 +169,5 @@ def _moved(T: FloatArray, step: FloatArray) -> FloatArray:
 
 def rotated(T: FloatArray, covariance: FloatArray) -> FloatArray:
     """Covariance (6, 6) of an error along the axes of ``T``'s child frame, along those of its parent."""
-    R = both_halves(T)
+    R = both_halves(T[:3, :3])
     return np.asarray(R @ covariance @ R.T)
-
-
-def both_halves(T: FloatArray) -> FloatArray:
-    """(6, 6) that turns both halves of an error from the axes of ``T``'s child frame to those of its parent."""
-    R = np.zeros((6, 6))
-    R[:3, :3] = R[3:, 3:] = T[:3, :3]
-    return R

@@ -21,9 +21,15 @@ from std_srvs.srv import Trigger
 
 from slam_bringup.bag import BagReader, RawMessage
 from slam_bringup.pacing import FlowControl, ReplayClock, header_stamp_ns
-from slam_core.base_node import PROGRESS_TOPIC, STATIC_TRANSFORMS_TOPIC
+from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.config import Config, parameter
-from slam_core.messages import stamp_ns, time_message, transform_from_message, transform_message
+from slam_core.messages import (
+    STATIC_TRANSFORMS_TOPIC,
+    stamp_ns,
+    time_message,
+    transform_from_message,
+    transform_message,
+)
 from slam_core.ros import RosTypes, declare_config, message_class, run_node, sensor_qos
 
 _DEPTH = 200
@@ -93,7 +99,8 @@ class BagPlayerNode(Node):
             self._send_static_transforms()
             if self.config.wait_for_start:
                 self._start.wait()
-            self._wait_for_subscribers()
+            else:
+                self._wait_for_subscribers()
             self._static_output.wait_for_all_acked(Duration(seconds=5))
             self._play_once()
             while self.config.loop and not self._stop.is_set():

@@ -8,7 +8,7 @@ import sys
 
 import click
 
-# Images and filter already run on two threads: BLAS threads beside them only wait for each other, spinning. NumPy and
+# The stages of a run have threads of their own: BLAS threads beside them only wait for each other, spinning. NumPy and
 # SciPy read this when they are loaded, here and in the nodes that are started from here. One number of threads also
 # means one order of summation, hence the same bytes.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

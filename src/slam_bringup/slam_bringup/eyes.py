@@ -87,7 +87,7 @@ class AgentEyes:
         """The filter input of a glimpse; may run in another thread than ``process``, in the same order."""
         if isinstance(item, FilterInput):
             return item
-        with self._times.measure("depth of features"):
+        with self._times.measure("features"):
             features = self.frontend.measure(item.keypoints, item.images, item.depth, self._T_left_tof)
         return FilterInput(self._agent, features=features)
 
@@ -109,7 +109,7 @@ class AgentEyes:
         return out
 
     def _glimpse(self, images: StereoImages | None, depth: DepthImage | None) -> Glimpse:
-        with self._times.measure("features"):
+        with self._times.measure("keypoints"):
             keypoints = self.frontend.extract(images)
         return Glimpse(self._agent, images, depth, keypoints)
 

@@ -11,6 +11,7 @@ from slam_bringup.node_arguments import ros_arguments
 from slam_bringup.processes import NodeCommand
 from slam_bringup.sensor_bag import AgentSensors
 from slam_core.config import Config, iterate_parameters
+from slam_core.messages import STATIC_TRANSFORMS_TOPIC
 
 RESULT_TOPICS = (
     "odom", "pose", "features", "landmarks", "ndt/odometry", "ndt/motion", "map_to_odom", "submap/landmarks",
@@ -109,7 +110,7 @@ def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odomet
         commands=tuple(spec.command for spec in specs),
         played_topics=tuple(t for s in sensors.values() for t in _topics(s, mode, odometry)),
         pace=tuple(p for s in sensors.values() for p in _pace(s, mode, odometry)),
-        recorded_topics=(*sorted(recorded), "/diagnostics", "/static_transforms"),
+        recorded_topics=(*sorted(recorded), "/diagnostics", STATIC_TRANSFORMS_TOPIC),
         filters=names["ekf_slam"],
         finishers=(*names["feature_extractor"], *names["ekf_slam"]),
     )

@@ -18,6 +18,7 @@ from slam_bringup.node_arguments import ros_arguments
 from slam_bringup.node_graph import NodeGraph, plan_nodes
 from slam_bringup.processes import NodeCommand, NodeGroup, PrivateDomain, ament_prefixes, node_environment
 from slam_bringup.sensor_bag import SensorBag
+from slam_core.messages import STATIC_TRANSFORMS_TOPIC
 
 START_TIMEOUT_S = 180.0
 """A cold start compiles kernels."""
@@ -119,7 +120,7 @@ class _Choreography:
         """All nodes, then the recorder; returns when every topic has reached whoever listens to it."""
         for command in self._graph.commands:
             self._group.start(command)
-        self._wait_until_ready(from_outside=self._graph.played_topics)
+        self._wait_until_ready(from_outside=(*self._graph.played_topics, STATIC_TRANSFORMS_TOPIC))
         self._start_recorder()
 
     def _wait_until_ready(self, from_outside: tuple[str, ...]) -> None:

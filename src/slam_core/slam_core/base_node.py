@@ -43,7 +43,7 @@ from slam_core.config import Config, parameter
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
 from slam_core.health import Health, State
-from slam_core.messages import header_message, stamp_ns, transform_from_message
+from slam_core.messages import STATIC_TRANSFORMS_TOPIC, header_message, stamp_ns, transform_from_message
 from slam_core.messages.base import Message
 from slam_core.ros import RosTypes, declare_config, has_tf2_msgs, incompatibility, sensor_qos
 from slam_core.synchronizer import ExactSynchronizer
@@ -56,8 +56,6 @@ _NOT_A_FRAME = ("CameraInfo", "Imu", "Odometry", "PoseWithCovarianceStamped", "P
 
 LATCHED_DEPTH = 1000
 PROGRESS_TOPIC = "/progress"
-STATIC_TRANSFORMS_TOPIC = "/static_transforms"
-"""TransformStamped, latched, one message per transform: /tf_static for installations without tf2_msgs."""
 
 
 @dataclass(frozen=True)
@@ -300,9 +298,12 @@ class SlamNode(Node, Generic[C]):
         return self.types.DiagnosticArray(header=header, status=[status])
 
     def _unconnected(self) -> list[str]:
-        """Required topics that no publisher has been matched with."""
+        """Required topics that no publisher has been matched with, static transforms included."""
         inputs = self._inputs.values()
-        return [entry.topic for entry in inputs if entry.required and not entry.subscription.get_publisher_count()]
+        topics = [entry.topic for entry in inputs if entry.required and not entry.subscription.get_publisher_count()]
+        if not any(subscription.get_publisher_count() for subscription in self._static_inputs):
+            topics.append(STATIC_TRANSFORMS_TOPIC)
+        return topics
 
     def _silence(self) -> str:
         """Which required topics have been silent for five seconds and why, or "" if none has."""
@@ -343,11 +344,14 @@ class SlamNode(Node, Generic[C]):
 
     def _listen_to_static_transforms(self) -> None:
         profile = sensor_qos(LATCHED_DEPTH, latched=True)
-        self.create_subscription(
-            self.types.TransformStamped, STATIC_TRANSFORMS_TOPIC, self._on_static_transform, profile
-        )
+        kind = self.types.TransformStamped
+        self._static_inputs = [
+            self.create_subscription(kind, STATIC_TRANSFORMS_TOPIC, self._on_static_transform, profile)
+        ]
         if has_tf2_msgs():
-            self.create_subscription(self.types.TFMessage, "/tf_static", self._on_tf_static, profile)
+            self._static_inputs.append(
+                self.create_subscription(self.types.TFMessage, "/tf_static", self._on_tf_static, profile)
+            )
 
     def _on_tf_static(self, message: Message) -> None:
         for transform in message.transforms:

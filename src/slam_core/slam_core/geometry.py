@@ -178,14 +178,19 @@ def boxminus(T: FloatArray, reference: FloatArray) -> FloatArray:
     return np.concatenate([T[..., :3, 3] - reference[..., :3, 3], so3_log(dR)], axis=-1)
 
 
+def both_halves(rotation: FloatArray) -> FloatArray:
+    """(6, 6) that turns translation and rotation of a pose error by the same rotation (3, 3)."""
+    R = np.zeros((6, 6))
+    R[:3, :3] = R[3:, 3:] = rotation
+    return R
+
+
 def compose_jacobians(T_a_b: FloatArray, T_b_c: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Jacobians (6, 6) of ``T_a_b @ T_b_c`` with respect to the errors of its two factors."""
     R = T_a_b[:3, :3]
     J_ab = np.eye(6)
     J_ab[:3, 3:] = -skew(R @ T_b_c[:3, 3])
-    J_bc = np.zeros((6, 6))
-    J_bc[:3, :3] = J_bc[3:, 3:] = R
-    return J_ab, J_bc
+    return J_ab, both_halves(R)
 
 
 def inverse_jacobian(T: FloatArray) -> FloatArray:

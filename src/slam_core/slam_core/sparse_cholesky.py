@@ -9,6 +9,7 @@ may improve on it.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -88,7 +89,7 @@ class _Backend(Protocol):
     def inverse_entries(self) -> Entries: ...
 
 
-class _Library:
+class _Library(ABC):
     """What the backends from libraries have in common: they know single unknowns only."""
 
     def __init__(self, pattern: BlockPattern) -> None:
@@ -97,12 +98,13 @@ class _Library:
         self._kept = np.nonzero(rows >= columns)[0]
         self._rows, self._columns = rows[self._kept], columns[self._kept]
 
+    @abstractmethod
     def solve(self, rhs: FloatArray) -> FloatArray:
-        raise NotImplementedError
+        """``A^-1 rhs`` with the last factor."""
 
+    @abstractmethod
     def lower(self) -> tuple[scipy.sparse.csc_matrix, IntArray]:
         """``L`` and ``p`` with ``A[p][:, p] = L L^T`` of the last factor."""
-        raise NotImplementedError
 
     def inverse_block(self, variables: IntArray) -> FloatArray:
         unit = np.zeros((self._n, len(variables)))

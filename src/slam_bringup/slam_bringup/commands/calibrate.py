@@ -30,7 +30,7 @@ from slam_core.calibration.report import (
 from slam_core.calibration.rig import calibrate
 from slam_core.camera import CameraInfo
 from slam_core.files import atomic_text
-from slam_core.geometry import make_transform, quaternion_from_rotation
+from slam_core.geometry import both_halves, make_transform, quaternion_from_rotation
 
 CAMERAS = {"mono": ("camera",), "stereo": ("left", "right"), "stereo-tof": ("left", "tof")}
 FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_frame", "tof": "tof_optical_frame"}
@@ -115,7 +115,7 @@ def _infos(kind: str, result: BundleResult, rectified_left: CameraInfo | None) -
 def _extrinsics(result: BundleResult, names: Sequence[str], infos: Sequence[CameraInfo]) -> str:
     """The static transform between the *rectified* optical frames, those that the nodes' images are in."""
     T, covariance = extrinsics_of(result, 1)
-    rotate = np.kron(np.eye(2), infos[0].R)
+    rotate = both_halves(infos[0].R)
     T = make_transform(infos[0].R, np.zeros(3)) @ T @ make_transform(infos[1].R.T, np.zeros(3))
     covariance = rotate @ covariance @ rotate.T
     document = {

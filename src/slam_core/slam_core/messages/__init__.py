@@ -26,6 +26,7 @@ from slam_core.messages.images import (
 )
 from slam_core.messages.markers import ellipsoid_markers, path_marker
 from slam_core.messages.poses import (
+    STATIC_TRANSFORMS_TOPIC,
     estimate_from_message,
     imu_from_message,
     imu_message,
@@ -46,6 +47,7 @@ from slam_core.messages.submaps import SUBMAP_TOPICS, SubmapMessages, submap_fro
 __all__ = [
     "DEPTH_TOPICS",
     "FEATURE_TOPICS",
+    "STATIC_TRANSFORMS_TOPIC",
     "SUBMAP_TOPICS",
     "DepthMessages",
     "FeatureMessages",

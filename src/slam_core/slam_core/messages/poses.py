@@ -10,6 +10,9 @@ from slam_core.geometry import FloatArray, pose7_from_transform, transform_from_
 from slam_core.messages.base import Message, MessageTypes, header_message, stamp_ns
 from slam_core.types import ImuSample, PoseEstimate, RelativeMotion
 
+STATIC_TRANSFORMS_TOPIC = "/static_transforms"
+"""TransformStamped, latched, one message per transform: /tf_static for installations without tf2_msgs."""
+
 
 def pose_message(types: MessageTypes, T: FloatArray) -> Message:
     """geometry_msgs/Pose of a transform (4, 4)."""
