@@ -1,0 +1,59 @@
+"""The stages of a run: each a thread ahead of the next, none lost, none left running."""
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from slam_bringup.pipeline import _ahead
+
+
+class Source:
+    """Numbers, until ``fails_at``; ``closed`` once nobody wants more."""
+
+    def __init__(self, fails_at: int = 1000) -> None:
+        self.fails_at, self.closed = fails_at, False
+
+    def items(self) -> Iterator[int]:
+        try:
+            for k in range(1000):
+                if k == self.fails_at:
+                    raise ValueError("unreadable")
+                yield k
+        finally:
+            self.closed = True
+
+
+def doubled(items):
+    for k in items:
+        time.sleep(0)
+        yield 2 * k
+
+
+def squared(items):
+    for k in _ahead(doubled(items)):
+        yield k * k
+
+
+def test_stages_keep_every_item_in_order():
+    assert list(_ahead(squared(_ahead(Source().items())))) == [4 * k * k for k in range(1000)]
+
+
+def test_an_error_of_the_first_stage_reaches_the_last_after_what_came_before_it():
+    seen = []
+    with pytest.raises(ValueError, match="unreadable"):
+        seen.extend(_ahead(squared(_ahead(Source(fails_at=7).items()))))
+    assert len(seen) == 7
+
+
+def test_whoever_stops_early_stops_every_stage():
+    before, source = threading.active_count(), Source()
+    last = _ahead(squared(_ahead(source.items())))
+    assert next(last) == 0
+    last.close()
+    deadline = time.monotonic() + 10.0
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert source.closed
+    assert threading.active_count() == before
