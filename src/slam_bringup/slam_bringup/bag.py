@@ -1,4 +1,4 @@
-"""Reading and writing rosbag2 bags (mcap and sqlite3) without ROS.
+"""Reading and writing rosbag2 bags (mcap and sqlite3) without ROS; bags of ROS 1 are read as well.
 
 A bag is a folder with ``metadata.yaml``, as ``ros2 bag`` makes it; a path that ends in ``.mcap`` is a single file, as
 Foxglove opens it. Writing is all or nothing, and the same input gives the same bytes.
@@ -12,9 +12,10 @@ import struct
 import tempfile
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, NamedTuple, Self
+from typing import NamedTuple, Self
 
 from rosbags.interfaces import (
     Connection,
@@ -28,16 +29,15 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
 
+from slam_bringup.bag_salvage import is_whole_mcap, salvage_mcap
 from slam_bringup.bag_types import typestore
+from slam_bringup.ros1_bag import Ros1Reader
 from slam_core.messages.base import Message
 
 LATCHED_TOPICS = ("tf_static", "static_transforms", "robot_description")
 """Last parts of topics that are transient-local wherever they stand."""
 
 _FOREVER = QosTime(2147483647, 4294967295)
-_MAGIC = b"\x89MCAP0\r\n"
-_FOOTER = struct.Struct("<BQQQI")
-_BLOCK = 1 << 20
 _STORAGE_SUFFIXES = (".mcap", ".db3")
 
 
@@ -147,9 +147,9 @@ class BagWriter:
 
 
 class BagReader:
-    """Reads a bag folder, or a single ``.mcap`` or ``.db3`` file.
+    """Reads a bag folder, or a single ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
 
-    A truncated mcap file is read up to where it breaks off; ``warning`` then says so.
+    A truncated or damaged bag is read up to where it breaks off; ``warning`` then says so.
 
     Raises
     ------
@@ -170,7 +170,6 @@ class BagReader:
             if source.suffix != ".mcap":
                 raise
             self._reader = self._open_salvaged(source, error)
-        self._order = {c.id: number for number, c in enumerate(self._reader.connections)}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -181,7 +180,8 @@ class BagReader:
     @property
     def topics(self) -> dict[str, TopicInfo]:
         """Every topic with its type and number of messages, sorted by name."""
-        return {c.topic: _topic_info(c) for c in sorted(self._reader.connections, key=lambda c: c.topic)}
+        by_topic = groupby(sorted(self._reader.connections, key=_topic), key=_topic)
+        return {topic: _topic_info(list(connections)) for topic, connections in by_topic}
 
     @property
     def start_ns(self) -> int:
@@ -198,11 +198,24 @@ class BagReader:
         wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
         if not wanted:
             return
+        messages = iter(self._reader.messages(wanted))
+        count = 0
+        while (message := self._next(messages, count)) is not None:
+            connection, stamp, data = message
+            yield RawMessage(connection.topic, int(stamp), bytes(data))
+            count += 1
+
+    def _next(
+        self, messages: Iterator[tuple[Connection, int, bytes]], count: int
+    ) -> tuple[Connection, int, bytes] | None:
+        """The next message; where a bag is damaged it ends after the ``count`` messages before."""
         try:
-            for connection, stamp, data in self._reader.messages(wanted):
-                yield RawMessage(connection.topic, int(stamp), bytes(data))
-        except (ReaderError, AssertionError, struct.error) as error:
-            raise ValueError(f"{self.path} cannot be read to its end: {error}") from error
+            return next(messages, None)
+        except Exception as error:  # whatever decompression, a database or the parser makes of damaged bytes
+            if count == 0:
+                raise ValueError(f"{self.path} cannot be read: {error}") from error
+            self.warning = f"{self.path} is damaged after {count} messages, what follows is lost: {error}"
+            return None
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
         """Messages of some topics (all by default), decoded, in the order of their time."""
@@ -219,10 +232,10 @@ class BagReader:
         except Exception as error:
             raise ValueError(f"{self.path}: a {type_name} cannot be decoded: {error}") from error
 
-    def _open_salvaged(self, source: Path, error: ValueError) -> Reader:
+    def _open_salvaged(self, source: Path, error: ValueError) -> Reader | Ros1Reader:
         self._salvaged = tempfile.TemporaryDirectory(prefix="slam-bag-")
         target = Path(self._salvaged.name) / source.name
-        kept = _salvage_mcap(source, target)
+        kept = salvage_mcap(source, target)
         try:
             reader = _opened(target)
         except ValueError:
@@ -238,7 +251,7 @@ def _storage_of(path: Path) -> Path:
         raise ValueError(f"no bag at {path}")
     if path.is_file() or (path / "metadata.yaml").exists():
         files = [p for p in path.glob("*.mcap")] if path.is_dir() else []
-        damaged = [p for p in files if not _is_whole_mcap(p)]
+        damaged = [p for p in files if not is_whole_mcap(p)]
         return damaged[0] if len(files) == 1 and damaged else path
     files = sorted(p for p in path.iterdir() if p.suffix in _STORAGE_SUFFIXES)
     if len(files) != 1:
@@ -246,52 +259,22 @@ def _storage_of(path: Path) -> Path:
     return files[0]
 
 
-def _opened(path: Path) -> Reader:
+def _opened(path: Path) -> Reader | Ros1Reader:
     try:
-        reader = Reader(path)
+        reader = Ros1Reader(path) if path.suffix == ".bag" else Reader(path)
         reader.open()
     except (ReaderError, FileNotFoundError, AssertionError, struct.error, OSError, TypeError, ValueError) as error:
         raise ValueError(f"{path} cannot be read as a bag: {error}") from error
     return reader
 
 
-def _topic_info(connection: Connection) -> TopicInfo:
-    extension = connection.ext
-    profiles = extension.offered_qos_profiles if isinstance(extension, ConnectionExtRosbag2) else []
+def _topic(connection: Connection) -> str:
+    return connection.topic
+
+
+def _topic_info(connections: list[Connection]) -> TopicInfo:
+    extensions = [c.ext for c in connections]
+    profiles = [q for e in extensions if isinstance(e, ConnectionExtRosbag2) for q in e.offered_qos_profiles]
     latched = any(q.durability == QosDurability.TRANSIENT_LOCAL for q in profiles)
     best_effort = bool(profiles) and all(q.reliability == QosReliability.BEST_EFFORT for q in profiles)
-    return TopicInfo(connection.msgtype, connection.msgcount, latched, best_effort)
-
-
-def _is_whole_mcap(path: Path) -> bool:
-    with path.open("rb") as file:
-        file.seek(0, os.SEEK_END)
-        if file.tell() < 2 * len(_MAGIC):
-            return False
-        file.seek(-len(_MAGIC), os.SEEK_END)
-        return file.read() == _MAGIC
-
-
-def _salvage_mcap(source: Path, target: Path) -> int:
-    """Copy the whole records of a truncated mcap file and close it with an empty footer; returns the bytes kept.
-
-    Records are an opcode (1 byte), a length (8 bytes) and the content (MCAP specification, section Records).
-    """
-    with source.open("rb") as old, target.open("wb") as new:
-        end = _end_of_whole_records(old, source.stat().st_size)
-        old.seek(0)
-        for start in range(0, end, _BLOCK):
-            new.write(old.read(min(_BLOCK, end - start)))
-        new.write(_FOOTER.pack(0x02, 20, 0, 0, 0) + _MAGIC)
-    return end
-
-
-def _end_of_whole_records(file: BinaryIO, size: int) -> int:
-    position = len(_MAGIC)
-    while position + 9 <= size:
-        file.seek(position)
-        opcode, length = struct.unpack("<BQ", file.read(9))
-        if opcode == 0x02 or position + 9 + length > size:
-            break
-        position += 9 + length
-    return min(position, size)
+    return TopicInfo(connections[0].msgtype, sum(c.msgcount for c in connections), latched, best_effort)

@@ -22,7 +22,10 @@ def dense_model(bag: SensorBag, config: SystemConfig, trajectories: Mapping[str,
         for agent, trajectory in trajectories.items()
         if len(trajectory)
     }
+    last_ns = max((int(t.stamps_ns[-1]) for t in trajectories.values() if len(t)), default=0)
     for reading in bag.readings():
+        if isinstance(reading, StereoReading | DepthReading) and reading.stamp_ns > last_ns:
+            break
         if reading.agent in builders:
             builders[reading.agent].add(reading)
     clouds = [builder.model.fuse() for builder in builders.values()]

@@ -26,6 +26,7 @@ from slam_bringup.eyes import AgentEyes, FilterInput, Glimpse
 from slam_bringup.mapper import Mapper
 from slam_bringup.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
 from slam_bringup.sensor_bag import SensorBag
+from slam_bringup.sensor_topics import BagNames
 from slam_bringup.stage_times import StageTimes
 from slam_core.trajectory import Trajectory
 
@@ -40,7 +41,9 @@ def run_bag(
     *,
     mapper: str = "sjsam",
     odometry: str = "none",
+    names: BagNames | None = None,
     on_reading: Callable[[], None] = lambda: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> tuple[RunResult, Mapper]:
     """Map a bag, offline and as fast as it goes.
 
@@ -52,8 +55,12 @@ def run_bag(
         Already adapted to mode, mapper and odometry by :func:`slam_bringup.configuration.choose`.
     mapper, odometry
         Named in the result; ``odometry`` other than "none" runs scan odometry as well.
+    names
+        Topics and frames of the bag that are not named like the nodes' own.
     on_reading
         Called after every reading of the bag, for a progress bar.
+    stopped
+        Asked after every reading: whether to end here, with what is mapped so far.
 
     Raises
     ------
@@ -62,42 +69,43 @@ def run_bag(
     """
     times = StageTimes()
     start = time.perf_counter()
-    with SensorBag(path) as bag:
+    with SensorBag(path, names) as bag:
         eyes = {agent: AgentEyes(config, bag.sensors[agent], odometry != "none", times) for agent in bag.agents}
         mapping = Mapper(config, {agent: e.T_rig_optical for agent, e in eyes.items()}, times)
         try:
-            for item in _ahead(_filter_inputs(bag, eyes, on_reading)):
+            for item in _ahead(_filter_inputs(bag, eyes, on_reading, stopped)):
                 mapping.process(item)
             mapping.finish()
         finally:
             mapping.stop()
         wall_s = time.perf_counter() - start
+        dropped = dict(bag.left_out)
         agents = _agent_results(bag, mapping)
         with times.measure("dense model"):
             dense = dense_model(bag, config, {a.name: a.trajectory for a in agents})
-        dropped = {"images without a partner of their stamp": bag.unpaired} if bag.unpaired else {}
-        if bag.reader.warning:
-            mapping.records[bag.agents[0]].events.append(bag.reader.warning)
+        mapping.records[bag.agents[0]].events[:0] = [w for w in (*bag.warnings, bag.reader.warning) if w]
     choice = (config.feature_extractor.mode, mapper, odometry)
     return _run_result(path, choice, mapping, agents, dense, dropped, times, wall_s), mapping
 
 
 def _filter_inputs(
-    bag: SensorBag, eyes: dict[str, AgentEyes], on_reading: Callable[[], None]
+    bag: SensorBag, eyes: dict[str, AgentEyes], on_reading: Callable[[], None], stopped: Callable[[], bool]
 ) -> Generator[FilterInput, None, None]:
     """Reading, finding features and measuring their depth, each on a thread of its own."""
-    with closing(_ahead(_glimpses(bag, eyes, on_reading))) as glimpses:
+    with closing(_ahead(_glimpses(bag, eyes, on_reading, stopped))) as glimpses:
         for item in glimpses:
             yield eyes[item.agent].complete(item)
 
 
 def _glimpses(
-    bag: SensorBag, eyes: dict[str, AgentEyes], on_reading: Callable[[], None]
+    bag: SensorBag, eyes: dict[str, AgentEyes], on_reading: Callable[[], None], stopped: Callable[[], bool]
 ) -> Generator[FilterInput | Glimpse, None, None]:
     with closing(_ahead(bag.readings())) as readings:
         for reading in readings:
             yield from eyes[reading.agent].process(reading)
             on_reading()
+            if stopped():
+                break
     for agent_eyes in eyes.values():
         yield from agent_eyes.finish()
 

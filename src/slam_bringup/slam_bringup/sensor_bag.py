@@ -4,19 +4,21 @@
         for reading in bag.readings():
             ...  # StereoReading, DepthReading or ImuReading, in the order of the bag
 
-Topics are those of the nodes, below each agent's namespace:
+Topics are those of the nodes, or given by role, see :mod:`slam_bringup.sensor_topics`:
 
 - ``stereo/{left,right}/image_raw`` (or ``image_rect``; also ``.../compressed``) with ``camera_info``;
 - ``tof/range/image_raw`` (along the ray) or ``tof/depth/image_raw`` (along z, any depth camera) with
   ``tof/camera_info`` and, where there are any, ``tof/{amplitude,intensity}/image_raw``;
 - ``imu`` and ``ground_truth/pose``.
 
-Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts.
+Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts. A
+message that is broken, has no partner, or is older than what came before it is left out and counted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections import Counter
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -25,6 +27,7 @@ from typing import Self
 import numpy as np
 
 from slam_bringup.bag import BagReader
+from slam_bringup.sensor_topics import BagNames, find_agents, is_rectified, join, topics_of
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
@@ -38,24 +41,21 @@ from slam_core.messages import (
     transform_from_message,
 )
 from slam_core.messages.base import Message
-from slam_core.synchronizer import ExactSynchronizer
+from slam_core.synchronizer import PAIRING_TOLERANCE_S, ExactSynchronizer
 from slam_core.trajectory import Trajectory
 from slam_core.types import AnyArray, ByteArray, ImuSample
 
-_LEFT = ("stereo/left/image_raw", "stereo/left/image_rect", "stereo/left/image_raw/compressed")
-_MEASUREMENTS = {"tof/range/image_raw": "range", "tof/depth/image_raw": "depth"}
-_MARKERS = (*_LEFT, *_MEASUREMENTS)
+_READ = ("left", "right", "depth", "amplitude", "intensity", "imu")
 
 
 @dataclass(frozen=True, eq=False)
 class StereoReading:
-    """A pair of grey images uint8 (height, width); ``rectified`` says whether they came rectified."""
+    """A pair of grey images uint8 (height, width)."""
 
     agent: str
     stamp_ns: int
     left: ByteArray
     right: ByteArray
-    rectified: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class AgentSensors:
     tof_frame: str = ""
     base_frame: str = "base_link"
     topics: dict[str, str] = field(default_factory=dict)
-    """Role ("left", "right", "depth", "amplitude", "intensity", "imu", "ground_truth") to the bag's topic."""
+    """Role ("left", "depth", "tof_info", "imu", ...) to the bag's topic; "depth" holds what ``measurement`` says."""
 
     def transform(self, target: str, source: str) -> FloatArray:
         """T_target_source between "base", "left" and "tof"; ValueError if the bag does not know it."""
@@ -108,16 +108,26 @@ class AgentSensors:
 class SensorBag:
     """A bag as a stream of readings; use it in a ``with`` block.
 
+    Parameters
+    ----------
+    path
+        The bag.
+    names
+        Topics and frame of the rig where they are not named like the nodes' own.
+
     Raises
     ------
     ValueError
         If the bag cannot be read or holds no camera.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, names: BagNames | None = None) -> None:
         self.reader = BagReader(path)
-        self.unpaired = 0
-        """Images without a partner of their stamp, of the last :meth:`readings`."""
+        self.left_out: Counter[str] = Counter()
+        """Messages that the last :meth:`readings` left out, by reason."""
+        self.warnings: list[str] = []
+        """What a user should know of this bag."""
+        self._names = names or BagNames()
 
     def __enter__(self) -> Self:
         self.reader.__enter__()
@@ -142,13 +152,26 @@ class SensorBag:
 
     def _in_order_of_arrival(self) -> Iterator[Reading]:
         """A pair comes when its last image does."""
-        pairing = {agent: _AgentPairing(sensors) for agent, sensors in self.sensors.items()}
+        self.left_out.clear()
+        pairing = {agent: _AgentPairing(sensors, self.left_out) for agent, sensors in self.sensors.items()}
         route = {t: (agent, role) for agent, s in self.sensors.items() for role, t in s.topics.items()}
-        wanted = [topic for topic, (_, role) in route.items() if role != "ground_truth"]
-        for topic, _, message in self.reader.messages(wanted):
+        wanted = [topic for topic, (_, role) in route.items() if role in _READ]
+        types = {name: info.type_name for name, info in self.reader.topics.items()}
+        for topic, _, data in self.reader.raw(wanted):
             agent, role = route[topic]
-            yield from pairing[agent].add(role, message)
-        self.unpaired = sum(p.unpaired for p in pairing.values())
+            try:
+                yield from pairing[agent].add(role, self.reader.decode(types[topic], data))
+            except ValueError as error:
+                self._count_unusable(topic, error)
+        for p in pairing.values():
+            p.finish()
+
+    def _count_unusable(self, topic: str, error: ValueError) -> None:
+        reason = f"unusable messages on {topic}"
+        self.left_out[reason] += 1
+        text = f"{topic}: {error}"
+        if self.left_out[reason] == 1 and text not in self.warnings:
+            self.warnings.append(text)
 
     def count(self, agent: str, role: str) -> int:
         """Messages of a role ("left", "depth", "imu", ...) of an agent; 0 if there is no such topic."""
@@ -165,47 +188,58 @@ class SensorBag:
         return Trajectory(np.array(stamps, dtype=np.int64), np.stack([poses[s] for s in stamps])) if stamps else None
 
     def _find_agents(self) -> tuple[str, ...]:
-        found = {t[1 : -len(m)].rstrip("/") for t in self.reader.topics for m in _MARKERS if t.endswith(f"/{m}")}
+        found = find_agents(self.reader.topics, self._names.topics)
         if not found:
-            topics = ", ".join(self.reader.topics) or "none"
-            raise ValueError(f"{self.reader.path} has no stereo or depth images; its topics: {topics}")
-        return tuple(sorted(found))
+            topics = ", ".join(f"{name} ({info.type_name})" for name, info in self.reader.topics.items()) or "none"
+            raise ValueError(
+                f"{self.reader.path} has no stereo or depth images under the names of the nodes; say which topics they "
+                f"are: --topic left=/... --topic right=/... or --topic depth=/... Its topics: {topics}"
+            )
+        return found
 
     def _find_sensors(self) -> dict[str, AgentSensors]:
         tree = self._read_frames()
         return {agent: self._sensors_of(agent, tree) for agent in self.agents}
 
     def _sensors_of(self, agent: str, tree: FrameTree) -> AgentSensors:
-        topics = self._topics_of(agent)
-        left, left_frame = self._camera_info(agent, "stereo/left/camera_info", "left" in topics)
-        right, _ = self._camera_info(agent, "stereo/right/camera_info", "right" in topics)
-        tof, tof_frame = self._camera_info(agent, "tof/camera_info", "depth" in topics)
-        own_base = f"{agent}/base_link"
-        base = own_base if own_base in tree else "base_link"
-        measurement = "range" if topics.get("depth", "").endswith("tof/range/image_raw") else "depth"
+        topics = topics_of(agent, self.reader.topics, self._names.topics)
+        measurement = "range" if "range" in topics else "depth"
+        if "range" in topics:
+            topics["depth"] = topics.pop("range")
+        left, left_frame = self._camera_info(topics, "left", "left_info")
+        right, _ = self._camera_info(topics, "right", "right_info")
+        tof, tof_frame = self._camera_info(topics, "depth", "tof_info")
+        base = self._base_frame(agent, tree, left_frame or tof_frame)
         return AgentSensors(agent, left, right, tof, measurement, tree, left_frame, tof_frame, base, topics)
 
-    def _topics_of(self, agent: str) -> dict[str, str]:
-        candidates = {
-            "left": _LEFT, "right": tuple(t.replace("left", "right") for t in _LEFT), "depth": tuple(_MEASUREMENTS),
-            "amplitude": ("tof/amplitude/image_raw",), "intensity": ("tof/intensity/image_raw",), "imu": ("imu",),
-            "ground_truth": ("ground_truth/pose",),
-        }  # fmt: skip
-        known = self.reader.topics
-        found = {}
-        for role, names in candidates.items():
-            present = [_join(agent, name) for name in names if known.get(_join(agent, name))]
-            if present:
-                found[role] = present[0]
-        return found
+    def _base_frame(self, agent: str, tree: FrameTree, camera_frame: str) -> str:
+        """Of a bag without base_link the root above the camera, which is as much of the rig as the bag knows."""
+        usual = [frame for frame in (join(agent, "base_link")[1:], "base_link") if frame in tree]
+        if self._names.base_frame or usual:
+            return self._names.base_frame or usual[0]
+        if camera_frame not in tree:
+            raise ValueError(
+                f"{self.reader.path} has no transform between base_link and '{camera_frame}' on /tf_static: record "
+                f"it, or map in the camera's own axes (x right, y down, z forward): --base-frame {camera_frame}"
+            )
+        root = tree.root(camera_frame)
+        self.warnings.append(f"no base_link on /tf_static: poses are those of {root}, another frame: --base-frame")
+        return root
 
-    def _camera_info(self, agent: str, name: str, needed: bool) -> tuple[CameraInfo | None, str]:
-        if not needed:
+    def _camera_info(self, topics: Mapping[str, str], role: str, info_role: str) -> tuple[CameraInfo | None, str]:
+        """Calibration of the images as they are in the bag, and their frame."""
+        if role not in topics:
             return None, ""
-        topic = _join(agent, name)
+        topic = topics[info_role]
         for _, _, message in self.reader.messages([topic]):
-            return camera_info_from_message(message), message.header.frame_id
-        raise ValueError(f"{self.reader.path} has images but no camera info on {topic}")
+            info = camera_info_from_message(message)
+            if role != "depth" and is_rectified(topics[role]):
+                info = CameraInfo(info.rectified, P=info.P)
+            return info, message.header.frame_id
+        raise ValueError(
+            f"{self.reader.path} has images but no camera info on {topic}: record it (slam calibrate makes one), or "
+            f"say where it is: --topic {info_role}=/..."
+        )
 
     def _read_frames(self) -> FrameTree:
         tree = FrameTree()
@@ -217,21 +251,20 @@ class SensorBag:
 
 
 class _AgentPairing:
-    """Pairs one agent's messages by exact stamp."""
+    """Pairs one agent's messages by stamp; what it drops is counted in ``left_out``."""
 
-    def __init__(self, sensors: AgentSensors) -> None:
+    def __init__(self, sensors: AgentSensors, left_out: Counter[str]) -> None:
         self._sensors = sensors
+        self._left_out = left_out
         self._ready: list[Reading] = []
+        self._newest_ns: dict[type[Reading], int] = {}
         has_stereo = {"left", "right"} <= sensors.topics.keys()
         depth_roles = [role for role in ("depth", "amplitude", "intensity") if role in sensors.topics]
-        self._stereo = ExactSynchronizer[Message](("left", "right") if has_stereo else (), self._on_stereo)
-        self._depth = ExactSynchronizer[Message](depth_roles, self._on_depth)
+        stereo_roles = ("left", "right") if has_stereo else ()
+        tolerance_ns = round(PAIRING_TOLERANCE_S * 1e9)
+        self._stereo = ExactSynchronizer[Message](stereo_roles, self._on_stereo, tolerance_ns=tolerance_ns)
+        self._depth = ExactSynchronizer[Message](depth_roles, self._on_depth, tolerance_ns=tolerance_ns)
         self._depth_roles = depth_roles
-
-    @property
-    def unpaired(self) -> int:
-        waiting = [*self._stereo.waiting.values(), *self._depth.waiting.values()]
-        return self._stereo.unpaired + self._depth.unpaired + sum(waiting)
 
     def add(self, role: str, message: Message) -> list[Reading]:
         """The readings that this message completes."""
@@ -244,23 +277,36 @@ class _AgentPairing:
             self._depth.add(role, stamp_ns(message), message)
         return self._ready
 
+    def finish(self) -> None:
+        """Count the images that never found their partner."""
+        waiting = [*self._stereo.waiting.values(), *self._depth.waiting.values()]
+        if unpaired := self._stereo.unpaired + self._depth.unpaired + sum(waiting):
+            self._left_out["images without a partner of their stamp"] += unpaired
+
     def _on_stereo(self, stamp: int, messages: tuple[Message, ...]) -> None:
         left, right = (grey_from_message(m) for m in messages)
-        rectified = self._sensors.topics["left"].endswith("image_rect")
-        self._ready.append(StereoReading(self._sensors.agent, stamp, left, right, rectified))
+        self._hand_on(stamp, StereoReading(self._sensors.agent, stamp, left, right))
 
     def _on_depth(self, stamp: int, messages: tuple[Message, ...]) -> None:
         images = dict(zip(self._depth_roles, (image_from_message(m) for m in messages), strict=True))
         reading = DepthReading(
             self._sensors.agent, stamp, images["depth"], images.get("amplitude"), images.get("intensity")
         )
-        self._ready.append(reading)
+        self._hand_on(stamp, reading)
 
     def _on_imu(self, message: Message) -> None:
         sample = imu_from_message(message)
         R = self._sensors.frames.lookup(self._sensors.base_frame, message.header.frame_id)[:3, :3]
         rotated = ImuSample(sample.stamp_ns, R @ sample.angular_velocity, R @ sample.linear_acceleration)
-        self._ready.append(ImuReading(self._sensors.agent, rotated))
+        self._hand_on(sample.stamp_ns, ImuReading(self._sensors.agent, rotated))
+
+    def _hand_on(self, stamp: int, reading: Reading) -> None:
+        """Only what is newer than all before: a message may have come twice, or time jumped back."""
+        if stamp <= self._newest_ns.get(type(reading), -1):
+            self._left_out["not newer than what came before"] += 1
+            return
+        self._newest_ns[type(reading)] = stamp
+        self._ready.append(reading)
 
 
 def _stamp(reading: Reading) -> int:
@@ -269,7 +315,3 @@ def _stamp(reading: Reading) -> int:
 
 def _rank(reading: Reading) -> int:
     return (ImuReading, DepthReading, StereoReading).index(type(reading))
-
-
-def _join(agent: str, name: str) -> str:
-    return f"/{agent}/{name}" if agent else f"/{name}"

@@ -7,14 +7,17 @@ from typing import Any
 
 from rich.table import Table
 
+_SHOWN_EVENTS = 8
+
 
 def summary_table(summary: dict[str, Any], out: Path) -> Table:
     """The figures of ``summary.json`` that a person wants to see first, and where the rest is."""
     table = Table(title=f"{summary['bag']} ({summary['mode']}, {summary['mapper']})", show_header=False)
     table.add_column(style="bold")
     table.add_column()
-    dropped = f", {summary['dropped']} dropped" if summary["dropped"] else ", none dropped"
-    table.add_row("frames", f"{summary['frames']}{dropped}")
+    table.add_row("frames", f"{summary['frames']}{'' if summary['dropped'] else ', none dropped'}")
+    for reason, count in summary["dropped_by_reason"].items():
+        table.add_row("dropped", f"{count} x {reason}")
     table.add_row("path", f"{summary['path_length_m']:.2f} m")
     table.add_row("map", f"{summary['landmarks']} landmarks, {summary['submaps']} submaps")
     table.add_row("loop closures", str(summary["loop_closures"]))
@@ -29,7 +32,8 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
     stages = [f"{name} {s['median']:.1f}" for name, s in summary["stage_ms"].items() if s]
     table.add_row("ms per call", ", ".join(stages))
     if summary["events"]:
-        table.add_row("events", "\n".join(summary["events"][:8]))
+        more = len(summary["events"]) - _SHOWN_EVENTS
+        table.add_row("events", "\n".join(summary["events"][:_SHOWN_EVENTS] + [f"and {more} more"] * (more > 0)))
     table.add_row("results", str(out))
     return table
 

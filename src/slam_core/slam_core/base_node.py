@@ -46,7 +46,7 @@ from slam_core.health import Health, State
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC, header_message, stamp_ns, transform_from_message
 from slam_core.messages.base import Message
 from slam_core.ros import RosTypes, declare_config, has_tf2_msgs, incompatibility, sensor_qos
-from slam_core.synchronizer import ExactSynchronizer
+from slam_core.synchronizer import PAIRING_TOLERANCE_S, ExactSynchronizer
 
 C = TypeVar("C", bound=Config)
 
@@ -69,7 +69,7 @@ class InputConfig(Config):
     )
     depth: int = parameter(200, "messages kept per topic while the node is busy", minimum=1)
     pairing_tolerance_s: float = parameter(
-        0.0, "largest difference of stamps that belong together", unit="s", minimum=0.0
+        PAIRING_TOLERANCE_S, "largest difference of stamps that belong together", unit="s", minimum=0.0
     )
 
 

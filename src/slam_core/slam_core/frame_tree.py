@@ -12,11 +12,13 @@ class FrameTree:
 
     def __init__(self) -> None:
         self._neighbours: dict[str, dict[str, FloatArray]] = {}
+        self._parents: dict[str, str] = {}
 
     def add(self, parent: str, child: str, T_parent_child: FloatArray) -> None:
         """Set or replace one transform (4, 4)."""
         if not is_rigid_transform(T_parent_child):
             raise ValueError(f"transform {parent} <- {child} is not rigid: {T_parent_child.tolist()}")
+        self._parents[child] = parent
         self._neighbours.setdefault(parent, {})[child] = T_parent_child
         self._neighbours.setdefault(child, {})[parent] = invert_transform(T_parent_child)
 
@@ -27,6 +29,15 @@ class FrameTree:
     def frames(self) -> tuple[str, ...]:
         """Names of all frames, sorted."""
         return tuple(sorted(self._neighbours))
+
+    def root(self, frame: str) -> str:
+        """The frame without a parent above ``frame``, perhaps itself; ValueError if the frames form a cycle."""
+        passed = [frame]
+        while passed[-1] in self._parents:
+            passed.append(self._parents[passed[-1]])
+            if passed[-1] in passed[:-1]:
+                raise ValueError(f"the frames {' -> '.join(passed)} form a cycle")
+        return passed[-1]
 
     def lookup(self, target: str, source: str) -> FloatArray:
         """T_target_source (4, 4).

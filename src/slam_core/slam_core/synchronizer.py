@@ -11,6 +11,11 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
+PAIRING_TOLERANCE_S = 0.004
+"""Stamps that differ by less are taken for one instant, s: cameras with one trigger and a stamp each. Far less than the
+time between two frames, so that equal stamps pair as if nothing else were allowed.
+"""
+
 
 class ExactSynchronizer(Generic[T]):
     """Collects one item per topic and hands complete sets on, in the order of their stamps.

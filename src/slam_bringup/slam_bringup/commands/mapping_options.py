@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import reduce
 from pathlib import Path
@@ -12,8 +13,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from slam_bringup.configuration import MAPPERS, MODES, ODOMETRIES
+from slam_bringup.results import RunResult
 from slam_bringup.sensor_bag import SensorBag
+from slam_bringup.sensor_topics import ROLES
 
+# fmt: off
 _OPTIONS = (
     click.argument("bag", type=click.Path(exists=True, path_type=Path)),
     click.option(
@@ -25,9 +29,19 @@ _OPTIONS = (
     ),
     click.option("--odometry", type=click.Choice(ODOMETRIES), default="none", show_default=True, help="of ToF scans"),
     click.option(
-        "--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="YAML, one group per node"
+        "--config", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        help="YAML, one group per node, as in docs/parameters.md",
+    ),
+    click.option(
+        "--topic", "topics", multiple=True, metavar="ROLE=TOPIC",
+        help=f"a topic that is not named like the nodes' (may be repeated); roles: {', '.join(ROLES)}",
+    ),
+    click.option(
+        "--base-frame", default="", metavar="FRAME",
+        help="the frame whose poses are wanted [base_link; else the root above the camera]",
     ),
 )
+# fmt: on
 
 
 def mapping_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -38,6 +52,20 @@ def mapping_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def mode_for(bag: SensorBag, mode: str | None) -> str:
     """The mode asked for, or the one that the bag's sensors suggest."""
     return mode or ("stereo" if bag.count(bag.agents[0], "left") else "tof")
+
+
+def require_writable(path: Path) -> None:
+    """Refuse a folder that could not be made or written when the run has ended; nothing is made here."""
+    existing = next(p for p in (path.resolve(), *path.resolve().parents) if p.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        raise ValueError(f"cannot write to {path}: {existing} is not a folder that you may write to")
+
+
+def require_frames(result: RunResult) -> None:
+    """Refuse a run in which not one frame was used; the message says what became of the images."""
+    if result.frames == 0:
+        losses = [f"{count} x {reason}" for reason, count in result.dropped.items()]
+        raise ValueError(f"not one frame of {result.bag} could be mapped: {'; '.join((*losses, *result.events))}")
 
 
 def progress_bar() -> Progress:

@@ -2,33 +2,57 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import click
 from rich.console import Console
 
-from slam_bringup.commands.mapping_options import mapping_options, mode_for, progress_bar
+from slam_bringup.commands.mapping_options import (
+    mapping_options,
+    mode_for,
+    progress_bar,
+    require_frames,
+    require_writable,
+)
 from slam_bringup.configuration import choose, load_system_config
+from slam_bringup.interrupt import INTERRUPTED, Interrupt
 from slam_bringup.output import write_results
 from slam_bringup.pipeline import run_bag
 from slam_bringup.result_bag import write_result_bag
 from slam_bringup.sensor_bag import SensorBag
+from slam_bringup.sensor_topics import BagNames, parse_topics
 from slam_bringup.summary_table import summary_table
 
 
 @click.command()
 @mapping_options
-def command(bag: Path, output: Path, mode: str | None, mapper: str, odometry: str, config: Path | None) -> None:
-    """Map BAG without ROS: same classes as the nodes, no drops, the same bytes every time."""
-    with SensorBag(bag) as opened:
+def command(
+    bag: Path, output: Path, mode: str | None, mapper: str, odometry: str, config: Path | None,
+    topics: tuple[str, ...], base_frame: str,
+) -> None:  # fmt: skip
+    """Map BAG without ROS: same classes as the nodes, no drops, the same bytes every time.
+
+    BAG is a folder or file of ROS 2 (mcap, db3) or a .bag of ROS 1. Ctrl-C ends it early and writes what is mapped.
+    """
+    names = BagNames(parse_topics(topics), base_frame)
+    with SensorBag(bag, names) as opened:
         readings = sum(opened.count(agent, role) for agent in opened.agents for role in ("left", "depth", "imu"))
         mode = mode_for(opened, mode)
     system = choose(load_system_config(config), mode, mapper, odometry)
-    with progress_bar() as progress:
+    require_writable(output)
+    with Interrupt() as interrupt, progress_bar() as progress:
         task = progress.add_task(f"mapping {bag.name}", total=readings)
         result, mapping = run_bag(
-            bag, system, mapper=mapper, odometry=odometry, on_reading=lambda: progress.advance(task)
-        )
+            bag, system, mapper=mapper, odometry=odometry, names=names,
+            on_reading=lambda: progress.advance(task), stopped=lambda: interrupt.asked,
+        )  # fmt: skip
+    require_frames(result)
+    if interrupt.asked:
+        result = replace(result, events=("stopped before the end of the bag", *result.events))
     write_result_bag(output / "result.mcap", result)
     summary = write_results(output, result, mapping.global_map.save)
     Console().print(summary_table(summary, output))
+    if interrupt.asked:
+        sys.exit(INTERRUPTED)
