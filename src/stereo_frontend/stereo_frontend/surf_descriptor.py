@@ -22,6 +22,7 @@ _NODES = TURNED_CORNERS - 2
 _TERMS = 8
 """Numbers per subregion."""
 _ROW = _TERMS * SAMPLES
+_FIRST_SAMPLE = np.float32(-0.5 * (SAMPLES - 1))
 DIMENSION = 16 * _TERMS
 WEIGHT_SIGMA = 5.0
 """Width of the Gaussian over the samples, in scale units. The paper has 3.3; on EuRoC and KITTI pairs 5 raised the
@@ -47,6 +48,10 @@ def _disc() -> tuple[np.ndarray, np.ndarray]:
 
 
 _DISC, _DISC_WEIGHTS = _disc()
+
+_PER_QUADRANT = DIRECTIONS // 4
+_BORDERS = np.tan(np.arange(1, _PER_QUADRANT) * (0.5 * np.pi / _PER_QUADRANT)).astype(np.float32)
+"""Tangents of the directions that divide a quadrant."""
 
 
 def region_weights() -> Float32Array:
@@ -84,12 +89,13 @@ def describe_oriented(integral, keypoints, weights, out):  # type: ignore[no-unt
     """
     lattice, line, row = lattice_room(TURNED_CORNERS), lattice_room(TURNED_CORNERS), np.empty(integral.shape[1])
     dx, dy = np.empty(_NODES * STRIDE, np.float32), np.empty(_NODES * STRIDE, np.float32)
+    nodes, samples = np.empty(2 * _NODES * STRIDE, np.float32), np.empty(2 * SAMPLES, np.float32)
     split = np.empty((SAMPLES, _ROW), np.float32)
     for k in range(keypoints.shape[0]):
         inside = read_lattice(integral, keypoints[k], TURNED_CORNERS, lattice, row)
         angle = _dominant_direction(lattice, inside, line)
         haar_wavelets(lattice, TURNED_CORNERS, inside, 1, 0, line, dx, dy)
-        _turned_samples(dx, dy, np.float32(np.cos(angle)), np.float32(np.sin(angle)), split)
+        _turned_samples(dx, dy, np.float32(np.cos(angle)), np.float32(np.sin(angle)), nodes, samples, split)
         _sum_regions(split, weights, out[k])
 
 
@@ -106,12 +112,11 @@ def _dominant_direction(lattice, inside, line):  # type: ignore[no-untyped-def]
     """Direction of the largest sum of wavelets of size 4s, their own directions within 60 degrees."""
     dx, dy = np.empty(_SIDE * STRIDE, np.float32), np.empty(_SIDE * STRIDE, np.float32)
     haar_wavelets(lattice, TURNED_CORNERS, inside, 2, _FIRST, line, dx, dy)
+    index = _directions(dx[_DISC], dy[_DISC])
     bins = np.zeros((DIRECTIONS + _WINDOW, 2))
     for k in range(len(_DISC)):
-        x, y = np.float64(dx[_DISC[k]]), np.float64(dy[_DISC[k]])
-        index = int((np.arctan2(y, x) + np.pi) * (DIRECTIONS / (2.0 * np.pi))) % DIRECTIONS
-        bins[index, 0] += _DISC_WEIGHTS[k] * x
-        bins[index, 1] += _DISC_WEIGHTS[k] * y
+        bins[index[k], 0] += _DISC_WEIGHTS[k] * np.float64(dx[_DISC[k]])
+        bins[index[k], 1] += _DISC_WEIGHTS[k] * np.float64(dy[_DISC[k]])
     bins[DIRECTIONS:] = bins[:_WINDOW]
     best, best_x, best_y = -1.0, 1.0, 0.0
     for start in range(DIRECTIONS):
@@ -125,27 +130,56 @@ def _dominant_direction(lattice, inside, line):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _turned_samples(dx, dy, cosine, sine, split):  # type: ignore[no-untyped-def]
-    """Wavelets at the samples of a turned square, bilinear between nodes, along the square's axes and split by sign."""
-    middle, first = np.float32(0.5 * (_NODES - 1)), np.float32(-0.5 * (SAMPLES - 1))
+def _directions(x, y):  # type: ignore[no-untyped-def]
+    """Which of the ``DIRECTIONS`` sectors, counted from the negative x axis, each vector (n,) points into.
+
+    By comparing with the tangents of their borders: a fifth of the time of as many arcs.
+    """
+    index = np.empty(len(x), np.int32)
+    rising, running = np.empty_like(x), np.empty_like(x)
+    for k in range(len(x)):
+        left = x[k] < 0.0 or (x[k] == 0.0 and y[k] > 0.0)
+        down = y[k] < 0.0 or (y[k] == 0.0 and x[k] < 0.0)
+        flat, steep = abs(x[k]), abs(y[k])
+        rising[k], running[k] = (steep, flat) if left == down else (flat, steep)
+        index[k] = _PER_QUADRANT * ((0 if left else 1) if down else (3 if left else 2))
+    for border in _BORDERS:
+        for k in range(len(x)):
+            index[k] += np.int32(rising[k] >= border * running[k])
+    return index
+
+
+@njit(cache=True, nogil=True)
+def _turned_samples(dx, dy, cosine, sine, nodes, samples, split):  # type: ignore[no-untyped-def]
+    """Wavelets at the samples of a turned square, bilinear between nodes, along the square's axes and split by sign.
+
+    ``nodes`` and ``samples`` are room for (dx, dy) pairs of all nodes and of one row of samples.
+    """
+    for k in range(len(dx)):
+        nodes[2 * k], nodes[2 * k + 1] = dx[k], dy[k]
+    middle = np.float32(0.5 * (_NODES - 1))
     for j in range(SAMPLES):
-        across = first + np.float32(j)
-        start_x, start_y = middle - sine * across, middle + cosine * across
+        across = _FIRST_SAMPLE + np.float32(j)
+        _between_nodes(nodes, middle - sine * across, middle + cosine * across, cosine, sine, samples)
         for i in range(SAMPLES):
-            along = first + np.float32(i)
-            x, y = start_x + cosine * along, start_y + sine * along
-            x0, y0 = int(x), int(y)
-            fx, fy = x - np.float32(x0), y - np.float32(y0)
-            a = _between_nodes(dx, y0 * STRIDE + x0, fx, fy)
-            b = _between_nodes(dy, y0 * STRIDE + x0, fx, fy)
+            a, b = samples[2 * i], samples[2 * i + 1]
             _split(cosine * a + sine * b, cosine * b - sine * a, split[j], _TERMS * i)
 
 
 @njit(cache=True, nogil=True)
-def _between_nodes(values, at, fx, fy):  # type: ignore[no-untyped-def]
-    upper = values[at] + fx * (values[at + 1] - values[at])
-    lower = values[at + STRIDE] + fx * (values[at + STRIDE + 1] - values[at + STRIDE])
-    return upper + fy * (lower - upper)
+def _between_nodes(nodes, start_x, start_y, step_x, step_y, out):  # type: ignore[no-untyped-def]
+    """Pairs (dx, dy) along a line of samples through the middle (start_x, start_y), one step apart."""
+    for i in range(SAMPLES):
+        along = _FIRST_SAMPLE + np.float32(i)
+        x, y = start_x + step_x * along, start_y + step_y * along
+        x0, y0 = int(x), int(y)
+        fx, fy = x - np.float32(x0), y - np.float32(y0)
+        at = 2 * (y0 * STRIDE + x0)
+        above, below = nodes[at : at + 4], nodes[at + 2 * STRIDE : at + 2 * STRIDE + 4]
+        for c in range(2):
+            upper = above[c] + fx * (above[c + 2] - above[c])
+            lower = below[c] + fx * (below[c + 2] - below[c])
+            out[2 * i + c] = upper + fy * (lower - upper)
 
 
 @njit(cache=True, nogil=True)

@@ -35,15 +35,17 @@ def read_lattice(integral, keypoint, corners, lattice, row):  # type: ignore[no-
     first_y, last_y = max(0, int(np.ceil(-top / scale))), min(corners - 1, int(np.floor((height - top) / scale)))
     begin = min(max(int(left + first_x * scale), 0), width - 1)
     end = min(max(int(left + last_x * scale), 0), width - 1) + 2
+    # Which columns lie beside a corner is the same for every row.
+    places, shares = np.empty(corners, np.int64), np.empty(corners)
+    for i in range(first_x, last_x + 1):
+        x = left + i * scale
+        x0 = min(max(int(x), 0), width - 1)
+        places[i], shares[i] = x0 - begin, x - x0
     for j in range(first_y, last_y + 1):
         y = top + j * scale
         y0 = min(max(int(y), 0), height - 1)
         _blend(integral[y0][begin:end], integral[y0 + 1][begin:end], y - y0, row)
-        for i in range(first_x, last_x + 1):
-            x = left + i * scale
-            x0 = min(max(int(x), 0), width - 1)
-            value = row[x0 - begin]
-            lattice[j * STRIDE + i] = value + (x - x0) * (row[x0 - begin + 1] - value)
+        _between(row, places[first_x : last_x + 1], shares[first_x:], lattice[j * STRIDE + first_x :])
     return first_x, last_x, first_y, last_y
 
 
@@ -51,6 +53,13 @@ def read_lattice(integral, keypoint, corners, lattice, row):  # type: ignore[no-
 def _blend(above, below, share, out):  # type: ignore[no-untyped-def]
     for x in range(len(above)):
         out[x] = above[x] + share * (below[x] - above[x])
+
+
+@njit(cache=True, nogil=True)
+def _between(row, places, shares, out):  # type: ignore[no-untyped-def]
+    for i in range(len(places)):
+        value = row[places[i]]
+        out[i] = value + shares[i] * (row[places[i] + 1] - value)
 
 
 @njit(cache=True, nogil=True)
