@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam_core.evaluation import align, anees_bounds, associate, evaluate, pose_nees
+from slam_core.evaluation import TruthAccuracy, align, anees_bounds, associate, evaluate, pose_nees
 from slam_core.geometry import boxplus, invert_transform, make_transform, so3_exp
 from slam_core.trajectory import Trajectory, read_trajectory
 
@@ -75,6 +75,27 @@ def test_anees_is_independent_of_the_frame_of_ground_truth(rng):
     noisy = invert_transform(noisy[0]) @ noisy
     estimate = Trajectory(truth.stamps_ns, noisy, np.tile(1e-4 * np.eye(6), (len(truth), 1, 1)))
     np.testing.assert_allclose(pose_nees(estimate, truth.poses), pose_nees(estimate, world @ truth.poses), rtol=1e-6)
+
+
+def test_anees_knows_the_error_of_ground_truth(rng):
+    """Truth off by a known error at every pose, the first too, far from the start and in a turned map."""
+    straight = [make_transform(np.eye(3), np.array([2.0 * k, 0.0, 0.0])) for k in range(5)]
+    start = make_transform(so3_exp(np.array([0.4, -0.8, 1.9])), np.array([1.0, 2.0, 3.0]))
+    poses, stamps = start @ np.stack(straight), np.arange(5, dtype=np.int64)
+    covariance = np.tile(np.diag([1e-3, 2e-3, 3e-3, 1e-4, 2e-4, 3e-4]) ** 2, (5, 1, 1))
+    accuracy = TruthAccuracy(position=0.02, rotation=0.01)
+    values = []
+    for _ in range(400):
+        error = rng.normal(size=(5, 6)) * np.repeat([accuracy.position, accuracy.rotation], 3)
+        estimate = boxplus(poses, rng.normal(size=(5, 6)) * np.sqrt(covariance[0].diagonal()))
+        estimate[0] = poses[0]
+        values.append(pose_nees(Trajectory(stamps, estimate, covariance), boxplus(poses, error), accuracy))
+    by_distance = np.mean(values, axis=0) / 6.0
+    low, high = anees_bounds(6, 400, 0.999)
+    assert (by_distance > low).all()
+    assert (by_distance < high).all()
+    with pytest.raises(ValueError, match="not negative"):
+        TruthAccuracy(position=-0.1)
 
 
 def test_association_by_nearest_and_by_interpolation(rng):

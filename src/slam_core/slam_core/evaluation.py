@@ -11,11 +11,41 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from slam_core.geometry import FloatArray, boxminus, invert_transform, so3_log
+from slam_core.geometry import FloatArray, both_halves, boxminus, invert_transform, skew, so3_log
 from slam_core.rigid_alignment import umeyama
 from slam_core.trajectory import Trajectory
 
 ALIGNMENTS = ("se3", "origin", "none")
+
+
+@dataclass(frozen=True)
+class TruthAccuracy:
+    """Standard deviations of ground truth itself, per axis and pose: position (m) and orientation (rad).
+
+    Errors of different poses count as independent; of a drift inside the truth this knows nothing.
+    """
+
+    position: float = 0.0
+    rotation: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.position >= 0.0 and self.rotation >= 0.0 and np.isfinite([self.position, self.rotation]).all()):
+            raise ValueError(
+                f"accuracy of ground truth must be finite and not negative, got {self.position} m, {self.rotation} rad"
+            )
+
+    def of_poses_from_start(self, poses: FloatArray) -> FloatArray:
+        """Covariances (n, 6, 6) of poses (n, 4, 4) relative to the start, whose own true pose is no better.
+
+        The start's error in direction swings a pose that is far away: ``d_t = d_rotation x t``.
+        """
+        sigma = np.repeat([self.position, self.rotation], 3)
+        J = np.tile(np.eye(6), (len(poses), 1, 1))
+        J[:, :3, 3:] = -skew(poses[:, :3, 3])
+        return np.asarray((J * sigma**2) @ np.swapaxes(J, 1, 2) + np.diag(sigma**2))
+
+
+EXACT_TRUTH = TruthAccuracy()
 
 
 @dataclass(frozen=True)
@@ -118,17 +148,21 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("...i,...i->...", error, np.linalg.solve(covariance, error[..., None])[..., 0]))
 
 
-def pose_nees(estimate: Trajectory, truth: FloatArray) -> FloatArray:
+def pose_nees(estimate: Trajectory, truth: FloatArray, accuracy: TruthAccuracy = EXACT_TRUTH) -> FloatArray:
     """NEES (m,) of the poses whose covariance is positive definite, with the first poses made to agree.
 
-    The frame of a SLAM map is its first pose, known exactly, so the comparison aligns there and nowhere else.
+    The frame of a SLAM map is its first pose, known exactly, so the comparison aligns there and nowhere else. The error
+    of ground truth, in the first pose and in the others, adds to the covariance.
     """
     if estimate.covariances is None:
         raise ValueError("NEES needs covariances")
     in_map = estimate.poses[0] @ invert_transform(truth[0]) @ truth
     usable = np.linalg.eigvalsh(estimate.covariances)[:, 0] > 1e-14
     usable[0] = False
-    return nees(boxminus(in_map[usable], estimate.poses[usable]), estimate.covariances[usable])
+    from_start = invert_transform(estimate.poses[:1]) @ estimate.poses
+    turn = both_halves(estimate.poses[0, :3, :3])
+    covariances = estimate.covariances + turn @ accuracy.of_poses_from_start(from_start) @ turn.T
+    return nees(boxminus(in_map[usable], estimate.poses[usable]), covariances[usable])
 
 
 def anees_bounds(dimension: int, samples: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -165,6 +199,7 @@ def evaluate(
     delta: int = 1,
     max_difference_s: float = 0.01,
     interpolate: bool = False,
+    accuracy: TruthAccuracy = EXACT_TRUTH,
 ) -> Evaluation:
     """Compare a trajectory with ground truth.
 
@@ -177,7 +212,7 @@ def evaluate(
     step, turn = relative_errors(matched.poses, true_poses, min(delta, len(matched) - 1))
     length = Trajectory(matched.stamps_ns, true_poses).length_m
     end, end_angle = end_error(matched.poses, true_poses)
-    values = None if matched.covariances is None else pose_nees(matched, true_poses)
+    values = None if matched.covariances is None else pose_nees(matched, true_poses, accuracy)
     anees = low = high = None
     if values is not None and len(values):
         anees, (low, high) = float(np.mean(values) / 6.0), anees_bounds(6, len(values))

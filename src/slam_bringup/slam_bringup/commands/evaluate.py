@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam_core.evaluation import ALIGNMENTS, ErrorStatistics, Evaluation, evaluate
+from slam_core.evaluation import ALIGNMENTS, ErrorStatistics, Evaluation, TruthAccuracy, evaluate
 from slam_core.files import atomic_text
 from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajectory
 
@@ -32,10 +32,14 @@ from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajector
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="covariances of the estimate; found by itself beside a trajectory.tum",
 )
+@click.option(
+    "--truth-sigma", nargs=2, type=click.FloatRange(0.0), default=(0.0, 0.0), show_default=True, metavar="M DEG",
+    help="standard deviations of ground truth, position [m] and orientation [deg] per axis, for the NEES",
+)  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="write the figures as JSON")
 def command(
     estimate: Path, ground_truth: Path, alignment: str, delta: int, max_difference: float, interpolate: bool,
-    covariance: Path | None, output: Path | None,
+    covariance: Path | None, truth_sigma: tuple[float, float], output: Path | None,
 ) -> None:  # fmt: skip
     """ATE, RPE and NEES of the trajectory ESTIMATE against GROUND_TRUTH (TUM, KITTI or EuRoC files)."""
     result = evaluate(
@@ -47,6 +51,7 @@ def command(
         delta=delta,
         max_difference_s=max_difference,
         interpolate=interpolate,
+        accuracy=TruthAccuracy(truth_sigma[0], float(np.radians(truth_sigma[1]))),
     )
     Console().print(evaluation_table(result))
     if output is not None:
