@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from slam_bringup.cli import slam
-from slam_core.geometry import make_transform
 from slam_core.trajectory import Trajectory, write_covariance_csv, write_tum
 
 
 def test_sigma_of_the_truth_lowers_the_anees(tmp_path):
     """Estimates that claim 1 mm and 1 mrad and are 10 mm off: NEES 100 of 6, or 100 / 201 with a truth of 10 mm."""
     stamps = np.arange(4, dtype=np.int64) * 10**9
-    truth = make_transform(np.eye(3), np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]))
+    truth = np.tile(np.eye(4), (4, 1, 1))
+    truth[:, 0, 3] = np.arange(4.0)
     off = truth.copy()
     off[1:, 0, 3] += 0.01
     write_tum(tmp_path / "truth.txt", Trajectory(stamps, truth))
