@@ -1,0 +1,30 @@
+"""What else errs on recordings, beside the estimate: ground truth and calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ekf_slam_node.calibration import CalibrationConfig, in_doubt
+from slam_core.evaluation import TruthAccuracy
+from slam_core.trajectory import Trajectory
+from slam_core.types import PoseEstimate
+
+TRUTH = {
+    # OXTS RT3003 with RTK corrections: Geiger et al. 2013 (IJRR), section on the sensor setup.
+    "kitti": TruthAccuracy(position=0.02, rotation=float(np.radians(0.1))),
+    # Vicon: Burri et al. 2016 (IJRR), positions to about 1 mm. The orientation is what ``ground_truth.py`` measures:
+    # 3.1 mrad a step between two poses, in three axes.
+    "euroc": TruthAccuracy(position=0.001, rotation=float(np.radians(0.08))),
+}
+"""Of ground truth as its makers say. For 7-Scenes, whose poses are KinectFusion's, no accuracy is published."""
+
+CALIBRATION = CalibrationConfig(sigma_scale=0.005, sigma_mounting=float(np.radians(0.3)))
+"""By as much as calibrations of one camera differ; the frame of the ground truth is another's."""
+
+
+def doubted(trajectory: Trajectory) -> Trajectory:
+    """A trajectory with covariances that know of the calibration's error, the same in all poses of a run."""
+    if trajectory.covariances is None:
+        raise ValueError("a trajectory without covariances has none to widen")
+    poses = zip(trajectory.stamps_ns, trajectory.poses, trajectory.covariances, strict=True)
+    return Trajectory.from_estimates([in_doubt(PoseEstimate(int(s), T, C), CALIBRATION) for s, T, C in poses])
