@@ -17,6 +17,7 @@ def sensors(agent: str = "") -> AgentSensors:
     topics = {
         "left": f"{below}/stereo/left/image_raw/compressed", "right": f"{below}/stereo/right/image_raw/compressed",
         "depth": f"{below}/tof/depth/image_raw", "amplitude": f"{below}/tof/amplitude/image_raw",
+        "tof_info": f"{below}/tof/camera_info",
     }  # fmt: skip
     return AgentSensors(agent, None, None, None, "depth", FrameTree(), topics=topics)
 
@@ -50,7 +51,7 @@ def test_parameters_follow_from_the_choice_and_the_bag() -> None:
     assert set(graph.pace) == {
         "/one/ekf_slam=/one/stereo/left/image_raw/compressed", "/one/ndt_odometry=/one/tof/depth/image_raw"
     }  # fmt: skip
-    assert "/one/tof/camera_info" in graph.played_topics
+    assert "/one/tof/camera_info" in graph.played.values()
 
 
 def test_the_frames_of_an_agent_are_those_of_its_bag_or_lie_below_its_name() -> None:
@@ -65,7 +66,7 @@ def test_the_frames_of_an_agent_are_those_of_its_bag_or_lie_below_its_name() -> 
 
 def test_the_stereo_mode_leaves_the_depth_camera_alone() -> None:
     graph = plan_nodes(choose(load_system_config(None), "stereo", "sjsam", "none"), {"": sensors()}, False, "map")
-    assert not [topic for topic in graph.played_topics if "tof" in topic]
+    assert not [topic for topic in graph.played.values() if "tof" in topic]
 
 
 @pytest.mark.parametrize("path", CONFIG_FILES, ids=lambda p: p.name)

@@ -46,6 +46,7 @@ class PlayerConfig(Config):
     loop: bool = parameter(False, "start again at the end")
     clock: bool = parameter(False, "publish /clock")
     topics: tuple[str, ...] = parameter((), "topics to play; empty: all")
+    rename: tuple[str, ...] = parameter((), "'<topic of the bag>=<topic>': publish under this name")
     pace: tuple[str, ...] = parameter((), "'<node>=<topic>': do not run ahead of this node on this topic")
     window: int = parameter(4, "messages of a paced topic that may be unprocessed", minimum=1)
     patience: float = parameter(120.0, "longest wait for a paced node that reports nothing", unit="s", minimum=1.0)
@@ -63,6 +64,7 @@ class BagPlayerNode(Node):
             raise ValueError("parameter 'bag' must name the bag to play")
         self._types = RosTypes()
         self._flow = FlowControl(self.config.pace, self.config.window, self.config.patience)
+        self._names = dict(pair.split("=", 1) for pair in self.config.rename)
         self._stop = threading.Event()
         self._start = threading.Event()
         self._sent = 0
@@ -125,10 +127,11 @@ class BagPlayerNode(Node):
             self._send(raw)
 
     def _send(self, raw: RawMessage) -> None:
-        if raw.topic in self._flow.topics:
-            if not self._flow.wait(raw.topic):
-                self.get_logger().warning(f"no progress on {raw.topic} for {self.config.patience:.0f} s, going on")
-            self._flow.sent(raw.topic, header_stamp_ns(raw.data))
+        topic = self._names.get(raw.topic, raw.topic)
+        if topic in self._flow.topics:
+            if not self._flow.wait(topic):
+                self.get_logger().warning(f"no progress on {topic} for {self.config.patience:.0f} s, going on")
+            self._flow.sent(topic, header_stamp_ns(raw.data))
         self._send_clock(raw.stamp_ns)
         self._outputs[raw.topic].publish(raw.data)
         self._sent += 1
@@ -153,7 +156,7 @@ class BagPlayerNode(Node):
             kind = message_class(info.type_name)
             if kind is not None:
                 profile = sensor_qos(_DEPTH, info.latched, best_effort=info.best_effort)
-                publishers[topic] = self.create_publisher(kind, topic, profile)
+                publishers[topic] = self.create_publisher(kind, self._names.get(topic, topic), profile)
             elif not topic.endswith("/tf_static"):
                 self.get_logger().warning(f"{topic} is not played: {info.type_name} is not installed")
         if not publishers:

@@ -11,6 +11,9 @@ import click
 INTERRUPTED = 130
 """Exit code of a program that Ctrl-C has ended."""
 
+STOPPED = "stopped before the end of the bag"
+"""What a result says of a run that ended early."""
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

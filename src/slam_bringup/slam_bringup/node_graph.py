@@ -10,6 +10,7 @@ from slam_bringup.configuration import SystemConfig
 from slam_bringup.node_arguments import ros_arguments
 from slam_bringup.processes import NodeCommand
 from slam_bringup.sensor_bag import AgentSensors
+from slam_bringup.sensor_topics import is_rectified, join, nodes_name
 from slam_core.config import Config, iterate_parameters
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC
 
@@ -40,12 +41,12 @@ class NodeSpec:
 class NodeGraph:
     """Nodes in the order of their start, and what the bag player and the recorder must know of them.
 
-    filters: full names of the ekf_slam nodes, one per agent. finishers: full names of the nodes that are told that the
-    input has ended, in this order.
+    played: topics of the bag, and what the nodes call them. filters: full names of the ekf_slam nodes, one per agent.
+    finishers: full names of the nodes that are told that the input has ended, in this order.
     """
 
     commands: tuple[NodeCommand, ...]
-    played_topics: tuple[str, ...]
+    played: dict[str, str]
     pace: tuple[str, ...]
     recorded_topics: tuple[str, ...]
     filters: tuple[str, ...]
@@ -57,20 +58,21 @@ def live_nodes(
     agents: Iterable[str],
     *,
     odometry: bool,
+    rectified: bool = False,
     extra: Mapping[str, Mapping[str, Any]] | None = None,
     base_frames: Mapping[str, str] | None = None,
 ) -> list[NodeSpec]:
     """Nodes for rigs with the sensors that the mode of ``config`` needs.
 
-    ``extra``: parameters by executable. ``base_frames``: frame of each agent's rig, by default ``base_link`` below the
-    agent's name.
+    ``rectified``: their stereo images are. ``extra``: parameters by executable. ``base_frames``: frame of each agent's
+    rig, by default ``base_link`` below the agent's name.
     """
     base_frames = base_frames or {}
     mode, extra, agents = config.feature_extractor.mode, extra or {}, tuple(agents)
     specs = []
     for agent in agents:
         base = {"base_frame": base_frames[agent]} if agent in base_frames else _below(agent, base_frame="base_link")
-        if mode != "tof":
+        if mode != "tof" and not rectified:
             specs.append(_spec("stereo_frontend", "stereo_driver", None, agent, extra))
         if mode != "stereo" or odometry:
             specs.append(_spec("tof_driver", "tof_driver", config.tof_driver, agent, extra))
@@ -100,15 +102,16 @@ def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odomet
     first = next(iter(sensors.values()))
     base_frames = {agent: sensor.base_frame for agent, sensor in sensors.items()}
     specs = live_nodes(
-        config, sensors, odometry=odometry, extra=_bag_parameters(first, map_path), base_frames=base_frames
-    )
+        config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
+        extra=_bag_parameters(first, map_path), base_frames=base_frames,
+    )  # fmt: skip
     names = {
         e: tuple(s.command.full_name for s in specs if s.executable == e) for e in ("feature_extractor", "ekf_slam")
     }
-    recorded = {_join(agent, topic) for agent in ("", *sensors) for topic in RESULT_TOPICS}
+    recorded = {join(agent, topic) for agent in ("", *sensors) for topic in RESULT_TOPICS}
     return NodeGraph(
         commands=tuple(spec.command for spec in specs),
-        played_topics=tuple(t for s in sensors.values() for t in _topics(s, mode, odometry)),
+        played={t: name for s in sensors.values() for t, name in _topics(s, mode, odometry).items()},
         pace=tuple(p for s in sensors.values() for p in _pace(s, mode, odometry)),
         recorded_topics=(*sorted(recorded), "/diagnostics", STATIC_TRANSFORMS_TOPIC),
         filters=names["ekf_slam"],
@@ -128,24 +131,27 @@ def _bag_parameters(sensor: AgentSensors, map_path: str) -> dict[str, dict[str, 
     }
 
 
-def _topics(sensor: AgentSensors, mode: str, odometry: bool) -> list[str]:
-    topics = sensor.topics
-    roles = ["left", "right"] if mode != "tof" else []
-    infos = [f"stereo/{side}/camera_info" for side in roles]
+def _topics(sensor: AgentSensors, mode: str, odometry: bool) -> dict[str, str]:
+    roles = ["imu"]
+    if mode != "tof":
+        roles += ["left", "right", "left_info", "right_info"]
     if mode != "stereo" or odometry:
-        roles += ["depth", "amplitude", "intensity"]
-        infos.append("tof/camera_info")
-    return [topics[r] for r in (*roles, "imu") if r in topics] + [_join(sensor.agent, info) for info in infos]
+        roles += ["depth", "amplitude", "intensity", "tof_info"]
+    return {sensor.topics[role]: _heard(sensor, role) for role in roles if role in sensor.topics}
+
+
+def _heard(sensor: AgentSensors, role: str) -> str:
+    return nodes_name(sensor.agent, role, sensor.topics[role], sensor.measurement)
 
 
 def _pace(sensor: AgentSensors, mode: str, odometry: bool) -> Iterable[str]:
     """The filter is last in line of the images; scan odometry and depth have their own line."""
     agent = sensor.agent
-    yield f"{_join(agent, 'ekf_slam')}={sensor.topics['depth' if mode == 'tof' else 'left']}"
+    yield f"{join(agent, 'ekf_slam')}={_heard(sensor, 'depth' if mode == 'tof' else 'left')}"
     if odometry:
-        yield f"{_join(agent, 'ndt_odometry')}={sensor.topics['depth']}"
+        yield f"{join(agent, 'ndt_odometry')}={_heard(sensor, 'depth')}"
     elif mode in ("replace", "fuse"):
-        yield f"{_join(agent, 'tof_driver')}={sensor.topics['depth']}"
+        yield f"{join(agent, 'tof_driver')}={_heard(sensor, 'depth')}"
 
 
 def _spec(
@@ -170,7 +176,3 @@ def _changed(config: Config) -> Iterable[tuple[str, Any]]:
     """Parameters that differ from their defaults."""
     defaults = {name: value for name, value, _ in iterate_parameters(type(config)())}
     return ((name, value) for name, value, _ in iterate_parameters(config) if value != defaults[name])
-
-
-def _join(agent: str, name: str) -> str:
-    return f"/{agent}/{name}" if agent else f"/{name}"

@@ -18,6 +18,7 @@ from slam_bringup.node_arguments import ros_arguments
 from slam_bringup.node_graph import NodeGraph, plan_nodes
 from slam_bringup.processes import NodeCommand, NodeGroup, PrivateDomain, ament_prefixes, node_environment
 from slam_bringup.sensor_bag import SensorBag
+from slam_bringup.sensor_topics import BagNames
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC
 
 START_TIMEOUT_S = 180.0
@@ -33,7 +34,8 @@ class OnlineRun:
     """What the nodes left behind.
 
     recording: the bag of their topics. map_folder: the map that ``sjsam`` saved. diagnostics: last values by full node
-    name. exit_codes: by full node name. wall_s: from the first message played to the last submap joined.
+    name. exit_codes: by full node name. wall_s: from the first message played to the last submap joined. stopped:
+    whether it was told to end before the bag did.
     """
 
     recording: Path
@@ -41,6 +43,7 @@ class OnlineRun:
     diagnostics: dict[str, dict[str, str]]
     exit_codes: dict[str, int]
     wall_s: float
+    stopped: bool = False
 
 
 def run_nodes(
@@ -50,7 +53,9 @@ def run_nodes(
     *,
     odometry: bool,
     rate: float = 0.0,
+    names: BagNames | None = None,
     on_progress: Callable[[int], None] = lambda frames: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> OnlineRun:
     """Map a bag with the nodes of the workspace.
 
@@ -66,22 +71,26 @@ def run_nodes(
         Whether scan odometry runs as well.
     rate
         Speed of the replay; 0: as fast as the nodes follow. Nothing is lost either way.
+    names
+        Topics and frames of the bag that are not named like the nodes' own.
     on_progress
         Called with the number of frames that the filters have processed.
+    stopped
+        Asked all the time: whether to end here, with what is mapped so far; KeyboardInterrupt if that is nothing yet.
 
     Raises
     ------
     ValueError
         If a node does not start, ends by itself, or does not answer; the message holds the end of its log.
     """
-    with SensorBag(bag) as opened:
+    with SensorBag(bag, names) as opened:
         graph = plan_nodes(config, opened.sensors, odometry, str(out / "map"))
     out.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(out / "map", ignore_errors=True)
     with PrivateDomain() as domain:
         environment = node_environment(domain, fastdds_profile())
         with NodeGroup(environment, out / "logs") as group, _supervisor(environment, group) as supervisor:
-            run = _Choreography(group, supervisor, graph, out)
+            run = _Choreography(group, supervisor, graph, out, stopped)
             run.start_nodes()
             started = time.monotonic()
             run.play(bag, rate, on_progress)
@@ -89,7 +98,7 @@ def run_nodes(
             wall_s = time.monotonic() - started
             diagnostics = run.last_diagnostics()
             group.stop()
-    return OnlineRun(out / "result.mcap", out / "map", diagnostics, group.exit_codes, wall_s)
+    return OnlineRun(out / "result.mcap", out / "map", diagnostics, group.exit_codes, wall_s, stopped())
 
 
 def _supervisor(environment: dict[str, str], group: NodeGroup) -> Any:
@@ -110,17 +119,20 @@ def fastdds_profile() -> Path | None:
 class _Choreography:
     """The steps of a run, in the order of its methods."""
 
-    def __init__(self, group: NodeGroup, supervisor: Any, graph: NodeGraph, out: Path) -> None:
+    def __init__(
+        self, group: NodeGroup, supervisor: Any, graph: NodeGraph, out: Path, stopped: Callable[[], bool]
+    ) -> None:
         self._group = group
         self._supervisor = supervisor
         self._graph = graph
         self._recording = out / "result.mcap"
+        self._stopped = stopped
 
     def start_nodes(self) -> None:
         """All nodes, then the recorder; returns when every topic has reached whoever listens to it."""
         for command in self._graph.commands:
             self._group.start(command)
-        self._wait_until_ready(from_outside=(*self._graph.played_topics, STATIC_TRANSFORMS_TOPIC))
+        self._wait_until_ready(from_outside=(*self._graph.played.values(), STATIC_TRANSFORMS_TOPIC))
         self._start_recorder()
 
     def _wait_until_ready(self, from_outside: tuple[str, ...]) -> None:
@@ -128,9 +140,13 @@ class _Choreography:
         names = [command.full_name for command in self._graph.commands]
         obstacles = self._supervisor.obstacles
         try:
-            self._supervisor.wait(lambda: not obstacles(names, from_outside), START_TIMEOUT_S, "start of the nodes")
+            self._supervisor.wait(
+                lambda: self._stopped() or not obstacles(names, from_outside), START_TIMEOUT_S, "start of the nodes"
+            )
         except TimeoutError as error:
             raise ValueError(f"{error}: {'; '.join(obstacles(names, from_outside))}") from None
+        if self._stopped():
+            raise KeyboardInterrupt
 
     def _start_recorder(self) -> None:
         parameters = {"bag": str(self._recording), "topics": self._graph.recorded_topics, "header_stamps": True}
@@ -144,7 +160,8 @@ class _Choreography:
     def play(self, bag: Path, rate: float, on_progress: Callable[[int], None]) -> None:
         """Play the bag to its end; the player ends when the paced nodes have processed everything."""
         parameters = {
-            "bag": str(bag), "rate": rate, "topics": self._graph.played_topics, "pace": self._graph.pace,
+            "bag": str(bag), "rate": rate, "topics": tuple(self._graph.played), "pace": self._graph.pace,
+            "rename": tuple(f"{topic}={name}" for topic, name in self._graph.played.items() if name != topic),
             "window": _WINDOW, "wait_for_start": True,
         }  # fmt: skip
         player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
@@ -155,6 +172,8 @@ class _Choreography:
         while player.is_running:
             self._supervisor.listen(0.2)
             on_progress(sum(self._supervisor.progress[name] for name in self._graph.filters))
+            if self._stopped():
+                player.interrupt()
         self._group.check()
 
     def finish(self) -> None:

@@ -83,7 +83,7 @@ def run_bag(
         agents = _agent_results(bag, mapping)
         with times.measure("dense model"):
             dense = dense_model(bag, config, {a.name: a.trajectory for a in agents})
-        mapping.records[bag.agents[0]].events[:0] = [w for w in (*bag.warnings, bag.reader.warning) if w]
+        mapping.records[bag.agents[0]].events[:0] = bag.warnings
     choice = (config.feature_extractor.mode, mapper, odometry)
     return _run_result(path, choice, mapping, agents, dense, dropped, times, wall_s), mapping
 

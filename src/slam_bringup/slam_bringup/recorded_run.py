@@ -11,9 +11,11 @@ from sjsam_node.global_map import GlobalMap
 from slam_bringup.bag import BagReader
 from slam_bringup.configuration import SystemConfig
 from slam_bringup.dense_run import dense_model
+from slam_bringup.interrupt import STOPPED
 from slam_bringup.online_run import OnlineRun, unclean_ends
 from slam_bringup.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
 from slam_bringup.sensor_bag import SensorBag
+from slam_bringup.sensor_topics import BagNames
 from slam_core.messages import estimate_from_message
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
@@ -70,12 +72,12 @@ class Recording:
 
 
 def collect(
-    bag: Path, config: SystemConfig, run: OnlineRun, *, mapper: str, odometry: str
+    bag: Path, config: SystemConfig, run: OnlineRun, *, mapper: str, odometry: str, names: BagNames | None = None
 ) -> tuple[RunResult, GlobalMap]:
     """The result of a run of nodes, and the map that ``sjsam`` saved."""
     recording = Recording(run.recording)
     global_map = GlobalMap.load(run.map_folder)
-    with SensorBag(bag) as opened:
+    with SensorBag(bag, names) as opened:
         agents = tuple(_agent_result(agent, opened, recording, global_map) for agent in opened.agents)
         dense = dense_model(opened, config, {a.name: a.trajectory for a in agents})
     landmarks = global_map.landmarks()
@@ -97,7 +99,7 @@ def collect(
         sensor_s=max((s[-1] - s[0]) / 1e9 for s in stamps) if stamps else 0.0,
         wall_s=run.wall_s,
         stage_ms=recording.stage_ms,
-        events=tuple(_events(agents, recording) + unclean_ends(run)),
+        events=tuple([STOPPED] * run.stopped + opened.warnings + _events(agents, recording) + unclean_ends(run)),
     )
     return result, global_map
 

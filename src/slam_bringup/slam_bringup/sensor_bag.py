@@ -125,8 +125,7 @@ class SensorBag:
         self.reader = BagReader(path)
         self.left_out: Counter[str] = Counter()
         """Messages that the last :meth:`readings` left out, by reason."""
-        self.warnings: list[str] = []
-        """What a user should know of this bag."""
+        self._warnings: list[str] = []
         self._names = names or BagNames()
 
     def __enter__(self) -> Self:
@@ -170,8 +169,13 @@ class SensorBag:
         reason = f"unusable messages on {topic}"
         self.left_out[reason] += 1
         text = f"{topic}: {error}"
-        if self.left_out[reason] == 1 and text not in self.warnings:
-            self.warnings.append(text)
+        if self.left_out[reason] == 1 and text not in self._warnings:
+            self._warnings.append(text)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a user should know of this bag, as far as it has been read."""
+        return self._warnings + [self.reader.warning] * bool(self.reader.warning)
 
     def count(self, agent: str, role: str) -> int:
         """Messages of a role ("left", "depth", "imu", ...) of an agent; 0 if there is no such topic."""
@@ -223,7 +227,7 @@ class SensorBag:
                 f"it, or map in the camera's own axes (x right, y down, z forward): --base-frame {camera_frame}"
             )
         root = tree.root(camera_frame)
-        self.warnings.append(f"no base_link on /tf_static: poses are those of {root}, another frame: --base-frame")
+        self._warnings.append(f"no base_link on /tf_static: poses are those of {root}, another frame: --base-frame")
         return root
 
     def _camera_info(self, topics: Mapping[str, str], role: str, info_role: str) -> tuple[CameraInfo | None, str]:

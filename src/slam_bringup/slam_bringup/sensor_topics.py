@@ -92,6 +92,29 @@ def is_rectified(image_topic: str) -> bool:
     return "rect" in _without_transport(image_topic).rsplit("/", 1)[-1]
 
 
+def nodes_name(agent: str, role: str, topic: str, measurement: str) -> str:
+    """What the nodes call the topic of a role; ``measurement`` is what the depth camera measures.
+
+    Raises
+    ------
+    ValueError
+        For compressed rectified images: the nodes take those as they come, not compressed.
+    """
+    if role in ("left", "right"):
+        compressed = topic.endswith("/compressed")
+        if compressed and is_rectified(topic):
+            raise ValueError(
+                f"{topic}: the nodes take rectified images that are not compressed; slam run takes them all"
+            )
+        kind = "image_rect" if is_rectified(topic) else "image_raw"
+        return join(agent, f"stereo/{role}/{kind}{'/compressed' if compressed else ''}")
+    if role == "tof_info":
+        return join(agent, "tof/camera_info")
+    if role.endswith("_info"):
+        return join(agent, f"stereo/{role.removesuffix('_info')}/camera_info")
+    return join(agent, _CANDIDATES[measurement if role == "depth" else role][0])
+
+
 def join(agent: str, name: str) -> str:
     """Full name of a topic below the namespace of an agent."""
     return f"/{agent}/{name}" if agent else f"/{name}"

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import click
 from rich.console import Console
 
-from slam_bringup.commands.mapping_options import mapping_options, mode_for, progress_bar
+from slam_bringup.commands.mapping_options import (
+    mapping_options,
+    mode_for,
+    progress_bar,
+    require_frames,
+    require_writable,
+)
 from slam_bringup.configuration import choose, load_system_config
+from slam_bringup.interrupt import INTERRUPTED, Interrupt
 from slam_bringup.online_run import run_nodes
 from slam_bringup.output import write_results
 from slam_bringup.recorded_run import collect
 from slam_bringup.sensor_bag import SensorBag
+from slam_bringup.sensor_topics import BagNames, parse_topics
 from slam_bringup.summary_table import summary_table
 
 
@@ -20,18 +29,24 @@ from slam_bringup.summary_table import summary_table
 @mapping_options
 @click.option("--rate", type=click.FloatRange(min=0.0), default=0.0, help="speed of the replay [as fast as it goes]")
 def command(
-    bag: Path, output: Path, rate: float, mode: str | None, mapper: str, odometry: str, config: Path | None
-) -> None:
+    bag: Path, output: Path, rate: float, mode: str | None, mapper: str, odometry: str, config: Path | None,
+    topics: tuple[str, ...], base_frame: str,
+) -> None:  # fmt: skip
     """Map BAG with the nodes of the workspace: starts them, plays the bag, and writes what ``slam run`` does."""
-    with SensorBag(bag) as opened:
+    names = BagNames(parse_topics(topics), base_frame)
+    with SensorBag(bag, names) as opened:
         mode = mode_for(opened, mode)
         frames = sum(opened.count(agent, "depth" if mode == "tof" else "left") for agent in opened.agents)
     system = choose(load_system_config(config), mode, mapper, odometry)
-    with progress_bar() as progress:
+    require_writable(output)
+    with Interrupt() as interrupt, progress_bar() as progress:
         task = progress.add_task(f"nodes mapping {bag.name}", total=frames)
         run = run_nodes(
-            bag, system, output, odometry=odometry != "none", rate=rate,
-            on_progress=lambda done: progress.update(task, completed=done),
+            bag, system, output, odometry=odometry != "none", rate=rate, names=names,
+            on_progress=lambda done: progress.update(task, completed=done), stopped=lambda: interrupt.asked,
         )  # fmt: skip
-    result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry)
+    result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)
+    require_frames(result)
     Console().print(summary_table(write_results(output, result), output))
+    if run.stopped:
+        sys.exit(INTERRUPTED)

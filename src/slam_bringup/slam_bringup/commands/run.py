@@ -17,7 +17,7 @@ from slam_bringup.commands.mapping_options import (
     require_writable,
 )
 from slam_bringup.configuration import choose, load_system_config
-from slam_bringup.interrupt import INTERRUPTED, Interrupt
+from slam_bringup.interrupt import INTERRUPTED, STOPPED, Interrupt
 from slam_bringup.output import write_results
 from slam_bringup.pipeline import run_bag
 from slam_bringup.result_bag import write_result_bag
@@ -50,7 +50,7 @@ def command(
         )  # fmt: skip
     require_frames(result)
     if interrupt.asked:
-        result = replace(result, events=("stopped before the end of the bag", *result.events))
+        result = replace(result, events=(STOPPED, *result.events))
     write_result_bag(output / "result.mcap", result)
     summary = write_results(output, result, mapping.global_map.save)
     Console().print(summary_table(summary, output))
