@@ -12,7 +12,6 @@ import numpy as np
 from laser_log import LaserScan, pose2
 from planar_graph import PlanarGraph, composed, relative
 
-from ndt_registration.local_map import for_the_plane
 from ndt_registration.registration import RegistrationConfig, Target, register
 from slam_core.geometry import FloatArray, invert_transform
 
@@ -51,7 +50,7 @@ class LoopCloser:
         self.loops: list[Loop] = []
         self._graph = PlanarGraph([planar(poses[0])])
         self._way = [0.0]
-        self._config = for_the_plane(RegistrationConfig())
+        self._config = RegistrationConfig()
         self._targets: dict[int, Target] = {}
 
     def run(self) -> list[FloatArray]:

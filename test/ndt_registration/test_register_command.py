@@ -65,6 +65,25 @@ def test_writes_result_and_picture(clouds: tuple[str, str], tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
+    ("unit", "guess", "advice"),
+    [
+        (1000.0, (), "are both in metres?"),
+        (1.0, (), "give --initial-guess; the search went as far as 0.6 times"),
+        (1.0, ("--initial-guess", "0 0 0"), "Try without --initial-guess"),
+    ],
+)
+def test_a_failure_says_what_to_try(
+    clouds: tuple[str, str], tmp_path: Path, unit: float, guess: tuple[str, ...], advice: str
+) -> None:
+    noise = unit * np.random.default_rng(5).normal(size=(2000, 3))
+    source = write_pcd(tmp_path / "noise.pcd", noise)
+    outcome = CliRunner().invoke(command, [str(source), clouds[1], *guess], catch_exceptions=False)
+    assert not json.loads(outcome.stdout)["converged"]
+    assert "not registered: " in outcome.stderr
+    assert advice in outcome.stderr
+
+
+@pytest.mark.parametrize(
     ("guess", "message"),
     [("1 2", "3, 6, 7 or 16 numbers, got 2"), ("far away", "neither numbers nor a file"), ("nan 0 0", "finite")],
 )

@@ -109,6 +109,7 @@ BAD = {
     "NaN": (np.full((900, 3), np.nan), "0 finite points"),
     "one point": (np.ones((1, 3)), "1 finite points"),
     "coincident": (np.ones((900, 3)), "coincide"),
+    "beyond all numbers": (1e200 * np.eye(3).repeat(300, axis=0), "spans 1e+200 m"),
 }
 
 
@@ -120,6 +121,43 @@ def test_bad_clouds_give_a_reason(room: Any, start: FloatArray, cloud: FloatArra
         assert not result.converged
         assert reason in result.reason
         assert np.isfinite(result.covariance).all()
+
+
+@pytest.mark.parametrize("method", ["ndt", "icp", "icp_plane"])
+def test_points_on_a_line_are_no_plain_success(method: str) -> None:
+    line = np.outer(np.linspace(0.0, 5.0, 2000), [1.0, 0.0, 0.0])
+    result = register(line, line, config=RegistrationConfig(method=method))
+    assert result.degenerate or not result.converged
+
+
+@pytest.mark.parametrize("method", ["ndt", "icp", "icp_plane"])
+def test_thousands_of_points_in_two_places_are_no_plain_success(method: str) -> None:
+    """A kd-tree of points that coincide searches all of them for each: that would take minutes."""
+    places = np.repeat([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]], 3000, axis=0)
+    result = register(places, places, config=RegistrationConfig(method=method))
+    assert result.degenerate or not result.converged
+
+
+@pytest.mark.parametrize("stray_in_target", [False, True])
+def test_a_stray_point_does_no_harm(
+    room: Any, start: FloatArray, at: Callable[..., FloatArray], stray_in_target: bool
+) -> None:
+    rng, truth = np.random.default_rng(5), at(0.1, 0.0, 0.0, 3.0)
+    source, target = room.scan(start @ truth, rng), room.scan(start, rng)
+    if stray_in_target:
+        target = np.vstack([target, [1e9, 0.0, 0.0]])
+    else:
+        source = np.vstack([source, [1e9, 0.0, 0.0]])
+    result = register(source, target)
+    assert result.converged, result.reason
+    assert error(result.T_target_source, truth)[0] < 0.01
+
+
+def test_covariance_stays_positive_definite_in_map_coordinates(room: Any, start: FloatArray) -> None:
+    rng = np.random.default_rng(5)
+    away = np.array([5e5, 4e6, 0.0])
+    result = register(room.scan(start, rng) + away, room.scan(start, rng) + away, np.eye(4))
+    np.linalg.cholesky(result.covariance)
 
 
 @pytest.mark.parametrize("method", ["ndt", "icp_plane"])
@@ -161,6 +199,37 @@ def test_plane_motion_from_laser_scans(at: Callable[..., FloatArray]) -> None:
     assert distance < 0.01
     assert angle < 0.3
     assert result.T_target_source[2, 3] == 0.0
+
+
+def test_a_turning_laser_scanner_with_infinite_ranges(at: Callable[..., FloatArray]) -> None:
+    """720 beams in a room with two pillars; every seventh hits nothing."""
+    rng = np.random.default_rng(5)
+    corners = np.array([[-4, -3], [6, -3], [6, 5], [-4, 5]], dtype=float)
+    walls = [(corners[k], corners[(k + 1) % 4] - corners[k]) for k in range(4)]
+    for x, y in ((2.0, 1.0), (-3.0, 2.0)):
+        box = np.array([[x, y], [x + 0.9, y], [x + 0.9, y + 0.7], [x, y + 0.7]])
+        walls += [(box[k], box[(k + 1) % 4] - box[k]) for k in range(4)]
+
+    def scan(T: FloatArray) -> FloatArray:
+        angles = np.deg2rad(np.arange(0.0, 360.0, 0.5))
+        beams = np.column_stack([np.cos(angles), np.sin(angles)])
+        turned, ranges = beams @ T[:2, :2].T, np.full(len(beams), np.inf)
+        for corner, edge in walls:
+            d, cross = corner - T[:2, 3], turned[:, 0] * edge[1] - turned[:, 1] * edge[0]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                distance = (d[0] * edge[1] - d[1] * edge[0]) / cross
+                along = (d[0] * turned[:, 1] - d[1] * turned[:, 0]) / cross
+            ranges = np.where((distance > 0) & (along >= 0) & (along <= 1) & (distance < ranges), distance, ranges)
+        points = beams * (ranges + 0.01 * rng.normal(size=len(beams)))[:, None]
+        points[::7] = np.inf
+        return points
+
+    truth = at(0.4, 0.2, 0.0, 8.0)
+    result = register(scan(truth), scan(np.eye(4)))
+    distance, angle = error(result.T_target_source, truth)
+    assert result.converged, result.reason
+    assert distance < 0.01
+    assert angle < 0.3
 
 
 @pytest.mark.parametrize("guess", [np.eye(3), np.full((4, 4), np.nan), 2.0 * np.eye(4)])

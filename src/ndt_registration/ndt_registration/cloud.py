@@ -20,6 +20,8 @@ _EVEN_SIZE = 0.01
 """Edge of the blocks of a crowded cloud, over the range that holds 90 % of its points."""
 _CROWDED = 8.0
 """A cloud is crowded where a typical point's block has this many times the points of a typical block."""
+_FARTHEST = 1e3
+"""Points farther off than so many times the median distance are strays: no sensor sees them and a room."""
 _FEWEST_RIMS = 60
 """Rims that go with even the smallest sample of points."""
 _SEED = 20100610
@@ -78,7 +80,7 @@ def is_planar(points: npt.ArrayLike) -> bool:
 def prepare(points: FloatArray, limit: int, *, planar: bool, centre: FloatArray) -> Cloud:
     """Thin finite points (n, 3) to at most ``limit`` and move ``centre`` to the origin."""
     rng = np.random.default_rng(_SEED)
-    points = _evened(points - centre)
+    points = _evened(_without_strays(points - centre))
     n = len(points)
     if n > limit:
         points = points[((np.arange(limit) + rng.random(limit)) * (n / limit)).astype(np.int64)]
@@ -87,6 +89,13 @@ def prepare(points: FloatArray, limit: int, *, planar: bool, centre: FloatArray)
     spacing = mean_spacing(points, range_image(points, _COVERAGE_SIZE), planar)
     rims = rim_points(points, spacing, _RIM_STEP * scale)
     return Cloud(points, rims[rng.permutation(len(rims))], scale, planar)
+
+
+def _without_strays(points: FloatArray) -> FloatArray:
+    """The points but those so far off that cells of a useful size could not be numbered up to them."""
+    distance = np.linalg.norm(points, axis=1)
+    median = float(np.median(distance)) if len(points) else 0.0
+    return points[distance <= _FARTHEST * median] if median > 0.0 else points
 
 
 def _evened(points: FloatArray) -> FloatArray:

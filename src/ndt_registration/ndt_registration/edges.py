@@ -50,9 +50,7 @@ def _sorted_by_bin(points: FloatArray, size: int) -> tuple[FloatArray, FloatArra
 def _nearest_behind(
     i: int, size: int, reach: float, step: float, d: FloatArray, r: FloatArray, bins: Int32Array, first: Int32Array
 ) -> int:
-    """The point nearest in direction to point ``i`` that is more than ``step`` farther away, -1 if none is within
-    reach.
-    """
+    """The nearest point beside ``i`` that is more than ``step`` farther away, -1 if none is within reach."""
     row, column = bins[i] // size, bins[i] % size
     best, nearest = -1, reach * reach
     for a in range(max(row - 1, 0), min(row + 2, size)):
@@ -61,7 +59,7 @@ def _nearest_behind(
         for j in range(first[low], first[high + 1]):
             if r[j] > r[i] + step:
                 distance = (d[j, 0] - d[i, 0]) ** 2 + (d[j, 1] - d[i, 1]) ** 2 + (d[j, 2] - d[i, 2]) ** 2
-                if distance < nearest:
+                if 0.0 < distance < nearest:
                     best, nearest = j, distance
     return best
 

@@ -46,9 +46,10 @@ class IcpOutcome(NamedTuple):
 
 
 class IcpTarget:
-    """kd-tree, spacing and normals of a cloud (n, 3)."""
+    """kd-tree, spacing and normals of a cloud (n, 3), each place once: a tree cannot part points that coincide."""
 
     def __init__(self, points: FloatArray, config: IcpConfig) -> None:
+        points = points[np.sort(np.unique(points, axis=0, return_index=True)[1])]
         self.points = points
         self.tree = cKDTree(points)
         distances, self._neighbours = self.tree.query(points, k=min(config.neighbours, len(points)))

@@ -5,7 +5,7 @@ by scan.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -38,19 +38,6 @@ class Keyframe:
     covariance: FloatArray
     points: FloatArray
     rims: FloatArray
-
-
-def for_the_plane(config: RegistrationConfig) -> RegistrationConfig:
-    """The configuration for scans (n, 2): a laser scanner's few hundred points need wide cells, and few in each."""
-    wide = max(config.grid.relative_voxel_size, _PLANAR_VOXEL_SIZE)
-    grid = replace(config.grid, relative_voxel_size=wide, min_points=min(config.grid.min_points, _PLANAR_CELL_POINTS))
-    return replace(config, grid=grid, min_points=min(config.min_points, _PLANAR_SCAN_POINTS))
-
-
-_PLANAR_VOXEL_SIZE = 0.18
-"""Edge of the finest cells over the scan's scale."""
-_PLANAR_CELL_POINTS = 4
-_PLANAR_SCAN_POINTS = 30
 
 
 class LocalMap:

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ndt_registration.gyro import Gyro, GyroConfig
-from ndt_registration.local_map import LocalMap, Scan, for_the_plane
+from ndt_registration.local_map import LocalMap, Scan
 from ndt_registration.motion_filter import MotionConfig, MotionFilter, rotated
 from ndt_registration.pyramid import GridConfig
-from ndt_registration.registration import RegistrationConfig, RegistrationResult, register
+from ndt_registration.registration import RegistrationConfig, RegistrationResult, for_dimension, register
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, boxminus, compose_jacobians, invert_transform
 from slam_core.types import RelativeMotion
@@ -83,8 +83,6 @@ class ScanOdometry:
 
     def __init__(self, config: OdometryConfig | None = None) -> None:
         self._config = config or OdometryConfig()
-        self._in_space = self._config.registration
-        self._in_plane = for_the_plane(self._in_space)
         self._map = LocalMap(self._config.keyframes)
         self._filter = MotionFilter(self._config.motion)
         self._gyro = Gyro(self._config.gyro)
@@ -141,7 +139,7 @@ class ScanOdometry:
             self._filter.turn(turn, self._gyro.sigma(seconds))
 
     def _registration(self, scan: Scan) -> RegistrationConfig:
-        return self._in_plane if scan.planar else self._in_space
+        return for_dimension(self._config.registration, planar=scan.planar)
 
     def _register(self, scan: Scan, *, lost: bool) -> RegistrationResult:
         """The scan's pose in the newest keyframe."""

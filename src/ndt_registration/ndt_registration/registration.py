@@ -116,6 +116,7 @@ class Target:
             If fewer than ``config.min_points`` points are finite, or all of them coincide.
         """
         finite = finite_points(points)
+        config = for_dimension(config, planar=is_planar(points))
         check_cloud(finite, "target", config)
         centre = viewpoint(finite)
         cloud = prepare(finite, config.target_points, planar=is_planar(points), centre=centre)
@@ -154,6 +155,7 @@ def register(
     if initial_guess is not None and not is_rigid_transform(np.asarray(initial_guess, dtype=np.float64), 1e-4):
         raise ValueError(f"the initial guess must be a rigid transform (4, 4), got {initial_guess}")
     points = finite_points(source)
+    config = for_dimension(config, planar=target.cloud.planar if isinstance(target, Target) else is_planar(target))
     try:
         check_cloud(points, "source", config)
         prepared = target if isinstance(target, Target) else Target.build(target, config)
@@ -174,8 +176,30 @@ def check_cloud(points: FloatArray, name: str, config: RegistrationConfig) -> No
         raise DegenerateCloudError(
             f"the {name} has {len(points)} finite points, at least {config.min_points} are needed"
         )
-    if float(np.ptp(points, axis=0).max()) < 1e-6:
+    extent = float(np.ptp(points, axis=0).max())
+    if extent < _LEAST_EXTENT:
         raise DegenerateCloudError(f"all points of the {name} coincide")
+    if not extent < _LARGEST_EXTENT:
+        raise DegenerateCloudError(f"the {name} spans {extent:.3g} m: no length of it can be computed with")
+
+
+_LEAST_EXTENT, _LARGEST_EXTENT = 1e-6, 1e15
+"""Extent of a cloud, m, between which sums and squares of its coordinates mean something."""
+
+
+def for_dimension(config: RegistrationConfig, *, planar: bool) -> RegistrationConfig:
+    """The configuration, for scans (n, 2) with wide cells and few points in each: a laser scanner has but hundreds."""
+    if not planar:
+        return config
+    wide = max(config.grid.relative_voxel_size, _PLANAR_VOXEL_SIZE)
+    grid = replace(config.grid, relative_voxel_size=wide, min_points=min(config.grid.min_points, _PLANAR_CELL_POINTS))
+    return replace(config, grid=grid, min_points=min(config.min_points, _PLANAR_SCAN_POINTS))
+
+
+_PLANAR_VOXEL_SIZE = 0.18
+"""Edge of the finest cells over the scan's scale."""
+_PLANAR_CELL_POINTS = 4
+_PLANAR_SCAN_POINTS = 30
 
 
 def _register(
@@ -325,6 +349,13 @@ def _shifted(T: FloatArray, centre: FloatArray) -> FloatArray:
 
 
 def _shifted_covariance(covariance: FloatArray, rotated_centre: FloatArray) -> FloatArray:
+    """Covariance where the frame's origin is ``-rotated_centre`` (3,) away; a lever of kilometres costs digits that
+    positive definiteness needs.
+    """
     J = np.eye(6)
     J[:3, 3:] = skew(rotated_centre)
-    return np.asarray(J @ covariance @ J.T)
+    shifted = J @ covariance @ J.T
+    return np.asarray(0.5 * (shifted + shifted.T) + _ROUNDING * np.trace(shifted) * np.eye(6))
+
+
+_ROUNDING = 4e-15

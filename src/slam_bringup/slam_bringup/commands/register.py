@@ -18,6 +18,8 @@ from slam_core.files import atomic_path
 from slam_core.geometry import FloatArray, make_transform, rotation_from_euler, transform_from_pose7, transform_points
 
 PICTURE_POINTS = 8000
+UNIT_RATIO = 20.0
+"""Clouds whose extents differ by more are hardly in the same unit."""
 
 
 @click.command()
@@ -37,9 +39,13 @@ def command(
     values = yaml.safe_load(config_file.read_text(encoding="utf-8")) or {} if config_file else {}
     config = from_mapping(RegistrationConfig, {**values, "method": method})
     source_points, target_points = (_read(path) for path in (source, target))
-    result = register(source_points, target_points, parse_guess(initial_guess) if initial_guess else None, config)
+    guess = parse_guess(initial_guess) if initial_guess else None
+    result = register(source_points, target_points, guess, config)
     text = json.dumps(result_as_json(result), indent=2)
     click.echo(text)
+    if not result.converged:
+        advice = next_step(source_points, target_points, config, guessed=guess is not None)
+        click.echo(f"slam register: not registered: {result.reason}. {advice}", err=True)
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
         with atomic_path(output / "result.json") as temporary:
@@ -53,6 +59,20 @@ def _read(path: Path) -> FloatArray:
     if len(points) == 0:
         raise ValueError(f"{path}: no finite points")
     return points
+
+
+def next_step(source: FloatArray, target: FloatArray, config: RegistrationConfig, *, guessed: bool) -> str:
+    """What to try where two clouds (n, 3) could not be registered."""
+    sizes = [float(np.ptp(cloud, axis=0).max()) for cloud in (source, target)]
+    if max(sizes) > UNIT_RATIO * min(sizes):
+        return f"The source spans {sizes[0]:.3g} m and the target {sizes[1]:.3g} m: are both in metres?"
+    if guessed:
+        return "Try without --initial-guess, or check that it takes the source's coordinates to the target's."
+    reach, angle = config.search.max_translation, config.search.max_rotation_deg
+    return (
+        f"If you know the pose roughly, give --initial-guess; the search went as far as {reach:g} times the target's "
+        f"median range and {angle:g} deg (search.max_translation and search.max_rotation_deg of --config)."
+    )
 
 
 def result_as_json(result: RegistrationResult) -> dict[str, object]:
