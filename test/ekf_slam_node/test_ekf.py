@@ -44,11 +44,10 @@ class TestCovariance:
     def test_square_and_product(self, rng: np.random.Generator) -> None:
         P = random_covariance(20, rng)
         owned = Covariance(P)
-        A, B = np.zeros((2, owned.capacity, 4))
-        A[:20], B[:20] = rng.standard_normal((2, 20, 4))
+        A, B = rng.standard_normal((2, 20, 4))
         owned.subtract_square(np.asfortranarray(A))
         owned.add_product(np.asfortranarray(A), np.asfortranarray(B))
-        expected = P - A[:20] @ A[:20].T + A[:20] @ B[:20].T + B[:20] @ A[:20].T
+        expected = P - A @ A.T + A @ B.T + B @ A.T
         np.testing.assert_allclose(owned.dense(), expected, atol=1e-10)
 
     def test_an_impossible_innovation_covariance_is_refused(self) -> None:

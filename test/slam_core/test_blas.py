@@ -25,6 +25,14 @@ def test_products_change_the_lower_triangle_only(rng):
     np.testing.assert_allclose(C, expected, atol=1e-13)
 
 
+def test_the_leading_part_of_a_larger_matrix_is_changed_alone(rng):
+    A, room = fortran(7, 3, rng=rng), fortran(9, 9, rng=rng)
+    expected = room.copy()
+    blas.subtract_square(room[:7, :7], A)
+    expected[:7, :7][np.tril_indices(7)] -= (A @ A.T)[np.tril_indices(7)]
+    np.testing.assert_allclose(room, expected, atol=1e-13)
+
+
 def test_cholesky_and_its_solution(rng):
     A, B = fortran(5, 5, rng=rng), fortran(9, 5, rng=rng)
     S = np.asfortranarray(A @ A.T + np.eye(5))
@@ -40,7 +48,7 @@ def test_an_indefinite_matrix_has_no_factor():
     assert not blas.cholesky(np.asfortranarray(np.diag([1.0, -1.0])))
 
 
-@pytest.mark.parametrize("wrong", [np.zeros((3, 2)), np.zeros((3, 2), np.float32, order="F")])
+@pytest.mark.parametrize("wrong", [np.zeros((3, 2)), np.zeros((3, 2), np.float32, order="F"), np.zeros((6, 2), order="F")[::2]])
 def test_what_blas_would_misread_is_refused(wrong):
     with pytest.raises(ValueError, match="Fortran order"):
         blas.subtract_square(np.zeros((3, 3), order="F"), wrong)

@@ -1,8 +1,7 @@
 """The covariance of a state that grows and shrinks: one class owns the matrix and every operation on it.
 
-Only the lower triangle is kept true, which halves the cost of the update (BLAS dsyrk, Eq. 6.20). The buffer is padded
-with zeros beyond the state, so that BLAS works on one contiguous matrix while landmarks come and go; a removed
-landmark's place is taken by the last one.
+Only the lower triangle is kept true, which halves the cost of the update (BLAS dsyrk, Eq. 6.20). The buffer is larger
+than the state, so that landmarks come and go without a copy; a removed landmark's place is taken by the last one.
 """
 
 from __future__ import annotations
@@ -16,7 +15,8 @@ from slam_core import blas
 from slam_core.geometry import FloatArray
 
 IndexArray = npt.NDArray[np.int64]
-_GROWTH = 96
+_GROWTH = 1.4
+"""Room for so much larger a state is taken when it runs out."""
 
 
 @njit(cache=True, nogil=True)
@@ -33,24 +33,24 @@ def _gather_columns(P, index, size, out):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _cross_covariance(P, size, core, J_pose, J_point, rows, out):  # type: ignore[no-untyped-def]
     """``out = P H'`` for observations that touch the pose (first six) and three entries from rows[k] each."""
-    column = np.empty((3, size))
+    x, y, z = np.empty(size), np.empty(size), np.empty(size)
     for k in range(len(rows)):
         first = rows[k]
-        for c in range(3):
-            j = first + c
-            for i in range(j):
-                column[c, i] = P[j, i]
-            for i in range(j, size):
-                column[c, i] = P[i, j]
+        for i in range(first + 3):
+            x[i], y[i], z[i] = P[first, i], P[first + 1, i], P[first + 2, i]
+        x[first + 1], x[first + 2], y[first + 2] = P[first + 1, first], P[first + 2, first], P[first + 2, first + 1]
+        for i in range(first + 3, size):
+            x[i], y[i], z[i] = P[i, first], P[i, first + 1], P[i, first + 2]
         for m in range(3):
-            target = 3 * k + m
-            a0, a1, a2 = J_point[k, m, 0], J_point[k, m, 1], J_point[k, m, 2]
-            for i in range(size):
-                out[i, target] = a0 * column[0, i] + a1 * column[1, i] + a2 * column[2, i]
-            for p in range(6):
-                b = J_pose[k, m, p]
-                for i in range(size):
-                    out[i, target] += b * core[i, p]
+            _combine(x, y, z, core, J_point[k, m], J_pose[k, m], out[:, 3 * k + m])
+
+
+@njit(cache=True, nogil=True)
+def _combine(x, y, z, core, a, b, out):  # type: ignore[no-untyped-def]
+    a0, a1, a2, b0, b1, b2, b3, b4, b5 = a[0], a[1], a[2], b[0], b[1], b[2], b[3], b[4], b[5]
+    for i in range(len(x)):
+        point = a0 * x[i] + a1 * y[i] + a2 * z[i] + b0 * core[i, 0] + b1 * core[i, 1] + b2 * core[i, 2]
+        out[i] = point + b3 * core[i, 3] + b4 * core[i, 4] + b5 * core[i, 5]
 
 
 class Covariance:
@@ -67,21 +67,21 @@ class Covariance:
         self._P = np.zeros((0, 0), order="F")
         self._reserve(len(initial))
         self.size = len(initial)
-        self._P[: self.size, : self.size] = initial
+        self._state[:] = initial
 
     @property
-    def capacity(self) -> int:
-        """Rows of the buffer; matrices handed to :meth:`subtract_square` have as many."""
-        return len(self._P)
+    def _state(self) -> FloatArray:
+        """The part of the buffer that is in use."""
+        return self._P[: self.size, : self.size]
 
     def dense(self) -> FloatArray:
         """A full symmetric copy (n, n)."""
-        lower = np.tril(self._P[: self.size, : self.size])
+        lower = np.tril(self._state)
         return np.asarray(lower + np.tril(lower, -1).T)
 
     def columns(self, index: IndexArray) -> FloatArray:
-        """Columns ``index`` (k,) as an array (capacity, k), rows beyond the state zero."""
-        out = np.zeros((self.capacity, len(index)), order="F")
+        """Columns ``index`` (k,) as an array (n, k)."""
+        out = np.empty((self.size, len(index)), order="F")
         _gather_columns(self._P, np.asarray(index, dtype=np.int64), self.size, out)
         return out
 
@@ -103,21 +103,19 @@ class Covariance:
         self._P[: self.size, : columns.shape[1]] = columns
 
     def cross_covariance(self, J_pose: FloatArray, J_point: FloatArray, rows: IndexArray) -> FloatArray:
-        """``P H'`` (capacity, 3 m) of m observations of a pose (head of the state) and of the point at ``rows`` (m,)
-        each.
-        """
-        out = np.zeros((self.capacity, 3 * len(rows)), order="F")
+        """``P H'`` (n, 3 m) of m observations of a pose (head of the state) and of the point at ``rows`` (m,) each."""
+        out = np.empty((self.size, 3 * len(rows)), order="F")
         core = np.asfortranarray(self.head(6))
         _cross_covariance(self._P, self.size, core, J_pose, J_point, np.asarray(rows, dtype=np.int64), out)
         return out
 
     def subtract_square(self, W: FloatArray) -> None:
-        """``P <- P - W W'`` (Eq. 6.20) for W (capacity, k), rows beyond the state zero."""
-        blas.subtract_square(self._P, W)
+        """``P <- P - W W'`` (Eq. 6.20) for W (n, k)."""
+        blas.subtract_square(self._state, W)
 
     def add_product(self, A: FloatArray, B: FloatArray) -> None:
-        """``P <- P + A B' + B A'`` for A, B (capacity, k), rows beyond the state zero."""
-        blas.add_product(self._P, np.asfortranarray(A), np.asfortranarray(B))
+        """``P <- P + A B' + B A'`` for A, B (n, k)."""
+        blas.add_product(self._state, np.asfortranarray(A), np.asfortranarray(B))
 
     def append(self, cross: FloatArray, block: FloatArray) -> None:
         """Add rows: their covariance with the state, ``cross`` (k, n), and among themselves, ``block`` (k, k) (Eq.
@@ -135,19 +133,18 @@ class Covariance:
         """
         last = self.size - width
         if first != last:
-            moved = self.columns(np.arange(last, self.size))[:last]
+            moved = self.columns(np.arange(last, self.size))
             own = self.blocks(np.array([last]), width)[0]
             self._P[first : first + width, :first] = moved[:first].T
             self._P[first : first + width, first : first + width] = own
-            self._P[first + width : last, first : first + width] = moved[first + width :]
-        self._P[last : self.size, : self.size] = 0.0
+            self._P[first + width : last, first : first + width] = moved[first + width : last]
         self.size = last
 
     def _reserve(self, rows: int) -> None:
-        if rows <= self.capacity:
+        if rows <= len(self._P):
             return
-        grown = np.zeros((-(-rows // _GROWTH) * _GROWTH,) * 2, order="F")
-        grown[: self.size, : self.size] = self._P[: self.size, : self.size]
+        grown = np.empty((int(_GROWTH * rows),) * 2, order="F")
+        grown[: self.size, : self.size] = self._state
         self._P = grown
 
 
@@ -159,7 +156,7 @@ def whiten(S: FloatArray, cross: FloatArray, innovation: FloatArray) -> tuple[Fl
     S
         Innovation covariance (k, k), lower triangle used.
     cross
-        ``P H'`` (capacity, k), overwritten.
+        ``P H'`` (n, k), overwritten.
     innovation
         (k,).
 

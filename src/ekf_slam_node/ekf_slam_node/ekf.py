@@ -120,14 +120,12 @@ class Ekf:
         The previous pose is no part of the state: its place is taken by the covariance of everything with the step
         (stochastic cloning, Roumeliotis and Burdick 2002, with the clone marginalised at once).
         """
-        cross = np.zeros((self.covariance.capacity, 6), order="F")
-        cross[: len(step.increment)] = step.increment
         S = step.increment_covariance[rows, rows] + covariance
         innovation = error - step.increment_offset[rows]
         nis = float(innovation @ np.linalg.solve(S, innovation))
         if not nis < gate:
             return UpdateReport(nis, len(innovation), False)
-        return self._update(S, np.asfortranarray(cross[:, rows]), innovation)
+        return self._update(S, np.array(step.increment[:, rows], order="F"), innovation)
 
     # --------------------------------------------------------------------------------------------------- measurement
     def innovation_blocks(self, seen: Observation, slots: IndexArray, variance: FloatArray) -> FloatArray:
@@ -164,7 +162,7 @@ class Ekf:
             return UpdateReport(np.nan, len(innovation), False)
         W, y = whitened
         self.covariance.subtract_square(W)
-        self._move(W[: self.covariance.size] @ y)
+        self._move(W @ y)
         return UpdateReport(float(y @ y), len(y), True)
 
     def _move(self, delta: FloatArray) -> None:
@@ -180,10 +178,10 @@ class Ekf:
             self._change_coordinates(new - old)
 
     def _change_coordinates(self, moved: FloatArray) -> None:
-        A = np.zeros((self.covariance.capacity, 3), order="F")
+        A = np.zeros((self.covariance.size, 3), order="F")
         turned = -skew(moved)
         A[:3] = turned[0]
-        A[CORE_DIM : self.covariance.size] = turned[1:].reshape(-1, 3)
+        A[CORE_DIM:] = turned[1:].reshape(-1, 3)
         B = self.covariance.columns(np.array([3, 4, 5]))
         self.covariance.add_product(A, B + 0.5 * A @ B[3:6])
 

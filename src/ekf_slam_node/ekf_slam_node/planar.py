@@ -131,7 +131,7 @@ class PlanarEkf:
             return UpdateReport(np.nan, innovation.size, False)
         W, y = whitened
         self.covariance.subtract_square(W)
-        self._move(W[: self.covariance.size] @ y)
+        self._move(W @ y)
         return UpdateReport(float(y @ y), len(y), True)
 
     def _predicted(self, slots: IndexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -158,9 +158,9 @@ class PlanarEkf:
 
     def _change_coordinates(self, moved: FloatArray) -> None:
         """As in the 3D filter: point errors are counted relative to the rotation error at the new estimate."""
-        A = np.zeros((self.covariance.capacity, 1), order="F")
+        A = np.zeros((self.covariance.size, 1), order="F")
         shift = moved @ _QUARTER_TURN.T
-        A[:2, 0], A[POSE_DIM : self.covariance.size, 0] = shift[0], shift[1:].ravel()
+        A[:2, 0], A[POSE_DIM:, 0] = shift[0], shift[1:].ravel()
         B = self.covariance.columns(np.array([2]))
         self.covariance.add_product(A, B + 0.5 * A @ B[2:3])
 

@@ -3,7 +3,7 @@
 ``scipy.linalg.blas`` holds the global interpreter lock while it computes, which stops every other thread of the process
 for the length of a matrix product. The same routines, of the same library, are called here by their addresses
 (``scipy.linalg.cython_blas`` exports them), and ``ctypes`` gives the lock away. All matrices are float64 in Fortran
-order; only lower triangles are read and written.
+order, or leading rows and columns of such; only lower triangles are read and written.
 """
 
 from __future__ import annotations
@@ -36,28 +36,35 @@ _dpotrf = _routine(cython_lapack, "dpotrf", 5)
 
 
 def _pointer(matrix: FloatArray) -> c_void_p:
-    if matrix.dtype != np.float64 or not matrix.flags.f_contiguous:
-        raise ValueError(f"BLAS needs float64 in Fortran order, got {matrix.dtype} with strides {matrix.strides}")
     return c_void_p(matrix.ctypes.data)
+
+
+def _stride(matrix: FloatArray) -> Any:
+    """From one column to the next, in numbers."""
+    rows, columns = matrix.shape
+    step, stride = (s // matrix.itemsize for s in matrix.strides)
+    if matrix.dtype != np.float64 or (rows > 1 and step != 1) or (columns > 1 and stride < rows):
+        raise ValueError(f"BLAS needs float64 in Fortran order, got {matrix.dtype} with strides {matrix.strides}")
+    return byref(c_int(max(stride, rows, 1)))
 
 
 def subtract_square(C: FloatArray, A: FloatArray) -> None:
     """``C <- C - A A'`` for C (n, n), A (n, k)."""
     n, k = A.shape
-    size, alpha, beta = c_int(n), c_double(-1.0), c_double(1.0)
+    alpha, beta = c_double(-1.0), c_double(1.0)
     _dsyrk(
-        byref(_LOWER), byref(_PLAIN), byref(size), byref(c_int(k)), byref(alpha), _pointer(A), byref(size),
-        byref(beta), _pointer(C), byref(size),
+        byref(_LOWER), byref(_PLAIN), byref(c_int(n)), byref(c_int(k)), byref(alpha), _pointer(A), _stride(A),
+        byref(beta), _pointer(C), _stride(C),
     )  # fmt: skip
 
 
 def add_product(C: FloatArray, A: FloatArray, B: FloatArray) -> None:
     """``C <- C + A B' + B A'`` for C (n, n), A and B (n, k)."""
     n, k = A.shape
-    size, one = c_int(n), c_double(1.0)
+    one = c_double(1.0)
     _dsyr2k(
-        byref(_LOWER), byref(_PLAIN), byref(size), byref(c_int(k)), byref(one), _pointer(A), byref(size),
-        _pointer(B), byref(size), byref(one), _pointer(C), byref(size),
+        byref(_LOWER), byref(_PLAIN), byref(c_int(n)), byref(c_int(k)), byref(one), _pointer(A), _stride(A),
+        _pointer(B), _stride(B), byref(one), _pointer(C), _stride(C),
     )  # fmt: skip
 
 
@@ -67,12 +74,12 @@ def solve_right(L: FloatArray, B: FloatArray) -> None:
     one = c_double(1.0)
     _dtrsm(
         byref(_RIGHT), byref(_LOWER), byref(_TRANSPOSED), byref(_PLAIN), byref(c_int(n)), byref(c_int(k)), byref(one),
-        _pointer(L), byref(c_int(k)), _pointer(B), byref(c_int(n)),
+        _pointer(L), _stride(L), _pointer(B), _stride(B),
     )  # fmt: skip
 
 
 def cholesky(S: FloatArray) -> bool:
     """``S <- L`` with S = L L' in the lower triangle; False, with S spoilt, if S is not positive definite."""
-    n, failed = c_int(len(S)), c_int(0)
-    _dpotrf(byref(_LOWER), byref(n), _pointer(S), byref(n), byref(failed))
+    failed = c_int(0)
+    _dpotrf(byref(_LOWER), byref(c_int(len(S))), _pointer(S), _stride(S), byref(failed))
     return failed.value == 0
