@@ -24,8 +24,8 @@ from stereo_frontend.keypoints import Keypoints, Selector
 from stereo_frontend.surf_descriptor import DIMENSION, describe_oriented, describe_upright, region_weights
 from stereo_frontend.surf_detector import (
     MAX_PIXELS,
-    allocate_octaves,
     find_keypoints,
+    fitting_octaves,
     integral_image,
 )
 
@@ -52,9 +52,6 @@ class SurfDetector:
     def __init__(self, config: SurfConfig | None = None) -> None:
         self.config = config or SurfConfig()
         self._weights = region_weights()
-        # Kept from image to image: fresh pages for 20 MB cost as much as the filters.
-        self._shape: tuple[int, ...] = (0, 0)
-        self._octaves: tuple[Float32Array, ...] = ()
         self._found = np.empty((_MOST_KEYPOINTS, 4), np.float32)
 
     def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
@@ -87,10 +84,6 @@ class SurfDetector:
 
     def _find(self, image: ByteArray, threshold: float) -> Float32Array:
         """Rows of u, v, scale, response."""
-        if self._shape != image.shape:
-            self._octaves = allocate_octaves(image.shape[0], image.shape[1], self.config.octaves)
-            self._shape = image.shape
-        if not self._octaves:
-            return self._found[:0].copy()
-        number = find_keypoints(image, self._octaves, np.float32(threshold), self._found)
+        octaves = fitting_octaves(image.shape[0], image.shape[1], self.config.octaves)
+        number = find_keypoints(image, octaves, np.float32(threshold), self._found)
         return self._found[:number].copy()

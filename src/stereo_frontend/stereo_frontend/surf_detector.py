@@ -13,16 +13,14 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from slam_core.types import ByteArray, Float32Array
+from slam_core.types import ByteArray
 
 LAYERS = 4
-_MIDDLE = (1, 2)
-"""Layers of an octave in which a maximum has neighbours on both sides."""
 MAX_PIXELS = 2**31 // 255
 """A larger image would overflow the 32-bit integral image."""
 
-_BLOCK = 64
-"""Pixels of a row that are looked at together for any candidate."""
+_KEPT_ROWS = 4
+"""Rows of determinants that are kept; a maximum needs three."""
 
 IntegralImage = npt.NDArray[np.int32]
 
@@ -33,36 +31,22 @@ def filter_sizes(octave: int) -> list[int]:
     return [step + 3 + step * layer for layer in range(LAYERS)]
 
 
-def allocate_octaves(height: int, width: int, octaves: int) -> tuple[Float32Array, ...]:
-    """Room for :func:`find_keypoints`, one array (2, rows, columns) per octave, sampled every 2^octave pixels.
-
-    Octaves whose filters do not fit the image are left out.
-    """
-    fitting = [o for o in range(octaves) if filter_sizes(o)[2] + 2 ** (o + 1) < min(height, width)]
-    return tuple(np.zeros((len(_MIDDLE), -(-height // 2**o), -(-width // 2**o)), np.float32) for o in fitting)
+def fitting_octaves(height: int, width: int, octaves: int) -> int:
+    """How many of so many octaves have filters that fit an image (height, width) px."""
+    return sum(filter_sizes(o)[2] + 2 ** (o + 1) < min(height, width) for o in range(octaves))
 
 
 @njit(cache=True, nogil=True)
 def find_keypoints(image, octaves, threshold, found):  # type: ignore[no-untyped-def]
     """Write keypoints above ``threshold`` to ``found`` rows u, v, scale, response; return their number.
 
-    ``octaves``, made by :func:`allocate_octaves` for this size of image, is room for determinants. All in one call, so
-    that no step waits for the interpreter.
+    All in one call, so that no step waits for the interpreter.
     """
     integral = integral_image(image)
     count = 0
-    for octave in range(len(octaves)):
-        hessian_octave(integral, octave, octaves[octave])
-        count += find_maxima(integral, octaves[octave], octave, threshold, found[count:])
+    for octave in range(octaves):
+        count += find_maxima(integral, octave, threshold, found[count:])
     return count
-
-
-@njit(cache=True, nogil=True)
-def hessian_octave(integral, octave, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` (2, rows, columns) with determinants of the Hessian at the middle sizes; borders stay zero."""
-    step = 3 * 2 ** (octave + 1)
-    for place, layer in enumerate(_MIDDLE):
-        hessian_layer(integral, step + 3 + step * layer, 2**octave, out[place])
 
 
 @njit(cache=True, nogil=True)
@@ -80,34 +64,30 @@ def integral_image(image: ByteArray) -> IntegralImage:
 
 
 @njit(cache=True, nogil=True)
-def hessian_layer(integral, size, step, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` with ``Dxx Dyy - (0.9 Dxy)^2``, normalised by the filter's area; the border stays as it is."""
-    height, width = integral.shape[0] - 1, integral.shape[1] - 1
+def hessian_row(integral, size, step, row, sums, determinants, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with ``Dxx Dyy - (0.9 Dxy)^2`` of a row, normalised by the filter's area; its ends stay as they are.
+
+    Rows and columns are ``step`` pixels apart. ``sums`` (6, width + 1) and ``determinants`` (width,) are room.
+    """
+    width, y = integral.shape[1] - 1, row * step
     lobe, half = size // 3, size // 2
     middle = lobe // 2
+    n = width - 2 * half
+    band, stack, cross, xx, yy, xy = sums[0], sums[1], sums[2], sums[3][:n], sums[4][:n], sums[5][:n]
+    # Column sums of Dxx's band, of Dyy's weighted stack, of Dxy's upper minus lower boxes.
+    _difference(integral[y + lobe], integral[y - lobe + 1], band)
+    _outer_less_inner(integral[y + half + 1], integral[y - half], integral[y + middle + 1], integral[y - middle], stack)
+    _crossed(integral[y], integral[y - lobe], integral[y + lobe + 1], integral[y + 1], cross)
+    _outer_less_inner(band[2 * half + 1 :], band, band[half + middle + 1 :], band[half - middle :], xx)
+    _difference(stack[half + lobe :], stack[half - lobe + 1 :], yy)
+    _crossed(cross[half + 1 :], cross[half - lobe :], cross[half + lobe + 1 :], cross[half:], xy)
     scale = np.float32(1.0 / (size * size))
-    n = max(width - 2 * half, 0)
-    first, last = -(-half // step), (height - 1 - half) // step
-    band, stack, cross = np.empty(width + 1, np.int32), np.empty(width + 1, np.int32), np.empty(width + 1, np.int32)
-    xx, yy, xy = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
-    line = np.empty(n, np.float32)
-    for row in range(first, last + 1):
-        y = row * step
-        # Column sums of Dxx's band, of Dyy's weighted stack, of Dxy's upper minus lower boxes.
-        _difference(integral[y + lobe], integral[y - lobe + 1], band)
-        _outer_less_inner(
-            integral[y + half + 1], integral[y - half], integral[y + middle + 1], integral[y - middle], stack
-        )
-        _crossed(integral[y], integral[y - lobe], integral[y + lobe + 1], integral[y + 1], cross)
-        _outer_less_inner(band[2 * half + 1 :], band, band[half + middle + 1 :], band[half - middle :], xx)
-        _difference(stack[half + lobe :], stack[half - lobe + 1 :], yy)
-        _crossed(cross[half + 1 :], cross[half - lobe :], cross[half + lobe + 1 :], cross[half:], xy)
-        if step == 1:
-            _determinants(xx, yy, xy, scale, out[row][half : half + n])
-            continue
-        _determinants(xx, yy, xy, scale, line)
-        for column in range(first, (width - 1 - half) // step + 1):
-            out[row, column] = line[column * step - half]
+    if step == 1:
+        _determinants(xx, yy, xy, scale, out[half : half + n])
+        return
+    _determinants(xx, yy, xy, scale, determinants[:n])
+    for column in range(-(-half // step), (width - 1 - half) // step + 1):
+        out[column] = determinants[column * step - half]
 
 
 # Each of these loops has one array to write and few to read: with more of them the compiler gives up proving that they
@@ -140,7 +120,7 @@ def _determinants(xx, yy, xy, scale, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _determinant_at(integral, x, y, size):  # type: ignore[no-untyped-def]
-    """The same as :func:`hessian_layer` at one pixel."""
+    """The same as :func:`hessian_row` at one pixel."""
     lobe, half = size // 3, size // 2
     middle = lobe // 2
     scale = np.float32(1.0 / (size * size))
@@ -167,64 +147,88 @@ def _box(integral, x, y, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def find_maxima(integral, layers, octave, threshold, found):  # type: ignore[no-untyped-def]
+def find_maxima(integral, octave, threshold, found):  # type: ignore[no-untyped-def]
     """Write maxima of 3x3x3 neighbourhoods above ``threshold`` to ``found`` rows u, v, scale, response; return their
     number.
 
-    Position and scale are those of the vertex of the parabola through the neighbourhood (Brown and Lowe 2002).
+    Both middle layers are filtered row by row and searched right behind, while their last rows are in the cache.
     """
-    step = 2**octave
-    increment = 3 * 2 ** (octave + 1)
+    height, width = integral.shape[0] - 1, integral.shape[1] - 1
+    step, increment = 2**octave, 3 * 2 ** (octave + 1)
+    rows, columns = -(-height // step), -(-width // step)
+    sums, determinants = np.empty((6, width + 1), np.int32), np.empty(width, np.float32)
+    layers = np.zeros((2, _KEPT_ROWS, columns), np.float32)
+    marks, cube = np.zeros(-(-columns // 8) * 8, np.uint8), np.empty((3, 3, 3), np.float32)
     count = 0
-    offset, cube = np.empty(3), np.empty((3, 3, 3), np.float32)
-    for place in range(2):
-        size = increment + 3 + increment * (place + 1)
-        border = (size + increment) // 2 // step + 2
-        own, other = layers[place], layers[1 - place]
-        outer = size - increment if place == 0 else size + increment
-        for y in range(border, layers.shape[1] - border):
-            row, end = own[y], layers.shape[2] - border
-            for begin in range(border, end, _BLOCK):
-                block = row[begin : min(begin + _BLOCK, end)]
-                if not _any_above(block, threshold):
-                    continue
-                for x in range(begin, begin + len(block)):
-                    value = row[x]
-                    if value <= threshold or not _is_highest(own, y, x, value, True):
-                        continue
-                    if not _is_highest(other, y, x, value, False) or count == found.shape[0]:
-                        continue
-                    if not _fill_outer(integral, x * step, y * step, step, outer, value, cube[2 * place]):
-                        continue
-                    cube[1], cube[2 - 2 * place] = (
-                        own[y - 1 : y + 2, x - 1 : x + 2],
-                        other[y - 1 : y + 2, x - 1 : x + 2],
-                    )
-                    if _vertex(cube, offset):
-                        found[count, 0] = (x + offset[0]) * step
-                        found[count, 1] = (y + offset[1]) * step
-                        found[count, 2] = 1.2 / 9.0 * (size + offset[2] * increment)
-                        found[count, 3] = value
-                        count += 1
+    for row in range(rows):
+        for place in range(2):
+            size = increment + 3 + increment * (place + 1)
+            if size // 2 <= row * step < height - size // 2:
+                hessian_row(integral, size, step, row, sums, determinants, layers[place, row % _KEPT_ROWS])
+        for place in range(2):
+            size = increment + 3 + increment * (place + 1)
+            border = (size + increment) // 2 // step + 2
+            if border <= row - 1 < rows - border:
+                count += _find_in_row(
+                    integral, layers, place, row - 1, border, step, increment, threshold, marks, cube, found[count:]
+                )
     return count
 
 
 @njit(cache=True, nogil=True)
-def _any_above(values, threshold):  # type: ignore[no-untyped-def]
-    """Whether any value is above; counting them all is one vector operation per eight."""
-    count = np.int32(0)
-    for i in range(len(values)):
-        count += np.int32(values[i] > threshold)
-    return count > 0
+def _find_in_row(integral, layers, place, y, border, step, increment, threshold, marks, cube, found):  # type: ignore[no-untyped-def]
+    """Maxima of one row of one layer; their position and scale are those of the vertex of the parabola through the
+    neighbourhood (Brown and Lowe 2002).
+    """
+    size = increment + 3 + increment * (place + 1)
+    outer = size - increment if place == 0 else size + increment
+    rows = ((y - 1) % _KEPT_ROWS, y % _KEPT_ROWS, (y + 1) % _KEPT_ROWS)
+    own, other = layers[place], layers[1 - place]
+    above, here, below = own[rows[0]], own[rows[1]], own[rows[2]]
+    other_above, other_here, other_below = other[rows[0]], other[rows[1]], other[rows[2]]
+    offset = np.empty(3)
+    count, end = 0, layers.shape[2] - border
+    _mark_peaks(above, here, below, threshold, marks)
+    eights = marks.view(np.uint64)
+    for eight in range(border // 8, (end + 7) // 8):
+        if eights[eight] == 0:
+            continue
+        for x in range(max(8 * eight, border), min(8 * eight + 8, end)):
+            if not marks[x] or count == len(found):
+                continue
+            value = here[x]
+            if not (_is_higher(above, x, value) and _is_higher(below, x, value)):
+                continue
+            if not (_is_higher(other_above, x, value) and _is_higher(other_here, x, value)):
+                continue
+            if not _is_higher(other_below, x, value):
+                continue
+            if not _fill_outer(integral, x * step, y * step, step, outer, value, cube[2 * place]):
+                continue
+            for j in range(3):
+                for i in range(3):
+                    cube[1, j, i], cube[2 - 2 * place, j, i] = own[rows[j], x - 1 + i], other[rows[j], x - 1 + i]
+            if _vertex(cube, offset):
+                found[count, 0] = (x + offset[0]) * step
+                found[count, 1] = (y + offset[1]) * step
+                found[count, 2] = 1.2 / 9.0 * (size + offset[2] * increment)
+                found[count, 3] = value
+                count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)
-def _is_highest(layer, y, x, value, skip_centre):  # type: ignore[no-untyped-def]
-    for j in range(y - 1, y + 2):
-        for i in range(x - 1, x + 2):
-            if layer[j, i] >= value and not (skip_centre and j == y and i == x):
-                return False
-    return True
+def _mark_peaks(above, here, below, threshold, marks):  # type: ignore[no-untyped-def]
+    """Mark values of a row that are above ``threshold`` and their four neighbours."""
+    for x in range(1, len(here) - 1):
+        around = max(max(above[x], below[x]), max(here[x - 1], here[x + 1]))
+        marks[x] = here[x] > max(around, threshold)
+
+
+@njit(cache=True, nogil=True)
+def _is_higher(row, x, value):  # type: ignore[no-untyped-def]
+    """Than the three pixels of another row or layer that are next to it."""
+    return value > row[x - 1] and value > row[x] and value > row[x + 1]
 
 
 @njit(cache=True, nogil=True)
