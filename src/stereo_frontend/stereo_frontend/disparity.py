@@ -96,9 +96,11 @@ def refine_disparity(
     found = _align(left, right, uv_left, u_right, config.radius, config)
     partner = uv_left - np.column_stack([found.disparity, -found.row_shift])
     back = _align(right, left, partner, uv_left[:, 0], config.radius, config)
-    inner = _align(left, right, uv_left, partner[:, 0], config.inner_radius, config)
-    there_and_back, inner_outer = found.disparity + back.disparity, found.disparity - inner.disparity
+    there_and_back = found.disparity + back.disparity
     agrees = np.abs(there_and_back) <= config.max_disagreement * found.sigma
+    u_inner = np.where(agrees, partner[:, 0], np.float32(np.nan))
+    inner = _align(left, right, uv_left, u_inner, config.inner_radius, config)
+    inner_outer = found.disparity - inner.disparity
     agrees &= np.abs(inner_outer) <= config.max_disagreement * inner.sigma
     disagreement = _DISAGREEMENT_WEIGHT * np.hypot(there_and_back, inner_outer)
     disparity = np.where(agrees, found.disparity, np.float32(np.nan))

@@ -13,6 +13,8 @@ _CONVERGED = 0.01
 _LEAST_ENERGY = 1.0
 _ROUNDING_VARIANCE = 0.1
 """Variance of grey values rounded to integers, both images."""
+_ONE = np.uintp(1)
+"""Unsigned indices cannot be negative, so that the kernels need not look whether they count from the end."""
 
 
 @njit(cache=True, nogil=True)
@@ -26,7 +28,7 @@ def align_patches(left, right, uv_left, u_right, radius, max_shift, information,
     """
     n = (2 * radius + 1) ** 2
     template, patch = np.empty(n, np.float32), np.empty(n, np.float32)
-    jacobian = np.empty((UNKNOWNS, n), np.float32)
+    jacobian, line = np.empty((UNKNOWNS, n), np.float32), np.empty(right.shape[1], np.float32)
     normal, hessian = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
     step, p = np.empty(UNKNOWNS), np.empty(UNKNOWNS)
     for k in range(len(uv_left)):
@@ -40,7 +42,7 @@ def align_patches(left, right, uv_left, u_right, radius, max_shift, information,
         p[:] = 0.0
         length = 1.0
         for _ in range(_MOST_ITERATIONS):
-            power = _sample_patch(right, u, v, u_right[k], p, radius, patch)
+            power = _sample_patch(right, u, v, u_right[k], p, radius, line, patch)
             if power < _LEAST_ENERGY * n or abs(p[0]) > max_shift:
                 break
             noise, correlation = _right_hand_side(template, patch, jacobian, energy, power, step)
@@ -74,15 +76,16 @@ def _take_template(image, u, v, radius, template, jacobian):  # type: ignore[no-
     u0, v0 = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
     if u0 < radius + 1 or v0 < radius + 1 or u0 > width - radius - 2 or v0 > height - radius - 2:
         return 0.0
-    n = 0
+    n, side, left = 0, 2 * radius + 1, np.uintp(u0 - radius)
     for y in range(v0 - radius, v0 + radius + 1):
-        row, above, below = image[y], image[y - 1], image[y + 1]
-        for x in range(u0 - radius, u0 + radius + 1):
-            gx = np.float32(0.5) * (np.float32(row[x + 1]) - np.float32(row[x - 1]))
+        above, row, below = image[y - 1], image[y], image[y + 1]
+        for i in range(side):
+            x = left + np.uintp(i)
+            gx = np.float32(0.5) * (np.float32(row[x + _ONE]) - np.float32(row[x - _ONE]))
             template[n] = row[x]
             jacobian[0, n] = gx
             jacobian[1, n] = np.float32(0.5) * (np.float32(below[x]) - np.float32(above[x]))
-            jacobian[2, n] = gx * (x - u)
+            jacobian[2, n] = gx * (u0 - radius + i - u)
             jacobian[3, n] = gx * (y - v)
             n += 1
     for i in range(UNKNOWNS):
@@ -92,27 +95,31 @@ def _take_template(image, u, v, radius, template, jacobian):  # type: ignore[no-
 
 
 @njit(cache=True, nogil=True)
-def _sample_patch(image, u, v, u_right, p, radius, patch):  # type: ignore[no-untyped-def]
-    """Right patch under the correction ``p``, bilinear, mean removed; returns its energy, 0 at the border."""
+def _sample_patch(image, u, v, u_right, p, radius, line, patch):  # type: ignore[no-untyped-def]
+    """Right patch under the correction ``p``, bilinear, mean removed; returns its energy, 0 at the border.
+
+    ``line`` is room for a row of the image.
+    """
     height, width = image.shape
     u0, v0 = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+    stretch = 1.0 + p[2]
+    reach = radius * stretch
     n = 0
     for j in range(-radius, radius + 1):
         y = v0 + j + p[1]
         y0 = int(np.floor(y))
-        start = u_right + (u0 - u) + p[0] + p[2] * (u0 - u) + p[3] * (v0 + j - v)
-        reach = radius * (1.0 + p[2])
-        if reach <= 0.0 or start < reach or start + reach >= width - 1 or y0 < 0 or y0 >= height - 1:
+        middle = u_right + (u0 - u) + p[0] + p[2] * (u0 - u) + p[3] * (v0 + j - v)
+        if reach <= 0.0 or middle < reach or middle + reach >= width - 1 or y0 < 0 or y0 >= height - 1:
             return np.float32(0.0)
-        fy = np.float32(y - y0)
-        above, below = image[y0], image[y0 + 1]
+        first, last = np.uintp(middle - reach), np.uintp(middle + reach) + _ONE
+        above, below, share = image[y0], image[y0 + 1], np.float32(y - y0)
+        for x in range(last - first + _ONE):
+            value = np.float32(above[first + x])
+            line[x] = value + share * (np.float32(below[first + x]) - value)
         for i in range(-radius, radius + 1):
-            x = start + i * (1.0 + p[2])
-            x0 = int(x)
-            fx = np.float32(x - x0)
-            upper = np.float32(above[x0]) + fx * (np.float32(above[x0 + 1]) - np.float32(above[x0]))
-            lower = np.float32(below[x0]) + fx * (np.float32(below[x0 + 1]) - np.float32(below[x0]))
-            patch[n] = upper + fy * (lower - upper)
+            along = middle - np.float64(first) + i * stretch
+            at = np.uintp(along)
+            patch[n] = line[at] + np.float32(along - np.float64(at)) * (line[at + _ONE] - line[at])
             n += 1
     _remove_mean(patch)
     return _dot(patch, patch)
