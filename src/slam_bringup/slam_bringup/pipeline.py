@@ -17,6 +17,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import TypeVar
 
+import cv2
 import numpy as np
 
 from slam_bringup.configuration import SystemConfig
@@ -67,6 +68,7 @@ def run_bag(
     ValueError
         If the bag cannot be read or lacks what the mode needs.
     """
+    cv2.setNumThreads(1)  # every stage has a thread; OpenCV's own would only wait beside them, spinning
     times = StageTimes()
     start = time.perf_counter()
     with SensorBag(path, names) as bag:
