@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -53,7 +54,7 @@ def header_only(stamp: int) -> Any:
 @pytest.mark.parametrize(
     ("encoding", "dtype", "channels"),
     [("mono8", "u1", 1), ("bgr8", "u1", 3), ("rgb8", "u1", 3), ("bgra8", "u1", 4), ("16UC1", "u2", 1),
-     ("32FC1", "f4", 1), ("64FC1", "f8", 1)],
+     ("8SC1", "i1", 1), ("32FC1", "f4", 1), ("64FC1", "f8", 1)],
 )  # fmt: skip
 @settings(max_examples=20)
 @given(data=st.data())
@@ -247,15 +248,21 @@ def make_submap(rng: np.random.Generator, n: int, agent: str, follows: bool) -> 
     return Submap(
         agent, 7, STAMP, STAMP + 2, path[-1].T, rng.normal(size=(n, 3)), random_covariance(rng, 6 + 3 * n),
         rng.integers(0, 2**40, n), rng.integers(1, 50, n).astype(np.int32),
-        rng.normal(size=(n, 128)).astype(np.float32), path, follows,
+        unit_rows(rng.normal(size=(n, 128))).astype(np.float32), path, follows,
     )  # fmt: skip
 
 
+def unit_rows(v: np.ndarray) -> np.ndarray:
+    return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
+
+
 @pytest.mark.parametrize(("n", "agent", "follows"), [(0, "", True), (11, "fireman_2", False)])
-def test_submaps_survive_exactly(rng: np.random.Generator, n: int, agent: str, follows: bool) -> None:
+def test_submaps_come_out_as_sent(rng: np.random.Generator, n: int, agent: str, follows: bool) -> None:
     submap = make_submap(rng, n, agent, follows)
     back = m.submap_from_messages(m.SubmapMessages(*map(over_the_wire, m.submap_messages(TYPES, submap))))
     for name in ("end_pose", "landmarks", "covariance", "landmark_ids", "sightings", "descriptors"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(m.as_sent(submap), name), err_msg=name)
+    for name in ("end_pose", "landmark_ids", "sightings"):
         np.testing.assert_array_equal(getattr(back, name), getattr(submap, name), err_msg=name)
     assert [getattr(back, k) for k in ("agent", "index", "start_stamp_ns", "end_stamp_ns", "follows_previous")] == [
         agent, 7, STAMP, STAMP + 2, follows
@@ -268,12 +275,49 @@ def test_submaps_survive_exactly(rng: np.random.Generator, n: int, agent: str, f
 
 def test_a_mixed_up_set_of_submap_messages_is_refused(rng: np.random.Generator) -> None:
     sets = [m.submap_messages(TYPES, make_submap(rng, n, "a", True)) for n in (3, 4)]
-    with pytest.raises(ValueError, match="gaussian must be 64FC1 of shape"):
+    with pytest.raises(ValueError, match="gaussian of 3 landmarks must have 15 rows, got 18"):
         m.submap_from_messages(sets[0]._replace(gaussian=sets[1].gaussian))
     late = sets[0].path
     late.header.stamp.sec += 1
     with pytest.raises(ValueError, match="share stamp and frame"):
         m.submap_from_messages(sets[0]._replace(path=late))
+
+
+def sent_covariance(rng: np.random.Generator, n: int, smallest: float) -> tuple[np.ndarray, np.ndarray]:
+    """A covariance whose correlations have eigenvalues down to ``smallest``, and what is sent of it."""
+    basis = np.linalg.qr(rng.normal(size=(6 + 3 * n, 6 + 3 * n)))[0]
+    correlated = (basis * np.geomspace(1.0, smallest, len(basis))) @ basis.T
+    scale = np.geomspace(1e-4, 1.0, len(basis))
+    covariance = scale[:, None] * (0.5 * (correlated + correlated.T)) * scale
+    return covariance, m.as_sent(replace(make_submap(rng, n, "a", True), covariance=covariance)).covariance
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 40])
+def test_a_sent_covariance_is_positive_definite_and_hardly_changed(rng: np.random.Generator, n: int) -> None:
+    covariance, sent = sent_covariance(rng, n, 1e-6)
+    assert np.abs(sent - covariance).max() > 0.0
+    assert np.linalg.eigvalsh(sent)[0] > 0.0
+    L = np.linalg.cholesky(covariance)
+    whitened = np.linalg.solve(L, np.linalg.solve(L, sent).T)
+    assert np.abs(np.linalg.eigvalsh(whitened) - 1.0).max() < 1e-3
+
+
+def test_a_covariance_that_rounding_would_change_goes_out_in_full(rng: np.random.Generator) -> None:
+    covariance, sent = sent_covariance(rng, 40, 1e-11)
+    np.testing.assert_array_equal(sent, covariance)
+
+
+def test_a_submap_takes_a_quarter_of_its_numbers(rng: np.random.Generator) -> None:
+    submap = make_submap(rng, 150, "a", True)
+    sent = sum(len(typestore().serialize_cdr(x, x.__msgtype__)) for x in m.submap_messages(TYPES, submap))
+    assert sent < 0.29 * (submap.covariance.nbytes + submap.descriptors.nbytes)
+
+
+def test_sent_descriptors_compare_as_before(rng: np.random.Generator) -> None:
+    submap = make_submap(rng, 50, "a", True)
+    sent = m.as_sent(submap).descriptors
+    np.testing.assert_allclose(np.linalg.norm(sent, axis=1), 1.0, atol=1e-6)
+    assert np.abs(sent @ sent.T - submap.descriptors @ submap.descriptors.T).max() < 0.01
 
 
 def test_submap_cloud_holds_the_marginals(rng: np.random.Generator) -> None:

@@ -1,6 +1,7 @@
 """The filters of all agents and the one map that their submaps are joined into.
 
-Joining runs on a thread of its own, submap after submap: no filter waits for the map, which it does not need.
+Joining runs on a thread of its own, submap after submap: no filter waits for the map, which it does not need. Submaps
+are joined as they would come out of their messages, so that the nodes make the same map.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from slam_bringup.configuration import SystemConfig
 from slam_bringup.eyes import FilterInput
 from slam_bringup.stage_times import StageTimes
 from slam_core.geometry import FloatArray
+from slam_core.messages import as_sent
 from slam_core.types import PoseEstimate, Submap
 
 
@@ -96,4 +98,4 @@ class Mapper:
 
     def _add(self, submap: Submap) -> JoinReport:
         with self._times.measure("sjsam"):
-            return self.global_map.add(submap)
+            return self.global_map.add(as_sent(submap))

@@ -42,7 +42,7 @@ from slam_core.messages.poses import (
     transform_from_message,
     transform_message,
 )
-from slam_core.messages.submaps import SUBMAP_TOPICS, SubmapMessages, submap_from_messages, submap_messages
+from slam_core.messages.submaps import SUBMAP_TOPICS, SubmapMessages, as_sent, submap_from_messages, submap_messages
 
 __all__ = [
     "DEPTH_TOPICS",
@@ -53,6 +53,7 @@ __all__ = [
     "FeatureMessages",
     "MessageTypes",
     "SubmapMessages",
+    "as_sent",
     "camera_info_from_message",
     "camera_info_message",
     "cloud_from_message",

@@ -12,7 +12,8 @@ from slam_core.types import AnyArray, ByteArray, Float32Array
 
 ENCODINGS = {
     "mono8": ("u1", 1), "8UC1": ("u1", 1), "8UC3": ("u1", 3), "bgr8": ("u1", 3), "rgb8": ("u1", 3), "bgra8": ("u1", 4),
-    "rgba8": ("u1", 4), "mono16": ("u2", 1), "16UC1": ("u2", 1), "32FC1": ("f4", 1), "64FC1": ("f8", 1),
+    "rgba8": ("u1", 4), "mono16": ("u2", 1), "16UC1": ("u2", 1), "8SC1": ("i1", 1), "32FC1": ("f4", 1),
+    "64FC1": ("f8", 1),
 }  # fmt: skip
 """Encoding to element type and number of channels."""
 
@@ -20,14 +21,14 @@ _TO_GREY = {
     "bgr8": cv2.COLOR_BGR2GRAY, "8UC3": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY, "bgra8": cv2.COLOR_BGRA2GRAY,
     "rgba8": cv2.COLOR_RGBA2GRAY,
 }  # fmt: skip
-_DEFAULT_ENCODING = {"|u1": "mono8", "<u2": "16UC1", "<f4": "32FC1", "<f8": "64FC1"}
+_DEFAULT_ENCODING = {"|u1": "mono8", "|i1": "8SC1", "<u2": "16UC1", "<f4": "32FC1", "<f8": "64FC1"}
 _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
 
 
 def image_message(types: MessageTypes, header: Message, image: AnyArray, encoding: str = "") -> Message:
     """sensor_msgs/Image of an array (height, width) or (height, width, channels).
 
-    ``encoding`` may be left out for mono8, 16UC1, 32FC1 and 64FC1, which follow from the element type.
+    ``encoding`` may be left out for mono8, 8SC1, 16UC1, 32FC1 and 64FC1, which follow from the element type.
     """
     image = np.ascontiguousarray(image)
     encoding = encoding or _DEFAULT_ENCODING.get(image.dtype.str, "")

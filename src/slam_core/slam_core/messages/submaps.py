@@ -2,19 +2,22 @@
 
 ==========================  =================================================================================
 ``submap/landmarks``        PointCloud2 for the eye: x y z, id, sightings, marginal covariances
-``submap/descriptors``      Image 32FC1, one row per landmark
-``submap/gaussian``         Image 64FC1, 6 + 3n rows: the mean (end pose tangent, landmarks), then the covariance
+``submap/descriptors``      Image 8SC1, one row per landmark, in steps of the row's own (its length is one)
+``submap/gaussian``         Image 32FC1, 6 + 3n rows: the mean (end pose tangent, landmarks), then the folded Cholesky
+                            factor of the covariance (:mod:`~slam_core.messages.submap_packing`)
 ``submap/path``             the rig poses inside, for the eye
 ``submap/path_covariance``  Image 64FC1, one row per pose: the upper 3x4 of T_start_rig, then its 6x6 covariance
 ``submap/info``             DiagnosticArray: agent, index, start and end stamp, whether it follows its predecessor
 ==========================  =================================================================================
 
-The 64-bit images carry every number exactly, so that joining online and offline gives the same map. Standard
-messages have no field for what ``submap/info`` says; a DiagnosticArray has a stamp and reads well in any tool.
+Packing rounds. Whoever joins submaps without sending them takes them :func:`as_sent`, so that joining online and
+offline gives the same map. Standard messages have no field for what ``submap/info`` says; a DiagnosticArray has a stamp
+and reads well in any tool.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +27,7 @@ from slam_core.messages.base import Message, MessageTypes, header_message, stamp
 from slam_core.messages.clouds import cloud_from_message, landmark_cloud
 from slam_core.messages.images import image_from_message, image_message
 from slam_core.messages.poses import path_message
+from slam_core.messages.submap_packing import pack_descriptors, pack_gaussian, unpack_descriptors, unpack_gaussian
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
 _POSE_COLUMNS = 12 + 36
@@ -48,21 +52,30 @@ SUBMAP_TOPICS = {
 
 
 def submap_messages(types: MessageTypes, submap: Submap) -> SubmapMessages:
-    """Messages that carry ``submap`` exactly."""
+    """Messages that carry ``submap``, rounded as :func:`as_sent` says."""
     header = header_message(types, submap.end_stamp_ns, submap.frame_id)
-    mean = np.concatenate([boxminus(submap.end_pose, np.eye(4)), submap.landmarks.ravel()])
     return SubmapMessages(
         landmark_cloud(types, header, submap.landmarks, _marginals(submap), submap.landmark_ids, submap.sightings),
-        image_message(types, header, np.asarray(submap.descriptors, dtype="<f4")),
-        image_message(types, header, np.column_stack([mean, submap.covariance]).astype("<f8")),
+        image_message(types, header, pack_descriptors(submap.descriptors)),
+        image_message(types, header, pack_gaussian(_mean(submap), submap.covariance)),
         path_message(types, submap.end_stamp_ns, submap.frame_id, submap.path),
         image_message(types, header, _pose_rows(submap.path)),
         _info_message(types, header, submap),
     )
 
 
+def as_sent(submap: Submap) -> Submap:
+    """The submap as it comes out of its messages."""
+    mean, covariance = unpack_gaussian(pack_gaussian(_mean(submap), submap.covariance))
+    descriptors = unpack_descriptors(pack_descriptors(submap.descriptors))
+    end_pose = _end_pose(submap.path, mean)
+    return replace(
+        submap, end_pose=end_pose, landmarks=mean[6:].reshape(-1, 3), covariance=covariance, descriptors=descriptors
+    )
+
+
 def submap_from_messages(messages: SubmapMessages) -> Submap:
-    """Inverse of :func:`submap_messages`.
+    """The submap of a set of messages: ``as_sent`` of what :func:`submap_messages` was given.
 
     Raises
     ------
@@ -72,22 +85,35 @@ def submap_from_messages(messages: SubmapMessages) -> Submap:
     _check_same_set(messages)
     info = _read_info(messages.info)
     cloud = cloud_from_message(messages.landmarks)
-    gaussian = _matrix(messages.gaussian, "gaussian", 6 + 3 * len(cloud), 7 + 3 * len(cloud))
+    mean, covariance = unpack_gaussian(image_from_message(messages.gaussian))
+    if len(mean) != 6 + 3 * len(cloud):
+        raise ValueError(
+            f"submap/gaussian of {len(cloud)} landmarks must have {6 + 3 * len(cloud)} rows, got {len(mean)}"
+        )
     path = _read_path(messages)
     return Submap(
         agent=info["agent"],
         index=int(info["index"]),
         start_stamp_ns=int(info["start_stamp_ns"]),
         end_stamp_ns=int(info["end_stamp_ns"]),
-        end_pose=path[-1].T if path else boxplus(np.eye(4), gaussian[:6, 0]),
-        landmarks=gaussian[6:, 0].reshape(-1, 3),
-        covariance=gaussian[:, 1:],
+        end_pose=_end_pose(path, mean),
+        landmarks=mean[6:].reshape(-1, 3),
+        covariance=covariance,
         landmark_ids=cloud["id"].astype(np.int64),
         sightings=cloud["sightings"].astype(np.int32),
-        descriptors=image_from_message(messages.descriptors),
+        descriptors=unpack_descriptors(image_from_message(messages.descriptors)),
         path=path,
         follows_previous=info["follows_previous"] == "true",
     )
+
+
+def _mean(submap: Submap) -> FloatArray:
+    return np.concatenate([boxminus(submap.end_pose, np.eye(4)), submap.landmarks.ravel()])
+
+
+def _end_pose(path: tuple[PoseEstimate, ...], mean: FloatArray) -> FloatArray:
+    """The path's last pose, which is sent in 64 bits."""
+    return path[-1].T if path else boxplus(np.eye(4), mean[:6])
 
 
 def _marginals(submap: Submap) -> FloatArray:
