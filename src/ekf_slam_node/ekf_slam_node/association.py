@@ -15,6 +15,7 @@ from ekf_slam_node.candidates import Candidates, innovation_covariance, predict
 from ekf_slam_node.config import AssociationConfig
 from ekf_slam_node.jcbb import JointPrediction, jcbb
 from ekf_slam_node.models import Frame, rig_points
+from ekf_slam_node.pair_kernels import first_of_both
 from slam_core.geometry import FloatArray, transform_points
 
 IndexArray = npt.NDArray[np.int64]
@@ -51,14 +52,7 @@ def pair_up(costs: FloatArray) -> tuple[IndexArray, IndexArray]:
     """Rows and columns of the pairs taken in the order of their finite costs, each row and column once."""
     rows, columns = np.nonzero(np.isfinite(costs))
     order = np.argsort(costs[rows, columns], kind="stable")
-    row_free, column_free = np.ones(costs.shape[0], dtype=bool), np.ones(costs.shape[1], dtype=bool)
-    chosen = []
-    for k in order:
-        i, j = rows[k], columns[k]
-        if row_free[i] and column_free[j]:
-            row_free[i] = column_free[j] = False
-            chosen.append(k)
-    picked = np.array(chosen, dtype=np.int64)
+    picked = order[first_of_both(rows[order], columns[order], *costs.shape)]
     return rows[picked], columns[picked]
 
 

@@ -1,5 +1,5 @@
 """Compiled kernels for pairs of a point and its measurement under a motion: errors, covariances, gates, normal
-equations.
+equations, and who is paired first.
 
 They are what :func:`ekf_slam_node.models.observe` and :mod:`ekf_slam_node.candidates` say in NumPy, for the loops that
 run many times per frame.
@@ -121,3 +121,15 @@ def normal_equations(error, S, J, chosen, scale):  # type: ignore[no-untyped-def
         for q in range(p):
             information[q, p] = information[p, q]
     return information, gradient
+
+
+@njit(cache=True, nogil=True)
+def first_of_both(rows, columns, row_count, column_count):  # type: ignore[no-untyped-def]
+    """Which pairs (n,) come when their row and their column have not been taken by a pair before."""
+    row_taken, column_taken = np.zeros(row_count, np.bool_), np.zeros(column_count, np.bool_)
+    out = np.zeros(len(rows), np.bool_)
+    for k in range(len(rows)):
+        out[k] = not row_taken[rows[k]] and not column_taken[columns[k]]
+        if out[k]:
+            row_taken[rows[k]] = column_taken[columns[k]] = True
+    return out
