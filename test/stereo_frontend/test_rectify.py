@@ -73,7 +73,10 @@ def test_a_principal_point_of_its_own_in_the_right_P_gives_no_disparity_offset()
 def test_a_rectified_image_passes_untouched(rng):
     info = CameraInfo(Camera(320, 240, 200.0, 200.0, 160.0, 120.0), P=P_LEFT)
     image = rng.integers(0, 256, (240, 320), dtype=np.uint8)
-    assert Rectifier(info)(image) is image
+    image.flags.writeable = False  # as in a message
+    passed = Rectifier(info)(image)
+    np.testing.assert_array_equal(passed, image)
+    assert passed.flags.writeable
 
 
 def test_swapped_infos_are_named_as_such():

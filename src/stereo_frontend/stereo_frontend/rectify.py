@@ -69,7 +69,8 @@ class Rectifier:
         """
         _check_image(image, self.source)
         if self._maps is None:
-            return image
+            # Not the image itself: a message's is read-only, for which every kernel would be compiled once more.
+            return image.copy()
         return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
 

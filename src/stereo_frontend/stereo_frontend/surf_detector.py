@@ -86,8 +86,8 @@ def hessian_row(integral, size, step, row, sums, determinants, out):  # type: ig
         _determinants(xx, yy, xy, scale, out[half : half + n])
         return
     _determinants(xx, yy, xy, scale, determinants[:n])
-    for column in range(-(-half // step), (width - 1 - half) // step + 1):
-        out[column] = determinants[column * step - half]
+    first, last = -(-half // step), (width - 1 - half) // step
+    out[first : last + 1] = determinants[first * step - half : n : step]
 
 
 # Each of these loops has one array to write and few to read: with more of them the compiler gives up proving that they
