@@ -107,13 +107,21 @@ class LocalMap:
     def measure(self, frame: Frame, sight: Sight) -> tuple[UpdateReport, Sight]:
         """Measurement update with the sightings whose innovation is inside the gate; returns those."""
         seen = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
-        z, variance = frame.z[sight.columns], frame.variance[sight.columns]
+        z, claimed = frame.z[sight.columns], frame.variance[sight.columns]
+        variance = claimed * self._unsteadiness(sight)
         S = self.ekf.innovation_blocks(seen, sight.slots, variance)
         innovation = self.ekf.innovation(z, seen)
         distance = squared_distances(innovation, S)
         good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > 0.05))
         report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good])
+        after = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
+        self.book.steadiness.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
         return report, sight.select(good)
+
+    def _unsteadiness(self, sight: Sight) -> FloatArray:
+        """Factors (k, 3) on the variances of u, v and inverse depth: a landmark's own share of the pixel noise."""
+        own = self.book.steadiness.factors(sight.slots)
+        return np.column_stack([own, own, np.ones(len(own))])
 
     def remember(self, frame: Frame, sight: Sight, link: Link, landmarks_before: int) -> None:
         """Keep the features of a frame that measured nothing as the next frame's pending ones, with any names."""
