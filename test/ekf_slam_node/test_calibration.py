@@ -1,4 +1,4 @@
-"""What the calibration leaves unknown: its effect on poses and points, and covariances that own up to it."""
+"""What the calibration leaves unknown: its effect on poses, and covariances that own up to it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from feature_world import T_RIG_OPTICAL, loop, room
 
-from ekf_slam_node.calibration import CalibrationConfig, point_sensitivity, pose_sensitivity
+from ekf_slam_node.calibration import CalibrationConfig, pose_sensitivity
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.slam import EkfSlam
@@ -27,14 +27,12 @@ def distorted(T: FloatArray, error: FloatArray) -> FloatArray:
     return make_transform(moved[:3, :3], (1.0 + error[0]) * moved[:3, 3])
 
 
-def test_sensitivities_are_the_derivatives(rng: np.random.Generator) -> None:
-    T, point = boxplus(np.eye(4), rng.standard_normal(6)), rng.standard_normal(3)
+def test_sensitivity_is_the_derivative(rng: np.random.Generator) -> None:
+    T = boxplus(np.eye(4), rng.standard_normal(6))
     step = 1e-6
     for k, unit in enumerate(np.eye(4)):
         change = boxminus(distorted(T, step * unit), distorted(T, -step * unit)) / (2.0 * step)
         np.testing.assert_allclose(pose_sensitivity(T)[:, k], change, atol=1e-8)
-        ends = [(1.0 + s * unit[0]) * so3_exp(s * unit[1:]) @ point for s in (step, -step)]
-        np.testing.assert_allclose(point_sensitivity(point)[:, k], (ends[0] - ends[1]) / (2.0 * step), atol=1e-8)
 
 
 def badly_calibrated(seed: int, calibration: CalibrationConfig) -> tuple[EkfResult, list[Submap], FloatArray]:
@@ -67,10 +65,7 @@ def test_poses_of_a_badly_calibrated_rig(calibration: CalibrationConfig, honest:
     assert (low < np.mean(values) / 6 < high) == honest
 
 
-def test_a_submap_says_so_too() -> None:
+def test_submaps_do_not_take_a_common_error_for_their_own() -> None:
     exact, doubted = (badly_calibrated(0, c)[1][0] for c in (CalibrationConfig(), DOUBT))
-    np.testing.assert_array_equal(doubted.landmarks, exact.landmarks)
-    added = doubted.covariance - exact.covariance
-    assert np.linalg.matrix_rank(added, tol=1e-9) == 4
-    np.testing.assert_allclose(added[:6, :6], doubted.path[-1].covariance - exact.path[-1].covariance, atol=1e-12)
-    np.testing.assert_array_equal(doubted.path[0].covariance, np.zeros((6, 6)))
+    np.testing.assert_array_equal(doubted.covariance, exact.covariance)
+    np.testing.assert_array_equal(doubted.path[-1].covariance, exact.path[-1].covariance)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ekf_slam_node.aids import ALL, Aid, MotionAids, aid_error
-from ekf_slam_node.calibration import in_doubt, submap_in_doubt
+from ekf_slam_node.calibration import in_doubt
 from ekf_slam_node.candidates import MotionPrior, motion_prior
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import Ekf, TimeUpdate, UpdateReport
@@ -301,7 +301,7 @@ class EkfSlam:
         if self._map is None or self._builder.is_empty:
             return ()
         self._next_submap += 1
-        return (submap_in_doubt(self._builder.close(self._map.ekf, self._map.book), self.config.calibration),)
+        return (self._builder.close(self._map.ekf, self._map.book),)
 
     # -------------------------------------------------------------------------------------------------------- output
     def _pose(self, stamp_ns: int) -> PoseEstimate:
