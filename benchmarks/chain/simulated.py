@@ -39,7 +39,8 @@ DEFAULT = (
 )  # fmt: skip
 HEADINGS = (
     "run", "frames", "path m", "submaps", "closures", "lost", "landmarks", "ATE mm", "end mm", "end deg", "ANEES",
-    "ANEES block", "filter: ATE mm", "ANEES", "ms features", "ms ekf", "merge ms/submap", "max", "x real time",
+    "ANEES block", "filter: ATE mm", "end mm", "ANEES", "ms features", "ms ekf", "merge ms/submap", "max",
+    "x real time",
 )  # fmt: skip
 AGENT_HEADINGS = ("run", "agent", "path m", "submaps", "sent kB/m", "ATE mm", "end mm", "ANEES",
                   "central: ATE mm", "largest difference mm")  # fmt: skip
@@ -85,7 +86,8 @@ def row(result: RunResult, submaps: list[Submap]) -> list[str]:
     times = [np.median(front_end), np.median(ms["ekf"]), np.median(ms["sjsam"]), np.max(ms["sjsam"])]
     return [
         str(summary["frames"]), f"{joined.truth_length_m:.1f}", *map(str, counts), str(lost), str(summary["landmarks"]),
-        *accuracy(joined), f"{by_blocks.anees:.2f}", f"{1e3 * filtered.ate.rmse:.1f}", f"{filtered.anees:.2f}",
+        *accuracy(joined), f"{by_blocks.anees:.2f}", f"{1e3 * filtered.ate.rmse:.1f}",
+        f"{1e3 * filtered.end_error_m:.1f}", f"{filtered.anees:.2f}",
         *(f"{t:.0f}" for t in times), f"{summary['real_time_factor']:.1f}",
     ]  # fmt: skip
 
@@ -95,6 +97,7 @@ def joined_again(submaps: list[Submap], agent: str, config: GlobalMapConfig | No
     joined = GlobalMap(config)
     for submap in sorted(submaps, key=lambda s: (s.agent, s.index)):
         joined.add(submap)
+    joined.settle()
     return Trajectory.from_estimates(joined.trajectory(agent))
 
 

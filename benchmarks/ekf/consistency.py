@@ -6,7 +6,8 @@ Every figure is per degree of freedom and should be one; the interval is where t
 lies in 95 % of the cases. "seam" is the disagreement of consecutive submaps about the landmarks they share: below one,
 the two share information that joining would count twice. NIS: the interval is that of a gated chi-square, widened for
 rigs that move more smoothly than their model says. "end": of the last pose against the first, and what the run says of
-its heading (root mean square of the standard deviations) beside how wrong it is.
+its heading (root mean square of the standard deviations) beside how wrong it is. ms: processor time of the estimator
+in one of the last ten frames.
 """
 
 from __future__ import annotations
@@ -100,6 +101,7 @@ def line(name: str, case: Case, runs: list[Run]) -> str:
         f"{first:6.3f} {bounds}", _mean([s.landmark_nees / 3 for s in submaps]),
         _mean([s.joint_nees for s in submaps]), _mean(seams), f"{nis:.3f} [{low:.3f} {high:.3f}]",
         f"{end:6.3f} {bounds}", f"{_rms_degrees(claimed):.2f}, wrong {_rms_degrees(wrong):.2f}",
+        f"{np.median([run.ms[-10:] for run in runs]):.1f}",
     )  # fmt: skip
     return f"{name:32}" + "".join(f"{cell:>21}" for cell in cells)
 
@@ -124,7 +126,7 @@ def _mean(values: list[float]) -> str:
 def main() -> None:
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else 50
     wanted = sys.argv[2] if len(sys.argv) > 2 else ""
-    headings = ("first pose", "landmarks", "joint", "seam", "NIS", "end pose", "end heading, deg")
+    headings = ("first pose", "landmarks", "joint", "seam", "NIS", "end pose", "end heading, deg", "ms")
     print(f"{runs} runs\n{'':32}" + "".join(f"{heading:>21}" for heading in headings))
     for name, case in CASES.items():
         if wanted in name:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -46,7 +47,8 @@ class SubmapErrors:
 @dataclass(frozen=True, eq=False)
 class Run:
     """One run: errors of its submaps, NEES (k,) of the poses inside the first submap, the sum of all NIS, its degrees
-    of freedom and the number of updates, error (6,) of the last pose of all and its covariance (6, 6).
+    of freedom and the number of updates, error (6,) of the last pose of all and its covariance (6, 6), and the
+    processor time (n,) that the estimator took for each frame, ms.
     """
 
     submaps: list[SubmapErrors]
@@ -56,6 +58,7 @@ class Run:
     updates: int
     end_error: FloatArray
     end_covariance: FloatArray
+    ms: FloatArray
 
 
 def mean_nis(runs: list[Run], gate: float, own_motion: bool) -> tuple[float, float, float]:
@@ -85,10 +88,12 @@ def simulate(
     slam = EkfSlam(config)
     names: dict[int, list[int]] = {}
     submaps: list[Submap] = []
-    nis, dof, updates = 0.0, 0, 0
+    nis, dof, updates, ms = 0.0, 0, 0, np.zeros(len(poses))
     for k, T in enumerate(poses):
         features, index = world.features(T, k * STEP_NS, rng)
+        start = time.process_time()
         result = slam.process(features)
+        ms[k] = 1e3 * (time.process_time() - start)
         submaps += result.submaps
         nis, dof, updates = nis + result.nis, dof + result.nis_dof, updates + (result.nis_dof > 0)
         for landmark, feature in zip(result.landmark_ids, result.feature_index, strict=True):
@@ -96,7 +101,7 @@ def simulate(
     submaps += slam.finish()
     errors = [_errors(submap, world, poses, names) for submap in submaps]
     end = boxminus(invert_transform(poses[0]) @ poses[-1], result.pose.T)
-    return Run(errors, _pose_nees(submaps[0].path, poses), nis, dof, updates, end, result.pose.covariance)
+    return Run(errors, _pose_nees(submaps[0].path, poses), nis, dof, updates, end, result.pose.covariance, ms)
 
 
 def _errors(submap: Submap, world: PointWorld, poses: list[FloatArray], names: dict[int, list[int]]) -> SubmapErrors:
