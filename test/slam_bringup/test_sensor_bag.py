@@ -90,7 +90,7 @@ def test_an_image_without_partner_is_counted(tmp_path: Path) -> None:
         SensorWriter(bag).picture("stereo/left/image_raw", 10**9, LEFT_FRAME, picture(1))
     with SensorBag(tmp_path / "bag") as opened:
         assert sum(isinstance(r, StereoReading) for r in opened.readings()) == 3
-        assert opened.left_out == {"images without a partner of their stamp": 1}
+        assert opened.left_out == {"images without a partner within 4 ms of their stamp": 1}
 
 
 def test_bags_without_cameras_or_calibration_are_refused(tmp_path: Path) -> None:

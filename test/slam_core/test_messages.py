@@ -80,7 +80,7 @@ def test_image_rows_may_be_padded_and_big_endian() -> None:
 
 @pytest.mark.parametrize(
     ("change", "text"),
-    [({"encoding": "yuv422"}, "encoding 'yuv422'"), ({"step": 4}, "step is 4"), ({"height": 9}, "truncated")],
+    [({"encoding": "nv21"}, "encoding 'nv21'"), ({"step": 4}, "step is 4"), ({"height": 9}, "truncated")],
 )
 def test_image_contradictions_are_named(change: dict[str, Any], text: str) -> None:
     message = m.image_message(TYPES, header(), np.zeros((6, 8), np.uint8))
@@ -100,8 +100,25 @@ def test_grey_of_colour_is_opencvs_and_of_sixteen_bits_is_refused(rng: np.random
     for encoding, conversion in (("bgr8", cv2.COLOR_BGR2GRAY), ("rgb8", cv2.COLOR_RGB2GRAY)):
         grey = m.grey_from_message(m.image_message(TYPES, header(), colour, encoding))
         np.testing.assert_array_equal(grey, cv2.cvtColor(colour, conversion))
-    with pytest.raises(ValueError, match="8 bits"):
-        m.grey_from_message(m.image_message(TYPES, header(), np.zeros((3, 3), np.uint16)))
+    deep = m.image_message(TYPES, header(), np.full((3, 3), 0x7FFF, np.uint16), "mono16")
+    assert (m.grey_from_message(deep) == 0x7F).all()
+    with pytest.raises(ValueError, match="8 or 16 bits"):
+        m.grey_from_message(m.image_message(TYPES, header(), np.zeros((3, 3), np.float32)))
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_a_bayer_pattern_becomes_the_grey_of_its_colour(pattern: str) -> None:
+    colour = {"r": 40, "g": 100, "b": 220}
+    mosaic = np.tile(np.array([colour[c] for c in pattern], np.uint8).reshape(2, 2), (6, 8))
+    grey = m.grey_from_message(m.image_message(TYPES, header(), mosaic, f"bayer_{pattern}8"))
+    assert abs(float(grey[4, 4]) - (0.299 * 40 + 0.587 * 100 + 0.114 * 220)) < 1.5
+
+
+def test_yuv_images_hold_their_grey() -> None:
+    image = np.arange(96, dtype=np.uint8).reshape(6, 8, 2)
+    for encoding, channel in (("yuv422", 1), ("uyvy", 1), ("yuyv", 0), ("yuv422_yuy2", 0)):
+        grey = m.grey_from_message(m.image_message(TYPES, header(), image, encoding))
+        np.testing.assert_array_equal(grey, image[..., channel])
 
 
 def test_compressed_images_decode(rng: np.random.Generator) -> None:

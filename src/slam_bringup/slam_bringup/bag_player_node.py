@@ -144,7 +144,8 @@ class BagPlayerNode(Node):
     def _finish(self) -> None:
         for publisher in self._outputs.values():
             publisher.wait_for_all_acked(Duration(seconds=5))
-        if not self._flow.drain():
+        # Told to stop, it hears no progress any more.
+        if not self._stop.is_set() and not self._flow.drain():
             self.get_logger().warning("the nodes have not processed everything")
         self.get_logger().info(f"played {self._sent} messages")
 

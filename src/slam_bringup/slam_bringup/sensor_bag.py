@@ -45,6 +45,7 @@ from slam_core.synchronizer import PAIRING_TOLERANCE_S, ExactSynchronizer
 from slam_core.trajectory import Trajectory
 from slam_core.types import AnyArray, ByteArray, ImuSample
 
+_UNPAIRED = f"images without a partner within {1000 * PAIRING_TOLERANCE_S:g} ms of their stamp"
 _READ = ("left", "right", "depth", "amplitude", "intensity", "imu")
 
 
@@ -285,7 +286,7 @@ class _AgentPairing:
         """Count the images that never found their partner."""
         waiting = [*self._stereo.waiting.values(), *self._depth.waiting.values()]
         if unpaired := self._stereo.unpaired + self._depth.unpaired + sum(waiting):
-            self._left_out["images without a partner of their stamp"] += unpaired
+            self._left_out[_UNPAIRED] += unpaired
 
     def _on_stereo(self, stamp: int, messages: tuple[Message, ...]) -> None:
         left, right = (grey_from_message(m) for m in messages)

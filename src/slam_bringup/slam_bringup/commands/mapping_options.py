@@ -61,11 +61,17 @@ def require_writable(path: Path) -> None:
         raise ValueError(f"cannot write to {path}: {existing} is not a folder that you may write to")
 
 
-def require_frames(result: RunResult) -> None:
-    """Refuse a run in which not one frame was used; the message says what became of the images."""
+def require_map(result: RunResult) -> None:
+    """Refuse a run that has mapped nothing; the message says what became of the images."""
+    if len(result.landmarks.positions) > 0:
+        return
+    losses = "; ".join((*(f"{count} x {reason}" for reason, count in result.dropped.items()), *result.events))
     if result.frames == 0:
-        losses = [f"{count} x {reason}" for reason, count in result.dropped.items()]
-        raise ValueError(f"not one frame of {result.bag} could be mapped: {'; '.join((*losses, *result.events))}")
+        raise ValueError(f"not one frame of {result.bag} could be used: {losses or 'it has none'}")
+    raise ValueError(
+        f"nothing of {result.bag} was mapped in {result.frames} frames: {losses or 'too short'}. Are left and right "
+        "swapped, do the camera infos belong to these cameras?"
+    )
 
 
 def progress_bar() -> Progress:

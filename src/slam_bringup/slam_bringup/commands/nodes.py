@@ -12,7 +12,7 @@ from slam_bringup.commands.mapping_options import (
     mapping_options,
     mode_for,
     progress_bar,
-    require_frames,
+    require_map,
     require_writable,
 )
 from slam_bringup.configuration import choose, load_system_config
@@ -46,7 +46,7 @@ def command(
             on_progress=lambda done: progress.update(task, completed=done), stopped=lambda: interrupt.asked,
         )  # fmt: skip
     result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)
-    require_frames(result)
+    require_map(result)
     Console().print(summary_table(write_results(output, result), output))
     if run.stopped:
         sys.exit(INTERRUPTED)

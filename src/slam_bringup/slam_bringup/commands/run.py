@@ -13,7 +13,7 @@ from slam_bringup.commands.mapping_options import (
     mapping_options,
     mode_for,
     progress_bar,
-    require_frames,
+    require_map,
     require_writable,
 )
 from slam_bringup.configuration import choose, load_system_config
@@ -48,7 +48,7 @@ def command(
             bag, system, mapper=mapper, odometry=odometry, names=names,
             on_reading=lambda: progress.advance(task), stopped=lambda: interrupt.asked,
         )  # fmt: skip
-    require_frames(result)
+    require_map(result)
     if interrupt.asked:
         result = replace(result, events=(STOPPED, *result.events))
     write_result_bag(output / "result.mcap", result)

@@ -13,13 +13,18 @@ from slam_core.types import AnyArray, ByteArray, Float32Array
 ENCODINGS = {
     "mono8": ("u1", 1), "8UC1": ("u1", 1), "8UC3": ("u1", 3), "bgr8": ("u1", 3), "rgb8": ("u1", 3), "bgra8": ("u1", 4),
     "rgba8": ("u1", 4), "mono16": ("u2", 1), "16UC1": ("u2", 1), "8SC1": ("i1", 1), "32FC1": ("f4", 1),
-    "64FC1": ("f8", 1),
+    "64FC1": ("f8", 1), "yuv422": ("u1", 2), "uyvy": ("u1", 2), "yuv422_yuy2": ("u1", 2), "yuyv": ("u1", 2),
+    "bayer_rggb8": ("u1", 1), "bayer_bggr8": ("u1", 1), "bayer_gbrg8": ("u1", 1), "bayer_grbg8": ("u1", 1),
 }  # fmt: skip
 """Encoding to element type and number of channels."""
 
 _TO_GREY = {
     "bgr8": cv2.COLOR_BGR2GRAY, "8UC3": cv2.COLOR_BGR2GRAY, "rgb8": cv2.COLOR_RGB2GRAY, "bgra8": cv2.COLOR_BGRA2GRAY,
-    "rgba8": cv2.COLOR_RGBA2GRAY,
+    "rgba8": cv2.COLOR_RGBA2GRAY, "yuv422": cv2.COLOR_YUV2GRAY_UYVY, "uyvy": cv2.COLOR_YUV2GRAY_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2GRAY_YUY2, "yuyv": cv2.COLOR_YUV2GRAY_YUY2,
+    # OpenCV names a Bayer pattern by its second row, ROS by its first.
+    "bayer_rggb8": cv2.COLOR_BayerBG2GRAY, "bayer_bggr8": cv2.COLOR_BayerRG2GRAY,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2GRAY, "bayer_grbg8": cv2.COLOR_BayerGB2GRAY,
 }  # fmt: skip
 _DEFAULT_ENCODING = {"|u1": "mono8", "|i1": "8SC1", "<u2": "16UC1", "<f4": "32FC1", "<f8": "64FC1"}
 _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
@@ -71,20 +76,20 @@ def image_from_message(message: Message) -> AnyArray:
 
 
 def grey_from_message(message: Message) -> ByteArray:
-    """A grey image, uint8 (height, width), of any image with 8 bits per channel.
+    """A grey image, uint8 (height, width), of a camera image; of 16 bits the upper eight, as cv_bridge does it.
 
     Raises
     ------
     ValueError
-        For an image of another depth: how to scale it to grey is not known here.
+        For floating-point images, whose scale is not known here.
     """
     image = image_from_message(message)
+    encoding = getattr(message, "encoding", "mono8" if image.ndim == 2 else "bgr8")
+    if image.dtype == np.uint16 and image.ndim == 2:
+        return np.asarray(image >> 8, dtype=np.uint8)
     if image.dtype != np.uint8:
-        raise ValueError(f"a grey or colour image with 8 bits is needed, got {image.dtype}")
-    if image.ndim == 2:
-        return image
-    conversion = _TO_GREY[getattr(message, "encoding", "bgr8")]
-    return np.asarray(cv2.cvtColor(image, conversion))
+        raise ValueError(f"a grey or colour image with 8 or 16 bits is needed, got {image.dtype}")
+    return np.asarray(cv2.cvtColor(image, _TO_GREY[encoding])) if encoding in _TO_GREY else image
 
 
 def metres_from_message(message: Message) -> Float32Array:
