@@ -97,6 +97,7 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=SCANS)
     parser.add_argument("--scenario", default=str(ROOM))
     parser.add_argument("--share", type=float, default=0.2, help="share of the points")
+    parser.add_argument("--only", default="", help="methods whose name contains this")
     arguments = parser.parse_args()
     methods: dict[str, Method] = {"ours": ours}
     folder = Path(tempfile.mkdtemp())
@@ -125,7 +126,7 @@ def main() -> None:
         ]
         for name, m in THESIS_MOTIONS.items()
     }
-    for name, method in methods.items():
+    for name, method in ((n, m) for n, m in methods.items() if arguments.only in n):
         successes, times = [], []
         for motion, clouds in pairs.items():
             truth, count = room.motion(THESIS_MOTIONS[motion]), 0

@@ -117,10 +117,13 @@ def sandwich(
 def gradient_scatter(pulls: Iterable[FloatArray], density_ratio: float) -> FloatArray:
     """Covariance (6, 6) of the cost's gradient from the pulls (b, 6) of the blocks of each layer.
 
-    The pulls vanish in sum at the optimum, and their scatter contains noise, discretisation and wrong matches of the
-    source's points alike; points of one block share much of their errors, blocks little. The target's points are as
-    noisy, but each cell's error is shared by all that is matched with it and shows in no scatter. By symmetry it pulls
-    as much, where the target is as dense: ``density_ratio`` is the source's number of points over the target's.
+    The pulls vanish in sum at the optimum, and their scatter contains noise, discretisation and wrong matches alike;
+    points of one block share much of their errors, blocks little. What is shared by more than a block shows in no
+    scatter: the errors of a plane that many blocks were given, and that two views show the same things from other
+    sides, which moves the optimum alike in every pair of scans taken there. These are counted as much as the scatter
+    where the target is as dense: ``density_ratio`` is the source's number of points over the target's. (Over repeated
+    scans of four rooms the noise is half of the sum, and the shared part most of the rest: ``covariance.py`` among the
+    benchmarks.)
     """
     total = np.zeros((6, 6))
     for layer in pulls:
