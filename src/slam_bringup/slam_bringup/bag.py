@@ -255,7 +255,8 @@ def _storage_of(path: Path) -> Path:
         return damaged[0] if len(files) == 1 and damaged else path
     files = sorted(p for p in path.iterdir() if p.suffix in _STORAGE_SUFFIXES)
     if len(files) != 1:
-        raise ValueError(f"{path} is no bag: no metadata.yaml and {len(files)} storage files (.mcap, .db3)")
+        hint = ": ros2 bag reindex makes it one, or name a file" if files else ""
+        raise ValueError(f"{path} is no bag: no metadata.yaml and {len(files)} storage files (.mcap, .db3){hint}")
     return files[0]
 
 
@@ -264,7 +265,8 @@ def _opened(path: Path) -> Reader | Ros1Reader:
         reader = Ros1Reader(path) if path.suffix == ".bag" else Reader(path)
         reader.open()
     except (ReaderError, FileNotFoundError, AssertionError, struct.error, OSError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read as a bag: {error}") from error
+        hint = "; each of its files can be read alone" if path.is_dir() else ""
+        raise ValueError(f"{path} cannot be read as a bag: {error}{hint}") from error
     return reader
 
 

@@ -46,7 +46,10 @@ class RecorderNode(Node):
         self.config = declare_config(self, RecorderConfig)
         if not self.config.bag:
             raise ValueError("parameter 'bag' must name the bag to write")
-        self._writer = BagWriter(Path(self.config.bag), self.config.storage).__enter__()
+        try:
+            self._writer = BagWriter(Path(self.config.bag), self.config.storage).__enter__()
+        except OSError as error:
+            raise ValueError(f"cannot write {self.config.bag}: {error}") from error
         self._known: set[str] = set()
         self._count = 0
         self.create_timer(_DISCOVERY_PERIOD_S, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME))
