@@ -18,8 +18,9 @@
         run_node(NdtNode)  # of slam_core.ros
 
 A callback that raises ``ValueError`` rejects its message: logged, counted, never the end of the node. Header stamps are
-the only time; a stamp that jumps backwards resets the node. Whatever a node has finished is announced on ``/progress``
-(Header: stamp, node name), which is what lets a player wait for it instead of losing messages.
+the only time; a stamp that jumps backwards resets the node, one a little out of order is rejected. Whatever a node has
+finished is announced on ``/progress`` (Header: stamp, node name), which is what lets a player wait for it instead of
+losing messages.
 """
 
 # rclpy is annotated in part only.
@@ -51,6 +52,9 @@ from slam_core.synchronizer import PAIRING_TOLERANCE_S, ExactSynchronizer
 C = TypeVar("C", bound=Config)
 
 WATCHDOG_S = 5.0
+JUMP_S = 1.0
+"""A stamp older by so much is a time that has begun anew; by less, a message out of order."""
+
 _NOT_A_FRAME = ("CameraInfo", "Imu", "Odometry", "PoseWithCovarianceStamped", "PointStamped")
 """Types whose messages accompany frames: having processed one says nothing of the frame of its stamp."""
 
@@ -211,8 +215,12 @@ class SlamNode(Node, Generic[C]):
             self.health.count("ignored_while_paused")
             return
         stamp = stamp_ns(message)
-        if entry.last_stamp_ns is not None and stamp < entry.last_stamp_ns:
-            self.reset(f"time jumped back by {(entry.last_stamp_ns - stamp) / 1e9:.3f} s on {entry.topic}")
+        back_s = 0.0 if entry.last_stamp_ns is None else (entry.last_stamp_ns - stamp) / 1e9
+        if 0.0 < back_s < JUMP_S:
+            self._reject(f"{entry.topic}: message rejected: {back_s:.3f} s older than the one before")
+            return
+        if back_s > 0.0:
+            self.reset(f"time jumped back by {back_s:.3f} s on {entry.topic}")
         entry.last_stamp_ns = stamp
         entry.handler(stamp, message)
 
