@@ -10,6 +10,7 @@ from ekf_slam_node.config import MotionConfig
 from slam_core.geometry import (
     FloatArray,
     both_halves,
+    boxminus,
     compose_covariance,
     interpolate_transform,
     make_transform,
@@ -130,6 +131,16 @@ def aid_error(aid: Aid, T_previous_now: FloatArray, rotation_map_previous: Float
     turn = both_halves(rotation_map_previous)
     rows = turn[aid.rows, aid.rows]
     return (turn @ error)[aid.rows], rows @ aid.covariance @ rows.T
+
+
+def contradicts(aid: Aid, T_previous_now: FloatArray, covariance: FloatArray, gate: float) -> bool:
+    """Whether an aid lies beyond the gate of a motion found otherwise, with its covariance (6, 6).
+
+    Scan registration that has slid along a wall is as wrong as it is sure of itself, and only vision can tell.
+    """
+    error = boxminus(aid.T, T_previous_now)[aid.rows]
+    S = aid.covariance + covariance[aid.rows, aid.rows]
+    return not float(error @ np.linalg.solve(S, error)) < gate
 
 
 def _is_usable(motion: RelativeMotion) -> bool:

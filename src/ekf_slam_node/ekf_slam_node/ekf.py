@@ -106,7 +106,8 @@ class Ekf:
 
     def apply_time_update(self, step: TimeUpdate) -> None:
         """Move the state to a prediction; a measurement update must follow if it was linearised at a guess."""
-        self.T, self.velocity, self._offset = step.T, step.velocity, step.offset
+        self.T, self.velocity = step.T, step.velocity
+        self._offset = np.concatenate([step.offset, np.zeros(self.covariance.size - CORE_DIM)])
         self.covariance.set_head(step.head)
 
     def update_increment(
@@ -115,7 +116,8 @@ class Ekf:
         """Measure the motion of the step just applied: error (k,) of its rows (translation, rotation) in the map's
         axes.
 
-        Not applied if its NIS is beyond the gate.
+        Not applied if its NIS is beyond the gate. The state stays where it is linearised, at the motion found from the
+        landmarks: an update by them must follow, or :meth:`settle`.
 
         The previous pose is no part of the state: its place is taken by the covariance of everything with the step
         (stochastic cloning, Roumeliotis and Burdick 2002, with the clone marginalised at once).
@@ -125,7 +127,11 @@ class Ekf:
         nis = float(innovation @ np.linalg.solve(S, innovation))
         if not nis < gate:
             return UpdateReport(nis, len(innovation), False)
-        return self._update(S, np.array(step.increment[:, rows], order="F"), innovation)
+        return self._update(S, np.array(step.increment[:, rows], order="F"), innovation, stay=True)
+
+    def settle(self) -> None:
+        """Move the state from where it was linearised to its mean."""
+        self._move(np.zeros(self.covariance.size))
 
     # --------------------------------------------------------------------------------------------------- measurement
     def innovation_blocks(self, seen: Observation, slots: IndexArray, variance: FloatArray) -> FloatArray:
@@ -140,9 +146,10 @@ class Ekf:
         S[:, np.arange(3), np.arange(3)] += variance
         return np.asarray(S)
 
-    def innovation(self, z: FloatArray, seen: Observation) -> FloatArray:
+    def innovation(self, z: FloatArray, seen: Observation, slots: IndexArray) -> FloatArray:
         """``z - h(x)`` (m, 3) at the predicted mean, also when the prediction was linearised elsewhere."""
-        return np.asarray(z - seen.z - seen.J_pose @ self._offset[:6])
+        points = self._offset[CORE_DIM:].reshape(-1, 3)[slots]
+        return np.asarray(z - seen.z - seen.J_pose @ self._offset[:6] - np.einsum("mij,mj->mi", seen.J_point, points))
 
     def update(self, z: FloatArray, variance: FloatArray, seen: Observation, slots: IndexArray) -> UpdateReport:
         """Measurements z (m, 3) with variances (m, 3) of the landmarks ``slots`` (m,), predicted as ``seen`` (Eqs.
@@ -154,20 +161,24 @@ class Ekf:
         k = 3 * len(rows)
         S = (seen.J_pose @ cross[:6] + seen.J_point @ points).reshape(k, k)
         S[np.arange(k), np.arange(k)] += variance.ravel()
-        return self._update(np.asfortranarray(0.5 * (S + S.T)), cross, self.innovation(z, seen).ravel())
+        return self._update(np.asfortranarray(0.5 * (S + S.T)), cross, self.innovation(z, seen, slots).ravel())
 
-    def _update(self, S: FloatArray, cross: FloatArray, innovation: FloatArray) -> UpdateReport:
+    def _update(self, S: FloatArray, cross: FloatArray, innovation: FloatArray, stay: bool = False) -> UpdateReport:
         whitened = whiten(S, cross, innovation)
         if whitened is None or not np.isfinite(whitened[1]).all():
             return UpdateReport(np.nan, len(innovation), False)
         W, y = whitened
         self.covariance.subtract_square(W)
-        self._move(W @ y)
+        delta = W @ y
+        if stay:
+            self._offset = self._offset + delta
+        else:
+            self._move(delta)
         return UpdateReport(float(y @ y), len(y), True)
 
     def _move(self, delta: FloatArray) -> None:
-        delta[:CORE_DIM] += self._offset
-        self._offset = np.zeros(CORE_DIM)
+        delta = delta + self._offset
+        self._offset = np.zeros(len(delta))
         self.velocity = self.velocity + delta[6:12]
         old = np.vstack([self.T[:3, 3], self.landmarks])
         shift = np.vstack([delta[:3], delta[CORE_DIM:].reshape(-1, 3)])
@@ -199,6 +210,7 @@ class Ekf:
         for i in range(k):
             block[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += own[i]
         self.covariance.append(J @ head.T, block)
+        self._offset = np.zeros(self.covariance.size)
         self.landmarks = np.vstack([self.landmarks, arm + self.T[:3, 3]])
         return np.arange(len(self.landmarks) - k, len(self.landmarks))
 
@@ -207,6 +219,7 @@ class Ekf:
         self.covariance.remove(CORE_DIM + 3 * slot, 3)
         self.landmarks[slot] = self.landmarks[-1]
         self.landmarks = self.landmarks[:-1]
+        self._offset = np.zeros(self.covariance.size)
 
     # ------------------------------------------------------------------------------------------------------- views
     def pose_covariance(self) -> FloatArray:

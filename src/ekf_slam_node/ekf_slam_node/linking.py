@@ -21,6 +21,9 @@ from ekf_slam_node.models import Frame
 from ekf_slam_node.motion_guess import MotionGuess, guess_motion, refine_motion
 from slam_core.geometry import FloatArray
 
+_CONVINCING = 0.3
+"""Share of the features, or of the candidates where these are fewer, that a right prediction links."""
+
 
 @dataclass(frozen=True, eq=False)
 class Link:
@@ -57,9 +60,12 @@ class Linker:
         # Seeded by the frame's own stamp: the result does not depend on what happened before.
         rng = np.random.default_rng((self._config.seed, frame.stamp_ns))
         similarity = np.asarray(candidates.descriptors @ frame.descriptors.T, dtype=np.float64)
-        return self._by_prediction(candidates, frame, similarity, prior, rng) or self._by_guess(
-            candidates, frame, similarity, rng
-        )
+        predicted = self._by_prediction(candidates, frame, similarity, prior, rng)
+        if predicted is not None and len(predicted.rows) >= _CONVINCING * min(len(candidates), len(frame)):
+            return predicted
+        # A prediction that is wrong and sure of itself finds the few pairs that agree with it: looks alone decide.
+        guessed = self._by_guess(candidates, frame, similarity, rng)
+        return max((link for link in (predicted, guessed) if link is not None), key=_number_of_pairs, default=None)
 
     def _by_prediction(
         self, candidates: Candidates, frame: Frame, similarity: FloatArray, prior: MotionPrior, rng: np.random.Generator
@@ -131,6 +137,10 @@ class Linker:
         inliers = np.flatnonzero(final.inliers)
         inliers = inliers[np.argsort(columns[inliers], kind="stable")]
         return Link(final.T, final.covariance, final.excess, rows[inliers], columns[inliers])
+
+
+def _number_of_pairs(link: Link) -> int:
+    return len(link.rows)
 
 
 def _image_spread(prior: MotionPrior, frame: Frame) -> float:

@@ -110,7 +110,7 @@ class LocalMap:
         z, claimed = frame.z[sight.columns], frame.variance[sight.columns]
         variance = claimed * self._unsteadiness(sight)
         S = self.ekf.innovation_blocks(seen, sight.slots, variance)
-        innovation = self.ekf.innovation(z, seen)
+        innovation = self.ekf.innovation(z, seen, sight.slots)
         distance = squared_distances(innovation, S)
         good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > 0.05))
         report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good])

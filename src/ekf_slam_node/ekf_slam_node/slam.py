@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ekf_slam_node.aids import ALL, Aid, MotionAids, aid_error
+from ekf_slam_node.aids import ALL, Aid, MotionAids, aid_error, contradicts
 from ekf_slam_node.calibration import in_doubt
 from ekf_slam_node.candidates import MotionPrior, motion_prior
 from ekf_slam_node.config import EkfSlamConfig
@@ -161,7 +161,10 @@ class EkfSlam:
         # Linearised at the motion found, not at the predicted one: over a large step the two are far apart.
         step = local.ekf.time_update(dt, self._excused_sigma(local, link, dt) if surprising else self._sigma, link.T)
         local.ekf.apply_time_update(step)
-        self._use_aid(local, step, aid, link.T)
+        if aid is not None and contradicts(aid, link.T, link.covariance, self.config.motion.aid_gate):
+            self.counters.add("aids_rejected")
+        else:
+            self._use_aid(local, step, aid, link.T)
         closing = self._builder.is_complete(local.ekf, self.config.submap, len(sight))
         divided = closing and self.config.submap.start == "independent"
         report, used = local.measure(frame, sight.every_second() if divided else sight)
@@ -213,6 +216,7 @@ class EkfSlam:
         step = local.ekf.time_update(dt, self._sigma, aid.T)
         local.ekf.apply_time_update(step)
         self._use_aid(local, step, aid, aid.T)
+        local.ekf.settle()
         self._builder.add_pose(frame.stamp_ns, local.ekf)
         self._reached(frame)
         local.pending = pending_of(frame, self._T_rig_optical)
