@@ -108,6 +108,8 @@ def test_shortened_scenario_keeps_its_motion() -> None:
         ({"rooms": [{"name": "x", "x": [0, 5], "y": [0, 5], "style": "castle"}]}, "castle"),
         ({"agents": [{"motion": "flying", "path": [[1, 1], [2, 2]]}]}, "flying"),
         ({"agents": [{"motion": "rig", "path": [[1, 1]]}]}, "way points"),
+        ({"agents": [{"motion": "rig", "path": [[1, 1], [2, "two"]]}]}, "a way point is"),
+        ({"agents": [{"motion": "rig", "path": [[1, 1], [9, 2]]}]}, r"leaves all rooms at \(9, 2\)"),
         ({"agents": [{"motion": "rig", "speed": 3, "path": [[1, 1], [2, 2]]}]}, "speed"),
         ({"stereo": {"baselime": 0.1}}, "baseline"),
         ({"objects": [{"kind": "piano", "at": [1, 1]}]}, "piano"),

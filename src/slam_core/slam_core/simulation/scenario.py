@@ -26,7 +26,7 @@ import numpy as np
 import yaml
 
 from slam_core.config import Config, from_mapping, group, parameter
-from slam_core.simulation.building import Doorway, Room, build_doorways, build_shell, room_walls
+from slam_core.simulation.building import WALL_GAP, Doorway, Room, build_doorways, build_shell, room_walls
 from slam_core.simulation.furniture import Spot, chair, furnish_wall, pillar, table
 from slam_core.simulation.imu import ImuSensorConfig
 from slam_core.simulation.stereo_sensor import StereoSensorConfig
@@ -56,7 +56,7 @@ class Agent:
         if bool(self.path) == bool(self.stations) or len(self.path) == 1:
             raise ValueError(f"agent '{self.name}' needs either a path of two or more way points or stations")
         for row in (*self.path, *self.stations):
-            if not 2 <= len(row) <= 5:
+            if not 2 <= len(row) <= 5 or not all(isinstance(value, int | float) for value in row):
                 raise ValueError(f"agent '{self.name}': a way point is x, y[, yaw[, pitch[, z]]], got {list(row)}")
 
 
@@ -108,6 +108,10 @@ class Scenario:
         unknown = set(self.sensors) - set(SENSORS)
         if unknown:
             raise ValueError(f"scenario '{self.name}': unknown sensors {sorted(unknown)}, known: {', '.join(SENSORS)}")
+        for agent in self.agents:
+            for x, y, *_ in (*agent.path, *agent.stations):
+                if not any(room.holds(x, y, WALL_GAP) for room in self.rooms):
+                    raise ValueError(f"agent '{agent.name}' of scenario '{self.name}' leaves all rooms at ({x}, {y}) m")
 
     @classmethod
     def load(cls, name_or_path: str | FilePath) -> Scenario:
@@ -174,7 +178,7 @@ class Scenario:
 
     def _room_at(self, at: tuple[float, float]) -> int:
         for k, room in enumerate(self.rooms):
-            if room.x[0] <= at[0] <= room.x[1] and room.y[0] <= at[1] <= room.y[1]:
+            if room.holds(*at):
                 return k
         raise ValueError(f"scenario '{self.name}': {at} m lies in no room")
 
