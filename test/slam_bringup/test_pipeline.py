@@ -3,10 +3,14 @@
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from slam_bringup.pipeline import _ahead
+from slam_bringup.configuration import choose, load_system_config
+from slam_bringup.pipeline import _ahead, run_bag
+
+DEMO = Path(__file__).resolve().parents[2] / "bags" / "demo"
 
 
 class Source:
@@ -57,3 +61,14 @@ def test_whoever_stops_early_stops_every_stage():
         time.sleep(0.01)
     assert source.closed
     assert threading.active_count() == before
+
+
+def test_a_run_that_is_told_to_stop_keeps_what_it_has():
+    asked = iter(range(1000))
+    config = choose(load_system_config(None), "stereo", "sjsam", "none")
+    result, _ = run_bag(DEMO, config, stopped=lambda: next(asked) >= 20)
+    assert 8 <= result.frames <= 12
+    assert len(result.agents[0].trajectory) == result.frames
+    assert len(result.landmarks.positions) > 50
+    assert len(result.dense_points) > 100
+    assert not result.dropped
