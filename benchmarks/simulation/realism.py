@@ -25,7 +25,8 @@ from slam_bringup.datasets.euroc import EurocDataset
 from slam_bringup.datasets.files import Dataset
 from slam_bringup.datasets.kitti import KittiDataset
 from slam_bringup.datasets.rgbd import RgbdDataset
-from slam_bringup.sensor_bag import DepthReading, SensorBag, StereoReading
+from slam_bringup.readings import DepthReading, StereoReading
+from slam_bringup.sensor_bag import SensorBag
 from slam_core.camera import Camera
 from slam_core.config import from_mapping
 from slam_core.geometry import FloatArray, invert_transform, make_transform, so3_log

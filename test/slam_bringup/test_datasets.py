@@ -13,7 +13,8 @@ from slam_bringup.datasets.euroc import EurocDataset
 from slam_bringup.datasets.files import Dataset
 from slam_bringup.datasets.kitti import KittiDataset
 from slam_bringup.datasets.rgbd import RgbdDataset
-from slam_bringup.sensor_bag import DepthReading, ImuReading, SensorBag, StereoReading
+from slam_bringup.readings import DepthReading, ImuReading, StereoReading
+from slam_bringup.sensor_bag import SensorBag
 from slam_core.geometry import invert_transform, make_transform, so3_exp
 
 EUROC_YAML = """%YAML:1.0

@@ -15,7 +15,8 @@ from slam_bringup.bag import BagReader, BagWriter
 from slam_bringup.bag_types import BagTypes, typestore
 from slam_bringup.cli import slam
 from slam_bringup.interrupt import Interrupt
-from slam_bringup.sensor_bag import SensorBag, StereoReading
+from slam_bringup.readings import StereoReading
+from slam_bringup.sensor_bag import SensorBag
 from slam_bringup.sensor_topics import BagNames, is_rectified, nodes_name, parse_topics, topics_of
 from slam_bringup.sensor_writer import LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_core.camera import Camera, CameraInfo

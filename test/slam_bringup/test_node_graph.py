@@ -6,7 +6,7 @@ import pytest
 
 from slam_bringup.configuration import choose, load_system_config
 from slam_bringup.node_graph import live_nodes, plan_nodes
-from slam_bringup.sensor_bag import AgentSensors
+from slam_bringup.readings import AgentSensors
 from slam_core.frame_tree import FrameTree
 
 CONFIG_FILES = sorted((Path(__file__).resolve().parents[2] / "src" / "slam_bringup" / "config").glob("*.yaml"))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from slam_bringup.bag import BagWriter
-from slam_bringup.sensor_bag import DepthReading, ImuReading, SensorBag, StereoReading
+from slam_bringup.readings import DepthReading, ImuReading, StereoReading
+from slam_bringup.sensor_bag import SensorBag
 from slam_bringup.sensor_writer import (
     IMU_FRAME,
     LEFT_FRAME,

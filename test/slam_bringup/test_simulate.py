@@ -9,7 +9,8 @@ from click.testing import CliRunner
 
 from slam_bringup.bag import BagReader
 from slam_bringup.commands.simulate import BagOptions, command, write_bag
-from slam_bringup.sensor_bag import DepthReading, SensorBag, StereoReading
+from slam_bringup.readings import DepthReading, StereoReading
+from slam_bringup.sensor_bag import SensorBag
 from slam_core.config import from_mapping
 from slam_core.messages import image_from_message
 from slam_core.simulation import Scenario, Simulator

@@ -9,7 +9,8 @@ import numpy as np
 from slam_bringup.configuration import SystemConfig
 from slam_bringup.dense_map import ColouredCloud, DenseMap
 from slam_bringup.eyes import depth_processor
-from slam_bringup.sensor_bag import AgentSensors, DepthReading, Reading, SensorBag, StereoReading
+from slam_bringup.readings import AgentSensors, DepthReading, Reading, StereoReading
+from slam_bringup.sensor_bag import SensorBag
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
 from stereo_frontend.rectify import StereoRectifier

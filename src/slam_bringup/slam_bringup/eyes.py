@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from ndt_registration.odometry import ScanOdometry
 from slam_bringup.configuration import SystemConfig
-from slam_bringup.sensor_bag import AgentSensors, DepthReading, ImuReading, Reading, StereoReading
+from slam_bringup.readings import AgentSensors, DepthReading, ImuReading, Reading, StereoReading
 from slam_bringup.stage_times import StageTimes
 from slam_core.geometry import FloatArray
 from slam_core.motion import motion_of_rig, pose_of_rig

@@ -9,7 +9,7 @@ from typing import Any
 from slam_bringup.configuration import SystemConfig
 from slam_bringup.node_arguments import ros_arguments
 from slam_bringup.processes import NodeCommand
-from slam_bringup.sensor_bag import AgentSensors
+from slam_bringup.readings import AgentSensors
 from slam_bringup.sensor_topics import is_rectified, join, nodes_name
 from slam_core.config import Config, iterate_parameters
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC

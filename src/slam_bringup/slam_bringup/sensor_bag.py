@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping
-from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Self
@@ -27,83 +26,19 @@ from typing import Self
 import numpy as np
 
 from slam_bringup.bag import BagReader
+from slam_bringup.readings import AgentPairing, AgentSensors, DepthReading, ImuReading, Reading, StereoReading
 from slam_bringup.sensor_topics import BagNames, find_agents, is_rectified, join, topics_of
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
-from slam_core.geometry import FloatArray
 from slam_core.messages import (
     camera_info_from_message,
-    grey_from_message,
-    image_from_message,
-    imu_from_message,
     pose_from_message,
     stamp_ns,
     transform_from_message,
 )
-from slam_core.messages.base import Message
-from slam_core.synchronizer import PAIRING_TOLERANCE_S, ExactSynchronizer
 from slam_core.trajectory import Trajectory
-from slam_core.types import AnyArray, ByteArray, ImuSample
 
-_UNPAIRED = f"images without a partner within {1000 * PAIRING_TOLERANCE_S:g} ms of their stamp"
 _READ = ("left", "right", "depth", "amplitude", "intensity", "imu")
-
-
-@dataclass(frozen=True, eq=False)
-class StereoReading:
-    """A pair of grey images uint8 (height, width)."""
-
-    agent: str
-    stamp_ns: int
-    left: ByteArray
-    right: ByteArray
-
-
-@dataclass(frozen=True, eq=False)
-class DepthReading:
-    """Images of a ToF or depth camera as recorded (uint16 mm or float32 m), with amplitude and intensity or None."""
-
-    agent: str
-    stamp_ns: int
-    image: AnyArray
-    amplitude: AnyArray | None
-    intensity: AnyArray | None
-
-
-@dataclass(frozen=True, eq=False)
-class ImuReading:
-    """An IMU sample in the axes of base_link."""
-
-    agent: str
-    sample: ImuSample
-
-
-Reading = StereoReading | DepthReading | ImuReading
-
-
-@dataclass(frozen=True, eq=False)
-class AgentSensors:
-    """What one agent carries. Frames and infos are None where there is no such sensor.
-
-    ``measurement``: "range" along the ray or "depth" along z. ``frames``: the static transforms between its frames.
-    """
-
-    agent: str
-    left: CameraInfo | None
-    right: CameraInfo | None
-    tof: CameraInfo | None
-    measurement: str
-    frames: FrameTree
-    left_frame: str = ""
-    tof_frame: str = ""
-    base_frame: str = "base_link"
-    topics: dict[str, str] = field(default_factory=dict)
-    """Role ("left", "depth", "tof_info", "imu", ...) to the bag's topic; "depth" holds what ``measurement`` says."""
-
-    def transform(self, target: str, source: str) -> FloatArray:
-        """T_target_source between "base", "left" and "tof"; ValueError if the bag does not know it."""
-        names = {"base": self.base_frame, "left": self.left_frame, "tof": self.tof_frame}
-        return self.frames.lookup(names[target], names[source])
 
 
 class SensorBag:
@@ -153,7 +88,7 @@ class SensorBag:
     def _in_order_of_arrival(self) -> Iterator[Reading]:
         """A pair comes when its last image does."""
         self.left_out.clear()
-        pairing = {agent: _AgentPairing(sensors, self.left_out) for agent, sensors in self.sensors.items()}
+        pairing = {agent: AgentPairing(sensors, self.left_out) for agent, sensors in self.sensors.items()}
         route = {t: (agent, role) for agent, s in self.sensors.items() for role, t in s.topics.items()}
         wanted = [topic for topic, (_, role) in route.items() if role in _READ]
         types = {name: info.type_name for name, info in self.reader.topics.items()}
@@ -253,65 +188,6 @@ class SensorBag:
             for transform in message.transforms:
                 tree.add(*transform_from_message(transform))
         return tree
-
-
-class _AgentPairing:
-    """Pairs one agent's messages by stamp; what it drops is counted in ``left_out``."""
-
-    def __init__(self, sensors: AgentSensors, left_out: Counter[str]) -> None:
-        self._sensors = sensors
-        self._left_out = left_out
-        self._ready: list[Reading] = []
-        self._newest_ns: dict[type[Reading], int] = {}
-        has_stereo = {"left", "right"} <= sensors.topics.keys()
-        depth_roles = [role for role in ("depth", "amplitude", "intensity") if role in sensors.topics]
-        stereo_roles = ("left", "right") if has_stereo else ()
-        tolerance_ns = round(PAIRING_TOLERANCE_S * 1e9)
-        self._stereo = ExactSynchronizer[Message](stereo_roles, self._on_stereo, tolerance_ns=tolerance_ns)
-        self._depth = ExactSynchronizer[Message](depth_roles, self._on_depth, tolerance_ns=tolerance_ns)
-        self._depth_roles = depth_roles
-
-    def add(self, role: str, message: Message) -> list[Reading]:
-        """The readings that this message completes."""
-        self._ready = []
-        if role == "imu":
-            self._on_imu(message)
-        elif role in ("left", "right"):
-            self._stereo.add(role, stamp_ns(message), message)
-        else:
-            self._depth.add(role, stamp_ns(message), message)
-        return self._ready
-
-    def finish(self) -> None:
-        """Count the images that never found their partner."""
-        waiting = [*self._stereo.waiting.values(), *self._depth.waiting.values()]
-        if unpaired := self._stereo.unpaired + self._depth.unpaired + sum(waiting):
-            self._left_out[_UNPAIRED] += unpaired
-
-    def _on_stereo(self, stamp: int, messages: tuple[Message, ...]) -> None:
-        left, right = (grey_from_message(m) for m in messages)
-        self._hand_on(stamp, StereoReading(self._sensors.agent, stamp, left, right))
-
-    def _on_depth(self, stamp: int, messages: tuple[Message, ...]) -> None:
-        images = dict(zip(self._depth_roles, (image_from_message(m) for m in messages), strict=True))
-        reading = DepthReading(
-            self._sensors.agent, stamp, images["depth"], images.get("amplitude"), images.get("intensity")
-        )
-        self._hand_on(stamp, reading)
-
-    def _on_imu(self, message: Message) -> None:
-        sample = imu_from_message(message)
-        R = self._sensors.frames.lookup(self._sensors.base_frame, message.header.frame_id)[:3, :3]
-        rotated = ImuSample(sample.stamp_ns, R @ sample.angular_velocity, R @ sample.linear_acceleration)
-        self._hand_on(sample.stamp_ns, ImuReading(self._sensors.agent, rotated))
-
-    def _hand_on(self, stamp: int, reading: Reading) -> None:
-        """Only what is newer than all before: a message may have come twice, or time jumped back."""
-        if stamp <= self._newest_ns.get(type(reading), -1):
-            self._left_out["not newer than what came before"] += 1
-            return
-        self._newest_ns[type(reading)] = stamp
-        self._ready.append(reading)
 
 
 def _stamp(reading: Reading) -> int:
