@@ -114,6 +114,14 @@ def test_a_bayer_pattern_becomes_the_grey_of_its_colour(pattern: str) -> None:
     assert abs(float(grey[4, 4]) - (0.299 * 40 + 0.587 * 100 + 0.114 * 220)) < 1.5
 
 
+def test_pictures_beside_depth_keep_their_values_and_colours_become_grey(rng: np.random.Generator) -> None:
+    amplitude = rng.random((4, 5)).astype(np.float32)
+    np.testing.assert_array_equal(m.picture_from_message(m.image_message(TYPES, header(), amplitude)), amplitude)
+    colour = rng.integers(0, 256, (4, 5, 3), dtype=np.uint8)
+    grey = m.picture_from_message(m.image_message(TYPES, header(), colour, "rgb8"))
+    np.testing.assert_array_equal(grey, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY))
+
+
 def test_yuv_images_hold_their_grey() -> None:
     image = np.arange(96, dtype=np.uint8).reshape(6, 8, 2)
     for encoding, channel in (("yuv422", 1), ("uyvy", 1), ("yuyv", 0), ("yuv422_yuy2", 0)):

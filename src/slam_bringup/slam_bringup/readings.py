@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
-from slam_core.messages import grey_from_message, image_from_message, imu_from_message, stamp_ns
+from slam_core.messages import grey_from_message, imu_from_message, picture_from_message, stamp_ns
 from slam_core.messages.base import Message
 from slam_core.synchronizer import PAIRING_TOLERANCE_S, ExactSynchronizer
 from slam_core.types import AnyArray, ByteArray, ImuSample
@@ -111,7 +111,7 @@ class AgentPairing:
         self._hand_on(stamp, StereoReading(self._sensors.agent, stamp, left, right))
 
     def _on_depth(self, stamp: int, messages: tuple[Message, ...]) -> None:
-        images = dict(zip(self._depth_roles, (image_from_message(m) for m in messages), strict=True))
+        images = dict(zip(self._depth_roles, (picture_from_message(m) for m in messages), strict=True))
         reading = DepthReading(
             self._sensors.agent, stamp, images["depth"], images.get("amplitude"), images.get("intensity")
         )

@@ -32,7 +32,7 @@ from slam_core.messages import (
     camera_info_message,
     cloud_message,
     depth_messages,
-    image_from_message,
+    picture_from_message,
     stamp_ns,
 )
 from slam_core.messages.base import Message
@@ -120,7 +120,7 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
 
     def _process_images(self, messages: tuple[Message, ...]) -> None:
         assert self.processor is not None
-        images = dict(zip((self.config.measurement, *self._pictures), map(image_from_message, messages), strict=True))
+        images = dict(zip((self.config.measurement, *self._pictures), map(picture_from_message, messages), strict=True))
         depth = self.processor.process(
             stamp_ns(messages[0]), images[self.config.measurement], images.get("amplitude"), images.get("intensity")
         )

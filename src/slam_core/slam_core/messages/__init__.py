@@ -23,6 +23,7 @@ from slam_core.messages.images import (
     image_from_message,
     image_message,
     metres_from_message,
+    picture_from_message,
 )
 from slam_core.messages.markers import ellipsoid_markers, path_marker
 from slam_core.messages.poses import (
@@ -80,6 +81,7 @@ __all__ = [
     "path_from_message",
     "path_marker",
     "path_message",
+    "picture_from_message",
     "points_from_message",
     "points_message",
     "pose_from_message",

@@ -92,6 +92,12 @@ def grey_from_message(message: Message) -> ByteArray:
     return np.asarray(cv2.cvtColor(image, _TO_GREY[encoding])) if encoding in _TO_GREY else image
 
 
+def picture_from_message(message: Message) -> AnyArray:
+    """An image beside a depth image, (height, width): amplitude or intensity as it is, colours as grey."""
+    image = image_from_message(message)
+    return image if image.ndim == 2 else grey_from_message(message)
+
+
 def metres_from_message(message: Message) -> Float32Array:
     """Metres, float32 (height, width), of a depth or range image: 16UC1 is mm, 32FC1 m; NaN where there is no value."""
     image = image_from_message(message)
