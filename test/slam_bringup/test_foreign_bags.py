@@ -161,7 +161,10 @@ def test_poses_are_those_of_base_link_or_of_the_root_above_the_camera(tmp_path: 
     bare = renamed(bag, tmp_path / "c.mcap", {"/tf_static": "/unheard"})
     with pytest.raises(ValueError, match=f"--base-frame {LEFT_FRAME}"):
         stamps_of(bare)
-    assert stamps_of(bare, BagNames(base_frame=LEFT_FRAME)) == [SECOND]
+    with SensorBag(bare, BagNames(base_frame=LEFT_FRAME)) as opened:
+        assert [r.stamp_ns for r in opened.readings() if isinstance(r, StereoReading)] == [SECOND]
+        assert opened.sensors[""].is_mounted("left")
+        assert not opened.sensors[""].is_mounted("tof")
 
 
 def test_bags_of_ros_1_are_read(tmp_path: Path) -> None:

@@ -40,10 +40,10 @@ class _AgentModel:
         self.model = DenseMap(config.dense_map)
         self._trajectory = trajectory
         self._depth = self._rectifier = None
-        if sensors.tof is not None:
+        if sensors.is_mounted("tof"):
             self._depth = depth_processor(config, sensors)
             self._T_base_optical = sensors.transform("base", "tof")
-        elif sensors.left is not None and sensors.right is not None:
+        elif sensors.left is not None and sensors.right is not None and sensors.is_mounted("left"):
             self._rectifier = StereoRectifier(sensors.left, sensors.right)
             self._T_base_optical = sensors.transform("base", "left")
 

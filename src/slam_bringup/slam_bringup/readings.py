@@ -72,6 +72,14 @@ class AgentSensors:
         names = {"base": self.base_frame, "left": self.left_frame, "tof": self.tof_frame}
         return self.frames.lookup(names[target], names[source])
 
+    def is_mounted(self, camera: str) -> bool:
+        """Whether the bag has "left" or "tof" and knows where it sits on the rig."""
+        try:
+            self.transform("base", camera)
+        except ValueError:
+            return False
+        return (self.tof if camera == "tof" else self.left) is not None
+
 
 class AgentPairing:
     """Pairs one agent's messages by stamp; what it drops is counted in ``left_out``."""
