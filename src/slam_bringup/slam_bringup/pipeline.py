@@ -26,14 +26,14 @@ from slam_bringup.dense_run import dense_model
 from slam_bringup.eyes import AgentEyes, FilterInput, Glimpse
 from slam_bringup.mapper import Mapper
 from slam_bringup.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
-from slam_bringup.sensor_bag import SensorBag
+from slam_bringup.sensor_bag import ImuReading, Reading, SensorBag
 from slam_bringup.sensor_topics import BagNames
 from slam_bringup.stage_times import StageTimes
 from slam_core.trajectory import Trajectory
 
 T = TypeVar("T")
-_AHEAD = 32
-"""Items that a stage may be ahead of the next: a few frames, also where an IMU adds ten readings to each."""
+_AHEAD = 8
+"""Images, or what became of them, that a stage may be ahead of the next."""
 
 
 def run_bag(
@@ -75,7 +75,7 @@ def run_bag(
         eyes = {agent: AgentEyes(config, bag.sensors[agent], odometry != "none", times) for agent in bag.agents}
         mapping = Mapper(config, {agent: e.T_rig_optical for agent, e in eyes.items()}, times)
         try:
-            for item in _ahead(_filter_inputs(bag, eyes, on_reading, stopped)):
+            for item in _ahead(_filter_inputs(bag, eyes, on_reading, stopped), _is_of_an_image):
                 mapping.process(item)
             mapping.finish()
         finally:
@@ -94,7 +94,7 @@ def _filter_inputs(
     bag: SensorBag, eyes: dict[str, AgentEyes], on_reading: Callable[[], None], stopped: Callable[[], bool]
 ) -> Generator[FilterInput, None, None]:
     """Reading, finding features and measuring their depth, each on a thread of its own."""
-    with closing(_ahead(_glimpses(bag, eyes, on_reading, stopped))) as glimpses:
+    with closing(_ahead(_glimpses(bag, eyes, on_reading, stopped), _is_of_an_image)) as glimpses:
         for item in glimpses:
             yield eyes[item.agent].complete(item)
 
@@ -102,7 +102,7 @@ def _filter_inputs(
 def _glimpses(
     bag: SensorBag, eyes: dict[str, AgentEyes], on_reading: Callable[[], None], stopped: Callable[[], bool]
 ) -> Generator[FilterInput | Glimpse, None, None]:
-    with closing(_ahead(bag.readings())) as readings:
+    with closing(_ahead(bag.readings(), _is_of_an_image)) as readings:
         for reading in readings:
             yield from eyes[reading.agent].process(reading)
             on_reading()
@@ -112,33 +112,46 @@ def _glimpses(
         yield from agent_eyes.finish()
 
 
-def _ahead(items: Generator[T, None, None]) -> Generator[T, None, None]:
-    """The same items, made by another thread a few ahead of their use."""
-    made: queue.Queue[tuple[T | None, BaseException | None]] = queue.Queue(_AHEAD)
+def _is_of_an_image(item: Reading | FilterInput | Glimpse) -> bool:
+    return not isinstance(item, ImuReading) and not (isinstance(item, FilterInput) and item.imu is not None)
+
+
+def _ahead(items: Generator[T, None, None], ends_batch: Callable[[T], bool]) -> Generator[T, None, None]:
+    """The same items, made by another thread a few batches ahead of their use.
+
+    Handing over wakes threads: IMU samples, ten to a frame, go together with the image that they come before.
+    """
+    made: queue.Queue[tuple[list[T] | None, BaseException | None]] = queue.Queue(_AHEAD)
     stopped = threading.Event()
 
     def make() -> None:
         error: BaseException | None = None
+        batch: list[T] = []
         with closing(items):
             try:
                 for item in items:
-                    made.put((item, None))
+                    batch.append(item)
+                    if not ends_batch(item):
+                        continue
+                    made.put((batch, None))
+                    batch = []
                     if stopped.is_set():
                         return
             except BaseException as caught:  # handed to the consumer, who raises it
                 error = caught
+        made.put((batch, None))
         made.put((None, error))
 
     thread = threading.Thread(target=make, name="images", daemon=True)
     thread.start()
     try:
         while True:
-            item, error = made.get()
+            ready, error = made.get()
             if error is not None:
                 raise error
-            if item is None:
+            if ready is None:
                 return
-            yield item
+            yield from ready
     finally:
         stopped.set()
         while thread.is_alive():  # it may wait for room; the bag must not be closed under it
