@@ -77,7 +77,7 @@ def row(result: RunResult, submaps: list[Submap]) -> list[str]:
     assert joined is not None
     assert filtered is not None
     block = GlobalMapConfig(joining=JoinerConfig(estimator=EstimatorConfig(rows="block")))
-    by_blocks = agent.evaluation(joined_again(submaps, agent.name, block))
+    by_blocks = agent.evaluation(joined_again(submaps, block)[agent.name])
     assert by_blocks is not None
     counts = [summary[key] for key in ("submaps", "loop_closures")]
     lost = sum("LOST" in event for event in result.events)
@@ -92,22 +92,23 @@ def row(result: RunResult, submaps: list[Submap]) -> list[str]:
     ]  # fmt: skip
 
 
-def joined_again(submaps: list[Submap], agent: str, config: GlobalMapConfig | None = None) -> Trajectory:
-    """An agent's trajectory in a map to which the submaps are given agent after agent."""
+def joined_again(submaps: list[Submap], config: GlobalMapConfig | None = None) -> dict[str, Trajectory]:
+    """Every agent's trajectory in a map to which the submaps are given agent after agent."""
     joined = GlobalMap(config)
     for submap in sorted(submaps, key=lambda s: (s.agent, s.index)):
         joined.add(submap)
     joined.settle()
-    return Trajectory.from_estimates(joined.trajectory(agent))
+    return {agent: Trajectory.from_estimates(poses) for agent, poses in joined.trajectory().items()}
 
 
 def agent_rows(result: RunResult, submaps: list[Submap]) -> Iterator[list[str]]:
+    central = joined_again(submaps)
     for agent in result.agents:
-        own, central = [s for s in submaps if s.agent == agent.name], joined_again(submaps, agent.name)
-        joined, centrally = agent.evaluation(), agent.evaluation(central)
+        own = [s for s in submaps if s.agent == agent.name]
+        joined, centrally = agent.evaluation(), agent.evaluation(central[agent.name])
         assert joined is not None
         assert centrally is not None
-        gap = np.linalg.norm(agent.trajectory.poses[:, :3, 3] - central.poses[:, :3, 3], axis=1).max()
+        gap = np.linalg.norm(agent.trajectory.poses[:, :3, 3] - central[agent.name].poses[:, :3, 3], axis=1).max()
         sent = sum(size_of(submap) for submap in own) / joined.truth_length_m
         yield [
             agent.name, f"{joined.truth_length_m:.1f}", str(len(own)), f"{1e-3 * sent:.0f}",

@@ -33,6 +33,7 @@ def test_a_loop_closes_and_the_landmarks_of_the_second_lap_are_those_of_the_firs
 def test_landmark_count_stays_bounded_over_laps(rng: np.random.Generator) -> None:
     agent = ring_agent(rng, turns=3.0, radius=3.0)
     joined, _ = join(agent.submaps())
+    joined.settle()
     assert len(joined.landmarks().ids) <= 1.05 * len(np.unique(np.concatenate(agent.seen)))
 
 

@@ -26,6 +26,7 @@ from sjsam_node.association import (
     similarity,
 )  # fmt: skip
 from sjsam_node.map_graph import Link, MapGraph, Record
+from sjsam_node.near_pairs import Chain, NearPairs
 from sjsam_node.place_recognition import PlaceIndex, PlaceRecognitionConfig
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import (
@@ -128,10 +129,13 @@ class LinkFinder:
 
     config: ClosureConfig = field(default_factory=ClosureConfig)
     index: PlaceIndex = field(init=False)
+    near: NearPairs = field(init=False)
     pending: list[Link] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.index = PlaceIndex(self.config.places)
+        near = 4 * self.config.near_candidates  # several passes and agents crowd around one place
+        self.near = NearPairs(self.config.proximity, near, self.config.association.position_noise)
 
     def sequential(self, graph: MapGraph, chain: list[int], new: int) -> list[Link]:
         """Links of record ``new`` to the records ``chain`` before it, newest first, by their odometry."""
@@ -154,14 +158,26 @@ class LinkFinder:
         recent = {*range(new, len(graph.records)), *chain[: self.config.window]}
         near = self._near(graph, new, recent)
         looks = self.index.query(graph.records[new].submap.descriptors, recent | set(near))
+        second = at_start(graph.records[new])
+        alike = [old for old in looks if self._is_alike(at_start(graph.records[old]), second)]
+        return self._judged(graph, [(old, new) for old in [*near, *alike]], relative_pose)
+
+    def missed(self, graph: MapGraph, chain: Chain, relative_pose: RelativePose, most: int | None = None) -> Findings:
+        """Links between records that have come near each other since they were compared, if ever they were.
+
+        ``most`` pairs are compared, the nearest; None for all.
+        """
+        return self._judged(graph, self.near.due(graph, chain)[:most], relative_pose)
+
+    def _judged(self, graph: MapGraph, pairs: list[tuple[int, int]], relative_pose: RelativePose) -> Findings:
+        """What geometry and the map say of pairs of records."""
         believed: list[Link] = []
         contradicted: list[Link] = []
-        second = at_start(graph.records[new])
-        for old in [*near, *looks]:
-            first = at_start(graph.records[old])
-            if old not in near and not self._is_alike(first, second):
-                continue
+        for old, new in pairs:
+            first, second = at_start(graph.records[old]), at_start(graph.records[new])
             prior, way = relative_pose(old, new), graph.way_between(old, new)
+            if prior is not None:
+                self.near.note(graph, old, new)
             found, standing = self.judge(first, second, prior, way, old, new)
             if found is None:
                 continue
@@ -197,7 +213,7 @@ class LinkFinder:
         """
         informative = prior is not None and _sigma(prior.covariance) < self.config.informative_sigma
         if informative and prior is not None:
-            found = match(first, second, prior, self.config.association)
+            found = self._around(first, second, prior)
             if len(found.pairs) >= self.config.min_near_inliers and self._overlaps(first, second, found):
                 return found, Standing.CERTAIN
         guess = self._by_looks(first, second, key)
@@ -206,6 +222,20 @@ class LinkFinder:
         if prior is not None and self._tension(guess, prior, way) > chi_square_bound(self.config.probability, 6):
             return guess, Standing.CONTRADICTED
         return guess, Standing.LIKELY
+
+    def _around(self, first: PointSet, second: PointSet, prior: Prior) -> Alignment:
+        """Match around a prior, then around what that found, as long as it finds more.
+
+        A map too sure of itself admits only matches that agree with its error; further ones show where they lead.
+        """
+        assert prior.covariance is not None
+        found = match(first, second, prior, self.config.association)
+        loose = self.config.association.max_variance_factor * prior.covariance
+        while True:
+            more = match(first, second, Prior(found.T, loose), self.config.association)
+            if len(more.pairs) <= len(found.pairs):
+                return found
+            found = more
 
     def _by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
         """Alignment from descriptors alone, refined with all landmarks around it."""

@@ -36,6 +36,9 @@ class GlobalMapConfig(Config):
     unlinked_sigma: float = parameter(
         100.0, "standard deviation given to poses of a stretch that nothing ties to the map yet", unit="m", minimum=1.0
     )
+    compared_at_once: int = parameter(
+        60, "pairs of submaps that a closure has brought near each other, compared before the next submap", minimum=0
+    )
     joining: JoinerConfig = group(JoinerConfig)
     closure: ClosureConfig = group(ClosureConfig)
     trial: TrialConfig = group(TrialConfig)
@@ -191,6 +194,8 @@ class GlobalMap:
             links += found.believed
             contradicted += found.contradicted
         verdict = self.trials.hear(links, contradicted, unsearched[-1]) if links or contradicted else Verdict()
+        if verdict.believed:
+            verdict = verdict.followed_by(self._catch_up(unsearched[-1], self.config.compared_at_once))
         for name, amount in (
             ("closures refused by the joined map", len(links) if not verdict.believed else 0),
             ("matches taken back", verdict.dropped),
@@ -203,6 +208,18 @@ class GlobalMap:
         older = [self.graph.records[link.first].submap for link in verdict.believed]
         return [(submap.agent, submap.index) for submap in older], verdict.dropped
 
+    def _catch_up(self, newest: int, most: int | None) -> Verdict:
+        """Compare what has come near each other, ``most`` pairs at once, until nothing new is believed."""
+        total = Verdict()
+        while True:
+            missed = self.finder.missed(self.graph, self._chain, self.joiner.relative_pose, most)
+            if not missed.believed:
+                return total
+            verdict = self.trials.hear(missed.believed, missed.contradicted, newest)
+            total = total.followed_by(verdict)
+            if not verdict.believed:
+                return total
+
     @overload
     def trajectory(self) -> dict[str, list[PoseEstimate]]: ...
 
@@ -214,19 +231,22 @@ class GlobalMap:
 
         Of every agent by name, or of one.
         """
-        self.settle()
         trajectories = map_view.trajectory(self)
         return trajectories if agent is None else trajectories.get(agent, [])
 
     def landmarks(self) -> map_view.MapLandmarks:
         """Every landmark once, with covariance, descriptor and id."""
-        self.settle()
         return map_view.landmarks(self)
 
     def settle(self) -> None:
-        """Do now what was put off: look for closures, and join what was added incrementally in batch."""
+        """Do now what was put off: look for closures, compare what has come near, and join in batch.
+
+        Reading the map does not: what is believed does not depend on who looks when.
+        """
         if self._unsearched:
             self._close_loops()
+        if self.graph.records:
+            self._catch_up(len(self.graph.records) - 1, None)
         for component in np.unique(self.graph.component_of):
             self.joiner.assembled(int(component))
 
@@ -270,7 +290,14 @@ class GlobalMap:
     def save(self, path: Path | str) -> None:
         """Write the map to a folder (see :mod:`sjsam_node.storage`), and go on from it as a map that is loaded does."""
         self.settle()
-        stored = StoredMap(self.graph, self.finder.pending, self.trials.contested, self.marks, self._closed_at)
+        stored = StoredMap(
+            self.graph,
+            self.finder.pending,
+            self.trials.contested,
+            self.finder.near.compared,
+            self.marks,
+            self._closed_at,
+        )
         storage.write(Path(path), stored)
         self.joiner.forget()
 
@@ -282,7 +309,7 @@ class GlobalMap:
         loaded.graph, loaded.marks, loaded._closed_at = graph, stored.marks, stored.closed_at
         loaded.joiner = Joiner(graph, loaded.config.closure.window, loaded.config.joining)
         loaded.trials = Trials(loaded.joiner, loaded.config.trial, loaded.config.closure, stored.contested)
-        loaded.finder.pending = stored.pending
+        loaded.finder.pending, loaded.finder.near.compared = stored.pending, stored.compared
         for i, record in enumerate(graph.records):
             agent, session, _ = record.key
             loaded._lookup[record.key] = i

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rclpy.clock import Clock, ClockType
 from std_srvs.srv import Trigger
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
@@ -45,6 +46,7 @@ from slam_core.ros import run_node
 from slam_core.types import PoseEstimate, Submap
 
 _ODOMETRY_KEPT = 20000
+_MAP_PERIOD_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,9 @@ class SjsamNodeConfig(GlobalMapConfig):
 
 
 class SjsamNode(SlamNode[SjsamNodeConfig]):
-    """Publishes the map after every submap, and for each agent ``map/path``, ``pose`` and ``map_to_odom``."""
+    """Publishes ``pose`` and ``map_to_odom`` of each agent after each of its submaps, and the map, which costs the more
+    the larger it is, once a second at most. Neither changes the map.
+    """
 
     def __init__(self) -> None:
         super().__init__("sjsam", SjsamNodeConfig)
@@ -68,6 +72,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self.localizers: dict[str, Localizer] = {}
         self.odometry: dict[str, dict[int, FloatArray]] = {agent: {} for agent in self.config.agents}
         self._stamp_ns = 0
+        self._map_is_news = False
         self._advertise_outputs()
         for agent in self.config.agents:
             self._listen_to(agent)
@@ -77,6 +82,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._serve("load_map", self.load_map)
         self._serve("export_ply", self.export_ply)
         self._serve("mark_here", self.mark_here)
+        self.create_timer(_MAP_PERIOD_S, self._publish_news, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if self.config.localize_only:
             self.get_logger().info(self.load_map())
 
@@ -122,7 +128,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         pose = self.global_map.end_pose(submap.agent)
         if pose is not None:
             self._publish_pose(agent, pose, submap)
-        self._publish_map()
+        self._map_is_news = True
 
     def on_odometry(self, agent: str, message: Message) -> None:
         """Remember the odometry: a submap's end is one of its stamps."""
@@ -151,6 +157,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             kept.clear()
         if not self.config.localize_only:
             self.global_map.reset()
+            self._map_is_news = False
 
     def _localizer(self, agent: str) -> Localizer:
         return self.localizers.setdefault(agent, Localizer(self.global_map))
@@ -178,6 +185,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def save_map(self) -> str:
         """Write the map to ``map_path``."""
         self.global_map.save(self.config.map_path)
+        self._publish_map()
         return f"{len(self.global_map.graph.records)} submaps written to {self.config.map_path}"
 
     def load_map(self) -> str:
@@ -204,7 +212,12 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     # -- outputs -------------------------------------------------------------------------------------------------------
 
+    def _publish_news(self) -> None:
+        if self._map_is_news:
+            self._publish_map()
+
     def _publish_map(self) -> None:
+        self._map_is_news = False
         header, landmarks = (
             header_message(self.types, self._stamp_ns, self.config.map_frame),
             self.global_map.landmarks(),

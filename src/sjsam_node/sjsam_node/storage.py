@@ -18,9 +18,10 @@ import numpy as np
 from sjsam_node.map_graph import Link, MapGraph
 from sjsam_node.marks import Mark, Marks
 from slam_core.files import atomic_path
+from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
-FORMAT, VERSION = "indoor-slam-map", 2
+FORMAT, VERSION = "indoor-slam-map", 3
 Arrays = dict[str, AnyArray]
 
 
@@ -28,13 +29,14 @@ Arrays = dict[str, AnyArray]
 class StoredMap:
     """All that a map needs to go on as if it had never been put away.
 
-    pending, contested: links that wait for confirmation and for support; closed_at: number of submaps at the last
-    closure.
+    pending, contested: links that wait for confirmation and for support; compared: pairs of submaps compared where they
+    were near (see :mod:`sjsam_node.near_pairs`); closed_at: number of submaps at the last closure.
     """
 
     graph: MapGraph
     pending: list[Link]
     contested: list[Link]
+    compared: dict[tuple[int, int], FloatArray]
     marks: Marks
     closed_at: int
 
@@ -46,6 +48,8 @@ def write(folder: Path, stored: StoredMap) -> None:
     arrays.update(_link_arrays("links", graph.links))
     arrays.update(_link_arrays("pending", stored.pending))
     arrays.update(_link_arrays("contested", stored.contested))
+    arrays["compared/pairs"] = np.array(list(stored.compared), dtype=np.int64).reshape(-1, 2)
+    arrays["compared/middles"] = np.array(list(stored.compared.values())).reshape(-1, 3)
     for i, record in enumerate(graph.records):
         arrays.update({f"submap_{i}/{name}": value for name, value in _submap_arrays(record.submap).items()})
     buffer = io.BytesIO()
@@ -88,7 +92,9 @@ def read(folder: Path) -> StoredMap:
         graph = _graph(manifest["records"], arrays)
         marks = Marks([Mark(str(name), int(node), np.array(point)) for name, node, *point in manifest["marks"]])
         pending, contested = _links("pending", arrays), _links("contested", arrays)
-        return StoredMap(graph, pending, contested, marks, int(manifest["closed_at"]))
+        pairs, middles = arrays["compared/pairs"].tolist(), arrays["compared/middles"]
+        compared = {(first, second): middle for (first, second), middle in zip(pairs, middles, strict=True)}
+        return StoredMap(graph, pending, contested, compared, marks, int(manifest["closed_at"]))
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(f"{folder}: the map is incomplete: {error}") from error
 

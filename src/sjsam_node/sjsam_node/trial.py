@@ -56,6 +56,12 @@ class Verdict:
     dropped: int = 0
     revoked: tuple[Link, ...] = ()
 
+    def followed_by(self, later: Verdict) -> Verdict:
+        """Both verdicts as one."""
+        return Verdict(
+            self.believed + later.believed, self.dropped + later.dropped, self.revoked + later.revoked
+        )  # fmt: skip
+
 
 @dataclass
 class Trials:
@@ -74,10 +80,24 @@ class Trials:
         """
         links = [link for link in links if not self._contradicts_odometry(link)]
         contradicted = [link for link in contradicted if not self._contradicts_odometry(link)]
-        verdict = self._tried(links, [], newest) if links else None
-        refused = [*contradicted, *([] if verdict else links)]
+        verdict = self._heard(links, newest) if links else None
+        taken = _names(verdict.believed) if verdict else set()
+        refused = [*contradicted, *(k for k in links if _name(k) not in taken)]
         self.contested = [*self.contested, *refused][-self.config.waiting :]
         return verdict or self._overturned(refused, newest) or self._reconsidered(newest)
+
+    def _heard(self, links: list[Link], newest: int) -> Verdict | None:
+        """Believe what the map can live with: all of the links, or else what it can of either half, the better first.
+
+        One false link among true ones must not be the end of them all.
+        """
+        whole = self._tried(links, [], newest)
+        if whole is not None or len(links) == 1:
+            return whole
+        offered = [*self.joiner.graph.links, *links]
+        ranked = sorted(links, key=lambda k: -len(k.pairs))
+        halves = [self._heard(part, newest) for part in (ranked[: len(links) // 2], ranked[len(links) // 2 :])]
+        return self._verdict(links, offered, newest) if any(halves) else None
 
     def _overturned(self, refused: list[Link], newest: int) -> Verdict | None:
         """Believe the best refused link and those waiting that say the same, and none that contradicts them, once
