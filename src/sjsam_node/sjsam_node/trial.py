@@ -23,6 +23,10 @@ from slam_core.geometry import FloatArray, boxminus
 from slam_core.least_squares import chi_square_bound
 
 
+_HALVINGS = 3
+"""How often refused links are divided to find the true ones among them: each time doubles the number of trials."""
+
+
 @dataclass(frozen=True)
 class TrialConfig(Config):
     """What a joined map must look like for a closure to be believed."""
@@ -86,17 +90,19 @@ class Trials:
         self.contested = [*self.contested, *refused][-self.config.waiting :]
         return verdict or self._overturned(refused, newest) or self._reconsidered(newest)
 
-    def _heard(self, links: list[Link], newest: int) -> Verdict | None:
+    def _heard(self, links: list[Link], newest: int, halvings: int = _HALVINGS) -> Verdict | None:
         """Believe what the map can live with: all of the links, or else what it can of either half, the better first.
 
         One false link among true ones must not be the end of them all.
         """
         whole = self._tried(links, [], newest)
-        if whole is not None or len(links) == 1:
+        if whole is not None or len(links) == 1 or halvings == 0:
             return whole
         offered = [*self.joiner.graph.links, *links]
         ranked = sorted(links, key=lambda k: -len(k.pairs))
-        halves = [self._heard(part, newest) for part in (ranked[: len(links) // 2], ranked[len(links) // 2 :])]
+        halves = [
+            self._heard(part, newest, halvings - 1) for part in (ranked[: len(links) // 2], ranked[len(links) // 2 :])
+        ]
         return self._verdict(links, offered, newest) if any(halves) else None
 
     def _overturned(self, refused: list[Link], newest: int) -> Verdict | None:
