@@ -48,7 +48,9 @@ def test_an_indefinite_matrix_has_no_factor():
     assert not blas.cholesky(np.asfortranarray(np.diag([1.0, -1.0])))
 
 
-@pytest.mark.parametrize("wrong", [np.zeros((3, 2)), np.zeros((3, 2), np.float32, order="F"), np.zeros((6, 2), order="F")[::2]])
+@pytest.mark.parametrize(
+    "wrong", [np.zeros((3, 2)), np.zeros((3, 2), np.float32, order="F"), np.zeros((6, 2), order="F")[::2]]
+)
 def test_what_blas_would_misread_is_refused(wrong):
     with pytest.raises(ValueError, match="Fortran order"):
         blas.subtract_square(np.zeros((3, 3), order="F"), wrong)
