@@ -112,12 +112,16 @@ def _dominant_direction(lattice, inside, line):  # type: ignore[no-untyped-def]
     """Direction of the largest sum of wavelets of size 4s, their own directions within 60 degrees."""
     dx, dy = np.empty(_SIDE * STRIDE, np.float32), np.empty(_SIDE * STRIDE, np.float32)
     haar_wavelets(lattice, TURNED_CORNERS, inside, 2, _FIRST, line, dx, dy)
-    index = _directions(dx[_DISC], dy[_DISC])
+    x, y = np.empty(len(_DISC), np.float32), np.empty(len(_DISC), np.float32)
+    for k in range(len(_DISC)):
+        x[k], y[k] = dx[_DISC[k]], dy[_DISC[k]]
+    index = _directions(x, y)
     bins = np.zeros((DIRECTIONS + _WINDOW, 2))
     for k in range(len(_DISC)):
-        bins[index[k], 0] += _DISC_WEIGHTS[k] * np.float64(dx[_DISC[k]])
-        bins[index[k], 1] += _DISC_WEIGHTS[k] * np.float64(dy[_DISC[k]])
-    bins[DIRECTIONS:] = bins[:_WINDOW]
+        bins[index[k], 0] += _DISC_WEIGHTS[k] * np.float64(x[k])
+        bins[index[k], 1] += _DISC_WEIGHTS[k] * np.float64(y[k])
+    for k in range(_WINDOW):
+        bins[DIRECTIONS + k, 0], bins[DIRECTIONS + k, 1] = bins[k, 0], bins[k, 1]
     best, best_x, best_y = -1.0, 1.0, 0.0
     for start in range(DIRECTIONS):
         sum_x, sum_y = 0.0, 0.0

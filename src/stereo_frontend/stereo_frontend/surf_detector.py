@@ -87,7 +87,7 @@ def hessian_row(integral, size, step, row, sums, determinants, out):  # type: ig
         return
     _determinants(xx, yy, xy, scale, determinants[:n])
     first, last = -(-half // step), (width - 1 - half) // step
-    out[first : last + 1] = determinants[first * step - half : n : step]
+    _every(determinants[first * step - half :], step, out[first : last + 1])
 
 
 # Each of these loops has one array to write and few to read: with more of them the compiler gives up proving that they
@@ -116,6 +116,12 @@ def _determinants(xx, yy, xy, scale, out):  # type: ignore[no-untyped-def]
     for x in range(len(out)):
         dxx, dyy, dxy = np.float32(xx[x]) * scale, np.float32(yy[x]) * scale, np.float32(xy[x]) * scale
         out[x] = dxx * dyy - np.float32(0.81) * dxy * dxy
+
+
+@njit(cache=True, nogil=True)
+def _every(values, step, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        out[x] = values[x * step]
 
 
 @njit(cache=True, nogil=True)
