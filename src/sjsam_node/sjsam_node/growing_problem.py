@@ -28,8 +28,6 @@ _SLOW = 0.25
 """A step that promises more than this share of what the last one did asks for a newer factor."""
 _STILL = 1e-4
 """rad that a local map must have turned for a newer factor to be of use."""
-_LEAST_GAIN = 1e-2
-"""Share of the tolerance below which no clique is moved."""
 
 
 class GrowingProblem:
@@ -95,10 +93,10 @@ class GrowingProblem:
         return out
 
     def update(
-        self, state: State, changed: dict[int, LocalMap], config: LevenbergMarquardtConfig
+        self, state: State, changed: dict[int, LocalMap], config: LevenbergMarquardtConfig, least: float = 0.0
     ) -> tuple[LeastSquaresResult, IntArray]:
         """Put local maps under their keys, and optimise from ``state``, which differs from the last one only in what
-        is new, and in what the ``changed`` maps see.
+        is new, and in what the ``changed`` maps see; ``least`` as in :meth:`converge`.
 
         Returns
         -------
@@ -110,7 +108,7 @@ class GrowingProblem:
         if changed and not self._replace(changed):
             result = LeastSquaresResult(np.nan, np.nan, 0, False, "the normal equations are singular")
             return result, np.empty(0, dtype=np.int64)
-        result, moved = self.converge(config)
+        result, moved = self.converge(config, least)
         return result, np.unique(np.concatenate([moved, np.array(list(changed), dtype=np.int64)]))
 
     # -- local maps ----------------------------------------------------------------------------------------------------
@@ -180,15 +178,18 @@ class GrowingProblem:
 
     # -- optimum -------------------------------------------------------------------------------------------------------
 
-    def converge(self, config: LevenbergMarquardtConfig) -> tuple[LeastSquaresResult, IntArray]:
-        """Steps to the optimum; the result and the keys of the local maps that moved."""
+    def converge(self, config: LevenbergMarquardtConfig, least: float = 0.0) -> tuple[LeastSquaresResult, IntArray]:
+        """Steps to the optimum; the result and the keys of the local maps that moved.
+
+        What would gain less chi2 than ``least`` by a move stays where it is; its gradient is not forgotten.
+        """
         initial = cost = self.cost
         moved, decrement = np.zeros(len(self._alive), dtype=np.bool_), np.inf
         iterations, reason = 0, "iteration limit"
         while iterations < config.max_iterations:
             iterations += 1
             enough, before = config.relative_tolerance * max(cost, 1e-9), decrement
-            step, decrement = self._tree.step(self._gradient.data, _LEAST_GAIN * enough)
+            step, decrement = self._tree.step(self._gradient.data, least)
             if decrement <= enough:
                 reason = ""
                 break

@@ -22,6 +22,8 @@ from slam_core.sparse_cholesky import IntArray
 _MOST_WASTED = 0.5
 """Share of the stored that may be out of date before all is built anew, in an order of less fill."""
 
+_LEAST_GAIN = 1e-6
+"""chi2 that moving a clique must gain: a move of a thousandth of its standard deviation waits for more."""
 _SETTLED = 1e-4
 """Share of the tolerance to which :meth:`JoinedComponent.settle` goes."""
 
@@ -87,7 +89,7 @@ class JoinedComponent:
         record = graph.records[newest]
         self._problem.last = record.end, graph.landmark_of[record.observations]
         local = {i: self._local_map(graph, i) for i in changed}
-        result, moved = self._problem.update(state, local, self._config(1.0))
+        result, moved = self._problem.update(state, local, self._config(1.0), _LEAST_GAIN)
         if result.converged:
             self._write(graph, moved)
         return result if result.converged else None

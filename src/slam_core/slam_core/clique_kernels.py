@@ -78,14 +78,14 @@ def add_packed(packed, rows, where, P, U):
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def step(tables, x, least):
-    """``x <- A^-1 x`` where x acts and where that moves something; the decrement."""
+    """``x <- A^-1 x`` where x acts and where that moves something."""
     alive, parent, width, ptr, unknowns, value_ptr, values = tables
     count = len(alive)
     active, touched = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
     largest = 0
     for c in range(count):
         largest = max(largest, width[c])
-    own, decrement = np.empty(largest), 0.0
+    own = np.empty(largest)
     for c in range(count):
         w, first = width[c], ptr[c]
         if not alive[c]:
@@ -103,7 +103,6 @@ def step(tables, x, least):
                 value -= values[at + j] * own[j]
             own[i] = value / values[at + i]
             x[unknowns[first + i]] = own[i]
-            decrement += own[i] * own[i]
             at += w
         for k in range(first + w, ptr[c + 1]):
             value = 0.0
@@ -139,7 +138,6 @@ def step(tables, x, least):
             for j in range(i):
                 own[j] -= values[row + j] * own[i]
             x[unknowns[first + i]] = own[i]
-    return decrement
 
 
 @njit(cache=True, nogil=True)

@@ -126,13 +126,14 @@ class CliqueTree:
             self._place.extend(np.zeros(missing, dtype=np.int64))
 
     def step(self, gradient: FloatArray, least: float) -> tuple[FloatArray, float]:
-        """``-A^-1 gradient``, and its decrement ``gradient^T A^-1 gradient``.
+        """``-A^-1 gradient``, and what it promises, its decrement ``-gradient^T step``.
 
         Only what the gradient acts on and what that moves is touched: a clique stays where it is if to move it would
         gain less than ``least``, in units of the decrement.
         """
         x = -gradient
-        return x, float(kernels.step(self._tables(), x, least))
+        kernels.step(self._tables(), x, least)
+        return x, float(-gradient @ x)
 
     def covariance(self, unknowns: IntArray) -> FloatArray:
         """Block (k, k) of the inverse."""
