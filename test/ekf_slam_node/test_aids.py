@@ -10,7 +10,7 @@ from ekf_slam_node.aids import ALL, ROTATION, MotionAids
 from ekf_slam_node.config import EkfSlamConfig, MotionConfig
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.slam import EkfSlam
-from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, so3_exp, so3_log
+from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, make_transform, so3_exp, so3_log
 from slam_core.types import ImuSample, RelativeMotion
 
 STEP_NS = 100_000_000
@@ -66,6 +66,44 @@ def test_turn_rates_are_integrated() -> None:
     assert aid.rows == ROTATION
     np.testing.assert_allclose(so3_log(aid.T[:3, :3]), 0.1 * rate, atol=1e-9)
     assert aids.between(0, 10**9) is None
+
+
+def test_constant_error_of_turn_rates_is_learnt() -> None:
+    """From the turns that the images show; one that has nothing to do with it is left out."""
+    config, rng, dt = MotionConfig(), np.random.default_rng(3), 0.1
+    aids, bias, seen = MotionAids(config), np.array([0.01, -0.02, 0.005]), np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
+    turn = np.array([0.3, 0.1, -0.6])
+    for k in range(200):
+        for part in range(11):
+            aids.add_imu(ImuSample((10 * k + part) * STEP_NS // 10 + 1, turn + bias, np.zeros(3)))
+        aid = aids.between(k * STEP_NS, (k + 1) * STEP_NS)
+        assert aid is not None
+        sudden = np.array([0.2, 0.0, 0.0]) if k == 150 else np.zeros(3)
+        shown = make_transform(so3_exp(turn * dt + sudden + 5e-4 * rng.standard_normal(3)), np.zeros(3))
+        aids.learn_bias(aid, shown, seen, dt)
+        aids.forget_before(k * STEP_NS)
+    aid = aids.between(199 * STEP_NS, 200 * STEP_NS)
+    assert aid is not None
+    error = so3_log(aid.T[:3, :3]) / dt - turn
+    claimed = np.sqrt(aid.covariance.diagonal() / dt**2 - config.sigma_gyro**2)
+    assert (np.abs(error) < 3.0 * claimed).all()
+    assert (claimed < 0.1 * config.sigma_gyro_bias).all()
+
+
+def test_biased_turn_rates_do_not_turn_the_map() -> None:
+    """Once round a room, with a gyroscope that is off by 2 degrees per second and with an exact one."""
+    ends = []
+    for bias in (np.zeros(3), np.array([0.0, 0.035, 0.0])):
+        rng = np.random.default_rng(5)
+        world, poses, slam = room(rng), loop(80), EkfSlam(EkfSlamConfig())
+        for k, T in enumerate(poses):
+            if k:
+                rate = so3_log(poses[k - 1][:3, :3].T @ T[:3, :3]) / 0.1 + bias
+                for part in range(10):
+                    slam.process_imu(ImuSample((k - 1) * STEP_NS + part * STEP_NS // 10 + 1, rate, np.zeros(3)))
+            result = slam.process(world.features(T, k * STEP_NS, rng, max_features=60)[0])
+        ends.append(result.pose.T)
+    assert np.degrees(np.linalg.norm(boxminus(*ends)[3:])) < 0.3
 
 
 def run(aided: str, steps: int = 30) -> tuple[EkfSlam, list[float]]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ekf_slam_node.config import MotionConfig
+from ekf_slam_node.gyro_bias import GyroBias
 from slam_core.geometry import (
     FloatArray,
     both_halves,
@@ -43,6 +44,7 @@ class MotionAids:
         self._config = config
         self._motions: list[RelativeMotion] = []
         self._samples: list[ImuSample] = []
+        self._bias = GyroBias(config)
 
     def add_motion(self, motion: RelativeMotion) -> bool:
         """Take a motion; False if it is not finite, not positive definite or not forward in time."""
@@ -66,6 +68,17 @@ class MotionAids:
         return self._motion_between(start_stamp_ns, end_stamp_ns) or self._rotation_between(
             start_stamp_ns, end_stamp_ns
         )
+
+    def learn_bias(self, aid: Aid, T_previous_now: FloatArray, covariance: FloatArray, dt: float) -> None:
+        """Compare an aid that came from turn rates with the motion that the images alone have shown, covariance (6, 6)
+        along the axes of the previous frame, dt (s).
+        """
+        if aid.rows != ROTATION:
+            return
+        R = T_previous_now[:3, :3]
+        error = so3_log(R.T @ aid.T[:3, :3]) / dt
+        noise = R.T @ covariance[3:, 3:] @ R / dt**2 + np.eye(3) * self._config.sigma_gyro**2
+        self._bias.learn(error, noise, dt)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop what lies before the frame the filter has reached; the last of it stays, it may go on."""
@@ -114,12 +127,13 @@ class MotionAids:
         rates = np.array([sample.angular_velocity for sample in self._samples])
         middle = 0.5 * (edges[1:] + edges[:-1]) - start_stamp_ns
         times = (stamps - start_stamp_ns).astype(np.float64)
-        at_middle = np.column_stack([np.interp(middle, times, rates[:, axis]) for axis in range(3)])
+        at_middle = np.column_stack([np.interp(middle, times, rates[:, axis]) for axis in range(3)]) - self._bias.rate
         rotation = np.eye(3)
         for step in so3_exp(at_middle * np.diff(edges)[:, None] * 1e-9):
             rotation = rotation @ step
-        sigma = self._config.sigma_gyro * (end_stamp_ns - start_stamp_ns) * 1e-9
-        return Aid(make_transform(rotation, np.zeros(3)), np.eye(3) * sigma**2, ROTATION)
+        dt = (end_stamp_ns - start_stamp_ns) * 1e-9
+        variance = np.eye(3) * self._config.sigma_gyro**2 + self._bias.covariance
+        return Aid(make_transform(rotation, np.zeros(3)), variance * dt**2, ROTATION)
 
     def _is_same_time(self, a: int, b: int) -> bool:
         return abs(a - b) <= self._config.aid_stamp_tolerance * 1e9

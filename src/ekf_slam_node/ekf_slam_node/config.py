@@ -22,6 +22,12 @@ class MotionConfig(Config):
     sigma_gyro: float = parameter(
         0.02, "noise of the mean turn rate of an IMU between two frames", unit="rad/s", minimum=1e-6
     )
+    sigma_gyro_bias: float = parameter(
+        0.02, "constant error of its turn rates, which is learnt", unit="rad/s", minimum=0.0
+    )
+    sigma_gyro_bias_walk: float = parameter(
+        1e-4, "change of that error within a second, growing with the root of the time", unit="rad/s", minimum=0.0
+    )
     aid_gate: float = parameter(22.46, "chi-square gate of a motion aid, 6 degrees of freedom (99.9 %)", minimum=1.0)
     aid_stamp_tolerance: float = parameter(
         0.005, "largest difference of the stamps of a motion aid and of the frames it joins", unit="s", minimum=0.0

@@ -165,6 +165,8 @@ class EkfSlam:
             self.counters.add("aids_rejected")
         else:
             self._use_aid(local, step, aid, link.T)
+        if aid is not None:
+            self._aids.learn_bias(aid, link.T, link.covariance, dt)
         closing = self._builder.is_complete(local.ekf, self.config.submap, len(sight))
         divided = closing and self.config.submap.start == "independent"
         report, used = local.measure(frame, sight.every_second() if divided else sight)
