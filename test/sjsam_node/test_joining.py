@@ -135,6 +135,15 @@ def test_optimum_and_marginals_are_those_of_dense_algebra(model: int, backend: s
     assert np.allclose(fixed[size:, size:], inverse[np.ix_(*[marginals.scalars([3], [])] * 2)], rtol=1e-4)
 
 
+def test_marginal_information_is_the_inverse_of_the_marginal_covariance(rng: np.random.Generator) -> None:
+    maps, s = random_problem(kernels.TANGENT, rng)
+    last = np.array([5, 6 + 1, 6 + 4])  # the newest pose and two landmarks
+    problem = JoiningProblem(flatten(maps), s, np.array([0]), kernels.TANGENT, last=last)
+    scalars = problem.scalars(np.array([5]), np.array([1, 4]))
+    covariance = problem.marginals(s).covariance([5], [1, 4])
+    assert np.allclose(np.linalg.inv(problem.marginal_information(s, scalars)), covariance, rtol=1e-8)
+
+
 def test_block_rows_keep_each_marginal_and_drop_correlations(rng: np.random.Generator) -> None:
     maps, _ = random_problem(kernels.TANGENT, rng)
     full, block = np.linalg.inv(maps[0].information), np.linalg.inv(block_rows(maps[0], 6, 3).information)

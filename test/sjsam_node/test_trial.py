@@ -58,7 +58,7 @@ def test_a_false_closure_that_was_believed_is_taken_back_when_true_ones_contradi
     false = false_link(joined, agent)
     assert len(false.pairs) >= 10
     joined.graph.add_link(false)
-    joined.joiner.join(arrival)
+    joined.joiner.batch(arrival)
     assert ate(errors(joined, agent)[0]) > 1.0
     join(submaps[arrival + 1 :], joined)
     joined.settle()

@@ -6,7 +6,6 @@ Gaussian's rows are dropped) and recovered afterwards from its correlation with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -36,11 +35,6 @@ class EstimatorConfig(Config):
         1e-9, "stop when a step promises to lower chi2 by less than this share", minimum=0.0
     )
     robust: RobustConfig = group(RobustConfig)
-
-    @property
-    def can_grow(self) -> bool:
-        """Whether the problem may stay factored: with the solver that can, to the optimum, and without weights."""
-        return self.solver in ("auto", "multifrontal") and self.robust.loss == "none" and self.iterations > 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +103,15 @@ class Estimator:
     config: EstimatorConfig = field(default_factory=EstimatorConfig)
     _cache: dict[int, tuple[bytes, ReducedMap]] = field(default_factory=dict)
 
-    def assemble(self, graph: MapGraph, component: int) -> Assembled:
-        """Pose the joining problem of a component, its frame fixed at the start of its oldest record."""
+    def assemble(self, graph: MapGraph, component: int, front: tuple[int, IntArray] | None = None) -> Assembled:
+        """Pose the joining problem of a component, its frame fixed at the start of its oldest record.
+
+        ``front``: a node and landmarks that are kept, even if private, and eliminated last.
+        """
         records, is_shared = graph.records_of(component), graph.shared()
-        reduced = [self.reduced(graph, i, is_shared) for i in records]
+        if front is not None:
+            is_shared = is_shared | np.isin(graph.landmark_of, front[1])
+        reduced = [self._reduced(graph, i, is_shared) for i in records]
         nodes = np.nonzero(graph.component_of == component)[0]
         seen = [
             graph.landmark_of[graph.records[i].observations[m.shared]] for i, m in zip(records, reduced, strict=True)
@@ -130,12 +129,14 @@ class Estimator:
             np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), graph.points[landmarks]
         )
         anchor = np.searchsorted(nodes, [graph.oldest(component).start])
-        problem = JoiningProblem(flatten(maps), state, anchor, kernels.TANGENT, self.config.solver)
+        last = None
+        if front is not None:
+            last = np.append(len(nodes) + np.searchsorted(landmarks, front[1]), np.searchsorted(nodes, front[0]))
+        problem = JoiningProblem(flatten(maps), state, anchor, kernels.TANGENT, self.config.solver, last)
         nothing = [np.empty(0, dtype=np.int64)] * len(maps)
         return Assembled(records, nodes, landmarks, reduced, maps, problem, state, nothing)
 
-    def reduced(self, graph: MapGraph, record: int, is_shared: BoolArray) -> ReducedMap:
-        """A record without those of its landmarks whose observations are not ``is_shared``."""
+    def _reduced(self, graph: MapGraph, record: int, is_shared: BoolArray) -> ReducedMap:
         mask = is_shared[graph.records[record].observations]
         known = self._cache.get(record)
         if known is None or known[0] != mask.tobytes():
@@ -143,9 +144,11 @@ class Estimator:
             self._cache[record] = known
         return known[1]
 
-    def optimize(self, graph: MapGraph, component: int) -> tuple[Assembled, LeastSquaresResult]:
-        """Bring a component to its optimum and write it back to the graph."""
-        assembled = self.assemble(graph, component)
+    def optimize(
+        self, graph: MapGraph, component: int, front: tuple[int, IntArray] | None = None
+    ) -> tuple[Assembled, LeastSquaresResult]:
+        """Bring a component to its optimum and write it back to the graph; ``front`` as in :meth:`assemble`."""
+        assembled = self.assemble(graph, component, front)
         optimizer = LevenbergMarquardtConfig(self.config.iterations, self.config.relative_tolerance)
         state, result = assembled.problem.optimize(assembled.state, optimizer)
         if self.config.robust.loss != "none":
@@ -172,11 +175,6 @@ class Estimator:
         problem.maps = flatten(found.maps)
         state, result = problem.optimize(found.state, optimizer)
         return state, result, replace(assembled, maps=found.maps, dropped=found.dropped)
-
-    def recover(self, graph: MapGraph, records: list[int], reduced: Mapping[int, ReducedMap]) -> None:
-        """Private landmarks of some records given what was joined."""
-        for i in records:
-            self._recover(graph, graph.records[i], reduced[i], np.empty(0, dtype=np.int64))
 
     @staticmethod
     def _recover(graph: MapGraph, record: Record, reduced: ReducedMap, dropped: IntArray) -> None:

@@ -50,8 +50,8 @@ class JoinReport:
 
     accepted with reason otherwise; matched: its landmarks already in the map; new_landmarks; closures: links believed
     now, as (agent, index) of the older submap; dropped_links: links taken back; components: parts of the map that
-    hang together; chi2, iterations, converged and solver of the joining; update: ``batch`` or
-    ``incremental``.
+    hang together; chi2, iterations, converged and solver of the joining; update: ``batch``, ``incremental`` or
+    ``odometry``.
     """
 
     accepted: bool
@@ -87,7 +87,7 @@ class GlobalMap:
         self.graph = MapGraph()
         self.marks = Marks()
         self.finder = LinkFinder(self.config.closure)
-        self.joiner = Joiner(self.graph, self.config.joining)
+        self.joiner = Joiner(self.graph, self.config.closure.window, self.config.joining)
         self.trials = Trials(self.joiner, self.config.trial, self.config.closure)
         self._sessions: dict[str, int] = {}
         self._lookup: dict[tuple[str, int, int], int] = {}
@@ -104,7 +104,7 @@ class GlobalMap:
         chain = self._chain(new)
         for link in self.finder.sequential(self.graph, chain, new):
             self.graph.add_link(link)
-        joined = self.joiner.join(new)
+        joined = self.joiner.absorb(new, chain)
         matched = self._matched(new)
         self._unsearched.append(new)
         closures, dropped = self._close_loops() if self._is_search_due(new) else ([], 0)
@@ -307,7 +307,7 @@ class GlobalMap:
         stored = storage.read(Path(path))
         loaded, graph = cls(config), stored.graph
         loaded.graph, loaded.marks, loaded._closed_at = graph, stored.marks, stored.closed_at
-        loaded.joiner = Joiner(graph, loaded.config.joining)
+        loaded.joiner = Joiner(graph, loaded.config.closure.window, loaded.config.joining)
         loaded.trials = Trials(loaded.joiner, loaded.config.trial, loaded.config.closure, stored.contested)
         loaded.finder.pending, loaded.finder.near.compared = stored.pending, stored.compared
         for i, record in enumerate(graph.records):

@@ -1,8 +1,8 @@
 """Keeps every component of a map graph at its optimum as submaps, links and doubts come in.
 
-A small component is joined in batch each time. A large one stays factored (:mod:`sjsam_node.incremental`): a submap, a
-link, or one taken back costs what it affects, and ends at the same optimum. A batch is left for a start so bad that
-steps have to be damped, for components that merge or fall apart, and for what is asked of the map as a whole.
+A submap that only continues its agent's path is joined through the front (:mod:`sjsam_node.incremental`); everything
+else, closures above all, is joined in batch, warm from the estimate. There is one front: where several agents take
+turns, the submaps of the others follow their odometry until the next batch.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import numpy as np
 
 from sjsam_node.association import Prior
 from sjsam_node.closures import prior_of_pair, relative_pose
-from sjsam_node.estimator import Assembled, Estimator, EstimatorConfig, ReducedMap
-from sjsam_node.incremental import JoinedComponent
+from sjsam_node.estimator import Assembled, Estimator, EstimatorConfig
+from sjsam_node.incremental import Front
 from sjsam_node.map_graph import MapGraph, Snapshot
 from slam_core.config import Config, group, parameter
-from slam_core.geometry import FloatArray
+from slam_core.geometry import compose_covariance
+from slam_core.sparse_cholesky import IntArray
 
 
 @dataclass(frozen=True)
@@ -28,14 +29,14 @@ class JoinerConfig(Config):
         40, "submaps of a component from which on they are joined incrementally; below, batch costs no more", minimum=2
     )
     relinearize_turn: float = parameter(
-        0.02, "turn of a submap, since it was linearised, after which it is linearised anew", unit="rad", minimum=0.0
+        0.02, "turn of a pose, since it was linearised, that calls for a batch", unit="rad", minimum=0.0
     )
     estimator: EstimatorConfig = group(EstimatorConfig)
 
 
 @dataclass(frozen=True, eq=False)
 class JoinResult:
-    """chi2 of the component, iterations, whether it converged, solver; ``batch`` or ``incremental``."""
+    """chi2 of the component, iterations, whether it converged, solver; ``batch``, ``incremental`` or ``odometry``."""
 
     cost: float
     iterations: int
@@ -46,11 +47,18 @@ class JoinResult:
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
-    """A component at its optimum: as it stays factored, or as the last batch posed it, or both."""
+    """A component: the last batch, what was added since, and the front that it is added to.
 
+    ``extensible``: the batch kept what a front needs.
+    """
+
+    assembled: Assembled
     result: JoinResult
-    live: JoinedComponent | None
-    assembled: Assembled | None
+    newest: int
+    window: IntArray
+    extensible: bool = False
+    front: Front | None = None
+    added: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +71,10 @@ class Checkpoint:
 
 @dataclass
 class Joiner:
-    """The estimate of a graph."""
+    """The estimate of a graph; ``window`` is how many submaps back a new one may be linked."""
 
     graph: MapGraph
+    window: int
     config: JoinerConfig = field(default_factory=JoinerConfig)
     estimator: Estimator = field(init=False)
     _joined: dict[int, _Joined] = field(default_factory=dict)
@@ -73,55 +82,85 @@ class Joiner:
     def __post_init__(self) -> None:
         self.estimator = Estimator(self.config.estimator)
 
-    def join(self, newest: int) -> JoinResult:
-        """Bring the component of record ``newest``, from whose end it goes on, to its optimum."""
+    def absorb(self, new: int, chain: list[int]) -> JoinResult:
+        """Join record ``new``, whose links to its ``chain`` have been added to the graph."""
+        window = self._window_landmarks([new, *chain[: self.window - 1]])
+        extended = self._put_off(new) or self._extended(new, window)
+        if extended is None:
+            going_on = self.graph.size(self.graph.component(new)) + 1 >= self.config.incremental_from
+            return self.batch(new, window, extensible=going_on)
+        self._joined[self.graph.component(new)] = extended
+        return extended.result
+
+    def _put_off(self, new: int) -> _Joined | None:
+        """The component with a submap of an agent whose end is not the front: its odometry places it until the next
+        batch. Agents that take turns would otherwise call for a batch each time.
+        """
+        joined = self._joined.get(self.graph.component(new))
+        if joined is None or not joined.extensible:
+            return None
+        if self.graph.records[joined.newest].end == self.graph.records[new].start:
+            return None
+        result = replace(joined.result, iterations=0, update="odometry")
+        return replace(joined, result=result, added=joined.added + 1)
+
+    def _extended(self, new: int, window: IntArray) -> _Joined | None:
+        """The component with one more submap joined through the front; None where that is not possible."""
+        component, record = self.graph.component(new), self.graph.records[new]
+        joined = self._joined.get(component)
+        if joined is None or not joined.extensible:
+            return None
+        if self.graph.records[joined.newest].end != record.start:
+            return None
+        try:
+            front, fusion = (joined.front or self._front(joined)).fused(self.graph.landmark_of)
+            seen = self.graph.landmark_of[record.observations]
+            if not np.all(np.isin(seen, front.landmarks) | (seen >= record.first_observation)):
+                return None
+            front, rise, turn = front.extended(self.graph, record, window, self.config.estimator.rows)
+        except (ValueError, np.linalg.LinAlgError):  # badly conditioned: batch damps
+            return None
+        if turn > self.config.relinearize_turn:
+            return None
+        result = replace(joined.result, cost=joined.result.cost + fusion + rise, iterations=1, update="incremental")
+        return replace(joined, result=result, newest=new, window=window, front=front, added=joined.added + 1)
+
+    def batch(self, newest: int, window: IntArray | None = None, *, extensible: bool = False) -> JoinResult:
+        """Join the whole component of a record, whose end is where it will go on.
+
+        ``extensible`` keeps the landmarks of the window even where one submap alone saw them, so that the next submap
+        can be joined through a front; it makes the problem larger, so trials do without.
+        """
         component = self.graph.component(newest)
-        return self._updated(component, newest) or self._batch(component)
+        if window is None:
+            known = self._joined.get(component)
+            window = known.window if known is not None and known.newest == newest else self._window_landmarks([newest])
+            window = np.unique(self.graph.landmark_of[window])
+        front = (self.graph.records[newest].end, window) if extensible else None
+        assembled, result = self.estimator.optimize(self.graph, component, front)
+        report = JoinResult(result.cost, result.iterations, result.converged, assembled.problem.backend, "batch")
+        self._joined[component] = _Joined(assembled, report, newest, window, extensible)
+        return report
 
-    def _updated(self, component: int, newest: int) -> JoinResult | None:
-        """Join what changed; None where only a batch will do."""
-        estimator = self.estimator.config
-        if self.graph.size(component) < self.config.incremental_from or not estimator.can_grow:
-            return None
-        known = self._joined.get(component)
-        live = known.live if known is not None else None
-        if live is None:
-            anchor = self.graph.oldest(component).start
-            live = JoinedComponent(self.estimator, anchor, self.config.relinearize_turn)
-        found = live.update(self.graph, component, newest)
-        if found is None:
-            return None
-        result = JoinResult(found.cost, found.iterations, found.converged, "multifrontal", "incremental")
-        self._joined[component] = _Joined(result, live, None)
-        return result
+    def _front(self, joined: _Joined) -> Front:
+        return Front.of(self.graph, joined.assembled, self.graph.records[joined.newest].end, joined.window)
 
-    def _batch(self, component: int) -> JoinResult:
-        assembled, found = self.estimator.optimize(self.graph, component)
-        result = JoinResult(found.cost, found.iterations, found.converged, assembled.problem.backend, "batch")
-        self._joined[component] = _Joined(result, None, assembled)
-        return result
+    def _window_landmarks(self, records: list[int]) -> IntArray:
+        return np.unique(np.concatenate([self.graph.landmark_of[self.graph.records[i].observations] for i in records]))
 
     def assembled(self, component: int) -> Assembled:
         """The joining problem of a component with everything in it."""
-        known = self._joined.get(component)
-        if known is None or known.assembled is None:
-            if known is not None and known.live is not None:
-                known.live.settle(self.graph)
+        joined = self._joined.get(component)
+        if joined is None:  # a map that was just loaded is at its optimum already
+            newest = int(self.graph.records_of(component)[-1])
+            window = self._window_landmarks([newest])
             assembled = self.estimator.assemble(self.graph, component)
-            if known is None:  # a map that was just loaded is at its optimum already
-                cost = assembled.problem.cost(assembled.state)
-                known = _Joined(JoinResult(cost, 0, True, assembled.problem.backend, "batch"), None, assembled)
-            self._joined[component] = known = replace(known, assembled=assembled)
-        assert known.assembled is not None
-        return known.assembled
-
-    def reduced(self, component: int) -> dict[int, ReducedMap]:
-        """Submaps of a component as they are joined."""
-        known = self._joined.get(component)
-        if known is not None and known.live is not None:
-            return known.live.reduced
-        assembled = self.assembled(component)
-        return dict(zip(assembled.records, assembled.reduced, strict=True))
+            cost = assembled.problem.cost(assembled.state)
+            report = JoinResult(cost, 0, True, assembled.problem.backend, "batch")
+            self._joined[component] = joined = _Joined(assembled, report, newest, window)
+        if joined.added:
+            self.batch(joined.newest)
+        return self._joined[component].assembled
 
     def cost(self, component: int) -> float:
         """chi2 of a component."""
@@ -144,38 +183,40 @@ class Joiner:
         return max(1.0, self.cost(component) / redundancy) if redundancy > 0 else 1.0
 
     def redundancy(self, component: int) -> int:
-        """Rows beyond the unknowns of a component."""
-        known = self._joined.get(component)
-        if known is not None and known.live is not None:
-            return known.live.redundancy
-        problem = self.assembled(component).problem
+        """Rows beyond the unknowns of the problem that was last joined in batch."""
+        problem = self._joined[component].assembled.problem
         return problem.rows - problem.layout.pattern.n
-
-    def covariance(self, component: int, nodes: list[int]) -> FloatArray:
-        """Joint covariance (6k, 6k) of nodes of a component."""
-        known = self._joined.get(component)
-        if known is not None and known.live is not None:
-            return known.live.covariance(nodes)
-        return self.assembled(component).covariance(nodes)
 
     # -- closures ------------------------------------------------------------------------------------------------------
 
     def relative_pose(self, first: int, second: int) -> Prior | None:
-        """What the map knows of T_first_second (starts of two records); None across components."""
+        """What the map knows of T_first_second (starts of two records, the second one the newer); None across
+        components. Submaps added since the last batch count with their odometry alone, which is never too sure.
+        """
         graph = self.graph
         component = graph.component(first)
         if component != graph.component(second):
             return None
-        nodes = [graph.records[first].start, graph.records[second].start]
-        joint = self.covariance(component, nodes)
-        return prior_of_pair(*relative_pose(graph.poses[nodes[0]], graph.poses[nodes[1]], joint))
+        if component not in self._joined:
+            self.assembled(component)
+        nodes, start = self._joined[component].assembled.nodes, graph.records[first].start
+        node, T, covariance = graph.records[second].start, np.eye(4), np.zeros((6, 6))
+        while node not in nodes and node != start:
+            submap = graph.records[graph.record_ending_at(node)].submap
+            covariance = compose_covariance(submap.end_pose, submap.covariance[:6, :6], T, covariance)
+            T = submap.end_pose @ T
+            node = graph.records[graph.record_ending_at(node)].start
+        if start not in nodes:
+            return None if node != start else prior_of_pair(T, covariance)
+        joint = self._joined[component].assembled.covariance([start, node])
+        T_known, known = relative_pose(graph.poses[start], graph.poses[node], joint)
+        return prior_of_pair(T_known @ T, compose_covariance(T_known, known, T, covariance))
 
     # -- trials --------------------------------------------------------------------------------------------------------
 
     def checkpoint(self) -> Checkpoint:
         """Everything a trial may change, to come back to."""
-        joined = {c: replace(k, live=None if k.live is None else k.live.copy()) for c, k in self._joined.items()}
-        return Checkpoint(self.graph.snapshot(), joined)
+        return Checkpoint(self.graph.snapshot(), dict(self._joined))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Back to a checkpoint taken since the last submap was added."""
@@ -192,7 +233,7 @@ class Joiner:
         components = np.unique(self.graph.component_of).tolist()
         for component in self._joined.keys() - {own}:
             records = self.graph.records_of(component) if component in components else []
-            if set(records) != self.reduced(component).keys():
+            if len(records) != len(self._joined[component].assembled.records):
                 del self._joined[component]
                 if records:
-                    self.join(records[-1])
+                    self.batch(records[-1])

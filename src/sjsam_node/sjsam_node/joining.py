@@ -39,6 +39,8 @@ class JoiningProblem:
         ``kernels.PLANAR``, ``TANGENT`` or ``EULER``.
     backend
         Of ``slam_core.sparse_cholesky``.
+    last
+        Nodes to eliminate last (see :func:`~sjsam_node.layout.make_layout`).
     """
 
     def __init__(
@@ -48,11 +50,12 @@ class JoiningProblem:
         fixed: IntArray,
         model: int,
         backend: str = "auto",
+        last: IntArray | None = None,
     ) -> None:
         self.maps, self.model = maps, model
         self.rows = int(maps.mean_ptr[-1])
         dimension = state.translations.shape[1]
-        self.layout: Layout = make_layout(maps, len(state.translations), len(state.landmarks), fixed, dimension)
+        self.layout: Layout = make_layout(maps, len(state.translations), len(state.landmarks), fixed, dimension, last)
         self.factor = SparseCholesky(self.layout.pattern, backend)
         self._sizes = state.model_dimensions
         pattern = self.layout.pattern
@@ -112,6 +115,12 @@ class JoiningProblem:
     def scalars(self, poses: IntArray, landmarks: IntArray) -> IntArray:
         """Scalar unknowns of poses and landmarks, in order; -1 for fixed ones."""
         return variable_scalars(self.layout, self._sizes, poses, landmarks)
+
+    def marginal_information(self, state: State, scalars: IntArray) -> FloatArray:
+        """Marginal information matrix of some variables, at ``state``."""
+        self._factorize_at(state)
+        information = np.linalg.inv(self.factor.inverse_block(scalars))
+        return np.asarray(0.5 * (information + information.T))
 
     def marginals(self, state: State) -> Marginals:
         """Exact marginal covariances, linearised at ``state``.

@@ -219,33 +219,24 @@ def local_normal_equations(model, f, maps, R, t, points, work):
 
 
 @njit(cache=True, nogil=True)
-def local_gradient(model, f, maps, R, t, points):
-    """Cost ``r^T information r`` and gradient ``J^T information r`` (reference pose, poses, landmarks) of local map
-    ``f``.
-    """
-    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info = maps
-    d = t.shape[1]
-    a = 1 if d == 2 else 3
-    m = z_ptr[f + 1] - z_ptr[f]
-    poses, landmarks = pose_idx[pose_ptr[f] : pose_ptr[f + 1]], lm_idx[lm_ptr[f] : lm_ptr[f + 1]]
-    r, B = np.empty(m), np.empty((len(poses), a, a))
-    local_residual(model, R[ref[f]], t[ref[f]], poses, landmarks, z[z_ptr[f] : z_ptr[f + 1]], R, t, points, r, B)
-    J, JB = np.empty((m, d + a)), np.zeros((m, 3))
-    reference_jacobian(R[ref[f]], t[ref[f]], poses, landmarks, t, points, B, J)
-    other_blocks(R[ref[f]], poses, landmarks, B, JB)
-    start, width = _block_starts(d, len(poses), len(landmarks))
-    flat, g = np.dot(info[info_ptr[f] : info_ptr[f + 1]].reshape((m, m)), r), np.empty(d + a + m)
-    _left_multiply(JB, start, width, flat.reshape((m, 1)), g[d + a :].reshape((m, 1)))
-    g[: d + a] = np.dot(J.T, flat)
-    return np.dot(r, flat), g
-
-
-@njit(cache=True, nogil=True)
 def joint_gradient(model, maps, R, t, points, scatter, gradient):
     """Add ``J^T information r`` of every local map."""
+    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info = maps
     item_ptr, item_group, item_offset, item_width, group_ptr, group_start = scatter[:6]
-    for f in range(len(maps[0])):
-        _, g = local_gradient(model, f, maps, R, t, points)
+    d = t.shape[1]
+    a = 1 if d == 2 else 3
+    for f in range(len(ref)):
+        m = z_ptr[f + 1] - z_ptr[f]
+        poses, landmarks = pose_idx[pose_ptr[f] : pose_ptr[f + 1]], lm_idx[lm_ptr[f] : lm_ptr[f + 1]]
+        r, B = np.empty(m), np.empty((len(poses), a, a))
+        local_residual(model, R[ref[f]], t[ref[f]], poses, landmarks, z[z_ptr[f] : z_ptr[f + 1]], R, t, points, r, B)
+        J, JB = np.empty((m, d + a)), np.zeros((m, 3))
+        reference_jacobian(R[ref[f]], t[ref[f]], poses, landmarks, t, points, B, J)
+        other_blocks(R[ref[f]], poses, landmarks, B, JB)
+        start, width = _block_starts(d, len(poses), len(landmarks))
+        flat, g = np.dot(info[info_ptr[f] : info_ptr[f + 1]].reshape((m, m)), r), np.empty(d + a + m)
+        _left_multiply(JB, start, width, flat.reshape((m, 1)), g[d + a :].reshape((m, 1)))
+        g[: d + a] = np.dot(J.T, flat)
         row = 0
         for i in range(item_ptr[f], item_ptr[f + 1]):
             at = group_start[group_ptr[f] + item_group[i]]

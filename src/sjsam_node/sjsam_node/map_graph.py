@@ -92,6 +92,7 @@ class MapGraph:
     component_of: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _seen_in: dict[int, set[int]] = field(default_factory=dict)
     _members: dict[int, list[int]] = field(default_factory=dict)
+    _ending_at: dict[int, int] = field(default_factory=dict)
     _way: dict[int, float] = field(default_factory=dict)
     _chained: dict[int, FloatArray] = field(default_factory=dict)
     _stretch: dict[int, int] = field(default_factory=dict)
@@ -113,6 +114,7 @@ class MapGraph:
         for observation in record.observations.tolist():
             self._seen_in[observation] = {len(self.records)}
             self._members[observation] = [observation]
+        self._ending_at[end] = len(self.records)
         middle = np.median(submap.landmarks, axis=0) if len(submap.landmarks) else np.zeros(3)
         self._middles, self._starts = np.concatenate([self._middles, middle[None]]), np.append(self._starts, start)
         self.records.append(record)
@@ -152,6 +154,10 @@ class MapGraph:
     def size(self, component: int) -> int:
         """Number of nodes of a component."""
         return int(np.count_nonzero(self.component_of == component))
+
+    def record_ending_at(self, node: int) -> int:
+        """The record whose end a node is."""
+        return self._ending_at[node]
 
     def add_link(self, link: Link) -> int:
         """Believe a link: fuse the landmarks that its pairs name; the number of pairs that could be fused.

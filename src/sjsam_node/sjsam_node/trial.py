@@ -22,6 +22,7 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.least_squares import chi_square_bound
 
+
 _HALVINGS = 3
 """How often refused links are divided to find the true ones among them: each time doubles the number of trials."""
 
@@ -170,7 +171,7 @@ class Trials:
             graph.replace_links([link for link in graph.links if not any(link is k for k in rivals)])
         for link in links:
             graph.add_link(link)
-        joiner.join(newest)
+        joiner.batch(newest)
         self._clean(newest)
         verdict = self._verdict(links, offered, newest)
         if not self._is_better(verdict, before, newest) or (links and not verdict.believed):
@@ -229,23 +230,23 @@ class Trials:
         worst = max(strain, key=lambda i: strain[i], default=None)
         if worst is not None and strain[worst] > gate:
             graph.replace_links([link for i, link in enumerate(graph.links) if i != worst])
-            self.joiner.join(newest)
+            self.joiner.batch(newest)
             return True
         outliers = self._outliers(component, nis, gate)
         if outliers:
             kept = [without(graph, link, outliers) for link in graph.links]
             graph.replace_links([link for link in kept if link is not None])
-            self.joiner.join(newest)
+            self.joiner.batch(newest)
         return bool(outliers)
 
     def _nis(self, component: int) -> FloatArray:
         """Squared error of every observation as the rest of its submap predicts it, NaN where no other submap sees
         it; (observations,), 3 degrees of freedom each.
         """
-        graph = self.joiner.graph
+        graph, assembled = self.joiner.graph, self.joiner.assembled(component)
         out = np.full(len(graph.points), np.nan)
         shared = graph.shared()
-        for i, reduced in self.joiner.reduced(component).items():
+        for i, reduced in zip(assembled.records, assembled.reduced, strict=True):
             record = graph.records[i]
             rows = record.observations[reduced.shared]
             values = observation_nis(local_residual(graph, record, reduced), reduced.information)

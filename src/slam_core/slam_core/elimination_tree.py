@@ -35,11 +35,6 @@ class Symbolic(NamedTuple):
     panel_ptr: IntArray
     parent: IntArray
 
-    def order(self, pattern: BlockPattern) -> IntArray:
-        """Number in the pattern of every unknown in postorder, (n,)."""
-        inside = np.arange(pattern.n) - np.repeat(self.start[:-1], self.width)
-        return np.asarray(np.repeat(pattern.start[:-1][self.given], self.width) + inside)
-
 
 def analyze(pattern: BlockPattern) -> Symbolic:
     """Elimination tree, fill and supernodes of a pattern."""

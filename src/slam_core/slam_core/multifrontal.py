@@ -24,7 +24,9 @@ class Multifrontal:
     def __init__(self, pattern: BlockPattern) -> None:
         self._entries = (pattern.value_ptr, pattern.height, pattern.column_ptr, pattern.rows, pattern.row_offset)
         self.symbolic = analyze(pattern)
-        self._order = self.symbolic.order(pattern)
+        scalars = pattern.start[:-1][self.symbolic.given]
+        inside = np.arange(pattern.n) - np.repeat(self.symbolic.start[:-1], self.symbolic.width)
+        self._order = np.repeat(scalars, self.symbolic.width) + inside
         self._position = np.empty_like(self._order)
         self._position[self._order] = np.arange(pattern.n)
         self._panels = np.empty(int(self.symbolic.panel_ptr[-1]))

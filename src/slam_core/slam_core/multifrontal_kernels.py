@@ -17,65 +17,43 @@ _STRIP = 32
 @njit(cache=True, nogil=True)
 def factorize(values, entries, symbolic, panels, stack):
     """Eliminate front after front; what a front leaves over waits on the stack for its parent."""
-    supernodes = len(symbolic.size)
-    slot = np.empty(len(symbolic.width), np.int64)
-    waiting = np.full((2, supernodes), -1, np.int64)
+    _, _, width, start, column_ptr, row_ptr, rows, size, eliminated, panel_ptr, parent = symbolic
+    supernodes = len(size)
+    slot = np.empty(len(width), np.int64)
+    latest, earlier = np.full(supernodes, -1, np.int64), np.full(supernodes, -1, np.int64)
     top = 0
     for s in range(supernodes):
-        P, _ = open_front(s, symbolic, symbolic.panel_ptr[s], slot, panels, stack, top)
+        m, w = size[s], eliminated[s]
+        h = m - w
+        for c in range(column_ptr[s], column_ptr[s + 1]):
+            slot[c] = start[c] - start[column_ptr[s]]
+        below = w
+        for k in range(row_ptr[s], row_ptr[s + 1]):
+            slot[rows[k]] = below
+            below += width[rows[k]]
+        P = panels[panel_ptr[s] : panel_ptr[s + 1]].reshape((m, w))
+        P[:] = 0.0
         _assemble(values, entries, symbolic, s, slot, P)
-        top = close_front(s, symbolic, symbolic.panel_ptr[s], slot, waiting, panels, stack, top)
-        if top < 0:
+        U = stack[top : top + h * h].reshape((h, h))
+        U[:] = 0.0
+        free = top
+        child = latest[s]
+        while child >= 0:
+            left = size[child] - eliminated[child]
+            free -= left * left
+            update = stack[free : free + left * left].reshape((left, left))
+            _extend_add(update, rows[row_ptr[child] : row_ptr[child + 1]], width, slot, w, P, U)
+            child = earlier[child]
+        if not _eliminate(panels[panel_ptr[s] : panel_ptr[s + 1]], m, w):
             return False
+        if h > 0:
+            below_pivots = panels[panel_ptr[s] + w * w : panel_ptr[s + 1]].reshape((h, w))
+            _subtract_product(below_pivots, U)
+            stack[free : free + h * h] = stack[top : top + h * h]
+            earlier[s] = latest[parent[s]]
+            latest[parent[s]] = s
+        top = free + h * h
     return True
-
-
-@njit(cache=True, nogil=True)
-def open_front(s, symbolic, at, slot, panels, stack, top):
-    """An empty front: pivot columns P (m, w), which ``panels`` holds from ``at`` on, and the rest U (h, h) on top of
-    the stack; ``slot`` becomes the row of every block.
-    """
-    _, _, width, start, column_ptr, row_ptr, rows, size, eliminated, _, _ = symbolic
-    m, w = size[s], eliminated[s]
-    for c in range(column_ptr[s], column_ptr[s + 1]):
-        slot[c] = start[c] - start[column_ptr[s]]
-    below = w
-    for k in range(row_ptr[s], row_ptr[s + 1]):
-        slot[rows[k]] = below
-        below += width[rows[k]]
-    P = panels[at : at + m * w].reshape((m, w))
-    U = stack[top : top + (m - w) ** 2].reshape((m - w, m - w))
-    P[:] = 0.0
-    U[:] = 0.0
-    return P, U
-
-
-@njit(cache=True, nogil=True)
-def close_front(s, symbolic, at, slot, waiting, panels, stack, top):
-    """Add what the children left over, and eliminate. The new top of the stack, below which the front leaves U over;
-    -1 if it is not positive definite. ``waiting`` links the children of every supernode.
-    """
-    _, _, width, _, _, row_ptr, rows, size, eliminated, _, parent = symbolic
-    latest, earlier = waiting[0], waiting[1]
-    m, w = size[s], eliminated[s]
-    h = m - w
-    P, U = panels[at : at + m * w].reshape((m, w)), stack[top : top + h * h].reshape((h, h))
-    free = top
-    child = latest[s]
-    while child >= 0:
-        left = size[child] - eliminated[child]
-        free -= left * left
-        update = stack[free : free + left * left].reshape((left, left))
-        _extend_add(update, rows[row_ptr[child] : row_ptr[child + 1]], width, slot, w, P, U)
-        child = earlier[child]
-    if not _eliminate(panels[at : at + m * w], m, w):
-        return -1
-    if h > 0:
-        _subtract_product(panels[at + w * w : at + m * w].reshape((h, w)), U)
-        stack[free : free + h * h] = stack[top : top + h * h]
-        earlier[s] = latest[parent[s]]
-        latest[parent[s]] = s
-    return free + h * h
 
 
 @njit(cache=True, nogil=True)
