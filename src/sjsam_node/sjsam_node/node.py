@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
