@@ -21,7 +21,7 @@ from ekf_slam_node.models import Frame
 from ekf_slam_node.motion_guess import MotionGuess, guess_motion, refine_motion
 from slam_core.geometry import FloatArray
 
-_CONVINCING = 0.3
+_CONVINCING = 0.5
 """Share of the features, or of the candidates where these are fewer, that a right prediction links."""
 
 
