@@ -22,7 +22,6 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.least_squares import chi_square_bound
 
-
 _HALVINGS = 3
 """How often refused links are divided to find the true ones among them: each time doubles the number of trials."""
 
