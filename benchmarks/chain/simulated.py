@@ -42,7 +42,7 @@ HEADINGS = (
     "ANEES block", "filter: ATE mm", "end mm", "ANEES", "ms features", "ms ekf", "merge ms/submap", "max",
     "x real time",
 )  # fmt: skip
-AGENT_HEADINGS = ("run", "agent", "path m", "submaps", "sent kB/m", "ATE mm", "end mm", "ANEES",
+AGENT_HEADINGS = ("run", "agent", "path m", "submaps", "sent kB/m", "compact", "ATE mm", "end mm", "ANEES",
                   "central: ATE mm", "largest difference mm")  # fmt: skip
 
 
@@ -109,17 +109,17 @@ def agent_rows(result: RunResult, submaps: list[Submap]) -> Iterator[list[str]]:
         assert joined is not None
         assert centrally is not None
         gap = np.linalg.norm(agent.trajectory.poses[:, :3, 3] - central[agent.name].poses[:, :3, 3], axis=1).max()
-        sent = sum(size_of(submap) for submap in own) / joined.truth_length_m
+        sent = [sum(size_of(s, compact) for s in own) / joined.truth_length_m for compact in (False, True)]
         yield [
-            agent.name, f"{joined.truth_length_m:.1f}", str(len(own)), f"{1e-3 * sent:.0f}",
+            agent.name, f"{joined.truth_length_m:.1f}", str(len(own)), *(f"{1e-3 * s:.0f}" for s in sent),
             f"{1e3 * joined.ate.rmse:.1f}", f"{1e3 * joined.end_error_m:.1f}", f"{joined.anees:.2f}",
             f"{1e3 * centrally.ate.rmse:.1f}", f"{1e3 * gap:.1f}",
         ]  # fmt: skip
 
 
-def size_of(submap: Submap) -> int:
+def size_of(submap: Submap, compact: bool) -> int:
     """Bytes of a submap's messages on the wire (CDR)."""
-    messages = submap_messages(BagTypes(), submap)
+    messages = submap_messages(BagTypes(), submap, compact=compact)
     return sum(len(typestore().serialize_cdr(message, message.__msgtype__)) for message in messages)
 
 

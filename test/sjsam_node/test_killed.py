@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from ros_probe import Probe  # noqa: E402
 from sjsam_node.global_map import GlobalMap  # noqa: E402
-from slam_core.messages import SUBMAP_TOPICS, as_sent, submap_messages  # noqa: E402
+from slam_core.messages import SUBMAP_TOPICS, submap_messages  # noqa: E402
 from slam_core.types import Submap  # noqa: E402
 
 DOMAIN = 97
@@ -94,7 +94,7 @@ def test_a_killed_node_goes_on_from_its_saved_map(rng: np.random.Generator, tmp_
         second.kill()
         second.wait()
     continued = GlobalMap.load(tmp_path / "map")
-    join(map(as_sent, submaps[half:]), saved)
+    join(submaps[half:], saved)
     saved.settle()  # as saving does
     assert any(k.is_closure for k in continued.graph.links)
     assert len(continued.graph.links) == len(saved.graph.links)

@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from sjsam_node.node import SjsamNode  # noqa: E402
 from slam_core.geometry import boxminus  # noqa: E402
-from slam_core.messages import SUBMAP_TOPICS, as_sent, path_from_message, submap_messages  # noqa: E402
+from slam_core.messages import SUBMAP_TOPICS, path_from_message, submap_messages  # noqa: E402
 from slam_core.ros import RosTypes, sensor_qos  # noqa: E402
 
 
@@ -84,7 +84,7 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
     assert bench.spin_until(lambda: len(bench.node.global_map.graph.records) == len(submaps))
     wanted = len(submaps) * agent.steps + 1
     assert bench.spin_until(lambda: any(len(m.poses) == wanted for m in bench.received["map/path"]))
-    offline, _ = join(map(as_sent, submaps))
+    offline, _ = join(submaps)
     online = path_from_message(bench.received["map/path"][-1])
     for (stamp, T), pose in zip(online, offline.trajectory(""), strict=True):
         assert stamp == pose.stamp_ns

@@ -281,12 +281,17 @@ def unit_rows(v: np.ndarray) -> np.ndarray:
     return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
 
 
+@pytest.mark.parametrize("compact", [False, True])
 @pytest.mark.parametrize(("n", "agent", "follows"), [(0, "", True), (11, "fireman_2", False)])
-def test_submaps_come_out_as_sent(rng: np.random.Generator, n: int, agent: str, follows: bool) -> None:
+def test_submaps_survive_exactly_or_rounded(
+    rng: np.random.Generator, n: int, agent: str, follows: bool, compact: bool
+) -> None:
     submap = make_submap(rng, n, agent, follows)
-    back = m.submap_from_messages(m.SubmapMessages(*map(over_the_wire, m.submap_messages(TYPES, submap))))
+    messages = m.submap_messages(TYPES, submap, compact=compact)
+    back = m.submap_from_messages(m.SubmapMessages(*map(over_the_wire, messages)))
+    expected = m.rounded(submap) if compact else submap
     for name in ("end_pose", "landmarks", "covariance", "landmark_ids", "sightings", "descriptors"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(m.as_sent(submap), name), err_msg=name)
+        np.testing.assert_array_equal(getattr(back, name), getattr(expected, name), err_msg=name)
     for name in ("end_pose", "landmark_ids", "sightings"):
         np.testing.assert_array_equal(getattr(back, name), getattr(submap, name), err_msg=name)
     assert [getattr(back, k) for k in ("agent", "index", "start_stamp_ns", "end_stamp_ns", "follows_previous")] == [
@@ -308,18 +313,18 @@ def test_a_mixed_up_set_of_submap_messages_is_refused(rng: np.random.Generator) 
         m.submap_from_messages(sets[0]._replace(path=late))
 
 
-def sent_covariance(rng: np.random.Generator, n: int, smallest: float) -> tuple[np.ndarray, np.ndarray]:
+def compact_covariance(rng: np.random.Generator, n: int, smallest: float) -> tuple[np.ndarray, np.ndarray]:
     """A covariance whose correlations have eigenvalues down to ``smallest``, and what is sent of it."""
     basis = np.linalg.qr(rng.normal(size=(6 + 3 * n, 6 + 3 * n)))[0]
     correlated = (basis * np.geomspace(1.0, smallest, len(basis))) @ basis.T
     scale = np.geomspace(1e-4, 1.0, len(basis))
     covariance = scale[:, None] * (0.5 * (correlated + correlated.T)) * scale
-    return covariance, m.as_sent(replace(make_submap(rng, n, "a", True), covariance=covariance)).covariance
+    return covariance, m.rounded(replace(make_submap(rng, n, "a", True), covariance=covariance)).covariance
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 40])
-def test_a_sent_covariance_is_positive_definite_and_hardly_changed(rng: np.random.Generator, n: int) -> None:
-    covariance, sent = sent_covariance(rng, n, 1e-6)
+def test_a_compact_covariance_is_positive_definite_and_hardly_changed(rng: np.random.Generator, n: int) -> None:
+    covariance, sent = compact_covariance(rng, n, 1e-6)
     assert np.abs(sent - covariance).max() > 0.0
     assert np.linalg.eigvalsh(sent)[0] > 0.0
     L = np.linalg.cholesky(covariance)
@@ -328,19 +333,19 @@ def test_a_sent_covariance_is_positive_definite_and_hardly_changed(rng: np.rando
 
 
 def test_a_covariance_that_rounding_would_change_goes_out_in_full(rng: np.random.Generator) -> None:
-    covariance, sent = sent_covariance(rng, 40, 1e-11)
+    covariance, sent = compact_covariance(rng, 40, 1e-11)
     np.testing.assert_array_equal(sent, covariance)
 
 
-def test_a_submap_takes_a_quarter_of_its_numbers(rng: np.random.Generator) -> None:
+def test_a_compact_submap_takes_a_quarter_of_its_numbers(rng: np.random.Generator) -> None:
     submap = make_submap(rng, 150, "a", True)
-    sent = sum(len(typestore().serialize_cdr(x, x.__msgtype__)) for x in m.submap_messages(TYPES, submap))
+    sent = sum(len(typestore().serialize_cdr(x, x.__msgtype__)) for x in m.submap_messages(TYPES, submap, compact=True))
     assert sent < 0.29 * (submap.covariance.nbytes + submap.descriptors.nbytes)
 
 
-def test_sent_descriptors_compare_as_before(rng: np.random.Generator) -> None:
+def test_compact_descriptors_compare_as_before(rng: np.random.Generator) -> None:
     submap = make_submap(rng, 50, "a", True)
-    sent = m.as_sent(submap).descriptors
+    sent = m.rounded(submap).descriptors
     np.testing.assert_allclose(np.linalg.norm(sent, axis=1), 1.0, atol=1e-6)
     assert np.abs(sent @ sent.T - submap.descriptors @ submap.descriptors.T).max() < 0.01
 

@@ -137,6 +137,9 @@ class SubmapConfig(Config):
     restart_sigma_turn_rate: float = parameter(
         1.0, "uncertainty of the turn rate at an independent start", unit="rad/s", minimum=0.0
     )
+    compact: bool = parameter(
+        False, "send submaps rounded, in a quarter of the bytes: 32-bit factor of the covariance, 8-bit descriptors"
+    )
 
 
 @dataclass(frozen=True)

@@ -165,7 +165,8 @@ class EkfNode(SlamNode[EkfNodeConfig]):
 
     def _publish_submaps(self, submaps: tuple[Submap, ...]) -> None:
         for submap in submaps:
-            for topic, message in zip(SUBMAP_TOPICS, submap_messages(self.types, submap), strict=True):
+            messages = submap_messages(self.types, submap, compact=self.config.submap.compact)
+            for topic, message in zip(SUBMAP_TOPICS, messages, strict=True):
                 self.publish(topic, message)
 
 

@@ -1,7 +1,7 @@
 """The filters of all agents and the one map that their submaps are joined into.
 
-Joining runs on a thread of its own, submap after submap: no filter waits for the map, which it does not need. Submaps
-are joined as they would come out of their messages, so that the nodes make the same map.
+Joining runs on a thread of its own, submap after submap: no filter waits for the map, which it does not need. Where the
+nodes would send compact submaps, their rounding is in the map here too.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from slam_bringup.configuration import SystemConfig
 from slam_bringup.eyes import FilterInput
 from slam_bringup.stage_times import StageTimes
 from slam_core.geometry import FloatArray
-from slam_core.messages import as_sent
+from slam_core.messages import rounded
 from slam_core.types import PoseEstimate, Submap
 
 
@@ -53,6 +53,7 @@ class Mapper:
 
     def __init__(self, config: SystemConfig, T_rig_optical: dict[str, FloatArray], times: StageTimes) -> None:
         self._times = times
+        self._compact = config.ekf_slam.submap.compact
         self._filters = {agent: EkfSlam(replace(config.ekf_slam, agent=agent), T) for agent, T in T_rig_optical.items()}
         self.records = {agent: AgentRecord() for agent in T_rig_optical}
         self.reports: list[JoinReport] = []
@@ -99,4 +100,4 @@ class Mapper:
 
     def _add(self, submap: Submap) -> JoinReport:
         with self._times.measure("sjsam"):
-            return self.global_map.add(as_sent(submap))
+            return self.global_map.add(rounded(submap) if self._compact else submap)

@@ -25,8 +25,9 @@ from slam_bringup.dense_map import ColouredCloud
 from slam_bringup.dense_run import dense_model
 from slam_bringup.eyes import AgentEyes, FilterInput, Glimpse
 from slam_bringup.mapper import Mapper
+from slam_bringup.readings import ImuReading, Reading
 from slam_bringup.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
-from slam_bringup.sensor_bag import ImuReading, Reading, SensorBag
+from slam_bringup.sensor_bag import SensorBag
 from slam_bringup.sensor_topics import BagNames
 from slam_bringup.stage_times import StageTimes
 from slam_core.trajectory import Trajectory

@@ -43,7 +43,7 @@ from slam_core.messages.poses import (
     transform_from_message,
     transform_message,
 )
-from slam_core.messages.submaps import SUBMAP_TOPICS, SubmapMessages, as_sent, submap_from_messages, submap_messages
+from slam_core.messages.submaps import SUBMAP_TOPICS, SubmapMessages, rounded, submap_from_messages, submap_messages
 
 __all__ = [
     "DEPTH_TOPICS",
@@ -54,7 +54,6 @@ __all__ = [
     "FeatureMessages",
     "MessageTypes",
     "SubmapMessages",
-    "as_sent",
     "camera_info_from_message",
     "camera_info_message",
     "cloud_from_message",
@@ -89,6 +88,7 @@ __all__ = [
     "pose_stamped_message",
     "pose_with_covariance_message",
     "rectified_info",
+    "rounded",
     "stamp_ns",
     "submap_from_messages",
     "submap_messages",

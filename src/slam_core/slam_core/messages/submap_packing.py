@@ -1,8 +1,9 @@
-"""A submap's Gaussian and descriptors in a quarter of the bytes.
+"""A submap's Gaussian as one matrix; Gaussian and descriptors compact, in a quarter of the bytes.
 
-The covariance goes out as its Cholesky factor in 32 bits: whatever rounding does to a factor, factor times transpose is
-positive definite. Rounding changes the covariance by about the factor's condition (rows scaled to one) times 6e-8, in
-units of its own standard deviations; where that could be seen, mean and covariance go out in full, in 64 bits.
+Compact, the covariance goes out as its Cholesky factor in 32 bits: whatever rounding does to a factor, factor times
+transpose is positive definite. Rounding changes the covariance by about the factor's condition (rows scaled to one)
+times 6e-8, in units of its own standard deviations; where that could be seen, mean and covariance go out in full, in
+64 bits.
 
 Of the lower triangular factor of m rows the first half of the columns stays where it is; the others, which are shorter,
 stand on their heads above the diagonal of those: m rows of m // 2 + 1 columns.
@@ -23,14 +24,19 @@ MAX_ROUNDING = 1e-3
 """Largest relative change of the covariance that rounding may make."""
 
 
+def full_gaussian(mean: FloatArray, covariance: FloatArray) -> AnyArray:
+    """Mean (m,) in column 0, then the covariance (m, m), float64."""
+    return np.column_stack([mean, covariance]).astype("<f8")
+
+
 def pack_gaussian(mean: FloatArray, covariance: FloatArray) -> AnyArray:
-    """Mean (m,) in column 0, then the folded factor, float32; or the covariance (m, m), float64."""
+    """Mean (m,) in column 0, then the folded factor, float32; where that would show, :func:`full_gaussian`."""
     try:
         L = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     except np.linalg.LinAlgError:  # whoever receives it can tell
-        return np.column_stack([mean, covariance]).astype("<f8")
+        return full_gaussian(mean, covariance)
     if np.finfo(np.float32).eps * _condition(L, covariance) > MAX_ROUNDING:
-        return np.column_stack([mean, covariance]).astype("<f8")
+        return full_gaussian(mean, covariance)
     return np.column_stack([mean, _folded(L)]).astype("<f4")
 
 
@@ -43,7 +49,7 @@ def _condition(L: FloatArray, covariance: FloatArray) -> float:
 
 
 def unpack_gaussian(packed: AnyArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (m,) and covariance (m, m) of what :func:`pack_gaussian` made.
+    """Mean (m,) and covariance (m, m) of what either of the two made.
 
     Raises
     ------

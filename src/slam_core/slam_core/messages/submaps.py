@@ -2,17 +2,16 @@
 
 ==========================  =================================================================================
 ``submap/landmarks``        PointCloud2 for the eye: x y z, id, sightings, marginal covariances
-``submap/descriptors``      Image 8SC1, one row per landmark, in steps of the row's own (its length is one)
-``submap/gaussian``         Image 32FC1, 6 + 3n rows: the mean (end pose tangent, landmarks), then the folded Cholesky
-                            factor of the covariance (:mod:`~slam_core.messages.submap_packing`)
+``submap/descriptors``      Image 32FC1, one row per landmark
+``submap/gaussian``         Image 64FC1, 6 + 3n rows: the mean (end pose tangent, landmarks), then the joint covariance
 ``submap/path``             the rig poses inside, for the eye
 ``submap/path_covariance``  Image 64FC1, one row per pose: the upper 3x4 of T_start_rig, then its 6x6 covariance
 ``submap/info``             DiagnosticArray: agent, index, start and end stamp, whether it follows its predecessor
 ==========================  =================================================================================
 
-Packing rounds. Whoever joins submaps without sending them takes them :func:`as_sent`, so that joining online and
-offline gives the same map. Standard messages have no field for what ``submap/info`` says; a DiagnosticArray has a stamp
-and reads well in any tool.
+Over a thin link descriptors and Gaussian can go out compact, in a quarter of the bytes
+(:mod:`~slam_core.messages.submap_packing`), which rounds; whoever receives them need not be told. Standard messages
+have no field for what ``submap/info`` says; a DiagnosticArray has a stamp and reads well in any tool.
 """
 
 from __future__ import annotations
@@ -27,7 +26,13 @@ from slam_core.messages.base import Message, MessageTypes, header_message, stamp
 from slam_core.messages.clouds import cloud_from_message, landmark_cloud
 from slam_core.messages.images import image_from_message, image_message
 from slam_core.messages.poses import path_message
-from slam_core.messages.submap_packing import pack_descriptors, pack_gaussian, unpack_descriptors, unpack_gaussian
+from slam_core.messages.submap_packing import (
+    full_gaussian,
+    pack_descriptors,
+    pack_gaussian,
+    unpack_descriptors,
+    unpack_gaussian,
+)
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
 _POSE_COLUMNS = 12 + 36
@@ -51,21 +56,23 @@ SUBMAP_TOPICS = {
 """Topic and type of each field of :class:`SubmapMessages`, in its order."""
 
 
-def submap_messages(types: MessageTypes, submap: Submap) -> SubmapMessages:
-    """Messages that carry ``submap``, rounded as :func:`as_sent` says."""
+def submap_messages(types: MessageTypes, submap: Submap, *, compact: bool = False) -> SubmapMessages:
+    """Messages that carry ``submap``; ``compact`` ones carry it :func:`rounded`."""
     header = header_message(types, submap.end_stamp_ns, submap.frame_id)
+    mean, descriptors = _mean(submap), submap.descriptors.astype("<f4")
+    gaussian = pack_gaussian(mean, submap.covariance) if compact else full_gaussian(mean, submap.covariance)
     return SubmapMessages(
         landmark_cloud(types, header, submap.landmarks, _marginals(submap), submap.landmark_ids, submap.sightings),
-        image_message(types, header, pack_descriptors(submap.descriptors)),
-        image_message(types, header, pack_gaussian(_mean(submap), submap.covariance)),
+        image_message(types, header, pack_descriptors(descriptors) if compact else descriptors),
+        image_message(types, header, gaussian),
         path_message(types, submap.end_stamp_ns, submap.frame_id, submap.path),
         image_message(types, header, _pose_rows(submap.path)),
         _info_message(types, header, submap),
     )
 
 
-def as_sent(submap: Submap) -> Submap:
-    """The submap as it comes out of its messages."""
+def rounded(submap: Submap) -> Submap:
+    """The submap as it comes out of its compact messages."""
     mean, covariance = unpack_gaussian(pack_gaussian(_mean(submap), submap.covariance))
     descriptors = unpack_descriptors(pack_descriptors(submap.descriptors))
     end_pose = _end_pose(submap.path, mean)
@@ -75,7 +82,7 @@ def as_sent(submap: Submap) -> Submap:
 
 
 def submap_from_messages(messages: SubmapMessages) -> Submap:
-    """The submap of a set of messages: ``as_sent`` of what :func:`submap_messages` was given.
+    """The submap of a set of messages, full or compact.
 
     Raises
     ------
