@@ -11,6 +11,9 @@ from rclpy.executors import SingleThreadedExecutor
 
 from slam_core.ros import RosTypes, sensor_qos
 
+_MOMENT_S = 0.5
+_PATIENCE_S = 3.0
+
 
 class Probe:
     """``received`` holds the messages of every topic listened to, in order."""
@@ -22,20 +25,35 @@ class Probe:
         self.types = RosTypes()
         self.received: dict[str, list[Any]] = {}
         self.senders: dict[str, Any] = {}
+        self._subscriptions: list[Any] = []
 
     def listen(self, topic: str, message_type: Any, *, latched: bool = False) -> None:
         self.received[topic] = []
         profile = sensor_qos(100, latched)
-        self.node.create_subscription(message_type, topic, self.received[topic].append, profile)
+        self._subscriptions.append(
+            self.node.create_subscription(message_type, topic, self.received[topic].append, profile)
+        )
 
     def send(self, topic: str, message: Any) -> None:
         if topic not in self.senders:
             self.senders[topic] = self.node.create_publisher(type(message), topic, sensor_qos(100))
             self.wait(lambda: self.senders[topic].get_subscription_count() > 0, f"nobody listens to {topic}")
+            self._let_others_find_us()
         self.senders[topic].publish(message)
 
     def wait(self, condition: Callable[[], bool], why: str, seconds: float = 60.0) -> None:
         end = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < end, why
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def _let_others_find_us(self) -> None:
+        """Only this side's matches can be seen; a node that has been found may need a moment more to find us, and what
+        is said before is lost.
+        """
+        end = time.monotonic() + _PATIENCE_S
+        while time.monotonic() < end and not all(s.get_publisher_count() for s in self._subscriptions):
+            self.executor.spin_once(timeout_sec=0.05)
+        end = time.monotonic() + _MOMENT_S
+        while time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.05)
