@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from submap_world import unit
+from submap_world import Agent, circle, ring_world, unit
 
 from sjsam_node.association import AssociationConfig, PointSet, Prior, match, mutual_best, variance_factor
-from slam_core.geometry import boxminus, boxplus, transform_points
+from sjsam_node.closures import at_end
+from sjsam_node.map_graph import MapGraph
+from slam_core.geometry import boxminus, boxplus, invert_transform, transform_points
 
 
 def two_views(
@@ -83,3 +85,20 @@ def test_variance_factor_is_one_for_honest_errors_and_measures_dishonest_ones(rn
     assert variance_factor(honest) == pytest.approx(1.0, abs=0.06)
     assert variance_factor(9.0 * honest) == pytest.approx(9.0, rel=0.06)
     assert variance_factor(np.concatenate([honest, np.full(800, 1e4)])) < 1.6
+
+
+def test_landmarks_seen_from_the_end_have_its_error_too(rng: np.random.Generator) -> None:
+    """The covariance is that of central differences of ``end^-1 p``."""
+    submap = Agent(ring_world(3.0, rng, 12.0), circle(3.0, 0.2), rng, "").submaps()[0]
+    graph = MapGraph()
+    graph.append(submap, 0, None, np.eye(4))
+
+    def seen(error: np.ndarray) -> np.ndarray:
+        end = boxplus(submap.end_pose, error[:6])
+        return transform_points(invert_transform(end), submap.landmarks + error[6:].reshape(-1, 3)).ravel()
+
+    steps = 1e-6 * np.eye(len(submap.covariance))
+    J = np.stack([(seen(e) - seen(-e)) / 2e-6 for e in steps], axis=1)
+    points = at_end(graph.records[0])
+    np.testing.assert_allclose(points.points.ravel(), seen(np.zeros(len(J.T))), atol=1e-12)
+    np.testing.assert_allclose(points.covariance, J @ submap.covariance @ J.T, atol=1e-9)

@@ -44,8 +44,20 @@ def test_cholesky_and_its_solution(rng):
     np.testing.assert_allclose(W @ W.T, B @ np.linalg.inv(S) @ B.T, atol=1e-12)
 
 
+@pytest.mark.parametrize("n", [0, 1, 40])
+def test_inverse_of_a_covariance(rng, n):
+    A = rng.normal(size=(n, n))
+    S = A @ A.T + np.eye(n)
+    inverse = blas.inverse(S)
+    np.testing.assert_allclose(inverse @ S, np.eye(n), atol=1e-11)
+    np.testing.assert_array_equal(inverse, inverse.T)
+
+
 def test_an_indefinite_matrix_has_no_factor():
-    assert not blas.cholesky(np.asfortranarray(np.diag([1.0, -1.0])))
+    indefinite = np.diag([1.0, -1.0])
+    with pytest.raises(np.linalg.LinAlgError):
+        blas.inverse(indefinite)
+    assert not blas.cholesky(np.asfortranarray(indefinite))
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_solve
 
+from slam_core import blas
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxplus, skew, transform_points
 from slam_core.least_squares import chi_square_bound
@@ -96,20 +96,27 @@ def candidate_pairs(first: PointSet, second: PointSet, prior: Prior, config: Ass
         score = np.linalg.norm(error, axis=1)
         inside = score < config.nearest_gate
     else:
-        S = _innovation_covariance(first, second, prior, i, j) + config.position_noise**2 * np.eye(3)
+        bound = chi_square_bound(config.probability, 3)
+        own, other = first.variances() + config.position_noise**2 * np.eye(3), _variances_seen(second, prior)
+        # No eigenvalue is larger than the trace: what this sends away is outside the gate.
+        largest = np.trace(own, axis1=1, axis2=2)[i] + np.trace(other, axis1=1, axis2=2)[j]
+        near = np.einsum("ni,ni->n", error, error) < bound * largest
+        i, j, error = i[near], j[near], error[near]
+        S = own[i] + other[j]
         nis = np.einsum("ni,ni->n", error, np.linalg.solve(S, error[..., None])[..., 0])
         score = nis + np.linalg.slogdet(S)[1]  # Eq. 4.8
-        inside = nis < chi_square_bound(config.probability, 3)
+        inside = nis < bound
     return mutual_best(i[inside], j[inside], score[inside])
 
 
-def _innovation_covariance(first: PointSet, second: PointSet, prior: Prior, i: IntArray, j: IntArray) -> FloatArray:
+def _variances_seen(points: PointSet, prior: Prior) -> FloatArray:
+    """Covariance (n, 3, 3) of each landmark as the prior places it."""
     R = prior.T[:3, :3]
-    S = first.variances()[i] + R @ second.variances()[j] @ R.T
+    seen = R @ points.variances() @ R.T
     if prior.covariance is not None:
-        J = _alignment_jacobian(prior.T, second.points[j]).reshape(-1, 3, 6)
-        S = S + J @ prior.covariance @ np.swapaxes(J, 1, 2)
-    return np.asarray(S)
+        J = _alignment_jacobian(prior.T, points.points).reshape(-1, 3, 6)
+        seen = seen + J @ prior.covariance @ np.swapaxes(J, 1, 2)
+    return np.asarray(seen)
 
 
 def mutual_best(i: IntArray, j: IntArray, score: FloatArray) -> IntArray:
@@ -185,7 +192,7 @@ def _solve(first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, con
     R = np.kron(np.eye(n), prior.T[:3, :3])
     C = a.covariance + R @ b.covariance @ R.T + config.position_noise**2 * np.eye(3 * n)
     error = (a.points - transform_points(prior.T, b.points)).ravel()
-    weight = cho_solve((np.linalg.cholesky(C), True), np.eye(3 * n))
+    weight = blas.inverse(C)
     if prior.covariance is None:
         return _Solution(prior.T, known, float(error @ weight @ error), 3 * n, _pair_nis(weight, weight @ error))
     J = _alignment_jacobian(prior.T, b.points)

@@ -98,14 +98,15 @@ def at_end(record: Record) -> PointSet:
     """
     submap = record.submap
     R, t = submap.end_pose[:3, :3], submap.end_pose[:3, 3]
-    n = len(submap.landmarks)
-    J = np.zeros((n, 3, 6 + 3 * n))
-    J[:, :, :3] = -R.T
-    J[:, :, 3:6] = R.T @ skew(submap.landmarks - t)
-    for axis in range(3):
-        J[np.arange(n), :, 6 + 3 * np.arange(n) + axis] = R.T[:, axis]
-    rows = J.reshape(3 * n, 6 + 3 * n)
-    return PointSet((submap.landmarks - t) @ R, rows @ submap.covariance @ rows.T, submap.descriptors)
+    J_end = np.concatenate([np.broadcast_to(-R.T, (len(submap.landmarks), 3, 3)), R.T @ skew(submap.landmarks - t)], 2)
+    half = _as_seen(submap.covariance, R, J_end.reshape(-1, 6))
+    return PointSet((submap.landmarks - t) @ R, _as_seen(half.T, R, J_end.reshape(-1, 6)), submap.descriptors)
+
+
+def _as_seen(rows: FloatArray, R: FloatArray, J_end: FloatArray) -> FloatArray:
+    """``J rows`` for the Jacobian of (end pose, landmarks): ``J_end`` (3n, 6), and ``R^T`` for each landmark's own."""
+    turned = R.T @ rows[6:].reshape(len(J_end) // 3, 3, rows.shape[1])
+    return np.asarray(J_end @ rows[:6] + turned.reshape(len(J_end), rows.shape[1]))
 
 
 class Standing(Enum):

@@ -16,6 +16,7 @@ from sjsam_node.joining import JoiningProblem, map_residual
 from sjsam_node.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
 from sjsam_node.robust import RobustConfig, RobustJoining, closing_rows, predicted
+from slam_core import blas
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, make_transform, so3_log
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
@@ -63,16 +64,16 @@ def reduce_map(record: Record, is_shared: BoolArray, rows: str) -> ReducedMap:
     end = submap.end_pose
     mean = np.concatenate([end[:3, 3], so3_log(end[:3, :3]), submap.landmarks[shared].ravel()])
     covariance = submap.covariance
-    information = np.linalg.inv(covariance[np.ix_(kept, kept)])
-    gain = covariance[np.ix_(dropped, kept)] @ information
+    information = blas.inverse(covariance[np.ix_(kept, kept)])
+    cross = covariance[np.ix_(dropped, kept)]
+    gain = cross @ information
     blocks = dropped.reshape(-1, 3)
     spread = covariance[blocks[:, :, None], blocks[:, None, :]]
     if rows == "block":
         local = block_rows(LocalMap(0, np.array([1]), shared, mean, information), 6, 3)
         return ReducedMap(shared, private, mean, local.information, np.zeros_like(gain), spread)
-    spread = spread - np.einsum("pim,pmj->pij", gain.reshape(-1, 3, len(kept)),
-                                covariance[kept[None, :, None], blocks[:, None, :]])  # fmt: skip
-    return ReducedMap(shared, private, mean, 0.5 * (information + information.T), gain, spread)
+    spread = spread - gain.reshape(-1, 3, len(kept)) @ np.swapaxes(cross.reshape(-1, 3, len(kept)), 1, 2)
+    return ReducedMap(shared, private, mean, information, gain, spread)
 
 
 @dataclass(frozen=True, eq=False)
