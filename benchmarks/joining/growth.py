@@ -26,6 +26,7 @@ def grow(count: int, laps: float, label: str) -> None:
         times.append(time.perf_counter() - began)
         updates.append(report.update)
     began = time.perf_counter()
+    global_map.settle()
     global_map.trajectory()
     settled = time.perf_counter() - began
     milliseconds, step = 1e3 * np.array(times), max(count // 8, 10)
