@@ -8,6 +8,7 @@ def test_rate_and_latency_are_of_the_last_period_counters_of_all() -> None:
     health.report(10.0)
     for duration in (0.010, 0.030):
         health.processed(duration)
+    health.processed(0.0001, is_frame=False)  # of an IMU
     health.count("rejected")
     health.set(State.DEGRADED, "few features")
     first = health.report(11.0)
@@ -16,7 +17,7 @@ def test_rate_and_latency_are_of_the_last_period_counters_of_all() -> None:
     second = health.report(12.0)
     assert second["rate_hz"] == "0.00"
     assert "latency_mean_ms" not in second
-    assert second["processed"] == "2"
+    assert second["processed"] == "3"
 
 
 def test_values_of_the_newest_input_are_reported() -> None:

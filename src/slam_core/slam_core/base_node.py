@@ -230,7 +230,7 @@ class SlamNode(Node, Generic[C]):
         started = time.perf_counter()
         try:
             callback(*messages)
-            self.health.processed(time.perf_counter() - started)
+            self.health.processed(time.perf_counter() - started, is_frame=announce)
         except ValueError as error:
             self._reject(f"{source}: message rejected: {error}")
         except Exception:

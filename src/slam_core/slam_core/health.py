@@ -39,10 +39,11 @@ class Health:
         """Set a value of the newest input, for instance "score"."""
         self.values[what] = str(value)
 
-    def processed(self, duration_s: float) -> None:
-        """One input was processed in ``duration_s``."""
+    def processed(self, duration_s: float, *, is_frame: bool = True) -> None:
+        """One input was processed in ``duration_s``; rate and latency are those of frames."""
         self.count("processed")
-        self._durations.append(duration_s)
+        if is_frame:
+            self._durations.append(duration_s)
 
     def report(self, now_s: float) -> dict[str, str]:
         """Key and text of every value; starts a new period for rate and durations. ``now_s`` is any steady clock."""
