@@ -52,7 +52,7 @@ from slam_core.synchronizer import PAIRING_TOLERANCE_S, ExactSynchronizer
 C = TypeVar("C", bound=Config)
 
 WATCHDOG_S = 5.0
-JUMP_S = 1.0
+JUMP_S = 0.25
 """A stamp older by so much is a time that has begun anew; by less, a message out of order."""
 
 _NOT_A_FRAME = ("CameraInfo", "Imu", "Odometry", "PoseWithCovarianceStamped", "PointStamped")
