@@ -4,12 +4,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_core.synchronizer import ExactSynchronizer
+from slam_core.synchronizer import StampSynchronizer
 
 
-def make(topics: tuple[str, ...] = ("a", "b"), **options: int) -> tuple[ExactSynchronizer[str], list]:
+def make(topics: tuple[str, ...] = ("a", "b"), **options: int) -> tuple[StampSynchronizer[str], list]:
     sets: list = []
-    return ExactSynchronizer[str](topics, lambda stamp, items: sets.append((stamp, items)), **options), sets
+    return StampSynchronizer[str](topics, lambda stamp, items: sets.append((stamp, items)), **options), sets
 
 
 def test_a_set_is_complete_with_its_last_item() -> None:

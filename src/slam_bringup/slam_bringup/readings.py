@@ -10,7 +10,7 @@ from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
 from slam_core.messages import grey_from_message, imu_from_message, picture_from_message, stamp_ns
 from slam_core.messages.base import Message
-from slam_core.synchronizer import PAIRING_TOLERANCE_S, ExactSynchronizer
+from slam_core.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
 from slam_core.types import AnyArray, ByteArray, ImuSample
 
 _UNPAIRED = f"images without a partner within {1000 * PAIRING_TOLERANCE_S:g} ms of their stamp"
@@ -93,8 +93,8 @@ class AgentPairing:
         depth_roles = [role for role in ("depth", "amplitude", "intensity") if role in sensors.topics]
         stereo_roles = ("left", "right") if has_stereo else ()
         tolerance_ns = round(PAIRING_TOLERANCE_S * 1e9)
-        self._stereo = ExactSynchronizer[Message](stereo_roles, self._on_stereo, tolerance_ns=tolerance_ns)
-        self._depth = ExactSynchronizer[Message](depth_roles, self._on_depth, tolerance_ns=tolerance_ns)
+        self._stereo = StampSynchronizer[Message](stereo_roles, self._on_stereo, tolerance_ns=tolerance_ns)
+        self._depth = StampSynchronizer[Message](depth_roles, self._on_depth, tolerance_ns=tolerance_ns)
         self._depth_roles = depth_roles
 
     def add(self, role: str, message: Message) -> list[Reading]:

@@ -47,7 +47,7 @@ from slam_core.health import Health, State
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC, header_message, stamp_ns, transform_from_message
 from slam_core.messages.base import Message
 from slam_core.ros import RosTypes, declare_config, has_tf2_msgs, incompatibility, sensor_qos
-from slam_core.synchronizer import PAIRING_TOLERANCE_S, ExactSynchronizer
+from slam_core.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
 
 C = TypeVar("C", bound=Config)
 
@@ -104,7 +104,7 @@ class SlamNode(Node, Generic[C]):
         self.health = Health()
         self.frames = FrameTree()
         self._inputs: dict[str, _Input] = {}
-        self._synchronizers: list[ExactSynchronizer[Message]] = []
+        self._synchronizers: list[StampSynchronizer[Message]] = []
         self._outputs: dict[str, Any] = {}
         self._paused = False
         self._silent = False
@@ -149,7 +149,7 @@ class SlamNode(Node, Generic[C]):
             self._process(" + ".join(names), stamp, callback, *messages)
 
         tolerance_ns = round(self.input_config.pairing_tolerance_s * 1e9)
-        pairs = ExactSynchronizer[Message](names, on_set, tolerance_ns=tolerance_ns, depth=self.input_config.depth)
+        pairs = StampSynchronizer[Message](names, on_set, tolerance_ns=tolerance_ns, depth=self.input_config.depth)
         self._synchronizers.append(pairs)
         for topic, type_name in topics.items():
             self._add_input(topic, type_name, lambda stamp, m, t=topic: pairs.add(t, stamp, m), latched, required)

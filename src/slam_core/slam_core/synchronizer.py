@@ -17,7 +17,7 @@ time between two frames, so that equal stamps pair as if nothing else were allow
 """
 
 
-class ExactSynchronizer(Generic[T]):
+class StampSynchronizer(Generic[T]):
     """Collects one item per topic and hands complete sets on, in the order of their stamps.
 
     A topic delivers in order, so once a set is complete nothing older can become complete: what is left of it is
