@@ -25,6 +25,7 @@ class Health:
         self.counters: Counter[str] = Counter()
         self.values: dict[str, str] = {}
         self._durations: list[float] = []
+        self._frames = 0
         self._reported_at: float | None = None
 
     def set(self, state: State, reason: str = "") -> None:
@@ -40,18 +41,21 @@ class Health:
         self.values[what] = str(value)
 
     def processed(self, duration_s: float, *, is_frame: bool = True) -> None:
-        """One input was processed in ``duration_s``; rate and latency are those of frames."""
+        """One input was processed in ``duration_s``: a frame, or what accompanies frames (an IMU's reading, a motion
+        that a frame has waited for). The rate is that of frames; the mean latency is all the work there was per frame.
+        """
         self.count("processed")
-        if is_frame:
-            self._durations.append(duration_s)
+        self._durations.append(duration_s)
+        self._frames += is_frame
 
     def report(self, now_s: float) -> dict[str, str]:
         """Key and text of every value; starts a new period for rate and durations. ``now_s`` is any steady clock."""
         period = now_s - self._reported_at if self._reported_at is not None else 0.0
         durations, self._durations, self._reported_at = self._durations, [], now_s
         values = {"state": self.state.name, "reason": self.reason}
-        values["rate_hz"] = f"{len(durations) / period:.2f}" if period > 0.0 else "0.00"
-        if durations:
-            values["latency_mean_ms"] = f"{1e3 * sum(durations) / len(durations):.2f}"
+        frames, self._frames = self._frames, 0
+        values["rate_hz"] = f"{frames / period:.2f}" if period > 0.0 else "0.00"
+        if frames:
+            values["latency_mean_ms"] = f"{1e3 * sum(durations) / frames:.2f}"
             values["latency_max_ms"] = f"{1e3 * max(durations):.2f}"
         return values | self.values | {name: str(number) for name, number in sorted(self.counters.items())}
