@@ -41,6 +41,15 @@ from slam_core.geometry import (
     skew,
 )
 
+_LEAST_EXTENT, _LARGEST_EXTENT = 1e-6, 1e15
+"""Extent of a cloud, m, between which sums and squares of its coordinates mean something."""
+_PLANAR_VOXEL_SIZE = 0.18
+"""Edge of the finest cells of a scan in the plane, over its scale."""
+_PLANAR_CELL_POINTS, _PLANAR_SCAN_POINTS = 4, 30
+"""Fewest points of a cell, and finite ones of a scan, in the plane."""
+_ROUNDING = 4e-15
+"""Variance of rounding over the trace of a covariance (6, 6): what keeps it positive definite at a long lever."""
+
 
 @dataclass(frozen=True)
 class RegistrationConfig(Config):
@@ -183,10 +192,6 @@ def check_cloud(points: FloatArray, name: str, config: RegistrationConfig) -> No
         raise DegenerateCloudError(f"the {name} spans {extent:.3g} m: no length of it can be computed with")
 
 
-_LEAST_EXTENT, _LARGEST_EXTENT = 1e-6, 1e15
-"""Extent of a cloud, m, between which sums and squares of its coordinates mean something."""
-
-
 def for_dimension(config: RegistrationConfig, *, planar: bool) -> RegistrationConfig:
     """The configuration, for scans (n, 2) with wide cells and few points in each: a laser scanner has but hundreds."""
     if not planar:
@@ -194,12 +199,6 @@ def for_dimension(config: RegistrationConfig, *, planar: bool) -> RegistrationCo
     wide = max(config.grid.relative_voxel_size, _PLANAR_VOXEL_SIZE)
     grid = replace(config.grid, relative_voxel_size=wide, min_points=min(config.grid.min_points, _PLANAR_CELL_POINTS))
     return replace(config, grid=grid, min_points=min(config.min_points, _PLANAR_SCAN_POINTS))
-
-
-_PLANAR_VOXEL_SIZE = 0.18
-"""Edge of the finest cells over the scan's scale."""
-_PLANAR_CELL_POINTS = 4
-_PLANAR_SCAN_POINTS = 30
 
 
 def _register(
@@ -356,6 +355,3 @@ def _shifted_covariance(covariance: FloatArray, rotated_centre: FloatArray) -> F
     J[:3, 3:] = skew(rotated_centre)
     shifted = J @ covariance @ J.T
     return np.asarray(0.5 * (shifted + shifted.T) + _ROUNDING * np.trace(shifted) * np.eye(6))
-
-
-_ROUNDING = 4e-15

@@ -189,8 +189,8 @@ def _solve(first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, con
     if n == 0:
         return _Solution(prior.T, known, 0.0, 0, np.empty(0))
     a, b = first.select(pairs[:, 0]), second.select(pairs[:, 1])
-    R = np.kron(np.eye(n), prior.T[:3, :3])
-    C = a.covariance + R @ b.covariance @ R.T + config.position_noise**2 * np.eye(3 * n)
+    R = prior.T[:3, :3]
+    C = a.covariance + turned(turned(b.covariance, R).T, R) + config.position_noise**2 * np.eye(3 * n)
     error = (a.points - transform_points(prior.T, b.points)).ravel()
     weight = blas.inverse(C)
     if prior.covariance is None:
@@ -203,6 +203,11 @@ def _solve(first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, con
     total = residual @ weight @ residual + step @ np.linalg.solve(prior.covariance, step)
     marginal = weight - weighted @ covariance @ weighted.T
     return _Solution(boxplus(prior.T, step), covariance, float(total), 3 * n, _pair_nis(marginal, weight @ residual))
+
+
+def turned(rows: FloatArray, R: FloatArray) -> FloatArray:
+    """Rows (3n, m) that belong to n points, with each point's three turned by ``R`` (3, 3)."""
+    return np.asarray((R @ rows.reshape(len(rows) // 3, 3, rows.shape[1])).reshape(rows.shape))
 
 
 def _alignment_jacobian(T: FloatArray, points: FloatArray) -> FloatArray:

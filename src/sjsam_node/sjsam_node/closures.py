@@ -24,6 +24,7 @@ from sjsam_node.association import (
     match,
     mutual_best,
     similarity,
+    turned,
 )  # fmt: skip
 from sjsam_node.map_graph import Link, MapGraph, Record
 from sjsam_node.near_pairs import Chain, NearPairs
@@ -98,15 +99,15 @@ def at_end(record: Record) -> PointSet:
     """
     submap = record.submap
     R, t = submap.end_pose[:3, :3], submap.end_pose[:3, 3]
-    J_end = np.concatenate([np.broadcast_to(-R.T, (len(submap.landmarks), 3, 3)), R.T @ skew(submap.landmarks - t)], 2)
-    half = _as_seen(submap.covariance, R, J_end.reshape(-1, 6))
-    return PointSet((submap.landmarks - t) @ R, _as_seen(half.T, R, J_end.reshape(-1, 6)), submap.descriptors)
+    own = np.broadcast_to(-R.T, (len(submap.landmarks), 3, 3))
+    J_end = np.concatenate([own, R.T @ skew(submap.landmarks - t)], axis=2).reshape(-1, 6)
+    half = _as_seen(submap.covariance, R, J_end)
+    return PointSet((submap.landmarks - t) @ R, _as_seen(half.T, R, J_end), submap.descriptors)
 
 
 def _as_seen(rows: FloatArray, R: FloatArray, J_end: FloatArray) -> FloatArray:
     """``J rows`` for the Jacobian of (end pose, landmarks): ``J_end`` (3n, 6), and ``R^T`` for each landmark's own."""
-    turned = R.T @ rows[6:].reshape(len(J_end) // 3, 3, rows.shape[1])
-    return np.asarray(J_end @ rows[:6] + turned.reshape(len(J_end), rows.shape[1]))
+    return J_end @ rows[:6] + turned(rows[6:], R.T)
 
 
 class Standing(Enum):
