@@ -178,5 +178,5 @@ def _coupled(odometry: FlatMaps, pose: IntArray, landmark: IntArray, poses: int,
     return FlatMaps(
         np.concatenate([odometry.reference, first]),
         np.concatenate([odometry.pose_ptr, odometry.pose_ptr[-1] + 1 + np.arange(len(first))]),
-        np.concatenate([odometry.poses, second]), none, none[:0], none, np.empty(0), none, np.empty(0),
+        np.concatenate([odometry.poses, second]), none, none[:0], none, np.empty(0), none, np.empty(0), np.empty(0),
     )  # fmt: skip

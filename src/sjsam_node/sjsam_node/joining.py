@@ -41,6 +41,8 @@ class JoiningProblem:
         Of ``slam_core.sparse_cholesky``.
     last
         Nodes to eliminate last (see :func:`~sjsam_node.layout.make_layout`).
+    constant
+        What the local maps cost beyond their residuals and pulls.
     """
 
     def __init__(
@@ -51,8 +53,9 @@ class JoiningProblem:
         model: int,
         backend: str = "auto",
         last: IntArray | None = None,
+        constant: float = 0.0,
     ) -> None:
-        self.maps, self.model = maps, model
+        self.maps, self.model, self._constant = maps, model, constant
         self.rows = int(maps.mean_ptr[-1])
         dimension = state.translations.shape[1]
         self.layout: Layout = make_layout(maps, len(state.translations), len(state.landmarks), fixed, dimension, last)
@@ -68,8 +71,8 @@ class JoiningProblem:
         return self.factor.backend
 
     def cost(self, state: State) -> float:
-        """chi2: sum over the local maps of ``r^T information r``."""
-        return float(kernels.joint_cost(self.model, self.maps, *_arrays(state)))
+        """chi2: sum over the local maps of ``r^T information r + 2 pull^T r``, and the constant."""
+        return self._constant + float(kernels.joint_cost(self.model, self.maps, *_arrays(state)))
 
     def linearize(self, state: State) -> FloatArray:
         """Normal equations at ``state``."""

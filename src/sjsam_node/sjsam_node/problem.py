@@ -19,7 +19,8 @@ class LocalMap:
 
     poses (k,) and landmarks (n,) are indices into the state; mean (m,) and information (m, m) are ordered poses first
     (position, then angles), landmarks after. The angles of the mean are a planar angle, a rotation vector or Euler
-    angles, as the problem's ``model`` says.
+    angles, as the problem's ``model`` says. pull (m,): gradient of half the cost at the mean, zero unless the mean was
+    taken elsewhere than at the map's own optimum; with the residual r the map costs ``r^T information r + 2 pull^T r``.
     """
 
     reference: int
@@ -27,6 +28,7 @@ class LocalMap:
     landmarks: IntArray
     mean: FloatArray
     information: FloatArray
+    pull: FloatArray | None = None
 
 
 def block_rows(m: LocalMap, pose_size: int, landmark_size: int) -> LocalMap:
@@ -54,13 +56,14 @@ class FlatMaps(NamedTuple):
     mean: FloatArray
     information_ptr: IntArray
     information: FloatArray
+    pull: FloatArray
 
     def first(self, count: int) -> FlatMaps:
         """The first ``count`` local maps, without copying the values."""
         return FlatMaps(
             self.reference[:count], self.pose_ptr[: count + 1], self.poses, self.landmark_ptr[: count + 1],
             self.landmarks, self.mean_ptr[: count + 1], self.mean, self.information_ptr[: count + 1],
-            self.information,
+            self.information, self.pull,
         )  # fmt: skip
 
 
@@ -76,6 +79,7 @@ def flatten(maps: Sequence[LocalMap]) -> FlatMaps:
         _joined([m.mean for m in maps], np.float64),
         pointers([m.information.size for m in maps]),
         _joined([m.information.ravel() for m in maps], np.float64),
+        _joined([np.zeros(len(m.mean)) if m.pull is None else m.pull for m in maps], np.float64),
     )
 
 
