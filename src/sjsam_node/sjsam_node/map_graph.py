@@ -13,15 +13,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse
 import scipy.sparse.csgraph
 
+from sjsam_node.fusion import BoolArray as BoolArray
+from sjsam_node.fusion import Fusion
 from slam_core.geometry import FloatArray, inverse_jacobian, invert_transform
 from slam_core.sparse_cholesky import IntArray
 from slam_core.types import Submap
-
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +77,8 @@ class Snapshot:
     links: list[Link]
     poses: FloatArray
     points: FloatArray
+    fusion: Fusion
+    component_of: IntArray
 
 
 @dataclass
@@ -88,16 +89,19 @@ class MapGraph:
     links: list[Link] = field(default_factory=list)
     poses: FloatArray = field(default_factory=lambda: np.empty((0, 4, 4)))
     points: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
-    landmark_of: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     component_of: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    _seen_in: dict[int, set[int]] = field(default_factory=dict)
-    _members: dict[int, list[int]] = field(default_factory=dict)
+    _fusion: Fusion = field(default_factory=Fusion)
     _ending_at: dict[int, int] = field(default_factory=dict)
     _way: dict[int, float] = field(default_factory=dict)
     _chained: dict[int, FloatArray] = field(default_factory=dict)
     _stretch: dict[int, int] = field(default_factory=dict)
     _middles: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     _starts: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    @property
+    def landmark_of(self) -> IntArray:
+        """Landmark of every observation, named after its oldest one, (observations,)."""
+        return self._fusion.landmark_of
 
     def append(self, submap: Submap, session: int, start: int | None, guess: FloatArray) -> Record:
         """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own."""
@@ -110,10 +114,7 @@ class MapGraph:
         self._way[end] = self._way.setdefault(start, 0.0) + float(np.linalg.norm(submap.end_pose[:3, 3]))
         record = Record(submap, session, start, end, len(self.points))
         self.points = np.concatenate([self.points, submap.landmarks @ T[:3, :3].T + T[:3, 3]])
-        self.landmark_of = np.concatenate([self.landmark_of, record.observations])
-        for observation in record.observations.tolist():
-            self._seen_in[observation] = {len(self.records)}
-            self._members[observation] = [observation]
+        self._fusion.append(len(submap.landmarks), len(self.records))
         self._ending_at[end] = len(self.records)
         middle = np.median(submap.landmarks, axis=0) if len(submap.landmarks) else np.zeros(3)
         self._middles, self._starts = np.concatenate([self._middles, middle[None]]), np.append(self._starts, start)
@@ -167,24 +168,12 @@ class MapGraph:
         if self.component(link.first) != self.component(link.second):
             self._merge(link)
         self.links.append(link)
-        return self._fuse(link)
+        return self._fusion.unite(self._observed(link))
 
-    def _fuse(self, link: Link) -> int:
-        a, b = self.records[link.first].first_observation, self.records[link.second].first_observation
-        return sum(self._unite(a + int(i), b + int(j)) for i, j in link.pairs)
-
-    def _unite(self, a: int, b: int) -> bool:
-        """Make two observations one landmark, unless a submap would then see the same landmark twice."""
-        keep, gone = sorted((int(self.landmark_of[a]), int(self.landmark_of[b])))
-        if keep == gone:
-            return True
-        if self._seen_in[keep] & self._seen_in[gone]:
-            return False
-        self._seen_in[keep] |= self._seen_in.pop(gone)
-        members = self._members.pop(gone)
-        self._members[keep] += members
-        self.landmark_of[members] = keep
-        return True
+    def _observed(self, link: Link) -> IntArray:
+        """The observations that a link's pairs name, (k, 2)."""
+        first = np.array([self.records[i].first_observation for i in (link.first, link.second)])
+        return np.asarray(link.pairs + first)
 
     def _merge(self, link: Link) -> None:
         first, second = self.component(link.first), self.component(link.second)
@@ -213,11 +202,9 @@ class MapGraph:
     def replace_links(self, links: Iterable[Link]) -> None:
         """Believe exactly these links (of those there were): landmarks are fused anew from them."""
         self.links = list(links)
-        self.landmark_of = np.arange(len(self.points))
-        self._members = {i: [i] for i in range(len(self.points))}
-        self._seen_in = {o: {i} for i, r in enumerate(self.records) for o in r.observations.tolist()}
-        for link in self.links:
-            self._fuse(link)
+        self._fusion.separate()
+        if self.links:
+            self._fusion.unite(np.concatenate([self._observed(link) for link in self.links]))
         self._split_components()
 
     def _split_components(self) -> None:
@@ -232,20 +219,19 @@ class MapGraph:
 
     def snapshot(self) -> Snapshot:
         """The beliefs and the estimate, to come back to."""
-        return Snapshot(list(self.links), self.poses.copy(), self.points.copy())
+        return Snapshot(
+            list(self.links), self.poses.copy(), self.points.copy(), self._fusion.copy(), self.component_of.copy()
+        )
 
     def restore(self, snapshot: Snapshot) -> None:
         """Back to a snapshot taken since the last submap was added."""
+        self.links = list(snapshot.links)
         self.poses, self.points = snapshot.poses.copy(), snapshot.points.copy()
-        self.replace_links(snapshot.links)
+        self._fusion, self.component_of = snapshot.fusion.copy(), snapshot.component_of.copy()
 
     def shared(self) -> BoolArray:
         """Whether each observation's landmark is seen by more than one submap, (observations,) bool."""
-        return np.asarray(np.bincount(self.landmark_of, minlength=len(self.points))[self.landmark_of] > 1)
-
-    def members(self, landmark: int) -> list[int]:
-        """Observations of a landmark."""
-        return self._members[landmark]
+        return self._fusion.is_shared()
 
 
 def without(graph: MapGraph, link: Link, observations: set[int]) -> Link | None:
