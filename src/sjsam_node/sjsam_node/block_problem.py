@@ -67,7 +67,7 @@ class BlockProblem:
         count = len(self.sightings.pose)
         self._M, self._v = np.zeros((count, d, d)), np.zeros((count, d))
         self._V, self._K = np.zeros((landmarks, d, d)), np.zeros((landmarks, d, d))
-        self._G = np.zeros((count, d, pose_size))
+        self._F = np.zeros((count, d, d))
 
     @property
     def backend(self) -> str:
@@ -99,9 +99,9 @@ class BlockProblem:
     def _factorize(self, damping: float) -> bool:
         values = self._values.copy()
         values[self.layout.pattern.diagonal] *= 1.0 + damping
-        if not self._kernels.factor_landmarks(self.sightings, damping, self._M, self._v, self._V, self._K, self._G):
+        if not self._kernels.factor_landmarks(self.sightings, damping, self._M, self._V, self._K, self._F):
             return False
-        self._kernels.reduce(self.sightings, self._pair_ptr, self._pair, self._stride, self._G, values)
+        self._kernels.reduce(self.sightings, self._pair_ptr, self._pair, self._stride, self._v, self._F, values)
         return self.factor.factorize(values)
 
     def gradient(self, state: State) -> FloatArray:
@@ -116,9 +116,9 @@ class BlockProblem:
         """Step for this gradient with the last factor."""
         n, offset = self.layout.pattern.n, self.layout.pose_offset
         right, step = gradient.copy(), np.empty_like(gradient)
-        self._kernels.reduce_gradient(self.sightings, offset, n, self._K, self._G, right)
+        self._kernels.reduce_gradient(self.sightings, offset, n, self._v, self._K, self._F, right)
         step[:n] = self.factor.solve(-right[:n])
-        self._kernels.recover(self.sightings, offset, n, self._K, self._G, right, step)
+        self._kernels.recover(self.sightings, offset, n, self._v, self._K, self._F, right, step)
         return step
 
     def retract(self, state: State, step: FloatArray) -> State:

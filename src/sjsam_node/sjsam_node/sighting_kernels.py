@@ -2,8 +2,8 @@
 
 With the residual turned to map axes, ``e = v - R z`` where ``v = l - t``, its information is ``M = R Omega R^T`` and
 its Jacobian ``J = [-I, [v]x]`` for the pose and I for the landmark. A landmark's block ``V = sum M`` has the factor
-``V^-1 = K K^T``, and with ``G = J^T M K`` for every sighting the landmark takes ``G_i G_j^T`` from the block of every
-two poses that see it.
+``V^-1 = K K^T``, and with ``F = M K`` for every sighting the landmark takes ``J_j^T (F_j F_i^T) J_i`` from the block of
+every two poses that see it.
 
 The kernels are made for 2 and for 3 dimensions from the same code, so that the compiler sees constant loop bounds.
 """
@@ -173,8 +173,8 @@ def make_kernels(d: int) -> SightingKernels:
                     _pull(v, weighted, out, offset[i])
 
     @njit(cache=True, nogil=True)
-    def factor_landmarks(sightings, damping, M, v, V, K, G):
-        """``K`` of every landmark from its damped block, and ``G`` of every sighting, (d, dp) transposed."""
+    def factor_landmarks(sightings, damping, M, V, K, F):
+        """``K`` of every landmark from its damped block, and ``F`` of every sighting."""
         landmark_ptr = sightings[0]
         L = np.zeros((d, d))
         for landmark in range(len(landmark_ptr) - 1):
@@ -202,50 +202,72 @@ def make_kernels(d: int) -> SightingKernels:
                         value -= L[i, s] * K[landmark, j, s]
                     K[landmark, j, i] = value / L[i, i]
             for o in range(landmark_ptr[landmark], landmark_ptr[landmark + 1]):
-                a, b, c = v[o, 0], v[o, 1], v[o, d - 1]
-                for q in range(d):
-                    for p in range(d):
+                for p in range(d):
+                    for q in range(d):
                         value = 0.0
                         for s in range(q + 1):
                             value += M[o, p, s] * K[landmark, s, q]
-                        G[o, q, p] = -value
-                    x, y, z = G[o, q, 0], G[o, q, 1], G[o, q, d - 1]
-                    if d == 2:
-                        G[o, q, 2] = a * y - b * x
-                    else:
-                        G[o, q, 3] = b * z - c * y
-                        G[o, q, 4] = c * x - a * z
-                        G[o, q, 5] = a * y - b * x
+                        F[o, p, q] = value
         return True
 
-    @njit(cache=True, nogil=True)
-    def reduce(sightings, pair_ptr, pair, stride, G, values):
-        """Take ``G_i G_j^T`` from the block of every two poses that see a landmark; ``pair`` says where it is."""
+    @njit(cache=True, nogil=True, fastmath={"contract"})
+    def reduce(sightings, pair_ptr, pair, stride, v, F, values):
+        """Take ``J_j^T (F_j F_i^T) J_i`` from the block of every two poses that see a landmark; ``pair`` says where it
+        is. Columns belong to the pose that is eliminated first.
+        """
         landmark_ptr, pose = sightings[0], sightings[1]
         for landmark in range(len(landmark_ptr) - 1):
             last = landmark_ptr[landmark + 1]
             for o in range(landmark_ptr[landmark], last):
-                step = stride[pose[o]]
+                step, own = stride[pose[o]], v[o]
                 for other in range(o, last):
                     base = pair[pair_ptr[o] + other - o]
-                    if base < 0:
-                        continue
-                    for a in range(dp):
-                        at = base + a * step
-                        if d == 3:
-                            x, y, z = G[o, 0, a], G[o, 1, a], G[o, 2, a]
-                            for b in range(dp):
-                                values[at + b] -= x * G[other, 0, b] + y * G[other, 1, b] + z * G[other, 2, b]
-                        else:
-                            x, y = G[o, 0, a], G[o, 1, a]
-                            for b in range(dp):
-                                values[at + b] -= x * G[other, 0, b] + y * G[other, 1, b]
+                    if base >= 0:
+                        _take_block(F[other], F[o], v[other], own, values, base, step)
+
+    @njit(cache=True, nogil=True, fastmath={"contract"}, inline="always")
+    def _take_block(A, B, v, w, values, base, step):
+        """Subtract ``J(v)^T (A B^T) J(w)``, column by column."""
+        if d == 2:
+            x0, y0, x1, y1 = _dot(A, B, 0, 0), _dot(A, B, 1, 0), _dot(A, B, 0, 1), _dot(A, B, 1, 1)
+            _take_column(x0, y0, 0.0, v, values, base)
+            _take_column(x1, y1, 0.0, v, values, base + step)
+            _take_column(w[0] * x1 - w[1] * x0, w[0] * y1 - w[1] * y0, 0.0, v, values, base + 2 * step)
+        else:
+            x0, y0, z0 = _dot(A, B, 0, 0), _dot(A, B, 1, 0), _dot(A, B, 2, 0)
+            x1, y1, z1 = _dot(A, B, 0, 1), _dot(A, B, 1, 1), _dot(A, B, 2, 1)
+            x2, y2, z2 = _dot(A, B, 0, 2), _dot(A, B, 1, 2), _dot(A, B, 2, 2)
+            a, b, c = w[0], w[1], w[2]
+            _take_column(x0, y0, z0, v, values, base)
+            _take_column(x1, y1, z1, v, values, base + step)
+            _take_column(x2, y2, z2, v, values, base + 2 * step)
+            _take_column(b * x2 - c * x1, b * y2 - c * y1, b * z2 - c * z1, v, values, base + 3 * step)
+            _take_column(c * x0 - a * x2, c * y0 - a * y2, c * z0 - a * z2, v, values, base + 4 * step)
+            _take_column(a * x1 - b * x0, a * y1 - b * y0, a * z1 - b * z0, v, values, base + 5 * step)
+
+    @njit(cache=True, nogil=True, fastmath={"contract"}, inline="always")
+    def _dot(A, B, p, q):
+        value = A[p, 0] * B[q, 0] + A[p, 1] * B[q, 1]
+        return value if d == 2 else value + A[p, 2] * B[q, 2]
+
+    @njit(cache=True, nogil=True, fastmath={"contract"}, inline="always")
+    def _take_column(x, y, z, v, values, at):
+        """Subtract ``-J(v)^T (x, y, z)``: itself and ``v x (x, y, z)``."""
+        values[at] -= x
+        values[at + 1] -= y
+        if d == 2:
+            values[at + 2] -= v[0] * y - v[1] * x
+        else:
+            values[at + 2] -= z
+            values[at + 3] -= v[1] * z - v[2] * y
+            values[at + 4] -= v[2] * x - v[0] * z
+            values[at + 5] -= v[0] * y - v[1] * x
 
     @njit(cache=True, nogil=True)
-    def reduce_gradient(sightings, offset, n, K, G, gradient):
+    def reduce_gradient(sightings, offset, n, v, K, F, gradient):
         """Take what the landmarks explain from the poses' gradient; theirs becomes ``K^T g``."""
         landmark_ptr, pose = sightings[0], sightings[1]
-        own = np.empty(d)
+        own, pulled = np.empty(d), np.empty(d)
         for landmark in range(len(landmark_ptr) - 1):
             at = n + d * landmark
             for q in range(d):
@@ -255,17 +277,18 @@ def make_kernels(d: int) -> SightingKernels:
             for q in range(d):
                 gradient[at + q] = own[q]
             for o in range(landmark_ptr[landmark], landmark_ptr[landmark + 1]):
-                to = offset[pose[o]]
-                if to >= 0:
-                    for a in range(dp):
+                if offset[pose[o]] >= 0:
+                    for p in range(d):
+                        pulled[p] = 0.0
                         for q in range(d):
-                            gradient[to + a] -= G[o, q, a] * own[q]
+                            pulled[p] -= F[o, p, q] * own[q]
+                    _pull(v[o], pulled, gradient, offset[pose[o]])
 
     @njit(cache=True, nogil=True)
-    def recover(sightings, offset, n, K, G, gradient, step):
-        """Steps of the landmarks, ``-K (K^T g + sum G^T step)``, behind those of the poses."""
+    def recover(sightings, offset, n, v, K, F, gradient, step):
+        """Steps of the landmarks, ``-K (K^T g + sum F^T J step)``, behind those of the poses."""
         landmark_ptr, pose = sightings[0], sightings[1]
-        own = np.empty(d)
+        own, moved = np.empty(d), np.empty(d)
         for landmark in range(len(landmark_ptr) - 1):
             at = n + d * landmark
             for q in range(d):
@@ -273,14 +296,28 @@ def make_kernels(d: int) -> SightingKernels:
             for o in range(landmark_ptr[landmark], landmark_ptr[landmark + 1]):
                 source = offset[pose[o]]
                 if source >= 0:
+                    _move(v[o], step, source, moved)
                     for q in range(d):
-                        for a in range(dp):
-                            own[q] += G[o, q, a] * step[source + a]
+                        for p in range(d):
+                            own[q] += F[o, p, q] * moved[p]
             for p in range(d):
                 value = 0.0
                 for q in range(p, d):
                     value -= K[landmark, p, q] * own[q]
                 step[at + p] = value
+
+    @njit(cache=True, nogil=True, inline="always")
+    def _move(v, step, at, out):
+        """``J step``."""
+        for p in range(d):
+            out[p] = -step[at + p]
+        if d == 2:
+            out[0] += v[1] * step[at + 2]
+            out[1] -= v[0] * step[at + 2]
+        else:
+            out[0] += v[1] * step[at + 5] - v[2] * step[at + 4]
+            out[1] += v[2] * step[at + 3] - v[0] * step[at + 5]
+            out[2] += v[0] * step[at + 4] - v[1] * step[at + 3]
 
     return SightingKernels(cost, linearize, gradient, factor_landmarks, reduce, reduce_gradient, recover)
 
