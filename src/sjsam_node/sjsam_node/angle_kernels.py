@@ -56,13 +56,12 @@ def _log(R, out):
         q[j] = R[j, i] + R[i, j]
         q[k] = R[k, i] + R[i, k]
         q[3] = R[k, j] - R[j, k]
-    if q[3] < 0.0:
-        q = -q
-    q /= math.sqrt((q * q).sum())
-    sine = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-    scale = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, q[3]) / sine
+    imaginary = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
+    norm = math.copysign(math.sqrt(imaginary + q[3] * q[3]), q[3])
+    sine, cosine = math.sqrt(imaginary) / abs(norm), q[3] / norm
+    scale = 2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, cosine) / sine
     for i in range(3):
-        out[i] = scale * q[i]
+        out[i] = scale * q[i] / norm
 
 
 @njit(cache=True, nogil=True)
@@ -73,9 +72,12 @@ def angle_error(model, Rh, z, r, B):
         B[0, 0] = 1.0
         return
     if model == TANGENT:
-        Rz = np.empty((3, 3))
+        Rz, R = np.empty((3, 3)), np.empty((3, 3))
         exp_rotation(z, Rz)
-        _log(Rh @ Rz.T, r)
+        for i in range(3):
+            for j in range(3):
+                R[i, j] = Rh[i, 0] * Rz[j, 0] + Rh[i, 1] * Rz[j, 1] + Rh[i, 2] * Rz[j, 2]
+        _log(R, r)
         angle = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
         b = 1.0 / 12.0 + angle * angle / 720.0
         if angle > 1e-3:
