@@ -20,13 +20,18 @@ from slam_core.geometry import FloatArray
 _LOWER, _PLAIN, _TRANSPOSED, _RIGHT = c_char(b"L"), c_char(b"N"), c_char(b"T"), c_char(b"R")
 
 
-def _routine(module: Any, name: str, arguments: int) -> Any:
-    """A routine all of whose arguments are pointers, as in Fortran."""
+def address_of(module: Any, name: str) -> int:
+    """Where a routine that a Cython module exports lies in memory."""
     capsule = module.__pyx_capi__[name]
     get_name, get_pointer = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
     get_name.restype, get_name.argtypes = ctypes.c_char_p, [ctypes.py_object]
     get_pointer.restype, get_pointer.argtypes = c_void_p, [ctypes.py_object, ctypes.c_char_p]
-    return ctypes.CFUNCTYPE(None, *[c_void_p] * arguments)(get_pointer(capsule, get_name(capsule)))
+    return int(get_pointer(capsule, get_name(capsule)))
+
+
+def _routine(module: Any, name: str, arguments: int) -> Any:
+    """A routine all of whose arguments are pointers, as in Fortran."""
+    return ctypes.CFUNCTYPE(None, *[c_void_p] * arguments)(address_of(module, name))
 
 
 _dsyrk = _routine(cython_blas, "dsyrk", 10)

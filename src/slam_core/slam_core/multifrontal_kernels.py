@@ -1,7 +1,7 @@
 """Compiled numeric part of a multifrontal factor; ``symbolic`` is :class:`~slam_core.elimination_tree.Symbolic`.
 
 Fronts are assembled from the matrix and from what their children in the elimination tree left over, w columns are
-eliminated, and the rest goes to the parent. All heavy work is dense matrix products.
+eliminated, and the rest goes to the parent. All heavy work is done by BLAS on dense matrices.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-_STRIP = 32
-"""Columns of a front that are eliminated one by one, before a product takes what they leave to the others."""
+from slam_core.blas_kernels import cholesky, solve_right, subtract_square
 
 
 @njit(cache=True, nogil=True)
@@ -44,11 +43,11 @@ def factorize(values, entries, symbolic, panels, stack):
             update = stack[free : free + left * left].reshape((left, left))
             _extend_add(update, rows[row_ptr[child] : row_ptr[child + 1]], width, slot, w, P, U)
             child = earlier[child]
-        if not _eliminate(panels[panel_ptr[s] : panel_ptr[s + 1]], m, w):
+        if not cholesky(P[:w]):
             return False
         if h > 0:
-            below_pivots = panels[panel_ptr[s] + w * w : panel_ptr[s + 1]].reshape((h, w))
-            _subtract_product(below_pivots, U)
+            solve_right(P[:w], P[w:])
+            subtract_square(P[w:], U)
             stack[free : free + h * h] = stack[top : top + h * h]
             earlier[s] = latest[parent[s]]
             latest[parent[s]] = s
@@ -106,50 +105,6 @@ def _extend_add(update, rows, width, slot, w, P, U):
 
 
 @njit(cache=True, nogil=True)
-def _eliminate(flat, m, w):
-    """Cholesky factor of the first w columns of a front (lower part, in place), a strip of columns at a time.
-
-    After k strips the last ``lowbit(k)`` of them update as many of the next: the recursive halving of the columns,
-    whose products are as large as can be, without recursion.
-    """
-    P = flat.reshape((m, w))
-    for k in range(0, w, _STRIP):
-        e = min(k + _STRIP, w)
-        if not _cholesky(P, k, e):
-            return False
-        if m == e:
-            break
-        turned = _inverse_of_lower(P, k, e - k).T
-        P[e:, k:e] = np.dot(P[e:, k:e].copy(), turned)
-        if e < w:
-            done = e // _STRIP
-            reach = _STRIP * (done & -done)
-            X = P[e:, e - reach : e].copy()
-            last = min(e + reach, w)
-            for first in range(e, last, 96):
-                end = min(first + 96, last)
-                P[first:, first:end] -= np.dot(X[first - e :], X[first - e : end - e].T)
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _cholesky(P, k, e):
-    """Factor of the triangle of ``P`` between k and e, in place."""
-    column = np.empty(e - k)
-    for j in range(k, e):
-        if not P[j, j] > 0.0:
-            return False
-        P[j, j] = np.sqrt(P[j, j])
-        for i in range(j + 1, e):
-            P[i, j] /= P[j, j]
-            column[i - k] = P[i, j]
-            scale = P[i, j]
-            for t in range(j + 1, i + 1):
-                P[i, t] -= scale * column[t - k]
-    return True
-
-
-@njit(cache=True, nogil=True)
 def _inverse_of_lower(L, k, b):
     """Inverse of the triangle of ``L`` that starts at (k, k), (b, b)."""
     out = np.zeros((b, b))
@@ -162,15 +117,6 @@ def _inverse_of_lower(L, k, b):
             out[i, j] /= L[k + i, k + i]
         out[i, i] = 1.0 / L[k + i, k + i]
     return out
-
-
-@njit(cache=True, nogil=True)
-def _subtract_product(X, U):
-    """``U -= X X^T`` in the lower triangle, by strips."""
-    h = len(X)
-    for first in range(0, h, 96):
-        last = min(first + 96, h)
-        U[first:, first:last] -= np.dot(X[first:], X[first:last].T)
 
 
 @njit(cache=True, nogil=True)
