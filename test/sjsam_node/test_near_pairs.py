@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from judging import join
@@ -25,6 +27,16 @@ def agent(rng: np.random.Generator) -> Agent:
 def believed_pairs(joined: GlobalMap) -> set[tuple[object, ...]]:
     records = joined.graph.records
     return {tuple(sorted((records[k.first].key, records[k.second].key))) for k in joined.graph.links if k.is_closure}
+
+
+def same_landmarks(joined: GlobalMap) -> set[frozenset[tuple[object, ...]]]:
+    """Every two observations that the map takes for one landmark."""
+    graph = joined.graph
+    seen: dict[int, list[tuple[object, ...]]] = {}
+    for record in graph.records:
+        for k, landmark in enumerate(graph.landmark_of[record.observations].tolist()):
+            seen.setdefault(landmark, []).append((*record.key, k))
+    return {frozenset(pair) for members in seen.values() for pair in combinations(members, 2)}
 
 
 def test_pairs_are_compared_once_and_again_when_they_have_moved(agent: Agent) -> None:
@@ -88,7 +100,7 @@ def test_one_false_link_is_not_the_end_of_the_true_ones(agent: Agent) -> None:
 
 
 def test_what_is_believed_hardly_depends_on_who_comes_first() -> None:
-    """Measured 0.93; comparing each submap only when it arrives, 0.80."""
+    """Of the observations that are one landmark; measured 0.994."""
     shares = []
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -99,9 +111,9 @@ def test_what_is_believed_hardly_depends_on_who_comes_first() -> None:
         one.settle()
         other.settle()
         shares.append(
-            len(believed_pairs(one) & believed_pairs(other)) / len(believed_pairs(one) | believed_pairs(other))
+            len(same_landmarks(one) & same_landmarks(other)) / len(same_landmarks(one) | same_landmarks(other))
         )
-    assert np.mean(shares) > 0.88
+    assert np.mean(shares) > 0.97
 
 
 def test_reading_the_map_does_not_change_it(agent: Agent) -> None:

@@ -28,6 +28,7 @@ from sjsam_node.association import (
 )  # fmt: skip
 from sjsam_node.map_graph import Link, MapGraph, Record
 from sjsam_node.near_pairs import Chain, NearPairs
+from sjsam_node.novelty import Novelty
 from sjsam_node.place_recognition import PlaceIndex, PlaceRecognitionConfig
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import (
@@ -136,8 +137,12 @@ class LinkFinder:
 
     def __post_init__(self) -> None:
         self.index = PlaceIndex(self.config.places)
-        near = 4 * self.config.near_candidates  # several passes and agents crowd around one place
-        self.near = NearPairs(self.config.proximity, near, self.config.association.position_noise)
+        self.near = NearPairs(self.config.proximity, self._neighbours, self.config.association.position_noise)
+
+    @property
+    def _neighbours(self) -> int:
+        """Near submaps that are of interest: several passes and agents crowd around one place."""
+        return 4 * self.config.near_candidates
 
     def sequential(self, graph: MapGraph, chain: list[int], new: int) -> list[Link]:
         """Links of record ``new`` to the records ``chain`` before it, newest first, by their odometry."""
@@ -158,24 +163,41 @@ class LinkFinder:
     def closures(self, graph: MapGraph, chain: list[int], new: int, relative_pose: RelativePose) -> Findings:
         """Links of record ``new`` beyond its chain; some may wait for confirmation."""
         recent = {*range(new, len(graph.records)), *chain[: self.config.window]}
-        near = self._near(graph, new, recent)
+        around = self._near(graph, new, recent)
+        near, further = around[: self.config.near_candidates], around[self.config.near_candidates :]
         looks = self.index.query(graph.records[new].submap.descriptors, recent | set(near))
-        second = at_start(graph.records[new])
+        second, known = at_start(graph.records[new]), self._novelty(graph)
         alike = [old for old in looks if self._is_alike(at_start(graph.records[old]), second)]
-        return self._judged(graph, [(old, new) for old in [*near, *alike]], relative_pose)
+        found = self._judged(graph, [(old, new) for old in [*near, *alike]], relative_pose, known)
+        if not known.is_known(new):
+            return found
+        # The map knows where it is: what else lies there is compared before all is joined, not after.
+        more = self._judged(graph, [(old, new) for old in further if old not in alike], relative_pose, known)
+        return Findings(found.believed + more.believed, found.contradicted + more.contradicted)
 
     def missed(self, graph: MapGraph, chain: Chain, relative_pose: RelativePose, most: int | None = None) -> Findings:
         """Links between records that have come near each other since they were compared, if ever they were.
 
         ``most`` pairs are compared, the nearest; None for all.
         """
-        return self._judged(graph, self.near.due(graph, chain)[:most], relative_pose)
+        return self._judged(graph, self.near.due(graph, chain)[:most], relative_pose, self._novelty(graph))
 
-    def _judged(self, graph: MapGraph, pairs: list[tuple[int, int]], relative_pose: RelativePose) -> Findings:
-        """What geometry and the map say of pairs of records."""
+    def _novelty(self, graph: MapGraph) -> Novelty:
+        config = self.config
+        return Novelty(
+            graph, config.min_near_inliers, config.association.descriptor_threshold, config.ransac_distance
+        )  # fmt: skip
+
+    def _judged(
+        self, graph: MapGraph, pairs: list[tuple[int, int]], relative_pose: RelativePose, known: Novelty
+    ) -> Findings:
+        """What geometry and the map say of pairs of records, but for those of which nothing new can be learnt."""
         believed: list[Link] = []
         contradicted: list[Link] = []
         for old, new in pairs:
+            if known.is_all_known(old, new):
+                self.near.note(graph, old, new)
+                continue
             first, second = at_start(graph.records[old]), at_start(graph.records[new])
             prior, way = relative_pose(old, new), graph.way_between(old, new)
             if prior is not None:
@@ -185,6 +207,7 @@ class LinkFinder:
                 continue
             link = Link(old, new, found.pairs, found.T, found.covariance, True)
             if standing is Standing.CERTAIN:
+                known.note(link)
                 believed.append(link)
             elif standing is Standing.CONTRADICTED:
                 contradicted.append(link)
@@ -195,15 +218,22 @@ class LinkFinder:
 
     def _near(self, graph: MapGraph, new: int, recent: set[int]) -> list[int]:
         """Older records of the same component whose landmarks are around those of ``new``, nearest first."""
-        return self.around(graph, _middle(graph, new), graph.records_of(graph.component(new)), recent)
+        return self.around(
+            graph, _middle(graph, new), graph.records_of(graph.component(new)), recent, self._neighbours
+        )  # fmt: skip
 
-    def around(self, graph: MapGraph, middle: FloatArray, records: Iterable[int], excluded: set[int]) -> list[int]:
-        """Those of ``records`` whose landmarks are around a point (3,) of the map, nearest first."""
+    def around(
+        self, graph: MapGraph, middle: FloatArray, records: Iterable[int], excluded: set[int], most: int | None = None
+    ) -> list[int]:
+        """Those of ``records`` whose landmarks are around a point (3,) of the map, nearest first.
+
+        ``most`` of them, by default as many as are tried.
+        """
         candidates = np.array([i for i in records if i not in excluded], dtype=np.int64)
         distance = np.linalg.norm(graph.middles(candidates) - middle, axis=1)
         ranked = sorted((d, i) for d, i in zip(distance.tolist(), candidates.tolist(), strict=True)
                         if d < self.config.proximity)  # fmt: skip
-        return [i for _, i in ranked[: self.config.near_candidates]]
+        return [i for _, i in ranked[: self.config.near_candidates if most is None else most]]
 
     def judge(
         self, first: PointSet, second: PointSet, prior: Prior | None, way: float, *key: int

@@ -203,6 +203,7 @@ class GlobalMap:
         ):
             if amount:
                 self.counters.add(name, amount)
+        self.finder.near.forget({i for k in verdict.revoked for i in (k.first, k.second)})
         if verdict.believed:
             self._closed_at = len(self.graph.records)
         older = [self.graph.records[link.first].submap for link in verdict.believed]

@@ -96,12 +96,17 @@ class MapGraph:
     _chained: dict[int, FloatArray] = field(default_factory=dict)
     _stretch: dict[int, int] = field(default_factory=dict)
     _middles: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
-    _starts: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    starts: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     @property
     def landmark_of(self) -> IntArray:
         """Landmark of every observation, named after its oldest one, (observations,)."""
         return self._fusion.landmark_of
+
+    @property
+    def record_of(self) -> IntArray:
+        """Record of every observation, (observations,)."""
+        return self._fusion.record_of
 
     def append(self, submap: Submap, session: int, start: int | None, guess: FloatArray) -> Record:
         """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own."""
@@ -117,7 +122,7 @@ class MapGraph:
         self._fusion.append(len(submap.landmarks), len(self.records))
         self._ending_at[end] = len(self.records)
         middle = np.median(submap.landmarks, axis=0) if len(submap.landmarks) else np.zeros(3)
-        self._middles, self._starts = np.concatenate([self._middles, middle[None]]), np.append(self._starts, start)
+        self._middles, self.starts = np.concatenate([self._middles, middle[None]]), np.append(self.starts, start)
         self.records.append(record)
         return record
 
@@ -132,7 +137,7 @@ class MapGraph:
 
     def records_of(self, component: int) -> list[int]:
         """Records of a component, ascending."""
-        return np.nonzero(self.component_of[self._starts] == component)[0].tolist()
+        return np.nonzero(self.component_of[self.starts] == component)[0].tolist()
 
     def way_between(self, first: int, second: int) -> float:
         """Length of the way that an agent went between two records, m; of both ways where they belong to two runs."""
@@ -149,7 +154,7 @@ class MapGraph:
 
     def middles(self, records: IntArray) -> FloatArray:
         """Middle of the landmarks of some records in the map frame, (n, 3); the start pose where there are none."""
-        T = self.poses[self._starts[records]]
+        T = self.poses[self.starts[records]]
         return np.asarray((T[:, :3, :3] @ self._middles[records][..., None])[..., 0] + T[:, :3, 3])
 
     def size(self, component: int) -> int:

@@ -199,13 +199,15 @@ class Trials:
 
     def _verdict(self, links: list[Link], offered: list[Link], newest: int) -> Verdict:
         """What became of ``offered``, all links there were, of which ``links`` are new."""
-        graph = self.joiner.graph
+        graph, new = self.joiner.graph, _names(links)
         self.joiner.forget_stale(newest)
-        kept, new = _names(graph.links), _names(links)
-        believed = tuple(k for k in graph.links if _name(k) in new)
-        gone = [k for k in offered if _name(k) not in kept]
-        revoked = tuple(k for k in gone if k.is_closure and _name(k) not in new)
-        return Verdict(believed, _matches(offered) - _matches(graph.links), revoked)
+        before, after = {id(k) for k in offered}, {id(k) for k in graph.links}
+        gone = [k for k in offered if id(k) not in after]
+        smaller = [k for k in graph.links if id(k) not in before]
+        believed = [k for k in links if id(k) in after] + [k for k in smaller if _name(k) in new]
+        kept = _names(smaller) | new
+        revoked = tuple(k for k in gone if k.is_closure and _name(k) not in kept)
+        return Verdict(tuple(believed), _matches(gone) - _matches(smaller), revoked)
 
     def _excess(self, rise: float, dof: int, newest: int) -> float:
         """How far chi2 rose above what true matches explain. Submaps that are too sure of themselves make every
@@ -225,18 +227,26 @@ class Trials:
         seen = nis[np.isfinite(nis)]
         factor = min(variance_factor(seen), self.config.max_variance_factor)
         gate = factor * chi_square_bound(self.config.outlier_probability, 3)
-        strain = {i: self._strain(link, nis) for i, link in enumerate(graph.links) if link.is_closure}
-        worst = max(strain, key=lambda i: strain[i], default=None)
-        if worst is not None and strain[worst] > gate:
-            graph.replace_links([link for i, link in enumerate(graph.links) if i != worst])
+        beyond = np.nonzero(nis > gate)[0]
+        if not len(beyond):
+            return False
+        suspects = set(graph.record_of[beyond].tolist())
+        strain = [
+            (self._strain(k, nis), i) for i, k in enumerate(graph.links)
+            if k.is_closure and (k.first in suspects or k.second in suspects)
+        ]  # fmt: skip
+        worst = max(strain, default=(0.0, 0), key=lambda entry: entry[0])
+        if worst[0] > gate:
+            graph.replace_links([link for i, link in enumerate(graph.links) if i != worst[1]])
             self.joiner.batch(newest)
             return True
-        outliers = self._outliers(component, nis, gate)
-        if outliers:
-            kept = [without(graph, link, outliers) for link in graph.links]
-            graph.replace_links([link for link in kept if link is not None])
-            self.joiner.batch(newest)
-        return bool(outliers)
+        outliers = self._outliers(sorted(suspects), nis, gate)
+        kept = [
+            without(graph, k, outliers) if k.first in suspects or k.second in suspects else k for k in graph.links
+        ]  # fmt: skip
+        graph.replace_links([link for link in kept if link is not None])
+        self.joiner.batch(newest)
+        return True
 
     def _nis(self, component: int) -> FloatArray:
         """Squared error of every observation as the rest of its submap predicts it, NaN where no other submap sees
@@ -261,10 +271,10 @@ class Trials:
         ]
         return max((float(np.median(s[np.isfinite(s)])) for s in sides if np.isfinite(s).any()), default=0.0)
 
-    def _outliers(self, component: int, nis: FloatArray, gate: float) -> set[int]:
+    def _outliers(self, records: Sequence[int], nis: FloatArray, gate: float) -> set[int]:
         """The worst observations of each record, where they are beyond the gate."""
         out: set[int] = set()
-        for i in self.joiner.graph.records_of(component):
+        for i in records:
             rows = self.joiner.graph.records[i].observations
             values = np.nan_to_num(nis[rows])
             allowed = max(1, int(self.config.outlier_share * np.isfinite(nis[rows]).sum()))
