@@ -5,8 +5,8 @@
 Every solver runs in a process of its own on the same submaps. Block rows (each landmark with its own 3x3) are what all
 of them can express with their own factors; chi2 is our cost function at their solution, so that all are measured
 alike. Times are medians; memory is what the process grew by while it solved. "batch" is from chained odometry to the
-optimum with everything symbolic; "covariances" is the joint covariance of eight
-poses along the way at the optimum, linearised and factored there.
+optimum with everything symbolic, given what each solver reads: flat maps, a factor graph, residual blocks.
+"covariances" is the joint covariance of eight poses along the way at the optimum, linearised and factored there.
 ``--incremental`` adds one submap after the other, with known association: iSAM2 with the estimate after each; ours
 placing each on the map at once and joining all of it every 1 + sqrt(n) / 3 submaps, as often as the node looks for
 closures. ``--node`` does it as the node does, finding associations and closures itself, of joint rows.
@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 from memory import PeakMemory
-from problems import KnownProblem, joining_problem, local_maps, ring
+from problems import KnownProblem, flattened, joining_problem, local_maps, ring
 
 from sjsam_node.block_problem import BlockProblem
 from sjsam_node.joining import JoiningProblem
@@ -55,12 +55,13 @@ def timed(action: Callable[[], Any]) -> tuple[float, Any]:
 
 
 def solve_ours(maps: list[LocalMap], state: State, rows: str, repeat: int) -> dict[str, Any]:
+    flat = flattened(maps, rows)
+
     def run() -> tuple[JoiningProblem | BlockProblem, State]:
-        problem = joining_problem(maps, state, rows)
+        problem = joining_problem(flat, state)
         return problem, problem.optimize(state, STOP)[0]
 
-    small = [m for m in maps if m.reference < 3]
-    few = joining_problem(small, state, rows)  # compiles
+    few = joining_problem(flat.first(3), state)  # compiles
     few.columns(few.optimize(state, LevenbergMarquardtConfig(max_iterations=3))[0], np.array([1]))
     memory = PeakMemory()
     seconds, (problem, optimum) = timed(run)
@@ -94,13 +95,14 @@ def child(solver: str, path: Path, repeat: int) -> dict[str, Any]:
         import gtsam_peer
 
         result = (gtsam_peer.isam2 if solver == "isam2" else gtsam_peer.solve)(maps, state, repeat)
-    result["chi2"] = joining_problem(maps, state, rows).cost(result.pop("state"))
+    result["chi2"] = joining_problem(flattened(maps, rows), state).cost(result.pop("state"))
     return result
 
 
 def in_turn(maps: list[LocalMap], state: State) -> dict[str, Any]:
     """One submap after the other; poses and landmarks are numbered by first sight, so that a prefix is a problem."""
-    joining_problem(maps[:3], state, "block").optimize(state, LevenbergMarquardtConfig(max_iterations=3))  # compile
+    compiles = joining_problem(flattened(maps[:3], "block"), state)
+    compiles.optimize(state, LevenbergMarquardtConfig(max_iterations=3))
     memory, began = PeakMemory(), time.perf_counter()
     R, t, points, seen, due = state.rotations.copy(), state.translations.copy(), state.landmarks.copy(), 0, 0.0
     for k, m in enumerate(maps):
@@ -111,7 +113,8 @@ def in_turn(maps: list[LocalMap], state: State) -> dict[str, Any]:
         due += 1.0 / (1.0 + np.sqrt(k) / 3.0)
         if due >= 1.0 or k == len(maps) - 1:
             known, due = State(R[: k + 2], t[: k + 2], points[:seen]), 0.0
-            known = joining_problem(maps[: k + 1], known, "block").optimize(known, STOP)[0]
+            flat = flattened(maps[: k + 1], "block")
+            known = joining_problem(flat, known).optimize(known, STOP)[0]
             R[: k + 2], t[: k + 2], points[:seen] = known.rotations, known.translations, known.landmarks
     seconds = time.perf_counter() - began
     return {"batch": [seconds], "memory": memory.grown(), "state": State(R, t, points)}

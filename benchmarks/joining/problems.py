@@ -18,9 +18,9 @@ sys.path[:0] = [str(p) for p in sorted((ROOT / "src").iterdir())] + [str(ROOT / 
 from submap_world import Agent, circle, ring_world  # noqa: E402
 
 from sjsam_node import kernels  # noqa: E402
-from sjsam_node.block_problem import BlockProblem  # noqa: E402
+from sjsam_node.block_problem import BlockProblem, FlatRows, flatten_rows  # noqa: E402
 from sjsam_node.joining import JoiningProblem  # noqa: E402
-from sjsam_node.problem import LocalMap, State, block_rows, flatten  # noqa: E402
+from sjsam_node.problem import FlatMaps, LocalMap, State, block_rows, flatten  # noqa: E402
 from slam_core.geometry import so3_log  # noqa: E402
 from slam_core.types import Submap  # noqa: E402
 
@@ -78,9 +78,12 @@ def local_maps(problem: KnownProblem, rows: str, shared_only: bool) -> tuple[lis
     return maps, state
 
 
-def joining_problem(
-    maps: list[LocalMap], state: State, rows: str, backend: str = "auto"
-) -> JoiningProblem | BlockProblem:
-    if rows == "block":
-        return BlockProblem(maps, state, np.array([0]), kernels.TANGENT, backend)
-    return JoiningProblem(flatten(maps), state, np.array([0]), kernels.TANGENT, backend)
+def flattened(maps: list[LocalMap], rows: str) -> FlatMaps | FlatRows:
+    """The maps as our solver reads them, as a factor graph is what GTSAM reads."""
+    return flatten_rows(maps, 6, 3) if rows == "block" else flatten(maps)
+
+
+def joining_problem(flat: FlatMaps | FlatRows, state: State, backend: str = "auto") -> JoiningProblem | BlockProblem:
+    if isinstance(flat, FlatRows):
+        return BlockProblem(flat, state, np.array([0]), kernels.TANGENT, backend)
+    return JoiningProblem(flat, state, np.array([0]), kernels.TANGENT, backend)

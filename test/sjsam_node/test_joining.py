@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sjsam_node import kernels
-from sjsam_node.block_problem import BlockProblem
+from sjsam_node.block_problem import BlockProblem, flatten_rows
 from sjsam_node.joining import JoiningProblem
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
 from slam_core.geometry import boxminus, euler_from_rotation, make_transform, so3_exp
@@ -167,7 +167,7 @@ def test_the_landmark_schur_complement_reaches_the_same_optimum_by_the_same_step
     size, d = s.model_dimensions
     uncorrelated = [block_rows(m, size, d) for m in maps]
     whole = JoiningProblem(flatten(uncorrelated), s, np.array([0]), model)
-    reduced = BlockProblem(uncorrelated, s, np.array([0]), model)
+    reduced = BlockProblem(flatten_rows(uncorrelated, size, d), s, np.array([0]), model)
     start = perturbed(whole, s, rng)
     assert reduced.cost(start) == pytest.approx(whole.cost(start), rel=1e-12)
     for damping in (0.0, 0.3):
@@ -190,7 +190,8 @@ def test_a_step_with_the_last_factor_solves_for_the_new_gradient(model: int, rng
     uncorrelated = [block_rows(m, *s.model_dimensions) for m in maps]
     whole = JoiningProblem(flatten(uncorrelated), s, np.array([0]), model)
     here = perturbed(whole, s, rng)
-    for problem in (whole, BlockProblem(uncorrelated, s, np.array([0]), model)):
+    reduced = BlockProblem(flatten_rows(uncorrelated, *s.model_dimensions), s, np.array([0]), model)
+    for problem in (whole, reduced):
         problem.linearize(s)
         step = problem.solve(0.0)
         assert step is not None

@@ -7,6 +7,7 @@ problem (:mod:`sjsam_node.sighting_kernels`), which is left with the poses alone
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +17,48 @@ from sjsam_node.joining import solved_covariance, variable_scalars
 from sjsam_node.layout import Layout, make_layout
 from sjsam_node.problem import FlatMaps, LocalMap, State, flatten
 from sjsam_node.sighting_kernels import KERNELS, counting_order, pair_positions, pose_pairs
-from slam_core.block_pattern import IntArray
+from slam_core.block_pattern import IntArray, pointers
 from slam_core.geometry import FloatArray
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
 from slam_core.sparse_cholesky import SparseCholesky
+
+
+class FlatRows(NamedTuple):
+    """Local maps of uncorrelated rows: the poses they measured, and their landmarks one by one.
+
+    sighting_ptr (maps + 1,): where those of each map start. pose (o,) that saw a landmark (o,), mean (o, d) and
+    information (o, d, d) of what it saw.
+    """
+
+    odometry: FlatMaps
+    sighting_ptr: IntArray
+    pose: IntArray
+    landmark: IntArray
+    mean: FloatArray
+    information: FloatArray
+
+    def first(self, count: int) -> FlatRows:
+        """The first ``count`` local maps, without copying the values."""
+        n = self.sighting_ptr[count]
+        return FlatRows(
+            self.odometry.first(count), self.sighting_ptr[: count + 1], self.pose[:n], self.landmark[:n],
+            self.mean[:n], self.information[:n],
+        )  # fmt: skip
+
+
+def flatten_rows(maps: Sequence[LocalMap], pose_size: int, d: int) -> FlatRows:
+    """The rows of local maps, each pose and landmark on its own, whatever correlates them."""
+    counts = [len(m.landmarks) for m in maps]
+    first = [pose_size * len(m.poses) for m in maps]
+    blocks = [_diagonal_blocks(m.information, n, d) for m, n in zip(maps, first, strict=True)]
+    return FlatRows(
+        flatten([_pose_rows(m, n) for m, n in zip(maps, first, strict=True)]),
+        pointers(counts),
+        np.repeat(np.array([m.reference for m in maps], dtype=np.int64), counts),
+        np.concatenate([m.landmarks for m in maps]),
+        np.concatenate([m.mean[n:].reshape(-1, d) for m, n in zip(maps, first, strict=True)]),
+        np.concatenate(blocks),
+    )
 
 
 class Sightings(NamedTuple):
@@ -40,13 +79,11 @@ class BlockProblem:
     Unknowns are ordered poses first, then landmarks; parameters as there.
     """
 
-    def __init__(self, maps: list[LocalMap], state: State, fixed: IntArray, model: int, backend: str = "auto") -> None:
+    def __init__(self, rows: FlatRows, state: State, fixed: IntArray, model: int, backend: str = "auto") -> None:
         self.model, d = model, state.translations.shape[1]
         self._kernels = KERNELS[d]
-        pose_size, poses, landmarks = state.model_dimensions[0], len(state.translations), len(state.landmarks)
-        self.odometry = flatten([_pose_rows(m, pose_size) for m in maps])
-        pose = np.repeat(np.array([m.reference for m in maps], dtype=np.int64), [len(m.landmarks) for m in maps])
-        landmark = np.concatenate([m.landmarks for m in maps])
+        poses, landmarks = len(state.translations), len(state.landmarks)
+        self.odometry, pose, landmark = rows.odometry, rows.pose, rows.landmark
         self.layout: Layout = make_layout(_coupled(self.odometry, pose, landmark, poses, landmarks), poses, 0, fixed, d)
         self.factor = SparseCholesky(self.layout.pattern, backend)
         pattern, offset = self.layout.pattern, self.layout.pose_offset
@@ -54,8 +91,9 @@ class BlockProblem:
         by_pose = counting_order(block[pose] + 1, len(pattern.width) + 1)[1]
         landmark_ptr, by_landmark = counting_order(landmark[by_pose], landmarks)
         order = by_pose[by_landmark]
-        mean, information = _rows(maps, pose_size, d)
-        self.sightings = Sightings(landmark_ptr, pose[order], mean[order], information[order], landmark[order])
+        self.sightings = Sightings(
+            landmark_ptr, pose[order], rows.mean[order], rows.information[order], landmark[order]
+        )
         pose_ptr, by_pose = counting_order(self.sightings.pose, poses)
         self._pair_ptr, self._pair = pair_positions(
             landmark_ptr, self.sightings.landmark, self.sightings.pose, pose_ptr, by_pose, block, pattern.column_ptr,
@@ -148,17 +186,8 @@ class BlockProblem:
         )
 
 
-def _pose_rows(m: LocalMap, pose_size: int) -> LocalMap:
-    rows = pose_size * len(m.poses)
+def _pose_rows(m: LocalMap, rows: int) -> LocalMap:
     return LocalMap(m.reference, m.poses, m.landmarks[:0], m.mean[:rows], m.information[:rows, :rows])
-
-
-def _rows(maps: list[LocalMap], pose_size: int, d: int) -> tuple[FloatArray, FloatArray]:
-    """Mean (o, d) and information (o, d, d) of every landmark of every map."""
-    means = [m.mean[pose_size * len(m.poses) :].reshape(-1, d) for m in maps]
-    return np.concatenate(means), np.concatenate(
-        [_diagonal_blocks(m.information, pose_size * len(m.poses), d) for m in maps]
-    )
 
 
 def _diagonal_blocks(A: FloatArray, first: int, d: int) -> FloatArray:
@@ -178,5 +207,5 @@ def _coupled(odometry: FlatMaps, pose: IntArray, landmark: IntArray, poses: int,
     return FlatMaps(
         np.concatenate([odometry.reference, first]),
         np.concatenate([odometry.pose_ptr, odometry.pose_ptr[-1] + 1 + np.arange(len(first))]),
-        np.concatenate([odometry.poses, second]), none, none[:0], none, np.empty(0), none, np.empty(0), np.empty(0),
+        np.concatenate([odometry.poses[: odometry.pose_ptr[-1]], second]), none, none[:0], none, np.empty(0), none, np.empty(0), np.empty(0),
     )  # fmt: skip

@@ -13,10 +13,10 @@ from functools import partial
 import numpy as np
 
 from sjsam_node import kernels
-from sjsam_node.block_problem import BlockProblem
+from sjsam_node.block_problem import BlockProblem, FlatRows, flatten_rows
 from sjsam_node.joining import JoiningProblem, map_residual
 from sjsam_node.linear_slam_text import Progress, TextMap
-from sjsam_node.problem import LocalMap, State, block_rows, flatten
+from sjsam_node.problem import FlatMaps, LocalMap, State, block_rows, flatten
 from sjsam_node.robust import RobustConfig, RobustJoining, closing_rows
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, euler_from_rotation, rotation_from_euler
@@ -142,7 +142,8 @@ class TextJoiner:
         size = 3 if index.dimension == 2 else 6
         block = config.rows == "block"
         self.maps = [block_rows(m, size, index.dimension) for m in index.maps] if block else index.maps
-        self.flat = flatten(self.maps)
+        flat = flatten_rows(self.maps, size, index.dimension) if block else flatten(self.maps)
+        self.flat: FlatMaps | FlatRows = flat
         self.solver, self.start, self.start_cost, self.dropped = "", "", np.nan, 0
 
     def best(self, progress: Progress | None) -> tuple[State, LeastSquaresResult]:
@@ -183,10 +184,10 @@ class TextJoiner:
         return problem.optimize(state, self.config.optimizer)
 
     def _problem(self, count: int, state: State) -> JoiningProblem | BlockProblem:
-        fixed = np.array([0])
-        if self.config.rows == "block":
-            return BlockProblem(self.maps[:count], state, fixed, self.model, self.config.solver)
-        return JoiningProblem(self.flat.first(count), state, fixed, self.model, self.config.solver)
+        fixed, maps = np.array([0]), self.flat.first(count)
+        if isinstance(maps, FlatRows):
+            return BlockProblem(maps, state, fixed, self.model, self.config.solver)
+        return JoiningProblem(maps, state, fixed, self.model, self.config.solver)
 
     def _incremental(self, growth: float, progress: Progress | None) -> State:
         """Place and join a growing part of the maps, by the share ``growth``, so that each starts near its optimum."""
