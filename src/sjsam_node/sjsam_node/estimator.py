@@ -6,6 +6,7 @@ Gaussian's rows are dropped) and recovered afterwards from its correlation with 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -15,6 +16,7 @@ from sjsam_node import kernels
 from sjsam_node.joining import JoiningProblem, map_residual
 from sjsam_node.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
+from sjsam_node.regions import Region
 from sjsam_node.robust import RobustConfig, RobustJoining, closing_rows, predicted
 from slam_core import blas
 from slam_core.config import Config, group, parameter
@@ -36,6 +38,11 @@ class EstimatorConfig(Config):
         1e-9, "stop when a step promises to lower chi2 by less than this share", minimum=0.0
     )
     robust: RobustConfig = group(RobustConfig)
+
+    @property
+    def linearises(self) -> bool:
+        """Whether submaps may be joined to larger ones: at the optimum, and with all their rows."""
+        return self.robust.loss == "none" and self.iterations > 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +85,14 @@ def reduce_map(record: Record, is_shared: BoolArray, rows: str) -> ReducedMap:
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """One component as a joining problem: which nodes, landmarks and records it is made of.
+    """One component as a joining problem: which nodes, landmarks, records and regions of records it is made of.
 
-    maps: the reduced submaps as they are joined. dropped: scalar rows of each that a robust loss left out.
+    maps: the reduced submaps as they are joined, then the regions. dropped: scalar rows of each that a robust loss left
+    out.
     """
 
     records: list[int]
+    regions: tuple[Region, ...]
     nodes: IntArray
     landmarks: IntArray
     reduced: list[ReducedMap]
@@ -92,8 +101,18 @@ class Assembled:
     state: State
     dropped: list[IntArray]
 
+    @property
+    def size(self) -> int:
+        """Number of records, those inside the regions included."""
+        return len(self.records) + sum(len(r.records) for r in self.regions)
+
+    @property
+    def redundancy(self) -> int:
+        """Rows beyond the unknowns, those inside the regions included."""
+        return self.problem.rows - self.problem.layout.pattern.n + sum(r.redundancy for r in self.regions)
+
     def covariance(self, nodes: list[int]) -> FloatArray:
-        """Joint covariance (6k, 6k) of nodes."""
+        """Joint covariance (6k, 6k) of nodes that are not inside a region."""
         return self.problem.columns(self.state, np.searchsorted(self.nodes, nodes))
 
 
@@ -104,27 +123,34 @@ class Estimator:
     config: EstimatorConfig = field(default_factory=EstimatorConfig)
     _cache: dict[int, tuple[bytes, ReducedMap]] = field(default_factory=dict)
 
-    def assemble(self, graph: MapGraph, component: int, front: tuple[int, IntArray] | None = None) -> Assembled:
+    def assemble(
+        self,
+        graph: MapGraph,
+        component: int,
+        front: tuple[int, IntArray] | None = None,
+        regions: Sequence[Region] = (),
+    ) -> Assembled:
         """Pose the joining problem of a component, its frame fixed at the start of its oldest record.
 
-        ``front``: a node and landmarks that are kept, even if private, and eliminated last.
+        ``front``: a node and landmarks that are kept, even if private, and eliminated last. ``regions`` stand for
+        their records.
         """
-        records, is_shared = graph.records_of(component), graph.shared()
+        inside = {i for region in regions for i in region.records.tolist()}
+        records = [i for i in graph.records_of(component) if i not in inside]
+        is_shared = graph.shared()
         if front is not None:
             is_shared = is_shared | np.isin(graph.landmark_of, front[1])
         reduced = [self._reduced(graph, i, is_shared) for i in records]
-        nodes = np.nonzero(graph.component_of == component)[0]
-        seen = [
-            graph.landmark_of[graph.records[i].observations[m.shared]] for i, m in zip(records, reduced, strict=True)
-        ]
-        landmarks = np.unique(np.concatenate(seen))
+        own = [graph.records[i] for i in records]
+        nodes = np.unique(
+            [n for r in own for n in (r.start, r.end)] + [n for r in regions for n in (r.reference, *r.rim)]
+        )
+        seen = [graph.landmark_of[r.observations[m.shared]] for r, m in zip(own, reduced, strict=True)]
+        landmarks = np.unique(np.concatenate([*seen, *(graph.landmark_of[r.landmarks] for r in regions)]))
         maps = [
-            LocalMap(
-                int(np.searchsorted(nodes, graph.records[i].start)), np.searchsorted(nodes, [graph.records[i].end]),
-                np.searchsorted(landmarks, ids), m.mean, m.information,
-            )
-            for i, m, ids in zip(records, reduced, seen, strict=True)
-        ]  # fmt: skip
+            *_local_maps(graph, records, reduced, nodes, landmarks),
+            *(region.local_map(graph, nodes, landmarks) for region in regions),
+        ]
         poses = graph.poses[nodes]
         state = State(
             np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), graph.points[landmarks]
@@ -133,9 +159,15 @@ class Estimator:
         last = None
         if front is not None:
             last = np.append(len(nodes) + np.searchsorted(landmarks, front[1]), np.searchsorted(nodes, front[0]))
-        problem = JoiningProblem(flatten(maps), state, anchor, kernels.TANGENT, self.config.solver, last)
-        nothing = [np.empty(0, dtype=np.int64)] * len(maps)
-        return Assembled(records, nodes, landmarks, reduced, maps, problem, state, nothing)
+        constant = sum(region.constant for region in regions)
+        problem = JoiningProblem(flatten(maps), state, anchor, kernels.TANGENT, self.config.solver, last, constant)
+        nothing = [np.empty(0, dtype=np.int64)] * len(records)
+        return Assembled(records, tuple(regions), nodes, landmarks, reduced, maps, problem, state, nothing)
+
+    def local_maps(self, graph: MapGraph, records: list[int], nodes: IntArray, landmarks: IntArray) -> list[LocalMap]:
+        """Reduced records over sorted lists of nodes and landmarks."""
+        is_shared = graph.shared()
+        return _local_maps(graph, records, [self._reduced(graph, i, is_shared) for i in records], nodes, landmarks)
 
     def _reduced(self, graph: MapGraph, record: int, is_shared: BoolArray) -> ReducedMap:
         mask = is_shared[graph.records[record].observations]
@@ -146,10 +178,16 @@ class Estimator:
         return known[1]
 
     def optimize(
-        self, graph: MapGraph, component: int, front: tuple[int, IntArray] | None = None
+        self,
+        graph: MapGraph,
+        component: int,
+        front: tuple[int, IntArray] | None = None,
+        regions: Sequence[Region] = (),
     ) -> tuple[Assembled, LeastSquaresResult]:
-        """Bring a component to its optimum and write it back to the graph; ``front`` as in :meth:`assemble`."""
-        assembled = self.assemble(graph, component, front)
+        """Bring a component to its optimum and write it back to the graph, but for what is inside the ``regions``;
+        ``front`` and ``regions`` as in :meth:`assemble`.
+        """
+        assembled = self.assemble(graph, component, front, regions)
         optimizer = LevenbergMarquardtConfig(self.config.iterations, self.config.relative_tolerance)
         state, result = assembled.problem.optimize(assembled.state, optimizer)
         if self.config.robust.loss != "none":
@@ -184,6 +222,18 @@ class Estimator:
         residual = predicted(reduced.information, local_residual(graph, record, reduced), dropped)
         private = record.submap.landmarks[reduced.private] + (reduced.gain @ residual).reshape(-1, 3)
         graph.points[record.observations[reduced.private]] = private @ T[:3, :3].T + T[:3, 3]
+
+
+def _local_maps(
+    graph: MapGraph, records: list[int], reduced: list[ReducedMap], nodes: IntArray, landmarks: IntArray
+) -> list[LocalMap]:
+    out = []
+    for i, m in zip(records, reduced, strict=True):
+        r = graph.records[i]
+        ids = np.searchsorted(landmarks, graph.landmark_of[r.observations[m.shared]])
+        start, end = np.searchsorted(nodes, [r.start, r.end])
+        out.append(LocalMap(int(start), np.array([end]), ids, m.mean, m.information))
+    return out
 
 
 def local_residual(graph: MapGraph, record: Record, reduced: ReducedMap) -> FloatArray:

@@ -16,6 +16,7 @@ from sjsam_node.closures import prior_of_pair, relative_pose
 from sjsam_node.estimator import Assembled, Estimator, EstimatorConfig
 from sjsam_node.incremental import Front
 from sjsam_node.map_graph import MapGraph, Snapshot
+from sjsam_node.regions import Region, RegionConfig, Regions
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import compose_covariance
 from slam_core.sparse_cholesky import IntArray
@@ -32,6 +33,7 @@ class JoinerConfig(Config):
         0.02, "turn of a pose, since it was linearised, that calls for a batch", unit="rad", minimum=0.0
     )
     estimator: EstimatorConfig = group(EstimatorConfig)
+    region: RegionConfig = group(RegionConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,7 @@ class Checkpoint:
 
     graph: Snapshot
     joined: dict[int, _Joined]
+    regions: tuple[Region, ...]
 
 
 @dataclass
@@ -77,14 +80,18 @@ class Joiner:
     window: int
     config: JoinerConfig = field(default_factory=JoinerConfig)
     estimator: Estimator = field(init=False)
+    regions: Regions = field(init=False)
     _joined: dict[int, _Joined] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.estimator = Estimator(self.config.estimator)
+        self.regions = Regions(self.estimator.local_maps, self.config.region)
 
     def absorb(self, new: int, chain: list[int]) -> JoinResult:
         """Join record ``new``, whose links to its ``chain`` have been added to the graph."""
         window = self._window_landmarks([new, *chain[: self.window - 1]])
+        if self.config.estimator.linearises:
+            self.regions.close(self.graph, self.graph.component(new), {new, *chain})
         extended = self._put_off(new) or self._extended(new, window)
         if extended is None:
             going_on = self.graph.size(self.graph.component(new)) + 1 >= self.config.incremental_from
@@ -125,7 +132,9 @@ class Joiner:
         result = replace(joined.result, cost=joined.result.cost + fusion + rise, iterations=1, update="incremental")
         return replace(joined, result=result, newest=new, window=window, front=front, added=joined.added + 1)
 
-    def batch(self, newest: int, window: IntArray | None = None, *, extensible: bool = False) -> JoinResult:
+    def batch(
+        self, newest: int, window: IntArray | None = None, *, extensible: bool = False, whole: bool = False
+    ) -> JoinResult:
         """Join the whole component of a record, whose end is where it will go on.
 
         ``extensible`` keeps the landmarks of the window even where one submap alone saw them, so that the next submap
@@ -137,7 +146,14 @@ class Joiner:
             window = known.window if known is not None and known.newest == newest else self._window_landmarks([newest])
             window = np.unique(self.graph.landmark_of[window])
         front = (self.graph.records[newest].end, window) if extensible else None
-        assembled, result = self.estimator.optimize(self.graph, component, front)
+        while True:
+            needed = window if extensible else window[:0]
+            regions = [] if whole else self.regions.fitting(self.graph, component, needed)
+            assembled, result = self.estimator.optimize(self.graph, component, front, regions)
+            bent = [r for r in regions if r.carry(self.graph) > self.config.region.bend]
+            if not bent:
+                break
+            self.regions.open(bent, len(self.graph.records))
         report = JoinResult(result.cost, result.iterations, result.converged, assembled.problem.backend, "batch")
         self._joined[component] = _Joined(assembled, report, newest, window, extensible)
         return report
@@ -150,6 +166,16 @@ class Joiner:
 
     def assembled(self, component: int) -> Assembled:
         """The joining problem of a component with everything in it."""
+        joined = self._latest(component)
+        if joined.added or joined.assembled.regions:
+            self.batch(joined.newest, whole=True)
+        return self._joined[component].assembled
+
+    def opened(self, component: int) -> Assembled:
+        """What was joined last of a component: with closed regions, and without what was added since."""
+        return self._latest(component).assembled
+
+    def _latest(self, component: int) -> _Joined:
         joined = self._joined.get(component)
         if joined is None:  # a map that was just loaded is at its optimum already
             newest = int(self.graph.records_of(component)[-1])
@@ -158,9 +184,7 @@ class Joiner:
             cost = assembled.problem.cost(assembled.state)
             report = JoinResult(cost, 0, True, assembled.problem.backend, "batch")
             self._joined[component] = joined = _Joined(assembled, report, newest, window)
-        if joined.added:
-            self.batch(joined.newest)
-        return self._joined[component].assembled
+        return joined
 
     def cost(self, component: int) -> float:
         """chi2 of a component."""
@@ -184,8 +208,7 @@ class Joiner:
 
     def redundancy(self, component: int) -> int:
         """Rows beyond the unknowns of the problem that was last joined in batch."""
-        problem = self._joined[component].assembled.problem
-        return problem.rows - problem.layout.pattern.n
+        return self._joined[component].assembled.redundancy
 
     # -- closures ------------------------------------------------------------------------------------------------------
 
@@ -197,9 +220,13 @@ class Joiner:
         component = graph.component(first)
         if component != graph.component(second):
             return None
-        if component not in self._joined:
-            self.assembled(component)
-        nodes, start = self._joined[component].assembled.nodes, graph.records[first].start
+        start = graph.records[first].start
+        inside = self.regions.around(start)
+        if inside:
+            self.regions.open(inside, len(graph.records))
+            joined = self._latest(component)
+            self.batch(joined.newest, extensible=joined.extensible)
+        nodes = self._latest(component).assembled.nodes
         node, T, covariance = graph.records[second].start, np.eye(4), np.zeros((6, 6))
         while node not in nodes and node != start:
             submap = graph.records[graph.record_ending_at(node)].submap
@@ -216,16 +243,18 @@ class Joiner:
 
     def checkpoint(self) -> Checkpoint:
         """Everything a trial may change, to come back to."""
-        return Checkpoint(self.graph.snapshot(), dict(self._joined))
+        return Checkpoint(self.graph.snapshot(), dict(self._joined), tuple(self.regions.closed))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Back to a checkpoint taken since the last submap was added."""
         self.graph.restore(checkpoint.graph)
         self._joined = dict(checkpoint.joined)
+        self.regions.closed = list(checkpoint.regions)
 
     def forget(self) -> None:
         """Keep nothing but the graph and its estimate, which must be at the optimum, as after loading a map."""
         self._joined.clear()
+        self.regions = Regions(self.estimator.local_maps, self.config.region)
 
     def forget_stale(self, newest: int) -> None:
         """After links were believed, with the component of ``newest`` joined: the other parts as they are now."""
@@ -233,7 +262,7 @@ class Joiner:
         components = np.unique(self.graph.component_of).tolist()
         for component in self._joined.keys() - {own}:
             records = self.graph.records_of(component) if component in components else []
-            if len(records) != len(self._joined[component].assembled.records):
+            if len(records) != self._joined[component].assembled.size:
                 del self._joined[component]
                 if records:
                     self.batch(records[-1])

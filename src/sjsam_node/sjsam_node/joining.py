@@ -125,6 +125,19 @@ class JoiningProblem:
         information = np.linalg.inv(self.factor.inverse_block(scalars))
         return np.asarray(0.5 * (information + information.T))
 
+    def gaussian(self, state: State, scalars: IntArray) -> tuple[FloatArray, FloatArray, float]:
+        """What the problem, linearised at ``state``, says of some unknowns: their mean as a step from there, their
+        joint covariance, and the cost at the mean.
+
+        Raises
+        ------
+        ValueError
+            If the problem does not determine all its variables.
+        """
+        self._factorize_at(state)
+        step = self.factor.solve(-self._gradient)
+        return step[scalars], self.factor.inverse_block(scalars), self.cost(state) + float(self._gradient @ step)
+
     def marginals(self, state: State) -> Marginals:
         """Exact marginal covariances, linearised at ``state``.
 

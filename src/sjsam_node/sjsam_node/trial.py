@@ -252,7 +252,7 @@ class Trials:
         """Squared error of every observation as the rest of its submap predicts it, NaN where no other submap sees
         it; (observations,), 3 degrees of freedom each.
         """
-        graph, assembled = self.joiner.graph, self.joiner.assembled(component)
+        graph, assembled = self.joiner.graph, self.joiner.opened(component)
         out = np.full(len(graph.points), np.nan)
         shared = graph.shared()
         for i, reduced in zip(assembled.records, assembled.reduced, strict=True):

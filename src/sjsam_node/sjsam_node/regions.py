@@ -1,0 +1,275 @@
+"""Old submaps joined to larger submaps, so that a closure relinearises and refactors only what it affects.
+
+A *region* is some submaps that lie together, joined to one Gaussian over what the rest of the map shares with them: the
+nodes and landmarks at its rim. To the joining problem it is one more local map, in the frame of its reference node
+(submaps of submaps: Ni and Dellaert 2010). It holds wherever later closures carry it as a whole. Once something inside
+it is linked to the outside, or it is bent further than its linearisation reaches, it is opened: its submaps take part
+in the joining again one by one, until it has been quiet there for a while.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+from sjsam_node import kernels
+from sjsam_node.joining import JoiningProblem
+from sjsam_node.map_graph import MapGraph
+from sjsam_node.problem import LocalMap, State, flatten
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
+from slam_core.sparse_cholesky import IntArray
+
+_FIRM = 4
+"""Landmarks in common that tie two submaps together."""
+_WORTH = 0.4
+"""A region's normal equations must be smaller than this share of those of its submaps together."""
+
+LocalMaps = Callable[[MapGraph, list[int], IntArray, IntArray], list[LocalMap]]
+"""Local maps of records, over the nodes and landmarks of two sorted lists."""
+
+
+@dataclass(frozen=True)
+class RegionConfig(Config):
+    """Which submaps of a large map are joined to larger ones until a closure needs them."""
+
+    size: int = parameter(96, "submaps that are joined to a larger one, at most", minimum=2)
+    open: int = parameter(192, "submaps of a component that take part in each joining one by one, about", minimum=2)
+    quiet: int = parameter(10, "submaps that came since one was needed, before it may be joined to others", minimum=0)
+    bend: float = parameter(
+        0.002, "turn of a region's rim since it was linearised beyond which it is opened", unit="rad", minimum=0.0
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Records that are joined to one local map, as they were when that was done.
+
+    Attributes
+    ----------
+    records
+        Those joined, ascending.
+    reference, rim, inner
+        Nodes: the one whose frame it is, others that the rest of the map knows (k,), and those inside (i,).
+    poses
+        T_reference_node of the rim, (k, 4, 4).
+    landmarks
+        An observation of each landmark that the rest of the map knows, (n,), and
+    points
+        where these are in the frame of the reference, (n, 3).
+    information, pull, constant
+        Over rim and landmarks: the cost is ``r^T information r + 2 pull^T r + constant``.
+    observations, group, landmark_of, sightings
+        All observations of its records; the index into ``landmarks`` of each, -1 for inner ones; what they were
+        observations of, and how many these had.
+    inner_poses, inner_observations, inner_points
+        What is inside, in the frame of the reference: (i, 4, 4), (m,), (m, 3).
+    uses
+        How many submaps started or ended at each inner node.
+    redundancy
+        Rows of the records beyond what is unknown inside and the rows of the local map.
+    """
+
+    records: IntArray
+    reference: int
+    rim: IntArray
+    inner: IntArray
+    poses: FloatArray
+    landmarks: IntArray
+    points: FloatArray
+    information: FloatArray
+    pull: FloatArray
+    constant: float
+    observations: IntArray
+    group: IntArray
+    landmark_of: IntArray
+    sightings: IntArray
+    inner_poses: FloatArray
+    inner_observations: IntArray
+    inner_points: FloatArray
+    uses: IntArray
+    redundancy: int
+
+    @property
+    def nodes(self) -> IntArray:
+        """Reference, rim and inner nodes."""
+        return np.concatenate([[self.reference], self.rim, self.inner])
+
+    def holds(self, graph: MapGraph, sightings: IntArray, uses: IntArray, anchor: int) -> bool:
+        """Whether the rest of the map knows no more of it than when it was joined, and what it knows is still apart.
+
+        ``sightings`` of every observation's landmark, ``uses`` of every node, the ``anchor`` of the component.
+        """
+        if np.any(graph.component_of[self.nodes] != graph.component_of[anchor]) or np.any(self.inner == anchor):
+            return False
+        if np.any(uses[self.inner] != self.uses):
+            return False
+        now, inside = graph.landmark_of[self.observations], self.group < 0
+        same = (now == self.landmark_of) & (sightings[self.observations] == self.sightings)
+        if not np.all(same[inside]):
+            return False
+        known = graph.landmark_of[self.landmarks]
+        return bool(np.all(now[~inside] == known[self.group[~inside]]) and len(np.unique(known)) == len(known))
+
+    def hides(self, graph: MapGraph, landmarks: IntArray) -> bool:
+        """Whether any of some landmarks is inside."""
+        return bool(np.isin(graph.landmark_of[self.observations[self.group < 0]], landmarks).any())
+
+    def local_map(self, graph: MapGraph, nodes: IntArray, landmarks: IntArray) -> LocalMap:
+        """As the joining problem takes it, over sorted lists of nodes and landmarks."""
+        turns = boxminus(self.poses, np.eye(4))
+        return LocalMap(
+            int(np.searchsorted(nodes, self.reference)), np.searchsorted(nodes, self.rim),
+            np.searchsorted(landmarks, graph.landmark_of[self.landmarks]),
+            np.concatenate([turns.ravel(), self.points.ravel()]), self.information, self.pull,
+        )  # fmt: skip
+
+    def carry(self, graph: MapGraph) -> float:
+        """Take what is inside along with the reference, after that and the rim were estimated; how far the rim is bent
+        (rad, or m per m).
+
+        Inside nothing is estimated until the region is opened, or the whole map is asked for.
+        """
+        T = graph.poses[self.reference]
+        graph.poses[self.inner] = T @ self.inner_poses
+        graph.points[self.inner_observations] = transform_points(T, self.inner_points)
+        T_reference = invert_transform(T)
+        shifted = transform_points(T_reference, graph.points[graph.landmark_of[self.landmarks]]) - self.points
+        moved = boxminus(T_reference @ graph.poses[self.rim], self.poses)
+        extent = max(float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self.points) else 0.0, 1.0)
+        sheared = np.linalg.norm(np.concatenate([moved[:, :3], shifted]), axis=1).max(initial=0.0) / extent
+        return max(float(np.linalg.norm(moved[:, 3:], axis=1).max(initial=0.0)), float(sheared))
+
+
+@dataclass
+class Regions:
+    """The regions of a map, and when each submap outside of them was needed last."""
+
+    local_maps: LocalMaps
+    config: RegionConfig = field(default_factory=RegionConfig)
+    closed: list[Region] = field(default_factory=list)
+    _needed: dict[int, int] = field(default_factory=dict)
+
+    def fitting(self, graph: MapGraph, component: int, needed: IntArray) -> list[Region]:
+        """Regions of a component; those that do not hold any more, or hide ``needed`` landmarks, are opened."""
+        sightings, uses, anchor = _sightings(graph), _uses(graph), graph.oldest(component).start
+        own = [r for r in self.closed if graph.component_of[r.reference] == component]
+        kept = [r for r in own if r.holds(graph, sightings, uses, anchor) and not r.hides(graph, needed)]
+        self.open([r for r in own if not any(r is k for k in kept)], len(graph.records))
+        return kept
+
+    def open(self, regions: Sequence[Region], now: int) -> None:
+        """Let the submaps of some regions take part again one by one."""
+        for region in regions:
+            self._needed.update(dict.fromkeys(region.records.tolist(), now))
+        self.closed = [r for r in self.closed if not any(r is other for other in regions)]
+
+    def around(self, node: int) -> list[Region]:
+        """The region that has a node inside, if any."""
+        return [r for r in self.closed if np.any(r.inner == node)]
+
+    def close(self, graph: MapGraph, component: int, busy: set[int]) -> None:
+        """Join the submaps that have been quiet for longest to one region, if more than enough are open; ``busy`` ones
+        stay. Small regions nearby become part of it.
+        """
+        now = len(graph.records)
+        inside = {i for r in self.closed for i in r.records.tolist()}
+        opened = [i for i in graph.records_of(component) if i not in inside]
+        if len(opened) <= self.config.open:
+            return
+        quiet = [i for i in opened if i not in busy and now - self._needed.get(i, i) > self.config.quiet]
+        if not quiet:
+            return
+        first = min(quiet, key=lambda i: (self._needed.get(i, i), i))
+        small = [
+            r
+            for r in self.closed
+            if len(r.records) < self.config.size // 2 and graph.component_of[r.reference] == component
+        ]
+        chosen = self._gathered(graph, np.concatenate([quiet, *(r.records for r in small)]), first)
+        region = join(graph, chosen, component, self.local_maps)
+        if region is None:
+            self._needed[first] = now
+        else:
+            taken = [r for r in small if np.isin(r.records, chosen).any()]
+            self.closed = [*(r for r in self.closed if not any(r is t for t in taken)), region]
+
+    def _gathered(self, graph: MapGraph, candidates: IntArray, first: int) -> IntArray:
+        """Of the candidates nearest to one, those that hang together with it."""
+        middles = graph.middles(candidates)
+        distance = np.linalg.norm(middles - graph.middles(np.array([first])), axis=1)
+        nearest = np.sort(candidates[np.argsort(distance, kind="stable")[: self.config.size]])
+        label = _tied(graph, nearest)
+        return np.asarray(nearest[label == label[np.searchsorted(nearest, first)]])
+
+
+def _tied(graph: MapGraph, records: IntArray) -> IntArray:
+    """Which of some records hang together by nodes or enough landmarks: a label for each."""
+    rows = np.repeat(np.arange(len(records)), [len(graph.records[i].submap.landmarks) for i in records])
+    seen = graph.landmark_of[np.concatenate([graph.records[i].observations for i in records])]
+    B = scipy.sparse.csr_matrix((np.ones(len(rows)), (rows, seen)), (len(records), len(graph.points)))
+    ends = np.array([[graph.records[i].start, graph.records[i].end] for i in records])
+    E = scipy.sparse.csr_matrix(
+        (np.full(ends.size, 10.0 * _FIRM), (np.repeat(np.arange(len(records)), 2), ends.ravel())),
+        (len(records), len(graph.poses)),
+    )
+    common = (B @ B.T + E @ E.T).tocsr()
+    common.data[common.data < _FIRM] = 0.0
+    common.eliminate_zeros()
+    return np.asarray(scipy.sparse.csgraph.connected_components(common, directed=False)[1])
+
+
+def _sightings(graph: MapGraph) -> IntArray:
+    """How many observations the landmark of each observation has."""
+    return np.asarray(np.bincount(graph.landmark_of, minlength=len(graph.points))[graph.landmark_of])
+
+
+def _uses(graph: MapGraph) -> IntArray:
+    """How many submaps start or end at each node; at the end of a way it counts as one more, that may come."""
+    ends = np.array([(r.start, r.end) for r in graph.records], dtype=np.int64).reshape(-1, 2)
+    uses = np.bincount(ends.ravel(), minlength=len(graph.poses))
+    open_end = np.ones(len(uses), dtype=bool)
+    open_end[ends[:, 0]] = False
+    return np.asarray(uses + 2 * open_end)
+
+
+def join(graph: MapGraph, records: IntArray, component: int, local_maps: LocalMaps) -> Region | None:
+    """Join records to one region at the graph's estimate; None where that does not pay, or is not determined."""
+    sightings, uses = _sightings(graph), _uses(graph)
+    own = [graph.records[i] for i in records]
+    nodes, used = np.unique([(r.start, r.end) for r in own], return_counts=True)
+    is_rim = (used < uses[nodes]) | (nodes == graph.oldest(component).start)
+    reference, rim, inner = int(nodes[is_rim][0]), nodes[is_rim][1:], nodes[~is_rim]
+    observations = np.concatenate([r.observations for r in own])
+    seen = graph.landmark_of[observations]
+    landmarks, first, times = np.unique(seen, return_index=True, return_counts=True)
+    known = times < sightings[observations[first]]
+    shared = landmarks[sightings[observations[first]] > 1]
+    T_reference = invert_transform(graph.poses[reference])
+    poses, points = T_reference @ graph.poses[nodes], transform_points(T_reference, graph.points)
+    state = State(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), points[shared])
+    maps = local_maps(graph, records.tolist(), nodes, shared)
+    at_rim, kept = np.searchsorted(nodes, rim), np.searchsorted(shared, landmarks[known])
+    rows = 6 * len(rim) + 3 * len(kept)
+    if rows**2 > _WORTH * sum(len(m.mean) ** 2 for m in maps):
+        return None
+    fixed, last = np.searchsorted(nodes, [reference]), np.concatenate([at_rim, len(nodes) + kept])
+    problem = JoiningProblem(flatten(maps), state, fixed, kernels.TANGENT, last=last)
+    try:
+        step, covariance, least = problem.gaussian(state, problem.scalars(at_rim, kept))
+        information = np.linalg.inv(covariance)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+    information = 0.5 * (information + information.T)
+    group = np.where(known, np.cumsum(known) - 1, -1)[np.searchsorted(landmarks, seen)]
+    carried = observations[~np.isin(observations, landmarks[known])]
+    return Region(
+        records, reference, rim, inner, poses[at_rim], observations[first[known]], points[landmarks[known]],
+        information, -information @ step, float(least + step @ information @ step), observations, group, seen,
+        sightings[observations], poses[np.searchsorted(nodes, inner)], carried, points[carried], uses[inner],
+        problem.rows - problem.layout.pattern.n,
+    )  # fmt: skip
