@@ -115,7 +115,6 @@ def test_what_links_the_inside_of_a_region_opens_it_and_what_links_its_rim_does_
     joiner, graph = way.joiner, way.graph
     region = a_region(way.joiner)
     other = len(graph.records) - 1
-    new = graph.records[other].first_observation
     for group, is_open in ((region.group >= 0, False), (region.group < 0, True)):
         observation = int(region.observations[group][0])
         record = next(i for i in region.records if observation in graph.records[i].observations)
