@@ -15,6 +15,7 @@ from sjsam_node.global_map import GlobalMap
 from sjsam_node.map_graph import Link
 from sjsam_node.trial import Verdict
 from slam_core.geometry import boxminus, boxplus, invert_transform
+from slam_core.types import Submap
 
 STEP = np.array([0.05, -0.03, 0.02, 0.01, 0.0, -0.01])
 
@@ -99,21 +100,48 @@ def test_one_false_link_is_not_the_end_of_the_true_ones(agent: Agent) -> None:
     assert [k is bad for k in joined.trials.contested][-1]
 
 
-def test_what_is_believed_hardly_depends_on_who_comes_first() -> None:
-    """Of the observations that are one landmark; measured 0.994."""
-    shares = []
+@pytest.fixture(scope="module")
+def two_agents() -> list[tuple[list[Submap], list[Submap]]]:
+    """Submaps of two agents in each of four worlds, who meet twice."""
+    met = []
     for seed in range(4):
         rng = np.random.default_rng(seed)
         world, path = ring_world(4.0, rng, 12.0), circle(4.0, 1.0)
         a = Agent(world, path[:61], rng, "a").submaps()
-        b = Agent(world, path[45:], rng, "b", stamp_ns=5_000_000_000).submaps()
+        met.append((a, Agent(world, path[45:], rng, "b", stamp_ns=5_000_000_000).submaps()))
+    return met
+
+
+def test_what_is_believed_hardly_depends_on_who_comes_first(
+    two_agents: list[tuple[list[Submap], list[Submap]]],
+) -> None:
+    """Of the observations that are one landmark; measured 0.994."""
+    shares = []
+    for a, b in two_agents:
         one, other = join(a + b)[0], join(b + a)[0]
         one.settle()
         other.settle()
-        shares.append(
-            len(same_landmarks(one) & same_landmarks(other)) / len(same_landmarks(one) | same_landmarks(other))
-        )
+        same = same_landmarks(one), same_landmarks(other)
+        shares.append(len(same[0] & same[1]) / len(same[0] | same[1]))
     assert np.mean(shares) > 0.97
+
+
+def test_the_central_map_does_not_depend_on_who_comes_first(
+    two_agents: list[tuple[list[Submap], list[Submap]]],
+) -> None:
+    for a, b in two_agents:
+        one, other = join(a + b)[0], join([*b[:3], *a[::-1], *b[3:]])[0]
+        mark = other.marks.add(other.graph, np.array([1.0, 2.0, 0.5]))
+        assert one.centrally() is one
+        central = other.centrally()
+        assert same_landmarks(one) == same_landmarks(central)
+        for name in "ab":
+            gap = [boxminus(p.T, q.T) for p, q in zip(one.trajectory(name), central.trajectory(name), strict=True)]
+            assert np.abs(gap).max() < 1e-9
+        marked = [[r.key for r in m.graph.records if m.marks.marks[0].node == r.start] for m in (other, central)]
+        assert marked[0] == marked[1]
+        assert len(marked[0]) == 1
+        assert np.array_equal(central.marks.marks[0].point, mark.point)
 
 
 def test_reading_the_map_does_not_change_it(agent: Agent) -> None:

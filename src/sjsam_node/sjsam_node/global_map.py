@@ -10,7 +10,7 @@ judge them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
 
@@ -250,6 +250,31 @@ class GlobalMap:
             self._catch_up(len(self.graph.records) - 1, None)
         for component in np.unique(self.graph.component_of):
             self.joiner.assembled(int(component))
+
+    def centrally(self) -> GlobalMap:
+        """The map that does not depend on who came first: all submaps joined anew, agent after agent, and settled.
+
+        The map itself where they came in that order; otherwise it costs as much as they did when they came.
+        """
+        records, central = self.graph.records, self
+        order = sorted(range(len(records)), key=lambda i: records[i].key)
+        if order != list(range(len(records))):
+            central = GlobalMap(self.config)
+            for record in (records[i] for i in order):
+                central._sessions[record.key[0]] = record.session
+                central.add(record.submap)
+            central.counters = self.counters
+            central.marks = self._marks_in(central)
+        central.settle()
+        return central
+
+    def _marks_in(self, other: GlobalMap) -> Marks:
+        """The marks of this map, on the nodes of another one of the same submaps."""
+        node = {}
+        for record in self.graph.records:
+            twin = other.graph.records[other._lookup[record.key]]
+            node[record.start], node[record.end] = twin.start, twin.end
+        return Marks([replace(mark, node=node[mark.node]) for mark in self.marks.marks])
 
     def map_to_odom(self, agent: str) -> FloatArray:
         """T_map_odom of an agent: what its newest joined pose adds to its own odometry (chained submap end poses)."""

@@ -78,11 +78,11 @@ class Mapper:
             self._join(result.submaps)
 
     def finish(self) -> None:
-        """Close the open submaps, wait until all are joined, and let the map look for what it put off."""
+        """Close the open submaps and wait until all are joined; the map ends up the same whoever came first."""
         for ekf in self._filters.values():
             self._join(ekf.finish())
         self.reports += [join.result() for join in self._joins]
-        self.global_map.settle()
+        self.global_map = self.global_map.centrally()
 
     def stop(self) -> None:
         """End the thread that joins, at the latest after the submap it is at."""
