@@ -104,6 +104,7 @@ def in_turn(maps: list[LocalMap], state: State) -> dict[str, Any]:
     compiles = joining_problem(flattened(maps[:3], "block"), state)
     compiles.optimize(state, LevenbergMarquardtConfig(max_iterations=3))
     memory, began = PeakMemory(), time.perf_counter()
+    flat = flattened(maps, "block")
     R, t, points, seen, due = state.rotations.copy(), state.translations.copy(), state.landmarks.copy(), 0, 0.0
     for k, m in enumerate(maps):
         R[k + 1], t[k + 1] = R[k] @ so3_exp(m.mean[3:6]), R[k] @ m.mean[:3] + t[k]
@@ -113,8 +114,7 @@ def in_turn(maps: list[LocalMap], state: State) -> dict[str, Any]:
         due += 1.0 / (1.0 + np.sqrt(k) / 3.0)
         if due >= 1.0 or k == len(maps) - 1:
             known, due = State(R[: k + 2], t[: k + 2], points[:seen]), 0.0
-            flat = flattened(maps[: k + 1], "block")
-            known = joining_problem(flat, known).optimize(known, STOP)[0]
+            known = joining_problem(flat.first(k + 1), known).optimize(known, STOP)[0]
             R[: k + 2], t[: k + 2], points[:seen] = known.rotations, known.translations, known.landmarks
     seconds = time.perf_counter() - began
     return {"batch": [seconds], "memory": memory.grown(), "state": State(R, t, points)}
@@ -142,7 +142,8 @@ def run_child(solver: str, path: Path, repeat: int) -> dict[str, Any] | None:
     command = [sys.executable, __file__, "--child", solver, "--problem", str(path), "--repeat", str(repeat)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        print(f"  {solver}: {done.stderr.strip().splitlines()[-1]}")
+        said = done.stderr.strip().splitlines()
+        print(f"  {solver:18s} failed: {next((line for line in reversed(said) if 'Error' in line), said[-1])}")
         return None
     return dict(json.loads(done.stdout.splitlines()[-1]))
 

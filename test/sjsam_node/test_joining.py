@@ -9,7 +9,7 @@ from sjsam_node import kernels
 from sjsam_node.block_problem import BlockProblem, flatten_rows
 from sjsam_node.joining import JoiningProblem
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
-from slam_core.geometry import boxminus, euler_from_rotation, make_transform, so3_exp
+from slam_core.geometry import boxminus, euler_from_rotation, make_transform, rotation_from_euler, so3_exp
 
 MODELS = {"planar": kernels.PLANAR, "tangent": kernels.TANGENT, "euler": kernels.EULER}
 
@@ -198,3 +198,20 @@ def test_a_step_with_the_last_factor_solves_for_the_new_gradient(model: int, rng
         assert np.allclose(problem.resolve(problem.gradient(s)), step, atol=1e-10)
         gradient = problem.gradient(here)
         assert np.allclose(problem.linearize(here), gradient, rtol=1e-9, atol=1e-6)
+
+
+@pytest.mark.parametrize("pitch", [1.5, 1.62, -1.7])
+def test_an_attitude_measured_beyond_a_pitch_of_90_degrees_is_the_attitude_it_says(
+    pitch: float, rng: np.random.Generator
+) -> None:
+    z = np.array([1.0, 2.0, 3.0, 0.4, pitch, -0.3])
+    R = np.stack([np.eye(3), rotation_from_euler(*z[3:])])
+    s = State(R, np.stack([np.zeros(3), z[:3]]), np.empty((0, 3)))
+    local = LocalMap(0, np.array([1]), np.empty(0, dtype=np.int64), z, np.diag(rng.uniform(1.0, 100.0, 6)))
+    problem = JoiningProblem(flatten([local]), s, np.array([0]), kernels.EULER)
+    assert problem.cost(s) < 1e-20
+    moved = problem.retract(s, 0.01 * rng.normal(size=6))
+    gradient = problem.linearize(moved)
+    for i, step in enumerate(1e-6 * np.eye(6)):
+        ahead, behind = (problem.cost(problem.retract(moved, sign * step)) for sign in (1.0, -1.0))
+        assert gradient[i] == pytest.approx((ahead - behind) / 4e-6, rel=1e-5, abs=1e-5)

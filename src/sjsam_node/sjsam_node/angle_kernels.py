@@ -97,10 +97,16 @@ def angle_error(model, Rh, z, r, B):
     yaw = math.atan2(Rh[1, 0], Rh[0, 0])
     pitch = math.asin(min(1.0, max(-1.0, -Rh[2, 0])))
     roll = math.atan2(Rh[2, 1], Rh[2, 2])
+    # The same rotation has a second triple, beyond a pitch of 90 deg; a measured one with noise may lie there.
+    first = abs(_wrap(yaw - z[0])) + abs(_wrap(pitch - z[1])) + abs(_wrap(roll - z[2]))
+    beyond = math.pi - pitch
+    second = abs(_wrap(yaw + math.pi - z[0])) + abs(_wrap(beyond - z[1])) + abs(_wrap(roll + math.pi - z[2]))
+    if second < first:
+        yaw, pitch, roll = yaw + math.pi, beyond, roll + math.pi
     r[0], r[1], r[2] = _wrap(yaw - z[0]), _wrap(pitch - z[1]), _wrap(roll - z[2])
     # Inverse of the map from Euler rates to the angular velocity in the reference frame; singular at pitch = 90 deg.
-    c, s = math.cos(yaw), math.sin(yaw)
-    cp = max(math.cos(pitch), 1e-9)
+    c, s, cp = math.cos(yaw), math.sin(yaw), math.cos(pitch)
+    cp = math.copysign(max(abs(cp), 1e-9), cp)
     tp = math.sin(pitch) / cp
     B[0, 0], B[0, 1], B[0, 2] = c * tp, s * tp, 1.0
     B[1, 0], B[1, 1], B[1, 2] = -s, c, 0.0

@@ -69,10 +69,12 @@ def read_maps(paths: Iterable[Path]) -> tuple[list[TextMap], int]:
 def _read(path: Path) -> tuple[int, IntArray, IntArray, FloatArray, FloatArray]:
     """Reference, ids with the number of values of each, all values, information."""
     try:
-        numbers = np.array(path.read_text().split(), dtype=np.float64)
+        numbers = np.array(path.read_text(encoding="utf-8-sig").split(), dtype=np.float64)
     except ValueError as error:
         raise ValueError(f"{path}: not a text submap: {error}") from error
-    count = int(numbers[1]) if len(numbers) >= 2 and np.isfinite(numbers[1]) else -1
+    if len(numbers) < 2:
+        raise ValueError(f"{path}: holds {len(numbers)} numbers, a submap starts with its reference and its size")
+    count = int(numbers[1]) if np.isfinite(numbers[1]) else -1
     if count < 1 or len(numbers) != 2 + 2 * count + count * count:
         raise ValueError(
             f"{path}: holds {len(numbers)} numbers, a submap of {count} values needs {2 + count * (2 + count)}"
@@ -111,7 +113,10 @@ def _interpret(
     is_pose = sizes == pose_size
     if not np.all(is_pose | (sizes == dimension)):
         wrong = sizes[~is_pose & (sizes != dimension)][0]
-        raise ValueError(f"{path}: an id has {wrong} values, {dimension}D poses have {pose_size}, features {dimension}")
+        raise ValueError(
+            f"{path}: an id has {wrong} values, {dimension}D poses have {pose_size}, features {dimension}"
+            " (2D and 3D maps in one folder?)"
+        )
     if np.any(ids[0, ~is_pose] <= 0):
         raise ValueError(f"{path}: feature id {ids[0, ~is_pose].min()} is not positive (a 2D map among 3D ones?)")
     of_pose = np.repeat(is_pose, sizes)

@@ -40,6 +40,8 @@ def command(folder: Path, output: Path, rows: str, robust: str | None, config_fi
     summary = _summary(result, len(maps), dimension, rows, time.perf_counter() - began)
     _write(output, result, summary)
     click.echo(json.dumps(summary))
+    if not result.converged:
+        click.echo(f"slam: not converged after {result.iterations} iterations: chi2 may not be the lowest", err=True)
 
 
 def _yaml(path: Path | None) -> dict[str, Any]:
