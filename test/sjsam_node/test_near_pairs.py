@@ -13,6 +13,7 @@ from sjsam_node.association import Prior, match
 from sjsam_node.closures import Standing, at_start
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.map_graph import Link
+from sjsam_node.near_pairs import Compared
 from sjsam_node.trial import Verdict
 from slam_core.geometry import boxminus, boxplus, invert_transform
 from slam_core.types import Submap
@@ -45,7 +46,7 @@ def test_pairs_are_compared_once_and_again_when_they_have_moved(agent: Agent) ->
     graph, near = joined.graph, joined.finder.near
     missed = {(k.first, k.second) for k in graph.links if k.is_closure}
     graph.links = [k for k in graph.links if not k.is_closure]
-    near.compared.clear()
+    near.compared = Compared()
     due = near.due(graph, joined._chain)
     assert len(missed & set(due)) > 10
     assert not any((k.first, k.second) in due for k in graph.links)
@@ -55,6 +56,25 @@ def test_pairs_are_compared_once_and_again_when_they_have_moved(agent: Agent) ->
     first, second = due[0]
     graph.poses[graph.records[second].start] = boxplus(graph.poses[graph.records[second].start], STEP)
     assert (first, second) in near.due(graph, joined._chain)
+
+
+def test_compared_pairs_are_kept_like_a_dictionary_of_them(rng: np.random.Generator) -> None:
+    compared, plain = Compared(), {}
+    for pair in rng.integers(0, 9, (60, 2)):
+        first, second = sorted(pair.tolist())
+        seen = rng.normal(size=(1, 3))
+        compared.note(np.array([[first, second]]), seen)
+        plain[first, second] = seen[0]
+    every = np.array([(i, k) for i in range(9) for k in range(i, 9)])
+    for forgotten in (set[int](), {3, 5}):
+        compared.forget(forgotten)
+        expected = [plain.get((i, k), np.full(3, np.inf)) for i, k in every if not {i, k} & forgotten]
+        kept = ~np.isin(every, list(forgotten)).any(axis=1)
+        assert np.array_equal(compared.where(every[kept]), expected)
+        assert np.isinf(compared.where(every[~kept])).all()
+    again = Compared.of(compared.pairs[::-1], compared.seen[::-1])
+    assert np.array_equal(again.codes, compared.codes)
+    assert np.array_equal(again.seen, compared.seen)
 
 
 def test_parts_without_a_tie_have_no_near_pairs(rng: np.random.Generator) -> None:

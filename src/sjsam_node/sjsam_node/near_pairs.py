@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sjsam_node.fusion import BoolArray
 from sjsam_node.map_graph import MapGraph
 from slam_core.geometry import FloatArray
 from slam_core.sparse_cholesky import IntArray
@@ -23,39 +22,86 @@ Chain = Callable[[int], list[int]]
 """The records before one along its agent's odometry that it is linked to anyway."""
 
 
+_SHIFT = 32
+"""A pair is one number, the first record shifted by so many bits and the second, so that many are found at once."""
+
+
+@dataclass
+class Compared:
+    """Pairs of records (first < second) as numbers (k,), ascending, and where the second's middle was when they were
+    compared, seen from the first (k, 3).
+    """
+
+    codes: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    seen: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+
+    @classmethod
+    def of(cls, pairs: IntArray, seen: FloatArray) -> Compared:
+        """From pairs (k, 2) and where each was seen (k, 3)."""
+        codes = _codes(pairs)
+        order = np.argsort(codes)
+        return cls(codes[order], seen[order])
+
+    @property
+    def pairs(self) -> IntArray:
+        """The pairs, (k, 2)."""
+        return np.stack([self.codes >> _SHIFT, self.codes & ((1 << _SHIFT) - 1)], axis=1)
+
+    def note(self, pair: IntArray, seen: FloatArray) -> None:
+        """A pair (1, 2) is compared now, the second seen at (1, 3) from the first."""
+        code = _codes(pair)
+        at = np.searchsorted(self.codes, code)
+        if at[0] < len(self.codes) and self.codes[at[0]] == code[0]:
+            self.seen[at] = seen
+        else:
+            self.codes, self.seen = np.insert(self.codes, at, code), np.insert(self.seen, at, seen, axis=0)
+
+    def forget(self, records: set[int]) -> None:
+        """Leave out all pairs with one of the records."""
+        kept = ~np.isin(self.pairs, list(records)).any(axis=1)
+        self.codes, self.seen = self.codes[kept], self.seen[kept]
+
+    def where(self, pairs: IntArray) -> FloatArray:
+        """Where each of some pairs (k, 2) was seen, (k, 3); infinitely far where it was not compared."""
+        codes = _codes(pairs)
+        at = np.searchsorted(self.codes, codes)
+        known = np.append(self.codes, -1)[at] == codes
+        return np.where(known[:, None], np.append(self.seen, [[np.inf] * 3], axis=0)[at], np.inf)
+
+
+def _codes(pairs: IntArray) -> IntArray:
+    return np.asarray((pairs[:, 0] << _SHIFT) | pairs[:, 1])
+
+
 @dataclass
 class NearPairs:
-    """Pairs of records (first < second); ``compared``: where the second's middle was, seen from the first."""
+    """Finds what is due; ``compared``: what was compared, and where."""
 
     proximity: float
     neighbours: int
     moved: float
-    compared: dict[tuple[int, int], FloatArray] = field(default_factory=dict)
+    compared: Compared = field(default_factory=Compared)
 
     def note(self, graph: MapGraph, first: int, second: int) -> None:
         """Remember that two records are compared now."""
-        first, second = sorted((first, second))
-        self.compared[first, second] = _seen_from(graph, np.array([first]), np.array([second]))[0]
+        pair = np.sort(np.array([[first, second]], dtype=np.int64))
+        self.compared.note(pair, _seen_from(graph, pair[:, 0], pair[:, 1]))
 
     def forget(self, records: set[int]) -> None:
         """These records are to be compared anew: what was believed of them is no longer."""
-        self.compared = {pair: seen for pair, seen in self.compared.items() if records.isdisjoint(pair)}
+        if records:
+            self.compared.forget(records)
 
     def due(self, graph: MapGraph, chain: Chain) -> list[tuple[int, int]]:
         """Pairs without a link, near in the map, that were not compared yet or lay elsewhere when they were; nearest
         first.
         """
         near = self._near(graph)
-        linked = {(k.first, k.second) if k.first < k.second else (k.second, k.first) for k in graph.links}
-        near = near[[pair not in linked for pair in map(tuple, near.tolist())]]
-        due = near[~self._were_compared_here(graph, near)].tolist()
+        linked = np.sort(np.array([(k.first, k.second) for k in graph.links], dtype=np.int64).reshape(-1, 2), axis=1)
+        near = near[~np.isin(_codes(near), _codes(linked))]
+        gap = _seen_from(graph, near[:, 0], near[:, 1]) - self.compared.where(near)
+        due = near[np.linalg.norm(gap, axis=1) >= self.moved].tolist()
         return [(first, second) for first, second in due if first not in chain(second)]
-
-    def _were_compared_here(self, graph: MapGraph, pairs: IntArray) -> BoolArray:
-        """Whether each pair (k, 2) was compared where it lies now."""
-        nowhere = np.full(3, np.inf)
-        known = np.array([self.compared.get(pair, nowhere) for pair in map(tuple, pairs.tolist())]).reshape(-1, 3)
-        return np.asarray(np.linalg.norm(_seen_from(graph, pairs[:, 0], pairs[:, 1]) - known, axis=1) < self.moved)
 
     def _near(self, graph: MapGraph) -> IntArray:
         """Every record with its nearest ones of the same component, (k, 2), the nearest pair first."""
@@ -72,8 +118,8 @@ class NearPairs:
             pairs.append(np.sort(ends, axis=1))
             distances.append(distance[row, column])
         ends, gap = np.concatenate(pairs), np.concatenate(distances)
-        ends, first = np.unique(ends, axis=0, return_index=True)
-        return np.asarray(ends[np.argsort(gap[first], kind="stable")])
+        _, first = np.unique(_codes(ends), return_index=True)
+        return np.asarray(ends[first][np.argsort(gap[first], kind="stable")])
 
 
 def _seen_from(graph: MapGraph, first: IntArray, second: IntArray) -> FloatArray:

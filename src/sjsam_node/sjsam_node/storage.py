@@ -17,8 +17,8 @@ import numpy as np
 
 from sjsam_node.map_graph import Link, MapGraph
 from sjsam_node.marks import Mark, Marks
+from sjsam_node.near_pairs import Compared
 from slam_core.files import atomic_path
-from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
 FORMAT, VERSION = "indoor-slam-map", 3
@@ -36,7 +36,7 @@ class StoredMap:
     graph: MapGraph
     pending: list[Link]
     contested: list[Link]
-    compared: dict[tuple[int, int], FloatArray]
+    compared: Compared
     marks: Marks
     closed_at: int
 
@@ -48,8 +48,7 @@ def write(folder: Path, stored: StoredMap) -> None:
     arrays.update(_link_arrays("links", graph.links))
     arrays.update(_link_arrays("pending", stored.pending))
     arrays.update(_link_arrays("contested", stored.contested))
-    arrays["compared/pairs"] = np.array(list(stored.compared), dtype=np.int64).reshape(-1, 2)
-    arrays["compared/middles"] = np.array(list(stored.compared.values())).reshape(-1, 3)
+    arrays["compared/pairs"], arrays["compared/middles"] = stored.compared.pairs, stored.compared.seen
     for i, record in enumerate(graph.records):
         arrays.update({f"submap_{i}/{name}": value for name, value in _submap_arrays(record.submap).items()})
     buffer = io.BytesIO()
@@ -92,8 +91,7 @@ def read(folder: Path) -> StoredMap:
         graph = _graph(manifest["records"], arrays)
         marks = Marks([Mark(str(name), int(node), np.array(point)) for name, node, *point in manifest["marks"]])
         pending, contested = _links("pending", arrays), _links("contested", arrays)
-        pairs, middles = arrays["compared/pairs"].tolist(), arrays["compared/middles"]
-        compared = {(first, second): middle for (first, second), middle in zip(pairs, middles, strict=True)}
+        compared = Compared.of(arrays["compared/pairs"], arrays["compared/middles"])
         return StoredMap(graph, pending, contested, compared, marks, int(manifest["closed_at"]))
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(f"{folder}: the map is incomplete: {error}") from error
