@@ -94,8 +94,7 @@ class Joiner:
             self.regions.close(self.graph, self.graph.component(new), {new, *chain})
         extended = self._put_off(new) or self._extended(new, window)
         if extended is None:
-            going_on = self.graph.size(self.graph.component(new)) + 1 >= self.config.incremental_from
-            return self.batch(new, window, extensible=going_on)
+            return self.batch(new, window)
         self._joined[self.graph.component(new)] = extended
         return extended.result
 
@@ -132,19 +131,19 @@ class Joiner:
         result = replace(joined.result, cost=joined.result.cost + fusion + rise, iterations=1, update="incremental")
         return replace(joined, result=result, newest=new, window=window, front=front, added=joined.added + 1)
 
-    def batch(
-        self, newest: int, window: IntArray | None = None, *, extensible: bool = False, whole: bool = False
-    ) -> JoinResult:
-        """Join the whole component of a record, whose end is where it will go on.
+    def batch(self, newest: int, window: IntArray | None = None, *, whole: bool = False) -> JoinResult:
+        """Join the component of a record, whose end is where it will go on; regions stay closed unless it is to be
+        joined as a ``whole``.
 
-        ``extensible`` keeps the landmarks of the window even where one submap alone saw them, so that the next submap
-        can be joined through a front; it makes the problem larger, so trials do without.
+        In a large component the landmarks of the window are kept even where one submap alone saw them, so that the next
+        submap can be joined through a front.
         """
         component = self.graph.component(newest)
         if window is None:
             known = self._joined.get(component)
             window = known.window if known is not None and known.newest == newest else self._window_landmarks([newest])
             window = np.unique(self.graph.landmark_of[window])
+        extensible = self.graph.size(component) + 1 >= self.config.incremental_from
         front = (self.graph.records[newest].end, window) if extensible else None
         while True:
             needed = window if extensible else window[:0]
@@ -221,11 +220,7 @@ class Joiner:
         if component != graph.component(second):
             return None
         start = graph.records[first].start
-        inside = self.regions.around(start)
-        if inside:
-            self.regions.open(inside, len(graph.records))
-            joined = self._latest(component)
-            self.batch(joined.newest, extensible=joined.extensible)
+        self._open(component, [start, graph.records[second].start])
         nodes = self._latest(component).assembled.nodes
         node, T, covariance = graph.records[second].start, np.eye(4), np.zeros((6, 6))
         while node not in nodes and node != start:
@@ -238,6 +233,15 @@ class Joiner:
         joint = self._joined[component].assembled.covariance([start, node])
         T_known, known = relative_pose(graph.poses[start], graph.poses[node], joint)
         return prior_of_pair(T_known @ T, compose_covariance(T_known, known, T, covariance))
+
+    def _open(self, component: int, nodes: list[int]) -> None:
+        """Join with the regions opened that have any of some nodes inside, if the last joining had them closed."""
+        joined = self._latest(component)
+        hidden = [n for n in nodes if n not in joined.assembled.nodes]
+        inside = [r for r in self.regions.closed if np.isin(r.inner, hidden).any()]
+        if inside:
+            self.regions.open(inside, len(self.graph.records))
+            self.batch(joined.newest)
 
     # -- trials --------------------------------------------------------------------------------------------------------
 

@@ -168,10 +168,6 @@ class Regions:
             self._needed.update(dict.fromkeys(region.records.tolist(), now))
         self.closed = [r for r in self.closed if not any(r is other for other in regions)]
 
-    def around(self, node: int) -> list[Region]:
-        """The region that has a node inside, if any."""
-        return [r for r in self.closed if np.any(r.inner == node)]
-
     def close(self, graph: MapGraph, component: int, busy: set[int]) -> None:
         """Join the submaps that have been quiet for longest to one region, if more than enough are open; ``busy`` ones
         stay. Small regions nearby become part of it.
