@@ -2,18 +2,21 @@
 
 ``ring``: laps along a ring with a wavy floor. ``park``: one step per map through a park with few trees, by ways that
 cross. ``city``: a pose graph on a grid of streets, with loops where a crossing is met again. ``sphere``: a pose graph
-along a spiral up a sphere, each turn tied to the one below. ``noise`` scales all standard deviations.
+along a spiral up a sphere, each turn tied to the one below. ``tumbling``: laps with any attitude from one map to the
+next. ``sparse``: laps where a map sees 0 to 3 landmarks, most of them once. ``noise`` scales all standard deviations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
+from submap_world import unit
 
 from sjsam_node.linear_slam_text import TextMap
-from slam_core.geometry import euler_from_rotation, rotation_from_euler
+from slam_core.geometry import euler_from_rotation, rotation_from_euler, so3_exp
 
 SIGMA = {"position": 0.05, "angle": 0.02, "feature": 0.2}
 
@@ -82,6 +85,32 @@ def sphere(count: int, seed: int = 0, noise: float = 1.0, turn: int = 50) -> lis
     return _graph(R, 50.0 * up, [i - turn if i >= turn else -1 for i in k.tolist()], noise, rng)
 
 
+def tumbling(count: int, seed: int = 0, noise: float = 1.0, features_seen: int = 6) -> list[TextMap]:
+    rng = np.random.default_rng(seed)
+    turns = so3_exp(rng.uniform(0.0, np.pi, (count, 1)) * unit(rng.normal(size=(count, 3))))
+    R = np.array(list(accumulate(turns, np.matmul, initial=np.eye(3))))
+    centre, points = _laps(count, 120, 3, rng)
+    return _walk(R, centre, points, [_nearest(points, place, features_seen) for place in centre[:-1]], noise, rng)
+
+
+def sparse(count: int, dimension: int, seed: int = 0, noise: float = 1.0) -> list[TextMap]:
+    rng = np.random.default_rng(seed)
+    centre, points = _laps(count, 3 * count, dimension, rng)
+    R = np.array([_rotation(k / 20, dimension) for k in range(count + 1)])
+    seen = [
+        np.sort(rng.choice(_nearest(points, place, 20), rng.integers(0, 4), replace=False)) for place in centre[:-1]
+    ]
+    return _walk(R, centre, points, seen, noise, rng)
+
+
+def _laps(count: int, features: int, dimension: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Places along laps of a circle, and points around it."""
+    angle = np.arange(count + 1) / 20
+    centre = 10.0 * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count + 1)])
+    points = np.column_stack([rng.uniform(-13, 13, (features, 2)), rng.uniform(-3, 3, features)])
+    return centre[:, :dimension], points[:, :dimension]
+
+
 def _rotation(yaw: float, dimension: int) -> np.ndarray:
     full = rotation_from_euler(yaw, 0.1 * np.sin(3 * yaw), 0.05)
     return full if dimension == 3 else rotation_from_euler(yaw)[:2, :2]
@@ -129,19 +158,23 @@ def _local_map(
     )  # fmt: skip
 
 
-SETS: dict[str, Callable[[int], list[TextMap]]] = {
-    "ring 700, 2D": lambda seed: ring(700, 2, seed),
-    "ring 870, 3D": lambda seed: ring(870, 3, seed),
-    "park 6898, 2D": lambda seed: park(6898, 2, seed),
-    "park 6898, 2D, noise x 2": lambda seed: park(6898, 2, seed, 2.0),
-    "park 870, 3D, noise x 2": lambda seed: park(870, 3, seed, 2.0),
-    "city 3500, pose graph": lambda seed: city(3500, seed),
-    "city 3500, pose graph, noise x 3": lambda seed: city(3500, seed, 3.0),
-    "city 10000, pose graph": lambda seed: city(10000, seed, extent=50),
-    "sphere 2500, pose graph": lambda seed: sphere(2500, seed),
-    "sphere 2500, pose graph, noise x 2": lambda seed: sphere(2500, seed, 2.0),
+SETS: dict[str, Callable[[int, float], list[TextMap]]] = {
+    "ring 700, 2D": lambda seed, noise: ring(700, 2, seed, noise),
+    "ring 870, 3D": lambda seed, noise: ring(870, 3, seed, noise),
+    "park 6898, 2D": lambda seed, noise: park(6898, 2, seed, noise),
+    "park 6898, 2D, noise x 2": lambda seed, noise: park(6898, 2, seed, 2.0 * noise),
+    "park 870, 3D, noise x 2": lambda seed, noise: park(870, 3, seed, 2.0 * noise),
+    "city 3500, pose graph": lambda seed, noise: city(3500, seed, noise),
+    "city 3500, pose graph, noise x 3": lambda seed, noise: city(3500, seed, 3.0 * noise),
+    "city 10000, pose graph": lambda seed, noise: city(10000, seed, noise, extent=50),
+    "sphere 2500, pose graph": lambda seed, noise: sphere(2500, seed, noise),
+    "sphere 2500, pose graph, noise x 2": lambda seed, noise: sphere(2500, seed, 2.0 * noise),
+    "tumbling 500, 3D, noise x 3": lambda seed, noise: tumbling(500, seed, 3.0 * noise),
+    "sparse 500, 2D": lambda seed, noise: sparse(500, 2, seed, noise),
 }
-"""Sets of the sizes that Linear SLAM was published with, by name; with a seed."""
+"""Sets of the sizes that Linear SLAM was published with, and two that are hard, by name; with a seed and the noise as a
+share of the set's own.
+"""
 
 
 def write(maps: list[TextMap], folder: Path) -> None:

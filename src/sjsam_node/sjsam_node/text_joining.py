@@ -146,15 +146,19 @@ class TextJoiner:
         self.flat: FlatMaps | FlatRows = flat
         self.solver, self.start, self.start_cost, self.dropped = "", "", np.nan, 0
 
+    def chained(self) -> State:
+        """Where the maps, each from where it starts, say that everything is."""
+        state = self._blank()
+        self._place(state, 0, len(self.index.maps), set())
+        return state
+
     def best(self, progress: Progress | None) -> tuple[State, LeastSquaresResult]:
         """The lowest optimum, once two ways have led there or none is left; from there robustly, if so configured."""
-        chained = self._blank()
-        self._place(chained, 0, len(self.index.maps), set())
-        self.start, (state, result) = "chained", self._optimize(chained)
+        self.start, (state, result) = "chained", self.optimize(self.chained())
         self.start_cost = result.initial_cost
         for k in range(1 + self.config.refinements):
             growth = self.config.growth / 3.0**k
-            found, other = self._optimize(self._incremental(growth, progress))
+            found, other = self.optimize(self._incremental(growth, progress))
             agree = abs(other.cost - result.cost) <= 1e-6 * result.cost + 1e-9
             if other.cost < result.cost:
                 self.start, state, result = f"incremental by {growth:.3g}", found, other
@@ -173,7 +177,8 @@ class TextJoiner:
         self.maps, self.dropped = found.maps, found.count
         return self._optimize_maps(found.maps, found.state)
 
-    def _optimize(self, state: State) -> tuple[State, LeastSquaresResult]:
+    def optimize(self, state: State) -> tuple[State, LeastSquaresResult]:
+        """The optimum of all maps reached from ``state``."""
         problem = self._problem(len(self.maps), state)
         self.solver = problem.backend
         return problem.optimize(state, self.config.optimizer)
