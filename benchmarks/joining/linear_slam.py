@@ -2,8 +2,8 @@
 
     python benchmarks/joining/linear_slam.py [FOLDER] [--seeds 1]
 
-For each: time, chi2, where the chained start lay, and which way led to the optimum; of the simulated ones the degrees of
-freedom that chi2 should be near, and the chi2 that is reached from the truth. Public sets with all libraries.
+For each: time, chi2, where the chained start lay, and which way led to the optimum; of the simulated ones the degrees
+of freedom that chi2 should be near, and the chi2 that is reached from the truth. Public sets with all libraries.
 """
 
 from __future__ import annotations
