@@ -142,8 +142,7 @@ def run_child(solver: str, path: Path, repeat: int) -> dict[str, Any] | None:
     command = [sys.executable, __file__, "--child", solver, "--problem", str(path), "--repeat", str(repeat)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        said = done.stderr.strip().splitlines()
-        print(f"  {solver:18s} failed: {next((line for line in reversed(said) if 'Error' in line), said[-1])}")
+        print(f"  {solver:18s} failed: {' '.join(done.stderr.rpartition('Error:')[2].split())[:150]}")
         return None
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
