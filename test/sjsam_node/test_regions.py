@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from judging import join
@@ -124,6 +126,24 @@ def test_what_links_the_inside_of_a_region_opens_it_and_what_links_its_rim_does_
         graph.add_link(Link(record, other, pairs, np.eye(4), np.eye(6), True))
         assert holds(region, graph) != is_open
         joiner.restore(before)
+
+
+def test_a_landmark_of_the_rim_that_is_let_go_is_estimated_by_the_region_alone(way: GlobalMap) -> None:
+    joiner, graph = way.joiner, way.graph
+    region = a_region(joiner)
+    was_older = graph.landmark_of[region.landmarks] < region.landmarks
+    inside = set(region.records.tolist())
+    graph.replace_links([k for k in graph.links if (k.first in inside) == (k.second in inside)])
+    assert holds(region, graph)
+    alone = region.landmarks[was_older & (graph.landmark_of[region.landmarks] == region.landmarks)]
+    joiner.config = replace(joiner.config, region=RegionConfig(bend=1.0))
+    joiner.regions.closed = [region]
+    joiner.batch(len(graph.records) - 1)
+    assert joiner.regions.closed == [region]
+    found = graph.points[alone]
+    joiner.batch(len(graph.records) - 1, whole=True)
+    assert len(alone) > 3
+    assert np.abs(found - graph.points[alone]).max() < 1e-3
 
 
 def test_a_closure_touches_only_the_regions_that_it_affects() -> None:

@@ -262,7 +262,7 @@ def join(graph: MapGraph, records: IntArray, component: int, local_maps: LocalMa
         return None
     information = 0.5 * (information + information.T)
     group = np.where(known, np.cumsum(known) - 1, -1)[np.searchsorted(landmarks, seen)]
-    carried = observations[~np.isin(observations, landmarks[known])]
+    carried = observations[group < 0]
     return Region(
         records, reference, rim, inner, poses[at_rim], observations[first[known]], points[landmarks[known]],
         information, -information @ step, float(least + step @ information @ step), observations, group, seen,
