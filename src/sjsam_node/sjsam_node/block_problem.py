@@ -207,5 +207,6 @@ def _coupled(odometry: FlatMaps, pose: IntArray, landmark: IntArray, poses: int,
     return FlatMaps(
         np.concatenate([odometry.reference, first]),
         np.concatenate([odometry.pose_ptr, odometry.pose_ptr[-1] + 1 + np.arange(len(first))]),
-        np.concatenate([odometry.poses[: odometry.pose_ptr[-1]], second]), none, none[:0], none, np.empty(0), none, np.empty(0), np.empty(0),
+        np.concatenate([odometry.poses[: odometry.pose_ptr[-1]], second]), none, none[:0], none, np.empty(0), none,
+        np.empty(0), np.empty(0),
     )  # fmt: skip
