@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from ndt_registration.ndt import Layer
-from ndt_registration.voxel_grid import NormalGrid, find_block, hash_table, pack_key, slot_of
+from ndt_registration.voxel_grid import NormalGrid, find_block
 from slam_core.geometry import FloatArray
 
 
@@ -16,10 +16,10 @@ class Fit(NamedTuple):
     """Share of points on the target's surfaces, their root mean square distance (m), their centroid (3,) about the
     target's axes and their root mean square distance from it.
 
-    friction (6, 6): expected curvature of the cost from errors of the cells' normals alone. A normal from ``n`` points
-    is off by
-    ``sqrt(variance / (n spread))``, so that a plane seems to hold points along itself with an information of ``1 / (n
-    spread)``.
+    friction (6, 6): expected part of the cost's Hessian that errors of the cells' normals alone make; majorant_friction
+    (6, 6): that of its majorant. A normal from ``n`` points is off by ``sqrt(variance / (n spread))``, so that a plane
+    seems to hold points along itself with an information of ``1 / (n spread)``, of which the Hessian keeps the more the
+    better a point fits.
     """
 
     overlap: float
@@ -27,30 +27,40 @@ class Fit(NamedTuple):
     centre: FloatArray
     radius: float
     friction: FloatArray
+    majorant_friction: FloatArray
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add_friction(px, py, pz, drag, F):  # type: ignore[no-untyped-def]
-    """Add ``drag J' J`` with ``J = [I, -[p]x]``."""
-    for k in range(3):
-        F[k, k] += drag
-    F[0, 4] += drag * pz
-    F[4, 0] += drag * pz
-    F[0, 5] -= drag * py
-    F[5, 0] -= drag * py
-    F[1, 3] -= drag * pz
-    F[3, 1] -= drag * pz
-    F[1, 5] += drag * px
-    F[5, 1] += drag * px
-    F[2, 3] += drag * py
-    F[3, 2] += drag * py
-    F[2, 4] -= drag * px
-    F[4, 2] -= drag * px
-    p, square = (px, py, pz), px * px + py * py + pz * pz
-    for r in range(3):
-        F[3 + r, 3 + r] += drag * square
-        for c in range(3):
-            F[3 + r, 3 + c] -= drag * p[r] * p[c]
+def _add_drag(px, py, pz, drag, sums):  # type: ignore[no-untyped-def]
+    """Add a point's drag and its first and second moments to ``sums`` (10,)."""
+    x, y, z = drag * px, drag * py, drag * pz
+    sums[0] += drag
+    sums[1] += x
+    sums[2] += y
+    sums[3] += z
+    sums[4] += x * px
+    sums[5] += x * py
+    sums[6] += x * pz
+    sums[7] += y * py
+    sums[8] += y * pz
+    sums[9] += z * pz
+
+
+@njit(cache=True, nogil=True)
+def _friction(sums: FloatArray) -> FloatArray:
+    """Sum of ``drag J' J`` with ``J = [I, -[p]x]`` from the moments of the drags."""
+    s, x, y, z = sums[0], sums[1], sums[2], sums[3]
+    xx, xy, xz, yy, yz, zz = sums[4], sums[5], sums[6], sums[7], sums[8], sums[9]
+    return np.array(
+        [
+            [s, 0.0, 0.0, 0.0, z, -y],
+            [0.0, s, 0.0, -z, 0.0, x],
+            [0.0, 0.0, s, y, -x, 0.0],
+            [0.0, -z, y, yy + zz, -xy, -xz],
+            [z, 0.0, -x, -xy, xx + zz, -yz],
+            [-y, x, 0.0, -xz, -yz, xx + yy],
+        ]
+    )
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -70,10 +80,10 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
     of its plane.
     """
     n = points.shape[0]
-    friction = np.zeros((6, 6))
+    drags, majorant_drags = np.zeros(10), np.zeros(10)
     inliers = 0
     squares = 0.0
-    centre, second = np.zeros(3), 0.0
+    cx = cy = cz = second = 0.0
     for i in range(n):
         px = R[0, 0] * points[i, 0] + R[0, 1] * points[i, 1] + R[0, 2] * points[i, 2]
         py = R[1, 0] * points[i, 0] + R[1, 1] * points[i, 1] + R[1, 2] * points[i, 2]
@@ -83,7 +93,7 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
         row = find_block(grid.keys, grid.rows, int(np.floor(mx * s)), int(np.floor(my * s)), int(np.floor(mz * s)))
         if row < 0:
             continue
-        weight = drag = 0.0
+        weight = drag = hold = 0.0
         best, distance = 4.5, 0.0
         for k in range(8):
             cell = grid.cells[row, k]
@@ -96,32 +106,37 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
             # In the plane the least variance is that of z, which is zero, and the second is across the wall.
             flat = grid.variance[cell, 0] <= 1e-9 * grid.variance[cell, 2]
             spread = grid.variance[cell, 2] if flat else grid.variance[cell, 1]
-            drag += e / (grid.counts[cell] * max(spread, 1e-12 * grid.block_size**2))
+            b = grid.information[cell]
+            information = e * min(1.0 / max(grid.counts[cell] * spread, 1e-300), b[0] + b[3] + b[5])
+            drag += information
+            hold += information * (1.0 - 2.0 * min(exponent, 30.0))
             if exponent < best:
                 best = exponent
                 distance = abs(qx * grid.normal[cell, 0] + qy * grid.normal[cell, 1] + qz * grid.normal[cell, 2])
         if best < 4.5 and distance < max_distance:
             inliers += 1
             squares += distance * distance
-            centre += np.array([px, py, pz])
+            cx += px
+            cy += py
+            cz += pz
             second += px * px + py * py + pz * pz
         if weight == 0.0:
             continue
-        _add_friction(px, py, pz, drag, friction)
-    centre /= max(inliers, 1)
+        _add_drag(px, py, pz, drag, majorant_drags)
+        _add_drag(px, py, pz, hold, drags)
+    centre = np.array([cx, cy, cz]) / max(inliers, 1)
     radius = np.sqrt(max(second / max(inliers, 1) - (centre * centre).sum(), 1e-12))
-    return Fit(inliers / max(n, 1), np.sqrt(squares / max(inliers, 1)), centre, radius, friction)
+    rmse = np.sqrt(squares / max(inliers, 1))
+    return Fit(inliers / max(n, 1), rmse, centre, radius, _friction(drags), _friction(majorant_drags))
 
 
 @njit(cache=True, nogil=True)
 def block_pulls(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Gradient (b, 6) of the cost of one layer at a pose, summed over each block of two cell edges."""
+    """Gradient (b, 6) of the cost of one layer at a pose, summed over each of the grid's blocks, half a cell's edge."""
     grid, n = layer.grid, layer.points.shape[0]
-    keys = hash_table(n)
-    rows = np.empty(keys.shape[0], np.int32)
-    pulls = np.zeros((n, 6))
-    blocks = 0
-    s, c = 1.0 / grid.block_size, 0.25 / grid.block_size
+    pulls = np.zeros((grid.cells.shape[0], 6))
+    pulled = np.zeros(grid.cells.shape[0], np.bool_)
+    s = 1.0 / grid.block_size
     for i in range(n):
         x, y, z = layer.points[i, 0], layer.points[i, 1], layer.points[i, 2]
         px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
@@ -141,17 +156,11 @@ def block_pulls(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
             vx += e * ux
             vy += e * uy
             vz += e * uz
-        key = pack_key(int(np.floor(mx * c)), int(np.floor(my * c)), int(np.floor(mz * c)))
-        slot = slot_of(keys, key)
-        if keys[slot] == -1:
-            keys[slot] = key
-            rows[slot] = blocks
-            blocks += 1
-        row = rows[slot]
+        pulled[row] = True
         pulls[row, 0] += vx
         pulls[row, 1] += vy
         pulls[row, 2] += vz
         pulls[row, 3] += py * vz - pz * vy
         pulls[row, 4] += pz * vx - px * vz
         pulls[row, 5] += px * vy - py * vx
-    return pulls[:blocks].copy()
+    return pulls[pulled]

@@ -30,8 +30,11 @@ class GridConfig(Config):
     )
     flatness: float = parameter(
         2.0,
-        "a cell takes the plane of the wider one whose variance across is at most so many times its own",
+        "a cell takes the normal of the wider one whose variance across is at most so many times its own",
         minimum=0.0,
+    )
+    agreement: float = parameter(
+        4.0, "and whose plane its own mean and normal meet within so many standard deviations", minimum=0.0
     )
     surface_smoothing: float = parameter(0.03, "like smoothing, on the surface levels", minimum=0.0)
     rim_ratio: float = parameter(2.0, "edge of the cells of rims over that of surfaces", minimum=0.1)
@@ -66,7 +69,9 @@ class Pyramid:
             for level in range(config.levels - 2, -1, -1):
                 slack = config.slack if level < config.surface_levels else -1.0
                 floor = (config.surface_smoothing * edge * 2**level) ** 2
-                adopt_planes(surface_grids[level], surface_grids[level + 1], config.flatness, floor, slack)
+                adopt_planes(
+                    surface_grids[level], surface_grids[level + 1], config.flatness, config.agreement, floor, slack
+                )
         return Pyramid(tuple(surface_grids), tuple(rim_grids))
 
     def layers(self, source: Cloud, level: int, count: int, rim_share: float) -> tuple[Layer, Layer]:

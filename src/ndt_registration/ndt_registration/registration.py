@@ -287,7 +287,7 @@ def _result(
     layers = target.pyramid.layers(source, 0, len(source), config.rim_share)
     pulls = [block_pulls(layer, optimum.rotation, optimum.translation) for layer in layers]
     uncertainty = sandwich(
-        Curvature(optimum.hessian, optimum.majorant, fit.friction),
+        Curvature(optimum.hessian, optimum.majorant, fit.friction, fit.majorant_friction),
         gradient_scatter(pulls, len(source) / len(target.cloud)),
         Extent(fit.centre, max(fit.radius, _LEAST_RADIUS * scale)),
         _loss(source, target, optimum, config),

@@ -40,12 +40,13 @@ class Uncertainty(NamedTuple):
 
 class Curvature(NamedTuple):
     """Second derivatives of the cost at the optimum (6, 6): exact, its semidefinite majorant, and what errors of
-    normals feign.
+    normals feign of either.
     """
 
     hessian: FloatArray
     majorant: FloatArray
     friction: FloatArray
+    majorant_friction: FloatArray
 
 
 class Extent(NamedTuple):
@@ -91,8 +92,8 @@ def sandwich(
     to_pose = np.eye(6)
     to_pose[:3, 3:] = skew(extent.centre) / extent.radius
     to_pose[3:, 3:] /= extent.radius
-    H, M, F, C = (to_pose.T @ A @ to_pose for A in (curvature.hessian, curvature.majorant, curvature.friction, scatter))
-    for A in (H, M, F, C):
+    H, M, F, feigned, C = (to_pose.T @ A @ to_pose for A in (*curvature, scatter))
+    for A in (H, M, F, feigned, C):
         A[fixed], A[:, fixed] = 0.0, 0.0
     vectors = np.linalg.eigh(M)[1]
     held = np.abs(vectors[fixed]).sum(axis=0) > 0.5
@@ -100,8 +101,8 @@ def sandwich(
     for k in np.flatnonzero(~held):
         v = vectors[:, k]
         step = config.probe * scale * (to_pose @ v)
-        least = config.least_loss * (_FEIGNED_FACTOR if v @ H @ v < v @ F @ v else 1.0)
-        free[k] = v @ M @ v <= v @ F @ v or min(loss(step), loss(-step)) < least
+        least = config.least_loss * (_FEIGNED_FACTOR if v @ H @ v < v @ feigned @ v else 1.0)
+        free[k] = v @ M @ v <= v @ feigned @ v or min(loss(step), loss(-step)) < least
         if not free[k]:
             break
     known = vectors[:, ~free & ~held]
@@ -115,20 +116,20 @@ def sandwich(
 
 
 def gradient_scatter(pulls: Iterable[FloatArray], density_ratio: float) -> FloatArray:
-    """Covariance (6, 6) of the cost's gradient from the pulls (b, 6) of the blocks of each layer.
+    """Covariance (6, 6) of the cost's gradient from the pulls (b, 6) of the small blocks of each layer.
 
-    The pulls vanish in sum at the optimum, and their scatter contains noise, discretisation and wrong matches alike;
-    points of one block share much of their errors, blocks little. What is shared by more than a block shows in no
-    scatter: the errors of a plane that many blocks were given, and that two views show the same things from other
-    sides, which moves the optimum alike in every pair of scans taken there. These are counted as much as the scatter
-    where the target is as dense: ``density_ratio`` is the source's number of points over the target's. (Over repeated
-    scans of four rooms the noise is half of the sum, and the shared part most of the rest: ``covariance.py`` among the
-    benchmarks.)
+    The pulls vanish in sum at the optimum; their scatter contains the noise of the source's points, discretisation and
+    wrong matches alike. Points of one block share much of their errors (neighbouring pixels, one and the same edge),
+    blocks of half a cell little. The target's points err as much as the source's and move the optimum as far, but
+    alike for all blocks that meet one plane, so that little of it shows in the scatter: it is counted as the source's,
+    times ``density_ratio``, the source's number of points over the target's.
+
+    What is the same in every pair of scans from two places, because the two views show rims and edges from other sides,
+    is seen only as far as blocks disagree about it: a fifth to a third more than the noise is claimed, which over many
+    places is what there is (``covariance.py`` among the benchmarks).
     """
-    total = np.zeros((6, 6))
-    for layer in pulls:
-        total += layer.T @ layer * (len(layer) / max(len(layer) - 6, 1))
-    return (1.0 + density_ratio) * total
+    each = np.vstack(tuple(pulls))
+    return np.asarray((1.0 + density_ratio) * len(each) / max(len(each) - 6, 1) * (each.T @ each))
 
 
 def _inverse(hessian: FloatArray, majorant: FloatArray) -> FloatArray:

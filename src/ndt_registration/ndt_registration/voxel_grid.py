@@ -270,12 +270,17 @@ _TINY = 1e-12
 
 
 @njit(cache=True, nogil=True)
-def adopt_planes(grid: NormalGrid, wider: NormalGrid, flatness: float, floor: float, slack: float) -> None:
-    """Give each cell the plane of the cell of twice its edge around it, where that is as flat as the cell itself.
+def adopt_planes(
+    grid: NormalGrid, wider: NormalGrid, flatness: float, agreement: float, floor: float, slack: float
+) -> None:
+    """Give each cell the normal of the cell of twice its edge around it, where its own points do not contradict that.
 
     The direction of a cell's normal errs by its thickness over its width and the root of its points, for a small piece
-    of a noisy wall by degrees: enough to hold points that should slide along. The wider plane errs sixteen times less
-    in variance. Cells are changed in place; with ``slack`` >= 0 their information becomes that of the plane alone.
+    of a noisy wall by degrees: enough to hold points that should slide along. The wider normal errs sixteen times less
+    in variance. Thickness alone hardly tells a picture or a skirting board from the wall behind it; where the cell's
+    mean lies, and how it is turned, does. The mean stays the cell's own: means err independently and average out,
+    while that of a wider plane with a step in it is wrong for either side. Cells are changed in place; with ``slack``
+    >= 0 their information becomes that of the plane alone.
 
     Parameters
     ----------
@@ -283,6 +288,8 @@ def adopt_planes(grid: NormalGrid, wider: NormalGrid, flatness: float, floor: fl
         The grid to change, and the next coarser one, changed before.
     flatness
         Largest ratio of the wider cell's thickness to the cell's own, as variances.
+    agreement
+        How far the cell's mean may lie off the wider plane, and its normal off the wider one, in standard deviations.
     floor
         Least variance across the plane, m2.
     slack
@@ -297,14 +304,18 @@ def adopt_planes(grid: NormalGrid, wider: NormalGrid, flatness: float, floor: fl
         # Of the eight cells, that whose centre is nearest.
         child = int(x - ix < 0.5) + 2 * int(y - iy < 0.5) + 4 * int(z - iz < 0.5)
         cell = wider.cells[row, child]
-        if cell < 0 or wider.variance[cell, 0] > flatness * max(grid.variance[i, 0], floor):
+        across = max(grid.variance[i, 0], floor)
+        if cell < 0 or wider.variance[cell, 0] > flatness * across:
             continue
         n = wider.normal[cell]
-        offset = 0.0
+        offset = cosine = 0.0
         for k in range(3):
             offset += n[k] * (grid.mean[i, k] - wider.mean[cell, k])
+            cosine += n[k] * grid.normal[i, k]
+        slope = (1.0 - cosine * cosine) * grid.variance[i, 1]
+        if max(offset * offset, slope) * grid.counts[i] > agreement * agreement * across:
+            continue
         for k in range(3):
-            grid.mean[i, k] -= offset * n[k]
             grid.normal[i, k] = n[k]
             grid.variance[i, k] = wider.variance[cell, k]
         grid.counts[i] = wider.counts[cell]
