@@ -116,3 +116,40 @@ def test_a_factor_that_leads_nowhere_is_not_used_again() -> None:
     x, result = levenberg_marquardt(problem, np.array([1.02, 1.03]))
     assert result.converged
     assert np.allclose(x, 1.0, atol=1e-5)
+
+
+class Parabola:
+    """One residual (x^2 - 1) / 2, or its tangent at 1, beside a rest of a million that no step can lower."""
+
+    def __init__(self, *, linear: bool) -> None:
+        self.linear = linear
+
+    def _residual(self, x: np.ndarray) -> np.ndarray:
+        return x - 1.0 if self.linear else 0.5 * (x**2 - 1.0)
+
+    def cost(self, state: np.ndarray) -> float:
+        return 1e6 + float(self._residual(state) @ self._residual(state))
+
+    def linearize(self, state: np.ndarray) -> np.ndarray:
+        self.J = np.ones(1) if self.linear else state
+        self.g = self.J * self._residual(state)
+        return self.g
+
+    def solve(self, damping: float) -> np.ndarray:
+        return -self.g / ((1.0 + damping) * self.J**2)
+
+    def retract(self, state: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return state + step
+
+
+def test_a_step_that_gained_what_it_promised_near_the_optimum_is_the_last() -> None:
+    _, result = levenberg_marquardt(Parabola(linear=True), np.array([1.3]))
+    assert result.converged
+    assert result.iterations == 1
+
+
+def test_a_step_that_gained_less_than_it_promised_is_not_the_last() -> None:
+    x, result = levenberg_marquardt(Parabola(linear=False), np.array([1.3]))
+    assert result.converged
+    assert result.iterations > 1
+    assert abs(x[0] - 1.0) < 1e-3

@@ -23,6 +23,8 @@ _NEAR = 0.2
 """A factor is used again from where a step promised less than this share of the cost: close to the optimum."""
 _REUSE_RATE = 0.25
 """And as long as each step promises less than this share of what the one before did."""
+_DOUBT = 4.0
+"""How many times more a step may promise than the linear model was wrong by at the one before."""
 
 
 def whitening(covariance: FloatArray) -> FloatArray:
@@ -132,12 +134,24 @@ def levenberg_marquardt(
             damping, growth = max(damping, 1e-9) * growth * 2.0, growth * 2.0
             if damping > config.max_damping:
                 return state, LeastSquaresResult(initial, cost, iteration, False, "no step lowers the cost")
-        ratio = (cost - candidate_cost) / max(decrement, 1e-300)
+        gained = cost - candidate_cost
         state, cost = candidate, candidate_cost
-        if decrement <= config.relative_tolerance * max(cost, 1e-9):
+        if _is_last(decrement, gained, max(cost, 1e-9), config.relative_tolerance):
             return state, LeastSquaresResult(initial, cost, iteration, True, "")
+        ratio = gained / max(decrement, 1e-300)
         damping, growth = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), config.initial_damping), 2.0
     return state, LeastSquaresResult(initial, cost, config.max_iterations, False, "iteration limit")
+
+
+def _is_last(decrement: float, gained: float, cost: float, tolerance: float) -> bool:
+    """Whether nothing worth a step is left: the step just taken promised as little, or the next one would.
+
+    Newton's steps promise about the square of what the one before did, as a share of the cost, and what the linear
+    model got wrong about a step is what the next can gain.
+    """
+    if decrement <= tolerance * cost:
+        return True
+    return decrement <= np.sqrt(tolerance) * cost and _DOUBT * abs(decrement - gained) <= tolerance * cost
 
 
 def _reuse(

@@ -56,7 +56,8 @@ def elimination_order(count: int, rows: IntArray, columns: IntArray) -> IntArray
     Approximate minimum degree (Amestoy, Davis and Duff 1996) where cvxopt is there, SuperLU's multiple minimum degree
     otherwise. Entry ``k`` of the result is the node that is eliminated k-th.
     """
-    low, high = np.minimum(rows, columns), np.maximum(rows, columns)
+    apart = rows != columns
+    low, high = np.minimum(rows, columns)[apart], np.maximum(rows, columns)[apart]
     # Sorted and unique: cvxopt inserts entries that come otherwise one by one.
     edges = np.unique(np.concatenate([low * count + high, np.arange(count, dtype=np.int64) * (count + 1)]))
     if cvxopt is None:
