@@ -256,7 +256,8 @@ def invert(symbolic, panels, inverse, stack):
             Z[w:, w:] = known
             Z[w:, :w] = side
             Z[:w, w:] = side.T
-        Z[:w, :w] = corner
+        # What rounding leaves of asymmetry would grow from front to front along a long way.
+        Z[:w, :w] = 0.5 * (corner + corner.T)
         inverse[panel_ptr[s] : panel_ptr[s + 1]] = Z[:, :w].copy().reshape(m * w)
         if children[s] > 0:
             at[s] = top
