@@ -159,12 +159,6 @@ def cost_and_derivatives(
     return cost
 
 
-def score_at(layers: tuple[Layer, ...], T: FloatArray) -> float:
-    """Score of all layers at a pose T_target_source (4, 4), summed over the points."""
-    R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
-    return -float(cost_and_derivatives(layers, R, t, np.empty(6), np.empty((6, 6)), np.empty((6, 6))))
-
-
 @njit(cache=True, nogil=True, inline="always")
 def _add_point(px, py, pz, vx, vy, vz, xx, xy, xz, yy, yz, zz, H):  # type: ignore[no-untyped-def]
     """Add ``J' B J`` with ``J = [I, -[p]x]`` to the upper triangle of H."""

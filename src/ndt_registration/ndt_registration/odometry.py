@@ -18,15 +18,22 @@ from ndt_registration.local_map import LocalMap, Scan
 from ndt_registration.motion_filter import MotionConfig, MotionFilter, rotated
 from ndt_registration.pyramid import GridConfig
 from ndt_registration.registration import RegistrationConfig, RegistrationResult, for_dimension, register
+from ndt_registration.uncertainty import UncertaintyConfig
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, boxminus, compose_jacobians, invert_transform
 from slam_core.types import RelativeMotion
 
 ODOMETRY_REGISTRATION = RegistrationConfig(
-    source_points=4000, target_points=8000, start_level=1, rim_share=0.2, grid=GridConfig(flatness=0.0)
+    source_points=4000,
+    target_points=8000,
+    start_level=1,
+    rim_share=0.2,
+    grid=GridConfig(flatness=0.0),
+    uncertainty=UncertaintyConfig(least_loss=0.06, score_noise=0.05),
 )
 """From a near guess. Cells keep their own normals: what is rough in them holds a scan of a wall where it started, while
-on perfect planes it would slide.
+on perfect planes it would slide. That is little knowledge of the pose: a determined one must lose more, and how far one
+that is not may be off follows from what it loses.
 """
 
 
@@ -110,7 +117,7 @@ class ScanOdometry:
             raise ValueError(f"scans must be in order of time, got stamp {stamp_ns} ns after {self._stamp_ns} ns")
         self._predict(stamp_ns, prior)
         result = self._register(scan, lost=prior is None and self._failures >= self._config.search_after)
-        return self._track(scan, result, prior) if result.converged else self._fail(scan, result)
+        return self._track(scan, result) if result.converged else self._fail(scan, result)
 
     def add_angular_velocity(self, stamp_ns: int, rate: FloatArray) -> None:
         """Take an IMU's angular velocity (3,) rad/s, along the axes of the scanning sensor, ahead of later scans."""
@@ -167,12 +174,8 @@ class ScanOdometry:
         T_odom_key = self._map.newest.T
         return T_odom_key @ result.T_target_source, rotated(T_odom_key, result.covariance)
 
-    def _track(self, scan: Scan, result: RegistrationResult, prior: RelativeMotion | None) -> OdometryResult:
-        T, covariance = self._in_odometry(result)
-        if prior is None:
-            self._filter.settle(T, covariance)
-        else:
-            self._filter.fuse(T, covariance)
+    def _track(self, scan: Scan, result: RegistrationResult) -> OdometryResult:
+        self._filter.fuse(*self._in_odometry(result))
         covariance = self._covariance()
         motion = None if self._failures else self._motion()
         self._failures = 0

@@ -7,7 +7,6 @@ by NDT from coarse to fine, and the one that respects best what the target has s
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,9 +14,10 @@ import numpy.typing as npt
 
 from ndt_registration.ambiguity import AmbiguityConfig, reason_of_doubt
 from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare, viewpoint
+from ndt_registration.holding import Holding
 from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
 from ndt_registration.matching import block_pulls, fit_to_grid
-from ndt_registration.ndt import NdtOptimum, ndt_align, score_at
+from ndt_registration.ndt import NdtOptimum, ndt_align
 from ndt_registration.pyramid import GridConfig, Pyramid
 from ndt_registration.search import Candidate, SearchConfig, Views, judge, planar_constraint, search
 from ndt_registration.uncertainty import (
@@ -33,7 +33,6 @@ from ndt_registration.visibility import RangeImage, range_image
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import (
     FloatArray,
-    boxplus,
     is_rigid_transform,
     make_transform,
     quaternion_from_rotation,
@@ -290,7 +289,7 @@ def _result(
         Curvature(optimum.hessian, optimum.majorant, fit.friction, fit.majorant_friction),
         gradient_scatter(pulls, len(source) / len(target.cloud)),
         Extent(fit.centre, max(fit.radius, _LEAST_RADIUS * scale)),
-        _loss(source, target, optimum, config),
+        Holding(target.pyramid.layers(source, 0, config.coarse_points, config.rim_share), _pose(optimum)).loss,
         scale,
         planar_constraint(source.planar) > 0.0,
         config.uncertainty,
@@ -309,16 +308,6 @@ def _result(
         reason=reason or ("not determined: " + "; ".join(names) if names else ""),
         degenerate=names,
     )
-
-
-def _loss(
-    source: Cloud, target: Target, optimum: NdtOptimum, config: RegistrationConfig
-) -> Callable[[FloatArray], float]:
-    """Share of the score that is lost when the optimum is moved by a vector (6,)."""
-    layers = target.pyramid.layers(source, 0, config.coarse_points, config.rim_share)
-    best = _pose(optimum)
-    score = score_at(layers, best)
-    return lambda step: 1.0 - score_at(layers, boxplus(best, step)) / max(score, 1e-300)
 
 
 _LEAST_RADIUS = 0.05

@@ -23,9 +23,16 @@ class UncertaintyConfig(Config):
         0.03, "how far the pose is moved to see whether it is determined, over the scale", minimum=0.001
     )
     least_loss: float = parameter(
-        0.03, "share of its score that a determined pose loses by that", minimum=0.0, maximum=1.0
+        0.015, "share of its fit that a determined pose loses by that", minimum=0.0, maximum=1.0
     )
-    free_sigma: float = parameter(1.0, "standard deviation given to a free direction, over the scale", minimum=0.0)
+    score_noise: float = parameter(
+        1.0,
+        "loss that chance makes up for: a free direction is known to the probe times this over its loss",
+        minimum=0.0,
+    )
+    free_sigma: float = parameter(
+        1.0, "largest standard deviation given to a free direction, over the scale", minimum=0.0
+    )
     sigma_floor: float = parameter(1e-5, "least standard deviation of any direction, over the scale", minimum=0.0)
 
 
@@ -69,7 +76,8 @@ def sandwich(
 
     A direction is free where the score hardly falls when the pose is moved along it by much more than the noise; no
     curvature shows that alone, because the small errors of many normals feign one. What they feign in the mean is taken
-    off the curvature, else the directions that little determines would seem far better known than they are.
+    off the curvature, else the directions that little determines would seem far better known than they are. How far
+    the pose may be off along a free direction follows from the loss: chance makes up for so much of it.
 
     Parameters
     ----------
@@ -97,20 +105,22 @@ def sandwich(
         A[fixed], A[:, fixed] = 0.0, 0.0
     vectors = np.linalg.eigh(M)[1]
     held = np.abs(vectors[fixed]).sum(axis=0) > 0.5
-    free = np.zeros(6, dtype=bool)
+    free, sigma = np.zeros(6, dtype=bool), np.zeros(6)
     for k in np.flatnonzero(~held):
         v = vectors[:, k]
         step = config.probe * scale * (to_pose @ v)
         least = config.least_loss * (_FEIGNED_FACTOR if v @ H @ v < v @ feigned @ v else 1.0)
-        free[k] = v @ M @ v <= v @ feigned @ v or min(loss(step), loss(-step)) < least
-        if not free[k]:
+        lost = min(loss(step), loss(-step))
+        free[k] = v @ M @ v <= v @ feigned @ v or lost < least
+        sigma[k] = scale * min(config.free_sigma, config.probe * config.score_noise / max(lost, 1e-9))
+        if not free[k] and lost > _PLAINLY_HELD * config.least_loss:
             break
     known = vectors[:, ~free & ~held]
     covariance = (config.sigma_floor * scale) ** 2 * np.eye(6)
     if known.shape[1]:
         inverse = _inverse(known.T @ (H - F) @ known, known.T @ M @ known)
         covariance += known @ inverse @ (known.T @ C @ known) @ inverse @ known.T
-    covariance += (vectors[:, free] * (config.free_sigma * scale) ** 2) @ vectors[:, free].T
+    covariance += (vectors[:, free] * sigma[free] ** 2) @ vectors[:, free].T
     covariance = to_pose @ covariance @ to_pose.T
     return Uncertainty(0.5 * (covariance + covariance.T), vectors[:, free].T)
 
@@ -144,6 +154,8 @@ def _inverse(hessian: FloatArray, majorant: FloatArray) -> FloatArray:
 
 
 _LEAST_RELATIVE_CURVATURE = 0.05
+_PLAINLY_HELD = 10.0
+"""So many times the least loss: directions of more curvature than one that loses this need not be tried."""
 _FEIGNED_FACTOR = 2.0
 """So many times the loss is asked for where the curvature is no more than what the normals' errors feign."""
 

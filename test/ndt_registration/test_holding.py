@@ -1,0 +1,45 @@
+"""What a scan loses when its pose is moved: much across a wall, nothing along it, although its view ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ndt_registration.cloud import prepare
+from ndt_registration.holding import Holding
+from ndt_registration.registration import RegistrationConfig, Target
+from slam_core.geometry import FloatArray
+
+STEP = 0.1
+
+
+def losses(scan: FloatArray, target: FloatArray, T: FloatArray) -> FloatArray:
+    """The lesser of the losses (3,) by a step forth and back along each axis."""
+    config = RegistrationConfig()
+    map_ = Target.build(target, config)
+    cloud = prepare(scan, 2000, planar=False, centre=np.zeros(3))
+    holding = Holding(map_.pyramid.layers(cloud, 0, 2000, config.rim_share), T)
+    return np.array([min(holding.loss(s * STEP * np.eye(6)[k]) for s in (1.0, -1.0)) for k in range(3)])
+
+
+def test_a_blank_wall_holds_across_only(empty_room: Any, at: Callable[..., FloatArray]) -> None:
+    rng, wall, start, truth = np.random.default_rng(4), empty_room(60.0, 60.0, 60.0), at(57.0, 30.0, 30.0), at(0.0, 0.1)
+    lost = losses(wall.scan(start @ truth, rng), wall.scan(start, rng), truth)
+    assert lost[0] > 0.9
+    assert (lost[1:] < 0.01).all()
+
+
+def test_a_furnished_room_holds_everywhere(room: Any, start: FloatArray, at: Callable[..., FloatArray]) -> None:
+    rng, truth = np.random.default_rng(4), at(0.0, 0.1)
+    lost = losses(room.scan(start @ truth, rng), room.scan(start, rng), truth)
+    assert (lost > 4.0 * RegistrationConfig().uncertainty.least_loss).all()
+
+
+def test_nothing_is_lost_where_nothing_moves(room: Any, start: FloatArray) -> None:
+    rng, config = np.random.default_rng(4), RegistrationConfig()
+    scan = room.scan(start, rng)
+    cloud = prepare(scan, 2000, planar=False, centre=np.zeros(3))
+    layers = Target.build(scan, config).pyramid.layers(cloud, 0, 2000, config.rim_share)
+    assert Holding(layers, np.eye(4)).loss(np.zeros(6)) == 0.0
