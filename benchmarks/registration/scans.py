@@ -43,10 +43,10 @@ HARDER_MOTIONS: dict[str, Motion] = {
 
 
 class TofRoom:
-    """A ToF camera that can be put anywhere in a scenario's building."""
+    """A ToF camera that can be put anywhere in the building of a scenario, or of that named or in a YAML file."""
 
-    def __init__(self, scenario: str = "tof_grid") -> None:
-        description = Scenario.load(scenario)
+    def __init__(self, scenario: str | Scenario = "tof_grid") -> None:
+        description = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         self._world = compile_world(description.world())
         self._sensor = TofSensor(description.suite.tof, description.seed)
         self._depth = DepthProcessor(DepthConfig(), self._sensor.camera)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from ndt_registration.eigen import cholesky_solve6, symmetric_eigen3
-from ndt_registration.voxel_grid import block_moments, coarser, find_block, normal_grid
+from ndt_registration.voxel_grid import NormalGrid, adopt_planes, block_moments, coarser, find_block, normal_grid
+from slam_core.geometry import FloatArray
 
 
 def test_eigenvalues_agree_with_lapack(rng: np.random.Generator) -> None:
@@ -78,3 +79,38 @@ def test_points_slide_along_the_surface_of_cells_with_slack(rng: np.random.Gener
 def test_blocks_too_small_for_the_cloud_are_refused() -> None:
     with pytest.raises(ValueError, match="too small"):
         block_moments(np.array([[1e6, 0.0, 0.0]]), 0.01)
+
+
+def flat_patch(rng: np.random.Generator, count: int, x: tuple[float, float], z: float) -> FloatArray:
+    """Points (n, 3) of a piece of the plane at height ``z`` with 5 mm of noise."""
+    return np.column_stack([rng.uniform(*x, count), rng.uniform(0.0, 0.8, count), z + 0.005 * rng.normal(size=count)])
+
+
+def adopted(points: FloatArray) -> tuple[NormalGrid, NormalGrid]:
+    """Cells of 0.1 m as they are and with the normals of those of 0.2 m."""
+    fine = block_moments(points, 0.05)
+    own, changed, wider = (
+        normal_grid(m, size, min_points=6, relative_floor=1e-3, variance_floor=1e-6, slack=10.0)
+        for m, size in ((fine, 0.05), (fine, 0.05), (coarser(fine), 0.1))
+    )
+    adopt_planes(changed, wider, 2.0, 4.0, 1e-6, 10.0)
+    return own, changed
+
+
+def test_cells_of_a_plane_take_the_wider_normal_and_keep_their_mean(rng: np.random.Generator) -> None:
+    own, changed = adopted(flat_patch(rng, 20000, (0.0, 0.8), 0.02))
+    tilt = [np.sqrt(np.mean(grid.normal[:, 0] ** 2 + grid.normal[:, 1] ** 2)) for grid in (own, changed)]
+    assert tilt[1] < 0.4 * tilt[0]
+    np.testing.assert_array_equal(changed.mean, own.mean)
+    assert changed.counts.mean() > 2.0 * own.counts.mean()
+
+
+def test_cells_at_a_step_keep_their_own_normal(rng: np.random.Generator) -> None:
+    """A picture 8 mm before its wall hardly thickens a wide cell, but tilts it by more than the cell beside allows."""
+    step = 0.39
+    points = np.vstack([flat_patch(rng, 10000, (0.0, step), 0.02), flat_patch(rng, 10000, (step, 0.8), 0.028)])
+    own, changed = adopted(points)
+    beside = (np.abs(own.mean[:, 0] - step) > 0.05) & (np.abs(own.mean[:, 0] - step) < 0.1)
+    assert beside.sum() > 40
+    upwards = changed.normal[beside] * np.sign(changed.normal[beside, 2:])
+    assert abs(upwards[:, 0].mean()) < 0.015
