@@ -158,8 +158,8 @@ class GlobalMap:
 
     def _last_pose(self, agent: str) -> FloatArray:
         """Where an agent was last; the origin for one not seen before."""
-        own = [r for r in self.graph.records if r.submap.agent == agent]
-        return self.graph.poses[own[-1].end] if own else np.eye(4)
+        newest = next((r for r in reversed(self.graph.records) if r.submap.agent == agent), None)
+        return np.eye(4) if newest is None else self.graph.poses[newest.end]
 
     def _chain(self, new: int) -> list[int]:
         """The last records before ``new`` along its agent's odometry, newest first, as many as it may be linked to."""

@@ -81,7 +81,8 @@ class PlaceIndex:
     _tree: VocabularyTree | None = None
     _waiting: list[tuple[int, Descriptors]] = field(default_factory=list)
     _postings: dict[int, list[int]] = field(default_factory=lambda: defaultdict(list))
-    _sizes: dict[int, int] = field(default_factory=dict)
+    _sizes: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    _posted: int = 0
     _descriptors: dict[int, Descriptors] = field(default_factory=dict)
 
     def add(self, place: int, descriptors: Descriptors) -> None:
@@ -97,7 +98,10 @@ class PlaceIndex:
         self._waiting.clear()
 
     def _post(self, place: int, words: IntArray) -> None:
+        missing = max(place + 1 - len(self._sizes), 0)
+        self._sizes = np.concatenate([self._sizes, np.ones(missing, dtype=np.int64)])
         self._sizes[place] = max(len(words), 1)
+        self._posted += 1
         for word in np.unique(words).tolist():
             self._postings[word].append(place)
 
@@ -106,24 +110,27 @@ class PlaceIndex:
 
         The vocabulary proposes a few times as many as are asked for; the descriptors themselves decide among them.
         """
-        known = [place for place in self._descriptors if place not in excluded]
-        if self._tree is not None:
-            scores = self._scores(self._tree.words(descriptors))
-            ranked = sorted((place for place in known if place in scores), key=lambda p: (-scores[p], p))
-            known = ranked[: self.config.proposals * self.config.candidates]
+        if self._tree is None:
+            known = [place for place in self._descriptors if place not in excluded]
+        else:
+            known = self._proposed(self._tree.words(descriptors), excluded)
         direct = {place: _likeness(self._descriptors[place], descriptors) for place in known}
         return sorted(known, key=lambda p: (-direct[p], p))[: self.config.candidates]
 
-    def _scores(self, words: IntArray) -> dict[int, float]:
-        """Similarity of every place that shares a word: rare words weigh more (inverse document frequency)."""
+    def _proposed(self, words: IntArray, excluded: set[int]) -> list[int]:
+        """The places that share most words, best first: rare words weigh more (inverse document frequency)."""
         shared = [self._postings[word] for word in np.unique(words).tolist() if word in self._postings]
         if not shared:
-            return {}
+            return []
         lengths = np.array([len(posting) for posting in shared])
         places = np.concatenate([np.asarray(posting, dtype=np.int64) for posting in shared])
-        idf = np.log(1.0 + len(self._sizes) / lengths)
-        total = np.bincount(places, weights=np.repeat(idf, lengths))
-        return {place: float(total[place]) / self._sizes[place] ** 0.5 for place in np.nonzero(total)[0].tolist()}
+        idf = np.log(1.0 + self._posted / lengths)
+        total = np.bincount(places, weights=np.repeat(idf, lengths), minlength=len(self._sizes))
+        total[[place for place in excluded if place < len(total)]] = 0.0
+        found = np.nonzero(total)[0]
+        score = total[found] / np.sqrt(self._sizes[found])
+        ranked = found[np.argsort(-score, kind="stable")]
+        return [int(place) for place in ranked[: self.config.proposals * self.config.candidates]]
 
 
 def _likeness(first: Descriptors, second: Descriptors) -> float:
