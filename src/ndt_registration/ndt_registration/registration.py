@@ -184,7 +184,7 @@ def check_cloud(points: FloatArray, name: str, config: RegistrationConfig) -> No
         raise DegenerateCloudError(
             f"the {name} has {len(points)} finite points, at least {config.min_points} are needed"
         )
-    extent = float(np.ptp(points, axis=0).max())
+    extent = max(float(np.ptp(column)) for column in points.T)
     if extent < _LEAST_EXTENT:
         raise DegenerateCloudError(f"all points of the {name} coincide")
     if not extent < _LARGEST_EXTENT:
