@@ -242,3 +242,12 @@ def test_a_guess_that_is_no_transform_is_an_error(room: Any, start: FloatArray, 
 def test_wrong_shapes_are_an_error() -> None:
     with pytest.raises(ValueError, match="shape"):
         register(np.ones((10, 4)), np.ones((10, 3)))
+
+
+@pytest.mark.parametrize("factors", [(1000.0, 1.0), (1.0, 1000.0)])
+def test_a_cloud_in_millimetres_is_noticed(room: Any, start: FloatArray, factors: tuple[float, float]) -> None:
+    rng = np.random.default_rng(6)
+    source, target = (factor * room.scan(start, rng) for factor in factors)
+    result = register(source, target)
+    assert not result.converged
+    assert result.reason.endswith("is one of them in mm?")

@@ -295,6 +295,8 @@ def _result(
         config.uncertainty,
     )
     reason = _reason_of_failure(optimum, fit.overlap, cost, config)
+    if reason and not 1.0 / _UNITS_APART < source.scale / scale < _UNITS_APART:
+        reason = f"the source is {source.scale / scale:.2g} times as large as the target: is one of them in mm?"
     names = direction_names(uncertainty.free)
     covariance = uncertainty.covariance if not reason else unknown(scale, config.uncertainty)
     return RegistrationResult(
@@ -310,6 +312,8 @@ def _result(
     )
 
 
+_UNITS_APART = 100.0
+"""Clouds of one place differ less in scale than so many times, unless their units do."""
 _LEAST_RADIUS = 0.05
 """Spread of the matched points, over the scale, below which rotations would be measured against nothing."""
 
