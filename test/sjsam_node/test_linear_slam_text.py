@@ -172,7 +172,8 @@ def test_files_of_other_editors_are_read(tmp_path: Path) -> None:
     first = tmp_path / "localmap_1.txt"
     first.write_bytes(b"\xef\xbb\xbf" + first.read_bytes().replace(b"\n", b"\r\n") + b"\r\n")
     maps, dimension = read_maps(find_maps(tmp_path))
-    assert len(maps) == 30 and dimension == 2
+    assert len(maps) == 30
+    assert dimension == 2
 
 
 def test_what_did_not_converge_is_said(tmp_path: Path) -> None:
@@ -181,5 +182,6 @@ def test_what_did_not_converge_is_said(tmp_path: Path) -> None:
     config.write_text("optimizer: {max_iterations: 1, relative_tolerance: 0.0}\n")
     arguments = [str(tmp_path / "maps"), "-o", str(tmp_path / "out"), "--config", str(config)]
     result = CliRunner().invoke(command, arguments)
-    assert result.exit_code == 0 and "not converged after 1 iterations" in result.output
+    assert result.exit_code == 0
+    assert "not converged after 1 iterations" in result.output
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["converged"] is False
