@@ -247,7 +247,11 @@ class GlobalMap:
         if self._unsearched:
             self._close_loops()
         if self.graph.records:
+            self._join_whole()
             self._catch_up(len(self.graph.records) - 1, None)
+        self._join_whole()
+
+    def _join_whole(self) -> None:
         for component in np.unique(self.graph.component_of):
             self.joiner.assembled(int(component))
 
