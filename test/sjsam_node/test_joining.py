@@ -10,6 +10,7 @@ from sjsam_node.block_problem import BlockProblem, flatten_rows
 from sjsam_node.joining import JoiningProblem
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
 from slam_core.geometry import boxminus, euler_from_rotation, make_transform, rotation_from_euler, so3_exp
+from slam_core.sparse_cholesky import BACKENDS
 
 MODELS = {"planar": kernels.PLANAR, "tangent": kernels.TANGENT, "euler": kernels.EULER}
 
@@ -135,10 +136,13 @@ def test_optimum_and_marginals_are_those_of_dense_algebra(model: int, backend: s
     assert np.allclose(fixed[size:, size:], inverse[np.ix_(*[marginals.scalars([3], [])] * 2)], rtol=1e-4)
 
 
-def test_marginal_information_is_the_inverse_of_the_marginal_covariance(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_marginal_information_is_the_inverse_of_the_marginal_covariance(
+    backend: str, rng: np.random.Generator
+) -> None:
     maps, s = random_problem(kernels.TANGENT, rng)
     last = np.array([5, 6 + 1, 6 + 4])  # the newest pose and two landmarks
-    problem = JoiningProblem(flatten(maps), s, np.array([0]), kernels.TANGENT, last=last)
+    problem = JoiningProblem(flatten(maps), s, np.array([0]), kernels.TANGENT, backend, last)
     scalars = problem.scalars(np.array([5]), np.array([1, 4]))
     covariance = problem.marginals(s).covariance([5], [1, 4])
     assert np.allclose(np.linalg.inv(problem.marginal_information(s, scalars)), covariance, rtol=1e-8)

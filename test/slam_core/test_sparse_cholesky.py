@@ -56,6 +56,42 @@ def test_solution_and_inverse_are_those_of_the_dense_matrix(blocks: int, backend
     assert np.allclose(2.0 * A @ factor.solve(b), b, atol=1e-10)
 
 
+def with_last_clique(blocks: int, last: int, seed: int) -> tuple[np.ndarray, BlockPattern, np.ndarray]:
+    """As :func:`problem`, with the last blocks coupled to each other, and what else hangs on them in any order."""
+    _, pattern, _ = problem(blocks, seed)
+    column = np.repeat(np.arange(blocks), np.diff(pattern.column_ptr))
+    a, b = np.tril_indices(last)
+    extra = (blocks - last + b) * blocks + blocks - last + a
+    extra = extra[(pattern.width[extra // blocks] > 0) & (pattern.width[extra % blocks] > 0)]
+    key = np.unique(np.concatenate([column * blocks + pattern.rows, extra]))
+    pattern = BlockPattern(pattern.width, np.searchsorted(key // blocks, np.arange(blocks + 1)), key % blocks)
+    rows, columns = pattern.scalar_entries()
+    values = np.random.default_rng(seed).normal(size=len(rows))
+    A = np.zeros((pattern.n, pattern.n))
+    A[rows, columns] = values
+    A = np.tril(A, -1) + np.tril(A, -1).T
+    values[pattern.diagonal] = np.abs(A).sum(axis=0) + 1.0
+    return A + np.diag(values[pattern.diagonal]), pattern, values
+
+
+@pytest.mark.parametrize("blocks", [6, 40, 150])
+def test_what_is_eliminated_last_keeps_its_marginal_information(blocks: int, backend: str) -> None:
+    A, pattern, values = with_last_clique(blocks, 5, blocks)
+    factor = SparseCholesky(pattern, backend)
+    assert factor.factorize(values)
+    last = np.random.default_rng(2).permutation(np.arange(pattern.start[-6], pattern.n))
+    expected = np.linalg.inv(np.linalg.inv(A)[np.ix_(last, last)])
+    assert np.allclose(factor.marginal_information(last), expected, rtol=1e-9, atol=1e-10)
+
+
+def test_marginal_information_of_what_is_not_last_is_refused() -> None:
+    _, pattern, values = with_last_clique(40, 5, 3)
+    factor = SparseCholesky(pattern, "multifrontal")
+    assert factor.factorize(values)
+    with pytest.raises(ValueError, match="eliminated after"):
+        factor.marginal_information(np.arange(pattern.start[-6], pattern.n)[:2])
+
+
 def test_wide_fronts_are_factored_strip_by_strip() -> None:
     """One block of 200 unknowns over another: several strips of the blocked elimination, and a product below them."""
     width = np.array([200, 150])

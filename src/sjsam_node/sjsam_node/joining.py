@@ -120,14 +120,12 @@ class JoiningProblem:
         return variable_scalars(self.layout, self._sizes, poses, landmarks)
 
     def marginal_information(self, state: State, scalars: IntArray) -> FloatArray:
-        """Marginal information matrix of some variables, at ``state``."""
+        """Marginal information matrix of the variables to eliminate ``last``, at ``state``."""
         self._factorize_at(state)
-        information = np.linalg.inv(self.factor.inverse_block(scalars))
-        return np.asarray(0.5 * (information + information.T))
+        return self.factor.marginal_information(scalars)
 
-    def gaussian(self, state: State, scalars: IntArray) -> tuple[FloatArray, FloatArray, float]:
-        """What the problem, linearised at ``state``, says of some unknowns: their mean as a step from there, their
-        joint covariance, and the cost at the mean.
+    def newton_step(self, state: State) -> tuple[FloatArray, float]:
+        """The step from ``state`` to the optimum of the problem linearised there, and the cost promised for it.
 
         Raises
         ------
@@ -136,7 +134,7 @@ class JoiningProblem:
         """
         self._factorize_at(state)
         step = self.factor.solve(-self._gradient)
-        return step[scalars], self.factor.inverse_block(scalars), self.cost(state) + float(self._gradient @ step)
+        return step, self.cost(state) + float(self._gradient @ step)
 
     def marginals(self, state: State) -> Marginals:
         """Exact marginal covariances, linearised at ``state``.

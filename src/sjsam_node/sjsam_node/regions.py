@@ -255,12 +255,12 @@ def join(graph: MapGraph, records: IntArray, component: int, local_maps: LocalMa
         return None
     fixed, last = np.searchsorted(nodes, [reference]), np.concatenate([at_rim, len(nodes) + kept])
     problem = JoiningProblem(flatten(maps), state, fixed, kernels.TANGENT, last=last)
+    scalars = problem.scalars(at_rim, kept)
     try:
-        step, covariance, least = problem.gaussian(state, problem.scalars(at_rim, kept))
-        information = np.linalg.inv(covariance)
-    except (ValueError, np.linalg.LinAlgError):
+        newton, least = problem.newton_step(state)
+        step, information = newton[scalars], problem.marginal_information(state, scalars)
+    except ValueError:
         return None
-    information = 0.5 * (information + information.T)
     group = np.where(known, np.cumsum(known) - 1, -1)[np.searchsorted(landmarks, seen)]
     carried = observations[group < 0]
     return Region(

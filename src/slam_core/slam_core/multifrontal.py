@@ -51,6 +51,28 @@ class Multifrontal:
         W = kernels.unit_columns(self.symbolic, self._panels, position)
         return np.asarray(W.T @ W)
 
+    def marginal_information(self, variables: IntArray) -> FloatArray:
+        """What eliminating all others leaves of ``variables`` (k,), which must be those that are eliminated last: with
+        their rows and columns of L it is ``L L^T``.
+        """
+        symbolic = self.symbolic
+        place = np.full(len(self._order), -1, dtype=np.int64)
+        place[self._position[variables]] = np.arange(len(variables))
+        L = np.zeros((len(variables), len(variables)))
+        ends = symbolic.start[symbolic.column_ptr]
+        for s in np.unique(np.searchsorted(ends, self._position[variables], side="right") - 1):
+            columns = np.arange(ends[s], ends[s + 1])
+            below = symbolic.rows[symbolic.row_ptr[s] : symbolic.row_ptr[s + 1]]
+            rows = np.concatenate([columns, *(np.arange(symbolic.start[b], symbolic.start[b + 1]) for b in below)])
+            panel = self._panels[symbolic.panel_ptr[s] : symbolic.panel_ptr[s + 1]].reshape(len(rows), len(columns))
+            own = columns[place[columns] >= 0]
+            lower = np.where(rows[:, None] >= own, panel[:, place[columns] >= 0], 0.0)
+            inside = place[rows] >= 0
+            if lower[~inside].any():
+                raise ValueError("others are eliminated after some of these variables")
+            L[np.ix_(place[rows[inside]], place[own])] = lower[inside]
+        return np.asarray(L @ L.T)
+
     def inverse_entries(self) -> InversePanels:
         """Exact entries of ``A^-1`` at the nonzeros of the factor (Takahashi, Fagan and Chin 1973)."""
         inverse = np.empty_like(self._panels)

@@ -87,6 +87,8 @@ class _Backend(Protocol):
 
     def inverse_block(self, variables: IntArray) -> FloatArray: ...
 
+    def marginal_information(self, variables: IntArray) -> FloatArray: ...
+
     def inverse_entries(self) -> Entries: ...
 
 
@@ -111,6 +113,9 @@ class _Library(ABC):
         unit = np.zeros((self._n, len(variables)))
         unit[variables, np.arange(len(variables))] = 1.0
         return self.solve(unit)[variables]
+
+    def marginal_information(self, variables: IntArray) -> FloatArray:
+        return np.asarray(np.linalg.inv(self.inverse_block(variables)))
 
     def inverse_entries(self) -> Entries:
         factor, order = self.lower()
@@ -224,6 +229,11 @@ class SparseCholesky:
         """Dense block (k, k) of ``A^-1`` for any variables, with the last factor."""
         block = self._impl.inverse_block(np.asarray(variables, dtype=np.int64))
         return 0.5 * (block + block.T)
+
+    def marginal_information(self, variables: IntArray) -> FloatArray:
+        """Inverse (k, k) of that block of ``A^-1``, for variables that are eliminated after all others."""
+        information = self._impl.marginal_information(np.asarray(variables, dtype=np.int64))
+        return 0.5 * (information + information.T)
 
     def inverse_entries(self) -> Entries:
         """Exact entries of ``A^-1`` inside the factor's pattern (Takahashi, Fagan and Chin 1973)."""
