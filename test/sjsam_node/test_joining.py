@@ -137,9 +137,7 @@ def test_optimum_and_marginals_are_those_of_dense_algebra(model: int, backend: s
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_marginal_information_is_the_inverse_of_the_marginal_covariance(
-    backend: str, rng: np.random.Generator
-) -> None:
+def test_marginal_information_is_the_inverse_of_the_marginal_covariance(backend: str, rng: np.random.Generator) -> None:
     maps, s = random_problem(kernels.TANGENT, rng)
     last = np.array([5, 6 + 1, 6 + 4])  # the newest pose and two landmarks
     problem = JoiningProblem(flatten(maps), s, np.array([0]), kernels.TANGENT, backend, last)
