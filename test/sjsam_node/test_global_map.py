@@ -59,11 +59,23 @@ def test_joined_covariances_are_honest() -> None:
 def test_incremental_joining_ends_at_the_batch_optimum(rng: np.random.Generator) -> None:
     submaps = ring_agent(rng, turns=1.0).submaps()
     batch, _ = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=10_000))))
-    step_by_step, reports = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5))))
+    step_by_step, reports = join(
+        submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5, front_work=1e9)))
+    )
     assert sum(r.update == "incremental" for r in reports) > 10
     a, b = step_by_step.trajectory("a"), batch.trajectory("a")
     assert max(np.abs(boxminus(p.T, q.T)).max() for p, q in zip(a, b, strict=True)) < 1e-6
     assert max(np.abs(p.covariance - q.covariance).max() for p, q in zip(a, b, strict=True)) < 1e-6
+
+
+def test_submaps_are_joined_through_a_front_where_that_is_less_work_than_a_batch(rng: np.random.Generator) -> None:
+    submaps = ring_agent(rng, turns=0.7).submaps()
+    updates = []
+    for front_work in (0.0, 1.0, 1e9):
+        config = GlobalMapConfig(joining=JoinerConfig(incremental_from=2, front_work=front_work))
+        updates.append(sum(r.update == "incremental" for r in join(submaps, GlobalMap(config))[1]))
+    assert updates[0] == 0
+    assert 0 < updates[1] < updates[2] == len(submaps) - 2
 
 
 def incremental_gap(scale: float) -> float:
@@ -73,7 +85,9 @@ def incremental_gap(scale: float) -> float:
         odometry=(0.02 * scale, 0.005 * scale), sigma_bearing=0.003 * scale, sigma_depth=0.004 * scale
     )
     submaps = agent.submaps()
-    joined, reports = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(5, relinearize_turn=10.0))))
+    joined, reports = join(
+        submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(5, front_work=1e9, relinearize_turn=10.0)))
+    )
     assert [r.update for r in reports[4:]] == ["incremental"] * (len(submaps) - 4)
     last = joined.graph.poses[-1].copy()
     batch = joined.joiner.batch(len(submaps) - 1)
@@ -133,7 +147,9 @@ def test_agents_are_joined_when_they_share_a_place_in_any_order(order: str, rng:
 def test_agents_that_take_turns_do_not_call_for_a_batch_each_time(rng: np.random.Generator) -> None:
     a, b = agents_in_one_ring(rng)
     A, B = a.submaps(), b.submaps()
-    turns, _ = join(A[:12] + B[:4], GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5))))
+    turns, _ = join(
+        A[:12] + B[:4], GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5, front_work=1e9)))
+    )
     assert turns.components == 1
     turns.finder.closures = lambda *_: Findings([], [])  # type: ignore[method-assign]
     _, reports = join([s for pair in zip(B[4:], A[12:], strict=False) for s in pair], turns)

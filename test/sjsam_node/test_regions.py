@@ -25,7 +25,7 @@ def walk(turns: float, radius: float = 8.0, seed: int = 7) -> list[Submap]:
 
 
 def global_map(region: RegionConfig) -> GlobalMap:
-    return GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=10, region=region)))
+    return GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=10, front_work=1e9, region=region)))
 
 
 @pytest.fixture(scope="module")

@@ -92,6 +92,14 @@ def test_marginal_information_of_what_is_not_last_is_refused() -> None:
         factor.marginal_information(np.arange(pattern.start[-6], pattern.n)[:2])
 
 
+def test_work_counts_the_multiplications_of_a_factor(backend: str) -> None:
+    """A dense matrix takes n^3 / 6; two that nothing couples take the sum of both."""
+    alone = BlockPattern(np.array([30]), np.array([0, 1]), np.array([0]))
+    assert SparseCholesky(alone, backend).work == pytest.approx(30.0**3 / 6.0)
+    apart = BlockPattern(np.array([30, 20]), np.array([0, 1, 2]), np.array([0, 1]))
+    assert SparseCholesky(apart, backend).work == pytest.approx((30.0**3 + 20.0**3) / 6.0)
+
+
 def test_wide_fronts_are_factored_strip_by_strip() -> None:
     """One block of 200 unknowns over another: several strips of the blocked elimination, and a product below them."""
     width = np.array([200, 150])

@@ -29,6 +29,9 @@ class JoinerConfig(Config):
     incremental_from: int = parameter(
         40, "submaps of a component from which on they are joined incrementally; below, batch costs no more", minimum=2
     )
+    front_work: float = parameter(
+        1.0, "work of joining a submap incrementally, over that of a batch, up to which it is done so", minimum=0.0
+    )
     relinearize_turn: float = parameter(
         0.02, "turn of a pose, since it was linearised, that calls for a batch", unit="rad", minimum=0.0
     )
@@ -61,6 +64,15 @@ class _Joined:
     extensible: bool = False
     front: Front | None = None
     added: int = 0
+
+
+_FRONT_STEPS, _BATCH_STEPS = 12.0, 3.0
+"""What joining a submap costs through a front and in batch, in factorisations of each: other steps included."""
+
+
+def _clique_work(landmarks: IntArray) -> float:
+    """Multiplications of factoring the front of a pose and landmarks."""
+    return float((6.0 + 3.0 * len(landmarks)) ** 3 / 6.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,15 +147,15 @@ class Joiner:
         """Join the component of a record, whose end is where it will go on; regions stay closed unless it is to be
         joined as a ``whole``.
 
-        In a large component the landmarks of the window are kept even where one submap alone saw them, so that the next
-        submap can be joined through a front.
+        Where the next submap is joined with less work through a front than in batch, the landmarks of the window are
+        kept even if one submap alone saw them.
         """
         component = self.graph.component(newest)
         if window is None:
             known = self._joined.get(component)
             window = known.window if known is not None and known.newest == newest else self._window_landmarks([newest])
             window = np.unique(self.graph.landmark_of[window])
-        extensible = self.graph.size(component) + 1 >= self.config.incremental_from
+        extensible = self._pays(component, window)
         front = (self.graph.records[newest].end, window) if extensible else None
         while True:
             needed = window if extensible else window[:0]
@@ -156,6 +168,14 @@ class Joiner:
         report = JoinResult(result.cost, result.iterations, result.converged, assembled.problem.backend, "batch")
         self._joined[component] = _Joined(assembled, report, newest, window, extensible)
         return report
+
+    def _pays(self, component: int, window: IntArray) -> bool:
+        """Whether joining through a front of the window's landmarks is less work than batches are by now."""
+        known = self._joined.get(component)
+        if known is None or self.graph.size(component) + 1 < self.config.incremental_from:
+            return False
+        batch = known.assembled.problem.factor.work - (_clique_work(known.window) if known.extensible else 0.0)
+        return _FRONT_STEPS * _clique_work(window) <= self.config.front_work * _BATCH_STEPS * batch
 
     def _front(self, joined: _Joined) -> Front:
         return Front.of(self.graph, joined.assembled, self.graph.records[joined.newest].end, joined.window)

@@ -72,6 +72,12 @@ def update_stack_size(symbolic: Symbolic) -> int:
     return int((after + of_children).max(initial=0))
 
 
+def factor_work(symbolic: Symbolic) -> float:
+    """Multiplications of a factorisation: of each front w columns are eliminated from w + h."""
+    w, h = symbolic.eliminated.astype(np.float64), (symbolic.size - symbolic.eliminated).astype(np.float64)
+    return float((w * (w**2 / 6.0 + w * h / 2.0 + h**2 / 2.0)).sum())
+
+
 def inverse_stack_size(symbolic: Symbolic) -> int:
     """Most that is on the stack of inverse fronts: a front leaves it when its last child has read it."""
     total = most = 0

@@ -20,6 +20,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from slam_core.block_pattern import BlockPattern, IntArray
+from slam_core.elimination_tree import analyze, factor_work
 from slam_core.geometry import FloatArray
 from slam_core.multifrontal import Multifrontal
 
@@ -216,6 +217,11 @@ class SparseCholesky:
         self.pattern = pattern
         self.backend = available_backend(backend)
         self._impl = _IMPLEMENTATIONS[self.backend](pattern)
+
+    @property
+    def work(self) -> float:
+        """Multiplications of a factorisation in this order."""
+        return factor_work(self._impl.symbolic if isinstance(self._impl, Multifrontal) else analyze(self.pattern))
 
     def factorize(self, values: FloatArray) -> bool:
         """Factor the matrix with these entries (in the order of the pattern); False if not positive definite."""
