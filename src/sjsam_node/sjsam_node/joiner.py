@@ -1,7 +1,8 @@
 """Keeps every component of a map graph at its optimum as submaps, links and doubts come in.
 
-A submap that only continues its agent's path is joined through the front (:mod:`sjsam_node.incremental`); everything
-else, closures above all, is joined in batch, warm from the estimate. There is one front: where several agents take
+A submap that only continues its agent's path is joined through the front (:mod:`sjsam_node.incremental`) where that is
+less work; everything else, closures above all, is joined in batch, warm from the estimate and with the regions closed
+that nothing new touches (:mod:`sjsam_node.regions`). There is one front: where several agents take
 turns, the submaps of the others follow their odometry until the next batch.
 """
 
@@ -26,9 +27,7 @@ from slam_core.sparse_cholesky import IntArray
 class JoinerConfig(Config):
     """When the map is joined how, and what it takes back."""
 
-    incremental_from: int = parameter(
-        40, "submaps of a component from which on they are joined incrementally; below, batch costs no more", minimum=2
-    )
+    incremental_from: int = parameter(40, "fewest submaps of a component that is joined incrementally", minimum=2)
     front_work: float = parameter(
         1.0, "work of joining a submap incrementally, over that of a batch, up to which it is done so", minimum=0.0
     )
