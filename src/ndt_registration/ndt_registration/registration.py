@@ -59,7 +59,7 @@ class RegistrationConfig(Config):
     source_points: int = parameter(8000, "most points of the source that are used", minimum=10)
     coarse_points: int = parameter(2000, "most points of the source on all but the finest level", minimum=10)
     min_points: int = parameter(50, "fewest finite points of a cloud", minimum=10)
-    max_iterations: int = parameter(30, "most iterations per level", minimum=1)
+    max_iterations: int = parameter(50, "most iterations per level", minimum=1)
     tolerance: float = parameter(1e-4, "length of the last step, over the scale", minimum=0.0)
     start_level: int = parameter(2, "coarsest level used from a given initial guess", minimum=0, maximum=7)
     image_size: int = parameter(64, "edge of the range image that holds free space", unit="px", minimum=8)
