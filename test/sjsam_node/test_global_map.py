@@ -71,7 +71,7 @@ def test_incremental_joining_ends_at_the_batch_optimum(rng: np.random.Generator)
 def test_submaps_are_joined_through_a_front_where_that_is_less_work_than_a_batch(rng: np.random.Generator) -> None:
     submaps = ring_agent(rng, turns=0.7).submaps()
     updates = []
-    for front_work in (0.0, 1.0, 1e9):
+    for front_work in (0.0, JoinerConfig().front_work, 1e9):
         config = GlobalMapConfig(joining=JoinerConfig(incremental_from=2, front_work=front_work))
         updates.append(sum(r.update == "incremental" for r in join(submaps, GlobalMap(config))[1]))
     assert updates[0] == 0

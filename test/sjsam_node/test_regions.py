@@ -117,8 +117,8 @@ def test_what_links_the_inside_of_a_region_opens_it_and_what_links_its_rim_does_
     joiner, graph = way.joiner, way.graph
     region = a_region(way.joiner)
     other = len(graph.records) - 1
-    for group, is_open in ((region.group >= 0, False), (region.group < 0, True)):
-        observation = int(region.observations[group][0])
+    for observations, is_open in ((region.rim_observations, False), (region.inner_observations, True)):
+        observation = int(observations[0])
         record = next(i for i in region.records if observation in graph.records[i].observations)
         pairs = np.array([[observation - graph.records[record].first_observation, 0]])
         before = joiner.checkpoint()

@@ -135,8 +135,8 @@ def gradient_scatter(pulls: Iterable[FloatArray], density_ratio: float) -> Float
     times ``density_ratio``, the source's number of points over the target's.
 
     What is the same in every pair of scans from two places, because the two views show rims and edges from other sides,
-    is seen only as far as blocks disagree about it: a fifth to a third more than the noise is claimed, which over many
-    places is what there is (``covariance.py`` among the benchmarks).
+    is seen only as far as blocks disagree about it: a fifth to a third more than the noise is claimed, too little where
+    one small thing holds a direction (``covariance.py`` among the benchmarks).
     """
     each = np.vstack(tuple(pulls))
     return np.asarray((1.0 + density_ratio) * len(each) / max(len(each) - 6, 1) * (each.T @ each))

@@ -29,7 +29,7 @@ class JoinerConfig(Config):
 
     incremental_from: int = parameter(40, "fewest submaps of a component that is joined incrementally", minimum=2)
     front_work: float = parameter(
-        1.0, "work of joining a submap incrementally, over that of a batch, up to which it is done so", minimum=0.0
+        0.25, "largest work of factoring a front, over that of a batch, for joining incrementally", minimum=0.0
     )
     relinearize_turn: float = parameter(
         0.02, "turn of a pose, since it was linearised, that calls for a batch", unit="rad", minimum=0.0
@@ -63,10 +63,6 @@ class _Joined:
     extensible: bool = False
     front: Front | None = None
     added: int = 0
-
-
-_FRONT_STEPS, _BATCH_STEPS = 12.0, 3.0
-"""What joining a submap costs through a front and in batch, in factorisations of each: other steps included."""
 
 
 def _clique_work(landmarks: IntArray) -> float:
@@ -169,12 +165,16 @@ class Joiner:
         return report
 
     def _pays(self, component: int, window: IntArray) -> bool:
-        """Whether joining through a front of the window's landmarks is less work than batches are by now."""
+        """Whether joining through a front of the window's landmarks is less work than batches are by now.
+
+        A submap factors its front some twelve times (three steps, elimination, and once more for the information of the
+        first front); a batch is worth about three of its factorisations.
+        """
         known = self._joined.get(component)
         if known is None or self.graph.size(component) + 1 < self.config.incremental_from:
             return False
         batch = known.assembled.problem.factor.work - (_clique_work(known.window) if known.extensible else 0.0)
-        return _FRONT_STEPS * _clique_work(window) <= self.config.front_work * _BATCH_STEPS * batch
+        return _clique_work(window) <= self.config.front_work * batch
 
     def _front(self, joined: _Joined) -> Front:
         return Front.of(self.graph, joined.assembled, self.graph.records[joined.newest].end, joined.window)
@@ -206,9 +206,7 @@ class Joiner:
 
     def cost(self, component: int) -> float:
         """chi2 of a component."""
-        if component not in self._joined:
-            self.assembled(component)
-        return self._joined[component].result.cost
+        return self._latest(component).result.cost
 
     def totals(self) -> tuple[float, int]:
         """chi2 and redundancy of all components, as far as they have been joined."""

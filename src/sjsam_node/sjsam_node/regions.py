@@ -63,11 +63,12 @@ class Region:
         where these are in the frame of the reference, (n, 3).
     information, pull, constant
         Over rim and landmarks: the cost is ``r^T information r + 2 pull^T r + constant``.
-    observations, group, landmark_of, sightings
-        All observations of its records; the index into ``landmarks`` of each, -1 for inner ones; what they were
-        observations of, and how many these had.
+    rim_observations, group
+        Observations of ``landmarks``, and the index of each into them, (r,).
     inner_poses, inner_observations, inner_points
         What is inside, in the frame of the reference: (i, 4, 4), (m,), (m, 3).
+    landmark_of, sightings
+        What the inner observations were observations of, and how many these had, (m,).
     uses
         How many submaps started or ended at each inner node.
     redundancy
@@ -84,40 +85,35 @@ class Region:
     information: FloatArray
     pull: FloatArray
     constant: float
-    observations: IntArray
+    rim_observations: IntArray
     group: IntArray
-    landmark_of: IntArray
-    sightings: IntArray
     inner_poses: FloatArray
     inner_observations: IntArray
     inner_points: FloatArray
+    landmark_of: IntArray
+    sightings: IntArray
     uses: IntArray
     redundancy: int
-
-    @property
-    def nodes(self) -> IntArray:
-        """Reference, rim and inner nodes."""
-        return np.concatenate([[self.reference], self.rim, self.inner])
 
     def holds(self, graph: MapGraph, sightings: IntArray, uses: IntArray, anchor: int) -> bool:
         """Whether the rest of the map knows no more of it than when it was joined, and what it knows is still apart.
 
         ``sightings`` of every observation's landmark, ``uses`` of every node, the ``anchor`` of the component.
         """
-        if np.any(graph.component_of[self.nodes] != graph.component_of[anchor]) or np.any(self.inner == anchor):
-            return False
-        if np.any(uses[self.inner] != self.uses):
-            return False
-        now, inside = graph.landmark_of[self.observations], self.group < 0
-        same = (now == self.landmark_of) & (sightings[self.observations] == self.sightings)
-        if not np.all(same[inside]):
-            return False
-        known = graph.landmark_of[self.landmarks]
-        return bool(np.all(now[~inside] == known[self.group[~inside]]) and len(np.unique(known)) == len(known))
+        nodes, known = np.concatenate([[self.reference], self.rim, self.inner]), graph.landmark_of[self.landmarks]
+        return bool(
+            np.all(graph.component_of[nodes] == graph.component_of[anchor])
+            and np.all(self.inner != anchor)
+            and np.array_equal(uses[self.inner], self.uses)
+            and np.array_equal(graph.landmark_of[self.inner_observations], self.landmark_of)
+            and np.array_equal(sightings[self.inner_observations], self.sightings)
+            and np.array_equal(graph.landmark_of[self.rim_observations], known[self.group])
+            and len(np.unique(known)) == len(known)
+        )
 
     def hides(self, graph: MapGraph, landmarks: IntArray) -> bool:
         """Whether any of some landmarks is inside."""
-        return bool(np.isin(graph.landmark_of[self.observations[self.group < 0]], landmarks).any())
+        return bool(np.isin(graph.landmark_of[self.inner_observations], landmarks).any())
 
     def local_map(self, graph: MapGraph, nodes: IntArray, landmarks: IntArray) -> LocalMap:
         """As the joining problem takes it, over sorted lists of nodes and landmarks."""
@@ -205,8 +201,8 @@ class Regions:
 
 def _tied(graph: MapGraph, records: IntArray) -> IntArray:
     """Which of some records hang together by nodes or enough landmarks: a label for each."""
-    rows = np.repeat(np.arange(len(records)), [len(graph.records[i].submap.landmarks) for i in records])
-    seen = graph.landmark_of[np.concatenate([graph.records[i].observations for i in records])]
+    observations = np.concatenate([graph.records[i].observations for i in records])
+    rows, seen = np.searchsorted(records, graph.record_of[observations]), graph.landmark_of[observations]
     B = scipy.sparse.csr_matrix((np.ones(len(rows)), (rows, seen)), (len(records), len(graph.points)))
     ends = np.array([[graph.records[i].start, graph.records[i].end] for i in records])
     E = scipy.sparse.csr_matrix(
@@ -262,10 +258,10 @@ def join(graph: MapGraph, records: IntArray, component: int, local_maps: LocalMa
     except ValueError:
         return None
     group = np.where(known, np.cumsum(known) - 1, -1)[np.searchsorted(landmarks, seen)]
-    carried = observations[group < 0]
+    is_known, inside = group >= 0, observations[group < 0]
     return Region(
         records, reference, rim, inner, poses[at_rim], observations[first[known]], points[landmarks[known]],
-        information, -information @ step, float(least + step @ information @ step), observations, group, seen,
-        sightings[observations], poses[np.searchsorted(nodes, inner)], carried, points[carried], uses[inner],
-        problem.rows - problem.layout.pattern.n,
+        information, -information @ step, float(least + step @ information @ step), observations[is_known],
+        group[is_known], poses[np.searchsorted(nodes, inner)], inside, points[inside], graph.landmark_of[inside],
+        sightings[inside], uses[inner], problem.rows - problem.layout.pattern.n,
     )  # fmt: skip
