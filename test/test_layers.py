@@ -12,6 +12,8 @@ import pytest
 SRC = Path(__file__).resolve().parent.parent / "src"
 LAYER = {
     "slam_core": 0,
+    "slam_simulation": 1,
+    "slam_calibration": 1,
     "stereo_frontend": 1,
     "tof_driver": 1,
     "ndt_registration": 1,

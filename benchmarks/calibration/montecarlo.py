@@ -14,10 +14,10 @@ import time
 
 import numpy as np
 
-from slam_core.calibration.board import Chessboard
-from slam_core.calibration.bundle import BundleResult, LensState
-from slam_core.calibration.rig import calibrate
-from slam_core.calibration.simulated import beside, example_camera, random_view, simulate_views
+from slam_calibration.board import Chessboard
+from slam_calibration.bundle import BundleResult, LensState
+from slam_calibration.rig import calibrate
+from slam_calibration.simulated import beside, example_camera, random_view, simulate_views
 from slam_core.geometry import FloatArray, boxminus
 
 BOARD = Chessboard(9, 7, 0.04).points

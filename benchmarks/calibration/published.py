@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from slam_core.calibration.board import AprilGrid, Chessboard
-from slam_core.calibration.bundle import BundleResult
-from slam_core.calibration.pictures import find_views, pair_pictures
-from slam_core.calibration.rig import calibrate
+from slam_calibration.board import AprilGrid, Chessboard
+from slam_calibration.bundle import BundleResult
+from slam_calibration.pictures import find_views, pair_pictures
+from slam_calibration.rig import calibrate
 from slam_core.geometry import invert_transform
 
 DATA = Path(os.environ.get("INDOOR_SLAM_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))

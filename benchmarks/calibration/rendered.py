@@ -13,12 +13,12 @@ import argparse
 import cv2
 import numpy as np
 
-from slam_core.calibration.board import AprilGrid, Board, parse_board
-from slam_core.calibration.bundle import LensState
-from slam_core.calibration.detection import find_corners
-from slam_core.calibration.drawing import draw_board
-from slam_core.calibration.rig import calibrate
-from slam_core.calibration.simulated import beside, example_camera, random_view
+from slam_calibration.board import AprilGrid, Board, parse_board
+from slam_calibration.bundle import LensState
+from slam_calibration.detection import find_corners
+from slam_calibration.drawing import draw_board
+from slam_calibration.rig import calibrate
+from slam_calibration.simulated import beside, example_camera, random_view
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.types import ByteArray
 

@@ -19,10 +19,10 @@ from rich.progress import track
 from rich.table import Table
 
 from slam_bringup.cli import slam
-from slam_bringup.configuration import choose, load_system_config
-from slam_bringup.output import write_results
-from slam_bringup.pipeline import run_bag
-from slam_bringup.results import AgentResult, summarise
+from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.offline import run_bag
+from slam_bringup.pipeline.results import AgentResult, summarise
+from slam_bringup.report.output import write_results
 from slam_core.evaluation import EXACT_TRUTH, evaluate
 from slam_core.trajectory import Trajectory
 

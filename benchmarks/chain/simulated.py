@@ -23,11 +23,11 @@ from rich.table import Table
 from sjsam_node.estimator import EstimatorConfig
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.joiner import JoinerConfig
-from slam_bringup.bag_types import BagTypes, typestore
+from slam_bringup.bags.bag_types import BagTypes, typestore
 from slam_bringup.cli import slam
-from slam_bringup.configuration import choose, load_system_config
-from slam_bringup.pipeline import run_bag
-from slam_bringup.results import RunResult, summarise
+from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.offline import run_bag
+from slam_bringup.pipeline.results import RunResult, summarise
 from slam_core.evaluation import Evaluation
 from slam_core.messages import submap_messages
 from slam_core.trajectory import Trajectory

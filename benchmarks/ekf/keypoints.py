@@ -19,10 +19,10 @@ import numpy as np
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.models import project, project_jacobian
 from ekf_slam_node.slam import EkfSlam
-from slam_bringup.configuration import choose, load_system_config
-from slam_bringup.eyes import AgentEyes
-from slam_bringup.sensor_bag import SensorBag
-from slam_bringup.stage_times import StageTimes
+from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.eyes import AgentEyes
+from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.geometry import FloatArray, transform_points
 from slam_core.types import Features
 

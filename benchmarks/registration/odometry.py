@@ -22,10 +22,10 @@ import numpy as np
 
 from ndt_registration.odometry import OdometryConfig, OdometryStatus, ScanOdometry
 from ndt_registration.registration import RegistrationConfig, register
-from slam_bringup.configuration import SystemConfig
-from slam_bringup.eyes import depth_processor
-from slam_bringup.readings import DepthReading
-from slam_bringup.sensor_bag import SensorBag
+from slam_bringup.bags.readings import DepthReading
+from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.eyes import depth_processor
 from slam_core.config import from_mapping
 from slam_core.geometry import FloatArray, boxminus, invert_transform
 from slam_core.rigid_alignment import umeyama

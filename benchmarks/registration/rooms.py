@@ -9,8 +9,8 @@ import numpy as np
 from scans import TofRoom, rig_pose
 
 from slam_core.geometry import FloatArray
-from slam_core.simulation.building import STYLES
-from slam_core.simulation.scenario import Scenario
+from slam_simulation.building import STYLES
+from slam_simulation.scenario import Scenario
 
 KINDS = ("table", "chair", "pillar")
 EMPTY = {

@@ -19,20 +19,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from slam_bringup.bags.readings import DepthReading, StereoReading
+from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.commands.convert import convert
 from slam_bringup.commands.simulate import BagOptions, write_bag
 from slam_bringup.datasets.euroc import EurocDataset
 from slam_bringup.datasets.files import Dataset
 from slam_bringup.datasets.kitti import KittiDataset
 from slam_bringup.datasets.rgbd import RgbdDataset
-from slam_bringup.readings import DepthReading, StereoReading
-from slam_bringup.sensor_bag import SensorBag
 from slam_core.camera import Camera
 from slam_core.config import from_mapping
 from slam_core.geometry import FloatArray, invert_transform, make_transform, so3_log
-from slam_core.simulation import Scenario
-from slam_core.simulation.scenario import SensorSuite
 from slam_core.types import ByteArray
+from slam_simulation import Scenario
+from slam_simulation.scenario import SensorSuite
 from stereo_frontend.rectify import StereoRectifier
 
 RATIO = 0.8

@@ -12,11 +12,11 @@ from statistics import median
 
 import numpy as np
 
-from slam_core.simulation import Scenario, Simulator
-from slam_core.simulation.raycaster import make_view, trace
-from slam_core.simulation.shading import render
-from slam_core.simulation.stereo_sensor import motion_blur
-from slam_core.simulation.surface_table import compile_world
+from slam_simulation import Scenario, Simulator
+from slam_simulation.raycaster import make_view, trace
+from slam_simulation.shading import render
+from slam_simulation.stereo_sensor import motion_blur
+from slam_simulation.surface_table import compile_world
 
 FRAMES = 8
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_core.simulation.surface_table import SurfaceTable, compile_world
-from slam_core.simulation.tof_sensor import TofSensor, TofSensorConfig
-from slam_core.simulation.world import Material, Surface, World
+from slam_simulation.surface_table import SurfaceTable, compile_world
+from slam_simulation.tof_sensor import TofSensor, TofSensorConfig
+from slam_simulation.world import Material, Surface, World
 
 SCANS = 20
 MIDDLE = slice(82, 122)

@@ -27,8 +27,8 @@ setup(
     entry_points={
         "console_scripts": [
             "slam = slam_bringup.cli:main",
-            "bag_player = slam_bringup.bag_player_node:main",
-            "recorder = slam_bringup.recorder_node:main",
+            "bag_player = slam_bringup.bags.bag_player_node:main",
+            "recorder = slam_bringup.bags.recorder_node:main",
         ]
     },
 )

@@ -17,6 +17,6 @@ setup(
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",
     maintainer_email="maintainers@indoor-slam.org",
-    description="Geometry, data types, least squares, evaluation, simulation and messages of the SLAM packages.",
+    description="Geometry, data types, least squares, linear algebra, evaluation and messages of the SLAM packages.",
     license="Apache-2.0",
 )

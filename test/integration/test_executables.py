@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from slam_bringup.bag import BagReader
-from slam_bringup.node_arguments import ros_arguments
-from slam_bringup.processes import NodeCommand, NodeGroup, NodeProcess, find_executable
+from slam_bringup.bags.bag import BagReader
+from slam_bringup.processes.node_arguments import ros_arguments
+from slam_bringup.processes.processes import NodeCommand, NodeGroup, NodeProcess, find_executable
 
 pytestmark = pytest.mark.ros
 
@@ -35,7 +35,7 @@ def test_the_ament_index_knows_the_executable(workspace: dict[str, str], package
 def test_every_node_starts_publishes_and_stops_on_sigint(
     domain_environment: dict[str, str], small_bag: Path, tmp_path: Path
 ) -> None:
-    from slam_bringup.supervisor_node import Supervisor
+    from slam_bringup.processes.supervisor_node import Supervisor
 
     recording = tmp_path / "recording"
     parameters = ros_arguments({"bag": str(small_bag), "rate": 2.0, "loop": True})

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam_bringup.bag import BagReader, BagWriter
-from slam_bringup.configuration import choose, load_system_config
-from slam_bringup.online_run import run_nodes
-from slam_bringup.pipeline import run_bag
-from slam_bringup.recorded_run import collect
+from slam_bringup.bags.bag import BagReader, BagWriter
+from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.offline import run_bag
+from slam_bringup.processes.online_run import run_nodes
+from slam_bringup.processes.recorded_run import collect
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 

@@ -10,7 +10,7 @@ from sjsam_node.block_problem import BlockProblem, flatten_rows
 from sjsam_node.joining import JoiningProblem
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
 from slam_core.geometry import boxminus, euler_from_rotation, make_transform, rotation_from_euler, so3_exp
-from slam_core.sparse_cholesky import BACKENDS
+from slam_core.linear_algebra.sparse_cholesky import BACKENDS
 
 MODELS = {"planar": kernels.PLANAR, "tangent": kernels.TANGENT, "euler": kernels.EULER}
 

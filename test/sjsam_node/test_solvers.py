@@ -16,7 +16,7 @@ from sjsam_node.estimator import EstimatorConfig
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
 from sjsam_node.joiner import JoinerConfig
 from sjsam_node.text_joining import TextJoiningConfig, TextJoiningResult, join_text_maps
-from slam_core.sparse_cholesky import BACKENDS
+from slam_core.linear_algebra.sparse_cholesky import BACKENDS
 
 LIBRARIES = [name for name in BACKENDS if name != "auto"]
 ROWS = ("joint", "block")

@@ -23,8 +23,8 @@ from sensor_msgs.msg import Image, PointCloud2  # noqa: E402
 from sensor_msgs.srv import SetCameraInfo  # noqa: E402
 
 from ros_probe import Probe  # noqa: E402
-from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info  # noqa: E402
 from slam_core.camera import Camera, CameraInfo  # noqa: E402
+from slam_core.camera_info import CameraInfoFile, read_camera_info  # noqa: E402
 from slam_core.messages import (  # noqa: E402
     FEATURE_TOPICS,
     camera_info_message,

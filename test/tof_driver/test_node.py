@@ -18,9 +18,9 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from sensor_msgs.srv import SetCameraInfo  # noqa: E402
 
 from ros_probe import Probe  # noqa: E402
-from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info  # noqa: E402
 from slam_core.camera import Camera  # noqa: E402
 from slam_core.camera import CameraInfo as Calibration  # noqa: E402
+from slam_core.camera_info import CameraInfoFile, read_camera_info  # noqa: E402
 from slam_core.messages import (  # noqa: E402
     camera_info_from_message,
     camera_info_message,

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from numba import njit
 from scipy.linalg import lapack
 
-from slam_core import blas
 from slam_core.geometry import FloatArray
+from slam_core.linear_algebra import blas
 
 IndexArray = npt.NDArray[np.int64]
 _GROWTH = 1.4

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from slam_core import blas
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxplus, skew, transform_points
 from slam_core.least_squares import chi_square_bound
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra import blas
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 METHODS = ("nearest", "mahalanobis", "joint")
 

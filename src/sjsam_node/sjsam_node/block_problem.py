@@ -17,10 +17,10 @@ from sjsam_node.joining import solved_covariance, variable_scalars
 from sjsam_node.layout import Layout, make_layout
 from sjsam_node.problem import FlatMaps, LocalMap, State, flatten
 from sjsam_node.sighting_kernels import KERNELS, counting_order, pair_positions, pose_pairs
-from slam_core.block_pattern import IntArray, pointers
 from slam_core.geometry import FloatArray
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
-from slam_core.sparse_cholesky import SparseCholesky
+from slam_core.linear_algebra.block_pattern import IntArray, pointers
+from slam_core.linear_algebra.sparse_cholesky import SparseCholesky
 
 
 class FlatRows(NamedTuple):

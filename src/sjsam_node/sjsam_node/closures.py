@@ -41,8 +41,8 @@ from slam_core.geometry import (
     skew,
 )  # fmt: skip
 from slam_core.least_squares import chi_square_bound
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 from slam_core.rigid_alignment import ransac_rigid_transform
-from slam_core.sparse_cholesky import IntArray
 
 RelativePose = Callable[[int, int], "Prior | None"]
 """Given two records: T_first_second of their starts with covariance, None if the map says nothing (other component)."""

@@ -18,11 +18,11 @@ from sjsam_node.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.problem import LocalMap, State, block_rows, flatten
 from sjsam_node.regions import Region
 from sjsam_node.robust import RobustConfig, RobustJoining, closing_rows, predicted
-from slam_core import blas
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, make_transform, so3_log
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
-from slam_core.sparse_cholesky import BACKENDS, IntArray
+from slam_core.linear_algebra import blas
+from slam_core.linear_algebra.sparse_cholesky import BACKENDS, IntArray
 
 
 @dataclass(frozen=True)

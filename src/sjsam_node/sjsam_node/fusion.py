@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 BoolArray = npt.NDArray[np.bool_]
 

@@ -20,7 +20,7 @@ from sjsam_node.estimator import Assembled, reduce_map
 from sjsam_node.map_graph import MapGraph, Record
 from sjsam_node.problem import LocalMap, flatten
 from slam_core.geometry import FloatArray, boxminus, boxplus
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 _ITERATIONS = 3
 

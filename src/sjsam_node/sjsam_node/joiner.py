@@ -20,7 +20,7 @@ from sjsam_node.map_graph import MapGraph, Snapshot
 from sjsam_node.regions import Region, RegionConfig, Regions
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import compose_covariance
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ import numpy as np
 from sjsam_node import kernels
 from sjsam_node.layout import Layout, make_layout
 from sjsam_node.problem import FlatMaps, LocalMap, State
-from slam_core.block_pattern import IntArray
 from slam_core.geometry import FloatArray
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
-from slam_core.sparse_cholesky import Entries, SparseCholesky
+from slam_core.linear_algebra.block_pattern import IntArray
+from slam_core.linear_algebra.sparse_cholesky import Entries, SparseCholesky
 
 
 class JoiningProblem:
@@ -38,7 +38,7 @@ class JoiningProblem:
     model
         ``kernels.PLANAR``, ``TANGENT`` or ``EULER``.
     backend
-        Of ``slam_core.sparse_cholesky``.
+        Of ``slam_core.linear_algebra.sparse_cholesky``.
     last
         Nodes to eliminate last (see :func:`~sjsam_node.layout.make_layout`).
     constant

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sjsam_node.problem import FlatMaps
-from slam_core.block_pattern import BlockPattern, IntArray, pointers
-from slam_core.sparse_cholesky import elimination_order
+from slam_core.linear_algebra.block_pattern import BlockPattern, IntArray, pointers
+from slam_core.linear_algebra.sparse_cholesky import elimination_order
 
 
 class Scatter(NamedTuple):

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_core.geometry import FloatArray
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ import scipy.sparse.csgraph
 from sjsam_node.fusion import BoolArray as BoolArray
 from sjsam_node.fusion import Fusion
 from slam_core.geometry import FloatArray, inverse_jacobian, invert_transform
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 from slam_core.types import Submap
 
 

@@ -28,7 +28,7 @@ from slam_core.geometry import (
     invert_transform,
     skew,
 )  # fmt: skip
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 from slam_core.types import Float32Array, PoseEstimate, Submap
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from sjsam_node.map_graph import MapGraph
 from slam_core.geometry import FloatArray
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 Chain = Callable[[int], list[int]]
 """The records before one along its agent's odometry that it is linked to anyway."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from sjsam_node.map_graph import Link, MapGraph
 from slam_core.geometry import FloatArray, invert_transform, transform_points
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 
 @dataclass

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.config import Config, parameter
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 Descriptors = npt.NDArray[np.float32]
 

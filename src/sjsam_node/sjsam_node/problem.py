@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sjsam_node import kernels
-from slam_core.block_pattern import IntArray, pointers
 from slam_core.geometry import FloatArray
+from slam_core.linear_algebra.block_pattern import IntArray, pointers
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from sjsam_node.map_graph import MapGraph
 from sjsam_node.problem import LocalMap, State, flatten
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
-from slam_core.sparse_cholesky import IntArray
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 _FIRM = 4
 """Landmarks in common that tie two submaps together."""

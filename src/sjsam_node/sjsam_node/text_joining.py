@@ -21,7 +21,7 @@ from sjsam_node.robust import RobustConfig, RobustJoining, closing_rows
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, euler_from_rotation, rotation_from_euler
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
-from slam_core.sparse_cholesky import BACKENDS, IntArray
+from slam_core.linear_algebra.sparse_cholesky import BACKENDS, IntArray
 
 ROWS = ("joint", "block")
 

@@ -16,8 +16,8 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchContext, LaunchDescription
-from slam_bringup.configuration import MODES, ODOMETRIES, choose, load_system_config
-from slam_bringup.node_graph import live_nodes
+from slam_bringup.pipeline.configuration import MODES, ODOMETRIES, choose, load_system_config
+from slam_bringup.processes.node_graph import live_nodes
 
 SHARE = Path(get_package_share_directory("slam_bringup"))
 ARGUMENTS = (

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-from slam_bringup.configuration import SystemConfig
+from slam_bringup.pipeline.configuration import SystemConfig
 from slam_core.config import Config, ParameterInfo, iterate_parameters
 
 _PREAMBLE = """\

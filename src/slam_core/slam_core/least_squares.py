@@ -1,7 +1,7 @@
 """Nonlinear least squares: whitening and Levenberg-Marquardt over any problem that can linearise itself.
 
-The sparse factors and their marginals are in :mod:`slam_core.sparse_cholesky`. Costs are plain sums of squared
-residuals, ``chi2 = sum r^T r`` (no factor one half), so that they compare with the chi-square distribution.
+The sparse factors and their marginals are in :mod:`slam_core.linear_algebra.sparse_cholesky`. Costs are plain sums of
+squared residuals, ``chi2 = sum r^T r`` (no factor one half), so that they compare with the chi-square distribution.
 """
 
 from __future__ import annotations

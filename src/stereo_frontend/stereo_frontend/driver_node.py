@@ -17,8 +17,8 @@ from typing import Any
 from sensor_msgs.srv import SetCameraInfo
 
 from slam_core.base_node import SlamNode
-from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info
 from slam_core.camera import CameraInfo
+from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.config import Config, parameter
 from slam_core.messages import (
     camera_info_from_message,

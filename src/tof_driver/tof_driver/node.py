@@ -22,8 +22,8 @@ import numpy as np
 from sensor_msgs.srv import SetCameraInfo
 
 from slam_core.base_node import SlamNode
-from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info
 from slam_core.camera import CameraInfo
+from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.config import parameter
 from slam_core.health import State
 from slam_core.messages import (

@@ -12,14 +12,13 @@ import yaml
 from rich.console import Console
 from rich.progress import Progress
 
-from slam_bringup.figures import save_png
-from slam_core.calibration.board import Board, parse_board
-from slam_core.calibration.bundle import BundleResult
-from slam_core.calibration.camera_info import CameraInfoFile, read_camera_info
-from slam_core.calibration.lens import DISTORTION_PARAMETERS, parameter_names
-from slam_core.calibration.pictures import BoardViews, find_views, pair_pictures
-from slam_core.calibration.rectification import stereo_infos
-from slam_core.calibration.report import (
+from slam_bringup.report.figures import save_png
+from slam_calibration.board import Board, parse_board
+from slam_calibration.bundle import BundleResult
+from slam_calibration.lens import DISTORTION_PARAMETERS, parameter_names
+from slam_calibration.pictures import BoardViews, find_views, pair_pictures
+from slam_calibration.rectification import stereo_infos
+from slam_calibration.report import (
     board_poses_figure,
     camera_deviations,
     extrinsics_of,
@@ -27,8 +26,9 @@ from slam_core.calibration.report import (
     summary,
     tables,
 )
-from slam_core.calibration.rig import calibrate
+from slam_calibration.rig import calibrate
 from slam_core.camera import CameraInfo
+from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.files import atomic_text
 from slam_core.geometry import both_halves, make_transform, quaternion_from_rotation
 

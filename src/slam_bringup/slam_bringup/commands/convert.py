@@ -8,12 +8,12 @@ from pathlib import Path
 import click
 from rich.progress import track
 
-from slam_bringup.bag import BagWriter
+from slam_bringup.bags.bag import BagWriter
+from slam_bringup.bags.sensor_writer import SensorWriter
 from slam_bringup.datasets.euroc import EurocDataset
 from slam_bringup.datasets.files import Dataset
 from slam_bringup.datasets.kitti import KittiDataset
 from slam_bringup.datasets.rgbd import RgbdDataset
-from slam_bringup.sensor_writer import SensorWriter
 
 DATASETS: dict[str, Callable[[Path, Path | None, Path | None], Dataset]] = {
     "euroc": EurocDataset,

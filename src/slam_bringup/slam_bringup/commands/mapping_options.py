@@ -12,10 +12,10 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from slam_bringup.configuration import MAPPERS, MODES, ODOMETRIES
-from slam_bringup.results import RunResult
-from slam_bringup.sensor_bag import SensorBag
-from slam_bringup.sensor_topics import ROLES
+from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.bags.sensor_topics import ROLES
+from slam_bringup.pipeline.configuration import MAPPERS, MODES, ODOMETRIES
+from slam_bringup.pipeline.results import RunResult
 
 # fmt: off
 _OPTIONS = (

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from slam_bringup.node_arguments import ros_arguments
-from slam_bringup.processes import become_node
+from slam_bringup.processes.node_arguments import ros_arguments
+from slam_bringup.processes.processes import become_node
 
 
 @click.command()

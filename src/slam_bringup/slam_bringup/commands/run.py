@@ -9,6 +9,8 @@ from pathlib import Path
 import click
 from rich.console import Console
 
+from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.bags.sensor_topics import BagNames, parse_topics
 from slam_bringup.commands.mapping_options import (
     mapping_options,
     mode_for,
@@ -16,14 +18,12 @@ from slam_bringup.commands.mapping_options import (
     require_map,
     require_writable,
 )
-from slam_bringup.configuration import choose, load_system_config
-from slam_bringup.interrupt import INTERRUPTED, STOPPED, Interrupt
-from slam_bringup.output import write_results
-from slam_bringup.pipeline import run_bag
-from slam_bringup.result_bag import write_result_bag
-from slam_bringup.sensor_bag import SensorBag
-from slam_bringup.sensor_topics import BagNames, parse_topics
-from slam_bringup.summary_table import summary_table
+from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.offline import run_bag
+from slam_bringup.processes.interrupt import INTERRUPTED, STOPPED, Interrupt
+from slam_bringup.report.output import write_results
+from slam_bringup.report.result_bag import write_result_bag
+from slam_bringup.report.summary_table import summary_table
 
 
 @click.command()

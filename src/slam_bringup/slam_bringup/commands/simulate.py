@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from slam_bringup.bag import BagWriter
-from slam_bringup.sensor_writer import (
+from slam_bringup.bags.bag import BagWriter
+from slam_bringup.bags.sensor_writer import (
     BASE_FRAME,
     IMU_FRAME,
     LEFT_FRAME,
@@ -29,11 +29,11 @@ from slam_bringup.sensor_writer import (
 from slam_core.camera import CameraInfo
 from slam_core.geometry import FloatArray
 from slam_core.messages import compressed_image_message, header_message, transform_message
-from slam_core.simulation import Scenario, SimulatedFrame, Simulator
-from slam_core.simulation.stereo_sensor import SIDES
-from slam_core.simulation.surface_table import compile_world
-from slam_core.simulation.tof_sensor import TofImages
 from slam_core.types import ByteArray
+from slam_simulation import Scenario, SimulatedFrame, Simulator
+from slam_simulation.stereo_sensor import SIDES
+from slam_simulation.surface_table import compile_world
+from slam_simulation.tof_sensor import TofImages
 
 IMAGE_FORMATS = ("raw", "png", "jpeg")
 

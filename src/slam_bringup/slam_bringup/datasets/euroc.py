@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 import yaml
 
+from slam_bringup.bags.sensor_writer import IMU_FRAME, LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_bringup.datasets.files import StampedPair, existing, read_grey
-from slam_bringup.sensor_writer import IMU_FRAME, LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import FloatArray, invert_transform, make_transform
 from slam_core.trajectory import Trajectory, read_trajectory

@@ -10,7 +10,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from slam_bringup.sensor_writer import SensorWriter
+from slam_bringup.bags.sensor_writer import SensorWriter
 from slam_core.types import AnyArray, ByteArray
 
 START_NS = 1_000_000_000

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from slam_bringup.bags.sensor_writer import LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_bringup.datasets.files import START_NS, StampedPair, existing, read_grey
-from slam_bringup.sensor_writer import LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import FloatArray, invert_transform, make_transform
 from slam_core.trajectory import read_trajectory

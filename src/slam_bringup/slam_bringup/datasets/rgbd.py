@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
+from slam_bringup.bags.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
 from slam_bringup.datasets.files import START_NS, StampedPair, existing, read_depth, read_grey
 from slam_bringup.datasets.picture_registration import ColourCamera, register_picture
-from slam_bringup.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
-from slam_core.calibration.camera_info import read_camera_info
 from slam_core.camera import Camera, CameraInfo
+from slam_core.camera_info import read_camera_info
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, invert_transform, make_transform, transform_from_pose7
 from slam_core.messages import rectified_info
 from slam_core.trajectory import read_trajectory

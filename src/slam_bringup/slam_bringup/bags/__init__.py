@@ -1,0 +1,1 @@
+"""Bags: reading, writing, playing and recording them; the sensors that are in them."""

@@ -1,0 +1,110 @@
+"""Node ``recorder``: writes topics to a bag as they come, with the quality of service their publishers offer.
+
+Topics are discovered while it runs. The bag is complete only when the node has ended; it is renamed to its name then.
+"""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls, disable-error-code="attr-defined,union-attr,arg-type,misc"
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+from slam_bringup.bags.bag import BagWriter
+from slam_bringup.bags.bag_types import typestore
+from slam_bringup.bags.pacing import header_stamp_ns
+from slam_bringup.bags.tf_recording import transform_topic, transforms_of
+from slam_core.config import Config, parameter
+from slam_core.ros import declare_config, has_tf2_msgs, message_class, run_node, sensor_qos
+
+_DEPTH = 1000
+_DISCOVERY_PERIOD_S = 0.2
+_HIDDEN = ("/parameter_events", "/rosout", "/progress")
+
+
+@dataclass(frozen=True)
+class RecorderConfig(Config):
+    """Parameters of ``recorder``."""
+
+    bag: str = parameter("", "bag to write: folder or .mcap")
+    topics: tuple[str, ...] = parameter((), "topics to record; empty: all but parameter events, rosout and progress")
+    storage: str = parameter("mcap", "storage of the bag", choices=("mcap", "sqlite3"))
+    header_stamps: bool = parameter(False, "store header stamps as the time of messages instead of the time of arrival")
+
+
+class RecorderNode(Node):
+    """Subscribes to what is published and appends the bytes to the bag."""
+
+    def __init__(self) -> None:
+        super().__init__("recorder", automatically_declare_parameters_from_overrides=True)
+        self.config = declare_config(self, RecorderConfig)
+        if not self.config.bag:
+            raise ValueError("parameter 'bag' must name the bag to write")
+        try:
+            self._writer = BagWriter(Path(self.config.bag), self.config.storage).__enter__()
+        except OSError as error:
+            raise ValueError(f"cannot write {self.config.bag}: {error}") from error
+        self._known: set[str] = set()
+        self._count = 0
+        self.create_timer(_DISCOVERY_PERIOD_S, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def on_shutdown(self) -> None:
+        """Complete the bag."""
+        self._writer.__exit__(None, None, None)
+        print(f"recorded {self._count} messages to {self.config.bag}", flush=True)
+
+    def _discover(self) -> None:
+        for topic, type_names in self.get_topic_names_and_types():
+            wanted = topic in self.config.topics if self.config.topics else topic not in _HIDDEN
+            if wanted and topic not in self._known and self.get_publishers_info_by_topic(topic):
+                self._known.add(topic)
+                self._record(topic, type_names[0])
+
+    def _record(self, topic: str, type_name: str) -> None:
+        kind = message_class(type_name)
+        if kind is None or type_name not in typestore().fielddefs:
+            self.get_logger().warning(f"{topic} is not recorded: {type_name} is not known")
+            return
+        offers = [p.qos_profile for p in self.get_publishers_info_by_topic(topic)]
+        latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in offers)
+        best_effort = all(q.reliability == ReliabilityPolicy.BEST_EFFORT for q in offers)
+        self._writer.declare(topic, type_name, latched=latched)
+        profile = sensor_qos(_DEPTH, latched, best_effort=best_effort)
+        callback = self._callback(topic, type_name)
+        self.create_subscription(kind, topic, callback, profile, raw=True)
+        self.get_logger().info(f"recording {topic}")
+
+    def _callback(self, topic: str, type_name: str) -> Any:
+        stamped = self._has_header(type_name)
+        carried = None if has_tf2_msgs() else transform_topic(topic)
+
+        def on_message(data: bytes) -> None:
+            use_header = stamped and self.config.header_stamps
+            stamp = header_stamp_ns(data) if use_header else self.get_clock().now().nanoseconds
+            self._writer.write_raw(topic, type_name, data, stamp)
+            self._count += 1
+            if carried is not None:
+                message = typestore().deserialize_cdr(data, type_name)
+                self._writer.write(carried, transforms_of(message), stamp)
+
+        return on_message
+
+    @staticmethod
+    def _has_header(type_name: str) -> bool:
+        fields = typestore().fielddefs[type_name][1]
+        return bool(fields) and fields[0][0] == "header"
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of the executable."""
+    run_node(RecorderNode, args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""What a bag holds for the estimators: per agent, paired and decoded images, depth, IMU, extrinsics, ground truth.
+
+    with SensorBag(path) as bag:
+        for reading in bag.readings():
+            ...  # StereoReading, DepthReading or ImuReading, in the order of the bag
+
+Topics are those of the nodes, or given by role, see :mod:`slam_bringup.bags.sensor_topics`:
+
+- ``stereo/{left,right}/image_raw`` (or ``image_rect``; also ``.../compressed``) with ``camera_info``;
+- ``tof/range/image_raw`` (along the ray) or ``tof/depth/image_raw`` (along z, any depth camera) with
+  ``tof/camera_info`` and, where there are any, ``tof/{amplitude,intensity}/image_raw``;
+- ``imu`` and ``ground_truth/pose``.
+
+Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts. A
+message that is broken, has no partner, or is older than what came before it is left out and counted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Generator, Iterator, Mapping
+from itertools import groupby
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from slam_bringup.bags.bag import BagReader
+from slam_bringup.bags.readings import AgentPairing, AgentSensors, DepthReading, ImuReading, Reading, StereoReading
+from slam_bringup.bags.sensor_topics import BagNames, find_agents, is_rectified, join, topics_of
+from slam_core.camera import CameraInfo
+from slam_core.frame_tree import FrameTree
+from slam_core.messages import (
+    camera_info_from_message,
+    pose_from_message,
+    stamp_ns,
+    transform_from_message,
+)
+from slam_core.trajectory import Trajectory
+
+_READ = ("left", "right", "depth", "amplitude", "intensity", "imu")
+
+
+class SensorBag:
+    """A bag as a stream of readings; use it in a ``with`` block.
+
+    Parameters
+    ----------
+    path
+        The bag.
+    names
+        Topics and frame of the rig where they are not named like the nodes' own.
+
+    Raises
+    ------
+    ValueError
+        If the bag cannot be read or holds no camera.
+    """
+
+    def __init__(self, path: Path, names: BagNames | None = None) -> None:
+        self.reader = BagReader(path)
+        self.left_out: Counter[str] = Counter()
+        """Messages that the last :meth:`readings` left out, by reason."""
+        self._warnings: list[str] = []
+        self._names = names or BagNames()
+
+    def __enter__(self) -> Self:
+        self.reader.__enter__()
+        try:
+            self.agents = self._find_agents()
+            self.sensors = self._find_sensors()
+        except BaseException:
+            self.reader.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.reader.__exit__()
+
+    def readings(self) -> Generator[Reading, None, None]:
+        """Every reading in the order of the bag; of those with one stamp IMU and depth come before the stereo pair.
+
+        What helps a frame thus comes before it, as at the node, which waits for it.
+        """
+        for _, together in groupby(self._in_order_of_arrival(), key=_stamp):
+            yield from sorted(together, key=_rank)
+
+    def _in_order_of_arrival(self) -> Iterator[Reading]:
+        """A pair comes when its last image does."""
+        self.left_out.clear()
+        pairing = {agent: AgentPairing(sensors, self.left_out) for agent, sensors in self.sensors.items()}
+        route = {t: (agent, role) for agent, s in self.sensors.items() for role, t in s.topics.items()}
+        wanted = [topic for topic, (_, role) in route.items() if role in _READ]
+        types = {name: info.type_name for name, info in self.reader.topics.items()}
+        for topic, _, data in self.reader.raw(wanted):
+            agent, role = route[topic]
+            try:
+                yield from pairing[agent].add(role, self.reader.decode(types[topic], data))
+            except ValueError as error:
+                self._count_unusable(topic, error)
+        for p in pairing.values():
+            p.finish()
+
+    def _count_unusable(self, topic: str, error: ValueError) -> None:
+        reason = f"unusable messages on {topic}"
+        self.left_out[reason] += 1
+        text = f"{topic}: {error}"
+        if self.left_out[reason] == 1 and text not in self._warnings:
+            self._warnings.append(text)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a user should know of this bag, as far as it has been read."""
+        return self._warnings + [self.reader.warning] * bool(self.reader.warning)
+
+    def count(self, agent: str, role: str) -> int:
+        """Messages of a role ("left", "depth", "imu", ...) of an agent; 0 if there is no such topic."""
+        topic = self.sensors[agent].topics.get(role)
+        return self.reader.topics[topic].count if topic else 0
+
+    def ground_truth(self, agent: str) -> Trajectory | None:
+        """Poses T_world_base of the agent, without covariance; None if the bag has none."""
+        topic = self.sensors[agent].topics.get("ground_truth")
+        if topic is None:
+            return None
+        poses = {stamp_ns(m): pose_from_message(m.pose) for _, _, m in self.reader.messages([topic])}
+        stamps = sorted(poses)
+        return Trajectory(np.array(stamps, dtype=np.int64), np.stack([poses[s] for s in stamps])) if stamps else None
+
+    def _find_agents(self) -> tuple[str, ...]:
+        found = find_agents(self.reader.topics, self._names.topics)
+        if not found:
+            topics = ", ".join(f"{name} ({info.type_name})" for name, info in self.reader.topics.items()) or "none"
+            raise ValueError(
+                f"{self.reader.path} has no stereo or depth images under the names of the nodes; say which topics they "
+                f"are: --topic left=/... --topic right=/... or --topic depth=/... Its topics: {topics}"
+            )
+        return found
+
+    def _find_sensors(self) -> dict[str, AgentSensors]:
+        tree = self._read_frames()
+        return {agent: self._sensors_of(agent, tree) for agent in self.agents}
+
+    def _sensors_of(self, agent: str, tree: FrameTree) -> AgentSensors:
+        topics = topics_of(agent, self.reader.topics, self._names.topics)
+        measurement = "range" if "range" in topics else "depth"
+        if "range" in topics:
+            topics["depth"] = topics.pop("range")
+        left, left_frame = self._camera_info(topics, "left", "left_info")
+        right, _ = self._camera_info(topics, "right", "right_info")
+        tof, tof_frame = self._camera_info(topics, "depth", "tof_info")
+        base = self._base_frame(agent, tree, left_frame or tof_frame)
+        return AgentSensors(agent, left, right, tof, measurement, tree, left_frame, tof_frame, base, topics)
+
+    def _base_frame(self, agent: str, tree: FrameTree, camera_frame: str) -> str:
+        """Of a bag without base_link the root above the camera, which is as much of the rig as the bag knows."""
+        usual = [frame for frame in (join(agent, "base_link")[1:], "base_link") if frame in tree]
+        if self._names.base_frame or usual:
+            return self._names.base_frame or usual[0]
+        if camera_frame not in tree:
+            raise ValueError(
+                f"{self.reader.path} has no transform between base_link and '{camera_frame}' on /tf_static: record "
+                f"it, or map in the camera's own axes (x right, y down, z forward): --base-frame {camera_frame}"
+            )
+        root = tree.root(camera_frame)
+        self._warnings.append(f"no base_link on /tf_static: poses are those of {root}, another frame: --base-frame")
+        return root
+
+    def _camera_info(self, topics: Mapping[str, str], role: str, info_role: str) -> tuple[CameraInfo | None, str]:
+        """Calibration of the images as they are in the bag, and their frame."""
+        if role not in topics:
+            return None, ""
+        topic = topics[info_role]
+        for _, _, message in self.reader.messages([topic]):
+            info = camera_info_from_message(message)
+            if role != "depth" and is_rectified(topics[role]):
+                info = CameraInfo(info.rectified, P=info.P)
+            return info, message.header.frame_id
+        raise ValueError(
+            f"{self.reader.path} has images but no camera info on {topic}: record it (slam calibrate makes one), or "
+            f"say where it is: --topic {info_role}=/..."
+        )
+
+    def _read_frames(self) -> FrameTree:
+        tree = FrameTree()
+        topics = [t for t in self.reader.topics if t.endswith("/tf_static")]
+        for _, _, message in self.reader.messages(topics):
+            for transform in message.transforms:
+                tree.add(*transform_from_message(transform))
+        return tree
+
+
+def _stamp(reading: Reading) -> int:
+    return reading.sample.stamp_ns if isinstance(reading, ImuReading) else reading.stamp_ns
+
+
+def _rank(reading: Reading) -> int:
+    return (ImuReading, DepthReading, StereoReading).index(type(reading))

@@ -1,0 +1,84 @@
+"""The configuration of the whole chain: one group per node, so that one YAML file serves ``slam run`` and the nodes.
+
+ekf_slam:
+  ros__parameters:          # this level may be left out
+    submap.max_distance: 1.5
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ekf_slam_node.config import EkfSlamConfig
+from ndt_registration.odometry import OdometryConfig
+from sjsam_node.global_map import GlobalMapConfig
+from slam_bringup.pipeline.dense_map import DenseMapConfig
+from slam_core.config import Config, from_mapping, group
+from stereo_frontend.frontend import FrontendConfig
+from tof_driver.depth import DepthConfig
+
+MODES = ("stereo", "tof", "replace", "fuse")
+MAPPERS = ("ekf", "sjsam")
+ODOMETRIES = ("none", "ndt", "icp")
+
+
+@dataclass(frozen=True)
+class SystemConfig(Config):
+    """Configurations of all nodes, named after them."""
+
+    tof_driver: DepthConfig = group(DepthConfig)
+    feature_extractor: FrontendConfig = group(FrontendConfig)
+    ndt_odometry: OdometryConfig = group(OdometryConfig)
+    ekf_slam: EkfSlamConfig = group(EkfSlamConfig)
+    sjsam: GlobalMapConfig = group(GlobalMapConfig)
+    dense_map: DenseMapConfig = group(DenseMapConfig)
+
+
+def load_system_config(path: Path | None) -> SystemConfig:
+    """Defaults, overridden by a YAML file where one is given.
+
+    Raises
+    ------
+    ValueError
+        If the file is no mapping, names an unknown node or parameter, or holds a value out of range.
+    """
+    return SystemConfig() if path is None else from_mapping(SystemConfig, read_overrides(path))
+
+
+def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
+    """Parameters by node, as they stand in a YAML file, without the level ``ros__parameters``."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not YAML: {error}") from error
+    nodes = {f.name for f in fields(SystemConfig)}
+    if not isinstance(content, Mapping) or not set(content) <= nodes:
+        raise ValueError(f"{path} must hold one mapping per node ({', '.join(sorted(nodes))}), found {list(content)}")
+    overrides = {}
+    for node, values in content.items():
+        values = values or {}
+        if not isinstance(values, Mapping):
+            raise ValueError(f"{path}: the parameters of {node} must be a mapping, found {values!r}")
+        overrides[node] = dict(values.get("ros__parameters", values))
+    return overrides
+
+
+def choose(config: SystemConfig, mode: str, mapper: str, odometry: str) -> SystemConfig:
+    """Apply the choices of the command line: where depth comes from, submaps or one filter, scan odometry or none."""
+    submap = config.ekf_slam.submap
+    if mapper == "ekf":
+        submap = replace(submap, max_distance=1e6, max_landmarks=10**9, max_frames=10**9)
+    registration = config.ndt_odometry.registration
+    if odometry != "none":
+        registration = replace(registration, method={"ndt": "ndt", "icp": "icp_plane"}[odometry])
+    return replace(
+        config,
+        feature_extractor=replace(config.feature_extractor, mode=mode),
+        ekf_slam=replace(config.ekf_slam, submap=submap),
+        ndt_odometry=replace(config.ndt_odometry, registration=registration),
+    )

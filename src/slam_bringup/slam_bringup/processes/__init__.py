@@ -1,0 +1,1 @@
+"""The nodes as processes: which ones, with which parameters, started, watched and ended."""

@@ -1,0 +1,178 @@
+"""Which nodes a run needs, with which parameters, and who has to keep up with which topic."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from slam_bringup.bags.readings import AgentSensors
+from slam_bringup.bags.sensor_topics import is_rectified, join, nodes_name
+from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.processes.node_arguments import ros_arguments
+from slam_bringup.processes.processes import NodeCommand
+from slam_core.config import Config, iterate_parameters
+from slam_core.messages import STATIC_TRANSFORMS_TOPIC
+
+RESULT_TOPICS = (
+    "odom", "pose", "features", "landmarks", "ndt/odometry", "ndt/motion", "map_to_odom", "submap/landmarks",
+    "submap/info", "submap/path", "map/landmarks", "map/path", "map/graph", "map/ellipsoids", "map/cloud", "map/marks",
+)  # fmt: skip
+"""What ``slam nodes`` records, below each agent's namespace and at the root."""
+
+
+@dataclass(frozen=True)
+class NodeSpec:
+    """One node: where it is, in which namespace, and its parameters that differ from their defaults."""
+
+    package: str
+    executable: str
+    namespace: str
+    parameters: dict[str, Any]
+
+    @property
+    def command(self) -> NodeCommand:
+        """The same as a command line."""
+        arguments = ros_arguments(self.parameters, self.namespace)
+        return NodeCommand(self.package, self.executable, tuple(arguments), self.namespace)
+
+
+@dataclass(frozen=True)
+class NodeGraph:
+    """Nodes in the order of their start, and what the bag player and the recorder must know of them.
+
+    played: topics of the bag, and what the nodes call them. filters: full names of the ekf_slam nodes, one per agent.
+    finishers: full names of the nodes that are told that the input has ended, in this order.
+    """
+
+    commands: tuple[NodeCommand, ...]
+    played: dict[str, str]
+    pace: tuple[str, ...]
+    recorded_topics: tuple[str, ...]
+    filters: tuple[str, ...]
+    finishers: tuple[str, ...]
+
+
+def live_nodes(
+    config: SystemConfig,
+    agents: Iterable[str],
+    *,
+    odometry: bool,
+    rectified: bool = False,
+    extra: Mapping[str, Mapping[str, Any]] | None = None,
+    base_frames: Mapping[str, str] | None = None,
+) -> list[NodeSpec]:
+    """Nodes for rigs with the sensors that the mode of ``config`` needs.
+
+    ``rectified``: their stereo images are. ``extra``: parameters by executable. ``base_frames``: frame of each agent's
+    rig, by default ``base_link`` below the agent's name.
+    """
+    base_frames = base_frames or {}
+    mode, extra, agents = config.feature_extractor.mode, extra or {}, tuple(agents)
+    specs = []
+    for agent in agents:
+        base = {"base_frame": base_frames[agent]} if agent in base_frames else _below(agent, base_frame="base_link")
+        if mode != "tof" and not rectified:
+            specs.append(_spec("stereo_frontend", "stereo_driver", None, agent, extra))
+        if mode != "stereo" or odometry:
+            specs.append(_spec("tof_driver", "tof_driver", config.tof_driver, agent, extra))
+        if odometry:
+            frames = base | _below(agent, odom_frame="odom")
+            specs.append(_spec("ndt_registration", "ndt_odometry", config.ndt_odometry, agent, extra, **frames))
+        specs.append(_spec("stereo_frontend", "feature_extractor", config.feature_extractor, agent, extra))
+        specs.append(
+            _spec(
+                "ekf_slam_node",
+                "ekf_slam",
+                config.ekf_slam,
+                agent,
+                extra,
+                agent=agent,
+                wait_for_motion=odometry,
+                **base,
+            )
+        )
+    specs.append(_spec("sjsam_node", "sjsam", config.sjsam, "", extra, agents=agents if any(agents) else ()))
+    return specs
+
+
+def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odometry: bool, map_path: str) -> NodeGraph:
+    """The nodes of a run over the agents of a bag."""
+    mode = config.feature_extractor.mode
+    first = next(iter(sensors.values()))
+    base_frames = {agent: sensor.base_frame for agent, sensor in sensors.items()}
+    specs = live_nodes(
+        config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
+        extra=_bag_parameters(first, map_path), base_frames=base_frames,
+    )  # fmt: skip
+    names = {
+        e: tuple(s.command.full_name for s in specs if s.executable == e) for e in ("feature_extractor", "ekf_slam")
+    }
+    recorded = {join(agent, topic) for agent in ("", *sensors) for topic in RESULT_TOPICS}
+    return NodeGraph(
+        commands=tuple(spec.command for spec in specs),
+        played={t: name for s in sensors.values() for t, name in _topics(s, mode, odometry).items()},
+        pace=tuple(p for s in sensors.values() for p in _pace(s, mode, odometry)),
+        recorded_topics=(*sorted(recorded), "/diagnostics", STATIC_TRANSFORMS_TOPIC),
+        filters=names["ekf_slam"],
+        finishers=(*names["feature_extractor"], *names["ekf_slam"]),
+    )
+
+
+def _bag_parameters(sensor: AgentSensors, map_path: str) -> dict[str, dict[str, Any]]:
+    """What the topics of a bag ask of the nodes."""
+    pictures = {"amplitude", "intensity"} & sensor.topics.keys()
+    chosen = {0: "none", 1: "amplitude", 2: "both"}[len(pictures)]
+    compressed = sensor.topics.get("left", "").endswith("/compressed")
+    return {
+        "stereo_driver": {"compressed": True} if compressed else {},
+        "tof_driver": {"measurement": sensor.measurement, "pictures": chosen},
+        "sjsam": {"map_path": map_path},
+    }
+
+
+def _topics(sensor: AgentSensors, mode: str, odometry: bool) -> dict[str, str]:
+    roles = ["imu"]
+    if mode != "tof":
+        roles += ["left", "right", "left_info", "right_info"]
+    if mode != "stereo" or odometry:
+        roles += ["depth", "amplitude", "intensity", "tof_info"]
+    return {sensor.topics[role]: _heard(sensor, role) for role in roles if role in sensor.topics}
+
+
+def _heard(sensor: AgentSensors, role: str) -> str:
+    return nodes_name(sensor.agent, role, sensor.topics[role], sensor.measurement)
+
+
+def _pace(sensor: AgentSensors, mode: str, odometry: bool) -> Iterable[str]:
+    """The filter is last in line of the images; scan odometry and depth have their own line."""
+    agent = sensor.agent
+    yield f"{join(agent, 'ekf_slam')}={_heard(sensor, 'depth' if mode == 'tof' else 'left')}"
+    if odometry:
+        yield f"{join(agent, 'ndt_odometry')}={_heard(sensor, 'depth')}"
+    elif mode in ("replace", "fuse"):
+        yield f"{join(agent, 'tof_driver')}={_heard(sensor, 'depth')}"
+
+
+def _spec(
+    package: str,
+    executable: str,
+    config: Config | None,
+    namespace: str,
+    extra: Mapping[str, Mapping[str, Any]],
+    **own: Any,
+) -> NodeSpec:
+    changed = dict(_changed(config)) if config is not None else {}
+    given = {name: value for name, value in own.items() if value not in ("", (), False)}
+    return NodeSpec(package, executable, namespace, changed | given | dict(extra.get(executable, {})))
+
+
+def _below(agent: str, **frames: str) -> dict[str, str]:
+    """Frames below an agent's name; those of a single rig keep the nodes' defaults."""
+    return {parameter: f"{agent}/{frame}" for parameter, frame in frames.items()} if agent else {}
+
+
+def _changed(config: Config) -> Iterable[tuple[str, Any]]:
+    """Parameters that differ from their defaults."""
+    defaults = {name: value for name, value, _ in iterate_parameters(type(config)())}
+    return ((name, value) for name, value, _ in iterate_parameters(config) if value != defaults[name])

@@ -1,0 +1,200 @@
+"""A bag through the real nodes: start them, play the bag no faster than they follow, record, stop, collect.
+
+private domain -> nodes ready and connected -> recorder -> player -> input has ended -> map saved -> nodes stopped
+"""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.bags.sensor_topics import BagNames
+from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.processes.node_arguments import ros_arguments
+from slam_bringup.processes.node_graph import NodeGraph, plan_nodes
+from slam_bringup.processes.processes import NodeCommand, NodeGroup, PrivateDomain, ament_prefixes, node_environment
+from slam_core.messages import STATIC_TRANSFORMS_TOPIC
+
+START_TIMEOUT_S = 180.0
+"""A cold start compiles kernels."""
+
+_SERVICE_TIMEOUT_S = 300.0
+_WINDOW = 4
+_SJSAM = "/sjsam"
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineRun:
+    """What the nodes left behind.
+
+    recording: the bag of their topics. map_folder: the map that ``sjsam`` saved. diagnostics: last values by full node
+    name. exit_codes: by full node name. wall_s: from the first message played to the last submap joined. stopped:
+    whether it was told to end before the bag did.
+    """
+
+    recording: Path
+    map_folder: Path
+    diagnostics: dict[str, dict[str, str]]
+    exit_codes: dict[str, int]
+    wall_s: float
+    stopped: bool = False
+
+
+def run_nodes(
+    bag: Path,
+    config: SystemConfig,
+    out: Path,
+    *,
+    odometry: bool,
+    rate: float = 0.0,
+    names: BagNames | None = None,
+    on_progress: Callable[[int], None] = lambda frames: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> OnlineRun:
+    """Map a bag with the nodes of the workspace.
+
+    Parameters
+    ----------
+    bag
+        The bag to play.
+    config
+        Already adapted to mode, mapper and odometry by :func:`slam_bringup.pipeline.configuration.choose`.
+    out
+        Folder for the recording ``result.mcap``, the map and the nodes' logs.
+    odometry
+        Whether scan odometry runs as well.
+    rate
+        Speed of the replay; 0: as fast as the nodes follow. Nothing is lost either way.
+    names
+        Topics and frames of the bag that are not named like the nodes' own.
+    on_progress
+        Called with the number of frames that the filters have processed.
+    stopped
+        Asked all the time: whether to end here, with what is mapped so far; KeyboardInterrupt if that is nothing yet.
+
+    Raises
+    ------
+    ValueError
+        If a node does not start, ends by itself, or does not answer; the message holds the end of its log.
+    """
+    with SensorBag(bag, names) as opened:
+        graph = plan_nodes(config, opened.sensors, odometry, str(out / "map"))
+    out.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(out / "map", ignore_errors=True)
+    with PrivateDomain() as domain:
+        environment = node_environment(domain, fastdds_profile())
+        with NodeGroup(environment, out / "logs") as group, _supervisor(environment, group) as supervisor:
+            run = _Choreography(group, supervisor, graph, out, stopped)
+            run.start_nodes()
+            started = time.monotonic()
+            run.play(bag, rate, on_progress)
+            run.finish()
+            wall_s = time.monotonic() - started
+            diagnostics = run.last_diagnostics()
+            group.stop()
+    return OnlineRun(out / "result.mcap", out / "map", diagnostics, group.exit_codes, wall_s, stopped())
+
+
+def _supervisor(environment: dict[str, str], group: NodeGroup) -> Any:
+    """The node that watches the others. ROS is imported here and not before, so that all else works without it."""
+    try:
+        module = importlib.import_module("slam_bringup.processes.supervisor_node")
+    except ImportError as error:
+        raise ValueError(f"the nodes need ROS 2 Jazzy ({error}): source an installation, or use ./slam") from error
+    return module.Supervisor(environment, group.check)
+
+
+def fastdds_profile() -> Path | None:
+    """The Fast DDS profile of this package: installed, or in the source tree."""
+    folders = [Path(p) / "share/slam_bringup" for p in ament_prefixes()] + [Path(__file__).resolve().parents[2]]
+    return next((f / "config/fastdds.xml" for f in folders if (f / "config/fastdds.xml").exists()), None)
+
+
+class _Choreography:
+    """The steps of a run, in the order of its methods."""
+
+    def __init__(
+        self, group: NodeGroup, supervisor: Any, graph: NodeGraph, out: Path, stopped: Callable[[], bool]
+    ) -> None:
+        self._group = group
+        self._supervisor = supervisor
+        self._graph = graph
+        self._recording = out / "result.mcap"
+        self._stopped = stopped
+
+    def start_nodes(self) -> None:
+        """All nodes, then the recorder; returns when every topic has reached whoever listens to it."""
+        for command in self._graph.commands:
+            self._group.start(command)
+        self._wait_until_ready(from_outside=(*self._graph.played.values(), STATIC_TRANSFORMS_TOPIC))
+        self._start_recorder()
+
+    def _wait_until_ready(self, from_outside: tuple[str, ...]) -> None:
+        """All nodes have reported themselves with all inputs connected, but those that come ``from_outside``."""
+        names = [command.full_name for command in self._graph.commands]
+        obstacles = self._supervisor.obstacles
+        try:
+            self._supervisor.wait(
+                lambda: self._stopped() or not obstacles(names, from_outside), START_TIMEOUT_S, "start of the nodes"
+            )
+        except TimeoutError as error:
+            raise ValueError(f"{error}: {'; '.join(obstacles(names, from_outside))}") from None
+        if self._stopped():
+            raise KeyboardInterrupt
+
+    def _start_recorder(self) -> None:
+        parameters = {"bag": str(self._recording), "topics": self._graph.recorded_topics, "header_stamps": True}
+        self._group.start(NodeCommand("slam_bringup", "recorder", tuple(ros_arguments(parameters))))
+        topics = [t for t in self._graph.recorded_topics if self._supervisor.publishes(t)]
+        recorded = self._supervisor.subscribers
+        self._supervisor.wait(
+            lambda: all("recorder" in recorded(topic) for topic in topics), START_TIMEOUT_S, "start of the recorder"
+        )
+
+    def play(self, bag: Path, rate: float, on_progress: Callable[[int], None]) -> None:
+        """Play the bag to its end; the player ends when the paced nodes have processed everything."""
+        parameters = {
+            "bag": str(bag), "rate": rate, "topics": tuple(self._graph.played), "pace": self._graph.pace,
+            "rename": tuple(f"{topic}={name}" for topic, name in self._graph.played.items() if name != topic),
+            "window": _WINDOW, "wait_for_start": True,
+        }  # fmt: skip
+        player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
+        self._supervisor.count_submaps(f"{name.rpartition('/')[0]}/submap/info" for name in self._graph.filters)
+        self._wait_until_ready(from_outside=())
+        heard = self._supervisor.progress.total
+        self._supervisor.call("/bag_player/start", has_effect=lambda: heard() > 0 or not player.is_running)
+        while player.is_running:
+            self._supervisor.listen(0.2)
+            on_progress(sum(self._supervisor.progress[name] for name in self._graph.filters))
+            if self._stopped():
+                player.interrupt()
+        self._group.check()
+
+    def finish(self) -> None:
+        """Tell the nodes that the input has ended, front to back, and have the map saved when all is joined."""
+        for name in self._graph.finishers:
+            self._supervisor.call(f"{name}/finish", _SERVICE_TIMEOUT_S)
+            self._supervisor.wait_until_quiet(1.0, _SERVICE_TIMEOUT_S)
+        self._supervisor.wait(self._all_joined, _SERVICE_TIMEOUT_S, "joining of the last submap")
+        self._supervisor.call(f"{_SJSAM}/save_map", _SERVICE_TIMEOUT_S)
+
+    def last_diagnostics(self) -> dict[str, dict[str, str]]:
+        """The final values of all nodes, once they have reported after the end."""
+        self._supervisor.listen(1.5)
+        return dict(self._supervisor.diagnostics)
+
+    def _all_joined(self) -> bool:
+        values = self._supervisor.diagnostics.get(_SJSAM, {})
+        joined = sum(int(values.get(key, "0")) for key in ("submaps", "rejected"))
+        return joined >= int(self._supervisor.submaps)
+
+
+def unclean_ends(run: OnlineRun) -> list[str]:
+    """Nodes that did not end with exit code 0."""
+    return [f"{name} ended with code {code}" for name, code in sorted(run.exit_codes.items()) if code != 0]

@@ -1,0 +1,206 @@
+"""Starting and stopping nodes as processes, without ``ros2launch``: found in the ament index, ended by SIGINT."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, NoReturn
+
+_MODULES = {
+    ("stereo_frontend", "stereo_driver"): "stereo_frontend.driver_node",
+    ("stereo_frontend", "feature_extractor"): "stereo_frontend.node",
+    ("tof_driver", "tof_driver"): "tof_driver.node",
+    ("ndt_registration", "ndt_odometry"): "ndt_registration.node",
+    ("ekf_slam_node", "ekf_slam"): "ekf_slam_node.node",
+    ("sjsam_node", "sjsam"): "sjsam_node.node",
+    ("slam_bringup", "bag_player"): "slam_bringup.bags.bag_player_node",
+    ("slam_bringup", "recorder"): "slam_bringup.bags.recorder_node",
+}
+"""Where each executable's ``main`` is, for a workspace that has not been built."""
+
+_DOMAINS = range(1, 101)
+_STOP_AFTER_S = 10.0
+
+
+def find_executable(package: str, executable: str, prefixes: Sequence[str] | None = None) -> list[str]:
+    """Command that starts a node: the installed executable as ``ros2 run`` finds it, else its module under this Python.
+
+    Parameters
+    ----------
+    package, executable
+        As for ``ros2 run``.
+    prefixes
+        Install prefixes to search; default: those of AMENT_PREFIX_PATH.
+
+    Raises
+    ------
+    ValueError
+        If there is no such node.
+    """
+    for prefix in map(Path, ament_prefixes() if prefixes is None else prefixes):
+        indexed = (prefix / "share/ament_index/resource_index/packages" / package).exists()
+        path = prefix / "lib" / package / executable
+        if indexed and os.access(path, os.X_OK):
+            return [str(path)]
+    if (package, executable) not in _MODULES:
+        raise ValueError(f"no executable '{executable}' in package '{package}'")
+    module = _MODULES[package, executable]
+    return [sys.executable, "-c", f"from {module} import main; main()"]
+
+
+def become_node(package: str, executable: str, arguments: Sequence[str]) -> NoReturn:
+    """Replace this process by a node, as ``ros2 run`` does: signals and exit code are the node's own."""
+    command = [*find_executable(package, executable), *arguments]
+    sys.stdout.flush()
+    os.execv(command[0], command)
+
+
+def ament_prefixes() -> list[str]:
+    """Install prefixes of the sourced workspaces."""
+    return [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+
+
+def node_environment(domain_id: int, profile: Path | None) -> dict[str, str]:
+    """Environment of the nodes: a private domain on this machine only, and the Fast DDS profile for large messages."""
+    environment = dict(os.environ)
+    environment |= {
+        "ROS_DOMAIN_ID": str(domain_id),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "PYTHONUNBUFFERED": "1",
+        "RCUTILS_LOGGING_USE_STDOUT": "1",
+        "RCUTILS_COLORIZED_OUTPUT": "0",
+    }
+    if profile is not None:
+        environment["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(profile)
+    return environment
+
+
+class PrivateDomain:
+    """A ROS domain that no other run on this machine uses, held by a locked file until the ``with`` block ends."""
+
+    def __enter__(self) -> int:
+        folder = Path(tempfile.gettempdir()) / "slam-domains"
+        folder.mkdir(mode=0o777, exist_ok=True)
+        first = os.getpid() % len(_DOMAINS)
+        domains: list[int] = [*_DOMAINS[first:], *_DOMAINS[:first]]
+        for domain in domains:
+            file = (folder / f"{domain}.lock").open("a")
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                file.close()
+                continue
+            self._file: IO[str] = file
+            return domain
+        raise ValueError("all ROS domains 1-100 are in use on this machine")
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+@dataclass(frozen=True)
+class NodeCommand:
+    """A node to start: ``ros2 run package executable arguments``, in a namespace."""
+
+    package: str
+    executable: str
+    arguments: tuple[str, ...] = ()
+    namespace: str = ""
+
+    @property
+    def full_name(self) -> str:
+        """Fully qualified node name; nodes are named after their executables."""
+        return f"/{self.namespace}/{self.executable}" if self.namespace else f"/{self.executable}"
+
+
+@dataclass(eq=False)
+class NodeProcess:
+    """A running node; its output goes to ``log``."""
+
+    command: NodeCommand
+    log: Path
+    process: subprocess.Popen[bytes] = field(repr=False)
+    _interrupted: bool = False
+
+    @classmethod
+    def start(cls, command: NodeCommand, log: Path, environment: Mapping[str, str]) -> NodeProcess:
+        """Start a node in a session of its own, so that Ctrl-C reaches it through us, in order."""
+        log.parent.mkdir(parents=True, exist_ok=True)
+        arguments = [*find_executable(command.package, command.executable), *command.arguments]
+        with log.open("wb") as output:
+            process = subprocess.Popen(
+                arguments, env=dict(environment), stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+            )
+        return cls(command, log, process)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the process still runs."""
+        return self.process.poll() is None
+
+    def interrupt(self) -> None:
+        """Ask the node to end (SIGINT), once."""
+        if self.is_running and not self._interrupted:
+            self.process.send_signal(signal.SIGINT)
+            self._interrupted = True
+
+    def stop(self) -> int:
+        """Ask the node to end (SIGINT), insist after ten seconds; returns the exit code."""
+        self.interrupt()
+        try:
+            return self.process.wait(_STOP_AFTER_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            return self.process.wait()
+
+    def complaint(self) -> str:
+        """The end of its log, for a message about why it ended."""
+        lines = self.log.read_text(errors="replace").strip().splitlines()
+        return "\n".join(lines[-15:])
+
+
+class NodeGroup:
+    """Nodes that are started together and stopped in reverse order when the ``with`` block ends."""
+
+    def __init__(self, environment: Mapping[str, str], logs: Path) -> None:
+        self._environment = environment
+        self._logs = logs
+        self.nodes: list[NodeProcess] = []
+        self.exit_codes: dict[str, int] = {}
+        """Exit code by full node name, once stopped."""
+
+    def __enter__(self) -> NodeGroup:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def start(self, command: NodeCommand) -> NodeProcess:
+        """Start one more node."""
+        name = command.full_name.strip("/").replace("/", "_")
+        node = NodeProcess.start(command, self._logs / f"{name}.log", self._environment)
+        self.nodes.append(node)
+        return node
+
+    def check(self) -> None:
+        """Raise ValueError with the end of its log if a node has ended by itself with an error."""
+        for node in self.nodes:
+            if not node.is_running and node.process.returncode != 0:
+                raise ValueError(
+                    f"node {node.command.full_name} ended with code {node.process.returncode}:\n{node.complaint()}"
+                )
+
+    def stop(self) -> None:
+        """Stop all nodes: everybody is asked at once, then waited for."""
+        for node in self.nodes:
+            node.interrupt()
+        for node in reversed(self.nodes):
+            self.exit_codes[node.command.full_name] = node.stop()
+        self.nodes = []

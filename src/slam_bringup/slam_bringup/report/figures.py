@@ -1,0 +1,188 @@
+"""The pictures of a run: the map from above, errors and standard deviations over time, time per frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
+from scipy.stats import chi2
+
+from slam_bringup.pipeline.results import AgentResult, RunResult
+from slam_core.evaluation import align, associate
+from slam_core.files import atomic_path
+from slam_core.geometry import FloatArray, boxminus
+
+matplotlib.use("Agg")
+
+ELLIPSE_CONFIDENCE = 0.995
+COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd")
+_TRUTH = "#222222"
+
+
+def save_png(path: Path, figure: Figure, dpi: int = 130) -> None:
+    """Write a figure; without a date in the file, so that equal figures are equal bytes."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
+
+
+def map_figure(result: RunResult) -> Figure:
+    """The map from above: dense points, landmarks with 99.5 % ellipses, trajectories, ground truth (Fig. 9.2)."""
+    figure = Figure(figsize=(10, 8), layout="constrained")
+    axes = figure.add_subplot()
+    _draw_dense(axes, result)
+    _draw_landmarks(axes, result)
+    for agent, colour in zip(result.agents, COLOURS * len(result.agents), strict=False):
+        _draw_agent(axes, agent, colour)
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.set_title(
+        f"{len(result.landmarks.positions)} landmarks (99.5 % ellipses), {result.submaps} submaps, "
+        f"{result.loop_closures} loop closures"
+    )
+    axes.grid(color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    named = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # ground truth of several agents: once
+    if named:
+        axes.legend(named.values(), named.keys(), loc="upper right", framealpha=0.9)
+    _limit_to_content(axes, result)
+    return figure
+
+
+def _draw_dense(axes: Axes, result: RunResult) -> None:
+    if len(result.dense_points):
+        low, high = np.percentile(result.dense_points[:, 2], [1, 99])
+        # Floor and ceiling hide everything from above: leave out the highest and lowest slices of the room.
+        keep = (result.dense_points[:, 2] > low + 0.15) & (result.dense_points[:, 2] < high - 0.15)
+        x, y, _ = result.dense_points[keep].T
+        axes.scatter(x, y, s=0.3, c="0.78", linewidths=0, rasterized=True)
+
+
+def _draw_landmarks(axes: Axes, result: RunResult) -> None:
+    landmarks = result.landmarks
+    if len(landmarks.positions) == 0:
+        return
+    values, vectors = np.linalg.eigh(landmarks.covariances[:, :2, :2])
+    axis_lengths = 2.0 * np.sqrt(np.maximum(values, 0.0) * chi2.ppf(ELLIPSE_CONFIDENCE, 2))
+    # An ellipse as large as a room says only that the landmark is far away.
+    shown = axis_lengths[:, 1] < 2.0
+    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    axes.add_collection(
+        EllipseCollection(
+            axis_lengths[shown, 1],
+            axis_lengths[shown, 0],
+            angle[shown],
+            units="xy",
+            offsets=landmarks.positions[shown, :2],
+            offset_transform=axes.transData,
+            facecolors="none",
+            edgecolors="#e69f00",
+            linewidths=0.5,
+            alpha=0.6,
+        )
+    )
+    axes.scatter(landmarks.positions[:, 0], landmarks.positions[:, 1], s=3, c="#b36b00", label="landmarks", zorder=3)
+
+
+def _draw_agent(axes: Axes, agent: AgentResult, colour: str) -> None:
+    if not len(agent.trajectory):
+        return
+    xy = agent.trajectory.poses[:, :2, 3]
+    axes.plot(*xy.T, color=colour, linewidth=1.6, label=agent.name or "trajectory", zorder=5)
+    axes.plot(*xy[0], "o", color=colour, markersize=6, zorder=6)
+    axes.plot(*xy[-1], "s", color=colour, markersize=6, zorder=6)
+    pair = matched_poses(agent)
+    if pair is not None:
+        truth = pair[1]
+        axes.plot(truth[:, 0, 3], truth[:, 1, 3], "--", color=_TRUTH, linewidth=1.0, label="ground truth", zorder=4)
+
+
+def _limit_to_content(axes: Axes, result: RunResult) -> None:
+    points = [agent.trajectory.poses[:, :2, 3] for agent in result.agents if len(agent.trajectory)]
+    if not points:
+        return
+    path = np.concatenate(points)
+    near = result.landmarks.positions[:, :2]
+    if len(near):
+        low, high = np.percentile(near, [2, 98], axis=0)
+        path = np.concatenate([path, [low, high]])
+    margin = 0.5
+    axes.set_xlim(path[:, 0].min() - margin, path[:, 0].max() + margin)
+    axes.set_ylim(path[:, 1].min() - margin, path[:, 1].max() + margin)
+
+
+def matched_poses(agent: AgentResult, alignment: str = "se3") -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Times (n,) s, true poses in the map frame (n, 4, 4) and estimated poses (n, 4, 4); None without ground truth."""
+    if len(agent.truth) < 2 or len(agent.trajectory) < 2:
+        return None
+    try:
+        matched, truth = associate(agent.trajectory, agent.truth)
+    except ValueError:
+        return None
+    return (
+        (matched.stamps_ns - agent.trajectory.stamps_ns[0]) / 1e9,
+        align(truth, matched.poses, alignment),
+        matched.poses,
+    )
+
+
+def error_figure(agent: AgentResult) -> Figure | None:
+    """Position and rotation error over time inside the 99.5 % bounds that the covariance states.
+
+    The first poses are made to agree: the map's frame is its first pose.
+    """
+    pair = matched_poses(agent, "origin")
+    if pair is None or agent.trajectory.covariances is None:
+        return None
+    times, truth, _ = pair
+    matched, _ = associate(agent.trajectory, agent.truth)
+    assert matched.covariances is not None
+    error = boxminus(matched.poses, truth)
+    error[:, 3:] = np.degrees(error[:, 3:])
+    sigma = np.sqrt(np.diagonal(matched.covariances, axis1=1, axis2=2)).copy()
+    sigma[:, 3:] = np.degrees(sigma[:, 3:])
+    bound = float(np.sqrt(chi2.ppf(ELLIPSE_CONFIDENCE, 1)))
+    figure = Figure(figsize=(10, 5), layout="constrained")
+    grid = figure.subplots(2, 3, sharex=True)
+    for i, (axes, name) in enumerate(
+        zip(grid.ravel(), ("x m", "y m", "z m", "rx deg", "ry deg", "rz deg"), strict=True)
+    ):
+        axes.fill_between(times, -bound * sigma[:, i], bound * sigma[:, i], color="0.88", label="99.5 % bound")
+        axes.plot(times, error[:, i], color=COLOURS[0], linewidth=1.0, label="error")
+        axes.set_title(name, fontsize=9)
+        axes.tick_params(labelsize=8)
+    grid[0, 0].legend(fontsize=7)
+    figure.supxlabel("time [s]", fontsize=9)
+    return figure
+
+
+def timing_figure(result: RunResult) -> Figure:
+    """Milliseconds of every stage over the run (thesis Fig. 9.20, time per sample)."""
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    for name, times in result.stage_ms.items():
+        if times:
+            axes.plot(np.linspace(0, 1, len(times)), times, linewidth=0.9, label=f"{name} ({np.median(times):.1f} ms)")
+    axes.set_xlabel("share of the run")
+    axes.set_ylabel("ms per call")
+    axes.set_yscale("log")
+    if result.stage_ms:
+        axes.legend(fontsize=8, ncols=3)
+    axes.grid(color="0.92")
+    return figure
+
+
+def features_figure(agent: AgentResult) -> Figure:
+    """Number of features with depth in each frame."""
+    figure = Figure(figsize=(10, 2.4), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(agent.feature_counts, color=COLOURS[1], linewidth=1.0)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("frame")
+    axes.set_ylabel("features")
+    axes.grid(color="0.92")
+    return figure

@@ -1,0 +1,54 @@
+"""The files of a run, the same for ``slam run`` and ``slam nodes``.
+
+``summary.json``, ``trajectory.tum`` (map frame, rig poses), ``trajectory_covariance.csv``, ``landmarks.ply``,
+``map.ply``, ``map/`` (loadable map), ``map.png``, ``report.html`` and ``result.mcap``. With several agents each has its
+own ``trajectory_<agent>.tum``; ``trajectory.tum`` is then the first one's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam_bringup.pipeline.results import AgentResult, RunResult, summarise
+from slam_bringup.report.figures import map_figure, save_png
+from slam_bringup.report.report import write_report
+from slam_core.files import atomic_text
+from slam_core.point_cloud import write_ply
+from slam_core.trajectory import write_covariance_csv, write_tum
+
+
+def write_results(out: Path, result: RunResult, save_map: Callable[[Path], object] | None = None) -> dict[str, Any]:
+    """Write all files of a run into the folder ``out`` (made if absent) and return the summary.
+
+    ``save_map`` is called with the path of ``map/`` and writes the loadable map there. ``summary.json`` comes last, so
+    that a folder that has one is complete.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "summary.json").unlink(missing_ok=True)
+    _write_trajectories(out, result.agents)
+    write_ply(out / "landmarks.ply", result.landmarks.positions.astype(np.float32))
+    write_ply(out / "map.ply", result.dense_points, result.dense_grey)
+    if save_map is not None:
+        save_map(out / "map")
+    summary = summarise(result)
+    save_png(out / "map.png", map_figure(result))
+    write_report(out / "report.html", result, summary)
+    atomic_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
+    return summary
+
+
+def _write_trajectories(out: Path, agents: tuple[AgentResult, ...]) -> None:
+    named = [("", agent) for agent in agents[:1]]
+    if len(agents) > 1:
+        named += [(f"_{agent.name}", agent) for agent in agents]
+    for suffix, agent in named:
+        write_tum(out / f"trajectory{suffix}.tum", agent.trajectory)
+        if agent.trajectory.covariances is not None:
+            write_covariance_csv(out / f"trajectory{suffix}_covariance.csv", agent.trajectory)
+        if len(agent.truth):
+            write_tum(out / f"ground_truth{suffix}.tum", agent.truth)

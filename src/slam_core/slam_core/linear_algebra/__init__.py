@@ -1,0 +1,1 @@
+"""Sparse and dense linear algebra: orderings, Cholesky factors, marginals, BLAS without the interpreter lock."""

@@ -1,0 +1,22 @@
+"""Build of slam_simulation (ament_python)."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "slam_simulation"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(),
+    package_data={"": ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=False,
+    maintainer="Indoor SLAM maintainers",
+    maintainer_email="maintainers@indoor-slam.org",
+    description="Simulated buildings, cameras, ToF camera and IMU, rendered with ground truth.",
+    license="Apache-2.0",
+)

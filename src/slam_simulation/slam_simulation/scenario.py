@@ -1,0 +1,220 @@
+"""A scenario: a building, who walks through it and what they carry, as one YAML file under ``bags/scenarios``.
+
+description: one room, once round, both cameras
+seed: 16
+rate: 10.0                       # frames per second
+frames: 414
+sensors: [stereo, tof, imu]
+rooms:
+  - {name: office, x: [0, 5], y: [0, 4], style: office}
+doorways:
+  - {at: [2.5, 4.0]}
+objects:
+  - {kind: table, at: [2.5, 2.0], size: [1.4, 0.8]}
+agents:
+  - {name: "", motion: handheld, height: 1.3, path: [[1, 1], [4, 1, 90], [1, 1]]}   # x, y[, yaw[, pitch[, z]]]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import yaml
+
+from slam_core.config import Config, from_mapping, group, parameter
+from slam_simulation.building import WALL_GAP, Doorway, Room, build_doorways, build_shell, room_walls
+from slam_simulation.furniture import Spot, chair, furnish_wall, pillar, table
+from slam_simulation.imu import ImuSensorConfig
+from slam_simulation.stereo_sensor import StereoSensorConfig
+from slam_simulation.tof_sensor import TofSensorConfig
+from slam_simulation.trajectory import MOTION_STYLES, Path, SplinePath, StationPath, resolve_waypoints
+from slam_simulation.world import World
+
+SENSORS = ("stereo", "tof", "imu")
+SCENARIO_FOLDERS = (FilePath("bags/scenarios"), FilePath(__file__).resolve().parents[4] / "bags/scenarios")
+
+
+@dataclass(frozen=True)
+class Agent:
+    """Who carries a rig: namespace, motion style, height of the camera and way points (or stations) of the path."""
+
+    name: str = ""
+    motion: str = "rig"
+    height: float = 1.2
+    path: tuple[tuple[float, ...], ...] = ()
+    stations: tuple[tuple[float, ...], ...] = ()
+    scans: int = 15
+    start_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.motion not in MOTION_STYLES:
+            raise ValueError(f"agent '{self.name}': unknown motion '{self.motion}', known: {', '.join(MOTION_STYLES)}")
+        if bool(self.path) == bool(self.stations) or len(self.path) == 1:
+            raise ValueError(f"agent '{self.name}' needs either a path of two or more way points or stations")
+        for row in (*self.path, *self.stations):
+            if not 2 <= len(row) <= 5 or not all(isinstance(value, int | float) for value in row):
+                raise ValueError(f"agent '{self.name}': a way point is x, y[, yaw[, pitch[, z]]], got {list(row)}")
+
+
+@dataclass(frozen=True)
+class FurnitureObject:
+    """A free-standing object: ``kind`` table, chair or pillar, ``at`` (x, y) m, ``size`` (x, y) m, ``yaw`` deg."""
+
+    kind: str
+    at: tuple[float, float]
+    size: tuple[float, float] = (1.6, 0.8)
+    yaw: float = 0.0
+
+
+@dataclass(frozen=True)
+class SensorSuite(Config):
+    """Overrides of the sensors' configurations."""
+
+    stereo: StereoSensorConfig = group(StereoSensorConfig)
+    tof: TofSensorConfig = group(TofSensorConfig)
+    imu: ImuSensorConfig = group(ImuSensorConfig)
+    start_stamp_s: float = parameter(1000.0, "header stamp of the first frame", unit="s", minimum=0.0)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """See the module's description; ``name`` is the file's."""
+
+    name: str
+    seed: int
+    rate: float
+    frames: int
+    rooms: tuple[Room, ...]
+    agents: tuple[Agent, ...]
+    sensors: tuple[str, ...] = SENSORS
+    doorways: tuple[Doorway, ...] = ()
+    objects: tuple[FurnitureObject, ...] = ()
+    description: str = ""
+    suite: SensorSuite = field(default_factory=SensorSuite)
+    full_frames: int = 0
+    """Frames of the whole motion, if ``frames`` has been cut."""
+
+    def __post_init__(self) -> None:
+        if self.rate <= 0.0 or self.frames < 1:
+            raise ValueError(
+                f"scenario '{self.name}': needs frames >= 1 and rate > 0, got {self.frames} at {self.rate} Hz"
+            )
+        if not self.rooms or not self.agents:
+            raise ValueError(f"scenario '{self.name}' needs at least one room and one agent")
+        unknown = set(self.sensors) - set(SENSORS)
+        if unknown:
+            raise ValueError(f"scenario '{self.name}': unknown sensors {sorted(unknown)}, known: {', '.join(SENSORS)}")
+        for agent in self.agents:
+            for x, y, *_ in (*agent.path, *agent.stations):
+                if not any(room.holds(x, y, WALL_GAP) for room in self.rooms):
+                    raise ValueError(f"agent '{agent.name}' of scenario '{self.name}' leaves all rooms at ({x}, {y}) m")
+
+    @classmethod
+    def load(cls, name_or_path: str | FilePath) -> Scenario:
+        """The scenario of a YAML file, or of that name under ``bags/scenarios``.
+
+        Raises
+        ------
+        ValueError
+            If it does not exist (with the names that do) or its contents are wrong.
+        """
+        path = _find(name_or_path)
+        try:
+            values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except yaml.YAMLError as error:
+            raise ValueError(f"{path}: not valid YAML: {error}") from error
+        if not isinstance(values, Mapping):
+            raise ValueError(f"{path}: a scenario is a mapping, got {type(values).__name__}")
+        return cls.from_mapping(path.stem, values)
+
+    @classmethod
+    def from_mapping(cls, name: str, values: Mapping[str, Any]) -> Scenario:
+        """A scenario from the YAML file's contents."""
+        plain = {k: v for k, v in values.items() if k not in ("rooms", "agents", "doorways", "objects", *SENSORS)}
+        suite = {key: values[key] for key in SENSORS if key in values}
+        for key in ("rooms", "agents", "doorways", "objects"):
+            kind = {"rooms": Room, "agents": Agent, "doorways": Doorway, "objects": FurnitureObject}[key]
+            plain[key] = tuple(_make(kind, row, name) for row in values.get(key, ()))
+        plain["sensors"] = tuple(plain.get("sensors", SENSORS))
+        made: Scenario = _make(cls, {**plain, "name": name, "suite": from_mapping(SensorSuite, suite)}, name)
+        return made
+
+    def shortened(self, frames: int) -> Scenario:
+        """The same scenario, cut off after ``frames`` frames; the motion stays as it was."""
+        if frames < 1:
+            raise ValueError(f"a scenario needs at least one frame, got {frames}")
+        full = self.full_frames or self.frames
+        return replace(self, frames=min(frames, self.frames), full_frames=full)
+
+    def world(self) -> World:
+        """The building, furnished from the seed."""
+        world = World(self.seed)
+        rng = np.random.default_rng([self.seed, 0])
+        everything = [room_walls(k, room, list(self.doorways)) for k, room in enumerate(self.rooms)]
+        for k, (room, walls) in enumerate(zip(self.rooms, everything, strict=True)):
+            build_shell(world, k, room, walls)
+            for wall in walls:
+                furnish_wall(world, wall, room, rng)
+        build_doorways(world, list(self.doorways), [wall for walls in everything for wall in walls])
+        for item in self.objects:
+            self._place(world, item, rng)
+        return world
+
+    def _place(self, world: World, item: FurnitureObject, rng: np.random.Generator) -> None:
+        room = self._room_at(item.at)
+        spot = Spot(room, np.array([*item.at, 0.0]), float(np.radians(item.yaw)))
+        if item.kind == "table":
+            table(world, spot, item.size, rng)
+        elif item.kind == "chair":
+            chair(world, spot)
+        elif item.kind == "pillar":
+            pillar(world, spot, self.rooms[room].height)
+        else:
+            raise ValueError(f"scenario '{self.name}': unknown object '{item.kind}', known: table, chair, pillar")
+
+    def _room_at(self, at: tuple[float, float]) -> int:
+        for k, room in enumerate(self.rooms):
+            if room.holds(*at):
+                return k
+        raise ValueError(f"scenario '{self.name}': {at} m lies in no room")
+
+    def path(self, agent: int = 0) -> Path:
+        """The motion of one agent, from its first to its last frame."""
+        who = self.agents[agent]
+        if who.stations:
+            return StationPath(resolve_waypoints([list(r) for r in who.stations], who.height), who.scans / self.rate)
+        duration = max((self.full_frames or self.frames) - 1, 1) / self.rate
+        rng = np.random.default_rng([self.seed, 1, agent])
+        waypoints = resolve_waypoints([list(r) for r in who.path], who.height)
+        return SplinePath(waypoints, duration, MOTION_STYLES[who.motion], rng)
+
+
+def _make(kind: Any, row: Any, scenario: str) -> Any:
+    """An object of dataclass ``kind`` from a mapping; lists become tuples, errors name the scenario."""
+    if not isinstance(row, Mapping):
+        raise ValueError(f"scenario '{scenario}': a {kind.__name__.lower()} is a mapping, got {row!r}")
+    try:
+        return kind(**{key: _frozen(value) for key, value in row.items()})
+    except TypeError as error:
+        raise ValueError(f"scenario '{scenario}': {kind.__name__.lower()}: {error}") from error
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(_frozen(v) for v in value) if isinstance(value, list) else value
+
+
+def _find(name_or_path: str | FilePath) -> FilePath:
+    path = FilePath(name_or_path)
+    if path.suffix in (".yaml", ".yml"):
+        if path.is_file():
+            return path
+        raise ValueError(f"no scenario file {path}")
+    for folder in SCENARIO_FOLDERS:
+        if (folder / f"{name_or_path}.yaml").is_file():
+            return folder / f"{name_or_path}.yaml"
+    known = sorted({p.stem for folder in SCENARIO_FOLDERS for p in folder.glob("*.yaml")})
+    raise ValueError(f"unknown scenario '{name_or_path}', known: {', '.join(known)}")

@@ -1,0 +1,183 @@
+"""Frame by frame: what every sensor of a rig reports while it moves through a scenario's building.
+
+Every random number is drawn from (scenario seed, agent, frame, sensor), so a frame is the same whatever else is
+rendered and on however many threads.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.geometry import FloatArray
+from slam_core.types import ByteArray, Float32Array, ImuSample
+from slam_simulation.imu import ImuSensor
+from slam_simulation.raycaster import Rays, camera_rays, make_view, trace
+from slam_simulation.scenario import Scenario
+from slam_simulation.stereo_sensor import StereoSensor
+from slam_simulation.surface_table import SurfaceTable, compile_world
+from slam_simulation.tof_sensor import TofImages, TofSensor
+from slam_simulation.trajectory import rig_twist
+
+
+@dataclass(frozen=True, eq=False)
+class DepthTruth:
+    """True depth of the *rectified* left image: float32 (h, w) m along z, and the surface of each pixel, int32 (h,
+    w).
+    """
+
+    depth: Float32Array
+    surface: npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedFrame:
+    """All that one agent's sensors report at one moment.
+
+    left, right: raw uint8 images, None for a sensor that is not carried or a frame that was lost; right_stamp_ns
+    differs from stamp_ns by the jitter between the cameras. tof: raw images or None. imu: samples since the previous
+    frame.
+    """
+
+    index: int
+    agent: str
+    stamp_ns: int
+    right_stamp_ns: int
+    T_world_rig: FloatArray
+    left: ByteArray | None
+    right: ByteArray | None
+    tof: TofImages | None
+    imu: tuple[ImuSample, ...]
+    truth: DepthTruth | None
+
+
+class Simulator:
+    """Renders the frames of one agent of a scenario.
+
+    Parameters
+    ----------
+    scenario
+        What to simulate.
+    agent
+        Number of the agent.
+    world
+        The compiled building, if it is shared between agents.
+    threads
+        Threads that draw; None takes all processors. The images do not depend on it.
+    truth
+        Also give the true depth of the rectified left image.
+    rectified
+        Stereo images as an ideal pair would take them, instead of raw ones.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        agent: int = 0,
+        world: SurfaceTable | None = None,
+        threads: int | None = None,
+        *,
+        truth: bool = False,
+        rectified: bool = False,
+    ) -> None:
+        if not 0 <= agent < len(scenario.agents):
+            raise ValueError(
+                f"scenario '{scenario.name}' has {len(scenario.agents)} agents, there is no number {agent}"
+            )
+        self.scenario, self.agent = scenario, agent
+        self.world = compile_world(scenario.world()) if world is None else world
+        self.path = scenario.path(agent)
+        self.stereo = StereoSensor(scenario.suite.stereo, scenario.seed, rectified=rectified)
+        self.tof = TofSensor(scenario.suite.tof, scenario.seed)
+        self.imu = ImuSensor(scenario.suite.imu, (scenario.seed, 9, agent))
+        self.threads = threads or os.cpu_count() or 1
+        self._truth_rays = camera_rays(self.stereo.stereo.camera) if truth else None
+
+    @property
+    def T_left_tof(self) -> FloatArray:
+        """Extrinsics of the ToF camera in the rectified left optical frame."""
+        T_left_rig = np.linalg.inv(self.T_rig_left)
+        return np.asarray(T_left_rig @ self.tof.T_rig_tof)
+
+    @property
+    def T_rig_left(self) -> FloatArray:
+        """Mounting of the rectified left camera."""
+        T = self.stereo.T_rig_raw[0].copy()
+        T[:3, :3] = T[:3, :3] @ self.stereo.infos[0].R.T
+        return T
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of the scenario."""
+        return self.scenario.frames
+
+    def stamp_ns(self, index: int) -> int:
+        """Header stamp of a frame."""
+        start = self.scenario.suite.start_stamp_s + self.scenario.agents[self.agent].start_s
+        return round(start * 1e9) + round(index / self.scenario.rate * 1e9)
+
+    def run(self, frames: int | None = None, every: int = 1, first: int = 0) -> Iterator[SimulatedFrame]:
+        """Every ``every``-th frame from ``first`` up to frame ``frames`` (all by default), in order."""
+        if every < 1:
+            raise ValueError(f"can take every frame or every n-th, got {every}")
+        indices = range(first, self.frames if frames is None else min(frames, self.frames), every)
+        if self.threads == 1:
+            yield from (self._frame(k, None, every) for k in indices)
+            return
+        with ThreadPoolExecutor(self.threads) as pool:
+            for k in indices:
+                yield self._frame(k, pool, every)
+
+    def _frame(self, k: int, pool: ThreadPoolExecutor | None, every: int = 1) -> SimulatedFrame:
+        scenario, t = self.scenario, k / self.scenario.rate
+        T = self.path.pose(t)
+        left, right = self._stereo(k, t, T, pool)
+        tof = None
+        if "tof" in scenario.sensors:
+            tof = self.tof.capture(self.world, T, self._rng(k, 3), pool)
+        jitter = scenario.suite.stereo.stamp_jitter_us * 1e3 * self._rng(k, 4).standard_normal()
+        return SimulatedFrame(
+            index=k,
+            agent=scenario.agents[self.agent].name,
+            stamp_ns=self.stamp_ns(k),
+            right_stamp_ns=self.stamp_ns(k) + round(jitter),
+            T_world_rig=T,
+            left=left,
+            right=right,
+            tof=tof,
+            imu=self._imu_samples(t - every / scenario.rate, t),
+            truth=None if self._truth_rays is None else self._truth(T, self._truth_rays, pool),
+        )
+
+    def _rng(self, k: int, sensor: int) -> np.random.Generator:
+        return np.random.default_rng([self.scenario.seed, 5, self.agent, k, sensor])
+
+    def _stereo(
+        self, k: int, t: float, T: FloatArray, pool: ThreadPoolExecutor | None
+    ) -> tuple[ByteArray | None, ByteArray | None]:
+        if "stereo" not in self.scenario.sensors:
+            return None, None
+        rng = self._rng(k, 2)
+        pair = self.stereo.capture(self.world, T, rig_twist(self.path, t), rng, pool)
+        return (None, None) if rng.random() < self.scenario.suite.stereo.drop_probability else pair
+
+    def _imu_samples(self, previous: float, t: float) -> tuple[ImuSample, ...]:
+        if "imu" not in self.scenario.sensors:
+            return ()
+        # The first frame brings the sample of its own moment.
+        return self.imu.read(self.path, max(previous, -1e-6), t, self.stamp_ns(0))
+
+    def _truth(self, T: FloatArray, rays: Rays, pool: ThreadPoolExecutor | None) -> DepthTruth:
+        view = make_view(self.world, T @ self.T_rig_left, rays.bounds)
+        hits = trace(view, rays, pool)
+        return DepthTruth(hits.depth, np.where(hits.surface >= 0, view.ids[hits.surface], -1).astype(np.int32))
+
+
+def simulate(scenario: Scenario, agent: int = 0, frames: int | None = None) -> Iterator[SimulatedFrame]:
+    """The frames of one agent of a scenario; see :class:`Simulator` for calibration, extrinsics and truth."""
+    return Simulator(scenario, agent).run(frames)

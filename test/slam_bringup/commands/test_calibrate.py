@@ -1,0 +1,82 @@
+"""``slam calibrate``: the files it writes feed the drivers, and bad input ends with one clear error."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from slam_bringup.commands.calibrate import command
+from slam_core.camera_info import read_camera_info
+from slam_core.geometry import make_transform, rotation_from_quaternion
+
+
+def run(*arguments: str) -> str:
+    result = CliRunner().invoke(command, arguments)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.data
+def test_stereo_writes_what_the_drivers_read(data_dir: Path, tmp_path: Path) -> None:
+    folder = data_dir / "calib_opencv_left_right"
+    patterns = [str(folder / f"{side}[01][0-9].jpg") for side in ("left", "right")]
+    printed = run("stereo", *patterns, "--board", "chessboard:9x6:0.025", "-o", str(tmp_path))
+    assert "| fx |" in printed
+    left, right = (read_camera_info(tmp_path / f"{side}.yaml") for side in ("left", "right"))
+    np.testing.assert_array_equal(left.info.P[:, :3], right.info.P[:, :3])
+    assert right.info.baseline == pytest.approx(0.0832, abs=0.001)
+    assert 0.0 < left.standard_deviations["fx"] < 1.0
+    extrinsics = yaml.safe_load((tmp_path / "extrinsics.yaml").read_text())
+    T = make_transform(rotation_from_quaternion(np.array(extrinsics["rotation_xyzw"])), extrinsics["translation_m"])
+    np.testing.assert_allclose(T, make_transform(np.eye(3), np.array([right.info.baseline, 0.0, 0.0])), atol=1e-9)
+    written = json.loads((tmp_path / "summary.json").read_text())
+    assert np.linalg.norm(np.array(written["T_left_right"])[:3, 3]) == pytest.approx(right.info.baseline)
+    assert written["rms_px"] < 0.45
+    expected = {"left.yaml", "right.yaml", "extrinsics.yaml", "report.md", "summary.json", "residuals.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {*expected, "board_poses.png"}
+    assert "left01.jpg | 54 | 54" in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.data
+def test_mono_and_tof_pairs(data_dir: Path, tmp_path: Path) -> None:
+    folder = data_dir / "calib_opencv_left_right"
+    board = ("--board", "chessboard:9x6:0.025")
+    run("mono", str(folder / "left0[1-9].jpg"), *board, "-o", str(tmp_path / "mono"), "--model", "plumb_bob4")
+    assert read_camera_info(tmp_path / "mono" / "camera.yaml").info.camera.distortion[4] == 0.0
+    patterns = [str(folder / f"{side}0[1-9].jpg") for side in ("left", "right")]
+    stereo = ("stereo", *patterns, *board, "-o", str(tmp_path / "stereo"))
+    run(*stereo, "--model", "plumb_bob,plumb_bob4")
+    tof_run = ("stereo-tof", *patterns, *board, "--model", "plumb_bob,plumb_bob4", "-o", str(tmp_path / "tof"))
+    run(*tof_run, "--left-info", str(tmp_path / "stereo" / "left.yaml"))
+    tof = read_camera_info(tmp_path / "tof" / "tof.yaml").info
+    np.testing.assert_array_equal(tof.P[:, :3], tof.camera.K)
+    extrinsics = yaml.safe_load((tmp_path / "tof" / "extrinsics.yaml").read_text())
+    assert extrinsics["child_frame"] == "tof_optical_frame"
+    # The second camera stands on the x axis of the rectified left frame.
+    baseline = read_camera_info(tmp_path / "stereo" / "right.yaml").info.baseline
+    np.testing.assert_allclose(extrinsics["translation_m"], [baseline, 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.data
+def test_bad_input_is_refused_and_leaves_nothing(data_dir: Path, tmp_path: Path) -> None:
+    folder, out = data_dir / "calib_opencv_left_right", tmp_path / "out"
+    left, right = str(folder / "left0[1-5].jpg"), str(folder / "right0[1-5].jpg")
+    cases = [
+        (("mono", left, "--board", "chessboard:9x5:0.025"), "9x6 inner corners"),
+        (("mono", str(folder / "left0[1-3].jpg"), "--board", "chessboard:9x6:0.025"), "3 pictures, at least 4"),
+        (("mono", left, "--board", "chessboard"), "chessboard:9x6:0.025"),
+        (("mono", left, "--board", "chessboard:9x6:0.025", "--model", "wide"), "unknown lens model 'wide'"),
+        (("stereo", right, left, "--board", "chessboard:9x6:0.025"), "swapped"),
+        (("stereo", left, right, "--board", "chessboard:9x6:0.025", "--model", "none,none,none"), "3 lens models"),
+    ]
+    for arguments, message in cases:
+        with pytest.raises(ValueError, match=message):
+            run(*arguments, "-o", str(out))
+    assert not out.exists()

@@ -1,0 +1,78 @@
+"""``slam run`` on the committed bag: accurate, complete, the same bytes every time, and clear about bad input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from slam_bringup.cli import slam
+from slam_core.trajectory import read_covariance_csv, read_trajectory
+
+DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
+
+
+def run(*arguments: str):
+    return CliRunner().invoke(slam, ["run", *arguments], catch_exceptions=True)
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory) -> list[Path]:
+    folders = [tmp_path_factory.mktemp("run") / name for name in ("first", "second")]
+    for folder in folders:
+        result = run(str(DEMO), "-o", str(folder))
+        assert result.exit_code == 0, result.output
+    return folders
+
+
+@pytest.mark.slow
+def test_the_same_bag_gives_the_same_bytes(outputs):
+    first, second = outputs
+    for name in ("trajectory.tum", "trajectory_covariance.csv", "landmarks.ply", "map.ply", "map.png", "result.mcap"):
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_the_demo_is_mapped_to_centimetres(outputs):
+    summary = json.loads((outputs[0] / "summary.json").read_text())
+    assert summary["frames"] == 52
+    assert summary["dropped"] == 0
+    assert summary["ate_rmse_m"] < 0.02
+    assert summary["end_error_m"] < 0.04
+    assert summary["path_length_m"] == pytest.approx(6.45, abs=0.1)
+    assert not summary["events"]
+
+
+@pytest.mark.slow
+def test_every_pose_has_a_covariance_that_is_one(outputs):
+    trajectory = read_trajectory(outputs[0] / "trajectory.tum")
+    stamps, covariances = read_covariance_csv(outputs[0] / "trajectory_covariance.csv")
+    np.testing.assert_array_equal(stamps, trajectory.stamps_ns)
+    assert len(stamps) == 52
+    assert np.isfinite(covariances).all()
+    assert np.linalg.eigvalsh(covariances).min() > 0.0
+
+
+def test_a_mode_without_its_sensor_says_which_one_would_do(tmp_path, data_dir):
+    bag = tmp_path / "kitti.mcap"
+    source = data_dir / "kitti_stereo_51x2" / "KITTI_sequence_1"
+    assert CliRunner().invoke(slam, ["convert", "kitti", str(source), "-o", str(bag)]).exit_code == 0
+    result = run(str(bag), "-o", str(tmp_path / "out"), "--mode", "tof")
+    assert isinstance(result.exception, ValueError)
+    assert "try --mode stereo" in str(result.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_bags_and_bad_configurations_are_refused(tmp_path):
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(b"not a bag")
+    assert "broken.mcap" in str(run(str(broken), "-o", str(tmp_path / "out")).exception)
+    config = tmp_path / "c.yaml"
+    config.write_text("ekf_slam:\n  submap.max_distanc: 2.0\n")
+    error = run(str(DEMO), "-o", str(tmp_path / "out"), "--config", str(config)).exception
+    assert "did you mean 'max_distance'" in str(error)
+    config.write_text("ekf_slam: [1]\n")
+    assert "must be a mapping" in str(run(str(DEMO), "-o", str(tmp_path / "out"), "--config", str(config)).exception)

@@ -1,0 +1,165 @@
+"""Data sets in miniature, made here; and the public ones where they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slam_bringup.bags.bag import BagWriter
+from slam_bringup.bags.readings import DepthReading, ImuReading, StereoReading
+from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.datasets.euroc import EurocDataset
+from slam_bringup.datasets.files import Dataset
+from slam_bringup.datasets.kitti import KittiDataset
+from slam_bringup.datasets.rgbd import RgbdDataset
+from slam_core.geometry import invert_transform, make_transform, so3_exp
+
+EUROC_YAML = """%YAML:1.0
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [{T}]
+resolution: [64, 48]
+intrinsics: [50.0, 50.0, 31.5, 23.5]
+distortion_coefficients: [-0.1, 0.01, 0.0, 0.0]
+"""
+STAMPS = (1403715273262142976, 1403715273312143104)
+
+
+def convert(dataset: Dataset, path: Path) -> SensorBag:
+    from slam_bringup.bags.sensor_writer import SensorWriter
+
+    with BagWriter(path) as bag:
+        assert list(dataset.write(SensorWriter(bag))) == list(range(len(dataset)))
+    return SensorBag(path)
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+def make_euroc(root: Path) -> tuple[Path, np.ndarray]:
+    T_body_left = make_transform(so3_exp(np.array([0.3, -0.2, 0.1])), np.array([0.1, 0.2, 0.3]))
+    for number in (0, 1):
+        T = T_body_left.copy()
+        T[:3, 3] += T[:3, :3] @ [0.11 * number, 0.0, 0.0]
+        cam = root / "mav0" / f"cam{number}"
+        lines = ["#timestamp [ns],filename"]
+        for stamp in STAMPS:
+            write_image(cam / "data" / f"{stamp}.png", np.full((48, 64), 10 + number, np.uint8))
+            lines.append(f"{stamp},{stamp}.png")
+        (cam / "data.csv").write_text("\r\n".join(lines) + "\r\n")
+        (cam / "sensor.yaml").write_text(EUROC_YAML.format(T=", ".join(str(v) for v in T.ravel())))
+    truth = root / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    truth.parent.mkdir()
+    truth.write_text("#t\n" + "".join(f"{s},1,2,3,1,0,0,0" + ",0" * 9 + "\n" for s in STAMPS))
+    imu = root / "mav0" / "imu0" / "data.csv"
+    imu.parent.mkdir()
+    imu.write_text("#t\n" + "".join(f"{s - 5},0.1,0.2,0.3,0,0,9.8\n" for s in STAMPS))
+    return root, T_body_left
+
+
+def test_euroc_folders(tmp_path: Path) -> None:
+    source, T_body_left = make_euroc(tmp_path / "euroc")
+    with convert(EurocDataset(source), tmp_path / "bag") as bag:
+        readings, sensors, truth = list(bag.readings()), bag.sensors[""], bag.ground_truth("")
+    stereo = [r for r in readings if isinstance(r, StereoReading)]
+    assert tuple(r.stamp_ns for r in stereo) == STAMPS
+    assert (stereo[0].left[0, 0], stereo[0].right[0, 0]) == (10, 11)
+    assert sum(isinstance(r, ImuReading) for r in readings) == 2
+    assert sensors.right is not None
+    assert sensors.left is not None
+    assert sensors.right.baseline == pytest.approx(0.11)
+    assert truth is not None
+    # The pair is parallel, so rectification turns nothing: base_link is the left camera with X forward.
+    expected = np.eye(4)
+    expected[:3, 3] = [1, 2, 3]
+    expected = expected @ T_body_left @ invert_transform(sensors.transform("base", "left"))
+    np.testing.assert_allclose(truth.poses[0], expected, atol=1e-9)
+
+
+def test_kitti_folders(tmp_path: Path) -> None:
+    source = tmp_path / "kitti"
+    for side, value in (("image_0", 20), ("image_1", 21)):
+        for i in range(2):
+            write_image(source / side / f"{i:06d}.png", np.full((40, 60), value, np.uint8))
+    (source / "calib.txt").write_text("P0: 50 0 30 0 0 50 20 0 0 0 1 0\nP1: 50 0 30 -25 0 50 20 0 0 0 1 0\n")
+    (source / "times.txt").write_text("0.0\n1.036e-01\n")
+    (source / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 1 0 0 0 0 1 1.5\n")
+    with convert(KittiDataset(source), tmp_path / "bag") as bag:
+        readings, sensors, truth = list(bag.readings()), bag.sensors[""], bag.ground_truth("")
+    assert [r.stamp_ns for r in readings if isinstance(r, StereoReading)] == [10**9, 10**9 + 103_600_000]
+    assert sensors.right is not None
+    assert sensors.right.baseline == pytest.approx(0.5)
+    assert truth is not None
+    np.testing.assert_allclose(truth.poses[1][:3, 3], [1.5, 0.0, 0.0], atol=1e-9)
+
+
+def make_tum(root: Path) -> Path:
+    for i in range(2):
+        write_image(root / "rgb" / f"{i}.png", np.full((48, 64, 3), 90, np.uint8))
+        write_image(root / "depth" / f"{i}.png", np.full((48, 64), 10_000, np.uint16))
+    (root / "rgb.txt").write_text("# rgb\n1305031102.175304 rgb/0.png\n1305031102.211214 rgb/1.png\n")
+    (root / "depth.txt").write_text("1305031102.160407 depth/0.png\n1305031102.226738 depth/1.png\n")
+    (root / "groundtruth.txt").write_text("1305031102.1758 1 2 3 0 0 0 1\n")
+    return root
+
+
+def test_tum_rgbd_folders(tmp_path: Path) -> None:
+    with convert(RgbdDataset(make_tum(tmp_path / "tum")), tmp_path / "bag") as bag:
+        readings, sensors, truth = list(bag.readings()), bag.sensors[""], bag.ground_truth("")
+    depth = readings[0]
+    assert isinstance(depth, DepthReading)
+    assert depth.stamp_ns == 1_305_031_102_160_407_000
+    assert (depth.image.dtype, depth.image[0, 0]) == (np.float32, 2.0)
+    assert sensors.measurement == "depth"
+    assert sensors.tof is not None
+    assert sensors.tof.camera.fx == 525.0
+    assert truth is not None
+    np.testing.assert_allclose(truth.poses[0][:3, 3], [3.0, -1.0, -2.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "text"), [(EurocDataset, "not found"), (KittiDataset, "not found"), (RgbdDataset, "not found")]
+)
+def test_a_missing_folder_is_named(tmp_path: Path, dataset: type, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        dataset(tmp_path / "nothing")
+
+
+def test_folders_of_something_else_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no RGB-D folder"):
+        RgbdDataset(tmp_path)
+    with pytest.raises(ValueError, match="none of the image folders"):
+        KittiDataset(tmp_path)
+    with pytest.raises(ValueError, match=r"camera calibration \(--calibration\) not found"):
+        EurocDataset(tmp_path)
+
+
+def test_a_broken_image_is_named(tmp_path: Path) -> None:
+    source = make_tum(tmp_path / "tum")
+    (source / "depth" / "1.png").write_bytes(b"no picture")
+    with pytest.raises(ValueError, match=r"depth.1\.png: expected an image of uint16"):
+        convert(RgbdDataset(source), tmp_path / "bag")
+    assert not (tmp_path / "bag").exists()
+
+
+@pytest.mark.data
+def test_the_public_keyframes_of_euroc(data_dir: Path, tmp_path: Path) -> None:
+    dataset = EurocDataset(
+        data_dir / "euroc_v101_visnav100" / "euroc_V1",
+        data_dir / "euroc_v101_micro95" / "MicroEurocDataset",
+        data_dir / "traj_gt_openvins" / "euroc_mav" / "V1_01_easy.txt",
+    )
+    assert len(dataset) == 50
+    with convert(dataset, tmp_path / "bag") as bag:
+        sensors, truth = bag.sensors[""], bag.ground_truth("")
+    assert sensors.right is not None
+    assert sensors.right.baseline == pytest.approx(0.110, abs=1e-3)
+    assert truth is not None
+    assert len(truth) > 1000

@@ -1,0 +1,79 @@
+"""The stages of a run: each a thread ahead of the next, none lost, none left running."""
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.offline import _ahead, run_bag
+
+DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
+
+
+class Source:
+    """Numbers, until ``fails_at``; ``closed`` once nobody wants more."""
+
+    def __init__(self, fails_at: int = 1000) -> None:
+        self.fails_at, self.closed = fails_at, False
+
+    def items(self) -> Iterator[int]:
+        try:
+            for k in range(1000):
+                if k == self.fails_at:
+                    raise ValueError("unreadable")
+                yield k
+        finally:
+            self.closed = True
+
+
+def doubled(items):
+    for k in items:
+        time.sleep(0)
+        yield 2 * k
+
+
+def stage(items):
+    """A stage that hands over three items at a time."""
+    return _ahead(items, lambda k: k % 3 == 0)
+
+
+def squared(items):
+    for k in stage(doubled(items)):
+        yield k * k
+
+
+def test_stages_keep_every_item_in_order():
+    assert list(stage(squared(stage(Source().items())))) == [4 * k * k for k in range(1000)]
+
+
+def test_an_error_of_the_first_stage_reaches_the_last_after_what_came_before_it():
+    seen = []
+    with pytest.raises(ValueError, match="unreadable"):
+        seen.extend(stage(squared(stage(Source(fails_at=7).items()))))
+    assert len(seen) == 7
+
+
+def test_whoever_stops_early_stops_every_stage():
+    before, source = threading.active_count(), Source()
+    last = stage(squared(stage(source.items())))
+    assert next(last) == 0
+    last.close()
+    deadline = time.monotonic() + 10.0
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert source.closed
+    assert threading.active_count() == before
+
+
+def test_a_run_that_is_told_to_stop_keeps_what_it_has():
+    asked = iter(range(1000))
+    config = choose(load_system_config(None), "stereo", "sjsam", "none")
+    result, _ = run_bag(DEMO, config, stopped=lambda: next(asked) >= 20)
+    assert 8 <= result.frames <= 12
+    assert len(result.agents[0].trajectory) == result.frames
+    assert len(result.landmarks.positions) > 50
+    assert len(result.dense_points) > 100
+    assert not result.dropped

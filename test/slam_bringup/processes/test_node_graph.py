@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from slam_bringup.bags.readings import AgentSensors
+from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.processes.node_graph import live_nodes, plan_nodes
+from slam_core.frame_tree import FrameTree
+
+CONFIG_FILES = sorted((Path(__file__).resolve().parents[3] / "src" / "slam_bringup" / "config").glob("*.yaml"))
+
+
+def sensors(agent: str = "") -> AgentSensors:
+    below = f"/{agent}" if agent else ""
+    topics = {
+        "left": f"{below}/stereo/left/image_raw/compressed", "right": f"{below}/stereo/right/image_raw/compressed",
+        "depth": f"{below}/tof/depth/image_raw", "amplitude": f"{below}/tof/amplitude/image_raw",
+        "tof_info": f"{below}/tof/camera_info",
+    }  # fmt: skip
+    return AgentSensors(agent, None, None, None, "depth", FrameTree(), topics=topics)
+
+
+def executables(mode: str, odometry: str = "none") -> list[str]:
+    config = choose(load_system_config(None), mode, "sjsam", odometry)
+    return [spec.executable for spec in live_nodes(config, [""], odometry=odometry != "none")]
+
+
+def test_every_mode_starts_what_it_needs() -> None:
+    assert executables("stereo") == ["stereo_driver", "feature_extractor", "ekf_slam", "sjsam"]
+    assert executables("tof") == ["tof_driver", "feature_extractor", "ekf_slam", "sjsam"]
+    assert executables("fuse", "ndt") == [
+        "stereo_driver", "tof_driver", "ndt_odometry", "feature_extractor", "ekf_slam", "sjsam"
+    ]  # fmt: skip
+
+
+def test_parameters_follow_from_the_choice_and_the_bag() -> None:
+    config = choose(load_system_config(None), "fuse", "sjsam", "icp")
+    graph = plan_nodes(config, {"one": sensors("one")}, True, "/out/map")
+    arguments = {c.executable: " ".join(c.arguments) for c in graph.commands}
+    assert "compressed:=true" in arguments["stereo_driver"]
+    assert 'measurement:="depth"' in arguments["tof_driver"]
+    assert 'pictures:="amplitude"' in arguments["tof_driver"]
+    assert 'mode:="fuse"' in arguments["feature_extractor"]
+    assert "wait_for_motion:=true" in arguments["ekf_slam"]
+    assert 'registration.method:="icp_plane"' in arguments["ndt_odometry"]
+    assert 'agents:=["one"]' in arguments["sjsam"]
+    assert graph.filters == ("/one/ekf_slam",)
+    assert graph.finishers == ("/one/feature_extractor", "/one/ekf_slam")
+    assert set(graph.pace) == {
+        "/one/ekf_slam=/one/stereo/left/image_raw/compressed", "/one/ndt_odometry=/one/tof/depth/image_raw"
+    }  # fmt: skip
+    assert "/one/tof/camera_info" in graph.played.values()
+
+
+def test_the_frames_of_an_agent_are_those_of_its_bag_or_lie_below_its_name() -> None:
+    config = choose(load_system_config(None), "fuse", "sjsam", "ndt")
+    live = {s.executable: s.parameters for s in live_nodes(config, ["one"], odometry=True)}
+    assert live["ekf_slam"]["base_frame"] == live["ndt_odometry"]["base_frame"] == "one/base_link"
+    assert live["ndt_odometry"]["odom_frame"] == "one/odom"
+    graph = plan_nodes(config, {"one": sensors("one")}, True, "map")  # this bag's frames have no prefix
+    arguments = {c.executable: " ".join(c.arguments) for c in graph.commands}
+    assert 'base_frame:="base_link"' in arguments["ekf_slam"]
+
+
+def test_the_stereo_mode_leaves_the_depth_camera_alone() -> None:
+    graph = plan_nodes(choose(load_system_config(None), "stereo", "sjsam", "none"), {"": sensors()}, False, "map")
+    assert not [topic for topic in graph.played.values() if "tof" in topic]
+
+
+@pytest.mark.parametrize("path", CONFIG_FILES, ids=lambda p: p.name)
+def test_every_shipped_configuration_loads_and_overrides(path: Path) -> None:
+    assert load_system_config(path) != load_system_config(None)

@@ -1,0 +1,75 @@
+"""The files of a run: complete, consistent with each other, and readable by other programs."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult
+from slam_bringup.report.output import write_results
+from slam_core.geometry import boxplus
+from slam_core.trajectory import Trajectory, read_trajectory
+
+
+def circle(n: int = 80, radius: float = 2.0) -> Trajectory:
+    angle = np.linspace(0, 2 * np.pi, n)
+    d = np.zeros((n, 6))
+    d[:, 0], d[:, 1], d[:, 5] = radius * np.sin(angle), radius * (1 - np.cos(angle)), angle
+    poses = boxplus(np.tile(np.eye(4), (n, 1, 1)), d)
+    covariances = np.stack([np.eye(6) * 1e-5 * (1 + i) for i in range(n)])
+    return Trajectory(np.arange(n, dtype=np.int64) * 100_000_000, poses, covariances)
+
+
+@pytest.fixture
+def result(rng) -> RunResult:
+    truth = circle()
+    noisy = Trajectory(truth.stamps_ns, boxplus(truth.poses, rng.normal(0, 0.01, (len(truth), 6))), truth.covariances)
+    positions = rng.uniform([-4, -2, -1], [4, 6, 2], (200, 3))
+    covariances = np.stack([np.diag(s) for s in rng.uniform(1e-4, 1e-2, (200, 3))])
+    return RunResult(
+        bag="circle", mode="stereo", mapper="sjsam", odometry="none",
+        agents=(AgentResult("", noisy, truth=truth, feature_counts=np.full(80, 250)),),
+        landmarks=LandmarkMap(positions, covariances, np.full(200, 5)),
+        dense_points=rng.uniform(-3, 3, (500, 3)).astype(np.float32), dense_grey=np.full(500, 128, dtype=np.uint8),
+        submaps=4, loop_closures=1, frames=80, dropped={"features without depth": 2}, rejections={"outlier": 3},
+        sensor_s=8.0, wall_s=2.0,
+        stage_ms={"features": [40.0] * 80, "ekf": [8.0] * 80}, events=("12.3 s: <lost>",),
+    )  # fmt: skip
+
+
+def test_all_files_are_written_and_agree(result, tmp_path):
+    summary = write_results(tmp_path, result, save_map=lambda path: path.mkdir())
+    names = {p.name for p in tmp_path.iterdir()}
+    assert {
+        "summary.json", "trajectory.tum", "trajectory_covariance.csv", "ground_truth.tum", "landmarks.ply", "map.ply",
+        "map", "map.png", "report.html",
+    } == names  # fmt: skip
+    assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
+    assert summary["real_time_factor"] == 4.0
+    assert summary["dropped"] == 2
+    np.testing.assert_allclose(
+        read_trajectory(tmp_path / "trajectory.tum").poses, result.agents[0].trajectory.poses, atol=1e-8
+    )
+    html = (tmp_path / "report.html").read_text()
+    assert "&lt;lost&gt;" in html
+    assert html.count("data:image/png;base64") == 4
+
+
+def test_the_same_result_gives_the_same_bytes(result, tmp_path):
+    for name in ("a", "b"):
+        write_results(tmp_path / name, result)
+    for path in (tmp_path / "a").iterdir():
+        if path.name not in ("summary.json", "report.html"):  # these state the memory used
+            assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
+
+
+def test_a_run_without_anything_still_has_its_files(tmp_path):
+    empty = RunResult(
+        "empty", "stereo", "sjsam", "none", (AgentResult("", Trajectory.from_estimates([])),), LandmarkMap.empty(),
+        np.empty((0, 3), np.float32), np.empty(0, np.uint8), 0, 0, 0, {}, {}, 0.0, 0.0, {},
+    )  # fmt: skip
+    summary = write_results(tmp_path, empty)
+    assert summary["end_error_m"] is None
+    assert (tmp_path / "report.html").exists()

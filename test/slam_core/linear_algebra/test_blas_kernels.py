@@ -1,0 +1,42 @@
+"""BLAS in compiled kernels, against NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam_core.linear_algebra import blas_kernels
+
+SIZES = [(1, 1), (3, 7), (48, 120), (130, 65)]
+
+
+@pytest.mark.parametrize(("k", "n"), SIZES)
+def test_a_front_is_eliminated_in_place(k: int, n: int, rng: np.random.Generator) -> None:
+    root = rng.normal(size=(k + n, k + n + 3))
+    S = root @ root.T
+    panel = S[:, :k].copy()
+    rest = S[k:, k:].copy()
+    assert blas_kernels.cholesky(panel[:k])
+    blas_kernels.solve_right(panel[:k], panel[k:])
+    blas_kernels.subtract_square(panel[k:], rest)
+    L = np.linalg.cholesky(S)
+    assert np.allclose(np.tril(panel), np.tril(L[:, :k]), rtol=1e-9)
+    assert np.allclose(np.tril(rest), np.tril(L[k:, k:] @ L[k:, k:].T), rtol=1e-9)
+    # What is above the diagonal is neither read nor written.
+    assert np.array_equal(np.triu(panel[:k], 1), np.triu(S[:k, :k], 1))
+    assert np.array_equal(np.triu(rest, 1), np.triu(S[k:, k:], 1))
+
+
+@pytest.mark.parametrize("spoilt", [0.0, -1.0, np.nan])
+def test_a_matrix_that_is_not_positive_definite_is_refused(spoilt: float) -> None:
+    S = np.eye(5)
+    S[3, 3] = spoilt
+    assert not blas_kernels.cholesky(S)
+
+
+def test_nothing_to_eliminate_is_no_error() -> None:
+    nothing, C = np.empty((0, 0)), np.eye(3)
+    assert blas_kernels.cholesky(nothing)
+    blas_kernels.solve_right(nothing, np.empty((3, 0)))
+    blas_kernels.subtract_square(np.empty((3, 0)), C)
+    assert np.array_equal(C, np.eye(3))
