@@ -201,3 +201,26 @@ def test_a_guess_far_from_the_prediction_gives_the_same_answer(rng: np.random.Ge
     error = boxminus(T, ekf.T)
     assert np.linalg.norm(error[:3]) < 0.03
     assert np.linalg.norm(error[3:]) < 0.01
+
+
+def test_an_update_without_measurements_moves_to_the_prediction(rng: np.random.Generator) -> None:
+    ekf = Ekf(np.array([1.0, 0, 0, 0, 0, 0]), np.diag([0.0] * 6 + [0.04] * 6), invariant=False)
+    slots = ekf.augment(np.array([[3.0, 0.0, 0.0]]), np.eye(3)[None] * 1e-4)
+    elsewhere = models.relative_motion(np.array([0.5, 0, 0, 0, 0, 0]), 0.1)
+    ekf.apply_time_update(ekf.time_update(0.1, np.full(6, 0.1), elsewhere))
+    before = ekf.covariance.dense()
+    seen = models.observe(ekf.T, T_RIG_OPTICAL, ekf.landmarks[slots], CAMERA).select(np.zeros(0, dtype=np.int64))
+    report = ekf.update(np.zeros((0, 3)), np.zeros((0, 3)), seen, slots[:0])
+    assert not report.applied
+    np.testing.assert_allclose(ekf.T[:3, 3], [0.1, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(ekf.covariance.dense(), before)
+
+
+def test_a_singular_innovation_changes_nothing_but_the_place_of_linearisation() -> None:
+    ekf = Ekf(np.zeros(6), np.zeros((12, 12)))
+    slots = ekf.augment(np.array([[3.0, 0.0, 0.0]]), np.zeros((1, 3, 3)))
+    seen = models.observe(ekf.T, T_RIG_OPTICAL, ekf.landmarks[slots], CAMERA)
+    report = ekf.update(seen.z + 1.0, np.zeros((1, 3)), seen, slots)
+    assert not report.applied
+    np.testing.assert_array_equal(ekf.T, np.eye(4))
+    assert ekf.is_finite

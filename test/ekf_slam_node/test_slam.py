@@ -10,10 +10,12 @@ import pytest
 from feature_world import PointWorld, loop, room
 
 from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.ekf import Ekf
+from ekf_slam_node.models import Observation
 from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.slam import EkfSlam
 from slam_core.config import from_mapping
-from slam_core.geometry import FloatArray, boxminus, invert_transform
+from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform, so3_exp
 from slam_core.types import Features, Submap
 
 STEP_NS = 100_000_000
@@ -235,3 +237,79 @@ def test_descriptors_of_another_size_are_refused(world: PointWorld, rng: np.rand
     assert odd.state is TrackingState.DEGRADED
     assert "32" in odd.reason
     assert slam.process(features).state is TrackingState.OK
+
+
+@pytest.mark.parametrize("turn_deg", [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0])
+def test_a_motion_that_contradicts_the_prediction_is_measured(
+    world: PointWorld, rng: np.random.Generator, turn_deg: float
+) -> None:
+    """A jerk of any size is either within every feature's gate, or a surprise that the prediction makes room for."""
+    slam, poses = EkfSlam(EkfSlamConfig()), loop(60)
+    jerk = make_transform(so3_exp(np.radians([0.0, 0.0, turn_deg])), np.zeros(3))
+    poses = [*poses[:8], poses[8] @ jerk]
+    results = run(slam, world, poses, rng)
+    assert "updates_failed" not in slam.counters.counts
+    assert len(results[-1].landmark_ids) > 30
+    assert np.linalg.norm(error_of(results[-1], poses, 8)[3:]) < 0.01
+
+
+def test_an_update_that_fails_is_counted_and_the_run_goes_on(
+    world: PointWorld, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slam, poses = EkfSlam(EkfSlamConfig()), loop(30)
+    update = Ekf.update
+
+    def without_rows(ekf: Ekf, z: FloatArray, variance: FloatArray, seen: Observation, slots: np.ndarray):
+        nobody = np.zeros(0, dtype=np.int64)
+        return update(ekf, z[:0], variance[:0], seen.select(nobody), slots[:0])
+
+    run(slam, world, poses[:10], rng)
+    monkeypatch.setattr(Ekf, "update", without_rows)
+    result = slam.process(world.features(poses[10], 10 * STEP_NS, rng)[0])
+    assert result.state is TrackingState.DEGRADED
+    assert slam.counters.counts["updates_failed"] == 1
+    monkeypatch.undo()
+    for k in range(11, 30):
+        result = slam.process(world.features(poses[k], k * STEP_NS, rng)[0])
+    assert result.state is TrackingState.OK
+    assert np.linalg.norm(error_of(result, poses, 29)[:3]) < 0.1
+
+
+@pytest.mark.parametrize("spoil", ["mean", "covariance"])
+def test_an_estimate_that_is_not_finite_costs_one_submap(
+    world: PointWorld, rng: np.random.Generator, spoil: str
+) -> None:
+    slam, poses = EkfSlam(EkfSlamConfig()), loop(60)
+    before = run(slam, world, poses[:30], rng)
+    assert slam._map is not None
+    if spoil == "mean":
+        slam._map.ekf.velocity[:] = np.nan
+    else:
+        slam._map.ekf.covariance.set_head(np.full((slam._map.ekf.covariance.size, 12), np.inf))
+    after = [slam.process(world.features(poses[k], k * STEP_NS, rng)[0]) for k in range(30, 60)]
+    assert slam.counters.counts["submaps_abandoned"] == 1
+    assert after[0].state is TrackingState.LOST
+    assert after[-1].state is TrackingState.OK
+    assert all(np.isfinite(r.pose.T).all() and np.isfinite(r.pose.covariance).all() for r in after)
+    submaps = submaps_of(before + after, slam)
+    assert sum(not s.follows_previous for s in submaps) == 2
+    for submap in submaps:
+        assert np.linalg.eigvalsh(submap.covariance)[0] > 0.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_features_out_of_all_proportion_do_not_end_a_run(world: PointWorld, seed: int) -> None:
+    rng, slam = np.random.default_rng(seed), EkfSlam(EkfSlamConfig())
+    for k, T in enumerate(loop(15)):
+        features, _ = world.features(T, k * STEP_NS, rng)
+        uv, depth, sigma = features.uv.copy(), features.depth.copy(), features.sigma_depth.copy()
+        wild = rng.random(len(depth)) < 0.3
+        uv[wild] *= 10.0 ** rng.uniform(-3, 6, (wild.sum(), 2)).astype(np.float32)
+        depth[wild] *= 10.0 ** rng.uniform(-1, 30, wild.sum()).astype(np.float32)
+        sigma[wild] = depth[wild] * 10.0 ** rng.uniform(-8, 0, wild.sum()).astype(np.float32)
+        features = dataclasses.replace(features, uv=uv, depth=depth, sigma_depth=sigma)
+        result = slam.process(features)
+        assert np.isfinite(result.pose.T).all()
+        assert np.isfinite(result.pose.covariance).all()
+    for submap in slam.finish():
+        assert np.linalg.eigvalsh(submap.covariance)[0] > 0.0

@@ -154,7 +154,12 @@ class Ekf:
     def update(self, z: FloatArray, variance: FloatArray, seen: Observation, slots: IndexArray) -> UpdateReport:
         """Measurements z (m, 3) with variances (m, 3) of the landmarks ``slots`` (m,), predicted as ``seen`` (Eqs.
         6.16-6.21).
+
+        Without measurements, and where S cannot be factored, the state moves to its prediction and nothing is applied.
         """
+        if not len(z):
+            self.settle()
+            return UpdateReport(0.0, 0, False)
         rows = CORE_DIM + 3 * np.asarray(slots, dtype=np.int64)
         cross = self.covariance.cross_covariance(seen.J_pose, seen.J_point, rows)
         points = cross[rows[:, None] + np.arange(3)]
@@ -166,6 +171,8 @@ class Ekf:
     def _update(self, S: FloatArray, cross: FloatArray, innovation: FloatArray, stay: bool = False) -> UpdateReport:
         whitened = whiten(S, cross, innovation)
         if whitened is None or not np.isfinite(whitened[1]).all():
+            if not stay:
+                self.settle()
             return UpdateReport(np.nan, len(innovation), False)
         W, y = whitened
         self.covariance.subtract_square(W)
@@ -225,6 +232,12 @@ class Ekf:
     def pose_covariance(self) -> FloatArray:
         """Covariance (6, 6) of the rig's pose."""
         return self.covariance.head(6)[:6]
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the mean and the rig's covariance with everything are finite numbers."""
+        parts = (self.T, self.velocity, self.landmarks, self.covariance.head(CORE_DIM))
+        return all(bool(np.isfinite(part).all()) for part in parts)
 
     def landmarks_in_rig(self) -> tuple[FloatArray, FloatArray]:
         """Landmarks as the rig has them around itself: positions (m, 3) in the rig frame and covariances (m, 3, 3)."""

@@ -131,12 +131,18 @@ class Linker:
         final = refine_motion(
             candidates.select(rows), frame.select(columns), self._T_rig_optical, guess.T, self._config.gate
         )
-        if final is None or final.inliers.sum() < least:
+        if final is None or final.inliers.sum() < least or not _is_usable(final):
             return None
         # In the order of the features, not of their errors: to measure the best-fitting first would choose by noise.
         inliers = np.flatnonzero(final.inliers)
         inliers = inliers[np.argsort(columns[inliers], kind="stable")]
         return Link(final.T, final.covariance, final.excess, rows[inliers], columns[inliers])
+
+
+def _is_usable(motion: MotionGuess) -> bool:
+    """Whether a motion is finite and determined in all directions."""
+    finite = np.isfinite(motion.T).all() and np.isfinite(motion.covariance).all()
+    return bool(finite) and bool(np.linalg.eigvalsh(motion.covariance)[0] > 0.0)
 
 
 def _number_of_pairs(link: Link) -> int:

@@ -24,9 +24,6 @@ from ekf_slam_node.submap_builder import SubmapBuilder, conditional_start
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, boxminus, is_rigid_transform, make_transform
 from slam_core.types import Counters, Features, ImuSample, PoseEstimate, RelativeMotion, Submap
 
-_MOTION_GATE = 22.46
-"""99.9 % of chi-square with 6 degrees of freedom: a motion beyond it contradicts the prediction."""
-
 _LONGEST_STEP_S = 10.0
 """A gap counts as no longer than this: the model says nothing about it any more, and larger variances cost digits."""
 
@@ -87,7 +84,13 @@ class EkfSlam:
             return self._report(self._newest_stamp_ns, TrackingState.DEGRADED, problem)
         self._newest_stamp_ns = features.stamp_ns
         frame = self._noise.corrected(self._usable(features))
-        return self._begin(frame) if self._map is None or self._is_finished else self._advance(self._map, frame)
+        if self._map is None or self._is_finished:
+            return self._begin(frame)
+        try:
+            result = self._advance(self._map, frame)
+        except np.linalg.LinAlgError:
+            return self._abandon(frame, "a matrix could not be factored")
+        return result if self._map.ekf.is_finite else self._abandon(frame, "the estimate was no longer finite", result)
 
     def _problem_with(self, features: Features) -> str:
         """Why a frame cannot be used at all, or ""."""
@@ -154,7 +157,7 @@ class EkfSlam:
         """The frame is linked: augmentation at the previous pose, time update, measurement update, perhaps a new
         submap.
         """
-        surprising = _is_surprising(link, expected)
+        surprising = _is_surprising(link, expected, self.config.association.gate)
         frame = self._noise.learn(frame, link.excess)
         landmarks_before = len(local.book)
         sight = self._confirm(local, frame, link, surprising)
@@ -170,8 +173,10 @@ class EkfSlam:
         closing = self._builder.is_complete(local.ekf, self.config.submap, len(sight))
         divided = closing and self.config.submap.start == "independent"
         report, used = local.measure(frame, sight.every_second() if divided else sight)
+        state, reason = TrackingState.OK, ""
         if not report.applied:
             self.counters.add("updates_failed")
+            state, reason = TrackingState.DEGRADED, "no landmark could be measured, moved by the prediction alone"
         self._builder.add_pose(frame.stamp_ns, local.ekf)
         self._reached(frame)
         submaps = self._closed() if closing else ()
@@ -181,7 +186,7 @@ class EkfSlam:
         else:
             local.remember(frame, used, link, landmarks_before)
             local.tidy(frame, used)
-        return self._report(frame.stamp_ns, TrackingState.OK, "", submaps, report, ids, index)
+        return self._report(frame.stamp_ns, state, reason, submaps, report, ids, index)
 
     def _confirm(self, local: LocalMap, frame: Frame, link: Link, surprising: bool) -> Sight:
         # A surprising motion rests on these pairs alone: all of them are worth their cost.
@@ -253,6 +258,15 @@ class EkfSlam:
         self._odometry.advance(pose)
         result = self._advance(self._start(missed), frame)
         return replace(result, submaps=submaps + result.submaps)
+
+    def _abandon(self, frame: Frame, reason: str, result: EkfResult | None = None) -> EkfResult:
+        """Give up the open submap, which cannot be trusted any more, and begin a new one at this frame."""
+        self.counters.add("submaps_abandoned")
+        last = self._builder.last_sound_pose()
+        self._odometry.advance(self._odometry.pose(frame.stamp_ns, last.T, last.covariance))
+        self._start(frame)
+        reason = f"{reason}: the open submap is given up, a new one begins"
+        return self._report(frame.stamp_ns, TrackingState.LOST, reason, () if result is None else result.submaps)
 
     # ------------------------------------------------------------------------------------------------------- submaps
     def _begin(self, frame: Frame) -> EkfResult:
@@ -346,10 +360,15 @@ def _seconds(start_stamp_ns: int, end_stamp_ns: int) -> float:
     return min((end_stamp_ns - start_stamp_ns) * 1e-9, _LONGEST_STEP_S)
 
 
-def _is_surprising(link: Link, expected: MotionPrior) -> bool:
-    """Whether the motion found contradicts constant velocity."""
+def _is_surprising(link: Link, expected: MotionPrior, gate: float) -> bool:
+    """Whether the motion found contradicts constant velocity, by the gate of one feature.
+
+    What a motion within this gate moves a feature by lies within the same gate of that feature: the normalised length
+    of an error cannot grow when it is seen in three coordinates. With a wider gate here than there a motion would pass
+    whose features are all refused.
+    """
     error = boxminus(link.T, expected.T)
-    return float(error @ np.linalg.solve(expected.covariance + link.covariance, error)) > _MOTION_GATE
+    return float(error @ np.linalg.solve(expected.covariance + link.covariance, error)) > gate
 
 
 def _aided(expected: MotionPrior, aid: Aid | None) -> MotionPrior:

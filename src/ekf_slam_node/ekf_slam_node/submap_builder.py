@@ -9,7 +9,12 @@ from ekf_slam_node.covariance import IndexArray
 from ekf_slam_node.ekf import Ekf
 from ekf_slam_node.landmarks import LandmarkBook
 from ekf_slam_node.models import CORE_DIM
+from slam_core.geometry import FloatArray
+from slam_core.linear_algebra import blas
 from slam_core.types import PoseEstimate, Submap
+
+_LEAST_EIGENVALUE = 1e-12
+"""Share of the largest eigenvalue that rounding may reach."""
 
 
 class SubmapBuilder:
@@ -51,10 +56,15 @@ class SubmapBuilder:
         """Whether the submap has no pose beside its first."""
         return len(self._path) < 2
 
+    def last_sound_pose(self) -> PoseEstimate:
+        """The newest pose of the path whose numbers are finite."""
+        sound = (p for p in reversed(self._path) if np.isfinite(p.T).all() and np.isfinite(p.covariance).all())
+        return next(sound)
+
     def close(self, ekf: Ekf, book: LandmarkBook) -> Submap:
         """The submap as it is now: its end pose is the last pose added."""
         keep = np.concatenate([np.arange(6), np.arange(CORE_DIM, ekf.covariance.size)])
-        covariance = ekf.covariance.dense()[np.ix_(keep, keep)]
+        covariance = _positive_definite(ekf.covariance.dense()[np.ix_(keep, keep)])
         end = self._path[-1]
         return Submap(
             agent=self._agent, index=self.index, start_stamp_ns=self._start_stamp_ns, end_stamp_ns=end.stamp_ns,
@@ -62,6 +72,14 @@ class SubmapBuilder:
             sightings=book.sightings.copy(), descriptors=book.descriptors.copy(), path=tuple(self._path),
             follows_previous=self._follows_previous,
         )  # fmt: skip
+
+
+def _positive_definite(P: FloatArray) -> FloatArray:
+    """A covariance whose smallest eigenvalues rounding has made negative, with these raised; others as they are."""
+    if blas.cholesky(np.array(P, order="F")):
+        return P
+    values, vectors = np.linalg.eigh(P)
+    return np.asarray((vectors * np.maximum(values, _LEAST_EIGENVALUE * values[-1])) @ vectors.T)
 
 
 def conditional_start(ekf: Ekf, slots: IndexArray, invariant: bool) -> Ekf:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from ekf_slam_node.slam import EkfSlam
 from slam_bringup.cli import slam
 from slam_core.trajectory import read_covariance_csv, read_trajectory
 
@@ -76,3 +78,34 @@ def test_bad_bags_and_bad_configurations_are_refused(tmp_path):
     assert "did you mean 'max_distance'" in str(error)
     config.write_text("ekf_slam: [1]\n")
     assert "must be a mapping" in str(run(str(DEMO), "-o", str(tmp_path / "out"), "--config", str(config)).exception)
+
+
+def fail_after(monkeypatch: pytest.MonkeyPatch, frames: int) -> None:
+    process, calls = EkfSlam.process, itertools.count()
+
+    def faulty(self: EkfSlam, *arguments):
+        if next(calls) == frames:
+            raise RuntimeError("something nobody has thought of")
+        return process(self, *arguments)
+
+    monkeypatch.setattr(EkfSlam, "process", faulty)
+
+
+def test_what_was_mapped_before_an_error_is_written(tmp_path, monkeypatch):
+    fail_after(monkeypatch, 30)
+    result = run(str(DEMO), "-o", str(tmp_path / "out"))
+    assert result.exit_code == 1
+    assert "something nobody has thought of" in result.output
+    assert "holds what was mapped until then" in result.output
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert "RuntimeError" in summary["failure"]
+    assert summary["frames"] == 30
+    assert summary["landmarks"] > 50
+    assert len(read_trajectory(tmp_path / "out" / "trajectory.tum")) == 30
+    assert (tmp_path / "out" / "map.ply").stat().st_size > 1000
+
+
+def test_an_error_before_the_first_frame_is_raised_and_writes_nothing(tmp_path, monkeypatch):
+    fail_after(monkeypatch, 0)
+    assert isinstance(run(str(DEMO), "-o", str(tmp_path / "out")).exception, RuntimeError)
+    assert not (tmp_path / "out").exists()

@@ -115,13 +115,56 @@ def test_tum_rgbd_folders(tmp_path: Path) -> None:
         readings, sensors, truth = list(bag.readings()), bag.sensors[""], bag.ground_truth("")
     depth = readings[0]
     assert isinstance(depth, DepthReading)
-    assert depth.stamp_ns == 1_305_031_102_160_407_000
+    assert depth.stamp_ns == 1_305_031_102_175_304_000
     assert (depth.image.dtype, depth.image[0, 0]) == (np.float32, 2.0)
     assert sensors.measurement == "depth"
     assert sensors.tof is not None
     assert sensors.tof.camera.fx == 525.0
     assert truth is not None
     np.testing.assert_allclose(truth.poses[0][:3, 3], [3.0, -1.0, -2.0], atol=1e-9)
+
+
+def make_numbered(root: Path) -> Path:
+    for i in (3, 4, 5):
+        write_image(root / "images" / f"{i:05d}.png", np.full((48, 64, 3), 90, np.uint8))
+        if i != 4:
+            write_image(root / "depth" / f"{i:05d}.png", np.full((48, 64), 2000, np.uint16))
+    (root / "K.txt").write_text("50 0 31.5\n0 51 23.5\n0 0 1\n")
+    poses = [make_transform(so3_exp(np.array([0.0, 0.1 * i, 0.0])), np.array([i, 0.0, 0.0])) for i in range(3)]
+    np.savetxt(root / "poses.txt", np.array(poses).reshape(3, 16), fmt="%.4f")
+    return root
+
+
+def test_numbered_frames_are_paired_by_name_and_what_has_no_partner_is_named(tmp_path: Path) -> None:
+    dataset = RgbdDataset(make_numbered(tmp_path / "office"))
+    assert dataset.left_out["pictures without a depth image"] == 1
+    with convert(dataset, tmp_path / "bag") as bag:
+        readings, sensors, truth = list(bag.readings()), bag.sensors[""], bag.ground_truth("")
+    assert [r.stamp_ns for r in readings if isinstance(r, DepthReading)] == [10**9, 10**9 + 200_000_000]
+    assert sensors.tof is not None
+    assert (sensors.tof.camera.fx, sensors.tof.camera.fy) == (50.0, 51.0)
+    assert truth is not None
+    # The camera's x is the rig's right: its steps go along -y of a level world.
+    np.testing.assert_allclose(truth.poses[2][:3, 3], [0.0, -2.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(truth.poses[2][:3, :3] @ truth.poses[2][:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_an_excerpt_of_euroc_with_text_tables(tmp_path: Path) -> None:
+    source, _ = make_euroc(tmp_path / "euroc")
+    mav = source / "mav0"
+    rows = [f"{s - 5} 0.1 0.2 0.3 0 0 9.8" for s in (STAMPS[0] - 2 * 10**9, *STAMPS)]
+    (mav / "imu0" / "data.csv").rename(mav / "imu0" / "data.txt").write_text("\n".join(rows))
+    (mav / "state_groundtruth_estimate0" / "data.csv").unlink()
+    (mav / "truth_body_imu.txt").write_text("# t\n" + "".join(f"{s / 1e9:.5f} 1 2 3 0 0 0 1\n" for s in STAMPS))
+    dataset = EurocDataset(mav)
+    assert dataset.left_out["IMU readings outside the time of the images"] == 1
+    with convert(dataset, tmp_path / "bag") as bag:
+        readings, truth = list(bag.readings()), bag.ground_truth("")
+    samples = [r.sample for r in readings if isinstance(r, ImuReading)]
+    assert [s.stamp_ns for s in samples] == [s - 5 for s in STAMPS]
+    assert np.linalg.norm(samples[0].linear_acceleration) == pytest.approx(9.8)
+    assert truth is not None
+    assert len(truth) == 2
 
 
 @pytest.mark.parametrize(
@@ -163,3 +206,23 @@ def test_the_public_keyframes_of_euroc(data_dir: Path, tmp_path: Path) -> None:
     assert sensors.right.baseline == pytest.approx(0.110, abs=1e-3)
     assert truth is not None
     assert len(truth) > 1000
+
+
+@pytest.mark.data
+def test_the_public_excerpt_of_euroc_has_imu_and_truth(data_dir: Path, tmp_path: Path) -> None:
+    with convert(EurocDataset(data_dir / "euroc_mh01_10hz"), tmp_path / "bag") as bag:
+        truth, counts = bag.ground_truth(""), {role: bag.count("", role) for role in ("left", "imu")}
+    assert counts == {"left": 80, "imu": 1680}
+    assert truth is not None
+    assert len(truth) > 1500
+
+
+@pytest.mark.data
+def test_the_public_office_of_the_hololens(data_dir: Path, tmp_path: Path) -> None:
+    dataset = RgbdDataset(data_dir / "hololens_office_120")
+    assert len(dataset) == 120
+    assert not any(dataset.left_out.values())
+    with convert(dataset, tmp_path / "bag") as bag:
+        truth = bag.ground_truth("")
+    assert truth is not None
+    assert truth.length_m == pytest.approx(9.4, abs=0.1)

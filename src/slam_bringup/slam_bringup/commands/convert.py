@@ -41,6 +41,14 @@ def convert(dataset: Dataset, target: Path, storage: str = "mcap") -> int:
 def command(
     kind: str, source: Path, output: Path, calibration: Path | None, ground_truth: Path | None, storage: str
 ) -> None:
-    """Convert a public data set (EuRoC, KITTI odometry, RGB-D) to a bag."""
-    frames = convert(DATASETS[kind](source, calibration, ground_truth), output, storage)
+    """Convert a public data set to a bag, and say what of it is left out.
+
+    KIND is euroc (folders with mav0, or key frames), kitti (odometry) or rgbd (7-Scenes, TUM RGB-D, plain folders of
+    pictures and depth). Logs without images, such as MRCLAM's, have no place in a bag of images.
+    """
+    dataset = DATASETS[kind](source, calibration, ground_truth)
+    frames = convert(dataset, output, storage)
     click.echo(f"{output}: {frames} frames")
+    for reason, count in dataset.left_out.items():
+        if count:
+            click.echo(f"left out: {count} {reason}")

@@ -25,6 +25,9 @@ from slam_bringup.report.output import write_results
 from slam_bringup.report.result_bag import write_result_bag
 from slam_bringup.report.summary_table import summary_table
 
+FAILED = 1
+"""Exit code of a run that an error has ended; its results are written."""
+
 
 @click.command()
 @mapping_options
@@ -34,7 +37,8 @@ def command(
 ) -> None:  # fmt: skip
     """Map BAG without ROS: same classes as the nodes, no drops, the same bytes every time.
 
-    BAG is a folder or file of ROS 2 (mcap, db3) or a .bag of ROS 1. Ctrl-C ends it early and writes what is mapped.
+    BAG is a folder or file of ROS 2 (mcap, db3) or a .bag of ROS 1. Ctrl-C ends it early and writes what is mapped; an
+    error on the way does too, is named, and makes the exit code 1.
     """
     names = BagNames(parse_topics(topics), base_frame)
     with SensorBag(bag, names) as opened:
@@ -54,5 +58,8 @@ def command(
     write_result_bag(output / "result.mcap", result)
     summary = write_results(output, result, mapping.global_map.save)
     Console().print(summary_table(summary, output))
+    if result.failure:
+        click.echo(f"slam: {result.failure}; {output} holds what was mapped until then", err=True)
+        sys.exit(FAILED)
     if interrupt.asked:
         sys.exit(INTERRUPTED)

@@ -1,7 +1,8 @@
 """EuRoC MAV (Burri et al. 2016): stereo and IMU with ground truth of the IMU body.
 
 Two layouts: the ASL folders (``mav0/cam0/data/*.png``, ``data.csv``, ``sensor.yaml``, ``imu0``,
-``state_groundtruth_estimate0``) and a flat folder of keyframes ``<ns>_0.jpg``, ``<ns>_1.jpg``, whose calibration is a
+``state_groundtruth_estimate0``; also ``imu0/data.txt`` and ``truth_body_imu.txt``, as excerpts have them, values apart
+by blanks) and a flat folder of keyframes ``<ns>_0.jpg``, ``<ns>_1.jpg``, whose calibration is a
 folder that holds ``cam0/sensor.yaml`` and ``cam1/sensor.yaml``.
 
 base_link is the rectified left camera turned to X forward, Y left, Z up; ground truth is carried over to it.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,7 +51,8 @@ class EurocDataset:
     calibration
         Folder with ``cam0/sensor.yaml`` and ``cam1/sensor.yaml`` (or with ``mav0`` above them); default: the source.
     ground_truth
-        Poses of the IMU body (EuRoC csv or TUM); default: ``state_groundtruth_estimate0`` of the source.
+        Poses of the IMU body (EuRoC csv or TUM); default: ``state_groundtruth_estimate0`` or ``truth_body_imu.txt`` of
+        the source.
     """
 
     def __init__(self, source: Path, calibration: Path | None = None, ground_truth: Path | None = None) -> None:
@@ -64,8 +67,12 @@ class EurocDataset:
             raise ValueError(
                 f"{source} holds no stereo pairs, neither mav0/cam0/data.csv nor <ns>_0.jpg and <ns>_1.jpg"
             )
+        self.left_out = Counter[str]()
         self._truth = self._read_truth(root, ground_truth)
-        self._imu = _read_imu(root / "imu0" / "data.csv", self._pairs[0].stamp_ns, self._pairs[-1].stamp_ns)
+        self._imu = self._read_imu(root / "imu0")
+        if (root / "cam0").is_dir():
+            images = _images_by_stamp(root / "cam0").keys() ^ _images_by_stamp(root / "cam1").keys()
+            self.left_out["images without a partner of the same stamp"] = len(images)
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -90,14 +97,26 @@ class EurocDataset:
         return frames | ({IMU_FRAME: invert_transform(self._T_body_base)} if self._imu else {})
 
     def _read_truth(self, root: Path, path: Path | None) -> Trajectory:
-        path = path or root / "state_groundtruth_estimate0" / "data.csv"
-        if not path.exists():
+        candidates = [root / "state_groundtruth_estimate0" / "data.csv", root / "truth_body_imu.txt"]
+        path = path or next((p for p in candidates if p.exists()), None)
+        if path is None:
             return Trajectory.from_estimates([])
         truth = read_trajectory(path)
         first, last = self._pairs[0].stamp_ns - _TRUTH_MARGIN_NS, self._pairs[-1].stamp_ns + _TRUTH_MARGIN_NS
         inside = truth.select((truth.stamps_ns >= first) & (truth.stamps_ns <= last))
         if not len(inside):
             raise ValueError(f"{path} has no pose within the time of the images")
+        self.left_out["true poses outside the time of the images"] = len(truth) - len(inside)
+        return inside
+
+    def _read_imu(self, folder: Path) -> list[ImuSample]:
+        path = next((p for p in (folder / "data.csv", folder / "data.txt") if p.exists()), None)
+        if path is None:
+            return []
+        samples = [_imu_sample(row) for row in _rows(path)]
+        first, last = self._pairs[0].stamp_ns - _TRUTH_MARGIN_NS, self._pairs[-1].stamp_ns
+        inside = [sample for sample in samples if first <= sample.stamp_ns <= last]
+        self.left_out["IMU readings outside the time of the images"] = len(samples) - len(inside)
         return inside
 
 
@@ -167,18 +186,13 @@ def _keyframe_pairs(folder: Path) -> list[StampedPair]:
     return sorted(pairs, key=lambda pair: pair.stamp_ns)
 
 
-def _read_imu(path: Path, first_ns: int, last_ns: int) -> list[ImuSample]:
-    if not path.exists():
-        return []
-    samples = []
-    for row in _rows(path):
-        stamp = int(row[0])
-        if first_ns - _TRUTH_MARGIN_NS <= stamp <= last_ns:
-            values = np.array(row[1:7], dtype=np.float64)
-            samples.append(ImuSample(stamp, values[:3], values[3:]))
-    return samples
+def _imu_sample(row: list[str]) -> ImuSample:
+    values = np.array(row[1:7], dtype=np.float64)
+    return ImuSample(int(row[0]), values[:3], values[3:])
 
 
 def _rows(path: Path) -> Iterator[list[str]]:
+    """Cells of a table whose values are apart by commas or, in ``.txt`` files, by blanks."""
     with path.open(encoding="utf-8", newline="") as file:
-        yield from (row for row in csv.reader(file) if row and not row[0].startswith("#"))
+        lines = (line for line in file if line.strip() and not line.startswith("#"))
+        yield from (line.split() for line in lines) if path.suffix == ".txt" else csv.reader(lines)

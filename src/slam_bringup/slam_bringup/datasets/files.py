@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,12 @@ START_NS = 1_000_000_000
 
 
 class Dataset(Protocol):
-    """A data set that can be written to a bag frame by frame."""
+    """A data set that can be written to a bag frame by frame.
+
+    ``left_out`` counts, by reason, what of the source does not go into the bag.
+    """
+
+    left_out: Counter[str]
 
     def __len__(self) -> int:
         """Number of frames."""

@@ -6,6 +6,7 @@ without ``times.txt`` the frames are 0.1 s apart.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from decimal import Decimal
 from pathlib import Path
@@ -40,6 +41,8 @@ class KittiDataset:
         self._pairs = _pairs(source, self._folders)
         self._projections = _read_projections(calibration or source / "calib.txt", self._folders[0].name)
         self._truth = _read_truth(ground_truth or source / "poses.txt", len(self._pairs))
+        names = [{path.name for path in folder.glob("*.png")} for folder in self._folders]
+        self.left_out = Counter({"right images without a left one": len(names[1] - names[0])})
 
     def __len__(self) -> int:
         return len(self._pairs)

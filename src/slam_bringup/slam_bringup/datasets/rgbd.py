@@ -2,8 +2,11 @@
 
 - 7-Scenes (Shotton et al. 2013): ``frame-000000.color.png``, ``.depth.png`` (mm; 0 and 65535 are invalid),
   ``.pose.txt`` (camera to world); 30 Hz; ``camera-intrinsics.txt`` if there is one.
-- TUM RGB-D (Sturm et al. 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; depth in 1/5000 m; paired by time.
+- TUM RGB-D (Sturm et al. 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; depth in 1/5000 m; paired by time, and
+  stamped as the picture: what a frame says of the motion is in its pixels, the depth changes little within 20 ms.
 - plain: ``color/<n>.png``, ``depth/<n>.png`` (mm), ``pose.txt`` with x y z qx qy qz qw per frame; 30 Hz.
+- numbered, as deep-video-mvs (Duzceker et al. 2021) has it: ``images/<n>.png``, ``depth/<n>.png`` (mm, registered),
+  ``K.txt``, ``poses.txt`` with a 4x4 camera-to-world matrix per line; no stamps, taken as 10 Hz.
 
 The depth is along z, so it goes to ``tof/depth/image_raw`` as it is; the grey picture, registered to it, becomes the
 amplitude.
@@ -12,8 +15,9 @@ amplitude.
 from __future__ import annotations
 
 import bisect
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
 
@@ -30,6 +34,7 @@ from slam_core.trajectory import read_trajectory
 from slam_core.types import AnyArray
 
 _PERIOD_NS = 33_333_333
+_NUMBERED_PERIOD_NS = 100_000_000
 _MILLIMETRES_INVALID = 65535
 _PAIRING_NS = 20_000_000
 _KINECT_SEVEN_SCENES = (585.0, 585.0, 320.0, 240.0)
@@ -48,6 +53,7 @@ class _Layout:
     poses: list[tuple[int, FloatArray]]
     colour: ColourCamera | None = None
     """The camera of the pictures where they are not registered to the depth."""
+    left_out: Counter[str] = field(default_factory=Counter)
 
 
 class RgbdDataset:
@@ -65,6 +71,7 @@ class RgbdDataset:
 
     def __init__(self, source: Path, calibration: Path | None = None, ground_truth: Path | None = None) -> None:
         self._layout = _find_layout(existing(source, "RGB-D folder"))
+        self.left_out = self._layout.left_out
         self._calibration = calibration
         self._poses = _read_tum(ground_truth) if ground_truth else self._layout.poses
 
@@ -117,7 +124,11 @@ def _find_layout(source: Path) -> _Layout:
             return _tum(candidate)
         if (candidate / "depth").is_dir() and (candidate / "color").is_dir():
             return _plain(candidate)
-    raise ValueError(f"{source} is no RGB-D folder: no frame-*.depth.png, no depth.txt, no depth/ and color/")
+        if (candidate / "depth").is_dir() and (candidate / "images").is_dir():
+            return _numbered(candidate)
+    raise ValueError(
+        f"{source} is no RGB-D folder: no frame-*.depth.png, no depth.txt, no depth/ beside color/ or images/"
+    )
 
 
 def _seven_scenes(folder: Path) -> _Layout:
@@ -137,17 +148,26 @@ def _seven_scenes(folder: Path) -> _Layout:
 
 def _tum(folder: Path) -> _Layout:
     colour, depth = (_read_file_list(folder, name) for name in ("rgb.txt", "depth.txt"))
-    colour_stamps = sorted(colour)
+    depth_stamps = sorted(depth)
     pairs = []
-    for stamp in sorted(depth):
-        after = bisect.bisect_left(colour_stamps, stamp)
-        nearest = min(colour_stamps[max(after - 1, 0) : after + 1], key=lambda s: abs(s - stamp), default=None)
-        if nearest is not None and abs(nearest - stamp) <= _PAIRING_NS:
-            pairs.append(StampedPair(stamp, colour[nearest], depth[stamp]))
+    for stamp in sorted(colour):
+        nearest = _nearest(depth_stamps, stamp)
+        if nearest is not None and abs(nearest - stamp) <= _PAIRING_NS and _nearest(sorted(colour), nearest) == stamp:
+            pairs.append(StampedPair(stamp, colour[stamp], depth[nearest]))
     if not pairs:
         raise ValueError(f"{folder}: no depth image has a colour image within {_PAIRING_NS / 1e6:.0f} ms")
     truth = folder / "groundtruth.txt"
-    return _Layout(pairs, 5000.0, _KINECT_TUM, _read_tum(truth) if truth.exists() else [])
+    left_out = Counter({
+        "pictures without depth near in time": len(colour) - len(pairs),
+        "depth images without a picture near in time": len(depth) - len(pairs),
+    })  # fmt: skip
+    return _Layout(pairs, 5000.0, _KINECT_TUM, _read_tum(truth) if truth.exists() else [], left_out=left_out)
+
+
+def _nearest(stamps: list[int], stamp: int) -> int | None:
+    """The one of sorted stamps that is nearest in time."""
+    after = bisect.bisect_left(stamps, stamp)
+    return min(stamps[max(after - 1, 0) : after + 1], key=lambda s: abs(s - stamp), default=None)
 
 
 def _plain(folder: Path) -> _Layout:
@@ -160,6 +180,25 @@ def _plain(folder: Path) -> _Layout:
     rows = np.loadtxt(pose_file, ndmin=2) if pose_file.exists() else np.empty((0, 7))
     poses = [(pair.stamp_ns, transform_from_pose7(row)) for pair, row in zip(pairs, rows, strict=False)]
     return _Layout(pairs, 1000.0, _KINECT_TUM, poses)
+
+
+def _numbered(folder: Path) -> _Layout:
+    """Frames of equal name in ``images`` and ``depth``; line k of ``poses.txt`` belongs to the k-th picture."""
+    pictures = sorted(p for p in (folder / "images").iterdir() if p.suffix in (".png", ".jpg"))
+    stamps = [START_NS + i * _NUMBERED_PERIOD_NS for i in range(len(pictures))]
+    depths = [folder / "depth" / f"{p.stem}.png" for p in pictures]
+    pairs = [StampedPair(*frame) for frame in zip(stamps, pictures, depths, strict=True) if frame[2].exists()]
+    if not pairs:
+        raise ValueError(f"{folder}: no picture of images/ has a depth image of the same name in depth/")
+    matrix, pose_file = folder / "K.txt", folder / "poses.txt"
+    rows = np.loadtxt(pose_file, ndmin=2).reshape(-1, 4, 4) if pose_file.exists() else np.empty((0, 4, 4))
+    usable = [(stamp, T) for stamp, T in zip(stamps, rows, strict=False) if np.isfinite(T).all()]
+    left_out = Counter({
+        "pictures without a depth image": len(pictures) - len(pairs),
+        "poses that are not finite or have no picture": len(rows) - len(usable),
+    })  # fmt: skip
+    intrinsics = _read_camera_matrix(matrix) if matrix.exists() else _KINECT_TUM
+    return _Layout(pairs, 1000.0, intrinsics, [(s, _rigid(T)) for s, T in usable], left_out=left_out)
 
 
 def _read_file_list(folder: Path, name: str) -> dict[int, Path]:
@@ -177,7 +216,11 @@ def _read_matrix(path: Path) -> FloatArray:
     T = np.loadtxt(path)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise ValueError(f"{path} holds no finite 4x4 pose")
-    # Stored with few digits: the nearest rotation keeps the pose rigid.
+    return _rigid(T)
+
+
+def _rigid(T: FloatArray) -> FloatArray:
+    """A pose stored with few digits, with the nearest rotation."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     return make_transform(U @ Vt, T[:3, 3])
 

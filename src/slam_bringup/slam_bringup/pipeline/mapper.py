@@ -78,10 +78,18 @@ class Mapper:
             self._join(result.submaps)
 
     def finish(self) -> None:
-        """Close the open submaps and wait until all are joined; the map ends up the same whoever came first."""
+        """Close the open submaps and wait until all are joined; the map ends up the same whoever came first.
+
+        A submap whose joining failed is left out of the map; the events say so.
+        """
         for ekf in self._filters.values():
             self._join(ekf.finish())
-        self.reports += [join.result() for join in self._joins]
+        for join in self._joins:
+            error = join.exception()
+            if error is None:
+                self.reports.append(join.result())
+            else:
+                next(iter(self.records.values())).events.append(f"a submap could not be joined: {error!r}")
         self.global_map = self.global_map.centrally()
 
     def stop(self) -> None:

@@ -9,11 +9,13 @@ does not depend on that.
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -33,6 +35,7 @@ from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.trajectory import Trajectory
 
 T = TypeVar("T")
+_LOG = logging.getLogger(__name__)
 _AHEAD = 8
 """Images, or what became of them, that a stage may be ahead of the next."""
 
@@ -68,6 +71,8 @@ def run_bag(
     ------
     ValueError
         If the bag cannot be read or lacks what the mode needs.
+
+    An error after the first frames ends the run early: the result holds what was mapped, and names it as ``failure``.
     """
     cv2.setNumThreads(1)  # every stage has a thread; OpenCV's own would only wait beside them, spinning
     times = StageTimes()
@@ -75,20 +80,38 @@ def run_bag(
     with SensorBag(path, names) as bag:
         eyes = {agent: AgentEyes(config, bag.sensors[agent], odometry != "none", times) for agent in bag.agents}
         mapping = Mapper(config, {agent: e.T_rig_optical for agent, e in eyes.items()}, times)
+        failure = ""
         try:
-            for item in _ahead(_filter_inputs(bag, eyes, on_reading, stopped), _is_of_an_image):
-                mapping.process(item)
+            try:
+                for item in _ahead(_filter_inputs(bag, eyes, on_reading, stopped), _is_of_an_image):
+                    mapping.process(item)
+            except Exception as error:
+                if not any(record.filtered for record in mapping.records.values()):
+                    raise
+                failure = _told(error, "the run ended early")
             mapping.finish()
         finally:
             mapping.stop()
         wall_s = time.perf_counter() - start
         dropped = dict(bag.left_out)
         agents = _agent_results(bag, mapping)
-        with times.measure("dense model"):
-            dense = dense_model(bag, config, {a.name: a.trajectory for a in agents})
+        dense = ColouredCloud.empty()
+        try:
+            with times.measure("dense model"):
+                dense = dense_model(bag, config, {a.name: a.trajectory for a in agents})
+        except Exception as error:
+            failure = failure or _told(error, "no dense model was made")
         mapping.records[bag.agents[0]].events[:0] = bag.warnings
     choice = (config.feature_extractor.mode, mapper, odometry)
-    return _run_result(path, choice, mapping, agents, dense, dropped, times, wall_s), mapping
+    result = _run_result(path, choice, mapping, agents, dense, dropped, times, wall_s)
+    return replace(result, failure=failure, events=(failure,) * bool(failure) + result.events), mapping
+
+
+def _told(error: Exception, consequence: str) -> str:
+    """An error as one line for a person; where it came from goes to the log."""
+    _LOG.debug(consequence, exc_info=error)
+    kind = "" if isinstance(error, ValueError | OSError) else f"{type(error).__name__}: "
+    return f"{consequence}: {kind}{error}"
 
 
 def _filter_inputs(

@@ -56,7 +56,10 @@ class LandmarkMap:
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """Everything a run found out. ``stage_ms`` holds the time of every call of a stage, in order."""
+    """Everything a run found out.
+
+    stage_ms: the time of every call of a stage, in order. failure: what ended the run early, "" if nothing did.
+    """
 
     bag: str
     mode: str
@@ -76,6 +79,7 @@ class RunResult:
     stage_ms: Mapping[str, list[float]]
     events: tuple[str, ...] = ()
     solver: str = ""
+    failure: str = ""
 
 
 def summarise(result: RunResult) -> dict[str, Any]:
@@ -100,6 +104,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "stage_ms": {name: _stage(times) for name, times in result.stage_ms.items()},
         "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         "solver": result.solver,
+        "failure": result.failure,
         "events": list(result.events),
         **_accuracy(first, first.trajectory),
     }
