@@ -61,7 +61,7 @@ def test_writes_result_and_picture(clouds: tuple[str, str], tmp_path: Path) -> N
     outcome = CliRunner().invoke(command, [*clouds, "-o", str(out)], catch_exceptions=False)
     assert json.loads((out / "result.json").read_text()) == json.loads(outcome.stdout)
     assert (out / "registration.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(path.name for path in out.iterdir()) == ["registration.png", "result.json"]
+    assert sorted(path.name for path in out.iterdir()) == [".slam.json", "registration.png", "result.json"]
 
 
 @pytest.mark.parametrize(

@@ -164,7 +164,7 @@ def test_the_command_writes_summary_poses_and_features(rows: str, rng: np.random
     assert len((out / "poses.txt").read_text().splitlines()) == 9
     assert summary["chi2"] > 0.0
     assert summary["wall_s"] > 0.0
-    assert sorted(p.name for p in out.iterdir()) == ["features.txt", "poses.txt", "summary.json"]
+    assert sorted(p.name for p in out.iterdir()) == [".slam.json", "features.txt", "poses.txt", "summary.json"]
 
 
 def test_files_of_other_editors_are_read(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ class StoredMap:
 
 
 def write(folder: Path, stored: StoredMap) -> None:
-    """Write a map to ``folder``, which is replaced if it is there."""
+    """Write a map to ``folder``; a map that is there is replaced, ValueError if there is anything else."""
     graph = stored.graph
     arrays = _graph_arrays(graph)
     arrays.update(_link_arrays("links", graph.links))
@@ -64,7 +64,7 @@ def write(folder: Path, stored: StoredMap) -> None:
         "closed_at": stored.closed_at,
         "sha256": hashlib.sha256(data).hexdigest(),
     }  # fmt: skip
-    with atomic_path(folder) as temporary:
+    with atomic_path(folder, may_replace=_is_map) as temporary:
         temporary.mkdir()
         (temporary / "arrays.npz").write_bytes(data)
         (temporary / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
@@ -95,6 +95,16 @@ def read(folder: Path) -> StoredMap:
         return StoredMap(graph, pending, contested, compared, marks, int(manifest["closed_at"]))
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(f"{folder}: the map is incomplete: {error}") from error
+
+
+def _is_map(folder: Path) -> bool:
+    """Whether a folder holds a map of any version, and nothing else."""
+    try:
+        content = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    is_ours = isinstance(content, dict) and content.get("format") == FORMAT
+    return is_ours and {p.name for p in folder.iterdir()} <= {"manifest.json", "arrays.npz"}
 
 
 def _manifest(folder: Path) -> dict[str, Any]:

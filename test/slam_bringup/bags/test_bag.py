@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
 
 from slam_bringup.bags.bag import BagReader, BagWriter
 from slam_bringup.bags.bag_types import BagTypes
@@ -12,8 +13,8 @@ from slam_core.messages import header_message, image_message, transform_message
 TYPES = BagTypes()
 
 
-def write(path: Path, storage: str = "mcap", count: int = 30) -> Path:
-    with BagWriter(path, storage) as bag:
+def write(path: Path, storage: str = "mcap", count: int = 30, *, overwrite: bool = False) -> Path:
+    with BagWriter(path, storage, overwrite=overwrite) as bag:
         transform = transform_message(TYPES, 1, "base_link", "camera", np.eye(4))
         bag.write("/tf_static", TYPES.TFMessage(transforms=[transform]), 1)
         for i in range(count):
@@ -55,10 +56,42 @@ def test_a_failure_leaves_nothing_and_keeps_what_was_there(tmp_path: Path) -> No
         assert old.topics["/image"].count == 2
 
 
-def test_an_existing_bag_is_replaced(tmp_path: Path) -> None:
-    write(tmp_path / "bag", count=5)
-    with BagReader(write(tmp_path / "bag", count=3)) as bag:
+@pytest.mark.parametrize(("name", "storage"), [("bag", "mcap"), ("bag", "sqlite3"), ("bag.mcap", "mcap")])
+def test_a_bag_of_ours_is_replaced_when_told_to_and_never_otherwise(tmp_path: Path, name: str, storage: str) -> None:
+    write(tmp_path / name, storage, count=5)
+    with pytest.raises(ValueError, match="exists: choose another name, or say --overwrite"):
+        write(tmp_path / name, storage)
+    with BagReader(write(tmp_path / name, storage, count=3, overwrite=True)) as bag:
         assert bag.topics["/image"].count == 3
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_what_is_not_a_bag_of_ours_is_never_replaced(tmp_path: Path) -> None:
+    with_notes = write(tmp_path / "with_notes", count=1)
+    (with_notes / "notes.txt").write_text("mine")
+    truncated = write(tmp_path / "truncated.mcap")
+    truncated.write_bytes(truncated.read_bytes()[:-9])
+    folder, file = tmp_path / "folder", tmp_path / "file.mcap"
+    folder.mkdir()
+    (folder / "thesis.tex").write_text("mine")
+    file.write_text("mine")
+    with Writer(tmp_path / "recorded", version=9, storage_plugin=StoragePlugin.MCAP):
+        pass
+    for path in (with_notes, truncated, folder, file, tmp_path / "recorded", tmp_path / "recorded" / "recorded.mcap"):
+        before = sorted(p.name for p in path.iterdir()) if path.is_dir() else path.read_bytes()
+        with pytest.raises(ValueError, match="is not a bag that slam wrote"):
+            write(path, overwrite=True)
+        assert before == (sorted(p.name for p in path.iterdir()) if path.is_dir() else path.read_bytes())
+
+
+def test_a_recording_whose_name_was_taken_meanwhile_is_kept_beside(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.mcap") as bag:
+        bag.write("/tf_static", TYPES.TFMessage(transforms=[]), 1)
+        (tmp_path / "a.mcap").write_text("mine")
+    assert bag.path == tmp_path / "a_1.mcap"
+    with BagReader(bag.path) as reader:
+        assert reader.topics["/tf_static"].count == 1
+    assert (tmp_path / "a.mcap").read_text() == "mine"
 
 
 def test_a_truncated_mcap_is_read_in_part_and_says_so(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ Foxglove opens it. Writing is all or nothing, and the same input gives the same 
 
 from __future__ import annotations
 
-import os
 import shutil
 import struct
 import tempfile
@@ -29,10 +28,13 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
 
+from slam_bringup.bags.bag_owner import OWNER, require_free
 from slam_bringup.bags.bag_salvage import is_whole_mcap, salvage_mcap
 from slam_bringup.bags.bag_types import typestore
 from slam_bringup.bags.ros1_bag import Ros1Reader
+from slam_core.files import replace
 from slam_core.messages.base import Message
+from slam_core.output_folder import free_name
 
 LATCHED_TOPICS = ("tf_static", "static_transforms", "robot_description")
 """Last parts of topics that are transient-local wherever they stand."""
@@ -82,18 +84,28 @@ class BagWriter:
     Parameters
     ----------
     path
-        Folder, or a single file if it ends in ``.mcap``. What was there before is replaced.
+        Folder, or a single file if it ends in ``.mcap``. After writing it is where the bag is: beside the name that
+        was asked for, should something have taken that in the meantime.
     storage
         "mcap" or "sqlite3".
+    overwrite
+        Whether a bag of ours that is there is replaced; anything else never is.
+
+    Raises
+    ------
+    ValueError
+        If there is something at ``path`` that must not be replaced.
     """
 
-    def __init__(self, path: Path, storage: str = "mcap") -> None:
+    def __init__(self, path: Path, storage: str = "mcap", *, overwrite: bool = True) -> None:
         if storage not in ("mcap", "sqlite3"):
             raise ValueError(f"bag storage must be mcap or sqlite3, got '{storage}'")
         self.path = Path(path)
         self._single_file = self.path.suffix == ".mcap"
         if self._single_file and storage != "mcap":
             raise ValueError(f"{path} is an mcap file, storage is '{storage}'")
+        require_free(self.path, overwrite=overwrite)
+        self._overwrite = overwrite
         self._storage = StoragePlugin[storage.upper()]
         self._connections: dict[str, Connection] = {}
 
@@ -102,6 +114,7 @@ class BagWriter:
         self._workshop = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", suffix=".part", dir=self.path.parent))
         name = self.path.stem if self._single_file else self.path.name
         self._writer = Writer(self._workshop / name, version=9, storage_plugin=self._storage)
+        self._writer.set_custom_data(*OWNER)
         self._writer.open()
         return self
 
@@ -141,9 +154,11 @@ class BagWriter:
         made = self._writer.path
         if self._single_file:
             made = made / f"{made.name}.mcap"
-        if self.path.is_dir() and not self.path.is_symlink():
-            shutil.rmtree(self.path)
-        os.replace(made, self.path)
+        try:
+            require_free(self.path, overwrite=self._overwrite)
+        except ValueError:
+            self.path = free_name(self.path)
+        replace(made, self.path)
 
 
 class BagReader:

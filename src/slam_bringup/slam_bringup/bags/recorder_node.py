@@ -35,6 +35,7 @@ class RecorderConfig(Config):
     bag: str = parameter("", "bag to write: folder or .mcap")
     topics: tuple[str, ...] = parameter((), "topics to record; empty: all but parameter events, rosout and progress")
     storage: str = parameter("mcap", "storage of the bag", choices=("mcap", "sqlite3"))
+    overwrite: bool = parameter(False, "replace a bag that was recorded before")
     header_stamps: bool = parameter(False, "store header stamps as the time of messages instead of the time of arrival")
 
 
@@ -47,17 +48,21 @@ class RecorderNode(Node):
         if not self.config.bag:
             raise ValueError("parameter 'bag' must name the bag to write")
         try:
-            self._writer = BagWriter(Path(self.config.bag), self.config.storage).__enter__()
+            self._writer = self._open()
         except OSError as error:
             raise ValueError(f"cannot write {self.config.bag}: {error}") from error
         self._known: set[str] = set()
         self._count = 0
         self.create_timer(_DISCOVERY_PERIOD_S, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
+    def _open(self) -> BagWriter:
+        path = Path(self.config.bag).expanduser()
+        return BagWriter(path, self.config.storage, overwrite=self.config.overwrite).__enter__()
+
     def on_shutdown(self) -> None:
         """Complete the bag."""
         self._writer.__exit__(None, None, None)
-        print(f"recorded {self._count} messages to {self.config.bag}", flush=True)
+        print(f"recorded {self._count} messages to {self._writer.path}", flush=True)
 
     def _discover(self) -> None:
         for topic, type_names in self.get_topic_names_and_types():

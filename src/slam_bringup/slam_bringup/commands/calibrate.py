@@ -12,6 +12,7 @@ import yaml
 from rich.console import Console
 from rich.progress import Progress
 
+from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.report.figures import save_png
 from slam_calibration.board import Board, parse_board
 from slam_calibration.bundle import BundleResult
@@ -31,6 +32,7 @@ from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.files import atomic_text
 from slam_core.geometry import both_halves, make_transform, quaternion_from_rotation
+from slam_core.output_folder import OutputFolder
 
 CAMERAS = {"mono": ("camera",), "stereo": ("left", "right"), "stereo-tof": ("left", "tof")}
 FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_frame", "tof": "tof_optical_frame"}
@@ -49,12 +51,14 @@ FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_fr
     help=f"lens model, or one per camera with a comma between: {', '.join(DISTORTION_PARAMETERS)}",
 )  # fmt: skip
 @click.option(
-    "--left-info", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    "--left-info", type=UserPath(exists=True, dir_okay=False),
     help="stereo-tof: left.yaml of the stereo calibration, so that the extrinsics are those of its rectified frame",
 )  # fmt: skip
-@click.option("-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path), help="folder to write")
+@click.option("-o", "--output", required=True, type=UserPath(file_okay=False), help="folder to write")
+@overwrite_option("results of other images, or results that were changed since")
 def command(
-    kind: str, images: tuple[str, ...], board_text: str, model: str, left_info: Path | None, output: Path
+    kind: str, images: tuple[str, ...], board_text: str, model: str, left_info: Path | None, output: Path,
+    overwrite: bool,
 ) -> None:  # fmt: skip
     """Calibrate one camera (mono), a stereo pair, or a stereo camera's left eye with a ToF camera (stereo-tof).
 
@@ -63,10 +67,14 @@ def command(
     """
     names, board = CAMERAS[kind], parse_board(board_text)
     lenses = _lenses(model, len(names))
-    views = _find(board, pair_pictures(images, len(names)))
-    result = calibrate(board.points, views.corners, views.sizes, lenses)
-    rectified_left = read_camera_info(left_info).info if left_info is not None else None
-    _write(output, kind, result, board, views, _infos(kind, result, rectified_left))
+    results = OutputFolder(output, "calibrate", f"{kind} {' '.join(images)}", overwrite=overwrite)
+    files = pair_pictures([str(Path(image).expanduser()) for image in images], len(names))
+    with results:
+        views = _find(board, files)
+        result = calibrate(board.points, views.corners, views.sizes, lenses)
+        rectified_left = read_camera_info(left_info).info if left_info is not None else None
+        with results.staged() as folder:
+            _write(folder, kind, result, board, views, _infos(kind, result, rectified_left))
     click.echo(tables(result, names))
     click.echo(f"written to {output}")
 
@@ -91,7 +99,6 @@ def _write(
     output: Path, kind: str, result: BundleResult, board: Board, views: BoardViews, infos: Sequence[CameraInfo]
 ) -> None:  # fmt: skip
     names = CAMERAS[kind]
-    output.mkdir(parents=True, exist_ok=True)
     for c, (name, info) in enumerate(zip(names, infos, strict=True)):
         CameraInfoFile(info, name, camera_deviations(result, c)).write(output / f"{name}.yaml")
     if len(names) > 1:

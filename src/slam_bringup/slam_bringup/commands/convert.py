@@ -9,7 +9,9 @@ import click
 from rich.progress import track
 
 from slam_bringup.bags.bag import BagWriter
+from slam_bringup.bags.bag_owner import require_free
 from slam_bringup.bags.sensor_writer import SensorWriter
+from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.datasets.euroc import EurocDataset
 from slam_bringup.datasets.files import Dataset
 from slam_bringup.datasets.kitti import KittiDataset
@@ -22,9 +24,9 @@ DATASETS: dict[str, Callable[[Path, Path | None, Path | None], Dataset]] = {
 }
 
 
-def convert(dataset: Dataset, target: Path, storage: str = "mcap") -> int:
+def convert(dataset: Dataset, target: Path, storage: str = "mcap", *, overwrite: bool = False) -> int:
     """Write a data set to a bag; returns the number of frames."""
-    with BagWriter(target, storage) as bag:
+    with BagWriter(target, storage, overwrite=overwrite) as bag:
         frames = dataset.write(SensorWriter(bag))
         for _ in track(frames, description=f"writing {target.name}", total=len(dataset), transient=True):
             pass
@@ -33,21 +35,24 @@ def convert(dataset: Dataset, target: Path, storage: str = "mcap") -> int:
 
 @click.command()
 @click.argument("kind", type=click.Choice(sorted(DATASETS)))
-@click.argument("source", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="the bag to write")
-@click.option("--calibration", type=click.Path(path_type=Path), help="calibration, where the source has none")
-@click.option("--ground-truth", type=click.Path(path_type=Path), help="poses, where the source has none")
+@click.argument("source", type=UserPath())
+@click.option("-o", "--output", type=UserPath(), required=True, help="the bag to write")
+@click.option("--calibration", type=UserPath(), help="calibration, where the source has none")
+@click.option("--ground-truth", type=UserPath(), help="poses, where the source has none")
 @click.option("--storage", type=click.Choice(["mcap", "sqlite3"]), default="mcap", show_default=True)
+@overwrite_option("a bag that slam wrote")
 def command(
-    kind: str, source: Path, output: Path, calibration: Path | None, ground_truth: Path | None, storage: str
-) -> None:
+    kind: str, source: Path, output: Path, calibration: Path | None, ground_truth: Path | None, storage: str,
+    overwrite: bool,
+) -> None:  # fmt: skip
     """Convert a public data set to a bag, and say what of it is left out.
 
     KIND is euroc (folders with mav0, or key frames), kitti (odometry) or rgbd (7-Scenes, TUM RGB-D, plain folders of
     pictures and depth). Logs without images, such as MRCLAM's, have no place in a bag of images.
     """
+    require_free(output, overwrite=overwrite)
     dataset = DATASETS[kind](source, calibration, ground_truth)
-    frames = convert(dataset, output, storage)
+    frames = convert(dataset, output, storage, overwrite=overwrite)
     click.echo(f"{output}: {frames} frames")
     for reason, count in dataset.left_out.items():
         if count:

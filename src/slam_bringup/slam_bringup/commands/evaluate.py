@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -11,14 +10,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.evaluation import ALIGNMENTS, ErrorStatistics, Evaluation, TruthAccuracy, evaluate
-from slam_core.files import atomic_text
+from slam_core.output_file import OutputFile
 from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajectory
 
 
 @click.command()
-@click.argument("estimate", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.argument("ground_truth", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("estimate", type=UserPath(exists=True, dir_okay=False))
+@click.argument("ground_truth", type=UserPath(exists=True, dir_okay=False))
 @click.option(
     "--align", "alignment", type=click.Choice(ALIGNMENTS), default="se3", show_default=True, help="frame alignment"
 )
@@ -29,19 +29,22 @@ from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajector
 @click.option("--interpolate", is_flag=True, help="interpolate ground truth between its poses")
 @click.option(
     "--covariance",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=UserPath(exists=True, dir_okay=False),
     help="covariances of the estimate; found by itself beside a trajectory.tum",
 )
 @click.option(
     "--truth-sigma", nargs=2, type=click.FloatRange(0.0), default=(0.0, 0.0), show_default=True, metavar="M DEG",
     help="standard deviations of ground truth, position [m] and orientation [deg] per axis, for the NEES",
 )  # fmt: skip
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="write the figures as JSON")
+@click.option("-o", "--output", type=UserPath(dir_okay=False), help="write the figures as JSON")
+@overwrite_option("figures of other trajectories")
 def command(
     estimate: Path, ground_truth: Path, alignment: str, delta: int, max_difference: float, interpolate: bool,
-    covariance: Path | None, truth_sigma: tuple[float, float], output: Path | None,
+    covariance: Path | None, truth_sigma: tuple[float, float], output: Path | None, overwrite: bool,
 ) -> None:  # fmt: skip
     """ATE, RPE and NEES of the trajectory ESTIMATE against GROUND_TRUTH (TUM, KITTI or EuRoC files)."""
+    trajectories = f"{estimate.resolve()} {ground_truth.resolve()}"
+    file = OutputFile(output, "evaluate", trajectories, overwrite=overwrite) if output is not None else None
     result = evaluate(
         _with_covariances(
             read_trajectory(estimate), covariance or estimate.with_name(f"{estimate.stem}_covariance.csv")
@@ -54,8 +57,8 @@ def command(
         accuracy=TruthAccuracy(truth_sigma[0], float(np.radians(truth_sigma[1]))),
     )
     Console().print(evaluation_table(result))
-    if output is not None:
-        atomic_text(output, json.dumps(asdict(result), indent=2) + "\n")
+    if file is not None:
+        file.write(asdict(result))
 
 
 def _with_covariances(trajectory: Trajectory, path: Path) -> Trajectory:

@@ -13,32 +13,41 @@ from rich.progress import Progress
 from sjsam_node.linear_slam_text import find_maps, read_maps, write_values
 from sjsam_node.robust import LOSSES
 from sjsam_node.text_joining import ROWS, TextJoiningConfig, TextJoiningResult, join_text_maps
+from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.config import from_mapping
+from slam_core.files import atomic_text
+from slam_core.output_folder import OutputFolder
 
 
 @click.command("join")
-@click.argument("folder", metavar="DIR", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option("-o", "--output", metavar="OUT", required=True, type=click.Path(file_okay=False, path_type=Path))
+@click.argument("folder", metavar="DIR", type=UserPath(exists=True, file_okay=False))
+@click.option("-o", "--output", metavar="OUT", required=True, type=UserPath(file_okay=False))
 @click.option("--rows", type=click.Choice(ROWS), default=TextJoiningConfig().rows, show_default=True,
               help="joint: each submap's full information; block: each landmark alone (Algorithm 4)")  # fmt: skip
 @click.option(
     "--robust", type=click.Choice(LOSSES), help="loss of what closes a loop: what the rest contradicts is left out"
 )
-@click.option("--config", "config_file", metavar="FILE", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+@click.option("--config", "config_file", metavar="FILE", type=UserPath(exists=True, dir_okay=False),
               help="YAML with parameters of the joining")  # fmt: skip
-def command(folder: Path, output: Path, rows: str, robust: str | None, config_file: Path | None) -> None:
+@overwrite_option("results of other submaps, or results that were changed since")
+def command(
+    folder: Path, output: Path, rows: str, robust: str | None, config_file: Path | None, overwrite: bool
+) -> None:
     """Join the submaps localmap_<k>.txt in DIR; writes summary.json, poses.txt and features.txt to OUT."""
     values = {**_yaml(config_file), "rows": rows}
     config = from_mapping(TextJoiningConfig, values if robust is None else {**values, "robust.loss": robust})
+    results = OutputFolder(output, "join", folder, overwrite=overwrite)
     began = time.perf_counter()
     maps, dimension = read_maps(find_maps(folder))
-    with Progress(transient=True) as bar:
-        task = bar.add_task("joining", total=len(maps))
-        result = join_text_maps(
-            maps, dimension, config, lambda done, total: bar.update(task, completed=done, total=total)
-        )
-    summary = _summary(result, len(maps), dimension, rows, time.perf_counter() - began)
-    _write(output, result, summary)
+    with results:
+        with Progress(transient=True) as bar:
+            task = bar.add_task("joining", total=len(maps))
+            result = join_text_maps(
+                maps, dimension, config, lambda done, total: bar.update(task, completed=done, total=total)
+            )
+        summary = _summary(result, len(maps), dimension, rows, time.perf_counter() - began)
+        with results.staged() as staged:
+            _write(staged, result, summary)
     click.echo(json.dumps(summary))
     if not result.converged:
         click.echo(f"slam: not converged after {result.iterations} iterations: chi2 may not be the lowest", err=True)
@@ -65,9 +74,6 @@ def _summary(result: TextJoiningResult, submaps: int, dimension: int, rows: str,
 
 
 def _write(output: Path, result: TextJoiningResult, summary: dict[str, Any]) -> None:
-    output.mkdir(parents=True, exist_ok=True)
     write_values(output / "poses.txt", result.pose_ids.tolist(), result.poses)
     write_values(output / "features.txt", result.feature_ids.tolist(), result.features)
-    temporary = output / "summary.json.part"
-    temporary.write_text(json.dumps(summary, indent=2) + "\n")
-    temporary.replace(output / "summary.json")
+    atomic_text(output / "summary.json", json.dumps(summary, indent=2) + "\n")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from functools import reduce
-from pathlib import Path
 from typing import Any
 
 import click
@@ -14,14 +12,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import ROLES
+from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.pipeline.configuration import MAPPERS, MODES, ODOMETRIES
 from slam_bringup.pipeline.results import RunResult
 
 # fmt: off
 _OPTIONS = (
-    click.argument("bag", type=click.Path(exists=True, path_type=Path)),
+    click.argument("bag", type=UserPath(exists=True)),
     click.option(
-        "-o", "--output", type=click.Path(file_okay=False, path_type=Path), required=True, help="folder to write"
+        "-o", "--output", type=UserPath(file_okay=False), required=True, help="folder to write"
     ),
     click.option("--mode", type=click.Choice(MODES), help="where depth comes from [stereo; tof without stereo]"),
     click.option(
@@ -29,7 +28,7 @@ _OPTIONS = (
     ),
     click.option("--odometry", type=click.Choice(ODOMETRIES), default="none", show_default=True, help="of ToF scans"),
     click.option(
-        "--config", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        "--config", type=UserPath(exists=True, dir_okay=False),
         help="YAML, one group per node, as in docs/parameters.md",
     ),
     click.option(
@@ -40,6 +39,7 @@ _OPTIONS = (
         "--base-frame", default="", metavar="FRAME",
         help="the frame whose poses are wanted [base_link; else the root above the camera]",
     ),
+    overwrite_option("results of another bag or command, or results that were changed since"),
 )
 # fmt: on
 
@@ -52,13 +52,6 @@ def mapping_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def mode_for(bag: SensorBag, mode: str | None) -> str:
     """The mode asked for, or the one that the bag's sensors suggest."""
     return mode or ("stereo" if bag.count(bag.agents[0], "left") else "tof")
-
-
-def require_writable(path: Path) -> None:
-    """Refuse a folder that could not be made or written when the run has ended; nothing is made here."""
-    existing = next(p for p in (path.resolve(), *path.resolve().parents) if p.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        raise ValueError(f"cannot write to {path}: {existing} is not a folder that you may write to")
 
 
 def require_map(result: RunResult) -> None:

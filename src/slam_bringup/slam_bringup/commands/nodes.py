@@ -15,7 +15,6 @@ from slam_bringup.commands.mapping_options import (
     mode_for,
     progress_bar,
     require_map,
-    require_writable,
 )
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.processes.interrupt import INTERRUPTED, Interrupt
@@ -23,6 +22,7 @@ from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.recorded_run import collect
 from slam_bringup.report.output import write_results
 from slam_bringup.report.summary_table import summary_table
+from slam_core.output_folder import OutputFolder
 
 
 @click.command()
@@ -30,7 +30,7 @@ from slam_bringup.report.summary_table import summary_table
 @click.option("--rate", type=click.FloatRange(min=0.0), default=0.0, help="speed of the replay [as fast as it goes]")
 def command(
     bag: Path, output: Path, rate: float, mode: str | None, mapper: str, odometry: str, config: Path | None,
-    topics: tuple[str, ...], base_frame: str,
+    topics: tuple[str, ...], base_frame: str, overwrite: bool,
 ) -> None:  # fmt: skip
     """Map BAG with the nodes of the workspace: starts them, plays the bag, and writes what ``slam run`` does."""
     names = BagNames(parse_topics(topics), base_frame)
@@ -38,15 +38,16 @@ def command(
         mode = mode_for(opened, mode)
         frames = sum(opened.count(agent, "depth" if mode == "tof" else "left") for agent in opened.agents)
     system = choose(load_system_config(config), mode, mapper, odometry)
-    require_writable(output)
-    with Interrupt() as interrupt, progress_bar() as progress:
-        task = progress.add_task(f"nodes mapping {bag.name}", total=frames)
-        run = run_nodes(
-            bag, system, output, odometry=odometry != "none", rate=rate, names=names,
-            on_progress=lambda done: progress.update(task, completed=done), stopped=lambda: interrupt.asked,
-        )  # fmt: skip
-    result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)
-    require_map(result)
-    Console().print(summary_table(write_results(output, result), output))
+    with OutputFolder(output, "nodes", bag, overwrite=overwrite) as results, results.staged() as folder:
+        with Interrupt() as interrupt, progress_bar() as progress:
+            task = progress.add_task(f"nodes mapping {bag.name}", total=frames)
+            run = run_nodes(
+                bag, system, folder, logs=results.logs, odometry=odometry != "none", rate=rate, names=names,
+                on_progress=lambda done: progress.update(task, completed=done), stopped=lambda: interrupt.asked,
+            )  # fmt: skip
+        result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)
+        require_map(result)
+        summary = write_results(folder, result)
+    Console().print(summary_table(summary, output))
     if run.stopped:
         sys.exit(INTERRUPTED)

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
+from slam_bringup.commands.paths import UserPath
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import become_node
 
 
 @click.command()
-@click.argument("bag", type=click.Path(path_type=Path))
+@click.argument("bag", type=UserPath())
 @click.option("--rate", type=click.FloatRange(min=0.0), default=1.0, show_default=True, help="0: as fast as possible")
 @click.option("--loop", is_flag=True, help="start again at the end")
 @click.option("--clock", is_flag=True, help="publish /clock")

@@ -6,15 +6,19 @@ from pathlib import Path
 
 import click
 
+from slam_bringup.bags.bag_owner import require_free
+from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import become_node
 
 
 @click.command()
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="the bag to write")
+@click.option("-o", "--output", type=UserPath(), required=True, help="the bag to write")
 @click.option("--storage", type=click.Choice(["mcap", "sqlite3"]), default="mcap", show_default=True)
+@overwrite_option("a bag that slam recorded or wrote")
 @click.argument("topics", nargs=-1)
-def command(output: Path, storage: str, topics: tuple[str, ...]) -> None:
+def command(output: Path, storage: str, overwrite: bool, topics: tuple[str, ...]) -> None:
     """Record TOPICS (all by default) until Ctrl-C."""
-    parameters = {"bag": str(output), "storage": storage, "topics": topics}
+    require_free(output, overwrite=overwrite)
+    parameters = {"bag": str(output), "storage": storage, "topics": topics, "overwrite": overwrite}
     become_node("slam_bringup", "recorder", ros_arguments(parameters))

@@ -13,9 +13,11 @@ import yaml
 from ndt_registration.cloud import finite_points
 from ndt_registration.cloud_io import read_cloud
 from ndt_registration.registration import RegistrationConfig, RegistrationResult, register
+from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.config import from_mapping
-from slam_core.files import atomic_path
+from slam_core.files import atomic_text
 from slam_core.geometry import FloatArray, make_transform, rotation_from_euler, transform_from_pose7, transform_points
+from slam_core.output_folder import OutputFolder
 
 PICTURE_POINTS = 8000
 UNIT_RATIO = 20.0
@@ -23,35 +25,43 @@ UNIT_RATIO = 20.0
 
 
 @click.command()
-@click.argument("source", type=click.Path(path_type=Path))
-@click.argument("target", type=click.Path(path_type=Path))
+@click.argument("source", type=UserPath())
+@click.argument("target", type=UserPath())
 @click.option("--method", type=click.Choice(["ndt", "icp", "icp_plane"]), default="ndt", show_default=True)
 @click.option(
     "--initial-guess",
     help="T_target_source: x y z, x y z yaw pitch roll (m, deg), x y z qx qy qz qw, 16 numbers, or a file of them",
 )
-@click.option("--config", "config_file", type=click.Path(path_type=Path), help="YAML with RegistrationConfig values")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="folder for result.json and registration.png")
+@click.option("--config", "config_file", type=UserPath(), help="YAML with RegistrationConfig values")
+@click.option("-o", "--output", type=UserPath(), help="folder for result.json and registration.png")
+@overwrite_option("results of other clouds, or results that were changed since")
 def command(
-    source: Path, target: Path, method: str, initial_guess: str | None, config_file: Path | None, output: Path | None
-) -> None:
+    source: Path, target: Path, method: str, initial_guess: str | None, config_file: Path | None, output: Path | None,
+    overwrite: bool,
+) -> None:  # fmt: skip
     """Align SOURCE to TARGET (pcd, ply, vtk)."""
     values = yaml.safe_load(config_file.read_text(encoding="utf-8")) or {} if config_file else {}
     config = from_mapping(RegistrationConfig, {**values, "method": method})
     source_points, target_points = (_read(path) for path in (source, target))
     guess = parse_guess(initial_guess) if initial_guess else None
+    folder = _output_folder(output, source, target, overwrite)
     result = register(source_points, target_points, guess, config)
     text = json.dumps(result_as_json(result), indent=2)
     click.echo(text)
     if not result.converged:
         advice = next_step(source_points, target_points, config, guessed=guess is not None)
         click.echo(f"slam register: not registered: {result.reason}. {advice}", err=True)
-    if output is not None:
-        output.mkdir(parents=True, exist_ok=True)
-        with atomic_path(output / "result.json") as temporary:
-            temporary.write_text(text + "\n", encoding="utf-8")
-        with atomic_path(output / "registration.png") as temporary:
-            draw_before_after(temporary, source_points, target_points, result)
+    if folder is not None:
+        with folder, folder.staged() as staged:
+            atomic_text(staged / "result.json", text + "\n")
+            draw_before_after(staged / "registration.png", source_points, target_points, result)
+
+
+def _output_folder(output: Path | None, source: Path, target: Path, overwrite: bool) -> OutputFolder | None:
+    if output is None:
+        return None
+    clouds = f"{source.resolve()} {target.resolve()}"
+    return OutputFolder(output, "register", clouds, overwrite=overwrite, last="result.json")
 
 
 def _read(path: Path) -> FloatArray:

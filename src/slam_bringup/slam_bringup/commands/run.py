@@ -16,7 +16,6 @@ from slam_bringup.commands.mapping_options import (
     mode_for,
     progress_bar,
     require_map,
-    require_writable,
 )
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
@@ -24,6 +23,7 @@ from slam_bringup.processes.interrupt import INTERRUPTED, STOPPED, Interrupt
 from slam_bringup.report.output import write_results
 from slam_bringup.report.result_bag import write_result_bag
 from slam_bringup.report.summary_table import summary_table
+from slam_core.output_folder import OutputFolder
 
 FAILED = 1
 """Exit code of a run that an error has ended; its results are written."""
@@ -33,7 +33,7 @@ FAILED = 1
 @mapping_options
 def command(
     bag: Path, output: Path, mode: str | None, mapper: str, odometry: str, config: Path | None,
-    topics: tuple[str, ...], base_frame: str,
+    topics: tuple[str, ...], base_frame: str, overwrite: bool,
 ) -> None:  # fmt: skip
     """Map BAG without ROS: same classes as the nodes, no drops, the same bytes every time.
 
@@ -45,18 +45,19 @@ def command(
         readings = sum(opened.count(agent, role) for agent in opened.agents for role in ("left", "depth", "imu"))
         mode = mode_for(opened, mode)
     system = choose(load_system_config(config), mode, mapper, odometry)
-    require_writable(output)
-    with Interrupt() as interrupt, progress_bar() as progress:
-        task = progress.add_task(f"mapping {bag.name}", total=readings)
-        result, mapping = run_bag(
-            bag, system, mapper=mapper, odometry=odometry, names=names,
-            on_reading=lambda: progress.advance(task), stopped=lambda: interrupt.asked,
-        )  # fmt: skip
-    require_map(result)
-    if interrupt.asked:
-        result = replace(result, events=(STOPPED, *result.events))
-    write_result_bag(output / "result.mcap", result)
-    summary = write_results(output, result, mapping.global_map.save)
+    with OutputFolder(output, "run", bag, overwrite=overwrite) as results:
+        with Interrupt() as interrupt, progress_bar() as progress:
+            task = progress.add_task(f"mapping {bag.name}", total=readings)
+            result, mapping = run_bag(
+                bag, system, mapper=mapper, odometry=odometry, names=names,
+                on_reading=lambda: progress.advance(task), stopped=lambda: interrupt.asked,
+            )  # fmt: skip
+        require_map(result)
+        if interrupt.asked:
+            result = replace(result, events=(STOPPED, *result.events))
+        with results.staged() as folder:
+            write_result_bag(folder / "result.mcap", result)
+            summary = write_results(folder, result, mapping.global_map.save)
     Console().print(summary_table(summary, output))
     if result.failure:
         click.echo(f"slam: {result.failure}; {output} holds what was mapped until then", err=True)

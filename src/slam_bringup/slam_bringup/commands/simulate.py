@@ -17,6 +17,7 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from slam_bringup.bags.bag import BagWriter
+from slam_bringup.bags.bag_owner import require_free
 from slam_bringup.bags.sensor_writer import (
     BASE_FRAME,
     IMU_FRAME,
@@ -26,6 +27,7 @@ from slam_bringup.bags.sensor_writer import (
     WORLD_FRAME,
     SensorWriter,
 )
+from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.camera import CameraInfo
 from slam_core.geometry import FloatArray
 from slam_core.messages import compressed_image_message, header_message, transform_message
@@ -45,6 +47,7 @@ class BagOptions:
     images: "raw" Image messages, or CompressedImage "png" (lossless) or "jpeg" (quality 90). compact: ToF images in
     16 bits (mm and counts, no intensity): their rounding is a tenth of the sensor's noise. truth: add the true depth of
     the left image on ``ground_truth/depth``. rectified: stereo images without distortion, as ``image_rect``.
+    overwrite: replace a bag of ours.
     """
 
     images: str = "raw"
@@ -53,13 +56,12 @@ class BagOptions:
     rectified: bool = False
     storage: str = "mcap"
     every: int = 1
+    overwrite: bool = False
 
 
 @click.command()
 @click.argument("scenario")
-@click.option(
-    "-o", "--output", required=True, type=click.Path(path_type=Path), help="the bag to write (folder or .mcap)"
-)
+@click.option("-o", "--output", required=True, type=UserPath(), help="the bag to write (folder or .mcap)")
 @click.option("--every", type=click.IntRange(1), default=1, show_default=True, help="take only every n-th frame")
 @click.option("--frames", type=click.IntRange(1), help="render only the first frames")
 @click.option("--seed", type=click.IntRange(0), help="another seed than the scenario's: same plan, other building")
@@ -71,17 +73,19 @@ class BagOptions:
 @click.option(
     "--threads", type=click.IntRange(1), help="threads that draw (all processors); the bag does not depend on it"
 )
+@overwrite_option("a bag that slam wrote")
 def command(
     scenario: str, output: Path, every: int, frames: int | None, seed: int | None, storage: str, images: str, compact:
-    bool, rectified: bool, truth: bool, threads: int | None,
+    bool, rectified: bool, truth: bool, threads: int | None, overwrite: bool,
 ) -> None:  # fmt: skip
     """Render SCENARIO (a YAML file, or a name of bags/scenarios) to a bag with ground truth."""
+    require_free(output, overwrite=overwrite)
     plan = Scenario.load(scenario)
     if seed is not None:
         plan = replace(plan, seed=seed)
     if frames is not None:
         plan = plan.shortened(frames)
-    options = BagOptions(images, compact, truth, rectified, storage, every)
+    options = BagOptions(images, compact, truth, rectified, storage, every, overwrite)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -108,7 +112,7 @@ def write_bag(
         Simulator(scenario, k, world, threads, truth=options.truth, rectified=options.rectified)
         for k in range(len(scenario.agents))
     ]
-    with BagWriter(output, options.storage) as bag:
+    with BagWriter(output, options.storage, overwrite=options.overwrite) as bag:
         writers = {s.scenario.agents[s.agent].name: SimulationWriter(bag, s, options) for s in agents}
         for writer in writers.values():
             writer.mountings(min(s.stamp_ns(0) for s in agents))

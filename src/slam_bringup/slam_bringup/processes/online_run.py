@@ -6,7 +6,6 @@ private domain -> nodes ready and connected -> recorder -> player -> input has e
 from __future__ import annotations
 
 import importlib
-import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -51,6 +50,7 @@ def run_nodes(
     config: SystemConfig,
     out: Path,
     *,
+    logs: Path | None = None,
     odometry: bool,
     rate: float = 0.0,
     names: BagNames | None = None,
@@ -66,7 +66,9 @@ def run_nodes(
     config
         Already adapted to mode, mapper and odometry by :func:`slam_bringup.pipeline.configuration.choose`.
     out
-        Folder for the recording ``result.mcap``, the map and the nodes' logs.
+        New folder for the recording ``result.mcap`` and the map.
+    logs
+        Folder for the nodes' logs; by default ``logs`` in ``out``.
     odometry
         Whether scan odometry runs as well.
     rate
@@ -85,11 +87,9 @@ def run_nodes(
     """
     with SensorBag(bag, names) as opened:
         graph = plan_nodes(config, opened.sensors, odometry, str(out / "map"))
-    out.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(out / "map", ignore_errors=True)
     with PrivateDomain() as domain:
         environment = node_environment(domain, fastdds_profile())
-        with NodeGroup(environment, out / "logs") as group, _supervisor(environment, group) as supervisor:
+        with NodeGroup(environment, logs or out / "logs") as group, _supervisor(environment, group) as supervisor:
             run = _Choreography(group, supervisor, graph, out, stopped)
             run.start_nodes()
             started = time.monotonic()

@@ -1,0 +1,67 @@
+"""Files are whole or absent, and no folder is removed that is not known to be ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from slam_core.files import atomic_path, atomic_text
+from slam_core.output_file import OutputFile
+
+
+def make_folder(path: Path, name: str = "a") -> None:
+    path.mkdir()
+    (path / name).write_text(name)
+
+
+def test_a_failure_keeps_what_was_there(tmp_path: Path) -> None:
+    atomic_text(tmp_path / "a", "old")
+
+    def fail() -> None:
+        with atomic_path(tmp_path / "a") as temporary:
+            temporary.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+    assert (tmp_path / "a").read_text() == "old"
+
+
+def test_a_file_never_takes_the_place_of_a_folder(tmp_path: Path) -> None:
+    make_folder(tmp_path / "mine")
+    (tmp_path / "empty").mkdir()
+    for name in ("mine", "empty"):
+        with pytest.raises(ValueError, match="folder"):
+            atomic_text(tmp_path / name, "text")
+    assert (tmp_path / "mine" / "a").read_text() == "a"
+
+
+def test_a_folder_replaces_only_what_is_said_to_be_ours(tmp_path: Path) -> None:
+    make_folder(tmp_path / "mine")
+
+    def write(path: Path, ours: bool) -> None:
+        with atomic_path(path, may_replace=lambda _: ours) as temporary:
+            make_folder(temporary, "b")
+
+    with pytest.raises(ValueError, match="would be lost"):
+        write(tmp_path / "mine", ours=False)
+    assert (tmp_path / "mine" / "a").exists()
+    write(tmp_path / "mine", ours=True)
+    assert [p.name for p in (tmp_path / "mine").iterdir()] == ["b"]
+    assert [p.name for p in tmp_path.iterdir()] == ["mine"]
+
+
+def test_a_results_file_replaces_its_own_kind_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    OutputFile(path, "evaluate", "x").write({"ate": 1.0})
+    OutputFile(path, "evaluate", "x").write({"ate": 2.0})
+    with pytest.raises(ValueError, match=r"holds the results of 'slam evaluate x'.*--overwrite"):
+        OutputFile(path, "evaluate", "y")
+    OutputFile(path, "evaluate", "y", overwrite=True).write({})
+    for foreign in ("{}", "mine", "[]", '{"written_by": {"program": "other"}}'):
+        path.write_text(foreign)
+        with pytest.raises(ValueError, match="not written by slam"):
+            OutputFile(path, "evaluate", "y", overwrite=True)
+        assert path.read_text() == foreign
