@@ -14,8 +14,8 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 from datasets import euroc_pairs, kitti_pairs
-from truth import TrueFrame, simulated_frames, spread, transfer
 
+from slam_bringup.experiments.true_frames import TrueFrame, simulated_frames, spread, transfer
 from slam_core.types import StereoImages
 from stereo_frontend.features import DETECTORS, FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints

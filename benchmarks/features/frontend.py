@@ -16,8 +16,8 @@ from typing import TypeVar
 import cv2
 import numpy as np
 from datasets import euroc_pairs, kitti_pairs
-from truth import simulated_frames
 
+from slam_bringup.experiments.true_frames import simulated_frames
 from slam_core.types import StereoImages
 from stereo_frontend.disparity import refine_disparity
 from stereo_frontend.features import FeatureExtractor

@@ -12,8 +12,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from truth import TrueFrame, simulated_frames, spread, transfer, true_depth
 
+from slam_bringup.experiments.true_frames import TrueFrame, simulated_frames, spread, transfer, true_depth
 from slam_core.geometry import FloatArray
 from slam_core.types import Features, FeatureSource
 from stereo_frontend.depth_fusion import map_depth

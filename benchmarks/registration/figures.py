@@ -20,10 +20,10 @@ from grid import ROOM
 from matplotlib.figure import Figure
 from odometry import ours, scans_of_bag
 from plain_icp import plain_icp
-from scans import SCANS, THESIS_MOTIONS, TofRoom, rig_motion, rig_pose, thinned
 
 from ndt_registration.odometry import OdometryConfig
 from ndt_registration.registration import RegistrationConfig, register
+from slam_bringup.experiments.tof_scans import SCANS, THESIS_MOTIONS, TofRoom, rig_motion, rig_pose, thinned
 from slam_core.geometry import FloatArray, boxminus
 
 SHARE = 0.2

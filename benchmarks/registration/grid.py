@@ -9,9 +9,17 @@ import time
 from pathlib import Path
 
 import numpy as np
-from scans import HARDER_MOTIONS, SCANS, THESIS_MOTIONS, TofRoom, rig_motion, rig_pose, thinned
 
 from ndt_registration.registration import RegistrationConfig, register
+from slam_bringup.experiments.tof_scans import (
+    HARDER_MOTIONS,
+    SCANS,
+    THESIS_MOTIONS,
+    TofRoom,
+    rig_motion,
+    rig_pose,
+    thinned,
+)
 from slam_core.geometry import boxminus
 
 ROOM = Path(__file__).parent / "room.yaml"

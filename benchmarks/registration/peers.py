@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 from grid import ROOM
-from scans import SCANS, THESIS_MOTIONS, TofRoom, rig_motion, rig_pose, thinned
 
 from ndt_registration.registration import register
+from slam_bringup.experiments.tof_scans import SCANS, THESIS_MOTIONS, TofRoom, rig_motion, rig_pose, thinned
 from slam_core.geometry import FloatArray, boxminus
 
 HERE = Path(__file__).parent

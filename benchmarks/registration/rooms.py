@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from scans import TofRoom, rig_pose
 
+from slam_bringup.experiments.tof_scans import TofRoom, rig_pose
 from slam_core.geometry import FloatArray
 from slam_simulation.building import STYLES
 from slam_simulation.scenario import Scenario

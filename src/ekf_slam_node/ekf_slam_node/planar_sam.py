@@ -52,6 +52,11 @@ def smooth(graph: PlanarGraph, first_pose: FloatArray, config: PlanarConfig) -> 
     return levenberg_marquardt(_Problem(graph, config), initial_map(graph, first_pose))
 
 
+def cost(graph: PlanarGraph, state: PlanarMap, config: PlanarConfig) -> float:
+    """Sum of the squared whitened residuals of a map; what :func:`smooth` minimises."""
+    return _Problem(graph, config).cost(state)
+
+
 class _Problem:
     """Whitened residuals, motions first, and their Jacobian without the first pose."""
 

@@ -23,6 +23,7 @@ COMMANDS = {
     "register": "align two point clouds (pcd, ply, vtk)",
     "join": "join text submaps of the Linear SLAM format",
     "evaluate": "ATE, RPE and NEES of a trajectory against ground truth",
+    "experiment": "the experiments of the thesis, beside its own figures",
     "calibrate": "camera_info with uncertainties from pictures of a board",
 }
 

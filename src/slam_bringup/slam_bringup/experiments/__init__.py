@@ -1,0 +1,1 @@
+"""The thesis's experiments, each run by ``slam experiment NAME`` and shown beside the thesis's own figures."""

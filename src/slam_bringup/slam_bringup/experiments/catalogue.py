@@ -1,0 +1,35 @@
+"""All experiments, in the order of the thesis."""
+
+from __future__ import annotations
+
+from slam_bringup.experiments import (
+    association,
+    calibration,
+    features,
+    filtering,
+    fusion,
+    joining,
+    planar,
+    registration,
+)
+from slam_bringup.experiments.findings import Experiment
+
+EXPERIMENTS: dict[str, Experiment] = {
+    experiment.name: experiment
+    for module in (planar, calibration, features, association, filtering, joining, registration, fusion)
+    for experiment in module.EXPERIMENTS
+}
+
+
+def chosen(names: tuple[str, ...]) -> list[Experiment]:
+    """The experiments of these names, or every one for "all".
+
+    Raises
+    ------
+    ValueError
+        If there is no experiment of a name; the message lists those there are.
+    """
+    unknown = [name for name in names if name not in (*EXPERIMENTS, "all")]
+    if unknown:
+        raise ValueError(f"no experiment {', '.join(unknown)}; there are: all, {', '.join(EXPERIMENTS)}")
+    return list(EXPERIMENTS.values()) if "all" in names else [EXPERIMENTS[name] for name in dict.fromkeys(names)]

@@ -1,0 +1,229 @@
+"""Chapter 3: SURF against SIFT and others on stereo pictures, and features on the laser camera's pictures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+
+from slam_bringup.experiments import plots
+from slam_bringup.experiments.chain import Kept
+from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
+from slam_bringup.experiments.job import RENDERING, Job, JobResult
+from slam_bringup.experiments.true_frames import TrueFrame, simulated_frames, spread, transfer
+from slam_core.geometry import FloatArray, invert_transform, transform_points
+from slam_core.types import ByteArray, DepthImage
+from stereo_frontend.depth_lookup import DepthLookupConfig, sample_depth
+from stereo_frontend.features import DETECTORS, FeatureConfig, FeatureExtractor
+from stereo_frontend.keypoints import Keypoints
+from stereo_frontend.tof_features import TofFeatureConfig, normalised_picture
+
+MODULE = "slam_bringup.experiments.features"
+_PACKAGES = (*RENDERING, "stereo_frontend", "tof_driver", "slam_bringup.experiments.true_frames")
+_SIZES = ((320, 240), (640, 480), (1024, 768))
+_THESIS_MS = {"sift": "about 300 (?)", "surf": "180 (?)"}
+_KINDS = ("amplitude", "range", "intensity")
+_SAME_PX = 2.0
+"""Two keypoints this near show the same point."""
+
+
+def available_detectors() -> dict[str, str]:
+    """Name of every detector, and why it cannot be used here, or ""."""
+    names = {}
+    for name in DETECTORS:
+        try:
+            FeatureExtractor(FeatureConfig(detector=name))
+            names[name] = ""
+        except ValueError as error:
+            names[name] = str(error)
+    return names
+
+
+def compare_detectors(folder: Path, before: list[Path], frames: int, repeats: int) -> Kept:
+    """Table 3.1: time and features of every detector; what of it is found again, three frames later."""
+    cv2.setNumThreads(1)
+    views = list(simulated_frames("small_room", frames, 3))
+    values: dict[str, dict[str, object]] = {}
+    for name, why in available_detectors().items():
+        if why:
+            values[name] = {"missing": why}
+            continue
+        extractor = FeatureExtractor(FeatureConfig(detector=name, target=600))
+        found = [extractor(view.images.left) for view in views]
+        values[name] = {"times": _times(name, views[0].images.left, repeats), **_found_again(views, found)}
+    return values, {"picture": views[0].images.left}
+
+
+def _times(name: str, picture: ByteArray, repeats: int) -> list[tuple[float, int]]:
+    """Median milliseconds of one thread and number of features for each picture size, 500 asked for."""
+    rows = []
+    for size in _SIZES:
+        scaled = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        extractor = FeatureExtractor(FeatureConfig(detector=name, target=500))
+        count, elapsed = 0, []
+        for _ in range(repeats + 3):  # the first ones compile, and settle the threshold
+            began = time.thread_time()
+            count = len(extractor(scaled))
+            elapsed.append(1e3 * (time.thread_time() - began))
+        rows.append((float(np.median(elapsed[3:])), count))
+    return rows
+
+
+def _found_again(views: Sequence[TrueFrame], found: Sequence[Keypoints]) -> dict[str, float]:
+    """Repeatability, precision of mutual best matches and their spread, px, between consecutive views."""
+    repeated, matched, right, errors = [], 0, 0, []
+    for k in range(len(views) - 1):
+        moved = transfer(views[k], views[k + 1], found[k].uv)
+        visible = np.isfinite(moved[:, 0])
+        distance = np.linalg.norm(moved[visible, None] - found[k + 1].uv[None], axis=2)
+        repeated.append((distance.min(axis=1) < _SAME_PX).mean())
+        i, j = mutual_matches(found[k], found[k + 1])
+        i, j = i[visible[i]], j[visible[i]]
+        error = found[k + 1].uv[j] - moved[i]
+        good = np.linalg.norm(error, axis=1) < _SAME_PX
+        errors.append(error[good])
+        matched, right = matched + len(i), right + int(good.sum())
+    pairs = len(views) - 1
+    return {"repeatability": float(np.mean(repeated)), "right": right / pairs, "precision": right / max(matched, 1),
+            "spread_px": spread(np.concatenate(errors))}  # fmt: skip
+
+
+def mutual_matches(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (k,), (k,) of keypoints whose descriptors are each other's best."""
+    similarity = first.descriptors @ second.descriptors.T
+    best = similarity.argmax(axis=1)
+    mutual = similarity.argmax(axis=0)[best] == np.arange(len(best))
+    return np.flatnonzero(mutual), best[mutual]
+
+
+def compare_tof_pictures(folder: Path, before: list[Path], frames: int) -> Kept:
+    """Section 3.3: how repeatable are features of amplitude, range and intensity pictures?"""
+    views = [view for view in simulated_frames("small_room", frames, 3) if view.depth is not None]
+    values = {kind: _tof_found_again(views, kind) for kind in _KINDS}
+    depth = views[0].depth
+    assert depth is not None
+    return values, {kind: tof_picture(depth, kind) for kind in _KINDS}
+
+
+def tof_picture(image: DepthImage, kind: str) -> ByteArray:
+    """One of the laser camera's pictures as features are looked for in it, uint8."""
+    config = TofFeatureConfig()
+    if kind == "range":
+        return normalised_picture(image.depth, config.clip, 1.0)
+    values = image.amplitude if kind == "amplitude" else image.intensity
+    assert values is not None
+    return normalised_picture(values, config.clip, config.gamma)
+
+
+def _tof_found_again(views: Sequence[TrueFrame], kind: str) -> dict[str, float]:
+    extractor = FeatureExtractor(FeatureConfig(target=300))
+    found = [_with_depth(extractor, view.depth, kind) for view in views if view.depth is not None]
+    repeated, right, matched = [], 0, 0
+    for k in range(len(views) - 1):
+        (a, depth), (b, _) = found[k], found[k + 1]
+        moved = _place_in_next(views[k], views[k + 1], a, depth)
+        visible = np.isfinite(moved[:, 0])
+        distance = np.linalg.norm(moved[:, None] - b.uv[None], axis=2)
+        repeated.append((distance[visible].min(axis=1) < _SAME_PX).mean())
+        i, j = mutual_matches(a, b)
+        i, j = i[visible[i]], j[visible[i]]
+        right, matched = right + int((distance[i, j] < _SAME_PX).sum()), matched + len(i)
+    return {"features": float(np.mean([len(f[0]) for f in found])), "repeatability": float(np.mean(repeated)),
+            "right": right / (len(views) - 1), "precision": right / max(matched, 1)}  # fmt: skip
+
+
+def _with_depth(extractor: FeatureExtractor, image: DepthImage, kind: str) -> tuple[Keypoints, FloatArray]:
+    """Keypoints that have a depth below them: the others cannot be used."""
+    keypoints = extractor(tof_picture(image, kind))
+    depth = sample_depth(image, keypoints.uv, DepthLookupConfig()).depth
+    known = np.isfinite(depth)
+    return keypoints.select(known), depth[known].astype(np.float64)
+
+
+def _place_in_next(first: TrueFrame, second: TrueFrame, keypoints: Keypoints, depth: FloatArray) -> FloatArray:
+    assert first.depth is not None
+    camera = first.depth.camera
+    T_first, T_second = (f.T_world_left @ f.T_left_tof for f in (first, second))
+    points = transform_points(
+        invert_transform(T_second) @ T_first, camera.unproject(keypoints.uv.astype(np.float64), depth)
+    )
+    pixels = camera.project(points)
+    inside = np.all((pixels > 6) & (pixels < [camera.width - 7, camera.height - 7]), axis=1)
+    return np.where(inside[:, None], pixels, np.nan)
+
+
+def _detectors() -> Experiment:
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        arguments = {"frames": 3 if quick else 12, "repeats": 3 if quick else 11}
+        return {"table": Job(f"{MODULE}:compare_detectors", arguments, _PACKAGES)}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        values = results["table"].values
+        usable = {name: v for name, v in values.items() if "missing" not in v}
+        times = {name: v["times"] for name, v in usable.items()}
+        ratio = times["surf"][1][0] / times["sift"][1][0]
+        rows = [
+            [name, *(f"{ms:.1f} ms, {count}" for ms, count in v["times"]), f"{v['repeatability']:.2f}",
+             f"{v['right']:.0f}", f"{v['precision']:.3f}", f"{v['spread_px']:.2f}"]
+            for name, v in usable.items()
+        ]  # fmt: skip
+        rows += [[name, v["missing"], *[""] * 6] for name, v in values.items() if "missing" in v]
+        header = ("detector", *(f"{w} x {h}" for w, h in _SIZES), "repeatability", "right matches", "precision",
+                  "spread px")  # fmt: skip
+        return Findings(
+            [
+                Comparison(f"{name}, ms a picture at 640 x 480", _THESIS_MS[name], f"{times[name][1][0]:.0f}")
+                for name in ("sift", "surf")
+            ]
+            + [Comparison("SURF's time over SIFT's", "0.6 (?)", f"{ratio:.2f}", "< 1", ratio < 1)],
+            [Table("Table 3.1: time of one thread and number of features; matching three frames later", header, rows)],
+            [Picture(_keypoint_figure(results["table"].arrays["picture"]), "3.1, 3.2", "Keypoints of SURF and SIFT.")],
+        )
+
+    return Experiment("detectors", "3.2", "SIFT against SURF", jobs, report)
+
+
+def _keypoint_figure(picture: ByteArray) -> Figure:
+    figure, axes = plots.new_figure(7, 5.3)
+    axes.imshow(picture, cmap="gray")
+    for name, colour, marker in (("surf", "#d62728", "o"), ("sift", "#1f77b4", "+")):
+        uv = FeatureExtractor(FeatureConfig(detector=name, target=300))(picture).uv
+        axes.plot(*uv.T, marker, color=colour, markersize=4, mfc="none", linestyle="", label=name.upper())
+    axes.set_axis_off()
+    axes.legend(loc="lower right")
+    return figure
+
+
+def _tof_features() -> Experiment:
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        return {"table": Job(f"{MODULE}:compare_tof_pictures", {"frames": 4 if quick else 20}, _PACKAGES)}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        values, arrays = results["table"].values, results["table"].arrays
+        verdict = {"amplitude": "useful", "range": "best", "intensity": "unstable"}
+        formats = {"features": ".0f", "repeatability": ".2f", "right": ".0f", "precision": ".2f"}
+        rows = [[kind, *(f"{v[key]:{form}}" for key, form in formats.items())] for kind, v in values.items()]
+        figure = Figure(figsize=(9, 3.2), layout="constrained")
+        for axes, kind in zip(figure.subplots(1, 3), _KINDS, strict=True):
+            axes.imshow(arrays[kind], cmap="gray")
+            axes.plot(
+                *FeatureExtractor(FeatureConfig(target=150))(arrays[kind]).uv.T, "*", color="#d62728", markersize=4
+            )
+            axes.set_title(kind, fontsize=9)
+            axes.set_axis_off()
+        return Findings(
+            [Comparison(f"repeatability on {kind}", verdict[kind], f"{values[kind]['repeatability']:.2f}")
+             for kind in _KINDS],
+            [Table("Features with a depth below them, three frames later",
+                   ("picture", "features", "repeatability", "right matches", "precision"), rows)],
+            [Picture(figure, "3.4", "Features in the pictures of the laser camera.")],
+        )  # fmt: skip
+
+    return Experiment("tof_features", "3.3", "Features on the laser camera's pictures", jobs, report)
+
+
+EXPERIMENTS = (_detectors(), _tof_features())

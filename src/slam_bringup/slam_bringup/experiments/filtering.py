@@ -1,0 +1,171 @@
+"""Section 9.1: the stereo camera alone, round the workshop, from a corner, in a sweep, round a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from slam_bringup.experiments import plots
+from slam_bringup.experiments.chain import mapped, yaw
+from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
+from slam_bringup.experiments.job import Job, JobResult
+
+_QUICK_FRAMES = 40
+ACCURACY_HEADER = (
+    "run", "frames", "landmarks", "submaps", "ATE mm", "end mm", "end deg", "ANEES", "filter alone: ATE mm",
+    "x real time",
+)  # fmt: skip
+
+
+def frames(quick: bool) -> int | None:
+    """How many frames of a scenario are used."""
+    return _QUICK_FRAMES if quick else None
+
+
+def accuracy_row(name: str, result: JobResult) -> list[str]:
+    """A row below ``ACCURACY_HEADER``."""
+    summary, agent = result.values["summary"], result.values["agents"][0]
+    anees = agent.get("joined_anees")
+    return [
+        name, str(summary["frames"]), str(summary["landmarks"]), str(summary["submaps"]),
+        *(f"{1e3 * agent[key]:.1f}" for key in ("joined_ate_m", "joined_end_m")), f"{agent['joined_end_deg']:.2f}",
+        "" if anees is None else f"{anees:.2f}", f"{1e3 * agent['filter_ate_m']:.1f}",
+        f"{summary['real_time_factor']:.1f}",
+    ]  # fmt: skip
+
+
+def end_comparison(result: JobResult, thesis: str, mark_m: float) -> Comparison:
+    """The error at the end of a loop beside the thesis's."""
+    end = result.values["agents"][0]["joined_end_m"]
+    return Comparison("end error", thesis, f"{1e3 * end:.1f} mm", f"<= {1e3 * mark_m:.0f} mm", end <= mark_m)
+
+
+def speed_comparison(result: JobResult, thesis: str) -> Comparison:
+    """Seconds of everything beside the seconds that the sensors recorded."""
+    summary = result.values["summary"]
+    ours = f"{summary['wall_s']:.0f} s of {summary['sensor_s']:.0f} s recorded"
+    return Comparison("time, features included", thesis, ours, "faster than real time", summary["real_time_factor"] > 1)
+
+
+def landmarks_comparison(result: JobResult, thesis: str) -> Comparison:
+    """Number of landmarks beside the thesis's."""
+    return Comparison("landmarks", thesis, str(result.values["summary"]["landmarks"]))
+
+
+def _workshop(name: str, thesis_landmarks: str, sections: str, title: str, numbers: tuple[str, ...]) -> Experiment:
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        return {"run": mapped(name, frames=frames(quick))}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        run = results["run"]
+        views = [
+            Picture(plots.map_view(run.arrays, 1), numbers[0], "Map from above."),
+            Picture(plots.map_view(run.arrays, 2), numbers[1], "From the side."),
+            Picture(plots.map_in_3d(run.arrays), numbers[2], "In three dimensions."),
+            Picture(
+                plots.standard_deviations(run.arrays, kind="filter"), numbers[3],
+                "Standard deviations of the filter, within its own odometry.",
+            ),
+            Picture(plots.standard_deviations(run.arrays), numbers[3], "The same of the joined map."),
+        ]  # fmt: skip
+        end = run.values["agents"][0]["joined_end_m"]
+        return Findings(
+            comparisons=[
+                landmarks_comparison(run, thesis_landmarks),
+                speed_comparison(run, "135 s without features"),
+                end_comparison(run, "15 mm", 0.015),
+            ],
+            tables=[Table("Accuracy against the simulated truth", ACCURACY_HEADER, [accuracy_row(name, run)])],
+            pictures=views,
+            answer=f"The loop closes with {1e3 * end:.1f} mm at its end.",
+        )
+
+    return Experiment(name, sections, title, jobs, report)
+
+
+def _fireman() -> Experiment:
+    rates = ("fireman_10hz", "fireman_5hz")
+
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        return {name: mapped(name, frames=frames(quick)) for name in rates}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        comparisons = []
+        for name, thesis in zip(rates, ("works", "fails"), strict=True):
+            summary = results[name].values["summary"]
+            lost = sum("LOST" in event for event in summary["events"])
+            end = results[name].values["agents"][0]["joined_end_m"]
+            comparisons.append(
+                Comparison(
+                    f"{name.removeprefix('fireman_')}, looking round", thesis,
+                    f"lost {lost} times, end error {1e3 * end:.1f} mm", "never lost, <= 15 mm",
+                    lost == 0 and end <= 0.015,
+                )
+            )  # fmt: skip
+        rows = [accuracy_row(name, results[name]) for name in rates]
+        pictures = [
+            Picture(plots.map_view(results["fireman_10hz"].arrays), "9.9", "10 frames a second."),
+            Picture(plots.standard_deviations(results["fireman_10hz"].arrays), "9.10", "Its standard deviations."),
+            Picture(plots.map_view(results["fireman_5hz"].arrays), "9.11", "Every second pair only."),
+        ]
+        return Findings(comparisons, [Table("Accuracy", ACCURACY_HEADER, rows)], pictures)
+
+    return Experiment("fireman", "9.1.3", "A fireman looks round a room from a corner", jobs, report)
+
+
+def _sweep() -> Experiment:
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        return {"run": mapped("sweep", frames=frames(quick))}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        run = results["run"]
+        turned = [np.degrees(np.ptp(yaw(run.arrays[f"0 joined {kind}"]))) for kind in ("poses", "truth")]
+        error = abs(turned[0] - turned[1])
+        angle, rate = plots.angles(run.arrays)
+        return Findings(
+            comparisons=[
+                Comparison("angle swept", "about 90 deg", f"{turned[0]:.2f} of {turned[1]:.2f} deg", "within 0.5 deg",
+                           bool(error <= 0.5)),
+            ],
+            tables=[Table("Accuracy", ACCURACY_HEADER, [accuracy_row("sweep", run)])],
+            pictures=[
+                Picture(plots.map_view(run.arrays), "9.12", "The sweep from above."),
+                Picture(angle, "9.13", "Angles."),
+                Picture(rate, "9.14", "Angular velocities."),
+            ],
+        )  # fmt: skip
+
+    return Experiment("sweep", "9.1.4", "A sweep of 90 degrees checks the angles", jobs, report)
+
+
+def _conference() -> Experiment:
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        return {"run": mapped("conference", frames=frames(quick))}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        run = results["run"]
+        return Findings(
+            comparisons=[
+                landmarks_comparison(run, "351"),
+                speed_comparison(run, "162 s features and 111 s EKF"),
+                end_comparison(run, "not given", 0.015),
+            ],
+            tables=[Table("Accuracy", ACCURACY_HEADER, [accuracy_row("conference", run)])],
+            pictures=[
+                Picture(plots.map_view(run.arrays), "9.15", "Map from above."),
+                Picture(plots.standard_deviations(run.arrays), "9.16", "Standard deviations."),
+            ],
+        )
+
+    return Experiment("conference", "9.1.5", "Round the table of a conference room", jobs, report)
+
+
+EXPERIMENTS = (
+    _workshop("workshop_rig", "349", "9.1.1", "A loop round the workshop, camera on a rig",
+              ("9.2", "9.3", "9.4", "9.5")),
+    _workshop("workshop_handheld", "356", "9.1.2", "The same loop, camera in the hand", ("9.7", "9.3", "9.4", "9.8")),
+    _fireman(),
+    _sweep(),
+    _conference(),
+)  # fmt: skip

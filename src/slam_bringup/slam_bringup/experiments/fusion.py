@@ -1,0 +1,68 @@
+"""Chapter 11 and section 1.3: what the laser camera adds to the stereo camera, and several firemen in one map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from slam_bringup.experiments import plots
+from slam_bringup.experiments.chain import mapped
+from slam_bringup.experiments.filtering import ACCURACY_HEADER, accuracy_row, frames
+from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
+from slam_bringup.experiments.job import Job, JobResult
+
+_MODES = ("stereo", "tof", "replace", "fuse")
+
+
+def _modes() -> Experiment:
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        runs = {mode: mapped("small_room", mode, frames=frames(quick)) for mode in _MODES}
+        return runs | {"fuse + ndt": mapped("small_room", "fuse", odometry="ndt", frames=frames(quick))}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        ate = {name: 1e3 * r.values["agents"][0]["joined_ate_m"] for name, r in results.items()}
+        best = min(_MODES, key=lambda mode: ate[mode])
+        comparisons = [
+            Comparison(f"ATE, {mode}", "missing from our copy", f"{ate[mode]:.1f} mm") for mode in _MODES
+        ] + [Comparison("best of the four", "missing from our copy", best, "fuse", best == "fuse")]  # fmt: skip
+        return Findings(
+            comparisons,
+            [Table("The four modes, and with scan odometry", ACCURACY_HEADER,
+                   [accuracy_row(name, result) for name, result in results.items()])],
+            [Picture(plots.map_view(results[mode].arrays), "", f"Mode {mode}.") for mode in _MODES],
+            f"Weighted by their variances, both cameras give {ate['fuse']:.1f} mm; the stereo camera alone "
+            f"{ate['stereo']:.1f} mm, the laser camera alone {ate['tof']:.1f} mm.",
+        )  # fmt: skip
+
+    return Experiment("modes", "11", "Stereo, laser camera, or both", jobs, report)
+
+
+def _firemen() -> Experiment:
+    names = ("firemen_2", "firemen_3")
+
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        return {name: mapped(name, frames=frames(quick)) for name in names}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        rows, comparisons = [], []
+        for name in names:
+            agents = results[name].values["agents"]
+            for agent in agents:
+                rows.append(
+                    [f"{name} {agent['name']}", f"{agent['path_m']:.1f}", f"{1e3 * agent['joined_ate_m']:.1f}",
+                     f"{1e3 * agent['joined_end_m']:.1f}", f"{agent['joined_anees']:.2f}"]
+                )  # fmt: skip
+            worst = max(agent["joined_ate_m"] for agent in agents)
+            comparisons.append(
+                Comparison(f"{len(agents)} firemen in one map, largest ATE", "only imagined", f"{1e3 * worst:.1f} mm",
+                           "<= 60 mm, as of one agent", worst <= 0.06)
+            )  # fmt: skip
+        return Findings(
+            comparisons,
+            [Table("Every fireman in the joint map", ("run", "way m", "ATE mm", "end mm", "ANEES"), rows)],
+            [Picture(plots.submaps(results[name].arrays, "joined"), "", f"Joint map of {name}.") for name in names],
+        )
+
+    return Experiment("firemen", "1.3", "Firemen with helmet cameras share one map", jobs, report)
+
+
+EXPERIMENTS = (_modes(), _firemen())

@@ -1,0 +1,141 @@
+"""Sections 9.1.6 and 9.2: one filter over two rooms, and the submaps that take its place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from slam_bringup.experiments import plots
+from slam_bringup.experiments.chain import mapped
+from slam_bringup.experiments.filtering import (
+    ACCURACY_HEADER,
+    accuracy_row,
+    end_comparison,
+    frames,
+    landmarks_comparison,
+    speed_comparison,
+)
+from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
+from slam_bringup.experiments.job import Job, JobResult
+
+
+def _one_filter() -> Experiment:
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        return {name: mapped("two_rooms", mapper=name, frames=frames(quick)) for name in ("ekf", "sjsam")}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        one, joined = results["ekf"], results["sjsam"]
+        heading = np.degrees(np.sqrt(one.arrays["0 joined covariances"][-1, 5, 5]))
+        error = one.values["agents"][0]["joined_end_deg"]
+        anees = [r.values["agents"][0]["joined_anees"] for r in (one, joined)]
+        last = np.median(one.arrays["ms ekf"][-50:]), np.median(joined.arrays["ms ekf"][-50:])
+        return Findings(
+            comparisons=[
+                landmarks_comparison(one, "818"),
+                Comparison("one filter: heading at the end", "sigma far too small, the map bends",
+                           f"claims {heading:.2f} deg, errs {error:.2f} deg"),
+                Comparison("ANEES, one filter and joined submaps", "not measured", f"{anees[0]:.2f}, {anees[1]:.2f}",
+                           "submaps more consistent", abs(np.log(anees[1])) <= abs(np.log(anees[0]))),
+                Comparison("time per frame at the end", "10 min in all", f"{last[0]:.0f} ms, with submaps "
+                           f"{last[1]:.0f} ms", "submaps cheaper", bool(last[1] < last[0])),
+            ],
+            tables=[Table("Accuracy", ACCURACY_HEADER, [accuracy_row("one filter", one),
+                                                       accuracy_row("submaps, joined", joined)])],
+            pictures=[
+                Picture(plots.map_view(one.arrays), "9.17", "One filter between two rooms through a corridor."),
+                Picture(plots.standard_deviations(one.arrays), "9.18", "Its standard deviations."),
+                Picture(plots.times(one.arrays, "ekf"), "9.20", "One filter: time per frame grows with the map."),
+                Picture(plots.map_view(joined.arrays), "", "The same rooms by joined submaps."),
+            ],
+            answer="One filter over the whole building costs more with every landmark and trusts its heading too much; "
+            "submaps keep both the cost and the linearisation errors small.",
+        )  # fmt: skip
+
+    return Experiment("one_filter", "9.1.6", "Two rooms and a corridor in one filter", jobs, report)
+
+
+def _joined(
+    name: str, sections: str, title: str, thesis: Mapping[str, str], mark_m: float | None, numbers: Mapping[str, str]
+) -> Experiment:
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        return {"run": mapped(name, frames=frames(quick))}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        run = results["run"]
+        summary, agent = run.values["summary"], run.values["agents"][0]
+        merge = run.arrays["ms sjsam"]
+        half = len(merge) // 2
+        comparisons = [
+            landmarks_comparison(run, thesis["landmarks"]),
+            Comparison("submaps", thesis["submaps"], str(summary["submaps"])),
+            speed_comparison(run, thesis["time"]),
+            Comparison("joining, s", thesis["joining"], f"{merge.sum() / 1e3:.1f} in all"),
+            Comparison("joining, ms a submap, first and second half", "spikes at closures",
+                       f"{np.mean(merge[:half]):.0f}, {np.mean(merge[half:]):.0f}"),
+        ]  # fmt: skip
+        if mark_m is not None:
+            comparisons.append(end_comparison(run, thesis["end"], mark_m))
+        else:
+            closed = summary["loop_closures"] > 0 and agent["joined_end_m"] < 0.01 * agent["path_m"]
+            comparisons.append(
+                Comparison("loop", thesis["end"], f"{summary['loop_closures']} closures, end error "
+                           f"{1e3 * agent['joined_end_m']:.1f} mm", "closed, end error < 1 % of the way", closed)
+            )  # fmt: skip
+        drift = np.linalg.norm(np.ptp(run.arrays["0 filter poses"][:, 2, 3]))
+        comparisons.append(Comparison("range of height before joining", thesis["height"], f"{drift:.2f} m"))
+        return Findings(
+            comparisons,
+            [Table("Accuracy", ACCURACY_HEADER, [accuracy_row(name, run)])],
+            [
+                Picture(plots.submaps(run.arrays, "chained"), numbers["before"], "Submaps before joining."),
+                Picture(plots.submaps(run.arrays, "joined"), numbers["after"], "The same submaps joined."),
+                Picture(plots.map_view(run.arrays), numbers["after"], "Map from above."),
+                Picture(plots.measurement_matrix(run.arrays), numbers["matrix"], "Pattern of the measurement matrix."),
+                Picture(plots.standard_deviations(run.arrays), numbers["sigma"], "Standard deviations when joined."),
+                Picture(plots.times(run.arrays, "sjsam"), numbers["times"], "Time to join each submap."),
+            ],
+        )
+
+    return Experiment(name, sections, title, jobs, report)
+
+
+def _workshop() -> Experiment:
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        return {"run": mapped("workshop_rig", frames=frames(quick))}
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        run = results["run"]
+        before = run.values["agents"][0]["filter_end_m"]
+        return Findings(
+            comparisons=[
+                Comparison("end error before joining", "30 cm (?)", f"{1e3 * before:.1f} mm"),
+                end_comparison(run, "2 cm", 0.02),
+            ],
+            pictures=[
+                Picture(plots.submaps(run.arrays, "chained"), "9.26", "Submaps of the workshop."),
+                Picture(plots.submaps(run.arrays, "joined"), "9.27", "Joined submaps of the workshop."),
+            ],
+        )
+
+    return Experiment("workshop_joined", "9.2.4", "The workshop by joined submaps", jobs, report)
+
+
+EXPERIMENTS = (
+    _one_filter(),
+    _joined(
+        "figure_eight", "9.2.1-9.2.3", "Two rooms in a figure eight",
+        {"landmarks": "1275", "submaps": "34", "time": "155 s without features", "joining": "21", "end": "6 cm",
+         "height": "not given"},
+        0.06,
+        {"before": "9.19", "after": "9.22", "matrix": "9.23", "sigma": "9.24", "times": "9.25"},
+    ),
+    _joined(
+        "five_rooms", "9.2.1", "Five rooms, a loop of 70 m",
+        {"landmarks": "not given", "submaps": "70 (?)", "time": "not given", "joining": "failed",
+         "end": "never closed", "height": "2 m"},
+        None,
+        {"before": "9.21", "after": "", "matrix": "", "sigma": "", "times": ""},
+    ),
+    _workshop(),
+)  # fmt: skip

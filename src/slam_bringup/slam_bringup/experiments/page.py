@@ -1,0 +1,84 @@
+"""``experiments.html``: one self-contained page with every experiment's comparisons, tables and figures."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from slam_core.files import atomic_text
+
+_PREAMBLE = """\
+# Experiments
+
+The thesis's experiments on simulated rooms of its sizes, with ground truth, beside the thesis's own figures. Made by
+`slam experiment all -o OUT`, which writes this page as `OUT/experiments.md`; do not edit. Times are of two cores of a
+shared machine.
+"""
+
+
+def write_page(path: Path, findings: Sequence[Mapping[str, Any]]) -> None:
+    """Write the page; pictures lie beside it and are embedded, so that it needs no other file and no network."""
+    template = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
+        resources.files("slam_bringup.experiments").joinpath("experiments.html.j2").read_text(encoding="utf-8")
+    )
+    marks = [c["met"] for entry in findings for c in entry["comparisons"] if c["met"] is not None]
+    html = template.render(
+        experiments=[_with_pictures(entry, path.parent) for entry in findings],
+        questions=_questions({entry["name"]: entry for entry in findings}),
+        met=sum(marks),
+        marks=len(marks),
+        quick=any(entry["quick"] for entry in findings),
+    )
+    atomic_text(path, html + "\n")
+
+
+def write_markdown(path: Path, findings: Sequence[Mapping[str, Any]]) -> None:
+    """The comparisons and tables as a page of the documentation."""
+    lines = [_PREAMBLE]
+    for entry in findings:
+        lines += [f"## {entry['title']} ({entry['sections']})", "", f"`slam experiment {entry['name']} -o OUT`", ""]
+        lines += [entry["answer"], ""] if entry["answer"] else []
+        met = {None: "", True: "met", False: "**not met**"}
+        rows = [[c["quantity"], c["thesis"], c["ours"], c["mark"], met[c["met"]]] for c in entry["comparisons"]]
+        lines += _markdown_table(("quantity", "thesis", "ours", "mark", ""), rows)
+        for table in entry["tables"]:
+            lines += [f"{table['title']}:", "", *_markdown_table(table["header"], table["rows"])]
+    atomic_text(path, "\n".join(lines).rstrip() + "\n")
+
+
+def _markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    cells = [header, ["---"] * len(header), *rows]
+    return ["| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |" for row in cells] + [""]
+
+
+def _with_pictures(entry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    pictures = []
+    for picture in entry["pictures"]:
+        data = base64.b64encode((folder / picture["file"]).read_bytes()).decode()
+        pictures.append({**picture, "data": f"data:image/png;base64,{data}"})
+    return {**entry, "pictures": pictures}
+
+
+def _questions(entries: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:
+    """The thesis's five questions (1.5) and what the experiments that were run say."""
+    asked = (
+        ("Which technique makes large and good maps?", ("one_filter", "figure_eight", "five_rooms")),
+        ("What does the laser camera add?", ("modes",)),
+        ("Does a systematic motion give a better map than a random one?", ("sweep", "fireman")),
+        ("Is a robot's map better than one made by hand?", ("workshop_rig", "workshop_handheld")),
+        ("ICP or NDT?", ("registration", "scan_trajectory")),
+    )
+    answers = []
+    for question, names in asked:
+        rows = [
+            f"{entries[name]['title']}: {c['quantity']} {c['ours']}"
+            for name in names if name in entries for c in entries[name]["comparisons"][-3:]
+        ]  # fmt: skip
+        if rows:
+            answers.append({"question": question, "answer": "; ".join(rows) + "."})
+    return answers

@@ -1,0 +1,98 @@
+"""Every experiment is complete and names what it shows; the quick ones run and mean what they say."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from slam_bringup.cli import slam
+from slam_bringup.experiments.association import METHODS, associate
+from slam_bringup.experiments.catalogue import EXPERIMENTS, chosen
+from slam_bringup.experiments.page import write_page
+from slam_bringup.experiments.planar import filter_run, graph_of
+from slam_bringup.experiments.registration import register_motions
+from slam_simulation.planar import PlanarConfig, simulate_planar
+
+
+def test_every_experiment_says_what_it_needs():
+    for experiment in EXPERIMENTS.values():
+        for quick in (True, False):
+            jobs = experiment.jobs(quick)
+            assert jobs
+            assert all(re.fullmatch(r"[0-9a-f]{16}", job.digest) for job in jobs.values())
+        assert {j.digest for j in experiment.jobs(True).values()} != {j.digest for j in experiment.jobs(False).values()}
+
+
+def test_an_unknown_name_lists_those_there_are():
+    with pytest.raises(ValueError, match=r"no experiment nonsense; there are: all, planar"):
+        chosen(("planar", "nonsense"))
+    assert [e.name for e in chosen(("all",))] == list(EXPERIMENTS)
+    assert [e.name for e in chosen(("planar", "planar"))] == ["planar"]
+
+
+@pytest.fixture(scope="module")
+def planar_run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("experiment")
+    result = CliRunner().invoke(slam, ["experiment", "planar", "-o", str(out), "--quick"])
+    assert result.exit_code == 0, result.output
+    return out, json.loads((out / "experiments.json").read_text())
+
+
+def test_planar_shows_its_figures_beside_the_thesis(planar_run):
+    out, (entry,) = planar_run
+    assert {p["number"] for p in entry["pictures"]} >= {"6.5", "6.6"}
+    assert all((out / p["file"]).read_bytes().startswith(b"\x89PNG") for p in entry["pictures"])
+    assert any("SAM's cost" in c["quantity"] and c["ours"] == "in every run" for c in entry["comparisons"])
+    assert all(c["met"] is None for c in entry["comparisons"])  # a quick run is held to no mark
+
+
+def test_the_page_needs_no_other_file(planar_run):
+    out, (entry,) = planar_run
+    page = (out / "experiments.html").read_text()
+    assert "data:image/png;base64," in page
+    assert not re.search(r'(src|href)="(?!data:|#)', page)
+    assert entry["title"] in page
+
+
+def test_the_markdown_page_holds_every_comparison(planar_run):
+    out, (entry,) = planar_run
+    page = (out / "experiments.md").read_text()
+    assert all(c["ours"] in page for c in entry["comparisons"])
+    assert "slam experiment planar" in page
+
+
+def test_an_unmet_mark_is_said(planar_run, tmp_path):
+    out, (entry,) = planar_run
+    failed = {**entry, "quick": False, "comparisons": [{**entry["comparisons"][0], "met": False}]}
+    write_page(out / "failed.html", [failed])
+    assert "not met" in (out / "failed.html").read_text()
+    assert "0 of 1 marks are met" in (out / "failed.html").read_text()
+
+
+def test_the_smoothers_problem_holds_every_associated_measurement():
+    run = simulate_planar(PlanarConfig(samples=20), np.random.default_rng(3))
+    _, _, slots = filter_run(run, known=True)
+    graph = graph_of(run, slots)
+    assert len(graph.measured) == sum(len(o.ids) for o in run.observations)
+    assert len(graph.motions) == 19
+
+
+def test_true_pairs_are_found_and_counted(tmp_path):
+    found = {name: associate(tmp_path, [], name, 1, 8)[0] for name in METHODS}
+    best = found["Algorithm 2 + descriptors"]
+    assert best["precision"] > 0.98
+    assert best["recall"] > 0.9
+    assert found["Algorithm 1: nearest"]["recall"] < best["recall"]
+
+
+@pytest.mark.slow
+def test_registrations_are_recorded_motion_by_motion(tmp_path):
+    values, arrays = register_motions(tmp_path, [], "ndt", 0.2, 1)
+    assert values["method"] == "ndt"
+    error = arrays["found"] - arrays["true"]
+    assert arrays["found"].shape[1:] == (1, 6)
+    assert np.median(np.linalg.norm(error[..., :3], axis=-1)) < 0.02
