@@ -22,12 +22,7 @@ from slam_core.config import Config, parameter
 from slam_core.types import ByteArray, Float32Array
 from stereo_frontend.keypoints import Keypoints, Selector
 from stereo_frontend.surf_descriptor import DIMENSION, describe_oriented, describe_upright, region_weights
-from stereo_frontend.surf_detector import (
-    MAX_PIXELS,
-    find_keypoints,
-    fitting_octaves,
-    integral_image,
-)
+from stereo_frontend.surf_detector import MAX_PIXELS, find_keypoints, fitting_octaves, halved, integral_image
 
 _MOST_KEYPOINTS = 20000
 _DIAMETER = 9.0 / 1.2
@@ -74,16 +69,14 @@ class SurfDetector:
 
     def _find_all(self, image: ByteArray, threshold: float) -> Float32Array:
         """Rows of u, v, scale, response, in pixels of ``image``."""
-        if not self.config.doubled:
-            return self._find(image, threshold)
-        large = np.asarray(cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_LINEAR), np.uint8)
-        found = self._find(large, threshold)
-        found[:, :2] = 0.5 * found[:, :2] - 0.25
-        found[:, 2] *= 0.5
+        if self.config.doubled:
+            large = np.asarray(cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_LINEAR), np.uint8)
+            first, second, pixel = large, image, 0.5
+        else:
+            first, second, pixel = image, halved(image), 1.0
+        octaves = fitting_octaves(first.shape[0], first.shape[1], self.config.octaves)
+        number = find_keypoints(first, second, octaves, np.float32(threshold), self._found)
+        found = self._found[:number].copy()
+        found[:, :2] = (found[:, :2] + 0.5) * pixel - 0.5
+        found[:, 2] *= pixel
         return found
-
-    def _find(self, image: ByteArray, threshold: float) -> Float32Array:
-        """Rows of u, v, scale, response."""
-        octaves = fitting_octaves(image.shape[0], image.shape[1], self.config.octaves)
-        number = find_keypoints(image, octaves, np.float32(threshold), self._found)
-        return self._found[:number].copy()

@@ -1,10 +1,12 @@
 """Compiled kernels that find SURF keypoints: box-filter Hessian on the integral image (Bay et al. 2008, section 3).
 
-A filter of size S stands for a Gaussian of scale ``1.2 S / 9``. An octave has four sizes; the next octave starts at the
-second of them, with twice the step between sizes and twice the sampling distance. Keypoints are maxima of the two
-middle sizes: these are filtered everywhere, the outer two only around candidates, which saves half of the work. The
-sums that the boxes of one row share are built once per row, which leaves 23 loads per pixel and layer instead of 32,
-all along the row, so that the compiler vectorises them.
+A filter of size S stands for a Gaussian of scale ``1.2 S / 9``. An octave is an image of half the size of the one
+before, searched with four filters. Those of the next octave are then twice as large, 18, 30, 42, 54, where the paper
+enlarges the filters instead: 15, 27, 39, 51. So octaves adjoin instead of overlapping, no keypoint is found twice, and
+each costs a quarter of the one before. Keypoints are maxima of the two middle sizes: these are filtered everywhere, the
+outer two only around candidates, which saves half of the work. The sums that the boxes of one row share are built once
+per row, which leaves 23 loads per pixel and layer instead of 32, all along the row, so that the compiler vectorises
+them.
 """
 
 from __future__ import annotations
@@ -15,38 +17,57 @@ from numba import njit
 
 from slam_core.types import ByteArray
 
-LAYERS = 4
+FILTER_SIZES = (9, 15, 21, 27)
+"""Edges (px) of the box filters of an octave."""
 MAX_PIXELS = 2**31 // 255
 """A larger image would overflow the 32-bit integral image."""
 
+_STEP = 6
+"""From one size to the next."""
+_BORDERS = (14, 17)
+"""Pixels from the edge within which no maximum of the two middle layers is looked for: half of the largest filter that
+it is compared with, and one around it, and one for the vertex."""
 _KEPT_ROWS = 4
 """Rows of determinants that are kept; a maximum needs three."""
 
 IntegralImage = npt.NDArray[np.int32]
 
 
-def filter_sizes(octave: int) -> list[int]:
-    """Sizes (px) of the four box filters of an octave: 9 15 21 27, 15 27 39 51, 27 51 75 99, ..."""
-    step = 3 * 2 ** (octave + 1)
-    return [step + 3 + step * layer for layer in range(LAYERS)]
-
-
 def fitting_octaves(height: int, width: int, octaves: int) -> int:
     """How many of so many octaves have filters that fit an image (height, width) px."""
-    return sum(filter_sizes(o)[2] + 2 ** (o + 1) < min(height, width) for o in range(octaves))
+    return sum(2 * _BORDERS[1] + 1 < min(height, width) >> octave for octave in range(octaves))
 
 
 @njit(cache=True, nogil=True)
-def find_keypoints(image, octaves, threshold, found):  # type: ignore[no-untyped-def]
+def find_keypoints(first, second, octaves, threshold, found):  # type: ignore[no-untyped-def]
     """Write keypoints above ``threshold`` to ``found`` rows u, v, scale, response; return their number.
 
-    All in one call, so that no step waits for the interpreter.
+    ``first`` and ``second`` are the images of the first two octaves; u, v and scale are in pixels of ``first``. All in
+    one call, so that no step waits for the interpreter.
     """
-    integral = integral_image(image)
-    count = 0
-    for octave in range(octaves):
-        count += find_maxima(integral, octave, threshold, found[count:])
+    count, pixel = 0, np.float32(1.0)
+    for _ in range(octaves):
+        number = find_maxima(integral_image(first), threshold, found[count:])
+        for k in range(count, count + number):
+            for axis in range(2):
+                found[k, axis] = (found[k, axis] + np.float32(0.5)) * pixel - np.float32(0.5)
+            found[k, 2] *= pixel
+        count += number
+        first, second, pixel = second, halved(second), np.float32(2.0) * pixel
     return count
+
+
+@njit(cache=True, nogil=True)
+def halved(image):  # type: ignore[no-untyped-def]
+    """Means of four pixels each, uint8 (height // 2, width // 2)."""
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    out = np.empty((height, width), np.uint8)
+    for y in range(height):
+        above, below, row = image[2 * y], image[2 * y + 1], out[y]
+        for x in range(width):
+            total = np.int32(above[2 * x]) + np.int32(above[2 * x + 1])
+            row[x] = (total + np.int32(below[2 * x]) + np.int32(below[2 * x + 1]) + 2) >> 2
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -64,12 +85,12 @@ def integral_image(image: ByteArray) -> IntegralImage:
 
 
 @njit(cache=True, nogil=True)
-def hessian_row(integral, size, step, row, sums, determinants, out):  # type: ignore[no-untyped-def]
+def hessian_row(integral, size, y, sums, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` with ``Dxx Dyy - (0.9 Dxy)^2`` of a row, normalised by the filter's area; its ends stay as they are.
 
-    Rows and columns are ``step`` pixels apart. ``sums`` (6, width + 1) and ``determinants`` (width,) are room.
+    ``sums`` (6, width + 1) is room.
     """
-    width, y = integral.shape[1] - 1, row * step
+    width = integral.shape[1] - 1
     lobe, half = size // 3, size // 2
     middle = lobe // 2
     n = width - 2 * half
@@ -81,13 +102,7 @@ def hessian_row(integral, size, step, row, sums, determinants, out):  # type: ig
     _outer_less_inner(band[2 * half + 1 :], band, band[half + middle + 1 :], band[half - middle :], xx)
     _difference(stack[half + lobe :], stack[half - lobe + 1 :], yy)
     _crossed(cross[half + 1 :], cross[half - lobe :], cross[half + lobe + 1 :], cross[half:], xy)
-    scale = np.float32(1.0 / (size * size))
-    if step == 1:
-        _determinants(xx, yy, xy, scale, out[half : half + n])
-        return
-    _determinants(xx, yy, xy, scale, determinants[:n])
-    first, last = -(-half // step), (width - 1 - half) // step
-    _every(determinants[first * step - half :], step, out[first : last + 1])
+    _determinants(xx, yy, xy, np.float32(1.0 / (size * size)), out[half : half + n])
 
 
 # Each of these loops has one array to write and few to read: with more of them the compiler gives up proving that they
@@ -119,12 +134,6 @@ def _determinants(xx, yy, xy, scale, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _every(values, step, out):  # type: ignore[no-untyped-def]
-    for x in range(len(out)):
-        out[x] = values[x * step]
-
-
-@njit(cache=True, nogil=True)
 def _determinant_at(integral, x, y, size):  # type: ignore[no-untyped-def]
     """The same as :func:`hessian_row` at one pixel."""
     lobe, half = size // 3, size // 2
@@ -153,41 +162,34 @@ def _box(integral, x, y, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def find_maxima(integral, octave, threshold, found):  # type: ignore[no-untyped-def]
+def find_maxima(integral, threshold, found):  # type: ignore[no-untyped-def]
     """Write maxima of 3x3x3 neighbourhoods above ``threshold`` to ``found`` rows u, v, scale, response; return their
     number.
 
     Both middle layers are filtered row by row and searched right behind, while their last rows are in the cache.
     """
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
-    step, increment = 2**octave, 3 * 2 ** (octave + 1)
-    rows, columns = -(-height // step), -(-width // step)
-    sums, determinants = np.empty((6, width + 1), np.int32), np.empty(width, np.float32)
-    layers = np.zeros((2, _KEPT_ROWS, columns), np.float32)
-    marks, cube = np.zeros(-(-columns // 8) * 8, np.uint8), np.empty((3, 3, 3), np.float32)
+    sums = np.empty((6, width + 1), np.int32)
+    layers = np.zeros((2, _KEPT_ROWS, width), np.float32)
+    marks, cube = np.zeros(-(-width // 8) * 8, np.uint8), np.empty((3, 3, 3), np.float32)
     count = 0
-    for row in range(rows):
+    for y in range(height):
         for place in range(2):
-            size = increment + 3 + increment * (place + 1)
-            if size // 2 <= row * step < height - size // 2:
-                hessian_row(integral, size, step, row, sums, determinants, layers[place, row % _KEPT_ROWS])
+            size = FILTER_SIZES[place + 1]
+            if size // 2 <= y < height - size // 2:
+                hessian_row(integral, size, y, sums, layers[place, y % _KEPT_ROWS])
         for place in range(2):
-            size = increment + 3 + increment * (place + 1)
-            border = (size + increment) // 2 // step + 2
-            if border <= row - 1 < rows - border:
-                count += _find_in_row(
-                    integral, layers, place, row - 1, border, step, increment, threshold, marks, cube, found[count:]
-                )
+            if _BORDERS[place] <= y - 1 < height - _BORDERS[place]:
+                count += _find_in_row(integral, layers, place, y - 1, threshold, marks, cube, found[count:])
     return count
 
 
 @njit(cache=True, nogil=True)
-def _find_in_row(integral, layers, place, y, border, step, increment, threshold, marks, cube, found):  # type: ignore[no-untyped-def]
+def _find_in_row(integral, layers, place, y, threshold, marks, cube, found):  # type: ignore[no-untyped-def]
     """Maxima of one row of one layer; their position and scale are those of the vertex of the parabola through the
     neighbourhood (Brown and Lowe 2002).
     """
-    size = increment + 3 + increment * (place + 1)
-    outer = size - increment if place == 0 else size + increment
+    size, outer, border = FILTER_SIZES[place + 1], FILTER_SIZES[3 * place], _BORDERS[place]
     rows = ((y - 1) % _KEPT_ROWS, y % _KEPT_ROWS, (y + 1) % _KEPT_ROWS)
     own, other = layers[place], layers[1 - place]
     above, here, below = own[rows[0]], own[rows[1]], own[rows[2]]
@@ -209,15 +211,15 @@ def _find_in_row(integral, layers, place, y, border, step, increment, threshold,
                 continue
             if not _is_higher(other_below, x, value):
                 continue
-            if not _fill_outer(integral, x * step, y * step, step, outer, value, cube[2 * place]):
+            if not _fill_outer(integral, x, y, outer, value, cube[2 * place]):
                 continue
             for j in range(3):
                 for i in range(3):
                     cube[1, j, i], cube[2 - 2 * place, j, i] = own[rows[j], x - 1 + i], other[rows[j], x - 1 + i]
             if _vertex(cube, offset):
-                found[count, 0] = (x + offset[0]) * step
-                found[count, 1] = (y + offset[1]) * step
-                found[count, 2] = 1.2 / 9.0 * (size + offset[2] * increment)
+                found[count, 0] = x + offset[0]
+                found[count, 1] = y + offset[1]
+                found[count, 2] = 1.2 / 9.0 * (size + offset[2] * _STEP)
                 found[count, 3] = value
                 count += 1
     return count
@@ -238,11 +240,11 @@ def _is_higher(row, x, value):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _fill_outer(integral, x, y, step, size, value, out):  # type: ignore[no-untyped-def]
+def _fill_outer(integral, x, y, size, value, out):  # type: ignore[no-untyped-def]
     """Determinants (3, 3) of a layer that is not filtered everywhere; False as soon as one is not below ``value``."""
     for j in range(3):
         for i in range(3):
-            out[j, i] = _determinant_at(integral, x + (i - 1) * step, y + (j - 1) * step, size)
+            out[j, i] = _determinant_at(integral, x + i - 1, y + j - 1, size)
             if out[j, i] >= value:
                 return False
     return True
