@@ -170,14 +170,18 @@ def test_empty_beginning_is_degraded_then_recovers(world: PointWorld, rng: np.ra
     assert states[-1] is TrackingState.OK
 
 
-def test_reset_forgets_everything(world: PointWorld, rng: np.random.Generator) -> None:
+def test_a_new_session_keeps_the_open_submap_and_begins_anew(world: PointWorld, rng: np.random.Generator) -> None:
     slam = EkfSlam(EkfSlamConfig())
-    run(slam, world, loop(20), rng)
-    slam.reset()
-    result = slam.process(world.features(loop(2)[0], 0, rng)[0])
-    np.testing.assert_array_equal(result.pose.T, np.eye(4))
-    assert len(result.landmarks.ids) == 0
-    assert slam.finish() == ()
+    results = run(slam, world, loop(20), rng)
+    closed = slam.start_session()
+    assert len(closed) == 1
+    assert {s.session for r in results for s in r.submaps} | {closed[0].session} == {0}
+    results = run(slam, world, loop(20), rng)  # stamps of the past
+    np.testing.assert_array_equal(results[0].pose.T, np.eye(4))
+    assert len(results[0].landmarks.ids) == 0
+    submaps = [s for r in results for s in r.submaps] + list(slam.finish())
+    assert [(s.session, s.index) for s in submaps] == [(1, k) for k in range(len(submaps))]
+    assert not submaps[0].follows_previous
 
 
 def test_wrong_mounting_is_refused() -> None:

@@ -91,7 +91,7 @@ def test_landmarks_seen_from_the_end_have_its_error_too(rng: np.random.Generator
     """The covariance is that of central differences of ``end^-1 p``."""
     submap = Agent(ring_world(3.0, rng, 12.0), circle(3.0, 0.2), rng, "").submaps()[0]
     graph = MapGraph()
-    graph.append(submap, 0, None, np.eye(4))
+    graph.append(submap, None, np.eye(4))
 
     def seen(error: np.ndarray) -> np.ndarray:
         end = boxplus(submap.end_pose, error[:6])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -284,6 +285,22 @@ def test_map_to_odom_carries_the_odometry_onto_the_map(rng: np.random.Generator)
         T_odom = T_odom @ submap.end_pose
     T_map = invert_transform(agent.path[0]) @ agent.true_start(len(submaps))
     assert np.linalg.norm((joined.map_to_odom("a") @ T_odom - T_map)[:3, 3]) < 0.1
+
+
+def test_a_restarted_filter_goes_on_in_a_session_of_its_own(rng: np.random.Generator, tmp_path: Path) -> None:
+    agent = ring_agent(rng, turns=1.5)
+    submaps = agent.submaps()
+    again = [replace(s, session=7, index=s.index - 14, follows_previous=s.index > 14) for s in submaps[14:]]
+    joined, reports = join([*submaps[:14], *again])
+    assert all(r.accepted for r in reports)
+    assert len(joined.graph.records) == len(submaps)
+    assert reports[-1].components == 1
+    end = np.linalg.multi_dot([s.end_pose for s in again])
+    assert np.allclose(joined.odometry_pose("a"), end)
+    joined.save(tmp_path / "map")
+    assert [r.key for r in GlobalMap.load(tmp_path / "map").graph.records] == [r.key for r in joined.graph.records]
+    refused = joined.add(replace(submaps[3], start_stamp_ns=-1))
+    assert "session" in refused.reason
 
 
 def test_an_empty_map_answers() -> None:

@@ -146,7 +146,7 @@ def ring_graph(seed: int) -> tuple[MapGraph, Agent]:
     agent, graph = Agent(ring_world(4.0, rng), circle(4.0, 1.2), rng), MapGraph()
     submaps = agent.submaps()
     for k, submap in enumerate(submaps):
-        graph.append(submap, 0, graph.records[-1].end if k else None, np.eye(4))
+        graph.append(submap, graph.records[-1].end if k else None, np.eye(4))
         for older in range(k):
             _, i, j = np.intersect1d(agent.seen[older], agent.seen[k], return_indices=True)
             if len(i):

@@ -1,30 +1,97 @@
-"""What a node does with stamps that are not in order, without a running graph."""
+"""What a node does with odd stamps, with faults of its callbacks, and with jumps of its inputs' clock."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import pytest
 
-from slam_core.health import Health
+rclpy = pytest.importorskip("rclpy", reason="needs ROS")
+pytestmark = pytest.mark.ros
 
-base_node = pytest.importorskip("slam_core.base_node", reason="needs ROS")
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from slam_core.base_node import SlamNode  # noqa: E402
+from slam_core.config import Config  # noqa: E402
+from slam_core.messages import header_message, stamp_ns  # noqa: E402
+
+START = 1_700_000_000 * 10**9
+MS = 10**6
 
 
-def message(seconds: float) -> SimpleNamespace:
-    nanoseconds = round(seconds * 1e9)
-    stamp = SimpleNamespace(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
-    return SimpleNamespace(header=SimpleNamespace(stamp=stamp))
+@dataclass(frozen=True)
+class NoConfig(Config):
+    """No parameters."""
 
 
-def test_a_message_out_of_order_is_rejected_and_time_that_begins_anew_resets() -> None:
-    handled: list[float] = []
-    resets: list[str] = []
-    rejected: list[str] = []
-    node = SimpleNamespace(_paused=False, health=Health(), reset=resets.append, _reject=rejected.append)
-    entry = base_node._Input("/imu", None, lambda stamp, _: handled.append(stamp / 1e9), latched=False, required=True)
-    for seconds in (10.0, 10.1, 10.095, 10.1, 10.2, 3.0, 3.1):
-        base_node.SlamNode._receive(node, entry, message(seconds))
-    assert handled == [10.0, 10.1, 10.1, 10.2, 3.0, 3.1]
-    assert rejected == ["/imu: message rejected: 0.005 s older than the one before"]
-    assert resets == ["time jumped back by 7.200 s on /imu"]
+class EarNode(SlamNode[NoConfig]):
+    """Remembers what it was given and what was made of it."""
+
+    def __init__(self) -> None:
+        super().__init__("ear", NoConfig)
+        self.heard: list[int] = []
+        self.sessions = self.resets = 0
+        self.listen("frames", "PointCloud2", lambda m: self.heard.append(stamp_ns(m)))
+        self.listen("click", "PointStamped", lambda m: self.heard.append(-stamp_ns(m)))
+        self.create_service(Trigger, "~/break", lambda request, response: 1 / 0)
+
+    def on_new_session(self) -> None:
+        self.sessions += 1
+
+    def on_reset(self) -> None:
+        self.resets += 1
+
+
+@pytest.fixture
+def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[EarNode]:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "94")
+    rclpy.init()
+    node = EarNode()
+    yield node
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def send(node: EarNode, topic: str, *stamps: int) -> None:
+    entry = node._inputs[topic]
+    kind = {"frames": node.types.PointCloud2, "click": node.types.PointStamped}[topic]
+    for stamp in stamps:
+        node._receive(entry, kind(header=header_message(node.types, stamp, "")))
+
+
+def test_odd_stamps_are_rejected_and_only_a_lasting_jump_begins_a_session(node: EarNode) -> None:
+    good = [START + k * 100 * MS for k in range(10)]
+    hour = 3600 * 10**9
+    send(node, "frames", *good[:5], good[4] + hour, good[5], 0, good[6], good[3], *good[7:])
+    assert node.heard == good
+    assert node.health.counters["rejected"] == 3
+    assert (node.sessions, node.resets) == (0, 0)
+    again = [stamp - hour for stamp in good]
+    send(node, "frames", *again)
+    assert node.heard == good + again
+    assert (node.sessions, node.resets) == (1, 0)
+
+
+def test_an_operators_stamp_means_nothing(node: EarNode) -> None:
+    send(node, "frames", START, START + 100 * MS)
+    send(node, "click", 0, 5 * START, 0, 1, 0, 2, 0)
+    send(node, "frames", START + 200 * MS)
+    assert len(node.heard) == 10
+    assert (node.sessions, node.resets, node.health.counters["rejected"]) == (0, 0, 0)
+
+
+def test_a_fault_in_a_service_or_timer_is_answered_and_counted(node: EarNode) -> None:
+    node.create_timer(0.01, lambda: [][1])
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    client: Any = node.create_client(Trigger, "/ear/break")
+    future = client.call_async(Trigger.Request())
+    executor.spin_until_future_complete(future, timeout_sec=20.0)
+    assert not future.result().success
+    assert "ZeroDivisionError" in future.result().message
+    while node.health.counters["faults"] < 3:
+        executor.spin_once(timeout_sec=1.0)
+    executor.shutdown()

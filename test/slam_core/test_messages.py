@@ -273,7 +273,7 @@ def make_submap(rng: np.random.Generator, n: int, agent: str, follows: bool) -> 
     return Submap(
         agent, 7, STAMP, STAMP + 2, path[-1].T, rng.normal(size=(n, 3)), random_covariance(rng, 6 + 3 * n),
         rng.integers(0, 2**40, n), rng.integers(1, 50, n).astype(np.int32),
-        unit_rows(rng.normal(size=(n, 128))).astype(np.float32), path, follows,
+        unit_rows(rng.normal(size=(n, 128))).astype(np.float32), path, follows, 3,
     )  # fmt: skip
 
 
@@ -297,6 +297,7 @@ def test_submaps_survive_exactly_or_rounded(
     assert [getattr(back, k) for k in ("agent", "index", "start_stamp_ns", "end_stamp_ns", "follows_previous")] == [
         agent, 7, STAMP, STAMP + 2, follows
     ]  # fmt: skip
+    assert back.session == submap.session == 3
     for a, b in zip(back.path, submap.path, strict=True):
         assert a.stamp_ns == b.stamp_ns
         np.testing.assert_array_equal(a.T, b.T)

@@ -79,3 +79,13 @@ def test_any_interleaving_that_keeps_each_topics_order_gives_every_set(order: li
 def test_nonsense_is_refused() -> None:
     with pytest.raises(ValueError, match="-1 ns"):
         make(tolerance_ns=-1)
+
+
+def test_sets_of_a_clock_that_has_jumped_back_are_not_taken_for_leftovers() -> None:
+    sets: list[int] = []
+    pairs = StampSynchronizer[str](["a", "b"], lambda stamp, _: sets.append(stamp))
+    for stamp in (1000, 10):
+        pairs.add("a", stamp, "a")
+    for stamp in (1000, 10):
+        pairs.add("b", stamp, "b")
+    assert (sets, pairs.unpaired) == ([1000, 10], 0)

@@ -44,6 +44,11 @@ class EkfNodeConfig(EkfSlamConfig):
     odom_frame: str = parameter("odom", "frame of the odometry")
     base_frame: str = parameter("base_link", "frame of the rig; the features' frame is looked up in it")
     path_length: int = parameter(2000, "newest poses shown in ``path``", minimum=1)
+    session: int = parameter(
+        -1,
+        "number of the first session; -1: the second of the first frame's stamp, which no run before had",
+        minimum=-1,
+    )
     wait_for_motion: bool = parameter(False, "features wait until ``ndt/motion`` has reached their stamp")
 
 
@@ -53,6 +58,7 @@ class EkfNode(SlamNode[EkfNodeConfig]):
     def __init__(self) -> None:
         super().__init__("ekf_slam", EkfNodeConfig)
         self.slam: EkfSlam | None = None
+        self._next_session = self.config.session
         self._frames = deque[Features]()
         self._aids = deque[tuple[int, RelativeMotion | ImuSample]]()
         self._motion_stamp_ns = -1
@@ -95,7 +101,17 @@ class EkfNode(SlamNode[EkfNodeConfig]):
 
     def on_reset(self) -> None:
         """Forget everything; the mounting is looked up anew."""
+        if self.slam is not None:
+            self._next_session = self.slam.session + 1
         self.slam = None
+        self._forget_queues()
+        self.path.clear()
+
+    def on_new_session(self) -> None:
+        """Process what waits and publish the open submap, then begin anew."""
+        while self._frames:
+            self._process_frame(self._frames.popleft())
+        self._publish_submaps(self.slam.start_session() if self.slam is not None else ())
         self._forget_queues()
         self.path.clear()
 
@@ -125,7 +141,7 @@ class EkfNode(SlamNode[EkfNodeConfig]):
     def _process_frame(self, features: Features) -> None:
         """One frame, after all that was measured up to its stamp; the camera's mounting is looked up at the first."""
         if self.slam is None:
-            self.slam = EkfSlam(self.config, self.lookup(self.config.base_frame, features.frame_id))
+            self.slam = self._make_filter(features)
         while self._aids and self._aids[0][0] <= features.stamp_ns:
             self._give_aid(self.slam, self._aids.popleft()[1])
         result = self.slam.process(features)
@@ -134,6 +150,10 @@ class EkfNode(SlamNode[EkfNodeConfig]):
         self.health.set(_STATES[result.state], result.reason)
         for name, count in self.slam.counters.counts.items():
             self.health.counters[name] = count
+
+    def _make_filter(self, first: Features) -> EkfSlam:
+        session = self._next_session if self._next_session >= 0 else first.stamp_ns // 1_000_000_000
+        return EkfSlam(self.config, self.lookup(self.config.base_frame, first.frame_id), session)
 
     @staticmethod
     def _give_aid(slam: EkfSlam, aid: RelativeMotion | ImuSample) -> None:

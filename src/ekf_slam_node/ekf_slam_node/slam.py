@@ -42,9 +42,11 @@ class EkfSlam:
     ----------
     T_rig_optical
         Mounting of the camera, (4, 4); by default at the rig's origin, looking along its X axis.
+    session
+        Number of the first session, see :class:`slam_core.types.Submap`.
     """
 
-    def __init__(self, config: EkfSlamConfig, T_rig_optical: FloatArray | None = None) -> None:
+    def __init__(self, config: EkfSlamConfig, T_rig_optical: FloatArray | None = None, session: int = 0) -> None:
         if T_rig_optical is None:
             T_rig_optical = make_transform(OPTICAL_FROM_RIG.T, np.zeros(3))
         if not is_rigid_transform(T_rig_optical):
@@ -53,16 +55,23 @@ class EkfSlam:
         self._T_rig_optical = T_rig_optical
         self._linker = Linker(config.association, T_rig_optical)
         self._sigma = np.repeat([config.motion.sigma_acceleration, config.motion.sigma_angular_acceleration], 3)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything, as if just made."""
         self.counters = Counters()
+        self.session = session
+        self._forget()
+
+    def start_session(self) -> tuple[Submap, ...]:
+        """Begin anew with the next frame, whatever its stamp; the open submap is closed and returned."""
+        submaps = self.finish()
+        self.session += 1
+        self._forget()
+        return submaps
+
+    def _forget(self) -> None:
         self._aids = MotionAids(self.config.motion)
         self._noise = NoiseMonitor(self.config.measurement)
         self._odometry = OdometryChain()
         self._map: LocalMap | None = None
-        self._builder = SubmapBuilder(self.config.agent, 0, 0, False)
+        self._builder = SubmapBuilder(self.config.agent, 0, 0, False, self.session)
         self._next_submap = 0
         self._next_id = 0
         self._stamp_ns = 0
@@ -293,7 +302,7 @@ class EkfSlam:
 
     def _open(self, local: LocalMap, frame: Frame, follows: bool) -> None:
         self._map = local
-        self._builder = SubmapBuilder(self.config.agent, self._next_submap, frame.stamp_ns, follows)
+        self._builder = SubmapBuilder(self.config.agent, self._next_submap, frame.stamp_ns, follows, self.session)
         self._reached(frame)
 
     def _first_variance(self) -> FloatArray:

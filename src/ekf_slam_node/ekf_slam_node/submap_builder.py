@@ -22,15 +22,16 @@ class SubmapBuilder:
 
     Parameters
     ----------
-    index, start_stamp_ns, follows_previous
+    index, start_stamp_ns, follows_previous, session
         As in :class:`slam_core.types.Submap`.
     """
 
-    def __init__(self, agent: str, index: int, start_stamp_ns: int, follows_previous: bool) -> None:
+    def __init__(self, agent: str, index: int, start_stamp_ns: int, follows_previous: bool, session: int = 0) -> None:
         self._agent = agent
         self.index = index
         self._start_stamp_ns = start_stamp_ns
         self._follows_previous = follows_previous
+        self._session = session
         self._path = [PoseEstimate(start_stamp_ns, np.eye(4), np.zeros((6, 6)))]
 
     def add_pose(self, stamp_ns: int, ekf: Ekf) -> None:
@@ -70,7 +71,7 @@ class SubmapBuilder:
             agent=self._agent, index=self.index, start_stamp_ns=self._start_stamp_ns, end_stamp_ns=end.stamp_ns,
             end_pose=end.T, landmarks=ekf.landmarks.copy(), covariance=covariance, landmark_ids=book.ids.copy(),
             sightings=book.sightings.copy(), descriptors=book.descriptors.copy(), path=tuple(self._path),
-            follows_previous=self._follows_previous,
+            follows_previous=self._follows_previous, session=self._session,
         )  # fmt: skip
 
 

@@ -89,7 +89,6 @@ class GlobalMap:
         self.finder = LinkFinder(self.config.closure)
         self.joiner = Joiner(self.graph, self.config.closure.window, self.config.joining)
         self.trials = Trials(self.joiner, self.config.trial, self.config.closure)
-        self._sessions: dict[str, int] = {}
         self._lookup: dict[tuple[str, int, int], int] = {}
         self._unsearched: list[int] = []
         self._closed_at = 0
@@ -133,27 +132,20 @@ class GlobalMap:
         known = self.graph.records[0].submap.descriptors.shape[1] if self.graph.records else None
         if known is not None and submap.descriptors.shape[1] != known and len(submap.landmarks):
             return f"descriptors of {submap.descriptors.shape[1]} columns in a map of {known}"
-        held = self._lookup.get((submap.agent, self._session_of(submap), submap.index))
-        return "" if held is None else "already joined"
-
-    def _session_of(self, submap: Submap) -> int:
-        """Run of the agent: an index that is already taken by another stamp means that the agent has started anew."""
-        session = self._sessions.get(submap.agent, 0)
-        held = self._lookup.get((submap.agent, session, submap.index))
-        if held is not None and self.graph.records[held].submap.start_stamp_ns != submap.start_stamp_ns:
-            return session + 1
-        return session
+        held = self._lookup.get((submap.agent, submap.session, submap.index))
+        if held is None:
+            return ""
+        same = self.graph.records[held].submap.start_stamp_ns == submap.start_stamp_ns
+        return "already joined" if same else "another submap of this agent, session and index is in the map"
 
     def _place(self, submap: Submap) -> int:
         """Add a record at the end of its predecessor, or as a component of its own where the agent was last seen."""
-        session = self._session_of(submap)
-        self._sessions[submap.agent] = session
-        previous = self._lookup.get((submap.agent, session, submap.index - 1))
+        previous = self._lookup.get((submap.agent, submap.session, submap.index - 1))
         follows = submap.follows_previous and previous is not None
         start = self.graph.records[previous].end if follows and previous is not None else None
-        self.graph.append(submap, session, start, self._last_pose(submap.agent))
+        self.graph.append(submap, start, self._last_pose(submap.agent))
         new = len(self.graph.records) - 1
-        self._lookup[submap.agent, session, submap.index] = new
+        self._lookup[self.graph.records[new].key] = new
         return new
 
     def _last_pose(self, agent: str) -> FloatArray:
@@ -265,7 +257,6 @@ class GlobalMap:
         if order != list(range(len(records))):
             central = GlobalMap(self.config)
             for record in (records[i] for i in order):
-                central._sessions[record.key[0]] = record.session
                 central.add(record.submap)
             central.counters = self.counters
             central.marks = self._marks_in(central)
@@ -289,9 +280,9 @@ class GlobalMap:
 
     def odometry_pose(self, agent: str) -> FloatArray:
         """End pose of an agent's newest submap in its own odometry frame: the chain of end poses of its current run."""
-        own = [r.submap for r in self.graph.records if r.submap.agent == agent and r.session == self._sessions[agent]]
+        own = [r.submap for r in self.graph.records if r.submap.agent == agent]
         T = np.eye(4)
-        for submap in sorted(own, key=lambda s: s.index):
+        for submap in sorted((s for s in own if s.session == own[-1].session), key=lambda s: s.index):
             T = T @ submap.end_pose
         return T
 
@@ -341,8 +332,6 @@ class GlobalMap:
         loaded.trials = Trials(loaded.joiner, loaded.config.trial, loaded.config.closure, stored.contested)
         loaded.finder.pending, loaded.finder.near.compared = stored.pending, stored.compared
         for i, record in enumerate(graph.records):
-            agent, session, _ = record.key
             loaded._lookup[record.key] = i
-            loaded._sessions[agent] = max(session, loaded._sessions.get(agent, 0))
             loaded.finder.index.add(i, record.submap.descriptors)
         return loaded

@@ -25,10 +25,9 @@ from slam_core.types import Submap
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A submap in the map: its nodes, its first observation, and the run of the agent it belongs to."""
+    """A submap in the map: its nodes and its first observation."""
 
     submap: Submap
-    session: int
     start: int
     end: int
     first_observation: int
@@ -36,7 +35,7 @@ class Record:
     @property
     def key(self) -> tuple[str, int, int]:
         """Agent, session and index: unique, and an order that does not depend on when a submap arrived."""
-        return self.submap.agent, self.session, self.submap.index
+        return self.submap.agent, self.submap.session, self.submap.index
 
     @property
     def observations(self) -> IntArray:
@@ -108,7 +107,7 @@ class MapGraph:
         """Record of every observation, (observations,)."""
         return self._fusion.record_of
 
-    def append(self, submap: Submap, session: int, start: int | None, guess: FloatArray) -> Record:
+    def append(self, submap: Submap, start: int | None, guess: FloatArray) -> Record:
         """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own."""
         if start is None:
             start = self._new_node(guess, len(self.poses))
@@ -117,7 +116,7 @@ class MapGraph:
         self._stretch[end] = self._stretch.setdefault(start, start)
         self._chained[end] = self._chained.setdefault(start, np.eye(4)) @ submap.end_pose
         self._way[end] = self._way.setdefault(start, 0.0) + float(np.linalg.norm(submap.end_pose[:3, 3]))
-        record = Record(submap, session, start, end, len(self.points))
+        record = Record(submap, start, end, len(self.points))
         self.points = np.concatenate([self.points, submap.landmarks @ T[:3, :3].T + T[:3, 3]])
         self._fusion.append(len(submap.landmarks), len(self.records))
         self._ending_at[end] = len(self.records)

@@ -43,6 +43,7 @@ from slam_core.messages.base import Message
 from slam_core.messages.submaps import SubmapMessages
 from slam_core.point_cloud import write_ply
 from slam_core.ros import run_node
+from slam_core.stamp_guard import StampPolicy
 from slam_core.types import PoseEstimate, Submap
 
 _ODOMETRY_KEPT = 20000
@@ -76,8 +77,9 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._advertise_outputs()
         for agent in self.config.agents:
             self._listen_to(agent)
-        self.listen("clicked_point", "PointStamped", self.on_clicked_point, required=False)
-        self.listen("initialpose", "PoseWithCovarianceStamped", self.on_initial_pose, required=False)
+        unordered = {"required": False, "stamps": StampPolicy.ANY}
+        self.listen("clicked_point", "PointStamped", self.on_clicked_point, **unordered)
+        self.listen("initialpose", "PoseWithCovarianceStamped", self.on_initial_pose, **unordered)
         self._serve("save_map", self.save_map)
         self._serve("load_map", self.load_map)
         self._serve("export_ply", self.export_ply)
@@ -98,8 +100,9 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def _listen_to(self, agent: str) -> None:
         topics = {_below(agent, topic): kind for topic, kind in SUBMAP_TOPICS.items()}
-        self.listen_together(topics, partial(self.on_submap, agent), latched=True)
-        self.listen(_below(agent, "odom"), "Odometry", partial(self.on_odometry, agent), required=False)
+        on_odometry = partial(self.on_odometry, agent)
+        self.listen_together(topics, partial(self.on_submap, agent), latched=True, stamps=StampPolicy.ANY)
+        self.listen(_below(agent, "odom"), "Odometry", on_odometry, required=False, stamps=StampPolicy.ANY)
 
     def _serve(self, name: str, action: Callable[[], str]) -> None:
         def answer(_: Any, response: Any) -> Any:
@@ -157,7 +160,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             kept.clear()
         if not self.config.localize_only:
             self.global_map.reset()
-            self._map_is_news = False
+            self._publish_map()
 
     def _localizer(self, agent: str) -> Localizer:
         return self.localizers.setdefault(agent, Localizer(self.global_map))
@@ -183,7 +186,9 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     # -- services ------------------------------------------------------------------------------------------------------
 
     def save_map(self) -> str:
-        """Write the map to ``map_path``."""
+        """Write the map to ``map_path``; an empty one never over another."""
+        if not self.global_map.graph.records and Path(self.config.map_path).exists():
+            raise ValueError(f"the map is empty: {self.config.map_path} is left as it is")
         self.global_map.save(self.config.map_path)
         self._publish_map()
         return f"{len(self.global_map.graph.records)} submaps written to {self.config.map_path}"

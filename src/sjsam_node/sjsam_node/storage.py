@@ -58,7 +58,7 @@ def write(folder: Path, stored: StoredMap) -> None:
         "format": FORMAT, "version": VERSION, "submaps": len(graph.records),
         "agents": sorted({r.submap.agent for r in graph.records}),
         "records": [
-            [r.submap.agent, r.submap.index, r.session, r.start, r.submap.follows_previous] for r in graph.records
+            [s.agent, s.index, s.session, r.start, s.follows_previous] for r in graph.records for s in [r.submap]
         ],
         "marks": [[m.name, m.node, *m.point.tolist()] for m in stored.marks.marks],
         "closed_at": stored.closed_at,
@@ -166,12 +166,12 @@ def _submap_arrays(submap: Submap) -> Arrays:
     }  # fmt: skip
 
 
-def _submap(agent: str, index: int, follows: bool, arrays: Arrays) -> Submap:
+def _submap(agent: str, index: int, session: int, follows: bool, arrays: Arrays) -> Submap:
     path = zip(arrays["path_stamps"].tolist(), arrays["path_poses"], arrays["path_covariances"], strict=True)
     return Submap(
         agent, index, int(arrays["stamps"][0]), int(arrays["stamps"][1]), arrays["end_pose"], arrays["landmarks"],
         arrays["covariance"], arrays["landmark_ids"], arrays["sightings"], arrays["descriptors"],
-        tuple(PoseEstimate(stamp, T, P) for stamp, T, P in path), follows,
+        tuple(PoseEstimate(stamp, T, P) for stamp, T, P in path), follows, session,
     )  # fmt: skip
 
 
@@ -181,9 +181,8 @@ def _graph(records: list[list[Any]], arrays: Arrays) -> MapGraph:
     for i, (agent, index, session, start, follows) in enumerate(records):
         prefix = f"submap_{i}/"
         own = {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}
-        graph.append(
-            _submap(agent, index, follows, own), session, start if start < len(graph.poses) else None, np.eye(4)
-        )
+        submap = _submap(agent, index, session, follows, own)
+        graph.append(submap, start if start < len(graph.poses) else None, np.eye(4))
     graph.component_of = arrays["component_of"]
     graph.poses, graph.points = arrays["poses"], arrays["points"]
     graph.replace_links(_links("links", arrays))

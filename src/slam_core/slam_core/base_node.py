@@ -18,9 +18,9 @@
         run_node(NdtNode)  # of slam_core.ros
 
 A callback that raises ``ValueError`` rejects its message: logged, counted, never the end of the node. Header stamps are
-the only time; a stamp that jumps backwards resets the node, one a little out of order is rejected. Whatever a node has
-finished is announced on ``/progress`` (Header: stamp, node name), which is what lets a player wait for it instead of
-losing messages.
+the only time. An odd stamp is rejected; where the clock of the inputs has jumped back for good a new session begins
+(:mod:`slam_core.stamp_guard`). Whatever a node has finished is announced on ``/progress`` (Header: stamp, node name),
+which is what lets a player wait for it instead of losing messages.
 """
 
 # rclpy is annotated in part only.
@@ -31,84 +31,46 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 
-from slam_core.config import Config, parameter
+from slam_core.config import Config
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
-from slam_core.health import Health, State
+from slam_core.health import State
+from slam_core.listening_node import LATCHED_DEPTH, Input, ListeningNode
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC, header_message, stamp_ns, transform_from_message
 from slam_core.messages.base import Message
-from slam_core.ros import RosTypes, declare_config, has_tf2_msgs, incompatibility, sensor_qos
-from slam_core.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
+from slam_core.ros import RosTypes, declare_config, has_tf2_msgs, sensor_qos
+from slam_core.stamp_guard import StampGuard, StampPolicy
+from slam_core.synchronizer import StampSynchronizer
 
 C = TypeVar("C", bound=Config)
 
-WATCHDOG_S = 5.0
-JUMP_S = 0.25
-"""A stamp older by so much is a time that has begun anew; by less, a message out of order."""
 
-_NOT_A_FRAME = ("CameraInfo", "Imu", "Odometry", "PoseWithCovarianceStamped", "PointStamped")
+_POLICIES = {
+    "CameraInfo": StampPolicy.ANY, "PointStamped": StampPolicy.ANY, "Imu": StampPolicy.FOLLOWS,
+    "PoseWithCovarianceStamped": StampPolicy.FOLLOWS, "Odometry": StampPolicy.FOLLOWS,
+}  # fmt: skip
 """Types whose messages accompany frames: having processed one says nothing of the frame of its stamp."""
 
-LATCHED_DEPTH = 1000
 PROGRESS_TOPIC = "/progress"
 
 
-@dataclass(frozen=True)
-class InputConfig(Config):
-    """How a node subscribes and pairs; parameters ``input.*`` of every node."""
-
-    reliability: str = parameter(
-        "match",
-        "reliability of subscriptions; match: what the publisher offers",
-        choices=("match", "reliable", "best_effort"),
-    )
-    depth: int = parameter(200, "messages kept per topic while the node is busy", minimum=1)
-    pairing_tolerance_s: float = parameter(
-        PAIRING_TOLERANCE_S, "largest difference of stamps that belong together", unit="s", minimum=0.0
-    )
-
-
-@dataclass
-class _Input:
-    """One subscription and what is known of its traffic; ``handler`` takes (stamp_ns, message)."""
-
-    topic: str
-    message_class: Any
-    handler: Callable[[int, Message], None]
-    latched: bool
-    required: bool
-    subscription: Any = None
-    best_effort: bool = False
-    volatile: bool = False
-    last_stamp_ns: int | None = None
-    seen_at_s: float | None = None
-
-
-class SlamNode(Node, Generic[C]):
+class SlamNode(ListeningNode, Generic[C]):
     """Base of all nodes, see the example above. ``config`` is the checked configuration, ``types`` makes messages."""
 
     def __init__(self, name: str, config_type: type[C]) -> None:
-        super().__init__(name, automatically_declare_parameters_from_overrides=True)
-        self.input_config = declare_config(self, InputConfig, "input.")
+        super().__init__(name)
         self.config: C = declare_config(self, config_type, ignore=("input.",))
         self.types = RosTypes()
-        self.health = Health()
         self.frames = FrameTree()
-        self._inputs: dict[str, _Input] = {}
+        self._stamps = StampGuard[Message]()
         self._synchronizers: list[StampSynchronizer[Message]] = []
         self._outputs: dict[str, Any] = {}
-        self._paused = False
         self._silent = False
-        self._started_at_s = time.monotonic()
         self._input_stamp_ns = 0
         self._reported_state = State.OK
         self._progress = self.create_publisher(self.types.Header, PROGRESS_TOPIC, sensor_qos(self.input_config.depth))
@@ -130,17 +92,28 @@ class SlamNode(Node, Generic[C]):
         *,
         latched: bool = False,
         required: bool = True,
+        stamps: StampPolicy | None = None,
     ) -> None:
-        """Subscribe. The silence of ``required`` inputs is reported. ``type_name`` as in MESSAGE_PACKAGES."""
-        announce = type_name not in _NOT_A_FRAME
+        """Subscribe. The silence of ``required`` inputs is reported. ``type_name`` as in MESSAGE_PACKAGES.
+
+        ``stamps`` says whether the topic's stamps must run in order, by default by its type.
+        """
+        policy = stamps or _POLICIES.get(type_name, StampPolicy.FRAMES)
+        announce = policy is StampPolicy.FRAMES
 
         def handle(stamp: int, message: Message) -> None:
             self._process(topic, stamp, callback, message, announce=announce)
 
-        self._add_input(topic, type_name, handle, latched, required)
+        self._add_input(topic, type_name, handle, latched, required, policy)
 
     def listen_together(
-        self, topics: Mapping[str, str], callback: Callable[..., None], *, latched: bool = False, required: bool = True
+        self,
+        topics: Mapping[str, str],
+        callback: Callable[..., None],
+        *,
+        latched: bool = False,
+        required: bool = True,
+        stamps: StampPolicy = StampPolicy.FRAMES,
     ) -> None:
         """Subscribe to several topics (topic: type); ``callback`` gets the messages of one stamp in that order."""
         names = list(topics)
@@ -152,7 +125,9 @@ class SlamNode(Node, Generic[C]):
         pairs = StampSynchronizer[Message](names, on_set, tolerance_ns=tolerance_ns, depth=self.input_config.depth)
         self._synchronizers.append(pairs)
         for topic, type_name in topics.items():
-            self._add_input(topic, type_name, lambda stamp, m, t=topic: pairs.add(t, stamp, m), latched, required)
+            self._add_input(
+                topic, type_name, lambda stamp, m, t=topic: pairs.add(t, stamp, m), latched, required, stamps
+            )
 
     def advertise(self, topic: str, type_name: str, *, latched: bool = False, depth: int | None = None) -> None:
         """Offer a topic: reliable; ``latched`` ones (maps) keep what they sent for those who come later."""
@@ -177,7 +152,11 @@ class SlamNode(Node, Generic[C]):
             self._tf.publish(self.types.TFMessage(transforms=list(transforms)))
 
     def on_reset(self) -> None:
-        """Start anew; override where there is state."""
+        """Forget everything (``~/reset``); override where there is state."""
+
+    def on_new_session(self) -> None:
+        """The clock of the inputs has jumped back: begin anew with the next message; what is mapped must survive."""
+        self.on_reset()
 
     def on_finish(self) -> str:
         """The input has ended: publish what is still open. Override where there is any; returns a line for the log."""
@@ -189,40 +168,37 @@ class SlamNode(Node, Generic[C]):
     # -- inputs --------------------------------------------------------------------------------------------------------
 
     def _add_input(
-        self, topic: str, type_name: str, handler: Callable[[int, Message], None], latched: bool, required: bool
+        self,
+        topic: str,
+        type_name: str,
+        handler: Callable[[int, Message], None],
+        latched: bool,
+        required: bool,
+        policy: StampPolicy,
     ) -> None:
-        entry = _Input(self.resolve_topic_name(topic), getattr(self.types, type_name), handler, latched, required)
+        kind = getattr(self.types, type_name)
+        entry = Input(self.resolve_topic_name(topic), kind, handler, latched, required, policy)
         entry.best_effort = self.input_config.reliability == "best_effort"
         self._inputs[topic] = entry
         self._subscribe(entry)
 
-    def _subscribe(self, entry: _Input) -> None:
-        if entry.subscription is not None:
-            self.destroy_subscription(entry.subscription)
-        depth = LATCHED_DEPTH if entry.latched else self.input_config.depth
-        profile = sensor_qos(depth, entry.latched and not entry.volatile, best_effort=entry.best_effort)
-        events = SubscriptionEventCallbacks(
-            message_lost=lambda event: self.health.count("lost_by_transport", event.total_count_change),
-            incompatible_qos=lambda event: None,
-        )
-        entry.subscription = self.create_subscription(
-            entry.message_class, entry.topic, lambda m: self._receive(entry, m), profile, event_callbacks=events
-        )
-
-    def _receive(self, entry: _Input, message: Message) -> None:
+    def _receive(self, entry: Input, message: Message) -> None:
         entry.seen_at_s = time.monotonic()
         if self._paused:
             self.health.count("ignored_while_paused")
             return
         stamp = stamp_ns(message)
-        back_s = 0.0 if entry.last_stamp_ns is None else (entry.last_stamp_ns - stamp) / 1e9
-        if 0.0 < back_s < JUMP_S:
-            self._reject(f"{entry.topic}: message rejected: {back_s:.3f} s older than the one before")
+        if entry.policy is StampPolicy.ANY:
+            entry.handler(stamp, message)
             return
-        if back_s > 0.0:
-            self.reset(f"time jumped back by {back_s:.3f} s on {entry.topic}")
-        entry.last_stamp_ns = stamp
-        entry.handler(stamp, message)
+        starts = entry.policy is StampPolicy.FRAMES
+        ruling = self._stamps.add(entry.topic, stamp, message, starts_sessions=starts)
+        if ruling.rejected:
+            self._reject(f"{entry.topic}: message rejected: {ruling.reason}", len(ruling.rejected))
+        if ruling.new_session:
+            self.start_session(f"{ruling.reason} on {entry.topic}")
+        for released_ns, released in ruling.released:
+            entry.handler(released_ns, released)
 
     def _process(
         self, source: str, stamp: int, callback: Callable[..., None], *messages: Message, announce: bool = True
@@ -240,22 +216,32 @@ class SlamNode(Node, Generic[C]):
             self._report_change()
             self._progress.publish(header_message(self.types, stamp, self.get_fully_qualified_name()))
 
-    def _reject(self, why: str) -> None:
-        self.health.count("rejected")
+    def _reject(self, why: str, number: int = 1) -> None:
+        self.health.count("rejected", number)
         self.get_logger().warning(why, throttle_duration_sec=1.0)
 
     # -- reset, pause, finish ------------------------------------------------------------------------------------------
 
+    def start_session(self, why: str) -> None:
+        """Flush the queues and go on in a new session: nothing that is mapped is forgotten."""
+        self.get_logger().warning(f"new session: {why}", throttle_duration_sec=1.0)
+        self.health.count("sessions")
+        self._flush()
+        self.on_new_session()
+        self.health.set(State.OK, f"new session: {why}")
+
     def reset(self, why: str) -> None:
-        """Flush the queues and start anew."""
-        self.get_logger().warning(f"reset: {why}")
+        """Flush the queues and forget everything."""
+        self.get_logger().warning(f"reset: {why}", throttle_duration_sec=1.0)
         self.health.count("resets")
-        for synchronizer in self._synchronizers:
-            synchronizer.clear()
-        for entry in self._inputs.values():
-            entry.last_stamp_ns = None
+        self._flush()
+        self._stamps.restart()
         self.on_reset()
         self.health.set(State.OK, f"reset: {why}")
+
+    def _flush(self) -> None:
+        for synchronizer in self._synchronizers:
+            synchronizer.clear()
 
     def _on_reset_service(self, _: Any, response: Any) -> Any:
         self.reset("asked by service")
@@ -306,47 +292,8 @@ class SlamNode(Node, Generic[C]):
         return self.types.DiagnosticArray(header=header, status=[status])
 
     def _unconnected(self) -> list[str]:
-        """Required topics that no publisher has been matched with, static transforms included."""
-        inputs = self._inputs.values()
-        topics = [entry.topic for entry in inputs if entry.required and not entry.subscription.get_publisher_count()]
-        if not any(subscription.get_publisher_count() for subscription in self._static_inputs):
-            topics.append(STATIC_TRANSFORMS_TOPIC)
-        return topics
-
-    def _silence(self) -> str:
-        """Which required topics have been silent for five seconds and why, or "" if none has."""
-        now, texts = time.monotonic(), []
-        for entry in self._inputs.values():
-            if entry.required and not self._paused and now - (entry.seen_at_s or self._started_at_s) > WATCHDOG_S:
-                texts.append(f"no input on {entry.topic} for {WATCHDOG_S:.0f} s ({self._publishers_text(entry)})")
-        return "; ".join(texts)
-
-    def _publishers_text(self, entry: _Input) -> str:
-        publishers = self.get_publishers_info_by_topic(entry.topic)
-        if not publishers:
-            return "it has no publisher"
-        wanted = entry.subscription.qos_profile
-        texts = []
-        for info in publishers:
-            why = incompatibility(info.qos_profile, wanted)
-            texts.append(
-                f"{info.node_namespace.rstrip('/')}/{info.node_name}" + (f", incompatible: {why}" if why else "")
-            )
-        return "published by " + ", ".join(texts)
-
-    def _match_publishers(self) -> None:
-        """Subscribe again where every publisher offers less than was asked for, as ``ros2 topic echo`` would."""
-        if self.input_config.reliability != "match":
-            return
-        for entry in self._inputs.values():
-            publishers = self.get_publishers_info_by_topic(entry.topic) if entry.seen_at_s is None else []
-            if not publishers:
-                continue
-            best_effort = all(p.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for p in publishers)
-            volatile = all(p.qos_profile.durability == DurabilityPolicy.VOLATILE for p in publishers)
-            if (best_effort, volatile and entry.latched) != (entry.best_effort, entry.volatile):
-                entry.best_effort, entry.volatile = best_effort, volatile and entry.latched
-                self._subscribe(entry)
+        static = [] if any(s.get_publisher_count() for s in self._static_inputs) else [STATIC_TRANSFORMS_TOPIC]
+        return super()._unconnected() + static
 
     # -- transforms ----------------------------------------------------------------------------------------------------
 

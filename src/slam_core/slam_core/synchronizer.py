@@ -18,10 +18,11 @@ time between two frames, so that equal stamps pair as if nothing else were allow
 
 
 class StampSynchronizer(Generic[T]):
-    """Collects one item per topic and hands complete sets on, in the order of their stamps.
+    """Collects one item per topic and hands complete sets on, in the order of their arrival.
 
-    A topic delivers in order, so once a set is complete nothing older can become complete: what is left of it is
-    counted in ``unpaired`` and dropped. Queues are bounded by ``depth``; what overflows is counted the same way.
+    A topic delivers in order, so once a set is complete nothing that came before it can become complete: what is left
+    of that is counted in ``unpaired`` and dropped. Queues are bounded by ``depth``; what overflows is counted the same
+    way.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ class StampSynchronizer(Generic[T]):
     def add(self, topic: str, stamp_ns: int, item: T) -> None:
         """Take one item; calls ``on_set`` before it returns if the item completes a set."""
         queue = self._queues[topic]
-        if stamp_ns in queue:
+        if queue.pop(stamp_ns, None) is not None:
             self.unpaired += 1
         queue[stamp_ns] = item
         if len(queue) > self._depth:
@@ -91,8 +92,8 @@ class StampSynchronizer(Generic[T]):
     def _emit(self, stamps: list[int]) -> None:
         items = []
         for queue, stamp in zip(self._queues.values(), stamps, strict=True):
-            items.append(queue.pop(stamp))
-            for old in [s for s in queue if s < stamp]:
-                del queue[old]
+            while (first := next(iter(queue))) != stamp:
+                del queue[first]
                 self.unpaired += 1
+            items.append(queue.pop(stamp))
         self._on_set(stamps[0], tuple(items))

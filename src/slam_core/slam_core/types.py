@@ -133,7 +133,8 @@ class Submap:
     known association (a hint, not proof). sightings: (n,) int32. descriptors: (n, d) float32, unit norm. path: the rig
     poses inside, T_start_rig, each with the marginal covariance (6, 6) at that time; the first is identity, the last is
     ``end_pose``. follows_previous: the start pose is the end pose of submap ``index - 1`` of the agent (odometry
-    chains); False after the rig was lost.
+    chains); False after the rig was lost. session: run of the agent's filter, given by the filter; indices begin anew
+    in each, and a later one has a larger number.
     """
 
     agent: str
@@ -148,6 +149,7 @@ class Submap:
     descriptors: Float32Array
     path: tuple[PoseEstimate, ...]
     follows_previous: bool = True
+    session: int = 0
 
     def __post_init__(self) -> None:
         n = len(self.landmarks)

@@ -51,8 +51,8 @@ class FlowControl:
         """``node`` has processed everything up to ``stamp_ns``."""
         with self._changed:
             for (name, _), stamps in self._on_the_way.items():
-                while name == node and stamps and stamps[0] <= stamp_ns:
-                    stamps.popleft()
+                if name == node:
+                    _forget_up_to(stamps, stamp_ns)
             self._changed.notify_all()
 
     def sent(self, topic: str, stamp_ns: int) -> None:
@@ -93,6 +93,13 @@ class FlowControl:
 
     def _total(self) -> int:
         return sum(len(s) for s in self._on_the_way.values())
+
+
+def _forget_up_to(stamps: deque[int], stamp_ns: int) -> None:
+    """Drop what was sent up to the last stamp that is not newer; an odd stamp before it is never reported itself."""
+    done = max((i for i, stamp in enumerate(stamps) if stamp <= stamp_ns), default=-1)
+    for _ in range(done + 1):
+        stamps.popleft()
 
 
 class ReplayClock:

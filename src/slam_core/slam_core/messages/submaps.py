@@ -6,7 +6,7 @@
 ``submap/gaussian``         Image 64FC1, 6 + 3n rows: the mean (end pose tangent, landmarks), then the joint covariance
 ``submap/path``             the rig poses inside, for the eye
 ``submap/path_covariance``  Image 64FC1, one row per pose: the upper 3x4 of T_start_rig, then its 6x6 covariance
-``submap/info``             DiagnosticArray: agent, index, start and end stamp, whether it follows its predecessor
+``submap/info``             DiagnosticArray: agent, session, index, start and end stamp, whether it follows the last
 ==========================  =================================================================================
 
 Over a thin link descriptors and Gaussian can go out compact, in a quarter of the bytes
@@ -111,6 +111,7 @@ def submap_from_messages(messages: SubmapMessages) -> Submap:
         descriptors=unpack_descriptors(image_from_message(messages.descriptors)),
         path=path,
         follows_previous=info["follows_previous"] == "true",
+        session=int(info["session"]),
     )
 
 
@@ -155,7 +156,8 @@ def _matrix(message: Message, name: str, rows: int, columns: int) -> AnyArray:
 
 def _info_message(types: MessageTypes, header: Message, submap: Submap) -> Message:
     values = {
-        "agent": submap.agent, "index": str(submap.index), "start_stamp_ns": str(submap.start_stamp_ns),
+        "agent": submap.agent, "session": str(submap.session), "index": str(submap.index),
+        "start_stamp_ns": str(submap.start_stamp_ns),
         "end_stamp_ns": str(submap.end_stamp_ns), "follows_previous": "true" if submap.follows_previous else "false",
         "landmarks": str(len(submap.landmarks)),
     }  # fmt: skip
@@ -168,7 +170,7 @@ def _read_info(message: Message) -> dict[str, str]:
     if len(message.status) != 1:
         raise ValueError(f"submap/info must have one status, got {len(message.status)}")
     values = {entry.key: entry.value for entry in message.status[0].values}
-    needed = ("agent", "index", "start_stamp_ns", "end_stamp_ns", "follows_previous")
+    needed = ("agent", "session", "index", "start_stamp_ns", "end_stamp_ns", "follows_previous")
     if missing := [key for key in needed if key not in values]:
         raise ValueError(f"submap/info lacks {', '.join(missing)}")
     return values

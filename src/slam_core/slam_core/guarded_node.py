@@ -1,0 +1,69 @@
+"""A node that no callback can end: what a subscription, timer or service raises is logged and counted."""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls, disable-error-code="attr-defined,union-attr,arg-type,misc"
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+
+from slam_core.health import Health
+
+
+class GuardedNode(Node):
+    """rclpy's node; subscriptions, timers and services made through it are guarded. ``health`` counts ``faults``."""
+
+    def __init__(self, name: str, **options: Any) -> None:
+        self.health = Health()
+        super().__init__(name, **options)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., None], *rest: Any, **options: Any
+    ) -> Any:
+        """As rclpy's, guarded."""
+        return super().create_subscription(msg_type, topic, self._guarded(topic, callback), *rest, **options)
+
+    def create_timer(self, timer_period_sec: float, callback: Callable[[], None], *rest: Any, **options: Any) -> Any:
+        """As rclpy's, guarded."""
+        return super().create_timer(timer_period_sec, self._guarded("timer", callback), *rest, **options)
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any], *rest: Any, **options: Any
+    ) -> Any:
+        """As rclpy's, guarded: a request that fails is answered with the reason."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except Exception as error:
+                self._on_fault(f"service {srv_name}")
+                return _failed(srv_type.Response(), f"{type(error).__name__}: {error}")
+
+        return super().create_service(srv_type, srv_name, answer, *rest, **options)
+
+    def _guarded(self, source: str, callback: Callable[..., None]) -> Callable[..., None]:
+        def call(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except Exception:
+                self._on_fault(source)
+
+        return call
+
+    def _on_fault(self, source: str) -> None:
+        if not self.context.ok():  # the node is ending: what fails then is no fault
+            return
+        self.health.count("faults")
+        self.get_logger().error(f"{source}: fault:\n{traceback.format_exc()}", throttle_duration_sec=1.0)
+
+
+def _failed(response: Any, why: str) -> Any:
+    """A response that says so in the fields that it has."""
+    for name, value in (("success", False), ("message", why), ("status_message", why)):
+        if hasattr(response, name):
+            setattr(response, name, value)
+    return response
