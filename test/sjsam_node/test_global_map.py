@@ -185,7 +185,7 @@ def test_a_restarted_agent_is_found_again(rng: np.random.Generator) -> None:
     world = ring_world(4.0, rng, 12.0)
     path = circle(4.0, 1.0)
     first, again = Agent(world, path[:49], rng, "a"), Agent(world, path[20:69], rng, "a", stamp_ns=10**11)
-    joined, reports = join(first.submaps() + again.submaps())
+    joined, reports = join(first.submaps() + [replace(s, session=1) for s in again.submaps()])
     assert all(r.accepted for r in reports)
     assert joined.components == 1
     T = invert_transform(path[0])
