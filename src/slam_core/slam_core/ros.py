@@ -11,7 +11,6 @@ from __future__ import annotations
 import array
 import importlib
 import importlib.util
-import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -29,6 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from slam_core.config import Config, ParameterInfo, from_mapping, iterate_parameters
 from slam_core.messages import MessageTypes
 from slam_core.messages.base import Message
+from slam_core.process_life import end_with_parent, on_request_to_end
 from slam_core.types import AnyArray
 
 C = TypeVar("C", bound=Config)
@@ -145,18 +145,18 @@ class RunnableNode(Protocol):
 
 
 def run_node(node_type: Callable[[], RunnableNode], args: list[str] | None = None) -> None:
-    """Run a node until SIGINT, SIGTERM or shutdown: exit code 0; a bad parameter ends it with one line and 2.
+    """Run a node until SIGINT, SIGTERM, SIGHUP or shutdown: exit code 0; a bad parameter ends it with one line and 2.
 
     A signal only asks for the end: rclpy's own handlers would shut the context down under a callback that still
     publishes. The message in hand is finished first.
     """
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopped.set())
+    on_request_to_end(lambda *_: stopped.set())
     executor = SingleThreadedExecutor()
     node: RunnableNode | None = None
     try:
+        end_with_parent()
         node = node_type()
         executor.add_node(node)
         node.get_logger().info("ready")

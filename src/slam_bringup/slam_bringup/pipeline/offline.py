@@ -97,8 +97,9 @@ def run_bag(
         agents = _agent_results(bag, mapping)
         dense = ColouredCloud.empty()
         try:
-            with times.measure("dense model"):
-                dense = dense_model(bag, config, {a.name: a.trajectory for a in agents})
+            if not stopped():  # who wants the end now does not want to wait for it
+                with times.measure("dense model"):
+                    dense = dense_model(bag, config, {a.name: a.trajectory for a in agents})
         except Exception as error:
             failure = failure or _told(error, "no dense model was made")
         mapping.records[bag.agents[0]].events[:0] = bag.warnings

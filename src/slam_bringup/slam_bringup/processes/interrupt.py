@@ -1,12 +1,19 @@
-"""Ctrl-C as a wish: a long run ends early and keeps what it has, instead of losing it."""
+"""Ctrl-C as a wish: a long run ends early and keeps what it has, instead of losing it.
+
+So does a terminal that is closed; what the run still has to say then goes nowhere.
+"""
 
 from __future__ import annotations
 
+import os
 import signal
+import stat
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 import click
+
+from slam_core.process_life import on_request_to_end
 
 INTERRUPTED = 130
 """Exit code of a program that Ctrl-C has ended."""
@@ -14,18 +21,19 @@ INTERRUPTED = 130
 STOPPED = "stopped before the end of the bag"
 """What a result says of a run that ended early."""
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
 
 class Interrupt:
-    """Within the ``with`` block the first SIGINT or SIGTERM sets :attr:`asked`; the second raises KeyboardInterrupt."""
+    """Within the ``with`` block the first SIGINT, SIGTERM or SIGHUP sets :attr:`asked`.
+
+    A second SIGINT or SIGTERM raises KeyboardInterrupt.
+    """
 
     def __init__(self) -> None:
         self.asked = False
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
-        self._before = {number: signal.signal(number, self._on_signal) for number in _SIGNALS}
+        self._before = dict(on_request_to_end(self._on_signal))
         return self
 
     def __exit__(
@@ -34,8 +42,21 @@ class Interrupt:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
-    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
+        if number == signal.SIGHUP:
+            self.asked = True
+            _forget_the_terminal()
+            return
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
         click.echo("\nstopping: what is mapped so far will be written; once more to give it up", err=True)
+
+
+def _forget_the_terminal() -> None:
+    """Writing to a terminal or a pipe that is gone fails, and must not end what goes on without it."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        if not stat.S_ISREG(os.fstat(stream).st_mode):
+            os.dup2(nowhere, stream)
+    os.close(nowhere)

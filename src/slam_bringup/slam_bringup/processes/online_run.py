@@ -9,6 +9,7 @@ import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,11 @@ START_TIMEOUT_S = 180.0
 """A cold start compiles kernels."""
 
 _SERVICE_TIMEOUT_S = 300.0
+_HURRIED_TIMEOUT_S = 2.0
+"""Longest wait for each step of the end once somebody wants the run to end."""
+_QUIET_S, _HURRIED_QUIET_S = 1.0, 0.3
+_HOPELESS_AFTER_S = 15.0
+"""A run in which no frame has reached a filter by then, while messages are rejected, never will."""
 _WINDOW = 4
 _SJSAM = "/sjsam"
 
@@ -169,20 +175,49 @@ class _Choreography:
         self._wait_until_ready(from_outside=())
         heard = self._supervisor.progress.total
         self._supervisor.call("/bag_player/start", has_effect=lambda: heard() > 0 or not player.is_running)
+        started = time.monotonic()
         while player.is_running:
             self._supervisor.listen(0.2)
-            on_progress(sum(self._supervisor.progress[name] for name in self._graph.filters))
+            frames = sum(self._supervisor.progress[name] for name in self._graph.filters)
+            on_progress(frames)
             if self._stopped():
                 player.interrupt()
+            elif frames == 0 and time.monotonic() > started + _HOPELESS_AFTER_S:
+                self._require_hope()
         self._group.check()
+
+    def _require_hope(self) -> None:
+        """Refuse to go on where nodes reject their input and nothing arrives; the message holds what they say."""
+        rejecting = [
+            name for name, values in self._supervisor.diagnostics.items() if values.get("rejected", "0") != "0"
+        ]
+        complaints = [
+            f"{node.command.full_name}: {line}"
+            for node in self._group.nodes
+            if node.command.full_name in rejecting and (line := node.last_line("rejected"))
+        ]
+        if complaints:
+            raise ValueError(f"no frame has reached the filter: {'; '.join(complaints)}. What does slam doctor say?")
 
     def finish(self) -> None:
         """Tell the nodes that the input has ended, front to back, and have the map saved when all is joined."""
         for name in self._graph.finishers:
-            self._supervisor.call(f"{name}/finish", _SERVICE_TIMEOUT_S)
-            self._supervisor.wait_until_quiet(1.0, _SERVICE_TIMEOUT_S)
-        self._supervisor.wait(self._all_joined, _SERVICE_TIMEOUT_S, "joining of the last submap")
+            self._patiently(partial(self._supervisor.call, f"{name}/finish"))
+            self._supervisor.wait_until_quiet(_HURRIED_QUIET_S if self._stopped() else _QUIET_S, self._limit_s)
+        self._patiently(partial(self._supervisor.wait, self._all_joined, what="joining of the last submap"))
         self._supervisor.call(f"{_SJSAM}/save_map", _SERVICE_TIMEOUT_S)
+
+    @property
+    def _limit_s(self) -> float:
+        return _HURRIED_TIMEOUT_S if self._stopped() else _SERVICE_TIMEOUT_S
+
+    def _patiently(self, step: Callable[[float], object]) -> None:
+        """Do a step of the end; one that a user is in too much of a hurry for is left out, the map is saved anyway."""
+        try:
+            step(self._limit_s)
+        except TimeoutError:
+            if not self._stopped():
+                raise
 
     def last_diagnostics(self) -> dict[str, dict[str, str]]:
         """The final values of all nodes, once they have reported after the end."""

@@ -8,10 +8,13 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, NoReturn
+
+from slam_core.process_life import PARENT
 
 _MODULES = {
     ("stereo_frontend", "stereo_driver"): "stereo_frontend.driver_node",
@@ -27,6 +30,7 @@ _MODULES = {
 
 _DOMAINS = range(1, 101)
 _STOP_AFTER_S = 10.0
+"""Longest that a node may take to end; the recorder needs some of it to complete its bag."""
 
 
 def find_executable(package: str, executable: str, prefixes: Sequence[str] | None = None) -> list[str]:
@@ -136,7 +140,11 @@ class NodeProcess:
         arguments = [*find_executable(command.package, command.executable), *command.arguments]
         with log.open("wb") as output:
             process = subprocess.Popen(
-                arguments, env=dict(environment), stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+                arguments,
+                env={**environment, PARENT: str(os.getpid())},
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
             )
         return cls(command, log, process)
 
@@ -151,11 +159,11 @@ class NodeProcess:
             self.process.send_signal(signal.SIGINT)
             self._interrupted = True
 
-    def stop(self) -> int:
-        """Ask the node to end (SIGINT), insist after ten seconds; returns the exit code."""
+    def stop(self, within_s: float = _STOP_AFTER_S) -> int:
+        """Ask the node to end (SIGINT), insist after ``within_s``; returns the exit code."""
         self.interrupt()
         try:
-            return self.process.wait(_STOP_AFTER_S)
+            return self.process.wait(max(within_s, 0.0))
         except subprocess.TimeoutExpired:
             self.process.kill()
             return self.process.wait()
@@ -164,6 +172,11 @@ class NodeProcess:
         """The end of its log, for a message about why it ended."""
         lines = self.log.read_text(errors="replace").strip().splitlines()
         return "\n".join(lines[-15:])
+
+    def last_line(self, word: str) -> str:
+        """The last line of its log that holds ``word``, without time and name; "" if there is none."""
+        lines = [line for line in self.log.read_text(errors="replace").splitlines() if word in line]
+        return lines[-1].rpartition("]: ")[2] if lines else ""
 
 
 class NodeGroup:
@@ -198,9 +211,10 @@ class NodeGroup:
                 )
 
     def stop(self) -> None:
-        """Stop all nodes: everybody is asked at once, then waited for."""
+        """Stop all nodes: everybody is asked at once, then waited for, ten seconds for all together."""
         for node in self.nodes:
             node.interrupt()
+        deadline = time.monotonic() + _STOP_AFTER_S
         for node in reversed(self.nodes):
-            self.exit_codes[node.command.full_name] = node.stop()
+            self.exit_codes[node.command.full_name] = node.stop(deadline - time.monotonic())
         self.nodes = []

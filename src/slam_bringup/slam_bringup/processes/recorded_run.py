@@ -12,6 +12,7 @@ from slam_bringup.bags.bag import BagReader
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.dense_map import ColouredCloud
 from slam_bringup.pipeline.dense_run import dense_model
 from slam_bringup.pipeline.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
 from slam_bringup.processes.interrupt import STOPPED
@@ -79,7 +80,12 @@ def collect(
     global_map = GlobalMap.load(run.map_folder)
     with SensorBag(bag, names) as opened:
         agents = tuple(_agent_result(agent, opened, recording, global_map) for agent in opened.agents)
-        dense = dense_model(opened, config, {a.name: a.trajectory for a in agents})
+        # Who wants the end now does not want to wait for the dense model.
+        dense = (
+            ColouredCloud.empty()
+            if run.stopped
+            else dense_model(opened, config, {a.name: a.trajectory for a in agents})
+        )
     landmarks = global_map.landmarks()
     stamps = [a.filtered.stamps_ns for a in agents if len(a.filtered)]
     result = RunResult(

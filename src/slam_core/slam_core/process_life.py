@@ -1,0 +1,42 @@
+"""When a process ends: with the one that started it, and by which signals it is asked to."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+from collections.abc import Callable
+from types import FrameType
+
+PARENT = "SLAM_PARENT_PID"
+"""Environment variable with the process that started this one and without which it is of no use."""
+
+_PR_SET_PDEATHSIG = 1
+_Handler = Callable[[int, FrameType | None], None]
+
+
+def end_with_parent() -> None:
+    """Have the kernel send SIGTERM when the process named by :data:`PARENT` ends, however it does (Linux).
+
+    Raises
+    ------
+    ValueError
+        If it has ended already.
+    """
+    parent = os.environ.pop(PARENT, "")
+    if not parent:
+        return
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != int(parent):
+        raise ValueError(f"the process {parent} that started this node has ended")
+
+
+def on_request_to_end(handler: _Handler) -> dict[signal.Signals, object]:
+    """Install ``handler`` for SIGINT, SIGTERM and SIGHUP; returns what was there before.
+
+    A hang-up that is ignored stays so: that is what ``nohup`` asks for.
+    """
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    return {number: signal.signal(number, handler) for number in numbers}

@@ -1,0 +1,100 @@
+"""How a run of nodes ends: with its terminal, with its starter, on Ctrl-C, and at once where its input cannot work."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+DEMO = ROOT / "bags" / "demo"
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+
+class Run:
+    """``slam nodes`` in a session of its own, as a terminal starts it."""
+
+    def __init__(self, environment: dict[str, str], out: Path, *options: str) -> None:
+        command = [sys.executable, "-m", "slam_bringup.cli", "nodes", str(DEMO), "-o", str(out), *options]
+        self.out = out
+        self.process = subprocess.Popen(
+            command,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+
+    def nodes(self) -> list[int]:
+        """Processes that name the output folder or were started by this run, and still live."""
+        return [pid for pid in map(int, filter(str.isdigit, os.listdir("/proc"))) if self._is_node(pid)]
+
+    def _is_node(self, pid: int) -> bool:
+        try:
+            environment = Path(f"/proc/{pid}/environ").read_bytes()
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return False
+        return f"SLAM_PARENT_PID={self.process.pid}".encode() in environment and state != "Z"
+
+
+def wait_for(condition: Callable[[], bool], timeout_s: float = 120.0) -> bool:
+    end = time.monotonic() + timeout_s
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.05)
+    return condition()
+
+
+@pytest.fixture
+def run(workspace: dict[str, str], tmp_path: Path) -> Iterator[Run]:
+    run = Run(workspace, tmp_path / "out", "--rate", "0.5")
+    yield run
+    if run.process.poll() is None:
+        run.process.kill()
+    run.process.wait()
+
+
+def is_playing(run: Run) -> bool:
+    log = run.out / "logs" / "ekf_slam.log"
+    player = run.out / "logs" / "bag_player.log"
+    return player.exists() and "ready" in player.read_text() and "ready" in log.read_text()
+
+
+def test_a_killed_run_leaves_no_nodes(run: Run) -> None:
+    assert wait_for(lambda: is_playing(run)), run.process.poll()
+    assert len(run.nodes()) >= 5
+    run.process.kill()
+    assert wait_for(lambda: not run.nodes(), 30.0), run.nodes()
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
+def test_a_run_that_is_asked_to_end_writes_what_is_mapped(run: Run, number: signal.Signals) -> None:
+    assert wait_for(lambda: is_playing(run))
+    time.sleep(6.0)  # some seconds of the bag, so that there is a map
+    assert run.process.stdout is not None
+    if number == signal.SIGHUP:
+        run.process.stdout.close()  # a terminal that is closed takes no more words
+    run.process.send_signal(number)
+    assert run.process.wait(60.0) == 130
+    assert not run.nodes()
+    summary = json.loads((run.out / "summary.json").read_text())
+    assert 0 < summary["frames"] < 52
+    assert "stopped before the end of the bag" in summary["events"]
+    assert (run.out / "map" / "manifest.json").exists()
+
+
+def test_nohup_is_respected(workspace: dict[str, str], tmp_path: Path) -> None:
+    script = "from slam_bringup.processes.interrupt import Interrupt; import os, signal\n"
+    script += "with Interrupt() as i: os.kill(os.getpid(), signal.SIGHUP); print(i.asked)"
+    command = ["sh", "-c", f"trap '' HUP; exec {sys.executable} -c '{script}'"]
+    out = subprocess.run(command, env=workspace, capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "False"
