@@ -20,6 +20,7 @@ LAYER = {
     "ndt_registration": 1,
     "ekf_slam_node": 2,
     "sjsam_node": 2,
+    "dense_mapping": 2,
     "slam_bringup": 3,
 }
 ROS = re.compile(r"^(rclpy|tf2_ros|launch(_ros)?|ament_index_python|builtin_interfaces|std_srvs|[a-z0-9]+_msgs)$")

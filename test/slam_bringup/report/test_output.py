@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from dense_mapping.surface import Surface
 from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult
 from slam_bringup.report.output import write_results
 from slam_core.geometry import boxplus
@@ -22,6 +23,15 @@ def circle(n: int = 80, radius: float = 2.0) -> Trajectory:
     return Trajectory(np.arange(n, dtype=np.int64) * 100_000_000, poses, covariances)
 
 
+def plate() -> Surface:
+    """A square metre of floor in two triangles."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float32)
+    normals = np.tile(np.float32([0, 0, 1]), (4, 1))
+    colours = np.full((4, 3), 128, dtype=np.uint8)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    return Surface(points, normals, colours, np.full(4, 0.01, dtype=np.float32), faces)
+
+
 @pytest.fixture
 def result(rng) -> RunResult:
     truth = circle()
@@ -32,7 +42,7 @@ def result(rng) -> RunResult:
         bag="circle", mode="stereo", mapper="sjsam", odometry="none",
         agents=(AgentResult("", noisy, truth=truth, feature_counts=np.full(80, 250)),),
         landmarks=LandmarkMap(positions, covariances, np.full(200, 5)),
-        dense_points=rng.uniform(-3, 3, (500, 3)).astype(np.float32), dense_grey=np.full(500, 128, dtype=np.uint8),
+        dense=plate(),
         submaps=4, loop_closures=1, frames=80, dropped={"features without depth": 2}, rejections={"outlier": 3},
         sensor_s=8.0, wall_s=2.0,
         stage_ms={"features": [40.0] * 80, "ekf": [8.0] * 80}, events=("12.3 s: <lost>",),
@@ -44,6 +54,7 @@ def test_all_files_are_written_and_agree(result, tmp_path):
     names = {p.name for p in tmp_path.iterdir()}
     assert {
         "summary.json", "trajectory.tum", "trajectory_covariance.csv", "ground_truth.tum", "landmarks.ply", "map.ply",
+        "mesh.ply", "mesh.glb",
         "map", "map.png", "report.html",
     } == names  # fmt: skip
     assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
@@ -68,7 +79,7 @@ def test_the_same_result_gives_the_same_bytes(result, tmp_path):
 def test_a_run_without_anything_still_has_its_files(tmp_path):
     empty = RunResult(
         "empty", "stereo", "sjsam", "none", (AgentResult("", Trajectory.from_estimates([])),), LandmarkMap.empty(),
-        np.empty((0, 3), np.float32), np.empty(0, np.uint8), 0, 0, 0, {}, {}, 0.0, 0.0, {},
+        Surface.empty(), 0, 0, 0, {}, {}, 0.0, 0.0, {},
     )  # fmt: skip
     summary = write_results(tmp_path, empty)
     assert summary["end_error_m"] is None

@@ -55,7 +55,7 @@ def map_bag(folder: Path, before: list[Path], mode: str, mapper: str, odometry: 
     arrays: dict[str, npt.NDArray[Any]] = {
         "landmarks": result.landmarks.positions,
         "landmark_covariances": result.landmarks.covariances,
-        "dense_points": result.dense_points[:: max(1, len(result.dense_points) // 100_000)],
+        "dense_points": result.dense.points[:: max(1, len(result.dense) // 100_000)],
         **_submap_arrays(graph),
         **{f"ms {name}": np.array(ms) for name, ms in result.stage_ms.items()},
     }

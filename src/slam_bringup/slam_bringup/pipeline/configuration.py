@@ -14,10 +14,10 @@ from typing import Any
 
 import yaml
 
+from dense_mapping.dense_model import DenseConfig
 from ekf_slam_node.config import EkfSlamConfig
 from ndt_registration.odometry import OdometryConfig
 from sjsam_node.global_map import GlobalMapConfig
-from slam_bringup.pipeline.dense_map import DenseMapConfig
 from slam_core.config import Config, from_mapping, group
 from stereo_frontend.frontend import FrontendConfig
 from tof_driver.depth import DepthConfig
@@ -36,7 +36,7 @@ class SystemConfig(Config):
     ndt_odometry: OdometryConfig = group(OdometryConfig)
     ekf_slam: EkfSlamConfig = group(EkfSlamConfig)
     sjsam: GlobalMapConfig = group(GlobalMapConfig)
-    dense_map: DenseMapConfig = group(DenseMapConfig)
+    dense_mapper: DenseConfig = group(DenseConfig)
 
 
 def load_system_config(path: Path | None) -> SystemConfig:

@@ -1,25 +1,29 @@
-"""The dense model of a bag on the trajectories of a finished run."""
+"""The dense model of a bag on the trajectories of a finished run: depth of the ToF camera and of stereo, fused."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from dense_mapping.dense_model import DenseConfig, DenseModel
+from dense_mapping.keyframes import grey_levels
+from dense_mapping.stereo_depth import stereo_depth
 from slam_bringup.bags.readings import AgentSensors, DepthReading, Reading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.dense_map import ColouredCloud, DenseMap
 from slam_bringup.pipeline.eyes import depth_processor
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
+from slam_core.types import ByteArray, DepthImage
 from stereo_frontend.rectify import StereoRectifier
 
 
-def dense_model(bag: SensorBag, config: SystemConfig, trajectories: Mapping[str, Trajectory]) -> ColouredCloud:
-    """Depth of the key frames of all agents in the map frame: of the ToF camera where there is one, else of stereo."""
-    builders = {
-        agent: _AgentModel(bag.sensors[agent], config, trajectory)
+def dense_model(bag: SensorBag, config: SystemConfig, trajectories: Mapping[str, Trajectory]) -> DenseModel:
+    """The model of all agents in the map frame; its surface is not made yet."""
+    model = DenseModel(config.dense_mapper)
+    cameras = {
+        agent: AgentDepth(bag.sensors[agent], config, trajectory)
         for agent, trajectory in trajectories.items()
         if len(trajectory)
     }
@@ -27,42 +31,51 @@ def dense_model(bag: SensorBag, config: SystemConfig, trajectories: Mapping[str,
     for reading in bag.readings():
         if isinstance(reading, StereoReading | DepthReading) and reading.stamp_ns > last_ns:
             break
-        if reading.agent in builders:
-            builders[reading.agent].add(reading)
-    clouds = [builder.model.fuse() for builder in builders.values()]
-    if not clouds:
-        return ColouredCloud.empty()
-    return ColouredCloud(np.concatenate([c.points for c in clouds]), np.concatenate([c.grey for c in clouds]))
+        if reading.agent in cameras:
+            cameras[reading.agent].add(reading, model)
+    return model
 
 
-class _AgentModel:
+class AgentDepth:
+    """Key frames of one agent's cameras on its trajectory."""
+
     def __init__(self, sensors: AgentSensors, config: SystemConfig, trajectory: Trajectory) -> None:
-        self.model = DenseMap(config.dense_map)
-        self._trajectory = trajectory
+        self._config: DenseConfig = config.dense_mapper
+        self._agent, self._trajectory = sensors.agent, trajectory
         self._depth = self._rectifier = None
-        if sensors.is_mounted("tof"):
+        if self._config.use_tof and sensors.is_mounted("tof"):
             self._depth = depth_processor(config, sensors)
-            self._T_base_optical = sensors.transform("base", "tof")
-        elif sensors.left is not None and sensors.right is not None and sensors.is_mounted("left"):
+            self._T_base_tof = sensors.transform("base", "tof")
+        if self._config.use_stereo and sensors.right is not None and sensors.is_mounted("left"):
+            assert sensors.left is not None
             self._rectifier = StereoRectifier(sensors.left, sensors.right)
-            self._T_base_optical = sensors.transform("base", "left")
+            self._T_base_left = sensors.transform("base", "left")
 
-    def add(self, reading: Reading) -> None:
-        """Add the reading if it is of the camera that makes the model, and of a key frame."""
+    def add(self, reading: Reading, model: DenseModel) -> None:
+        """Put the reading into the model if it is an image of a key frame."""
         if isinstance(reading, DepthReading) and self._depth is not None:
-            pose = self._key_pose(reading.stamp_ns)
-            if pose is not None:
-                depth = self._depth.process(reading.stamp_ns, reading.image, reading.amplitude, reading.intensity)
-                self.model.add_depth(pose, depth)
+            for camera, T in self._wanted(model, "tof", reading.stamp_ns, self._T_base_tof):
+                image = self._depth.process(reading.stamp_ns, reading.image, reading.amplitude, reading.intensity)
+                model.add(camera, T, image, self._picture(image))
         elif isinstance(reading, StereoReading) and self._rectifier is not None:
-            pose = self._key_pose(reading.stamp_ns)
-            if pose is not None:
-                self.model.add_stereo(pose, self._rectifier(reading.stamp_ns, reading.left, reading.right))
+            for camera, T in self._wanted(model, "stereo", reading.stamp_ns, self._T_base_left):
+                images = self._rectifier(reading.stamp_ns, reading.left, reading.right)
+                model.add(camera, T, stereo_depth(images, self._config.stereo), images.left)
 
-    def _key_pose(self, stamp_ns: int) -> FloatArray | None:
-        """T_map_optical if the stamp lies within the trajectory and its pose makes a key frame."""
+    def _wanted(
+        self, model: DenseModel, sensor: str, stamp_ns: int, T_base_camera: FloatArray
+    ) -> Iterator[tuple[str, FloatArray]]:
+        """Name and pose T_map_camera if the stamp lies within the trajectory and its pose makes a key frame."""
         stamps = self._trajectory.stamps_ns
         if not stamps[0] <= stamp_ns <= stamps[-1]:
-            return None
-        T = self._trajectory.interpolate(np.array([stamp_ns]))[0]
-        return np.asarray(T @ self._T_base_optical) if self.model.wants(T) else None
+            return
+        T = self._trajectory.interpolate(np.array([stamp_ns]))[0] @ T_base_camera
+        camera = f"{self._agent}/{sensor}"
+        if model.wants(camera, T):
+            yield camera, T
+
+    def _picture(self, image: DepthImage) -> ByteArray | None:
+        """A ToF amplitude is no picture where stereo gives one: two kinds of grey on one wall are blotches."""
+        if self._rectifier is not None or image.amplitude is None:
+            return np.empty((0, 0, 3), dtype=np.uint8)
+        return grey_levels(image.amplitude)

@@ -22,11 +22,11 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
+from dense_mapping.surface import Surface
 from slam_bringup.bags.readings import ImuReading, Reading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.dense_map import ColouredCloud
 from slam_bringup.pipeline.dense_run import dense_model
 from slam_bringup.pipeline.eyes import AgentEyes, FilterInput, Glimpse
 from slam_bringup.pipeline.mapper import Mapper
@@ -95,11 +95,11 @@ def run_bag(
         wall_s = time.perf_counter() - start
         dropped = dict(bag.left_out)
         agents = _agent_results(bag, mapping)
-        dense = ColouredCloud.empty()
+        dense = Surface.empty()
         try:
             if not stopped():  # who wants the end now does not want to wait for it
                 with times.measure("dense model"):
-                    dense = dense_model(bag, config, {a.name: a.trajectory for a in agents})
+                    dense = dense_model(bag, config, {a.name: a.trajectory for a in agents}).surface()
         except Exception as error:
             failure = failure or _told(error, "no dense model was made")
         mapping.records[bag.agents[0]].events[:0] = bag.warnings
@@ -204,7 +204,7 @@ def _run_result(
     choice: tuple[str, str, str],
     mapping: Mapper,
     agents: tuple[AgentResult, ...],
-    dense: ColouredCloud,
+    dense: Surface,
     dropped: dict[str, int],
     times: StageTimes,
     wall_s: float,
@@ -220,8 +220,7 @@ def _run_result(
         odometry=odometry,
         agents=agents,
         landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings),
-        dense_points=dense.points,
-        dense_grey=dense.grey,
+        dense=dense,
         submaps=len(mapping.reports),
         loop_closures=sum(len(report.closures) for report in mapping.reports),
         frames=sum(len(s) for s in stamps),

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dense_mapping.surface import Surface
 from slam_core.evaluation import Evaluation, evaluate
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
-from slam_core.types import Float32Array
 
 EMPTY_TRAJECTORY = Trajectory.from_estimates([])
 
@@ -67,8 +67,7 @@ class RunResult:
     odometry: str
     agents: tuple[AgentResult, ...]
     landmarks: LandmarkMap
-    dense_points: Float32Array
-    dense_grey: npt.NDArray[np.uint8]
+    dense: Surface
     submaps: int
     loop_closures: int
     frames: int
@@ -95,6 +94,8 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "dropped_by_reason": dict(result.dropped),
         "rejections": dict(result.rejections),
         "landmarks": len(result.landmarks.positions),
+        "dense_points": len(result.dense),
+        "dense_triangles": len(result.dense.faces),
         "submaps": result.submaps,
         "loop_closures": result.loop_closures,
         "path_length_m": sum(agent.trajectory.length_m for agent in result.agents),

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dense_mapping.surface import Surface
 from sjsam_node.global_map import GlobalMap
 from slam_bringup.bags.bag import BagReader
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.dense_map import ColouredCloud
 from slam_bringup.pipeline.dense_run import dense_model
 from slam_bringup.pipeline.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
 from slam_bringup.processes.interrupt import STOPPED
@@ -82,9 +82,9 @@ def collect(
         agents = tuple(_agent_result(agent, opened, recording, global_map) for agent in opened.agents)
         # Who wants the end now does not want to wait for the dense model.
         dense = (
-            ColouredCloud.empty()
+            Surface.empty()
             if run.stopped
-            else dense_model(opened, config, {a.name: a.trajectory for a in agents})
+            else dense_model(opened, config, {a.name: a.trajectory for a in agents}).surface()
         )
     landmarks = global_map.landmarks()
     stamps = [a.filtered.stamps_ns for a in agents if len(a.filtered)]
@@ -95,8 +95,7 @@ def collect(
         odometry=odometry,
         agents=agents,
         landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings.astype(np.int32)),
-        dense_points=dense.points,
-        dense_grey=dense.grey,
+        dense=dense,
         submaps=recording.submaps,
         loop_closures=int(run.diagnostics.get("/sjsam", {}).get("closures", "0")),
         frames=sum(len(s) for s in stamps),

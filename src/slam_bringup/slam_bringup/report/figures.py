@@ -54,11 +54,11 @@ def map_figure(result: RunResult) -> Figure:
 
 
 def _draw_dense(axes: Axes, result: RunResult) -> None:
-    if len(result.dense_points):
-        low, high = np.percentile(result.dense_points[:, 2], [1, 99])
+    if len(result.dense):
+        low, high = np.percentile(result.dense.points[:, 2], [1, 99])
         # Floor and ceiling hide everything from above: leave out the highest and lowest slices of the room.
-        keep = (result.dense_points[:, 2] > low + 0.15) & (result.dense_points[:, 2] < high - 0.15)
-        x, y, _ = result.dense_points[keep].T
+        keep = (result.dense.points[:, 2] > low + 0.15) & (result.dense.points[:, 2] < high - 0.15)
+        x, y, _ = result.dense.points[keep].T
         axes.scatter(x, y, s=0.3, c="0.78", linewidths=0, rasterized=True)
 
 

@@ -1,7 +1,8 @@
 """The files of a run, the same for ``slam run`` and ``slam nodes``.
 
 ``summary.json``, ``trajectory.tum`` (map frame, rig poses), ``trajectory_covariance.csv``, ``landmarks.ply``,
-``map.ply``, ``map/`` (loadable map), ``map.png``, ``report.html`` and ``result.mcap``. With several agents each has its
+``map.ply`` (dense points), ``mesh.ply`` and ``mesh.glb``, ``map/`` (loadable map), ``map.png``, ``report.html`` and
+``result.mcap``. With several agents each has its
 own ``trajectory_<agent>.tum``; ``trajectory.tum`` is then the first one's.
 """
 
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from dense_mapping.surface_io import write_glb, write_mesh, write_points
 from slam_bringup.pipeline.results import AgentResult, RunResult, summarise
 from slam_bringup.report.figures import map_figure, save_png
 from slam_bringup.report.report import write_report
@@ -32,7 +34,9 @@ def write_results(out: Path, result: RunResult, save_map: Callable[[Path], objec
     (out / "summary.json").unlink(missing_ok=True)
     _write_trajectories(out, result.agents)
     write_ply(out / "landmarks.ply", result.landmarks.positions.astype(np.float32))
-    write_ply(out / "map.ply", result.dense_points, result.dense_grey)
+    write_points(out / "map.ply", result.dense)
+    write_mesh(out / "mesh.ply", result.dense)
+    write_glb(out / "mesh.glb", result.dense)
     if save_map is not None:
         save_map(out / "map")
     summary = summarise(result)

@@ -86,7 +86,7 @@ def _map_messages(result: RunResult, stamp: int) -> list[_Stamped]:
         (stamp, "/map/landmarks", landmark_cloud(
             _TYPES, header, landmarks.positions, landmarks.covariances, ids, landmarks.sightings.astype(np.int32))),
         (stamp, "/map/ellipsoids", ellipsoid_markers(_TYPES, header, landmarks.positions, landmarks.covariances, ids)),
-        (stamp, "/map/cloud", points_message(_TYPES, header, result.dense_points)),
+        (stamp, "/map/cloud", points_message(_TYPES, header, result.dense.points)),
     ]  # fmt: skip
 
 

@@ -1,0 +1,1 @@
+"""Dense model and floor plan: stereo and ToF depth fused in a TSDF on the optimised trajectory."""

@@ -1,0 +1,125 @@
+"""The dense model: key frames of all cameras fused in one TSDF, moved when the trajectory is corrected.
+
+    model = DenseModel(DenseConfig())
+    model.add("agent/tof", T_map_camera, depth_image)      # only key frames are taken
+    model.move(lambda camera, stamp_ns: T_map_camera)      # after a loop closure
+    surface = model.surface()
+
+A key frame keeps its depth image. When its pose changes, it is taken out of the field where it was put in and put in
+where it belongs (Dai et al. 2017), those that moved farthest first and a bounded number at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from dense_mapping.keyframes import Keyframe, KeyframeConfig, KeyframeSelector, make_keyframe
+from dense_mapping.stereo_depth import StereoDepthConfig
+from dense_mapping.surface import Surface, SurfaceConfig, extract_surface
+from dense_mapping.tsdf import TsdfConfig, TsdfVolume
+from slam_core.config import Config, group, parameter
+from slam_core.geometry import FloatArray, boxminus
+from slam_core.types import ByteArray, DepthImage
+
+PoseLookup = Callable[[str, int], FloatArray | None]
+"""T_map_camera of a camera at a stamp, or None where it is not known (any more)."""
+
+
+@dataclass(frozen=True)
+class DenseConfig(Config):
+    """The dense model."""
+
+    use_tof: bool = parameter(True, "depth of the ToF or depth camera, where there is one")
+    use_stereo: bool = parameter(True, "depth of the stereo camera, where there is one")
+    max_keyframes: int = parameter(
+        1500, "key frames kept to be moved; the oldest beyond that stay where they are", minimum=1
+    )
+    move_distance: float = parameter(0.01, "a key frame is moved when its pose changes by more", unit="m", minimum=0.0)
+    move_angle_deg: float = parameter(0.3, "or turns by more", unit="deg", minimum=0.0)
+    moves_at_once: int = parameter(40, "key frames moved in one step", minimum=1)
+    keyframe: KeyframeConfig = group(KeyframeConfig)
+    stereo: StereoDepthConfig = group(StereoDepthConfig)
+    tsdf: TsdfConfig = group(TsdfConfig)
+    surface: SurfaceConfig = group(SurfaceConfig)
+
+
+@dataclass(eq=False)
+class PlacedKeyframe:
+    """A key frame of ``camera`` with the pose T_map_camera at which it is in the field."""
+
+    camera: str
+    keyframe: Keyframe
+    T_map_camera: FloatArray
+
+
+class DenseModel:
+    """Collects key frames of any number of cameras.
+
+    Attributes
+    ----------
+    moved
+        How often a key frame was moved since the start.
+    """
+
+    def __init__(self, config: DenseConfig | None = None) -> None:
+        self.config = config or DenseConfig()
+        self.moved = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.volume = TsdfVolume(self.config.tsdf)
+        self._selectors: dict[str, KeyframeSelector] = {}
+        self._placed: list[PlacedKeyframe] = []
+
+    @property
+    def keyframes(self) -> tuple[PlacedKeyframe, ...]:
+        """The key frames that are kept, oldest first."""
+        return tuple(self._placed)
+
+    def wants(self, camera: str, T_map_camera: FloatArray) -> bool:
+        """Whether a frame of ``camera`` at this pose is a key frame; the caller then adds it."""
+        selector = self._selectors.setdefault(camera, KeyframeSelector(self.config.keyframe))
+        return selector.wants(T_map_camera)
+
+    def add(self, camera: str, T_map_camera: FloatArray, image: DepthImage, picture: ByteArray | None = None) -> None:
+        """Put a key frame into the field; ``picture`` (h, w[, 3]) uint8 of its camera, by default the amplitude."""
+        placed = PlacedKeyframe(camera, make_keyframe(image, self.config.keyframe, picture), T_map_camera)
+        self._put(placed)
+        self._placed.append(placed)
+        del self._placed[: -self.config.max_keyframes]
+
+    def move(self, lookup: PoseLookup, most: int | None = None) -> int:
+        """Move key frames whose pose has changed, ``most`` at once (default ``moves_at_once``); returns how many."""
+        changes = sorted(self._changes(lookup), key=lambda change: -change[0])
+        chosen = changes[: self.config.moves_at_once if most is None else most]
+        for _, placed, T in chosen:
+            k = placed.keyframe
+            self.volume.remove(placed.T_map_camera, k.camera, k.depth, k.sigma)
+            placed.T_map_camera = T
+            self._put(placed)
+        self.moved += len(chosen)
+        return len(chosen)
+
+    def surface(self) -> Surface:
+        """The mesh of all key frames."""
+        return extract_surface(self.volume, self.config.surface)
+
+    def _put(self, placed: PlacedKeyframe) -> None:
+        k = placed.keyframe
+        self.volume.add(placed.T_map_camera, k.camera, k.depth, k.sigma, k.picture)
+
+    def _changes(self, lookup: PoseLookup) -> Iterator[tuple[float, PlacedKeyframe, FloatArray]]:
+        """How far key frames are from where they belong, in units of what is tolerated."""
+        tolerance = np.array([self.config.move_distance, np.radians(self.config.move_angle_deg)]) + 1e-9
+        for placed in self._placed:
+            T = lookup(placed.camera, placed.keyframe.stamp_ns)
+            if T is None:
+                continue
+            moved = boxminus(T, placed.T_map_camera)
+            size = max(np.linalg.norm(moved[:3]) / tolerance[0], np.linalg.norm(moved[3:]) / tolerance[1])
+            if size > 1.0:
+                yield float(size), placed, T

@@ -1,0 +1,110 @@
+"""Key frames: which images make the dense model, and how they are kept to be moved when a loop closes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.camera import Camera
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray, boxminus
+from slam_core.types import ByteArray, DepthImage, Float32Array
+
+_DEPTH_UNIT = 0.00025
+_SIGMA_UNIT = 0.0005
+_NO_PICTURE: ByteArray = np.empty((0, 0, 3), dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class KeyframeConfig(Config):
+    """Which frames become key frames, and which of their pixels count."""
+
+    distance: float = parameter(0.2, "a key frame every so much way", unit="m", minimum=0.01)
+    angle_deg: float = parameter(10.0, "or every so much turn", unit="deg", minimum=1.0)
+    min_depth: float = parameter(0.3, "depth below which a pixel is left out", unit="m", minimum=0.0)
+    max_depth: float = parameter(5.0, "depth beyond which a pixel is left out", unit="m", minimum=0.5, maximum=16.0)
+    max_sigma: float = parameter(
+        0.12, "standard deviation of depth beyond which a pixel is left out", unit="m", minimum=1e-3, maximum=0.12
+    )
+    max_pixels: int = parameter(
+        320 * 240, "larger depth images are halved until they have no more pixels", unit="px", minimum=1000
+    )
+
+
+class KeyframeSelector:
+    """Says which frames of one camera are far enough from the key frame before."""
+
+    def __init__(self, config: KeyframeConfig) -> None:
+        self._config = config
+        self._last: FloatArray | None = None
+
+    def wants(self, T_map_camera: FloatArray) -> bool:
+        """Whether a frame at this pose is a key frame; the next ones are then compared with it."""
+        if self._last is not None:
+            moved = boxminus(T_map_camera, self._last)
+            near = np.linalg.norm(moved[:3]) < self._config.distance
+            if near and np.linalg.norm(moved[3:]) < np.radians(self._config.angle_deg):
+                return False
+        self._last = T_map_camera
+        return True
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A depth image as small as it may be kept: depth in quarters, sigma in halves of a millimetre; 0: no reading.
+
+    ``picture``: (height, width, 3) uint8, or of no size.
+    """
+
+    stamp_ns: int
+    camera: Camera
+    depth_units: npt.NDArray[np.uint16]
+    sigma_units: ByteArray
+    picture: ByteArray
+
+    @property
+    def depth(self) -> Float32Array:
+        """Depth (height, width) m, 0 where there is none."""
+        return self.depth_units.astype(np.float32) * np.float32(_DEPTH_UNIT)
+
+    @property
+    def sigma(self) -> Float32Array:
+        """Standard deviation (height, width) m."""
+        return self.sigma_units.astype(np.float32) * np.float32(_SIGMA_UNIT)
+
+
+def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray | None = None) -> Keyframe:
+    """The key frame of a depth image; ``picture`` (h, w) or (h, w, 3) uint8, by default the amplitude as grey."""
+    if picture is None and image.amplitude is not None:
+        picture = grey_levels(image.amplitude)
+    if picture is not None and picture.ndim == 2:
+        picture = np.repeat(picture[..., None], 3, axis=2)
+    depth, sigma, camera = image.depth, image.sigma, image.camera
+    with np.errstate(invalid="ignore"):
+        good = (depth >= config.min_depth) & (depth <= config.max_depth) & (sigma <= config.max_sigma)
+    depth, sigma = np.where(good, depth, 0.0).astype(np.float32), np.where(good, sigma, 0.0).astype(np.float32)
+    while depth.size > config.max_pixels:
+        # Every other pixel, not a mean: a mean over an edge would be a point in the air.
+        depth, sigma = depth[::2, ::2], sigma[::2, ::2]
+        picture = None if picture is None else np.asarray(cv2.blur(picture, (2, 2))[::2, ::2], dtype=np.uint8)
+        camera = Camera(depth.shape[1], depth.shape[0], camera.fx / 2, camera.fy / 2, camera.cx / 2, camera.cy / 2)
+    return Keyframe(
+        image.stamp_ns,
+        camera,
+        np.rint(depth / _DEPTH_UNIT).astype(np.uint16),
+        np.where(depth > 0.0, np.clip(np.rint(sigma / _SIGMA_UNIT), 1, 255), 0).astype(np.uint8),
+        _NO_PICTURE if picture is None else np.ascontiguousarray(picture),
+    )
+
+
+def grey_levels(amplitude: Float32Array) -> ByteArray:
+    """Amplitude as 0..255: a picture as it is; a ToF amplitude, which falls with range squared, by its root."""
+    values = np.maximum(np.nan_to_num(amplitude), 0.0)
+    top = float(np.percentile(values, 99.5))
+    if 1.0 < top <= 255.0:
+        return np.asarray(np.clip(values, 0.0, 255.0).astype(np.uint8))
+    root = np.sqrt(values)
+    return np.asarray(np.clip(root * (255.0 / max(float(np.sqrt(top)), 1e-6)), 0.0, 255.0).astype(np.uint8))

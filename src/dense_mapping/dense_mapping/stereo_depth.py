@@ -1,0 +1,173 @@
+r"""Dense depth of a stereo pair with the standard deviation of every pixel.
+
+    semi-global matching, both ways -> left-right check -> sub-pixel step -> sigma from residual and texture
+
+Semi-global matching (Hirschmueller 2008, OpenCV) fills textureless walls with whatever is smooth. What tells a
+measured disparity from a guessed one is the image itself: the right image, warped by the disparity, leaves a residual
+``r``, and a window whose gradient along the row is ``g`` fixes the disparity to ``s^2 = var(r) / sum(g^2)`` (the
+Cramer-Rao bound of a shift). The same sums give the Gauss-Newton step ``sum(g r) / sum(g^2)``, which removes the
+matcher's preference for whole pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.config import Config, parameter
+from slam_core.types import AnyArray, ByteArray, DepthImage, Float32Array, StereoImages
+
+Mask = npt.NDArray[np.bool_]
+
+_SUBPIXELS = 16.0
+"""OpenCV gives disparities in sixteenths of a pixel."""
+_FAR_PX = 1e6
+
+
+@dataclass(frozen=True)
+class StereoDepthConfig(Config):
+    """Semi-global matching and the noise of its disparities."""
+
+    min_depth: float = parameter(0.3, "nearest depth that is searched", unit="m", minimum=0.05)
+    block_size: int = parameter(9, "window that is compared, odd", unit="px", minimum=3, maximum=21)
+    uniqueness_percent: int = parameter(
+        5, "how much better the best disparity must be than the second best", unit="%", minimum=0, maximum=100
+    )
+    max_left_right: float = parameter(
+        1.0, "largest difference between the disparities left to right and right to left", unit="px", minimum=0.1
+    )
+    speckle_size: int = parameter(200, "islands of disparity up to this size are dropped", unit="px", minimum=0)
+    edge_radius: int = parameter(
+        4, "pixels so near a jump of disparity are dropped: the matcher widens near objects", unit="px", minimum=0
+    )
+    jump: float = parameter(
+        3.0, "difference of disparities within ``edge_radius`` that is a jump", unit="px", minimum=0.1
+    )
+    window: int = parameter(15, "window of the sub-pixel step and of sigma, odd", unit="px", minimum=3, maximum=31)
+    image_noise: float = parameter(2.0, "standard deviation of a grey value", minimum=0.1)
+    sigma_scale: float = parameter(
+        2.0, "factor on the standard deviation from residual and gradient: neighbours share their errors", minimum=0.1
+    )
+    sigma_floor: float = parameter(0.12, "standard deviation of a perfect window's disparity", unit="px", minimum=0.001)
+    max_sigma: float = parameter(1.0, "disparities with a larger sigma are dropped", unit="px", minimum=0.01)
+
+
+def stereo_depth(images: StereoImages, config: StereoDepthConfig) -> DepthImage:
+    """Depth of the left image with sigma; NaN where the disparity is not known. The left image is the amplitude."""
+    disparity, sigma = _disparity(images, config)
+    stereo = images.stereo
+    with np.errstate(invalid="ignore"):
+        depth = (np.float32(stereo.camera.fx * stereo.baseline) / disparity).astype(np.float32)
+        sigma_depth = (depth * sigma / disparity).astype(np.float32)
+    return DepthImage(images.stamp_ns, depth, sigma_depth, stereo.camera, amplitude=images.left.astype(np.float32))
+
+
+def _disparity(images: StereoImages, config: StereoDepthConfig) -> tuple[Float32Array, Float32Array]:
+    """Disparity and its standard deviation (height, width) px, NaN where either is not trusted."""
+    disparity = _checked_disparity(images, config)
+    refined, sigma = _refined(images.left, images.right, disparity, config)
+    dropped = ~(sigma < config.max_sigma) | ~(np.abs(refined - disparity) < 1.0) | ~(refined > 0.5)
+    refined[dropped] = np.nan
+    sigma[dropped] = np.nan
+    return refined, sigma
+
+
+def _checked_disparity(images: StereoImages, config: StereoDepthConfig) -> Float32Array:
+    """Disparity by matching both ways, NaN where the two disagree or near a jump."""
+    stereo = images.stereo
+    largest = stereo.camera.fx * stereo.baseline / config.min_depth
+    steps = 16 * max(1, int(np.ceil(min(largest, images.left.shape[1] / 3.0) / 16.0)))
+    left = _match(images.left, images.right, steps, config)
+    mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (images.right, images.left)]
+    right = _match(mirrored[0], mirrored[1], steps, config)[:, ::-1]
+    left[_disagrees(left, right, config.max_left_right)] = np.nan
+    left[_near_jump(left, config)] = np.nan
+    return left
+
+
+def _match(image: ByteArray, other: ByteArray, steps: int, config: StereoDepthConfig) -> Float32Array:
+    area = config.block_size**2
+    # Columns left of the first disparity cannot be matched: widened images keep the left edge of the picture.
+    padded = [cv2.copyMakeBorder(i, 0, 0, steps, 0, cv2.BORDER_REPLICATE) for i in (image, other)]
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0, numDisparities=steps, blockSize=config.block_size, P1=8 * area, P2=64 * area, preFilterCap=31,
+        uniquenessRatio=config.uniqueness_percent, speckleWindowSize=config.speckle_size, speckleRange=1,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )  # fmt: skip
+    disparity = matcher.compute(*padded)[:, steps:].astype(np.float32) / np.float32(_SUBPIXELS)
+    disparity[disparity <= 0.0] = np.nan
+    return disparity
+
+
+def _disagrees(left: Float32Array, right: Float32Array, most: float) -> Mask:
+    """Where the partner of a left pixel does not point back to it; (height, width)."""
+    rows, columns = np.indices(left.shape)
+    partner = np.rint(columns - np.nan_to_num(left)).astype(np.int64)
+    inside = partner >= 0
+    back = right[rows, np.maximum(partner, 0)]
+    return _mask(~(inside & (np.abs(left - back) <= most)))
+
+
+def _near_jump(disparity: Float32Array, config: StereoDepthConfig) -> Mask:
+    """Within ``edge_radius`` of a jump; a slope as steep as a floor is none."""
+    if config.edge_radius == 0:
+        return np.zeros(disparity.shape, dtype=bool)
+    known = np.isfinite(disparity)
+    window = np.ones((2 * config.edge_radius + 1,) * 2, np.uint8)
+    lowest = cv2.erode(np.where(known, disparity, _FAR_PX).astype(np.float32), window)
+    highest = cv2.dilate(np.where(known, disparity, -_FAR_PX).astype(np.float32), window)
+    return _mask((highest - lowest > config.jump) & (highest > 0.0) & (lowest < _FAR_PX))
+
+
+def _mask(values: AnyArray) -> Mask:
+    return np.asarray(values, dtype=np.bool_)
+
+
+def _refined(
+    left: ByteArray, right: ByteArray, disparity: Float32Array, config: StereoDepthConfig
+) -> tuple[Float32Array, Float32Array]:
+    """Disparity after one Gauss-Newton step, and its standard deviation, from a window around each pixel."""
+    known = np.isfinite(disparity)
+    warped = _warped(right, np.where(known, disparity, np.float32(0.0)))
+    image = left.astype(np.float32)
+    gradient = 0.5 * (_along_row(image) + _along_row(warped))
+    residual = warped - image
+    sums = _WindowSums(known, config.window)
+    offset, slope = sums(residual) / sums.count, sums(gradient) / sums.count
+    noise = np.float32(config.image_noise**2)
+    energy = np.maximum(sums(gradient**2) - sums.count * (slope**2 + 0.25 * noise), 1e-3)
+    product = sums(gradient * residual) - sums.count * slope * offset
+    variance = np.maximum(sums(residual**2) / sums.count - offset**2, 2.0 * noise)
+    # warped(u) = R(u - d): a larger d moves the right image to the right, so dr/dd = -g.
+    refined = np.where(known, disparity + np.clip(product / energy, -2.0, 2.0), np.nan).astype(np.float32)
+    sigma = np.hypot(config.sigma_scale * np.sqrt(variance / energy), config.sigma_floor)
+    return refined, np.where(known, sigma, np.nan).astype(np.float32)
+
+
+def _warped(right: ByteArray, disparity: Float32Array) -> Float32Array:
+    """The right image as seen through the disparity of every left pixel."""
+    rows, columns = np.indices(disparity.shape)
+    u = np.asarray(columns - disparity, dtype=np.float32)
+    v = np.asarray(rows, dtype=np.float32)
+    image = right.astype(np.float32)
+    return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _along_row(image: Float32Array) -> Float32Array:
+    kernel = np.array([[-0.5, 0.0, 0.5]], dtype=np.float32)
+    return np.asarray(cv2.filter2D(image, cv2.CV_32F, kernel))
+
+
+class _WindowSums:
+    """Sums over the window around each pixel, of known pixels only."""
+
+    def __init__(self, known: Mask, window: int) -> None:
+        self._known, self._window = known.astype(np.float32), window
+        self.count: Float32Array = np.maximum(self(np.ones_like(self._known)), np.float32(1.0))
+
+    def __call__(self, values: Float32Array) -> Float32Array:
+        size, border = (self._window, self._window), cv2.BORDER_REPLICATE
+        return np.asarray(cv2.boxFilter(values * self._known, cv2.CV_32F, size, normalize=False, borderType=border))
