@@ -20,9 +20,9 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from sjsam_node.estimator import EstimatorConfig
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
-from sjsam_node.joiner import JoinerConfig
+from sjsam_node.smoothing.estimator import EstimatorConfig
+from sjsam_node.smoothing.smoother import SmootherConfig
 from slam_bringup.bags.bag_types import BagTypes, typestore
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.configuration import choose, load_system_config
@@ -77,7 +77,7 @@ def row(result: RunResult, submaps: list[Submap]) -> list[str]:
     joined, filtered = agent.evaluation(), agent.evaluation(agent.filtered)
     assert joined is not None
     assert filtered is not None
-    block = GlobalMapConfig(joining=JoinerConfig(estimator=EstimatorConfig(rows="block")))
+    block = GlobalMapConfig(smoothing=SmootherConfig(estimator=EstimatorConfig(rows="block")))
     by_blocks = agent.evaluation(joined_again(submaps, block)[agent.name])
     assert by_blocks is not None
     counts = [summary[key] for key in ("submaps", "loop_closures")]

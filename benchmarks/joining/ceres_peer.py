@@ -14,7 +14,7 @@ from memory import PeakMemory
 from pycolmap import cost_functions
 from scipy.spatial.transform import Rotation
 
-from sjsam_node.problem import LocalMap, State
+from sjsam_node.smoothing.problem import LocalMap, State
 from slam_core.geometry import make_transform, so3_exp
 
 THREADS = 1

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from memory import PeakMemory
 
-from sjsam_node.problem import LocalMap, State
+from sjsam_node.smoothing.problem import LocalMap, State
 from slam_core.geometry import make_transform, so3_exp
 
 X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L

@@ -36,9 +36,9 @@ import numpy as np
 from memory import PeakMemory
 from problems import KnownProblem, flattened, joining_problem, local_maps, ring
 
-from sjsam_node.block_problem import BlockProblem
-from sjsam_node.joining import JoiningProblem
-from sjsam_node.problem import LocalMap, State
+from sjsam_node.smoothing.block_problem import BlockProblem
+from sjsam_node.smoothing.joining import JoiningProblem
+from sjsam_node.smoothing.problem import LocalMap, State
 from slam_core.geometry import so3_exp
 from slam_core.least_squares import LevenbergMarquardtConfig
 

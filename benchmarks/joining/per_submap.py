@@ -71,7 +71,7 @@ def measure(path: Path, is_read: bool, every: bool, most: int) -> None:
             r = reports[-1]
             print(f"{len(adding):4d} add {1e3 * adding[-1]:8.1f} read {1e3 * reading[-1]:8.1f} ms {memory[-1]:7.1f} MB"
                   f" landmarks {len(submap.landmarks):4d} closures {len(r.closures):3d} dropped {r.dropped:4d}"
-                  f" {r.update}", flush=True)  # fmt: skip
+                  f" iterations {r.iterations} {'redundant' * r.redundant}", flush=True)  # fmt: skip
     live = closed(global_map)
     began = time.process_time()
     final = global_map.centrally()
@@ -94,7 +94,7 @@ def print_row(name: str, recording: Recording, final: GlobalMap, reports: list[J
         f"{ms.mean():.0f}", f"{np.percentile(ms, 95):.0f}", f"{ms.max():.0f}", f"{ms[20:40].mean():.0f}",
         f"{ms[-20:].mean():.0f}", f"{growth:.2f}", f"{finish:.2f}", f"{100 * total / span:.1f}",
         f"{total / features:.2f}", f"{sum(len(r.closures) for r in reports)}, {live}, {closed(final)}",
-        final.components, f"{sum(final.joiner.totals()[:1]):.0f}/{final.joiner.totals()[1]}",
+        final.components, "{:.0f}/{}".format(*final.smoother.totals()),
         ", ".join(f"{a:.1f}" for a in ate), ", ".join(f"{a:.2f}" for a in anees),
         ", ".join(f"{a:.1f}" for a in filtered),
     )  # fmt: skip
@@ -123,7 +123,7 @@ def publish(global_map: GlobalMap, agent: str) -> None:
     """Ask for what the node publishes after a submap; making the messages of it is not joining."""
     global_map.end_pose(agent)
     global_map.landmarks()
-    global_map.trajectory()
+    global_map.path() if hasattr(global_map, "path") else global_map.trajectory()
     global_map.map_to_odom(agent)
     graph = global_map.graph
     np.array([graph.poses[[r.start, r.end], :3, 3] for r in graph.records])

@@ -17,10 +17,10 @@ sys.path[:0] = [str(p) for p in sorted((ROOT / "src").iterdir())] + [str(ROOT / 
 
 from submap_world import Agent, circle, ring_world  # noqa: E402
 
-from sjsam_node import kernels  # noqa: E402
-from sjsam_node.block_problem import BlockProblem, FlatRows, flatten_rows  # noqa: E402
-from sjsam_node.joining import JoiningProblem  # noqa: E402
-from sjsam_node.problem import FlatMaps, LocalMap, State, block_rows, flatten  # noqa: E402
+from sjsam_node.smoothing import kernels  # noqa: E402
+from sjsam_node.smoothing.block_problem import BlockProblem, FlatRows, flatten_rows  # noqa: E402
+from sjsam_node.smoothing.joining import JoiningProblem  # noqa: E402
+from sjsam_node.smoothing.problem import FlatMaps, LocalMap, State, block_rows, flatten  # noqa: E402
 from slam_core.geometry import so3_log  # noqa: E402
 from slam_core.types import Submap  # noqa: E402
 

@@ -8,9 +8,9 @@ import pytest
 from judging import ate, chain_error, errors, join
 from submap_world import Agent, Sensor, World, circle, path_through, pose, ring_world, room
 
-from sjsam_node.closures import Findings
-from sjsam_node.global_map import GlobalMap, GlobalMapConfig
-from sjsam_node.joiner import JoinerConfig
+from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
+from sjsam_node.smoothing.regions import RegionConfig
+from sjsam_node.smoothing.smoother import SmootherConfig
 from slam_core.geometry import boxminus, invert_transform
 from slam_core.types import Submap
 
@@ -57,49 +57,79 @@ def test_joined_covariances_are_honest() -> None:
     assert 0.75 < np.mean(landmark_nees) < 1.3
 
 
-def test_incremental_joining_ends_at_the_batch_optimum(rng: np.random.Generator) -> None:
+def read_all(joined: GlobalMap) -> None:
+    """Everything that the node and its services read."""
+    joined.landmarks()
+    joined.trajectory()
+    joined.path()
+    for agent in "ab":
+        joined.end_pose(agent)
+        joined.map_to_odom(agent)
+    joined.start_pose(len(joined.graph.records) // 2)
+    joined.smoother.relative_pose(0, len(joined.graph.records) - 1)
+    joined.marks.positions(joined.graph)
+
+
+def same_reports(one: list[JoinReport], other: list[JoinReport]) -> bool:
+    return all(vars(a) == vars(b) for a, b in zip(one, other, strict=True))
+
+
+def same_map(one: GlobalMap, other: GlobalMap) -> bool:
+    """Whether two maps are the same to the last bit, covariances included."""
+    pairs = [
+        (one.graph.poses, other.graph.poses), (one.graph.points, other.graph.points),
+        (one.landmarks().covariances, other.landmarks().covariances),
+        *((p.covariance, q.covariance) for k in "ab"
+          for p, q in zip(one.trajectory(k), other.trajectory(k), strict=True)),
+    ]  # fmt: skip
+    return all(np.array_equal(a, b) for a, b in pairs)
+
+
+def test_reading_the_map_changes_nothing_to_the_last_bit(rng: np.random.Generator, tmp_path: Path) -> None:
+    """Small regions, two agents, closures; read after every submap, or never."""
+    world, path = ring_world(8.0, rng, 12.0), circle(8.0, 1.1)
+    A = Agent(world, path[:161], rng, "a").submaps()
+    B = Agent(world, path[121:], rng, "b", stamp_ns=5_000_000_000).submaps()
+    submaps = [s for pair in zip(A, B, strict=False) for s in pair] + A[len(B) :]
+    small = SmootherConfig(region=RegionConfig(size=8, open=12, quiet=1))
+    read, unread = (GlobalMap(GlobalMapConfig(smoothing=small)) for _ in range(2))
+    reports: list[JoinReport] = []
+    closed = 0
+    for submap in submaps:
+        reports.append(read.add(submap))
+        read_all(read)
+        closed += len(read.smoother.assembled(0).regions)
+    assert any(r.closures for r in reports)
+    assert closed > 10
+    assert same_reports(reports, join(submaps, unread)[1])
+    assert same_map(read, unread)
+    for joined in (read, unread):
+        joined.save(tmp_path / "map")
+        read_all(read)
+    assert same_map(read, unread)
+
+
+def test_settling_brings_the_map_to_its_optimum_with_all_landmarks(rng: np.random.Generator) -> None:
     submaps = ring_agent(rng, turns=1.0).submaps()
-    batch, _ = join(submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=10_000))))
-    step_by_step, reports = join(
-        submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5, front_work=1e9)))
-    )
-    assert sum(r.update == "incremental" for r in reports) > 10
-    a, b = step_by_step.trajectory("a"), batch.trajectory("a")
-    assert max(np.abs(boxminus(p.T, q.T)).max() for p, q in zip(a, b, strict=True)) < 1e-6
-    assert max(np.abs(p.covariance - q.covariance).max() for p, q in zip(a, b, strict=True)) < 1e-6
+    few, _ = join(submaps, GlobalMap(GlobalMapConfig(ties=6)))
+    every, _ = join(submaps)
+    assert few.smoother.totals()[1] < 0.5 * every.smoother.totals()[1]
+    gaps = []
+    for _ in range(2):
+        a, b = few.trajectory("a"), every.trajectory("a")
+        gaps.append(max(np.abs(boxminus(p.T, q.T)).max() for p, q in zip(a, b, strict=True)))
+        few.settle()
+        every.settle()
+    assert gaps[1] < 1e-6 < gaps[0]
 
 
-def test_submaps_are_joined_through_a_front_where_that_is_less_work_than_a_batch(rng: np.random.Generator) -> None:
-    submaps = ring_agent(rng, turns=0.7).submaps()
-    updates = []
-    for front_work in (0.0, JoinerConfig().front_work, 1e9):
-        config = GlobalMapConfig(joining=JoinerConfig(incremental_from=2, front_work=front_work))
-        updates.append(sum(r.update == "incremental" for r in join(submaps, GlobalMap(config))[1]))
-    assert updates[0] == 0
-    assert 0 < updates[1] < updates[2] == len(submaps) - 2
-
-
-def incremental_gap(scale: float) -> float:
-    """Distance of the incremental estimate from the optimum after 17 submaps, in units of the noise."""
-    agent = ring_agent(np.random.default_rng(5), turns=0.7)
-    agent.sensor = Sensor(
-        odometry=(0.02 * scale, 0.005 * scale), sigma_bearing=0.003 * scale, sigma_depth=0.004 * scale
-    )
-    submaps = agent.submaps()
-    joined, reports = join(
-        submaps, GlobalMap(GlobalMapConfig(joining=JoinerConfig(5, front_work=1e9, relinearize_turn=10.0)))
-    )
-    assert [r.update for r in reports[4:]] == ["incremental"] * (len(submaps) - 4)
-    last = joined.graph.poses[-1].copy()
-    batch = joined.joiner.batch(len(submaps) - 1)
-    assert reports[-1].chi2 == pytest.approx(batch.cost, rel=1e-2 * scale)
-    return float(np.abs(boxminus(joined.graph.poses[-1], last)).max()) / scale
-
-
-def test_incremental_joining_differs_from_batch_by_linearisation_only() -> None:
-    """Then the gap, in units of the noise, falls with the noise; a forgotten constraint would leave a constant one."""
-    assert incremental_gap(0.03) < 0.5 * incremental_gap(0.3)
-    assert incremental_gap(0.03) < 0.01
+def test_few_ties_are_within_a_sigma_of_all(rng: np.random.Generator) -> None:
+    submaps = ring_agent(rng, turns=1.25).submaps()
+    few, _ = join(submaps, GlobalMap(GlobalMapConfig(ties=16)))
+    every, _ = join(submaps, GlobalMap(GlobalMapConfig(ties=1000)))
+    for p, q in zip(few.trajectory("a")[1:], every.trajectory("a")[1:], strict=True):
+        gap = boxminus(p.T, q.T)
+        assert gap @ np.linalg.solve(p.covariance, gap) < 6.0
 
 
 def building(rng: np.random.Generator, alike: bool) -> tuple[World, list[tuple[float, float]]]:
@@ -145,27 +175,12 @@ def test_agents_are_joined_when_they_share_a_place_in_any_order(order: str, rng:
         assert ate(e) < 0.15
 
 
-def test_agents_that_take_turns_do_not_call_for_a_batch_each_time(rng: np.random.Generator) -> None:
-    a, b = agents_in_one_ring(rng)
-    A, B = a.submaps(), b.submaps()
-    turns, _ = join(
-        A[:12] + B[:4], GlobalMap(GlobalMapConfig(joining=JoinerConfig(incremental_from=5, front_work=1e9)))
-    )
-    assert turns.components == 1
-    turns.finder.closures = lambda *_: Findings([], [])  # type: ignore[method-assign]
-    _, reports = join([s for pair in zip(B[4:], A[12:], strict=False) for s in pair], turns)
-    assert [r.update for r in reports].count("batch") <= 1
-    assert {"incremental", "odometry"} <= {r.update for r in reports}
-    turns.settle()
-    assert len(turns.assembled(0).records) == len(turns.graph.records)
-
-
 def test_joining_does_not_depend_on_the_order_of_agents(rng: np.random.Generator) -> None:
     a, b = agents_in_one_ring(rng)
     A, B = a.submaps(), b.submaps()
     one, _ = join(A + B)
     other, _ = join(B + A)
-    assert one.joiner.cost(0) == pytest.approx(other.joiner.cost(0), rel=0.02)
+    assert one.smoother.totals()[0] == pytest.approx(other.smoother.totals()[0], rel=0.02)
     for name in "ab":
         gap = [
             np.abs(boxminus(p.T, q.T)).max() for p, q in zip(one.trajectory(name), other.trajectory(name), strict=True)

@@ -23,6 +23,7 @@ def mean_nees(claim: float) -> float:
                     for p in s.path)) for s in agent.submaps()
         ]  # fmt: skip
         joined, _ = join(submaps)
+        joined.settle()
         values.append(errors(joined, agent)[1].mean() / 6.0)
     return float(np.mean(values))
 

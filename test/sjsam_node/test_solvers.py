@@ -10,12 +10,12 @@ from judging import ate, chain_error, errors, join
 from submap_world import Agent, circle, ring_world
 from text_world import ring
 
-from sjsam_node.association import METHODS, AssociationConfig
-from sjsam_node.closures import ClosureConfig
-from sjsam_node.estimator import EstimatorConfig
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
-from sjsam_node.joiner import JoinerConfig
-from sjsam_node.text_joining import TextJoiningConfig, TextJoiningResult, join_text_maps
+from sjsam_node.linear_slam.text_joining import TextJoiningConfig, TextJoiningResult, join_text_maps
+from sjsam_node.loop_closure.association import METHODS, AssociationConfig
+from sjsam_node.loop_closure.verification import ClosureConfig
+from sjsam_node.smoothing.estimator import EstimatorConfig
+from sjsam_node.smoothing.smoother import SmootherConfig
 from slam_core.linear_algebra.sparse_cholesky import BACKENDS
 
 LIBRARIES = [name for name in BACKENDS if name != "auto"]
@@ -24,7 +24,8 @@ ROWS = ("joint", "block")
 
 def joined_with(agent: Agent, estimator: EstimatorConfig, method: str = "joint") -> tuple[GlobalMap, list[JoinReport]]:
     config = GlobalMapConfig(
-        joining=JoinerConfig(estimator=estimator), closure=ClosureConfig(association=AssociationConfig(method=method))
+        smoothing=SmootherConfig(estimator=estimator),
+        closure=ClosureConfig(association=AssociationConfig(method=method)),
     )
     joined, reports = join(agent.submaps(), GlobalMap(config))
     joined.settle()

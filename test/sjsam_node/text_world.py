@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from submap_world import unit
 
-from sjsam_node.linear_slam_text import TextMap
+from sjsam_node.linear_slam.text_maps import TextMap
 from slam_core.geometry import euler_from_rotation, rotation_from_euler, so3_exp
 
 SIGMA = {"position": 0.05, "angle": 0.02, "feature": 0.2}

@@ -4,8 +4,9 @@
     for submap in submaps:
         report = global_map.add(submap)
 
-:meth:`GlobalMap.add` reads as Algorithm 4 does: place the submap, associate, join; and beyond it: look for closures,
-judge them.
+:meth:`GlobalMap.add` reads as Algorithm 4 does: place the submap, associate, join; and beyond it: look for closures and
+keep those that the map can live with. Only ``add``, ``settle``, ``save`` and ``reset`` write; what is read is as fresh
+as the last of them and changes nothing.
 """
 
 from __future__ import annotations
@@ -16,14 +17,17 @@ from typing import overload
 
 import numpy as np
 
-from sjsam_node import map_view, storage
-from sjsam_node.closures import ClosureConfig, LinkFinder
-from sjsam_node.estimator import Assembled
-from sjsam_node.joiner import Joiner, JoinerConfig
-from sjsam_node.map_graph import Link, MapGraph
+from sjsam_node import storage
+from sjsam_node.graph.links import Link, Status
+from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.graph.offload import Offload
+from sjsam_node.loop_closure.consistency import Consistency, ConsistencyConfig, Verdict
+from sjsam_node.loop_closure.detector import LoopDetector
+from sjsam_node.loop_closure.verification import ClosureConfig
+from sjsam_node.map_view import MapLandmarks, MapView
 from sjsam_node.marks import Marks
+from sjsam_node.smoothing.smoother import Smoother, SmootherConfig
 from sjsam_node.storage import StoredMap
-from sjsam_node.trial import TrialConfig, Trials, Verdict
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
 from slam_core.types import Counters, PoseEstimate, Submap
@@ -37,21 +41,26 @@ class GlobalMapConfig(Config):
         100.0, "standard deviation given to poses of a stretch that nothing ties to the map yet", unit="m", minimum=1.0
     )
     compared_at_once: int = parameter(
-        60, "pairs of submaps that a closure has brought near each other, compared before the next submap", minimum=0
+        2, "pairs of submaps that a closure has brought near each other, compared with each new submap", minimum=0
     )
-    joining: JoinerConfig = group(JoinerConfig)
+    compared_at_settling: int = parameter(2, "the same per submap when the map settles", minimum=0)
+    ties: int = parameter(48, "landmarks by which two submaps are tied together, at most", minimum=3)
+    redundant_share: float = parameter(
+        0.6, "share of a submap's landmarks that closures match from which on it shows nothing new", minimum=0.0
+    )
+    redundant_ties: int = parameter(12, "landmarks that tie such a submap to each other one, at most", minimum=3)
+    smoothing: SmootherConfig = group(SmootherConfig)
     closure: ClosureConfig = group(ClosureConfig)
-    trial: TrialConfig = group(TrialConfig)
+    consistency: ConsistencyConfig = group(ConsistencyConfig)
 
 
 @dataclass(frozen=True, eq=False)
 class JoinReport:
     """What became of one submap.
 
-    accepted with reason otherwise; matched: its landmarks already in the map; new_landmarks; closures: links believed
-    now, as (agent, index) of the older submap; dropped_links: links taken back; components: parts of the map that
-    hang together; chi2, iterations, converged and solver of the joining; update: ``batch``, ``incremental`` or
-    ``odometry``.
+    accepted with reason otherwise; matched: its landmarks already in the map; new_landmarks; closures: links accepted
+    now, as (agent, index) of the older submap; dropped: matches let go; components: parts of the map that hang
+    together; chi2, variance_factor, iterations, converged and solver of the update; redundant: it shows nothing new.
     """
 
     accepted: bool
@@ -62,19 +71,21 @@ class JoinReport:
     dropped: int = 0
     components: int = 0
     chi2: float = 0.0
+    variance_factor: float = 1.0
     iterations: int = 0
     converged: bool = True
     solver: str = ""
-    update: str = ""
+    redundant: bool = False
 
 
 class GlobalMap:
     """Joins submaps of one or several agents, each as it comes."""
 
     graph: MapGraph
-    finder: LinkFinder
-    joiner: Joiner
-    trials: Trials
+    smoother: Smoother
+    detector: LoopDetector
+    consistency: Consistency
+    view: MapView
     marks: Marks
 
     def __init__(self, config: GlobalMapConfig | None = None) -> None:
@@ -84,14 +95,19 @@ class GlobalMap:
 
     def reset(self) -> None:
         """Forget everything."""
-        self.graph = MapGraph()
+        self._take(MapGraph())
         self.marks = Marks()
-        self.finder = LinkFinder(self.config.closure)
-        self.joiner = Joiner(self.graph, self.config.closure.window, self.config.joining)
-        self.trials = Trials(self.joiner, self.config.trial, self.config.closure)
+        self._offload = Offload()
         self._lookup: dict[tuple[str, int, int], int] = {}
-        self._unsearched: list[int] = []
-        self._closed_at = 0
+        self._has_moved = False
+
+    def _take(self, graph: MapGraph) -> None:
+        """Work on a graph."""
+        self.graph = graph
+        self.smoother = Smoother(graph, self.config.smoothing)
+        self.detector = LoopDetector(self.smoother, self.config.closure)
+        self.consistency = Consistency(self.smoother, self.config.consistency, self.config.closure)
+        self.view = MapView(self.smoother, self.config.unlinked_sigma)
 
     def add(self, submap: Submap) -> JoinReport:
         """Join one submap; a faulty one is refused with the reason, counted, and changes nothing."""
@@ -101,18 +117,58 @@ class GlobalMap:
             return JoinReport(False, reason)
         new = self._place(submap)
         chain = self._chain(new)
-        for link in self.finder.sequential(self.graph, chain, new):
+        for link in self.detector.sequential(chain, new):
             self.graph.add_link(link)
-        joined = self.joiner.absorb(new, chain)
         matched = self._matched(new)
-        self._unsearched.append(new)
-        closures, dropped = self._close_loops() if self._is_search_due(new) else ([], 0)
-        self.finder.index.add(new, submap.descriptors)
+        self.smoother.condense(new, chain)
+        found = self.detector.closures(chain, new)
+        if self._has_moved:
+            found += self.detector.missed(self._chain, self.config.compared_at_once)
+        self._judge_redundancy(new, found)
+        result, verdict = self.consistency.update(found, new)
+        self._account(verdict, len(found))
+        if not self.graph.redundant[new]:
+            self.detector.index.add(new, submap.descriptors)
+        self._put_away(new - self.config.closure.window)
         return JoinReport(
-            True, "", matched, len(submap.landmarks) - self._matched(new), tuple(closures), dropped, self.components,
-            self.joiner.cost(self.graph.component(new)), joined.iterations, joined.converged, joined.solver,
-            "batch" if closures else joined.update,
+            True, "", matched, len(submap.landmarks) - self._matched(new), self._named(verdict.accepted),
+            verdict.dropped, self.components, result.cost, result.variance_factor, result.iterations, result.converged,
+            result.solver, bool(self.graph.redundant[new]),
         )  # fmt: skip
+
+    def _judge_redundancy(self, new: int, found: list[Link]) -> None:
+        """A submap of a place that the map knows well adds few unknowns, and nothing is compared with it later."""
+        known = [k.pairs[:, 1] for k in found if k.second == new and k.status is Status.CONSISTENT]
+        count = len(np.unique(np.concatenate(known))) if known else 0
+        if count > max(self.config.redundant_share * len(self.graph.records[new].observations), self.config.ties):
+            self.graph.mark_redundant(new, self.config.redundant_ties)
+
+    def _account(self, verdict: Verdict, found: int) -> None:
+        """Count what became of closures, and compare anew what they let go."""
+        for name, amount in (
+            ("closures refused by the joined map", found if not verdict.accepted else 0),
+            ("matches let go", verdict.dropped),
+            ("closures let go", len(verdict.removed)),
+        ):
+            if amount:
+                self.counters.add(name, amount)
+        self.detector.near.forget({i for k in verdict.removed for i in k.ends})
+        self._has_moved = self._has_moved or bool(verdict.accepted)
+
+    def _named(self, links: tuple[Link, ...]) -> tuple[tuple[str, int], ...]:
+        older = [self.graph.records[link.first].submap for link in links]
+        return tuple((submap.agent, submap.index) for submap in older)
+
+    def _put_away(self, old: int) -> None:
+        """Keep the large arrays of a submap on disk from here on."""
+        if old >= 0:
+            submap = self.graph.records[old].submap
+            small = replace(
+                submap,
+                covariance=self._offload.put(submap.covariance),
+                descriptors=self._offload.put(submap.descriptors),
+            )
+            self.graph.records[old] = replace(self.graph.records[old], submap=small)
 
     @property
     def components(self) -> int:
@@ -143,7 +199,7 @@ class GlobalMap:
         previous = self._lookup.get((submap.agent, submap.session, submap.index - 1))
         follows = submap.follows_previous and previous is not None
         start = self.graph.records[previous].end if follows and previous is not None else None
-        self.graph.append(submap, start, self._last_pose(submap.agent))
+        self.graph.append(submap, start, self._last_pose(submap.agent), self.config.ties)
         new = len(self.graph.records) - 1
         self._lookup[self.graph.records[new].key] = new
         return new
@@ -170,49 +226,6 @@ class GlobalMap:
         """Landmarks of a record that another record sees too."""
         return int(self.graph.shared()[self.graph.records[new].observations].sum())
 
-    def _is_search_due(self, new: int) -> bool:
-        """A revisit closes again and again at the cost of a batch; the larger the map, the fewer of these at once."""
-        size = self.graph.size(self.graph.component(new))
-        interval = 1 if size <= self.config.joining.incremental_from else 1 + int(np.sqrt(size) / 3.0)
-        return len(self.graph.records) - self._closed_at >= interval
-
-    def _close_loops(self) -> tuple[list[tuple[str, int]], int]:
-        """Look for closures of the submaps not looked at yet; believe those that the joined map can live with."""
-        unsearched, self._unsearched = self._unsearched, []
-        links: list[Link] = []
-        contradicted: list[Link] = []
-        for new in unsearched:
-            found = self.finder.closures(self.graph, self._chain(new), new, self.joiner.relative_pose)
-            links += found.believed
-            contradicted += found.contradicted
-        verdict = self.trials.hear(links, contradicted, unsearched[-1]) if links or contradicted else Verdict()
-        if verdict.believed:
-            verdict = verdict.followed_by(self._catch_up(unsearched[-1], self.config.compared_at_once))
-        for name, amount in (
-            ("closures refused by the joined map", len(links) if not verdict.believed else 0),
-            ("matches taken back", verdict.dropped),
-            ("closures taken back", len(verdict.revoked)),
-        ):
-            if amount:
-                self.counters.add(name, amount)
-        self.finder.near.forget({i for k in verdict.revoked for i in (k.first, k.second)})
-        if verdict.believed:
-            self._closed_at = len(self.graph.records)
-        older = [self.graph.records[link.first].submap for link in verdict.believed]
-        return [(submap.agent, submap.index) for submap in older], verdict.dropped
-
-    def _catch_up(self, newest: int, most: int | None) -> Verdict:
-        """Compare what has come near each other, ``most`` pairs at once, until nothing new is believed."""
-        total = Verdict()
-        while True:
-            missed = self.finder.missed(self.graph, self._chain, self.joiner.relative_pose, most)
-            if not missed.believed:
-                return total
-            verdict = self.trials.hear(missed.believed, missed.contradicted, newest)
-            total = total.followed_by(verdict)
-            if not verdict.believed:
-                return total
-
     @overload
     def trajectory(self) -> dict[str, list[PoseEstimate]]: ...
 
@@ -220,32 +233,33 @@ class GlobalMap:
     def trajectory(self, agent: str) -> list[PoseEstimate]: ...
 
     def trajectory(self, agent: str | None = None) -> dict[str, list[PoseEstimate]] | list[PoseEstimate]:
-        """Rig poses in the map frame with covariances (see :func:`sjsam_node.map_view.trajectory`).
+        """Rig poses in the map frame with covariances (see :meth:`sjsam_node.map_view.MapView.trajectory`).
 
         Of every agent by name, or of one.
         """
-        trajectories = map_view.trajectory(self)
+        trajectories = self.view.trajectory()
         return trajectories if agent is None else trajectories.get(agent, [])
 
-    def landmarks(self) -> map_view.MapLandmarks:
+    def path(self) -> dict[str, list[PoseEstimate]]:
+        """The same poses by agent, with no more covariance than inside their submaps; costs little."""
+        return self.view.path()
+
+    def landmarks(self) -> MapLandmarks:
         """Every landmark once, with covariance, descriptor and id."""
-        return map_view.landmarks(self)
+        return self.view.landmarks()
 
     def settle(self) -> None:
-        """Do now what was put off: look for closures, compare what has come near, and join in batch.
-
-        Reading the map does not: what is believed does not depend on who looks when.
-        """
-        if self._unsearched:
-            self._close_loops()
-        if self.graph.records:
-            self._join_whole()
-            self._catch_up(len(self.graph.records) - 1, None)
-        self._join_whole()
-
-    def _join_whole(self) -> None:
-        for component in np.unique(self.graph.component_of):
-            self.joiner.assembled(int(component))
+        """Do now what was put off: compare what has come near, let go what does not fit, and join in batch."""
+        if not self.graph.records:
+            return
+        newest = len(self.graph.records) - 1
+        self.smoother.settle()
+        found = self.detector.missed(self._chain, self.config.compared_at_settling * len(self.graph.records))
+        if found:
+            self._account(self.consistency.update(found, newest)[1], len(found))
+        self._account(self.consistency.settle(newest), 0)
+        self.smoother.settle()
+        self._has_moved = False
 
     def centrally(self) -> GlobalMap:
         """The map that does not depend on who came first: all submaps joined anew, agent after agent, and settled.
@@ -286,19 +300,10 @@ class GlobalMap:
             T = T @ submap.end_pose
         return T
 
-    def assembled(self, component: int) -> Assembled:
-        """The joining problem of a component, everything in it, at its optimum."""
-        return self.joiner.assembled(component)
-
     def start_pose(self, record: int) -> PoseEstimate:
         """Start pose of a record in the map frame, with covariance."""
         r = self.graph.records[record]
-        return PoseEstimate(r.submap.start_stamp_ns, self.graph.poses[r.start], self._covariance(r.start))
-
-    def _covariance(self, node: int) -> FloatArray:
-        """Covariance (6, 6) of a node, honest as :mod:`sjsam_node.map_view` says."""
-        component = int(self.graph.component_of[node])
-        return self.joiner.variance_factor(component) * self.assembled(component).covariance([node])
+        return PoseEstimate(r.submap.start_stamp_ns, self.graph.poses[r.start], self.view.node(r.start))
 
     def end_pose(self, agent: str) -> PoseEstimate | None:
         """Where an agent's newest submap ends in the map frame; None for one not heard of."""
@@ -306,32 +311,30 @@ class GlobalMap:
         if not own:
             return None
         r = self.graph.records[own[-1]]
-        return PoseEstimate(r.submap.end_stamp_ns, self.graph.poses[r.end], self._covariance(r.end))
+        return PoseEstimate(r.submap.end_stamp_ns, self.graph.poses[r.end], self.view.node(r.end))
 
     def save(self, path: Path | str) -> None:
         """Write the map to a folder (see :mod:`sjsam_node.storage`), and go on from it as a map that is loaded does."""
         self.settle()
         stored = StoredMap(
-            self.graph,
-            self.finder.pending,
-            self.trials.contested,
-            self.finder.near.compared,
-            self.marks,
-            self._closed_at,
+            self.graph, self.detector.pending, self.consistency.refused, self.detector.near.compared, self.marks
         )
         storage.write(Path(path), stored)
-        self.joiner.forget()
+        self.smoother.resume()
 
     @classmethod
     def load(cls, path: Path | str, config: GlobalMapConfig | None = None) -> GlobalMap:
         """The map that :meth:`save` wrote; ``ValueError`` if the folder is no such map."""
         stored = storage.read(Path(path))
         loaded, graph = cls(config), stored.graph
-        loaded.graph, loaded.marks, loaded._closed_at = graph, stored.marks, stored.closed_at
-        loaded.joiner = Joiner(graph, loaded.config.closure.window, loaded.config.joining)
-        loaded.trials = Trials(loaded.joiner, loaded.config.trial, loaded.config.closure, stored.contested)
-        loaded.finder.pending, loaded.finder.near.compared = stored.pending, stored.compared
+        loaded._take(graph)
+        loaded.marks = stored.marks
+        loaded.consistency.refused = stored.refused
+        loaded.detector.pending, loaded.detector.near.compared = stored.pending, stored.compared
         for i, record in enumerate(graph.records):
             loaded._lookup[record.key] = i
-            loaded.finder.index.add(i, record.submap.descriptors)
+            if not graph.redundant[i]:
+                loaded.detector.index.add(i, record.submap.descriptors)
+            loaded._put_away(i)
+        loaded.smoother.resume()
         return loaded

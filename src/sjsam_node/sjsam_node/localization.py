@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sjsam_node.association import PointSet, Prior
-from sjsam_node.closures import Standing, at_start, prior_of_pair
+from sjsam_node.graph.links import Prior, Status
+from sjsam_node.loop_closure.association import PointSet
+from sjsam_node.loop_closure.point_sets import at_start
+from sjsam_node.smoothing.marginals import prior_of_pair
 from slam_core.geometry import FloatArray, compose_covariance, inverse_jacobian, invert_transform
 from slam_core.types import PoseEstimate, Submap
 
@@ -54,10 +56,10 @@ class Localizer:
         seen = PointSet(submap.landmarks, submap.covariance[6:, 6:], submap.descriptors)
         best, most = self._pose, 0
         for record in self._candidates(submap):
-            link, standing = self._map.finder.judge(
+            link, status = self._map.detector.verifier.verify(
                 at_start(self._map.graph.records[record]), seen, self._prior(record), 0.0, record
             )
-            trusted = standing is Standing.CERTAIN or self._pose is None
+            trusted = status is Status.CONSISTENT or self._pose is None
             if link is not None and len(link.pairs) > most and trusted:
                 anchor = self._map.start_pose(record)
                 covariance = compose_covariance(anchor.T, anchor.covariance, link.T, link.covariance)
@@ -65,11 +67,11 @@ class Localizer:
         return best, most
 
     def _candidates(self, submap: Submap) -> list[int]:
-        finder, graph = self._map.finder, self._map.graph
+        detector, graph = self._map.detector, self._map.graph
         if self._pose is None:
-            return finder.index.query(submap.descriptors, set())
+            return detector.index.query(submap.descriptors, set())
         middle = self._pose.T[:3, :3] @ np.median(submap.landmarks, axis=0) + self._pose.T[:3, 3]
-        return finder.around(graph, middle, range(len(graph.records)), set())
+        return detector.around(middle, range(len(graph.records)), set())
 
     def _prior(self, record: int) -> Prior | None:
         if self._pose is None:

@@ -1,8 +1,7 @@
-"""The joined map as others want it: trajectories and landmarks with exact marginal covariances.
+"""The joined map as others want it: paths, trajectories and landmarks with marginal covariances.
 
-The poses inside a submap hang on the joined skeleton: what joining changed at the submap's end is handed to each pose
-by the gain with which the end, once known better, corrects it (a Rauch-Tung-Striebel step with the submap's own
-covariances).
+The poses inside a submap hang on the joined skeleton: what joining changed at the submap's end moves each pose by the
+gain with which the end, once known better, corrects it (a Rauch-Tung-Striebel step with the submap's own covariances).
 
 Submaps that contradict one another more than they claim possible are too sure of themselves, each as much as the
 others as far as the map can tell: every covariance that goes out is multiplied by the component's variance factor, chi2
@@ -11,14 +10,14 @@ per degree of freedom (the "variance of unit weight"; Baarda 1968), never below 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from sjsam_node.estimator import Assembled, ReducedMap
-from sjsam_node.joining import Marginals
-from sjsam_node.map_graph import MapGraph, Record
+from sjsam_node.graph.map_graph import BoolArray, MapGraph, Record
+from sjsam_node.smoothing.marginals import ComponentMarginals
+from sjsam_node.smoothing.smoother import Smoother
 from slam_core.geometry import (
     FloatArray,
     boxminus,
@@ -30,9 +29,6 @@ from slam_core.geometry import (
 )  # fmt: skip
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 from slam_core.types import Float32Array, PoseEstimate, Submap
-
-if TYPE_CHECKING:
-    from sjsam_node.global_map import GlobalMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,54 +44,113 @@ class MapLandmarks:
     covariances: FloatArray
     descriptors: Float32Array
     sightings: IntArray
-    linked: FloatArray
+    linked: BoolArray
 
 
-def trajectory(global_map: GlobalMap) -> dict[str, list[PoseEstimate]]:
-    """Poses of every agent, in the order of their stamps.
+@dataclass
+class MapView:
+    """Pictures of the estimate as of the last update; looking changes nothing."""
 
-    A component that nothing ties to the map yet is given in its own frame, laid where its agent was last seen, and its
-    covariances are widened by ``unlinked_sigma``: a receiver sees that these poses mean nothing in the map frame.
-    """
-    out: dict[str, list[PoseEstimate]] = {}
-    for part in _components(global_map):
-        for i in part.assembled.records:
-            record = global_map.graph.records[i]
-            joint = part.marginals.covariance(np.searchsorted(part.assembled.nodes, [record.start, record.end]))
-            poses = _hung(global_map.graph, record, joint)
-            out.setdefault(record.submap.agent, []).extend(
-                PoseEstimate(p.stamp_ns, p.T, part.factor * p.covariance + part.widening) for p in poses
-            )
-    return {agent: _unique_stamps(poses) for agent, poses in sorted(out.items())}
+    smoother: Smoother
+    unlinked_sigma: float
+    _gains: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+
+    @property
+    def graph(self) -> MapGraph:
+        """What is pictured."""
+        return self.smoother.graph
+
+    def path(self) -> dict[str, list[PoseEstimate]]:
+        """Poses of every agent in the order of their stamps, with no more covariance than inside their submaps."""
+        records = self.graph.records
+        for i in range(len(self._gains), len(records)):
+            self._gain(i)
+        if not records:
+            return {}
+        inside = [p for r in records for p in r.submap.path]
+        count = [len(r.submap.path) for r in records]
+        gains = np.concatenate([self._gains[i][0] for i in range(len(records))])
+        poses = _on_skeleton(self.graph, records, np.repeat(np.arange(len(records)), count), inside, gains)
+        out: dict[str, list[PoseEstimate]] = {}
+        first = 0
+        for n, r in zip(count, records, strict=True):
+            own = zip(r.submap.path, poses[first : first + n], strict=True)
+            out.setdefault(r.submap.agent, []).extend(PoseEstimate(p.stamp_ns, T, p.covariance) for p, T in own)
+            first += n
+        return {agent: _unique_stamps(poses) for agent, poses in sorted(out.items())}
+
+    def trajectory(self) -> dict[str, list[PoseEstimate]]:
+        """Poses of every agent, in the order of their stamps, with covariances.
+
+        A component that nothing ties to the map yet is given in its own frame, laid where its agent was last seen, and
+        its covariances are widened by ``unlinked_sigma``: a receiver sees that these poses mean nothing in the map
+        frame.
+        """
+        out: dict[str, list[PoseEstimate]] = {}
+        for component in np.unique(self.graph.component_of).tolist():
+            marginals, widening = self.smoother.marginals(component), self._widening(component)
+            for i in marginals.records:
+                record = self.graph.records[i]
+                poses, covariances = _with_covariances(self.graph, marginals, i, *self._gain(i))
+                own = record.submap.path
+                out.setdefault(record.submap.agent, []).extend(
+                    PoseEstimate(p.stamp_ns, T, P + widening) for p, T, P in zip(own, poses, covariances, strict=True)
+                )
+        return {agent: _unique_stamps(poses) for agent, poses in sorted(out.items())}
+
+    def node(self, node: int) -> FloatArray:
+        """Covariance (6, 6) of a node in the map frame."""
+        component = int(self.graph.component_of[node])
+        return self.smoother.marginals(component).node(node) + self._widening(component)
+
+    def landmarks(self) -> MapLandmarks:
+        """Every landmark once; what one submap alone saw counts only if that submap showed something new."""
+        graph = self.graph
+        ids, counts = np.unique(graph.landmark_of, return_counts=True)
+        kept = (counts > 1) | ~graph.redundant[graph.record_of[ids]]
+        ids, counts = ids[kept], counts[kept]
+        rows = _estimated(graph)[ids]
+        component = graph.component_of[graph.starts[graph.record_of[rows]]]
+        covariances = np.empty((len(ids), 3, 3))
+        for c in np.unique(component).tolist():
+            own = component == c
+            covariances[own] = self.smoother.marginals(c).landmarks(rows[own]) + self._widening(c)[:3, :3]
+        main = graph.component(0) if graph.records else 0
+        return MapLandmarks(ids, graph.points[rows], covariances, _descriptors(graph, rows), counts, component == main)
+
+    def _widening(self, component: int) -> FloatArray:
+        """What is added (6, 6) to the covariances of a component whose frame nothing ties to the map's."""
+        if component == self.graph.component(0):
+            return np.zeros((6, 6))
+        return np.diag(np.square([*[self.unlinked_sigma] * 3, np.pi, np.pi, np.pi]))
+
+    def _gain(self, record: int) -> tuple[FloatArray, FloatArray]:
+        """Of each pose of a submap: how its end corrects it, and what covariance that leaves; they never change."""
+        if record not in self._gains:
+            submap = self.graph.records[record].submap
+            found = [_smoothing(submap, pose) for pose in submap.path]
+            self._gains[record] = np.array([g for g, _ in found]), np.array([r for _, r in found])
+        return self._gains[record]
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A component with what its covariances are multiplied by, and what is added (6, 6) where its frame is unknown."""
-
-    assembled: Assembled
-    marginals: Marginals
-    factor: float
-    widening: FloatArray
+def _estimated(graph: MapGraph) -> IntArray:
+    """For every landmark, at its name, the observation whose point is the best known."""
+    rows = np.arange(len(graph.points))
+    tying = np.nonzero(graph.tying())[0]
+    rows[graph.landmark_of[tying]] = graph.variable_of[tying]
+    return rows
 
 
-def _components(global_map: GlobalMap) -> list[_Part]:
-    graph = global_map.graph
+def _descriptors(graph: MapGraph, rows: IntArray) -> Float32Array:
+    """Descriptors (n, d) of some observations."""
     if not graph.records:
-        return []
-    main = int(graph.component_of[graph.records[0].start])
-    out = []
-    for component in np.unique(graph.component_of).tolist():
-        assembled = global_map.assembled(component)
-        widening = np.zeros((6, 6)) if component == main else _unknown(global_map.config.unlinked_sigma)
-        marginals = assembled.problem.marginals(assembled.state)
-        out.append(_Part(assembled, marginals, global_map.joiner.variance_factor(component), widening))
+        return np.empty((0, 0), np.float32)
+    out = np.empty((len(rows), graph.records[0].submap.descriptors.shape[1]), np.float32)
+    record = graph.record_of[rows]
+    for i in np.unique(record).tolist():
+        own, r = record == i, graph.records[i]
+        out[own] = r.submap.descriptors[rows[own] - r.first_observation]
     return out
-
-
-def _unknown(sigma: float) -> FloatArray:
-    """Covariance (6, 6) of a frame of which nothing is known: position by ``sigma`` m, orientation by half a turn."""
-    return np.diag(np.square([sigma, sigma, sigma, np.pi, np.pi, np.pi]))
 
 
 def _unique_stamps(poses: list[PoseEstimate]) -> list[PoseEstimate]:
@@ -103,23 +158,35 @@ def _unique_stamps(poses: list[PoseEstimate]) -> list[PoseEstimate]:
     return [poses[i] for i in np.unique([p.stamp_ns for p in poses], return_index=True)[1]]
 
 
-def _hung(graph: MapGraph, record: Record, joint: FloatArray) -> list[PoseEstimate]:
-    """The poses inside a submap on the joined skeleton; ``joint`` (12, 12) of its start and end node."""
+def _on_skeleton(
+    graph: MapGraph, records: Sequence[Record], of: IntArray, inside: Sequence[PoseEstimate], gains: FloatArray
+) -> FloatArray:
+    """Poses inside submaps, on the joined skeleton, (n, 4, 4); ``of`` which of the records each is in."""
+    T_start, T_end = (graph.poses[[getattr(r, end) for r in records]] for end in ("start", "end"))
+    end_poses = np.array([r.submap.end_pose for r in records])
+    correction = boxminus(np.linalg.inv(T_start) @ T_end, end_poses)
+    T = boxplus(np.array([p.T for p in inside]), (gains @ correction[of][..., None])[..., 0])
+    return np.asarray(T_start[of] @ T)
+
+
+def _with_covariances(
+    graph: MapGraph, marginals: ComponentMarginals, i: int, gains: FloatArray, remaining: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The poses inside record ``i`` with their covariances (n, 6, 6)."""
+    record, joint = graph.records[i], marginals.ends(i)
     T_start, T_end = graph.poses[record.start], graph.poses[record.end]
-    T_inverse = invert_transform(T_start)
-    correction = boxminus(T_inverse @ T_end, record.submap.end_pose)
+    inside, T_inverse = record.submap.path, invert_transform(T_start)
+    poses = _on_skeleton(graph, [record], np.zeros(len(inside), dtype=np.int64), inside, gains)
     J_inverse, J_end = compose_jacobians(T_inverse, T_end)
     D = np.concatenate([J_inverse @ inverse_jacobian(T_start), J_end], axis=1)
-    out = []
-    for pose in record.submap.path:
-        gain, remaining = _smoothing(record.submap, pose)
-        T = boxplus(pose.T, gain @ correction)
-        J_start, J_pose = compose_jacobians(T_start, T)
-        J = J_pose @ gain @ D
+    covariances = np.empty((len(poses), 6, 6))
+    for k, T in enumerate(poses):
+        J_start, J_pose = compose_jacobians(T_start, T_inverse @ T)
+        J = J_pose @ gains[k] @ D
         J[:, :6] += J_start
-        covariance = J @ joint @ J.T + J_pose @ remaining @ J_pose.T
-        out.append(PoseEstimate(pose.stamp_ns, T_start @ T, _positive(covariance)))  # the map's first pose has none
-    return out
+        # The map's first pose has no covariance of its own.
+        covariances[k] = _positive(J @ joint @ J.T + marginals.factor * J_pose @ remaining[k] @ J_pose.T)
+    return poses, covariances
 
 
 def _smoothing(submap: Submap, pose: PoseEstimate) -> tuple[FloatArray, FloatArray]:
@@ -144,60 +211,3 @@ def _positive(covariance: FloatArray) -> FloatArray:
     """Nearest positive definite matrix: eigenvalues no smaller than nothing much."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     return np.asarray((vectors * np.maximum(values, 1e-12)) @ vectors.T)
-
-
-def landmarks(global_map: GlobalMap) -> MapLandmarks:
-    """Every landmark once, from the submap that saw it last."""
-    graph = global_map.graph
-    covariances = np.zeros((len(graph.points), 3, 3))
-    linked = np.zeros(len(graph.points), dtype=bool)
-    for part in _components(global_map):
-        for i, reduced in zip(part.assembled.records, part.assembled.reduced, strict=True):
-            record = graph.records[i]
-            rows = record.observations
-            own = _observation_covariances(graph, record, reduced, part.assembled, part.marginals)
-            covariances[rows] = part.factor * own + part.widening[:3, :3]
-            linked[rows] = part.widening[0, 0] == 0.0
-    ids, counts = np.unique(graph.landmark_of, return_counts=True)
-    newest = np.empty(len(graph.points), dtype=np.int64)
-    newest[graph.landmark_of] = np.arange(len(graph.points))
-    descriptors = [r.submap.descriptors for r in graph.records]
-    stacked = np.concatenate(descriptors) if descriptors else np.empty((0, 0), np.float32)
-    rows = newest[ids]
-    return MapLandmarks(ids, graph.points[ids], covariances[rows], stacked[rows], counts, linked[rows])
-
-
-def _observation_covariances(
-    graph: MapGraph, record: Record, reduced: ReducedMap, assembled: Assembled, marginals: Marginals
-) -> FloatArray:
-    """Covariance (n, 3, 3) in the map frame of each landmark of a record."""
-    nodes = np.searchsorted(assembled.nodes, [record.start, record.end])
-    shared = np.searchsorted(assembled.landmarks, graph.landmark_of[record.observations[reduced.shared]])
-    joint = marginals.covariance(nodes, shared)
-    out = np.empty((len(record.observations), 3, 3))
-    k = np.arange(len(shared))
-    out[reduced.shared] = joint[12:, 12:].reshape(len(k), 3, len(k), 3)[k, :, k, :]
-    R = graph.poses[record.start][:3, :3]
-    J = _private_jacobian(graph, record, reduced)
-    out[reduced.private] = np.einsum("pim,mn,pjn->pij", J, joint, J, optimize=True) + R @ reduced.spread @ R.T
-    return out
-
-
-def _private_jacobian(graph: MapGraph, record: Record, reduced: ReducedMap) -> FloatArray:
-    """Derivative (p, 3, 12 + 3k) of private landmarks, in the map, by start, end and shared landmarks."""
-    T_start, T_end = graph.poses[record.start], graph.poses[record.end]
-    R, t = T_start[:3, :3], T_start[:3, 3]
-    k, p = len(reduced.shared), len(reduced.private)
-    points = graph.points[graph.landmark_of[record.observations[reduced.shared]]]
-    residual_jacobian = np.zeros((6 + 3 * k, 12 + 3 * k))
-    J_inverse, J_end = compose_jacobians(invert_transform(T_start), T_end)
-    residual_jacobian[:6, :6], residual_jacobian[:6, 6:12] = J_inverse @ inverse_jacobian(T_start), J_end
-    for n in range(k):
-        row = slice(6 + 3 * n, 9 + 3 * n)
-        residual_jacobian[row, :3] = -R.T
-        residual_jacobian[row, 3:6] = R.T @ skew(points[n] - t)
-        residual_jacobian[row, 12 + 3 * n : 15 + 3 * n] = R.T
-    moved = R @ (reduced.gain @ residual_jacobian).reshape(p, 3, 12 + 3 * k)
-    moved[:, :, :3] += np.eye(3)
-    moved[:, :, 3:6] -= skew(graph.points[record.observations[reduced.private]] - t)
-    return np.asarray(moved)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sjsam_node.map_graph import MapGraph
+from sjsam_node.graph.map_graph import MapGraph
 from slam_core.geometry import FloatArray
 
 

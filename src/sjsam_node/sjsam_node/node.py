@@ -233,9 +233,9 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self.publish("map/ellipsoids", ellipsoids_message(self.types, header, landmarks))
         self.publish("map/graph", graph_message(self.types, header, self.global_map))
         self._publish_marks()
-        trajectories = self.global_map.trajectory()
+        paths = self.global_map.path()
         for agent in self.config.agents:
-            path = path_message(self.types, self._stamp_ns, self.config.map_frame, trajectories.get(agent, []))
+            path = path_message(self.types, self._stamp_ns, self.config.map_frame, paths.get(agent, []))
             self.publish(_below(agent, "map/path"), path)
 
     def _publish_marks(self) -> None:

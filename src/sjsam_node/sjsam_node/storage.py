@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from sjsam_node.map_graph import Link, MapGraph
+from sjsam_node.graph.links import Link
+from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.loop_closure.near_pairs import Compared
 from sjsam_node.marks import Mark, Marks
-from sjsam_node.near_pairs import Compared
 from slam_core.files import atomic_path
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
-FORMAT, VERSION = "indoor-slam-map", 3
+FORMAT, VERSION = "indoor-slam-map", 4
 Arrays = dict[str, AnyArray]
 
 
@@ -29,16 +30,15 @@ Arrays = dict[str, AnyArray]
 class StoredMap:
     """All that a map needs to go on as if it had never been put away.
 
-    pending, contested: links that wait for confirmation and for support; compared: pairs of submaps compared where they
-    were near (see :mod:`sjsam_node.near_pairs`); closed_at: number of submaps at the last closure.
+    pending, refused: closures that wait for another that says the same, and for more that speaks for them; compared:
+    pairs of submaps compared where they were near (see :mod:`sjsam_node.loop_closure.near_pairs`).
     """
 
     graph: MapGraph
     pending: list[Link]
-    contested: list[Link]
+    refused: list[Link]
     compared: Compared
     marks: Marks
-    closed_at: int
 
 
 def write(folder: Path, stored: StoredMap) -> None:
@@ -47,7 +47,7 @@ def write(folder: Path, stored: StoredMap) -> None:
     arrays = _graph_arrays(graph)
     arrays.update(_link_arrays("links", graph.links))
     arrays.update(_link_arrays("pending", stored.pending))
-    arrays.update(_link_arrays("contested", stored.contested))
+    arrays.update(_link_arrays("refused", stored.refused))
     arrays["compared/pairs"], arrays["compared/middles"] = stored.compared.pairs, stored.compared.seen
     for i, record in enumerate(graph.records):
         arrays.update({f"submap_{i}/{name}": value for name, value in _submap_arrays(record.submap).items()})
@@ -61,7 +61,6 @@ def write(folder: Path, stored: StoredMap) -> None:
             [s.agent, s.index, s.session, r.start, s.follows_previous] for r in graph.records for s in [r.submap]
         ],
         "marks": [[m.name, m.node, *m.point.tolist()] for m in stored.marks.marks],
-        "closed_at": stored.closed_at,
         "sha256": hashlib.sha256(data).hexdigest(),
     }  # fmt: skip
     with atomic_path(folder, may_replace=_is_map) as temporary:
@@ -90,9 +89,9 @@ def read(folder: Path) -> StoredMap:
     try:
         graph = _graph(manifest["records"], arrays)
         marks = Marks([Mark(str(name), int(node), np.array(point)) for name, node, *point in manifest["marks"]])
-        pending, contested = _links("pending", arrays), _links("contested", arrays)
+        pending, refused = _links("pending", arrays), _links("refused", arrays)
         compared = Compared.of(arrays["compared/pairs"], arrays["compared/middles"])
-        return StoredMap(graph, pending, contested, compared, marks, int(manifest["closed_at"]))
+        return StoredMap(graph, pending, refused, compared, marks)
     except (KeyError, IndexError, TypeError) as error:
         raise ValueError(f"{folder}: the map is incomplete: {error}") from error
 
@@ -122,7 +121,10 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 
 def _graph_arrays(graph: MapGraph) -> Arrays:
-    return {"poses": graph.poses, "points": graph.points, "component_of": graph.component_of}
+    return {
+        "poses": graph.poses, "points": graph.points, "component_of": graph.component_of, "ties": graph.ties,
+        "redundant": graph.redundant,
+    }  # fmt: skip
 
 
 def _link_arrays(name: str, links: list[Link]) -> Arrays:
@@ -132,7 +134,7 @@ def _link_arrays(name: str, links: list[Link]) -> Arrays:
             [[k.first, k.second, len(k.pairs), k.is_closure] for k in links], dtype=np.int64
         ).reshape(-1, 4),
         f"{name}/pairs": np.concatenate(pairs) if pairs else np.empty((0, 2), dtype=np.int64),
-        f"{name}/tension": np.array([link.tension for link in links], dtype=np.float64),
+        f"{name}/error": np.array([link.error for link in links], dtype=np.float64),
         f"{name}/T": np.array([link.T for link in links]).reshape(-1, 4, 4),
         f"{name}/covariance": np.array([link.covariance for link in links]).reshape(-1, 6, 6),
     }
@@ -149,7 +151,7 @@ def _links(name: str, arrays: Arrays) -> list[Link]:
             arrays[f"{name}/T"][i],
             arrays[f"{name}/covariance"][i],
             bool(closure),
-            float(arrays[f"{name}/tension"][i]),
+            float(arrays[f"{name}/error"][i]),
         )
         for i, (first, second, _, closure) in enumerate(ends)
     ]
@@ -185,5 +187,6 @@ def _graph(records: list[list[Any]], arrays: Arrays) -> MapGraph:
         graph.append(submap, start if start < len(graph.poses) else None, np.eye(4))
     graph.component_of = arrays["component_of"]
     graph.poses, graph.points = arrays["poses"], arrays["points"]
+    graph.ties, graph.redundant = arrays["ties"], arrays["redundant"]
     graph.replace_links(_links("links", arrays))
     return graph

@@ -10,9 +10,9 @@ from typing import Any
 import click
 from rich.progress import Progress
 
-from sjsam_node.linear_slam_text import find_maps, read_maps, write_values
-from sjsam_node.robust import LOSSES
-from sjsam_node.text_joining import ROWS, TextJoiningConfig, TextJoiningResult, join_text_maps
+from sjsam_node.linear_slam.text_joining import ROWS, TextJoiningConfig, TextJoiningResult, join_text_maps
+from sjsam_node.linear_slam.text_maps import find_maps, read_maps, write_values
+from sjsam_node.smoothing.robust import LOSSES
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.config import from_mapping
 from slam_core.files import atomic_text

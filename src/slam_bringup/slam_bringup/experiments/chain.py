@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sjsam_node.map_graph import MapGraph
+from sjsam_node.graph.map_graph import MapGraph
 from slam_bringup.experiments.job import EVERYTHING, RENDERING, Job
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag

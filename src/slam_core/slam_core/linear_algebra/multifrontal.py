@@ -102,3 +102,9 @@ class InversePanels:
         if np.isnan(block).any():
             raise KeyError("inverse entries outside the factor's pattern")
         return block
+
+    def blocks(self, variables: IntArray) -> FloatArray:
+        """Dense blocks (n, k, k) of the inverse for ``variables`` (n, k), each inside one block of the pattern."""
+        return np.asarray(
+            kernels.gather_many(self._symbolic, self._panels, self._position[variables], self._block, self._supernode)
+        )

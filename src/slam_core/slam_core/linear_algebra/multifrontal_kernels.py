@@ -293,3 +293,13 @@ def gather(symbolic, panels, position, block_of, supernode_of):
             if at >= 0:
                 out[a, b] = out[b, a] = panels[panel_ptr[s] + at * eliminated[s] + inside]
     return out
+
+
+@njit(cache=True, nogil=True)
+def gather_many(symbolic, inverse, positions, block, supernode):
+    """Entries (n, k, k) of the inverse for each row of ``positions`` (n, k)."""
+    n, k = positions.shape
+    out = np.empty((n, k, k))
+    for i in range(n):
+        out[i] = gather(symbolic, inverse, positions[i], block, supernode)
+    return out

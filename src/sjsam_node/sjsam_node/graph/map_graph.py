@@ -1,0 +1,267 @@
+"""What has been joined so far: submaps, the poses between them, and which of their landmarks are the same.
+
+*Nodes* are the poses at which submaps start and end (the skeleton of chapter 7). An *observation* is one landmark of
+one submap, numbered through all submaps. *Links* say that observations of two submaps are the same thing; a landmark
+of the map is a set of observations that hang together by links, named after its oldest observation. Links can be
+removed, so that a closure that turns out false leaves no trace. A *component* is what hangs together by submaps
+and links; each has its own frame until it is joined to another.
+
+The poses and points are the estimate. Submaps enter it at a first guess; then :mod:`sjsam_node.smoothing` alone changes
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+from sjsam_node.graph.fusion import BoolArray as BoolArray
+from sjsam_node.graph.fusion import Fusion
+from sjsam_node.graph.links import Link
+from sjsam_node.graph.selection import spread_order, variables
+from slam_core.geometry import FloatArray, invert_transform
+from slam_core.linear_algebra.sparse_cholesky import IntArray
+from slam_core.types import Submap
+
+_ALL = 1 << 30
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A submap in the map: its nodes and its first observation."""
+
+    submap: Submap
+    start: int
+    end: int
+    first_observation: int
+
+    @property
+    def key(self) -> tuple[str, int, int]:
+        """Agent, session and index: unique, and an order that does not depend on when a submap arrived."""
+        return self.submap.agent, self.submap.session, self.submap.index
+
+    @property
+    def observations(self) -> IntArray:
+        """Numbers of its observations, (n,)."""
+        return np.arange(self.first_observation, self.first_observation + len(self.submap.landmarks))
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """Links and estimate of a map graph at one time."""
+
+    links: list[Link]
+    poses: FloatArray
+    points: FloatArray
+    fusion: Fusion
+    component_of: IntArray
+
+
+@dataclass
+class MapGraph:
+    """Submaps, nodes, links and the current estimate of all of them."""
+
+    records: list[Record] = field(default_factory=list)
+    links: list[Link] = field(default_factory=list)
+    poses: FloatArray = field(default_factory=lambda: np.empty((0, 4, 4)))
+    points: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    component_of: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    _fusion: Fusion = field(default_factory=Fusion)
+    _ending_at: dict[int, int] = field(default_factory=dict)
+    _way: dict[int, float] = field(default_factory=dict)
+    _chained: dict[int, FloatArray] = field(default_factory=dict)
+    _stretch: dict[int, int] = field(default_factory=dict)
+    _middles: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    starts: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    point_covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
+    ties: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    redundant: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    is_complete: bool = False
+    _rank: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    _variable_of: IntArray | None = None
+
+    @property
+    def landmark_of(self) -> IntArray:
+        """Landmark of every observation, named after its oldest one, (observations,)."""
+        return self._fusion.landmark_of
+
+    @property
+    def record_of(self) -> IntArray:
+        """Record of every observation, (observations,)."""
+        return self._fusion.record_of
+
+    @property
+    def variable_of(self) -> IntArray:
+        """Variable of the estimate that each observation is of, (observations,): one for all those of a landmark that
+        tie submaps together (:mod:`sjsam_node.graph.selection`), named after the oldest of them, else its own.
+        """
+        if self._variable_of is None:
+            counts = np.array([len(k.pairs) for k in self.links], dtype=np.int64)
+            ends = np.array([k.ends for k in self.links], dtype=np.int64).reshape(-1, 2)
+            pairs = [np.empty((0, 2), dtype=np.int64), *(self._observed(k) for k in self.links)]
+            self._variable_of = variables(
+                np.concatenate(pairs), np.append(0, np.cumsum(counts)),
+                counts if self.is_complete else self.ties[ends].min(axis=1, initial=_ALL),
+                self.landmark_of, self._rank,
+            )  # fmt: skip
+        return self._variable_of
+
+    def mark_redundant(self, record: int, ties: int) -> None:
+        """A record shows nothing that others do not: so many landmarks, at most, tie it to each of them."""
+        self.ties[record], self.redundant[record] = ties, True
+        self._variable_of = None
+
+    def use_all_ties(self, use: bool) -> None:
+        """Let all landmarks that submaps share tie them together, or a selection of them."""
+        if use != self.is_complete:
+            self.is_complete, self._variable_of = use, None
+
+    def append(self, submap: Submap, start: int | None, guess: FloatArray, ties: int = _ALL) -> Record:
+        """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own;
+        ``ties`` landmarks, at most, tie it to each other one.
+        """
+        if start is None:
+            start = self._new_node(guess, len(self.poses))
+        T = self.poses[start]
+        end = self._new_node(T @ submap.end_pose, int(self.component_of[start]))
+        self._stretch[end] = self._stretch.setdefault(start, start)
+        self._chained[end] = self._chained.setdefault(start, np.eye(4)) @ submap.end_pose
+        self._way[end] = self._way.setdefault(start, 0.0) + float(np.linalg.norm(submap.end_pose[:3, 3]))
+        record = Record(submap, start, end, len(self.points))
+        self.points = np.concatenate([self.points, submap.landmarks @ T[:3, :3].T + T[:3, 3]])
+        n, k = len(submap.landmarks), np.arange(len(submap.landmarks))
+        own = submap.covariance[6:, 6:].reshape(n, 3, n, 3)[k, :, k, :]
+        self.point_covariances = np.concatenate([self.point_covariances, own])
+        self._fusion.append(n, len(self.records))
+        self._ending_at[end] = len(self.records)
+        middle = np.median(submap.landmarks, axis=0) if len(submap.landmarks) else np.zeros(3)
+        self._middles, self.starts = np.concatenate([self._middles, middle[None]]), np.append(self.starts, start)
+        self.ties, self._rank = np.append(self.ties, ties), np.append(self._rank, spread_order(submap.landmarks))
+        self.redundant = np.append(self.redundant, False)
+        self.use_all_ties(False)
+        self._variable_of = None
+        self.records.append(record)
+        return record
+
+    def _new_node(self, T: FloatArray, component: int) -> int:
+        self.poses = np.concatenate([self.poses, T[None]])
+        self.component_of = np.append(self.component_of, component)
+        return len(self.poses) - 1
+
+    def component(self, record: int) -> int:
+        """Component that a record is in."""
+        return int(self.component_of[self.records[record].start])
+
+    def records_of(self, component: int) -> list[int]:
+        """Records of a component, ascending."""
+        return np.nonzero(self.component_of[self.starts] == component)[0].tolist()
+
+    def way_between(self, first: int, second: int) -> float:
+        """Length of the way that an agent went between two records, m; of both ways where they belong to two runs."""
+        a, b = self.records[first], self.records[second]
+        ways = self._way[a.start], self._way[b.start]
+        return abs(ways[1] - ways[0]) if a.key[:2] == b.key[:2] else sum(ways)
+
+    def odometry_between(self, first: int, second: int) -> FloatArray | None:
+        """T_first_second of two records' starts by the end poses between them; None where nothing chains them."""
+        a, b = self.records[first].start, self.records[second].start
+        if self._stretch[a] != self._stretch[b]:
+            return None
+        return np.asarray(invert_transform(self._chained[a]) @ self._chained[b])
+
+    def middles(self, records: IntArray) -> FloatArray:
+        """Middle of the landmarks of some records in the map frame, (n, 3); the start pose where there are none."""
+        T = self.poses[self.starts[records]]
+        return np.asarray((T[:, :3, :3] @ self._middles[records][..., None])[..., 0] + T[:, :3, 3])
+
+    def size(self, component: int) -> int:
+        """Number of nodes of a component."""
+        return int(np.count_nonzero(self.component_of == component))
+
+    def record_ending_at(self, node: int) -> int | None:
+        """The record whose end a node is; None where a way begins."""
+        return self._ending_at.get(node)
+
+    def add_link(self, link: Link) -> int:
+        """Believe a link: fuse the landmarks that its pairs name; the number of pairs that could be fused.
+
+        Where the two records are in different components the younger one (by key) is moved onto the older.
+        """
+        if self.component(link.first) != self.component(link.second):
+            self._merge(link)
+        self.links.append(link)
+        self._variable_of = None
+        return self._fusion.unite(self._observed(link))
+
+    def _observed(self, link: Link) -> IntArray:
+        """The observations that a link's pairs name, (k, 2)."""
+        first = np.array([self.records[i].first_observation for i in (link.first, link.second)])
+        return np.asarray(link.pairs + first)
+
+    def _merge(self, link: Link) -> None:
+        first, second = self.component(link.first), self.component(link.second)
+        T_first_second = link.T
+        anchor, moved = link.first, link.second
+        if self.oldest(first).key > self.oldest(second).key:
+            first, second, anchor, moved = second, first, moved, anchor
+            T_first_second = invert_transform(link.T)
+        T_map_moved = self.poses[self.records[anchor].start] @ T_first_second
+        self.move(second, T_map_moved @ invert_transform(self.poses[self.records[moved].start]))
+        members = np.isin(self.component_of, [first, second])
+        self.component_of[members] = min(first, second)
+
+    def oldest(self, component: int) -> Record:
+        """The record of a component with the least key: its start defines the component's frame."""
+        return min((self.records[i] for i in self.records_of(component)), key=lambda r: r.key)
+
+    def move(self, component: int, T: FloatArray) -> None:
+        """Transform the estimate of a whole component by ``T``, on the left."""
+        nodes = self.component_of == component
+        self.poses[nodes] = T @ self.poses[nodes]
+        for i in self.records_of(component):
+            rows = self.records[i].observations
+            self.points[rows] = self.points[rows] @ T[:3, :3].T + T[:3, 3]
+
+    def replace_links(self, links: Iterable[Link]) -> None:
+        """Believe exactly these links (of those there were): landmarks are fused anew from them."""
+        self.links = list(links)
+        self._variable_of = None
+        self._fusion.separate()
+        if self.links:
+            self._fusion.unite(np.concatenate([self._observed(link) for link in self.links]))
+        self._split_components()
+
+    def _split_components(self) -> None:
+        """Components anew from submaps and links; each is named after its first node."""
+        count = len(self.poses)
+        a = [r.start for r in self.records] + [self.records[k.first].start for k in self.links]
+        b = [r.end for r in self.records] + [self.records[k.second].start for k in self.links]
+        graph = scipy.sparse.coo_matrix((np.ones(len(a)), (a, b)), (count, count))
+        _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        first = np.unique(label, return_index=True)[1]
+        self.component_of = first[label].astype(np.int64)
+
+    def snapshot(self) -> Snapshot:
+        """The beliefs and the estimate, to come back to."""
+        return Snapshot(
+            list(self.links), self.poses.copy(), self.points.copy(), self._fusion.copy(), self.component_of.copy()
+        )
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Back to a snapshot taken since the last submap was added."""
+        self.links = list(snapshot.links)
+        self._variable_of = None
+        self.poses, self.points = snapshot.poses.copy(), snapshot.points.copy()
+        self._fusion, self.component_of = snapshot.fusion.copy(), snapshot.component_of.copy()
+
+    def shared(self) -> BoolArray:
+        """Whether each observation's landmark is seen by more than one submap, (observations,) bool."""
+        return self._fusion.is_shared()
+
+    def tying(self) -> BoolArray:
+        """Whether each observation is of a variable that ties submaps together, (observations,) bool."""
+        return np.bincount(self.variable_of, minlength=len(self.points))[self.variable_of] > 1

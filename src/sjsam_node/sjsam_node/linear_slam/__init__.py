@@ -1,0 +1,1 @@
+"""Text submaps of Linear SLAM, joined by ``slam join``."""

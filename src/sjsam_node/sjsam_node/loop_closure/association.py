@@ -1,0 +1,255 @@
+"""Which landmarks of two submaps are the same (chapter 4, 7.5 and 9.4.1).
+
+Three ways, weakest first: *nearest* neighbour within a Euclidean gate (Algorithm 1, as chapter 7 uses it),
+*mahalanobis* with each pair's innovation covariance (Algorithm 2), *joint*, which in addition asks that all pairs
+together agree with the joint covariance of both submaps (Neira and Tardos 2001) and drops the worst until they do.
+All ask for similar descriptors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from sjsam_node.graph.links import Prior
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray, boxplus, skew, transform_points
+from slam_core.least_squares import chi_square_bound
+from slam_core.linear_algebra import blas
+from slam_core.linear_algebra.sparse_cholesky import IntArray
+
+METHODS = ("nearest", "mahalanobis", "joint")
+
+
+@dataclass(frozen=True)
+class AssociationConfig(Config):
+    """Gates of the association between submaps."""
+
+    method: str = parameter("joint", "how landmarks are matched", choices=METHODS)
+    descriptor_threshold: float = parameter(
+        0.6, "least scalar product of two descriptors (7.5)", minimum=-1.0, maximum=1.0
+    )
+    probability: float = parameter(
+        0.999, "share of true pairs inside a chi-square gate", minimum=0.5, maximum=0.9999999
+    )
+    nearest_gate: float = parameter(0.3, "distance below which the nearest neighbour is taken", unit="m", minimum=0.0)
+    max_variance_factor: float = parameter(
+        16.0, "submaps too sure of themselves by up to this factor are matched all the same", minimum=1.0
+    )
+    joint_pairs: int = parameter(
+        64, "pairs that are tested together; where there are more, the others are tested against what these say",
+        minimum=3,
+    )  # fmt: skip
+    position_noise: float = parameter(
+        0.005, "standard deviation added to each landmark when gating: submaps are linearised", unit="m", minimum=0.0
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PointSet:
+    """Landmarks as seen from one frame: points (n, 3) m, joint covariance (3n, 3n), descriptors (n, d) of unit norm."""
+
+    points: FloatArray
+    covariance: FloatArray
+    descriptors: npt.NDArray[np.float32]
+
+    def select(self, index: IntArray) -> PointSet:
+        """The landmarks at ``index`` with their joint covariance."""
+        rows = (3 * index[:, None] + np.arange(3)).ravel()
+        return PointSet(self.points[index], self.covariance[np.ix_(rows, rows)], self.descriptors[index])
+
+    def at(self, index: IntArray) -> PointSet:
+        """The same, where all are meant without a copy."""
+        return self if len(index) == len(self.points) else self.select(index)
+
+    def variances(self) -> FloatArray:
+        """Covariance (n, 3, 3) of each landmark."""
+        rows = np.arange(3 * len(self.points)).reshape(-1, 3)
+        return np.asarray(self.covariance[rows[:, :, None], rows[:, None, :]])
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Matched landmarks of two sets: index pairs (k, 2), T_first_second with covariance, chi2 and its degrees of
+    freedom.
+    """
+
+    pairs: IntArray
+    T: FloatArray
+    covariance: FloatArray
+    chi2: float
+    dof: int
+
+
+def similarity(first: PointSet, second: PointSet) -> npt.NDArray[np.float32]:
+    """Scalar products of all descriptors (Eq. 3.1), shape (n, m)."""
+    return np.asarray(first.descriptors @ second.descriptors.T)
+
+
+def candidate_pairs(first: PointSet, second: PointSet, prior: Prior, config: AssociationConfig) -> IntArray:
+    """One-to-one pairs (k, 2) inside the gate around the prior, each the other's best."""
+    i, j = np.nonzero(similarity(first, second) >= config.descriptor_threshold)
+    error = first.points[i] - transform_points(prior.T, second.points)[j]
+    if config.method == "nearest":
+        score = np.linalg.norm(error, axis=1)
+        inside = score < config.nearest_gate
+    else:
+        bound = chi_square_bound(config.probability, 3)
+        own, other = first.variances() + config.position_noise**2 * np.eye(3), _variances_seen(second, prior)
+        # No eigenvalue is larger than the trace: what this sends away is outside the gate.
+        largest = np.trace(own, axis1=1, axis2=2)[i] + np.trace(other, axis1=1, axis2=2)[j]
+        near = np.einsum("ni,ni->n", error, error) < bound * largest
+        i, j, error = i[near], j[near], error[near]
+        S = own[i] + other[j]
+        nis = np.einsum("ni,ni->n", error, np.linalg.solve(S, error[..., None])[..., 0])
+        score = nis + np.linalg.slogdet(S)[1]  # Eq. 4.8
+        inside = nis < bound
+    return mutual_best(i[inside], j[inside], score[inside])
+
+
+def _variances_seen(points: PointSet, prior: Prior) -> FloatArray:
+    """Covariance (n, 3, 3) of each landmark as the prior places it."""
+    R = prior.T[:3, :3]
+    seen = R @ points.variances() @ R.T
+    if prior.covariance is not None:
+        J = _alignment_jacobian(prior.T, points.points).reshape(-1, 3, 6)
+        seen = seen + J @ prior.covariance @ np.swapaxes(J, 1, 2)
+    return np.asarray(seen)
+
+
+def mutual_best(i: IntArray, j: IntArray, score: FloatArray) -> IntArray:
+    """Pairs (k, 2) whose score is the least of both their row and their column."""
+    if len(i) == 0:
+        return np.empty((0, 2), dtype=np.int64)
+    best_row, best_column = np.full(i.max() + 1, np.inf), np.full(j.max() + 1, np.inf)
+    np.minimum.at(best_row, i, score)
+    np.minimum.at(best_column, j, score)
+    kept = (score == best_row[i]) & (score == best_column[j])
+    pairs = np.stack([i[kept], j[kept]], axis=1)
+    return np.asarray(pairs[np.unique(pairs[:, 0], return_index=True)[1]])
+
+
+def match(first: PointSet, second: PointSet, prior: Prior, config: AssociationConfig) -> Alignment:
+    """Match two sets around a prior with the configured method."""
+    pairs = candidate_pairs(first, second, prior, config)
+    if config.method == "joint":
+        return jointly_compatible(first, second, pairs, prior, config)
+    return align(first, second, pairs, prior, config)
+
+
+def jointly_compatible(
+    first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig
+) -> Alignment:
+    """The pairs that agree together with the joint covariance of both submaps.
+
+    Of many pairs a sample is tested so, and the others, one by one, against the alignment that it gives.
+    """
+    if len(pairs) <= config.joint_pairs:
+        return _compatible(first, second, pairs, prior, config)[0]
+    sample = np.linspace(0, len(pairs) - 1, config.joint_pairs).astype(np.int64)
+    found, scale = _compatible(first, second, pairs[sample], prior, config)
+    others = np.delete(pairs, sample, axis=0)
+    nis = _nis_one_by_one(first, second, others, Prior(found.T, found.covariance), config)
+    fitting = others[nis <= scale * chi_square_bound(config.probability, 3)]
+    kept = np.concatenate([found.pairs, fitting])
+    return replace(found, pairs=kept[np.argsort(kept[:, 0], kind="stable")])
+
+
+def _compatible(
+    first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig
+) -> tuple[Alignment, float]:
+    """What is left when the worst is dropped until all agree, and how much too sure of themselves the submaps are."""
+    scale = 1.0
+    while True:
+        solved = _solve(first, second, pairs, prior, config)
+        scale = min(max(scale, variance_factor(solved.nis)), config.max_variance_factor)
+        bound = scale * chi_square_bound(config.probability, max(solved.dof, 1))
+        outlier = solved.nis > scale * chi_square_bound(config.probability, 3)
+        if len(pairs) == 0 or (solved.chi2 <= bound and not outlier.any()):
+            return replace(solved.alignment(pairs), covariance=scale * solved.covariance), scale
+        # Those that stand out together are dropped together, but never more than a tenth at once: bad ones spoil
+        # good ones.
+        count = max(1, min(int(outlier.sum()), len(pairs) // 10))
+        pairs = np.delete(pairs, np.argsort(solved.nis)[-count:], axis=0)
+
+
+def _nis_one_by_one(
+    first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig
+) -> FloatArray:
+    """Normalised squared error (n,) of each pair by itself, 3 degrees of freedom."""
+    i, j = pairs[:, 0], pairs[:, 1]
+    error = first.points[i] - transform_points(prior.T, second.points[j])
+    own = first.variances()[i] + config.position_noise**2 * np.eye(3)
+    S = own + _variances_seen(second, prior)[j]
+    return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(S, error[..., None])[..., 0]))
+
+
+def variance_factor(nis: FloatArray) -> float:
+    """How much too sure of themselves covariances are, from normalised squared errors of 3 degrees of freedom each.
+
+    The median tells, so that false matches do not: where it is what it should be, or below, the factor is one.
+    """
+    return max(1.0, float(np.median(nis)) / chi_square_bound(0.5, 3)) if len(nis) >= 5 else 1.0
+
+
+def align(first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig) -> Alignment:
+    """Generalised least-squares alignment of given pairs, with the joint covariance of both sets."""
+    return _solve(first, second, pairs, prior, config).alignment(pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    T: FloatArray
+    covariance: FloatArray
+    chi2: float
+    dof: int
+    nis: FloatArray
+
+    def alignment(self, pairs: IntArray) -> Alignment:
+        return Alignment(pairs, self.T, self.covariance, self.chi2, self.dof)
+
+
+def _solve(first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig) -> _Solution:
+    """Alignment from the pairs and the prior, with the normalised error of each pair given all others."""
+    n = len(pairs)
+    known = np.zeros((6, 6)) if prior.covariance is None else prior.covariance
+    if n == 0:
+        return _Solution(prior.T, known, 0.0, 0, np.empty(0))
+    a, b = first.select(pairs[:, 0]), second.select(pairs[:, 1])
+    R = prior.T[:3, :3]
+    C = a.covariance + turned(turned(b.covariance, R).T, R) + config.position_noise**2 * np.eye(3 * n)
+    error = (a.points - transform_points(prior.T, b.points)).ravel()
+    weight = blas.inverse(C)
+    if prior.covariance is None:
+        return _Solution(prior.T, known, float(error @ weight @ error), 3 * n, _pair_nis(weight, weight @ error))
+    J = _alignment_jacobian(prior.T, b.points)
+    weighted = weight @ J
+    covariance = np.linalg.inv(J.T @ weighted + np.linalg.inv(prior.covariance))
+    step = covariance @ (weighted.T @ error)
+    residual = error - J @ step
+    total = residual @ weight @ residual + step @ np.linalg.solve(prior.covariance, step)
+    marginal = weight - weighted @ covariance @ weighted.T
+    return _Solution(boxplus(prior.T, step), covariance, float(total), 3 * n, _pair_nis(marginal, weight @ residual))
+
+
+def turned(rows: FloatArray, R: FloatArray) -> FloatArray:
+    """Rows (3n, m) that belong to n points, with each point's three turned by ``R`` (3, 3)."""
+    return np.asarray((R @ rows.reshape(len(rows) // 3, 3, rows.shape[1])).reshape(rows.shape))
+
+
+def _alignment_jacobian(T: FloatArray, points: FloatArray) -> FloatArray:
+    """Derivative (3n, 6) of ``T [+] d`` applied to ``points``."""
+    J = np.zeros((len(points), 3, 6))
+    J[:, :, :3] = np.eye(3)
+    J[:, :, 3:] = -skew(points @ T[:3, :3].T)
+    return J.reshape(-1, 6)
+
+
+def _pair_nis(weight: FloatArray, weighted_error: FloatArray) -> FloatArray:
+    """Squared error of each pair as the others predict it, normalised: 3 degrees of freedom each (Baarda 1968)."""
+    n = len(weighted_error) // 3
+    blocks = weight.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :] + 1e-12 * np.eye(3)
+    e = weighted_error.reshape(n, 3)
+    return np.asarray(np.einsum("ni,ni->n", e, np.linalg.solve(blocks, e[..., None])[..., 0]))

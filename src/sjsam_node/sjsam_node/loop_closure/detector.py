@@ -1,0 +1,185 @@
+"""Links between submaps: to the ones just before, to ones the estimate says are near, and to ones that look alike.
+
+Candidates come from where the map believes the new submap to be and from what it looks like; geometry verifies them
+(:mod:`sjsam_node.loop_closure.verification`), and where the map cannot tell, a second link has to say the same. A place
+is compared with a bounded number of submaps, and with none that show nothing new.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sjsam_node.graph.links import Link, Prior, Status
+from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.loop_closure.association import match
+from sjsam_node.loop_closure.near_pairs import Chain, NearPairs
+from sjsam_node.loop_closure.novelty import Novelty
+from sjsam_node.loop_closure.place_recognition import PlaceIndex
+from sjsam_node.loop_closure.point_sets import at_end, at_start
+from sjsam_node.loop_closure.verification import ClosureConfig, Verifier, largest_sigma
+from sjsam_node.smoothing.smoother import Smoother
+from slam_core.geometry import FloatArray, boxminus, compose_covariance, invert_transform
+
+
+@dataclass
+class LoopDetector:
+    """Finds and verifies the links of a new record; ``pending`` closures wait for another that says the same."""
+
+    smoother: Smoother
+    config: ClosureConfig = field(default_factory=ClosureConfig)
+    verifier: Verifier = field(init=False)
+    index: PlaceIndex = field(init=False)
+    near: NearPairs = field(init=False)
+    pending: list[Link] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.verifier = Verifier(self.config)
+        self.index = PlaceIndex(self.config.places)
+        noise = self.config.association.position_noise
+        self.near = NearPairs(self.config.proximity, 4 * self.config.near_candidates, noise)
+
+    @property
+    def graph(self) -> MapGraph:
+        """Where links are looked for."""
+        return self.smoother.graph
+
+    def sequential(self, chain: list[int], new: int) -> list[Link]:
+        """Links of record ``new`` to the records ``chain`` before it, newest first, by their odometry; to each by what
+        the newer ones have not linked already.
+        """
+        graph, links = self.graph, []
+        T, covariance = np.eye(4), np.zeros((6, 6))
+        left, taken = np.arange(len(graph.records[new].observations)), np.empty(0, dtype=np.int64)
+        for k, previous in enumerate(chain[: self.config.window]):
+            record, threshold = graph.records[previous], self.config.association.descriptor_threshold
+            end, end_covariance = record.submap.end_pose, record.submap.covariance[:6, :6]
+            points = at_start(graph.records[new]).at(left)
+            alike = (record.submap.descriptors @ points.descriptors.T >= threshold).any(axis=1)
+            there = np.nonzero(alike & ~np.isin(graph.landmark_of[record.observations], taken))[0]
+            found = match(at_end(record, there), points, Prior(T, covariance if k else None), self.config.association)
+            if len(found.pairs):
+                pairs = np.stack([there[found.pairs[:, 0]], left[found.pairs[:, 1]]], axis=1)
+                links.append(Link(previous, new, pairs, end @ found.T,
+                                  compose_covariance(end, end_covariance, found.T, found.covariance)))  # fmt: skip
+                left = np.setdiff1d(left, pairs[:, 1])
+                taken = np.append(taken, graph.landmark_of[record.observations[pairs[:, 0]]])
+            covariance = compose_covariance(end, end_covariance, T, covariance)
+            T = end @ T
+        return links
+
+    def closures(self, chain: list[int], new: int) -> list[Link]:
+        """Verified links of record ``new`` beyond its chain, consistent or inconsistent with the map; others wait."""
+        graph, recent = self.graph, {*range(new, len(self.graph.records)), *chain[: self.config.window]}
+        near = self._near(new, recent)
+        known = self._novelty()
+        found = self._verified([(old, new) for old in near], known, by_looks=False)
+        if known.is_known(new):  # the map knows where it is: looks would tell nothing more
+            return found
+        looks = self.index.query(graph.records[new].submap.descriptors, recent | set(near))
+        second = at_start(graph.records[new])
+        alike = [old for old in looks if self.verifier.is_alike(at_start(graph.records[old]), second)]
+        return found + self._verified([(old, new) for old in alike[: self.config.alike_candidates]], known)
+
+    def missed(self, chain: Chain, most: int) -> list[Link]:
+        """Links between records that have come near each other since they were compared, if ever they were; of ``most``
+        pairs, the nearest.
+        """
+        due = self.near.due(self.graph, chain)
+        return self._verified(due[:most], self._novelty())
+
+    def around(self, middle: FloatArray, records: Iterable[int], excluded: set[int]) -> list[int]:
+        """Those of ``records`` whose landmarks are around a point (3,) of the map, nearest first."""
+        graph = self.graph
+        candidates = np.array([i for i in records if i not in excluded and not graph.redundant[i]], dtype=np.int64)
+        distance = np.linalg.norm(graph.middles(candidates) - middle, axis=1)
+        ranked = sorted((d, i) for d, i in zip(distance.tolist(), candidates.tolist(), strict=True)
+                        if d < self.config.proximity)  # fmt: skip
+        return [i for _, i in ranked[: self.config.near_candidates]]
+
+    def _near(self, new: int, recent: set[int]) -> list[int]:
+        """Older records of the same component whose landmarks are around those of ``new``, nearest first."""
+        graph = self.graph
+        return self.around(_middle(graph, new), graph.records_of(graph.component(new)), recent)
+
+    def _novelty(self) -> Novelty:
+        config = self.config
+        return Novelty(
+            self.graph, config.min_near_inliers, config.association.descriptor_threshold, config.ransac_distance
+        )  # fmt: skip
+
+    def _verified(self, pairs: list[tuple[int, int]], known: Novelty, *, by_looks: bool = True) -> list[Link]:
+        """What geometry and the map say of pairs of records, but for those of which nothing new can be learnt."""
+        out: list[Link] = []
+        for old, new in pairs:
+            if known.is_all_known(old, new):
+                self.near.note(self.graph, old, new)
+                continue
+            prior = self.smoother.relative_pose(old, new)
+            if prior is not None:
+                self.near.note(self.graph, old, new)
+            link = self._compared(old, new, prior, by_looks)
+            if link is None:
+                continue
+            if link.status is Status.CONSISTENT:
+                known.note(link)
+            out += self._confirmed(link) if link.status is Status.UNINFORMATIVE else [link]
+        return out
+
+    def _compared(self, old: int, new: int, prior: Prior | None, by_looks: bool) -> Link | None:
+        """The closure between two records, if there is one."""
+        first, second = (at_start(self.graph.records[i]) for i in (old, new))
+        if not by_looks and prior is not None:
+            found, status = self.verifier.verify_near(first, second, prior), Status.CONSISTENT
+        else:
+            way = self.graph.way_between(old, new)
+            found, status = self.verifier.verify(first, second, prior, way, old, new)
+        if found is None:
+            return None
+        unsure = status is Status.UNINFORMATIVE and prior is not None
+        error = self.verifier.error_against(found, prior, 0.0) if unsure and prior is not None else 0.0
+        return Link(old, new, found.pairs, found.T, found.covariance, True, error, status)
+
+    def _confirmed(self, link: Link) -> list[Link]:
+        """The link with those waiting that say the same, if together they are enough; otherwise it waits too."""
+        agreeing = [other for other in self.pending if _same_loop(self.graph, other, link)]
+        self.pending.append(link)
+        if len(agreeing) + 1 < self.config.confirmations:
+            return []
+        group_ = [*agreeing, link]
+        self.pending = [p for p in self.pending if not any(p is g for g in group_)]
+        return [replace(g, status=Status.CONSISTENT) for g in group_]
+
+
+def _same_loop(graph: MapGraph, a: Link, b: Link) -> bool:
+    """Whether two links between the same parts of the map move the second part alike, within what both claim."""
+    if (graph.component(a.first), graph.component(a.second)) != (
+        graph.component(b.first),
+        graph.component(b.second),
+    ):
+        b = b.inverted()
+        if (graph.component(a.first), graph.component(a.second)) != (
+            graph.component(b.first), graph.component(b.second),
+        ):  # fmt: skip
+            return False
+    if {a.first, a.second} == {b.first, b.second}:
+        return False
+    T_a, T_b = _movement(graph, a), _movement(graph, b)
+    here, there = _middle(graph, b.second), _middle(graph, a.second)
+    gap = np.linalg.norm((T_a[:3, :3] - T_b[:3, :3]) @ here + T_a[:3, 3] - T_b[:3, 3])
+    # Between the two the odometry has drifted on both stretches.
+    way = np.linalg.norm(there - here) + np.linalg.norm(_middle(graph, a.first) - _middle(graph, b.first))
+    allowed = 0.1 + 0.05 * way + 3.0 * (largest_sigma(a.covariance) + largest_sigma(b.covariance))
+    return bool(gap < allowed and np.linalg.norm(boxminus(T_a, T_b)[3:]) < 0.15)
+
+
+def _movement(graph: MapGraph, link: Link) -> FloatArray:
+    """How a link would move the part of the map that its second record is in."""
+    T_first, T_second = (graph.poses[graph.records[i].start] for i in (link.first, link.second))
+    return np.asarray(T_first @ link.T @ invert_transform(T_second))
+
+
+def _middle(graph: MapGraph, record: int) -> FloatArray:
+    return np.asarray(graph.middles(np.array([record]))[0])

@@ -1,0 +1,186 @@
+"""Compares two submaps: enough landmarks, spread in space, must agree on one rigid alignment within both submaps' joint
+covariance, and that must agree with what the map already knows of the two poses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sjsam_node.graph.links import Prior, Status
+from sjsam_node.loop_closure.association import (
+    Alignment,
+    AssociationConfig,
+    PointSet,
+    jointly_compatible,
+    match,
+    mutual_best,
+    similarity,
+)  # fmt: skip
+from sjsam_node.loop_closure.place_recognition import PlaceRecognitionConfig
+from slam_core.config import Config, group, parameter
+from slam_core.geometry import FloatArray, boxminus
+from slam_core.least_squares import chi_square_bound
+from slam_core.linear_algebra.sparse_cholesky import IntArray
+from slam_core.rigid_alignment import ransac_rigid_transform
+
+
+@dataclass(frozen=True)
+class ClosureConfig(Config):
+    """What a link between submaps must show before it is believed."""
+
+    window: int = parameter(3, "submaps back along the agent's path that a new one is linked to directly", minimum=1)
+    proximity: float = parameter(
+        3.0, "distance between the middles of submaps that are tried as near", unit="m", minimum=0.0
+    )
+    near_candidates: int = parameter(3, "near submaps tried per new one", minimum=0)
+    alike_candidates: int = parameter(2, "submaps that look alike tried per new one", minimum=0)
+    informative_sigma: float = parameter(
+        0.5, "largest standard deviation of a relative position that can tell two places apart", unit="m", minimum=0.0
+    )
+    drift: float = parameter(
+        0.01, "drift of odometry to expect beyond its covariance, per metre of way, one sigma", unit="m/m", minimum=0.0
+    )
+    drift_angle: float = parameter(0.003, "the same for rotation", unit="rad/m", minimum=0.0)
+    ratio: float = parameter(
+        0.9, "second best to best angle of descriptors, where no prior helps", minimum=0.1, maximum=1.0
+    )
+    place_threshold: float = parameter(0.7, "least scalar product of descriptors, where no prior helps", maximum=1.0)
+    ransac_distance: float = parameter(
+        0.15, "largest distance of an inlier of the first alignment", unit="m", minimum=0.001
+    )
+    min_near_inliers: int = parameter(5, "least matches of a link to a near submap", minimum=3)
+    min_inliers: int = parameter(10, "least matches of a link to a submap found by its looks", minimum=3)
+    min_spread: float = parameter(
+        0.25, "least second-largest standard deviation of the matched landmarks", unit="m", minimum=0.0
+    )
+    min_overlap: float = parameter(
+        0.3, "least share of the landmarks expected in both that match", minimum=0.0, maximum=1.0
+    )
+    confirmations: int = parameter(2, "links that must agree where the map cannot judge", minimum=1)
+    probability: float = parameter(
+        0.9999, "share of true closures inside the chi-square gate", minimum=0.9, maximum=0.9999999
+    )
+    seed: int = parameter(1, "seed of the random samples", minimum=0)
+    association: AssociationConfig = group(AssociationConfig)
+    places: PlaceRecognitionConfig = group(PlaceRecognitionConfig)
+
+
+@dataclass
+class Verifier:
+    """Compares two submaps, landmark by landmark."""
+
+    config: ClosureConfig = field(default_factory=ClosureConfig)
+
+    def verify(
+        self, first: PointSet, second: PointSet, prior: Prior | None, way: float, *key: int
+    ) -> tuple[Alignment | None, Status]:
+        """The alignment of two submaps if geometry supports it, and what the prior says of it.
+
+        First around the prior, if it is informative, then by looks. ``way`` is the length of the path between them, m:
+        what the prior does not know is at least its drift. ``key`` seeds the random samples, so that the same pair
+        always gets the same verdict.
+        """
+        found = self.verify_near(first, second, prior)
+        return (found, Status.CONSISTENT) if found is not None else self.verify_alike(first, second, prior, way, *key)
+
+    def verify_near(self, first: PointSet, second: PointSet, prior: Prior | None) -> Alignment | None:
+        """The alignment of two submaps around a prior; None where it is not informative, or geometry does not support
+        it.
+        """
+        if prior is None or largest_sigma(prior.covariance) >= self.config.informative_sigma:
+            return None
+        found = self._around(first, second, prior)
+        enough = len(found.pairs) >= self.config.min_near_inliers and self._overlaps(first, second, found)
+        return found if enough else None
+
+    def verify_alike(
+        self, first: PointSet, second: PointSet, prior: Prior | None, way: float, *key: int
+    ) -> tuple[Alignment | None, Status]:
+        """The alignment of two submaps by their looks, if geometry supports it, and what the prior says of it."""
+        guess = self._by_looks(first, second, key)
+        if guess is None or not self._supported(first, second, guess):
+            return None, Status.UNINFORMATIVE
+        if prior is not None and self.error_against(guess, prior, way) > chi_square_bound(self.config.probability, 6):
+            return guess, Status.INCONSISTENT
+        return guess, Status.UNINFORMATIVE
+
+    def _around(self, first: PointSet, second: PointSet, prior: Prior) -> Alignment:
+        """Match around a prior, then around what that found, as long as it finds more.
+
+        A map too sure of itself admits only matches that agree with its error; further ones show where they lead.
+        """
+        assert prior.covariance is not None
+        found = match(first, second, prior, self.config.association)
+        loose = self.config.association.max_variance_factor * prior.covariance
+        while True:
+            more = match(first, second, Prior(found.T, loose), self.config.association)
+            if len(more.pairs) <= len(found.pairs):
+                return found
+            found = more
+
+    def _by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
+        """Alignment from descriptors alone, refined with all landmarks around it."""
+        pairs = self._distinct_pairs(first, second)
+        if len(pairs) < self._few_pairs:
+            return None
+        rng = np.random.default_rng([self.config.seed, *key])
+        coarse = ransac_rigid_transform(
+            second.points[pairs[:, 1]], first.points[pairs[:, 0]], self.config.ransac_distance, rng,
+            min_inliers=self._few_pairs,
+        )  # fmt: skip
+        if not coarse.success:
+            return None
+        loose = np.diag([self.config.ransac_distance**2] * 3 + [0.05**2] * 3)
+        found = match(first, second, Prior(coarse.T, loose), self.config.association)
+        # The guess came from the same landmarks: without its weight the covariance is that of the landmarks alone.
+        free = Prior(found.T, 1e4 * np.eye(6))
+        return jointly_compatible(first, second, found.pairs, free, self.config.association)
+
+    @property
+    def _few_pairs(self) -> int:
+        return max(3, self.config.min_inliers // 2)
+
+    def is_alike(self, first: PointSet, second: PointSet) -> bool:
+        """Whether descriptors alone leave a chance, before anything dearer is asked."""
+        return len(self._distinct_pairs(first, second)) >= self._few_pairs
+
+    def _distinct_pairs(self, first: PointSet, second: PointSet) -> IntArray:
+        """Mutually best descriptor pairs, clearly better than the second best."""
+        S = similarity(first, second)
+        if min(S.shape) < 2:
+            return np.empty((0, 2), dtype=np.int64)
+        i, j = np.nonzero(self.config.place_threshold <= S)
+        pairs = mutual_best(i, j, -S[i, j].astype(np.float64))
+        angle = np.arccos(np.clip(np.partition(S[pairs[:, 0]], -2, axis=1)[:, -2:], -1.0, 1.0))
+        return pairs[angle[:, 1] <= self.config.ratio * angle[:, 0]]
+
+    def _supported(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
+        return len(found.pairs) >= self.config.min_inliers and self._overlaps(first, second, found)
+
+    def _overlaps(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
+        """Matches are spread, and most landmarks that lie among them on both sides are matched."""
+        matched = first.points[found.pairs[:, 0]]
+        if np.sqrt(max(np.linalg.eigvalsh(np.cov(matched.T))[1], 0.0)) < self.config.min_spread:
+            return False
+        low, high = matched.min(axis=0), matched.max(axis=0)
+        moved = second.points @ found.T[:3, :3].T + found.T[:3, 3]
+        expected = min(_inside(first.points, low, high), _inside(moved, low, high))
+        return len(matched) >= self.config.min_overlap * expected
+
+    def error_against(self, found: Alignment, prior: Prior, way: float) -> float:
+        """Normalised squared error of an alignment against the prior, which has drifted along the ``way`` (m)."""
+        assert prior.covariance is not None
+        error = boxminus(found.T, prior.T)
+        drift = np.diag([(self.config.drift * way) ** 2] * 3 + [(self.config.drift_angle * way) ** 2] * 3)
+        return float(error @ np.linalg.solve(prior.covariance + found.covariance + drift, error))
+
+
+def largest_sigma(covariance: FloatArray | None) -> float:
+    """Largest standard deviation of a position, m."""
+    return 0.0 if covariance is None else float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+
+
+def _inside(points: FloatArray, low: FloatArray, high: FloatArray) -> int:
+    return int(np.all((points >= low) & (points <= high), axis=1).sum())

@@ -1,0 +1,108 @@
+"""Marginal covariances of the last update, read from its factor; nothing here changes the estimate.
+
+What the last update did not hold is answered conservatively from what it did: nodes and landmarks inside a region, and
+landmarks that tie no submaps together, hang on a node of the factor with the covariance that their own submaps give
+them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+from sjsam_node.graph.links import Prior
+from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.smoothing.estimator import Assembled
+from sjsam_node.smoothing.joining import Marginals
+from sjsam_node.smoothing.regions import Region
+from slam_core.geometry import FloatArray, compose_jacobians, inverse_jacobian, invert_transform, skew
+from slam_core.linear_algebra.sparse_cholesky import IntArray
+
+
+class ComponentMarginals:
+    """Covariances of one component as of its last update, all multiplied by its variance ``factor``."""
+
+    def __init__(self, graph: MapGraph, assembled: Assembled, factor: float) -> None:
+        self.factor, self._graph, self._assembled = factor, graph, assembled
+        self._region_of = {int(i): region for region in assembled.regions for i in region.records}
+        self._poses = graph.poses.copy()
+
+    @property
+    def records(self) -> list[int]:
+        """Records of the last update, those inside regions included, ascending."""
+        return sorted([*self._assembled.records, *self._region_of])
+
+    @cached_property
+    def _marginals(self) -> Marginals:
+        return self._assembled.problem.marginals(self._assembled.state)
+
+    def node(self, node: int) -> FloatArray:
+        """Covariance (6, 6) of a node that the last update held by itself."""
+        return self.factor * self._assembled.covariance([node])
+
+    def ends(self, record: int) -> FloatArray:
+        """Joint covariance (12, 12) of the start and end of a record."""
+        r, region = self._graph.records[record], self._region_of.get(record)
+        if region is None:
+            return self.factor * self._of_nodes([r.start, r.end])
+        return self.factor * self._inside(region, [r.start, r.end])
+
+    def _of_nodes(self, nodes: Sequence[int]) -> FloatArray:
+        return self._marginals.covariance(np.searchsorted(self._assembled.nodes, nodes))
+
+    def _inside(self, region: Region, nodes: Sequence[int]) -> FloatArray:
+        """Joint covariance of nodes of a region: they move with its reference, each with an error of its own."""
+        T_reference = self._poses[region.reference]
+        jacobians, own = [], np.zeros((6 * len(nodes), 6 * len(nodes)))
+        for k, node in enumerate(nodes):
+            T, covariance = region.node(node)
+            J_reference, J_node = compose_jacobians(T_reference, T)
+            jacobians.append(J_reference)
+            own[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = J_node @ covariance @ J_node.T
+        J = np.concatenate(jacobians)
+        return np.asarray(J @ self._of_nodes([region.reference]) @ J.T + own)
+
+    def landmarks(self, observations: IntArray) -> FloatArray:
+        """Covariance (n, 3, 3) in the map frame of the landmarks of some observations."""
+        graph, held = self._graph, self._assembled.landmarks
+        variables = graph.variable_of[observations]
+        at = np.searchsorted(held, variables)
+        is_held = np.append(held, -1)[at] == variables
+        out = np.empty((len(observations), 3, 3))
+        out[is_held] = self._marginals.landmark_blocks(at[is_held])
+        others = observations[~is_held]
+        record = graph.record_of[others]
+        starts = {int(i): self.ends(int(i))[:6, :6] / self.factor for i in np.unique(record)}
+        pose = np.array([starts[int(i)] for i in record]).reshape(-1, 6, 6)
+        T = graph.poses[graph.starts[record]]
+        J = np.concatenate(
+            [np.broadcast_to(np.eye(3), (len(others), 3, 3)), -skew(graph.points[others] - T[:, :3, 3])], axis=2
+        )
+        R = T[:, :3, :3]
+        out[~is_held] = J @ pose @ np.swapaxes(J, 1, 2) + R @ graph.point_covariances[others] @ np.swapaxes(R, 1, 2)
+        return self.factor * out
+
+
+def prior_of_pair(T_a_b: FloatArray, covariance: FloatArray) -> Prior:
+    """A prior with a covariance that can be inverted: two poses that are tied exactly get a micrometre."""
+    return Prior(T_a_b, covariance + 1e-12 * np.eye(6))
+
+
+def relative_pose(T_map_a: FloatArray, T_map_b: FloatArray, joint: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """T_a_b of two poses with joint covariance (12, 12), and its covariance (6, 6)."""
+    T_a_map = invert_transform(T_map_a)
+    J_a, J_b = compose_jacobians(T_a_map, T_map_b)
+    J = np.concatenate([J_a @ inverse_jacobian(T_map_a), J_b], axis=1)
+    return T_a_map @ T_map_b, J @ joint @ J.T
+
+
+def seen_from(
+    T_a_b: FloatArray, covariance_ab: FloatArray, T_a_c: FloatArray, covariance_ac: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """T_b_c with covariance (6, 6), from two independent poses of one frame."""
+    T_b_a, J = invert_transform(T_a_b), inverse_jacobian(T_a_b)
+    J_ba, J_ac = compose_jacobians(T_b_a, T_a_c)
+    covariance = J_ba @ J @ covariance_ab @ J.T @ J_ba.T + J_ac @ covariance_ac @ J_ac.T
+    return np.asarray(T_b_a @ T_a_c), np.asarray(covariance)

@@ -1,0 +1,237 @@
+"""The only writer of the estimate: it takes what was added and removed, and brings the map to its optimum.
+
+    result = smoother.update(newest, added, removed)
+    marginals = smoother.marginals(component)
+
+What is read is const: it comes from the last update's factor, and is as fresh as that. Every update joins in batch,
+warm from the estimate, with the old submaps that nothing new touches condensed to regions
+(:mod:`sjsam_node.smoothing.regions`) and a selection of the shared landmarks (:mod:`sjsam_node.graph.selection`), so
+that it costs what is near the new submap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sjsam_node.graph.links import Link, Prior
+from sjsam_node.graph.map_graph import MapGraph, Snapshot
+from sjsam_node.smoothing.estimator import Assembled, Estimator, EstimatorConfig
+from sjsam_node.smoothing.marginals import ComponentMarginals, prior_of_pair, relative_pose, seen_from
+from sjsam_node.smoothing.regions import Region, RegionConfig, Regions
+from slam_core.config import Config, group, parameter
+from slam_core.geometry import FloatArray, compose_covariance
+
+
+@dataclass(frozen=True)
+class SmootherConfig(Config):
+    """How the estimate is kept."""
+
+    settled_work: float = parameter(
+        3e7, "entries of the submaps' information matrices up to which a map settles with all its landmarks",
+        minimum=0.0,
+    )  # fmt: skip
+    estimator: EstimatorConfig = group(EstimatorConfig)
+    region: RegionConfig = group(RegionConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class UpdateResult:
+    """chi2 of the component and its redundancy, iterations, whether it converged, and the solver."""
+
+    cost: float
+    redundancy: int
+    iterations: int
+    converged: bool
+    solver: str
+
+    @property
+    def variance_factor(self) -> float:
+        """chi2 per degree of freedom: how much larger the errors of the submaps are than they claim; never below one.
+
+        Submaps that agree better than they should are not made surer.
+        """
+        return max(1.0, self.cost / self.redundancy) if self.redundancy > 0 else 1.0
+
+
+@dataclass(eq=False)
+class _Solved:
+    """A component's last update; ``marginals`` once somebody has asked for them."""
+
+    assembled: Assembled
+    result: UpdateResult
+    marginals: ComponentMarginals | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """Links, estimate and what was solved at one time."""
+
+    graph: Snapshot
+    solved: dict[int, _Solved]
+    regions: tuple[Region, ...]
+
+
+@dataclass
+class Smoother:
+    """Keeps every component of a map graph at its optimum."""
+
+    graph: MapGraph
+    config: SmootherConfig = field(default_factory=SmootherConfig)
+    estimator: Estimator = field(init=False)
+    regions: Regions = field(init=False)
+    updates: int = 0
+    _solved: dict[int, _Solved] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.estimator = Estimator(self.config.estimator)
+        self.regions = Regions(self.estimator.local_maps, self.config.region)
+
+    # -- writing -------------------------------------------------------------------------------------------------------
+
+    def update(self, newest: int, added: Sequence[Link] = (), removed: Sequence[Link] = ()) -> UpdateResult:
+        """Take in links and let others go, and bring the component of record ``newest`` to its optimum.
+
+        Other components that the change split off are brought to theirs.
+        """
+        if removed:
+            gone = {id(k) for k in removed}
+            self.graph.replace_links([k for k in self.graph.links if id(k) not in gone])
+        for link in added:
+            self.graph.add_link(link)
+        result = self._solve(self.graph.component(newest))
+        self._solve_changed()
+        return result
+
+    def replace(self, removed: Sequence[Link], added: Sequence[Link]) -> None:
+        """Let links go and take in others; the next update takes notice, but parts that this splits off do at once."""
+        gone = {id(k) for k in removed}
+        self.graph.replace_links([*(k for k in self.graph.links if id(k) not in gone), *added])
+        self._solve_changed()
+
+    def condense(self, new: int, busy: Sequence[int]) -> None:
+        """Join old submaps that nothing touches to regions; ``busy`` records stay as they are."""
+        if self.config.estimator.linearises:
+            self.regions.close(self.graph, self.graph.component(new), {new, *busy})
+
+    def settle(self) -> None:
+        """Bring all to its optimum, with every submap on its own and all shared landmarks, where that is affordable."""
+        self.graph.use_all_ties(True)
+        if self._work() > self.config.settled_work:
+            self.graph.use_all_ties(False)
+        self.regions.open(self.regions.closed, len(self.graph.records))
+        for component in np.unique(self.graph.component_of).tolist():
+            self._solve(component, coarse=False)
+
+    def resume(self) -> None:
+        """Keep nothing but the graph and its estimate, which is at its optimum: after loading as after saving."""
+        self.graph.use_all_ties(True)
+        if self._work() > self.config.settled_work:
+            self.graph.use_all_ties(False)
+        self._solved.clear()
+        self.regions = Regions(self.estimator.local_maps, self.config.region)
+        for component in np.unique(self.graph.component_of).tolist():
+            assembled = self.estimator.assemble(self.graph, component)
+            cost = assembled.problem.cost(assembled.state)
+            self._solved[component] = _Solved(assembled, _result_of(assembled, cost, 0, True))
+
+    def checkpoint(self) -> Checkpoint:
+        """Everything that an update changes, to come back to."""
+        return Checkpoint(self.graph.snapshot(), dict(self._solved), tuple(self.regions.closed))
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Back to a checkpoint taken since the last submap was added."""
+        self.graph.restore(checkpoint.graph)
+        self._solved = dict(checkpoint.solved)
+        self.regions.closed = list(checkpoint.regions)
+
+    def _work(self) -> float:
+        """Entries of the information matrices that the selected landmarks make."""
+        ties = np.bincount(self.graph.record_of[self.graph.tying()], minlength=len(self.graph.records))
+        return float(np.square(6.0 + 3.0 * ties).sum())
+
+    def _solve(self, component: int, *, coarse: bool = True) -> UpdateResult:
+        """Optimise a component; regions that this bends are opened."""
+        while True:
+            regions = self.regions.fitting(self.graph, component)
+            assembled, found = self.estimator.optimize(self.graph, component, regions, coarse=coarse)
+            bent = [r for r in regions if r.carry(self.graph) > self.config.region.relinearize]
+            if not bent:
+                break
+            self.regions.open(bent, len(self.graph.records))
+        self.updates += 1
+        result = _result_of(assembled, found.cost, found.iterations, found.converged)
+        self._solved[component] = _Solved(assembled, result)
+        return result
+
+    def _solve_changed(self) -> None:
+        """Forget components that are no more, and solve those that have other records than when they were solved."""
+        components = np.unique(self.graph.component_of).tolist()
+        for gone in self._solved.keys() - set(components):
+            del self._solved[gone]
+        for component in components:
+            solved = self._solved.get(component)
+            if solved is None or solved.assembled.size != len(self.graph.records_of(component)):
+                self._solve(component)
+
+    # -- reading -------------------------------------------------------------------------------------------------------
+
+    def result(self, component: int) -> UpdateResult:
+        """What the last update of a component said."""
+        return self._solved[component].result
+
+    def assembled(self, component: int) -> Assembled:
+        """The problem of a component's last update."""
+        return self._solved[component].assembled
+
+    def totals(self) -> tuple[float, int]:
+        """chi2 and redundancy of all components."""
+        results = [s.result for s in self._solved.values()]
+        return sum(r.cost for r in results), sum(r.redundancy for r in results)
+
+    def marginals(self, component: int) -> ComponentMarginals:
+        """Covariances of a component from the factor of its last update, multiplied by its variance factor."""
+        solved = self._solved[component]
+        if solved.marginals is None:
+            solved.marginals = ComponentMarginals(self.graph, solved.assembled, solved.result.variance_factor)
+        return solved.marginals
+
+    def relative_pose(self, first: int, second: int) -> Prior | None:
+        """What the map knows of T_first_second (starts of two records, the second one the newer); None across
+        components. What the last factor does not hold counts with its odometry alone, which is never too sure.
+        """
+        graph, component = self.graph, self.graph.component(first)
+        if component != graph.component(second):
+            return None
+        first_node, T_first, first_covariance = self._anchored(component, first)
+        node, T, covariance = self._anchored(component, second)
+        if first_node is None or node is None:
+            return None
+        joint = self.assembled(component).covariance([first_node, node])
+        T_known, known = relative_pose(graph.poses[first_node], graph.poses[node], joint)
+        T_node, T_covariance = T_known @ T, compose_covariance(T_known, known, T, covariance)
+        return prior_of_pair(*seen_from(T_first, first_covariance, T_node, T_covariance))
+
+    def _anchored(self, component: int, record: int) -> tuple[int | None, FloatArray, FloatArray]:
+        """The last node before a record's start that the last factor holds, and the way from there."""
+        graph, nodes = self.graph, self.assembled(component).nodes
+        node, T, covariance = graph.records[record].start, np.eye(4), np.zeros((6, 6))
+        while node not in nodes:
+            region = next((r for r in self.assembled(component).regions if node in r.inner), None)
+            if region is not None:
+                T_node, own = region.node(node)
+                return region.reference, T_node @ T, compose_covariance(T_node, own, T, covariance)
+            before = graph.record_ending_at(node)
+            if before is None:
+                return None, T, covariance
+            submap = graph.records[before].submap
+            covariance = compose_covariance(submap.end_pose, submap.covariance[:6, :6], T, covariance)
+            T = submap.end_pose @ T
+            node = graph.records[before].start
+        return node, T, covariance
+
+
+def _result_of(assembled: Assembled, cost: float, iterations: int, converged: bool) -> UpdateResult:
+    return UpdateResult(cost, assembled.redundancy, iterations, converged, assembled.problem.backend)

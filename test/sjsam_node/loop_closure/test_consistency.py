@@ -1,0 +1,102 @@
+"""Closures that later ones contradict: a false one that was believed goes, a false one that comes late is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from judging import ate, errors, join
+from submap_world import Agent, Sensor, World, path_through, room
+
+from sjsam_node.global_map import GlobalMap
+from sjsam_node.graph.links import Link, Prior
+from sjsam_node.loop_closure.association import match
+from sjsam_node.loop_closure.point_sets import at_start
+from slam_core.geometry import boxminus, invert_transform
+
+BACK_AND_FORTH = [
+    (-1.0, -1.0), (1.0, -1.0), (1.0, 0.0), (13.0, 0.0), (13.0, -1.0), (15.0, -1.0), (15.0, 1.0), (13.0, 0.5),
+    (1.0, 0.5), (-1.0, 0.5), (-1.0, -1.0), (1.0, -1.0), (1.0, 0.0),
+]  # fmt: skip
+
+
+def look_alike_rooms(rng: np.random.Generator) -> Agent:
+    """A walk through two rooms that look alike to the last descriptor, 14 m apart, and back to the first."""
+    first = room((0.0, 0.0), (4.0, 4.0), 90, rng)
+    corridor = np.stack([rng.uniform(2, 12, 120), rng.choice([-1.2, 1.2], 120), rng.uniform(-1, 1.5, 120)], axis=1)
+    world = World.random(np.concatenate([first, first + np.array([14.0, 0.0, 0.0]), corridor]), rng)
+    world.descriptors[90:180] = world.descriptors[:90]
+    return Agent(world, path_through(BACK_AND_FORTH), rng, "a", Sensor(max_range=3.5))
+
+
+def false_link(joined: GlobalMap, agent: Agent) -> Link:
+    """The closure that looks best of those between the two rooms, 14 m off."""
+    graph, best = joined.graph, None
+    for first in (i for i in range(len(graph.records)) if agent.true_start(i)[0, 3] < 2.0):
+        for second in (i for i in range(len(graph.records)) if agent.true_start(i)[0, 3] > 12.0):
+            shift = agent.true_start(second).copy()
+            shift[0, 3] -= 14.0
+            T = invert_transform(agent.true_start(first)) @ shift
+            prior = Prior(T, 1e-2 * np.eye(6))
+            found = match(at_start(graph.records[first]), at_start(graph.records[second]), prior,
+                          joined.config.closure.association)  # fmt: skip
+            if best is None or len(found.pairs) > len(best.pairs):
+                best = Link(first, second, found.pairs, found.T, found.covariance, is_closure=True)
+    assert best is not None
+    return best
+
+
+@pytest.fixture
+def agent(rng: np.random.Generator) -> Agent:
+    return look_alike_rooms(rng)
+
+
+def test_a_false_closure_that_was_believed_is_taken_back_when_true_ones_contradict_it(agent: Agent) -> None:
+    submaps = agent.submaps()
+    arrival = next(k for k in range(len(submaps)) if agent.true_start(k)[0, 3] > 14.0)
+    honest, _ = join(submaps)
+    joined, _ = join(submaps[: arrival + 1])
+    false = false_link(joined, agent)
+    assert len(false.pairs) >= 10
+    joined.smoother.update(arrival, [false])
+    assert ate(errors(joined, agent)[0]) > 1.0
+    join(submaps[arrival + 1 :], joined)
+    joined.settle()
+    assert not any(k.first == false.first and k.second == false.second for k in joined.graph.links)
+    assert joined.counters.counts["closures let go"] >= 1
+    assert ate(errors(joined, agent)[0]) < 1.5 * ate(errors(honest, agent)[0])
+
+
+def test_a_false_closure_on_trial_is_refused_and_leaves_no_trace(agent: Agent) -> None:
+    submaps = agent.submaps()
+    arrival = next(k for k in range(len(submaps)) if agent.true_start(k)[0, 3] > 14.0)
+    joined, _ = join(submaps[: arrival + 1])
+    joined.settle()
+    before, links = joined.graph.poses.copy(), len(joined.graph.links)
+    _, verdict = joined.consistency.update([false_link(joined, agent)], arrival)
+    assert not verdict.accepted
+    assert len(joined.graph.links) == links
+    joined.settle()
+    assert np.abs(boxminus(joined.graph.poses[-1], before[-1])).max() < 1e-6
+
+
+def test_agents_joined_by_rooms_that_look_alike_are_told_apart_by_what_they_see_later(agent: Agent) -> None:
+    """Nothing but what comes later can tell two such rooms apart."""
+    path, sensor = agent.path, agent.sensor
+    arrival = next(k for k, T in enumerate(path) if T[0, 3] > 12.9)
+    first = Agent(agent.world, path[:25], agent.rng, "a", sensor)
+    second = Agent(agent.world, path[arrival:], agent.rng, "b", sensor, stamp_ns=10**11)
+    origin = invert_transform(first.path[0])
+
+    def error(joined: GlobalMap) -> float:
+        return float(np.abs(boxminus(origin @ second.path[0], joined.trajectory("b")[0].T)).max())
+
+    joined, _ = join(first.submaps())
+    B = second.submaps()
+    alone = next(k for k in range(len(B)) if second.true_start(k)[0, 3] < 13.0 and k > 3)
+    join(B[:alone], joined)
+    assert joined.components == 1
+    assert error(joined) > 10.0
+    join(B[alone:], joined)
+    assert joined.counters.counts["closures let go"] > 0
+    assert joined.components == 1
+    assert error(joined) < 0.3

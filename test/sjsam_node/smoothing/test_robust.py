@@ -1,0 +1,188 @@
+"""Joining with a robust loss: what it does to a Gaussian, and that false closures leave no trace."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from submap_world import Agent, circle, ring_world
+from text_world import city, park
+
+from sjsam_node.graph.links import Link
+from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.linear_slam.text_joining import (
+    TextIndex,
+    TextJoiner,
+    TextJoiningConfig,
+    TextJoiningResult,
+    join_text_maps,
+)
+from sjsam_node.linear_slam.text_maps import TextMap
+from sjsam_node.smoothing.estimator import Estimator, EstimatorConfig
+from sjsam_node.smoothing.joining import JoiningProblem
+from sjsam_node.smoothing.problem import LocalMap, flatten
+from sjsam_node.smoothing.robust import LOSSES, RobustConfig, closing_rows, normalized_error, predicted, weight, widened
+from slam_core.geometry import boxminus
+from slam_core.least_squares import chi_square_bound
+
+ROBUST = [loss for loss in LOSSES if loss != "none"]
+
+
+@pytest.fixture
+def gaussian(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance (9, 9) and a residual."""
+    root = rng.normal(size=(9, 9))
+    return root @ root.T + np.eye(9), rng.normal(size=9)
+
+
+@pytest.mark.parametrize("loss", ROBUST)
+def test_weights_fall_with_the_error(loss: str) -> None:
+    weights = [weight(loss, nis, 10.0) for nis in (0.0, 1.0, 10.0, 100.0, 1e6)]
+    assert weights[0] == 1.0
+    assert weights[1] > 0.9
+    assert sorted(weights, reverse=True) == weights
+    assert weights[-1] < 0.01
+
+
+def test_widened_rows_have_a_larger_covariance_and_nothing_else(gaussian: tuple[np.ndarray, np.ndarray]) -> None:
+    covariance, _ = gaussian
+    information, rows = np.linalg.inv(covariance), np.array([3, 4, 5])
+    added = np.zeros((9, 9))
+    added[3:6, 3:6] = (1.0 / 0.2 - 1.0) * np.linalg.inv(information[3:6, 3:6])
+    assert np.allclose(widened(information, rows, 0.2), np.linalg.inv(covariance + added))
+    others = np.setdiff1d(np.arange(9), rows)
+    marginal = widened(information, rows, 0.0)
+    assert np.allclose(marginal[np.ix_(others, others)], np.linalg.inv(covariance[np.ix_(others, others)]))
+    assert np.allclose(marginal[rows], 0.0, atol=1e-12)
+
+
+def test_errors_are_against_what_the_other_rows_predict(gaussian: tuple[np.ndarray, np.ndarray]) -> None:
+    covariance, residual = gaussian
+    information, rows, others = np.linalg.inv(covariance), np.array([0, 1]), np.arange(2, 9)
+    gain = covariance[np.ix_(rows, others)] @ np.linalg.inv(covariance[np.ix_(others, others)])
+    innovation = residual[rows] - gain @ residual[others]
+    spread = covariance[np.ix_(rows, rows)] - gain @ covariance[np.ix_(others, rows)]
+    assert normalized_error(information, residual, rows) == pytest.approx(
+        innovation @ np.linalg.solve(spread, innovation)
+    )
+    assert np.allclose(predicted(information, residual, rows)[rows], gain @ residual[others])
+
+
+def test_only_what_was_seen_before_closes() -> None:
+    def local(reference: int, poses: list[int], landmarks: list[int]) -> LocalMap:
+        return LocalMap(reference, np.array(poses), np.array(landmarks, np.int64), np.empty(0), np.empty((0, 0)))
+
+    maps = [local(0, [1], [5, 6]), local(1, [2, 0], [6, 7]), local(3, [2], [5])]
+    rows = closing_rows(maps, 3, 2)
+    assert rows[0] == []
+    assert [r.tolist() for r in rows[1]] == [[3, 4, 5], [6, 7]]
+    assert [r.tolist() for r in rows[2]] == [[3, 4]]  # the pose is all that ties the map, not a closure
+
+
+def with_false_loops(
+    maps: list[TextMap], rng: np.random.Generator, share: float
+) -> tuple[list[TextMap], list[TextMap], int]:
+    """The maps with some of their loops led elsewhere, and the maps without these."""
+    false, clean, count = [], [], 0
+    for k, m in enumerate(maps):
+        spoilt = len(m.pose_ids) > 1 and k > 60 and rng.random() < share
+        wrong = np.array([m.pose_ids[0], rng.integers(0, k - 30)]) if spoilt else m.pose_ids
+        count += int(spoilt)
+        covariance = np.linalg.inv(m.information)
+        false.append(replace(m, pose_ids=wrong))
+        clean.append(
+            replace(m, pose_ids=m.pose_ids[:1], poses=m.poses[:1], information=np.linalg.inv(covariance[:3, :3]))
+            if spoilt else m
+        )  # fmt: skip
+    return false, clean, count
+
+
+def joined(maps: list[TextMap], loss: str) -> TextJoiningResult:
+    return join_text_maps(maps, 2, TextJoiningConfig(refinements=0, robust=RobustConfig(loss)))
+
+
+@pytest.mark.parametrize("loss", ["cauchy", "dcs"])
+def test_false_loops_leave_no_trace(loss: str, rng: np.random.Generator) -> None:
+    false, clean, count = with_false_loops(city(400, seed=3, extent=6), rng, 0.1)
+    assert count >= 5
+    truth, plain, robust = joined(clean, "none"), joined(false, "none"), joined(false, loss)
+    assert robust.dropped == count
+    assert robust.chi2 == pytest.approx(truth.chi2, rel=1e-6)
+    assert np.allclose(robust.poses, truth.poses, atol=1e-5)
+    assert np.abs(plain.poses - truth.poses).max() > 1.0
+
+
+def test_covariances_are_those_without_the_false_loops(rng: np.random.Generator) -> None:
+    """Neither of a compromise of weights nor of rows that are wrong."""
+    false, clean, _ = with_false_loops(city(300, seed=4, extent=6), rng, 0.1)
+    config = TextJoiningConfig(refinements=0, robust=RobustConfig("cauchy"))
+    joiner = TextJoiner(TextIndex.of(false, 2), config)
+    state, _ = joiner.best(None)
+    expected = JoiningProblem(flatten(TextIndex.of(clean, 2).maps), state, np.array([0]), joiner.model)
+    found = JoiningProblem(flatten(joiner.maps), state, np.array([0]), joiner.model)
+    poses = np.array([50, 150, 300])
+    assert np.allclose(found.columns(state, poses), expected.columns(state, poses), rtol=1e-6)
+
+
+def test_a_feature_taken_for_another_is_left_out(rng: np.random.Generator) -> None:
+    maps = park(120, 2, seed=1, features=80)
+    false = []
+    for k, m in enumerate(maps):
+        ids = m.feature_ids.copy()
+        if k % 20 == 19 and len(ids) > 2:
+            ids[1] = rng.choice(np.setdiff1d(np.arange(1, 81), ids))
+        false.append(replace(m, feature_ids=ids))
+    spoilt = sum(bool(np.any(a.feature_ids != b.feature_ids)) for a, b in zip(maps, false, strict=True))
+    truth, robust = joined(maps, "none"), joined(false, "cauchy")
+    assert spoilt >= 5
+    assert robust.dropped >= spoilt - 1  # one may be seen nowhere else: then nothing contradicts it
+    assert np.abs(robust.poses - truth.poses).max() < 0.1
+
+
+def test_true_maps_are_left_as_they_are() -> None:
+    maps = city(200, seed=5, extent=6)
+    plain, robust = joined(maps, "none"), joined(maps, "dcs")
+    assert robust.dropped == 0
+    assert robust.chi2 == pytest.approx(plain.chi2, rel=1e-9)
+
+
+def ring_graph(seed: int) -> tuple[MapGraph, Agent]:
+    """One lap and a bit around a ring, linked by the true association."""
+    rng = np.random.default_rng(seed)
+    agent, graph = Agent(ring_world(4.0, rng), circle(4.0, 1.2), rng), MapGraph()
+    submaps = agent.submaps()
+    for k, submap in enumerate(submaps):
+        graph.append(submap, graph.records[-1].end if k else None, np.eye(4))
+        for older in range(k):
+            _, i, j = np.intersect1d(agent.seen[older], agent.seen[k], return_indices=True)
+            if len(i):
+                graph.add_link(link(older, k, np.stack([i, j], axis=1)))
+    return graph, agent
+
+
+def link(first: int, second: int, pairs: np.ndarray) -> Link:
+    return Link(first, second, pairs, np.eye(4), 0.01 * np.eye(6), is_closure=True)
+
+
+def optimized(seed: int, loss: str, *, spoilt: bool) -> tuple[float, float]:
+    """Largest error of a pose in m, and the joint squared normalised error of three poses (18 degrees of freedom)."""
+    graph, agent = ring_graph(seed)
+    if spoilt:
+        graph.add_link(link(3, 12, np.stack([np.arange(10), np.arange(10)], axis=1)))
+    assembled, _ = Estimator(EstimatorConfig(robust=RobustConfig(loss))).optimize(graph, 0)
+    truth = np.array([agent.true_start(k) for k in range(len(graph.poses))])
+    some = [5, 12, 18]
+    error = np.concatenate([boxminus(truth[k], graph.poses[k]) for k in some])
+    nees = error @ np.linalg.solve(assembled.covariance(some), error)
+    return float(np.linalg.norm(graph.poses[:, :3, 3] - truth[:, :3, 3], axis=1).max()), float(nees)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_false_link_between_submaps_does_not_bend_the_joined_map(seed: int) -> None:
+    """Ten landmarks of two places that have nothing to do with each other are taken for the same."""
+    clean, bent = optimized(seed, "none", spoilt=False)[0], optimized(seed, "none", spoilt=True)[0]
+    robust, nees = optimized(seed, "cauchy", spoilt=True)
+    assert bent > 5.0 * clean
+    assert robust < 2.0 * clean  # the true sightings of those landmarks are lost too
+    assert nees < chi_square_bound(0.999, 18)
