@@ -21,7 +21,7 @@ from ekf_slam_node.models import project, project_jacobian
 from ekf_slam_node.slam import EkfSlam
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import choose, load_system_config
-from slam_bringup.pipeline.eyes import AgentEyes
+from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.geometry import FloatArray, transform_points
 from slam_core.types import Features
@@ -59,11 +59,12 @@ def _frames(path: Path) -> tuple[list[Features], FloatArray, FloatArray]:
     system = choose(load_system_config(None), "stereo", "sjsam", "none")
     with SensorBag(path) as bag:
         agent = bag.agents[0]
-        eyes, truth = AgentEyes(system, bag.sensors[agent], False, StageTimes()), bag.ground_truth(agent)
-        items = [eyes.complete(item) for reading in bag.readings() for item in eyes.process(reading)]
+        pipeline, truth = SensorPipeline(system, bag.sensors[agent], False, StageTimes()), bag.ground_truth(agent)
+        items = [pipeline.measure(item).value for reading in bag.readings() for item in pipeline.add(reading)]
+        T_rig_optical = bag.sensors[agent].transform("base", "left")
     assert truth is not None, f"{path} holds no ground truth"
-    frames = [item.features for item in items if item.features is not None]
-    return frames, truth.interpolate(np.array([f.stamp_ns for f in frames])), eyes.T_rig_optical
+    frames = [value for value in items if isinstance(value, Features)]
+    return frames, truth.interpolate(np.array([f.stamp_ns for f in frames])), T_rig_optical
 
 
 def _track(frames: list[Features], cameras: FloatArray, seen: list[tuple[int, int]]) -> Track:

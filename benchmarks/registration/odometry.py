@@ -25,7 +25,7 @@ from ndt_registration.registration import RegistrationConfig, register
 from slam_bringup.bags.readings import DepthReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.eyes import depth_processor
+from slam_bringup.pipeline.sensor_pipeline import depth_stage
 from slam_core.config import from_mapping
 from slam_core.geometry import FloatArray, boxminus, invert_transform
 from slam_core.rigid_alignment import umeyama
@@ -66,13 +66,14 @@ def scans_of_bag(path: Path) -> list[Scan]:
         agent = bag.agents[0]
         sensors, truth = bag.sensors[agent], bag.ground_truth(agent)
         assert truth is not None
-        processor, T_base_tof = depth_processor(SystemConfig(), sensors), sensors.transform("base", "tof")
+        stage, T_base_tof = depth_stage(SystemConfig(), sensors), sensors.transform("base", "tof")
         poses = dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True))
         for reading in bag.readings():
             if isinstance(reading, DepthReading):
-                depth = processor.process(reading.stamp_ns, reading.image, reading.amplitude, reading.intensity)
-                points = depth.points().reshape(-1, 3).astype(np.float64)
-                scans.append(Scan(reading.stamp_ns, points, poses[reading.stamp_ns] @ T_base_tof))
+                stage.add(reading.raw)
+                for depth in stage.ready():
+                    points = depth.points().reshape(-1, 3).astype(np.float64)
+                    scans.append(Scan(reading.stamp_ns, points, poses[reading.stamp_ns] @ T_base_tof))
     return scans
 
 

@@ -138,13 +138,13 @@ def views(bag: Path, stride: int, frames: int) -> Iterator[View]:
             T = truth.poses[nearest] @ T_base_camera
             if isinstance(reading, StereoReading):
                 assert rectifier is not None
-                pair = rectifier(reading.stamp_ns, reading.left, reading.right)
+                pair = rectifier(reading.stamp_ns, reading.pair.left, reading.pair.right)
                 yield stereo_view(pair.left, pair.right, pair.stereo.camera, pair.stereo.baseline, T)
             else:
-                scale = 0.001 if reading.image.dtype == np.uint16 else 1.0
+                scale = 0.001 if reading.raw.image.dtype == np.uint16 else 1.0
                 assert sensors.tof is not None
-                assert reading.amplitude is not None
-                yield depth_view(reading.amplitude, reading.image * scale, sensors.tof.camera, T)
+                assert reading.raw.amplitude is not None
+                yield depth_view(reading.raw.amplitude, reading.raw.image * scale, sensors.tof.camera, T)
 
 
 def relative_pose(a: View, b: View, pairs: np.ndarray) -> tuple[FloatArray, np.ndarray] | None:

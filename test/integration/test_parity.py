@@ -1,48 +1,73 @@
-"""The bag in bags/ through the nodes and offline: the same trajectory and map, nothing lost."""
+"""The bag in bags/ with an IMU, through the nodes and offline: the same trajectory and map, nothing lost."""
 
 from __future__ import annotations
 
+from collections import deque
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from slam_bringup.bags.bag import BagReader, BagWriter
+from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.bags.sensor_writer import IMU_FRAME, SensorWriter
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.recorded_run import collect
+from slam_core.geometry import make_transform, so3_exp, so3_log
+from slam_core.types import ImuSample
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 DEMO = Path(__file__).resolve().parents[2] / "bags" / "demo"
 FRAMES_NS = 2_500_000_000
+IMU_STEP_NS = 10_000_000
+IMU_OFFSET_NS = 3_000_000
+T_BASE_IMU = make_transform(so3_exp(np.array([0.0, 0.0, 0.5 * np.pi])), np.array([0.1, 0.0, 0.0]))
 NUMERICALLY_EQUAL = 1e-9
 """A unit of the last decimal of trajectory.tum; below it, rounding in two processes may differ."""
 
 
 @pytest.fixture(scope="module")
 def short_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first two and a half seconds of the bag in bags/."""
+    """The first two and a half seconds of the bag in bags/, and an IMU at 100 Hz whose stamps are not the cameras'."""
     if not DEMO.is_dir():
         pytest.skip(f"no bag at {DEMO}")
     path = tmp_path_factory.mktemp("bags") / "short"
     with BagReader(DEMO) as long, BagWriter(path) as short:
         types = {topic: info.type_name for topic, info in long.topics.items()}
+        writer, samples = SensorWriter(short), turn_rates(long.start_ns)
+        writer.extrinsics(long.start_ns, {IMU_FRAME: T_BASE_IMU})
         for topic, stamp, data in long.raw():
+            while samples and samples[0].stamp_ns <= stamp:
+                writer.imu(samples.popleft())
             if stamp <= long.start_ns + FRAMES_NS:
                 short.write_raw(topic, types[topic], data, stamp)
     return path
 
 
-@pytest.mark.parametrize("mode", ["stereo", "fuse"])
+def turn_rates(start_ns: int) -> deque[ImuSample]:
+    """What an IMU measures on the true trajectory."""
+    with SensorBag(DEMO) as bag:
+        truth = bag.ground_truth("")
+    assert truth is not None
+    stamps = start_ns + IMU_OFFSET_NS + np.arange(FRAMES_NS // IMU_STEP_NS) * IMU_STEP_NS
+    poses = truth.interpolate(np.append(stamps, stamps[-1] + IMU_STEP_NS))
+    R_imu_base = T_BASE_IMU[:3, :3].T
+    rates = [R_imu_base @ so3_log(a[:3, :3].T @ b[:3, :3]) / (IMU_STEP_NS * 1e-9) for a, b in pairwise(poses)]
+    return deque(ImuSample(int(t), rate, np.array([0.0, 0.0, 9.8])) for t, rate in zip(stamps, rates, strict=True))
+
+
+@pytest.mark.parametrize(("mode", "odometry"), [("stereo", "none"), ("fuse", "ndt")])
 def test_nodes_and_the_offline_pipeline_agree(
-    domain_environment: dict[str, str], short_bag: Path, tmp_path: Path, mode: str
+    domain_environment: dict[str, str], short_bag: Path, tmp_path: Path, mode: str, odometry: str
 ) -> None:
-    config = choose(load_system_config(None), mode, "sjsam", "none")
-    run = run_nodes(short_bag, config, tmp_path, odometry=False)
-    online, _ = collect(short_bag, config, run, mapper="sjsam", odometry="none")
-    offline, _ = run_bag(short_bag, config)
+    config = choose(load_system_config(None), mode, "sjsam", odometry)
+    run = run_nodes(short_bag, config, tmp_path, odometry=odometry != "none")
+    online, _ = collect(short_bag, config, run, mapper="sjsam", odometry=odometry)
+    offline, _ = run_bag(short_bag, config, odometry=odometry)
     assert set(run.exit_codes.values()) == {0}, run.exit_codes
     assert sum(online.dropped.values()) == 0, online.dropped
     assert (online.frames, online.submaps) == (offline.frames, offline.submaps)

@@ -255,7 +255,7 @@ def test_depth_images_survive(rng: np.random.Generator) -> None:
     depth = rng.uniform(0.5, 5.0, (6, 8)).astype(np.float32)
     depth[1, 2] = np.nan
     image = DepthImage(STAMP, depth, depth * np.float32(0.01), CAMERA, depth * np.float32(9), None)
-    sent = m.depth_messages(TYPES, image, "tof")
+    sent = m.depth_messages(TYPES, image)
     assert sent.intensity is None
     back = m.depth_from_messages(
         *(over_the_wire(x) for x in (sent.depth, sent.noise, sent.camera_info, sent.amplitude))

@@ -49,7 +49,8 @@ def test_a_pair_without_a_depth_image_near_enough_goes_alone():
 def test_a_silent_depth_camera_holds_nothing_up():
     pairing = DepthPairing(0.03, patience=2)
     released = [stamps(pairing.add_pair(pair_or_depth(t))) for t in (0, 100, 200, 300)]
-    assert released == [[], [], [(0.0, None)], [(100.0, None)]]
+    assert released == [[], [], [(0.0, None), (100.0, None), (200.0, None)], [(300.0, None)]]
+    assert "no depth image" in pairing.complaint
     pairing.clear()
     assert pairing.flush() == []
 
@@ -60,9 +61,9 @@ def test_pairs_wait_for_both_camera_infos():
     for k in range(3):
         pairs.add(k)
     assert pairs.set_info("left", info)
-    assert pairs.ready() == []
+    assert pairs.pop() is None
     assert pairs.set_info("right", info)
-    assert pairs.ready() == [1, 2]
+    assert [pairs.pop() for _ in range(3)] == [1, 2, None]
     assert pairs.dropped == 1
     assert not pairs.set_info("right", CameraInfo(info.camera))
     assert pairs.set_info("right", CameraInfo(info.camera, R=np.diag([1.0, -1.0, -1.0])))

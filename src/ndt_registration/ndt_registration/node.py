@@ -10,7 +10,10 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from ndt_registration.odometry import OdometryConfig, OdometryResult, OdometryStatus, ScanOdometry
+import numpy as np
+
+from ndt_registration.odometry import OdometryConfig, OdometryResult, OdometryStatus
+from ndt_registration.stage import Scan, ScanOdometryStage
 from slam_core.base_node import SlamNode
 from slam_core.config import parameter
 from slam_core.geometry import FloatArray
@@ -26,12 +29,8 @@ from slam_core.messages import (
     stamp_ns,
 )
 from slam_core.messages.base import Message
-from slam_core.motion import motion_of_rig, pose_of_rig
 from slam_core.ros import run_node
-from slam_core.types import ImuSample, PoseEstimate, RelativeMotion
-
-RATES_KEPT = 10_000
-"""IMU readings kept while no scan comes."""
+from slam_core.types import PoseEstimate, RelativeMotion
 
 
 @dataclass(frozen=True)
@@ -48,41 +47,43 @@ class NdtNode(SlamNode[NdtNodeConfig]):
 
     def __init__(self) -> None:
         super().__init__("ndt_odometry", NdtNodeConfig)
-        self.odometry = ScanOdometry(self.config)
+        self.stage = ScanOdometryStage(self.config, self.frames, self.config.base_frame)
         self.path = deque[PoseEstimate](maxlen=self.config.path_length)
         self.advertise("ndt/odometry", "Odometry")
         self.advertise("ndt/motion", "PoseWithCovarianceStamped")
         self.advertise("ndt/path", "Path")
         self.advertise("ndt/points_aligned", "PointCloud2")
-        self._rates = deque[tuple[str, ImuSample]](maxlen=RATES_KEPT)
         self.listen("tof/points", "PointCloud2", self.on_points)
         self.listen("imu", "Imu", self.on_imu, required=False)
 
     def on_points(self, cloud: Message) -> None:
         """One scan."""
-        T_base_sensor = self.lookup(self.config.base_frame, cloud.header.frame_id)
-        points = points_from_message(cloud)
-        while self._rates:
-            frame, sample = self._rates.popleft()
-            R_sensor_imu = self.lookup(cloud.header.frame_id, frame)[:3, :3]
-            self.odometry.add_angular_velocity(sample.stamp_ns, R_sensor_imu @ sample.angular_velocity)
-        result = self.odometry.process(stamp_ns(cloud), points)
-        pose = pose_of_rig(PoseEstimate(result.stamp_ns, result.T, result.covariance), T_base_sensor)
-        motion = None if result.motion is None else motion_of_rig(result.motion, T_base_sensor)
-        self._publish(pose, motion)
-        if self.has_listeners("ndt/points_aligned"):
-            self._publish_aligned(points, pose.T @ T_base_sensor, pose.stamp_ns)
-        self._report(result)
+        self.stage.add_scan(Scan(stamp_ns(cloud), points_from_message(cloud), cloud.header.frame_id))
+        self._publish_ready()
 
     def on_imu(self, message: Message) -> None:
-        """A reading of the IMU, kept until the scan says in which frame it is wanted."""
-        self._rates.append((message.header.frame_id, imu_from_message(message)))
+        """A reading of the IMU."""
+        self.stage.add_imu(imu_from_message(message))
+        self._publish_ready()
 
     def on_reset(self) -> None:
         """Forget everything: the next scan is the origin."""
-        self.odometry.reset()
-        self._rates.clear()
+        self.stage.reset()
         self.path.clear()
+
+    def on_finish(self) -> str:
+        """Register the scans that still wait for the IMU."""
+        self.stage.finish()
+        self._publish_ready()
+        return "all scans registered"
+
+    def _publish_ready(self) -> None:
+        for estimate in self.stage.ready():
+            self._publish(estimate.pose, estimate.motion)
+            if self.has_listeners("ndt/points_aligned"):
+                points = np.asarray(estimate.scan.points).reshape(-1, 3)
+                self._publish_aligned(points, estimate.T_odom_sensor, estimate.pose.stamp_ns)
+            self._report(estimate.result)
 
     def _publish(self, pose: PoseEstimate, motion: RelativeMotion | None) -> None:
         odom, base = self.config.odom_frame, self.config.base_frame
@@ -98,10 +99,10 @@ class NdtNode(SlamNode[NdtNodeConfig]):
         self.publish("ndt/points_aligned", points_message(self.types, header, aligned))
 
     def _report(self, result: OdometryResult) -> None:
-        self.health.count(result.status.value.lower())
+        self.health.take(self.stage.counters.counts)
         self._show(result)
-        failed = result.status is OdometryStatus.FAILED
-        self.health.set(State.DEGRADED if failed else State.OK, result.reason)
+        degraded = result.status is OdometryStatus.FAILED or self.stage.complaint
+        self.health.set(State.DEGRADED if degraded else State.OK, result.reason)
 
     def _show(self, result: OdometryResult) -> None:
         """What the newest registration says of itself, in ``/diagnostics``."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from enum import IntEnum
 
 
@@ -35,6 +36,11 @@ class Health:
     def count(self, what: str, number: int = 1) -> None:
         """Add to a counter, for instance "rejected"."""
         self.counters[what] += number
+
+    def take(self, counts: Mapping[str, int]) -> None:
+        """Set counters that an algorithm keeps itself."""
+        for what, number in counts.items():
+            self.counters[what] = number
 
     def show(self, what: str, value: object) -> None:
         """Set a value of the newest input, for instance "score"."""

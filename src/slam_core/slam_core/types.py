@@ -31,12 +31,13 @@ class FeatureSource(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class StereoImages:
-    """A rectified pair: ``left`` and ``right`` uint8, shape (height, width), of ``stereo``."""
+    """A rectified pair: ``left`` and ``right`` uint8, shape (height, width), of ``stereo``, left in ``frame_id``."""
 
     stamp_ns: int
     left: ByteArray
     right: ByteArray
     stereo: StereoCamera
+    frame_id: str = "stereo_left_optical_frame"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,7 @@ class DepthImage:
     """A rectified depth image with its uncertainty.
 
     depth: float32 (height, width), m along z, NaN where there is none. sigma: float32, standard deviation of depth, m,
-    NaN likewise. amplitude, intensity: float32 or None.
+    NaN likewise. amplitude, intensity: float32 or None. All in the optical frame ``frame_id``.
     """
 
     stamp_ns: int
@@ -53,6 +54,7 @@ class DepthImage:
     camera: Camera
     amplitude: Float32Array | None = None
     intensity: Float32Array | None = None
+    frame_id: str = "tof_optical_frame"
 
     def points(self) -> Float32Array:
         """Points (height, width, 3) float32 in the optical frame, NaN where there is no depth."""
@@ -116,11 +118,18 @@ class RelativeMotion:
 
 @dataclass(frozen=True, eq=False)
 class ImuSample:
-    """An IMU reading, rig frame: angular_velocity (3,) rad/s, linear_acceleration (3,) m/s2 with gravity."""
+    """An IMU reading along the axes of ``frame_id``: angular_velocity (3,) rad/s, linear_acceleration (3,) m/s2 with
+    gravity.
+    """
 
     stamp_ns: int
     angular_velocity: FloatArray
     linear_acceleration: FloatArray
+    frame_id: str = "base_link"
+
+    def turned(self, R: FloatArray, frame_id: str) -> ImuSample:
+        """The same reading along the axes of another frame, ``R`` = R_frame_own (3, 3)."""
+        return ImuSample(self.stamp_ns, R @ self.angular_velocity, R @ self.linear_acceleration, frame_id)
 
 
 @dataclass(frozen=True, eq=False)

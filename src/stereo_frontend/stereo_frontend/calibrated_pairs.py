@@ -36,19 +36,15 @@ class CalibratedPairs(Generic[T]):
         return True
 
     def add(self, item: T) -> None:
-        """Take an item; :meth:`ready` returns it when its infos are there."""
+        """Take an item; :meth:`pop` returns it when its infos are there."""
         self._waiting.append(item)
         if self.infos is None and len(self._waiting) > self._depth:
             self._waiting.popleft()
             self.dropped += 1
 
-    def ready(self) -> list[T]:
-        """The items that may go on, oldest first."""
-        if self.infos is None:
-            return []
-        items = list(self._waiting)
-        self._waiting.clear()
-        return items
+    def pop(self) -> T | None:
+        """The oldest item, if both infos are known and one waits."""
+        return self._waiting.popleft() if self.infos is not None and self._waiting else None
 
     def clear(self) -> None:
         """Forget the items; calibrations stay."""

@@ -1,17 +1,22 @@
 """Brings stereo pairs and depth images of other stamps together, in the same way online and offline.
 
 A pair waits until the depth camera has reached its stamp, then takes the nearest depth image. Only stamps decide, so
-the order in which the two cameras' messages happen to arrive does not change the result. A depth camera that has fallen
-silent holds nothing up for longer than ``patience`` pairs.
+the order in which the two cameras' messages happen to arrive does not change the result. For a depth camera that has
+fallen silent no pair waits, see :class:`slam_core.awaited_streams.AwaitedStreams`.
 """
 
 from __future__ import annotations
 
 from collections import deque
 
+from slam_core.awaited_streams import PATIENCE, AwaitedStreams
 from slam_core.types import DepthImage, StereoImages
 
 Paired = tuple[StereoImages, DepthImage | None]
+
+_STREAM = "depth image"
+_DEPTHS = 40
+"""Depth images kept while no pair comes: a second and more of a camera at 30 Hz."""
 
 
 class DepthPairing:
@@ -22,27 +27,37 @@ class DepthPairing:
     max_age
         Greatest difference of the stamps, s; a pair without such a depth image gets None.
     patience
-        Pairs that may wait; beyond it the oldest goes on with what there is.
+        Pairs that may be ahead of the depth camera before it counts as silent.
     """
 
-    def __init__(self, max_age: float, patience: int = 10) -> None:
+    def __init__(self, max_age: float, patience: int = PATIENCE) -> None:
         self._max_age_ns = round(max_age * 1e9)
-        self._patience = patience
+        self._awaited = AwaitedStreams([_STREAM], patience)
         self._pairs: deque[StereoImages] = deque()
-        self._depths: deque[DepthImage] = deque()
+        self._depths: deque[DepthImage] = deque(maxlen=_DEPTHS)
+
+    @property
+    def complaint(self) -> str:
+        """Since when the depth camera is silent, or ""."""
+        return self._awaited.complaint()
 
     def add_pair(self, images: StereoImages) -> list[Paired]:
         """Take a pair; returns what is complete, oldest first."""
         self._pairs.append(images)
-        ready = self._complete()
-        if len(self._pairs) > self._patience:
-            ready.append(self._take())
-        return ready
+        self._awaited.frame(images.stamp_ns)
+        return self._complete()
 
     def add_depth(self, depth: DepthImage) -> list[Paired]:
         """Take a depth image; returns what is complete, oldest first."""
         self._depths.append(depth)
+        self._awaited.heard(_STREAM, depth.stamp_ns)
         return self._complete()
+
+    def give_up(self) -> list[Paired]:
+        """Everything that waits; later pairs do not, until a depth image comes."""
+        if self._pairs:
+            self._awaited.give_up(self._pairs[-1].stamp_ns)
+        return self.flush()
 
     def flush(self) -> list[Paired]:
         """Everything that still waits, for the end of the input."""
@@ -52,10 +67,11 @@ class DepthPairing:
         """Forget everything."""
         self._pairs.clear()
         self._depths.clear()
+        self._awaited.clear()
 
     def _complete(self) -> list[Paired]:
         ready = []
-        while self._pairs and self._depths and self._depths[-1].stamp_ns >= self._pairs[0].stamp_ns:
+        while self._pairs and not self._awaited.must_wait(self._pairs[0].stamp_ns):
             ready.append(self._take())
         return ready
 

@@ -10,7 +10,7 @@ camera infos from YAML files. ``stereo/{left,right}/set_camera_info`` writes new
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +26,13 @@ from slam_core.messages import (
     grey_from_message,
     header_message,
     image_message,
+    stamp_ns,
 )
 from slam_core.messages.base import Message
 from slam_core.ros import run_node
-from slam_core.types import ByteArray
-from stereo_frontend.calibrated_pairs import SIDES, CalibratedPairs
-from stereo_frontend.rectify import StereoRectifier
+from stereo_frontend.calibrated_pairs import SIDES
 from stereo_frontend.sources import FolderSource, RawPair, SideBySideSource
+from stereo_frontend.stage import StereoStage
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
 
     def __init__(self) -> None:
         super().__init__("stereo_driver", StereoDriverConfig)
-        self.calibrated = CalibratedPairs[tuple[Message, Message]]()
+        self.stage = StereoStage()
         self.files = {"left": self.config.left_info, "right": self.config.right_info}
-        self._rectifier: StereoRectifier | None = None
+        self.right_frame = self.config.right_frame
         self._open_files()
         for side in SIDES:
             self.advertise(f"stereo/{side}/image_rect", "Image")
@@ -73,7 +73,7 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
 
     def on_reset(self) -> None:
         """Forget what waits."""
-        self.calibrated.clear()
+        self.stage.reset()
 
     def on_shutdown(self) -> None:
         """Let go of the camera."""
@@ -90,17 +90,14 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
         self.listen_together({f"stereo/{side}/image_raw{ending}": kind for side in SIDES}, self._on_pair)
 
     def _on_info(self, side: str, message: Message) -> None:
-        self._set_info(side, camera_info_from_message(message))
-        self._release()
+        self.stage.set_info(side, camera_info_from_message(message))
+        self._publish_rectified()
 
     def _on_pair(self, left: Message, right: Message) -> None:
-        self.calibrated.add((left, right))
-        self._release()
-
-    def _release(self) -> None:
-        for left, right in self.calibrated.ready():
-            self._publish_rectified(left.header, right.header, grey_from_message(left), grey_from_message(right))
-        self.health.counters["pairs_without_camera_info"] = self.calibrated.dropped
+        self.right_frame = right.header.frame_id
+        pictures = grey_from_message(left), grey_from_message(right)
+        self.stage.add(RawPair(stamp_ns(left), *pictures, left.header.frame_id))
+        self._publish_rectified()
 
     # -- own sources ---------------------------------------------------------------------------------------------------
 
@@ -143,26 +140,25 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
 
     def _publish_pair(self, pair: RawPair) -> None:
         frames = self.config.left_frame, self.config.right_frame
-        headers = [header_message(self.types, pair.stamp_ns, frame) for frame in frames]
-        infos = self.calibrated.infos
+        infos = self.stage.infos
         assert infos is not None
-        for side, header, image, info in zip(SIDES, headers, (pair.left, pair.right), infos, strict=True):
+        for side, frame, image, info in zip(SIDES, frames, (pair.left, pair.right), infos, strict=True):
+            header = header_message(self.types, pair.stamp_ns, frame)
             self.publish(f"stereo/{side}/image_raw", image_message(self.types, header, image))
             self.publish(f"stereo/{side}/camera_info", camera_info_message(self.types, header, info))
-        self._publish_rectified(*headers, pair.left, pair.right)
+        self.stage.add(replace(pair, frame_id=self.config.left_frame))
+        self._publish_rectified()
 
     # -- both ----------------------------------------------------------------------------------------------------------
 
-    def _publish_rectified(
-        self, left_header: Message, right_header: Message, left: ByteArray, right: ByteArray
-    ) -> None:
-        if self._rectifier is None:
-            infos = self.calibrated.infos
-            assert infos is not None
-            self._rectifier = StereoRectifier(*infos)
-        images = self._rectifier(0, left, right)
-        self.publish("stereo/left/image_rect", image_message(self.types, left_header, images.left))
-        self.publish("stereo/right/image_rect", image_message(self.types, right_header, images.right))
+    def _publish_rectified(self) -> None:
+        """Both rectified images have the left one's stamp: they are one instant."""
+        for images in self.stage.ready():
+            frames = images.frame_id, self.right_frame
+            for side, frame, image in zip(SIDES, frames, (images.left, images.right), strict=True):
+                header = header_message(self.types, images.stamp_ns, frame)
+                self.publish(f"stereo/{side}/image_rect", image_message(self.types, header, image))
+        self.health.take(self.stage.counters)
 
     # -- calibration ---------------------------------------------------------------------------------------------------
 
@@ -170,13 +166,9 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
         for side, path in self.files.items():
             if path:
                 try:
-                    self._set_info(side, read_camera_info(Path(path).expanduser()).info)
+                    self.stage.set_info(side, read_camera_info(Path(path).expanduser()).info)
                 except OSError as error:
                     raise ValueError(f"{side}_info: {error}") from error
-
-    def _set_info(self, side: str, info: CameraInfo) -> None:
-        if self.calibrated.set_info(side, info):
-            self._rectifier = None
 
     def _on_set_info(self, side: str, request: Any, response: Any) -> Any:
         try:
@@ -192,7 +184,7 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
                 f"the {side} camera info comes from its topic: set the parameter {side}_info to a YAML file"
             )
         CameraInfoFile(info, side).write(Path(self.files[side]).expanduser())
-        self._set_info(side, info)
+        self.stage.set_info(side, info)
         return f"written to {self.files[side]} and in use"
 
 

@@ -29,11 +29,12 @@ _NAME_ENDS = (("_left", "_right"), ("_l", "_r"), ("_0", "_1"), ("left", "right")
 
 @dataclass(frozen=True, eq=False)
 class RawPair:
-    """One unrectified pair: left and right uint8 (height, width)."""
+    """One unrectified pair: left and right uint8 (height, width), the left one in ``frame_id``."""
 
     stamp_ns: int
     left: ByteArray
     right: ByteArray
+    frame_id: str = "stereo_left_optical_frame"
 
 
 class SideBySideSource:

@@ -13,12 +13,10 @@ node publishes it. ``tof/set_camera_info`` writes that file.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from sensor_msgs.srv import SetCameraInfo
 
 from slam_core.base_node import SlamNode
@@ -32,19 +30,16 @@ from slam_core.messages import (
     camera_info_message,
     cloud_message,
     depth_messages,
+    header_message,
     picture_from_message,
     stamp_ns,
 )
 from slam_core.messages.base import Message
 from slam_core.ros import run_node
 from slam_core.types import DepthImage
-from tof_driver.depth import DepthConfig, DepthProcessor
+from tof_driver.depth import DepthConfig
 from tof_driver.points import depth_cloud
-
-WAITING = 100
-"""Images kept while no camera info has come."""
-FEW_PIXELS = 0.05
-"""A smaller share of pixels with depth is reported as DEGRADED."""
+from tof_driver.stage import DepthStage, RawDepth
 
 
 @dataclass(frozen=True)
@@ -64,19 +59,17 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
 
     def __init__(self) -> None:
         super().__init__("tof_driver", TofDriverConfig)
-        self.info: CameraInfo | None = None
-        self.processor: DepthProcessor | None = None
-        self._waiting: deque[tuple[Message, ...]] = deque()
+        self.stage = DepthStage(depth_config(self.config))
         self._pictures = self._picture_names()
         if self.config.info:
-            self._use(_read(self.config.info))
+            self.stage.set_info(_read(self.config.info))
         self._topics = self._advertise_outputs()
         self._listen_to_inputs()
         self.create_service(SetCameraInfo, "tof/set_camera_info", self._on_set_info)
 
     def on_reset(self) -> None:
         """Forget what waits; the calibration stays."""
-        self._waiting.clear()
+        self.stage.reset()
 
     # -- topics --------------------------------------------------------------------------------------------------------
 
@@ -105,56 +98,34 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
     # -- inputs --------------------------------------------------------------------------------------------------------
 
     def _on_info(self, message: Message) -> None:
-        self._use(camera_info_from_message(message))
-        while self._waiting:
-            self._process_images(self._waiting.popleft())
+        self.stage.set_info(camera_info_from_message(message))
+        self._publish_ready()
 
     def _on_images(self, *messages: Message) -> None:
-        if self.processor is not None:
-            self._process_images(messages)
-            return
-        self._waiting.append(messages)
-        if len(self._waiting) > WAITING:
-            self._waiting.popleft()
-            self.health.count("images_without_camera_info")
+        pictures = dict(zip(self._pictures, map(picture_from_message, messages[1:]), strict=True))
+        header = messages[0].header
+        image = picture_from_message(messages[0])
+        self.stage.add(RawDepth(stamp_ns(messages[0]), image, **pictures, frame_id=header.frame_id))
+        self._publish_ready()
 
-    def _process_images(self, messages: tuple[Message, ...]) -> None:
-        assert self.processor is not None
-        images = dict(zip((self.config.measurement, *self._pictures), map(picture_from_message, messages), strict=True))
-        depth = self.processor.process(
-            stamp_ns(messages[0]), images[self.config.measurement], images.get("amplitude"), images.get("intensity")
-        )
-        self._report(depth)
-        self._publish_all(messages[0].header, depth)
+    def _publish_ready(self) -> None:
+        for depth in self.stage.ready():
+            self._publish(depth)
+            self.health.set(State.DEGRADED if self.stage.complaint else State.OK, self.stage.complaint)
+        self.health.take(self.stage.counters)
 
-    def _report(self, depth: DepthImage) -> None:
-        assert self.processor is not None
-        for name, number in self.processor.counters.counts.items():
-            self.health.counters[name] = number
-        share = float(np.isfinite(depth.depth).mean())
-        if share < FEW_PIXELS:
-            self.health.set(State.DEGRADED, f"{100.0 * share:.1f} % of the pixels have depth")
-        else:
-            self.health.set(State.OK)
-
-    def _publish_all(self, header: Message, depth: DepthImage) -> None:
-        assert self.info is not None
-        outputs = depth_messages(self.types, depth, header.frame_id)._replace(
+    def _publish(self, depth: DepthImage) -> None:
+        assert self.stage.info is not None
+        header = header_message(self.types, depth.stamp_ns, depth.frame_id)
+        outputs = depth_messages(self.types, depth)._replace(
             points=cloud_message(self.types, header, depth_cloud(depth)),
-            camera_info=camera_info_message(self.types, header, self.info),
+            camera_info=camera_info_message(self.types, header, self.stage.info),
         )
         for topic, message in zip(DEPTH_TOPICS, outputs, strict=True):
             if topic in self._topics:
                 self.publish(topic, message)
 
     # -- calibration ---------------------------------------------------------------------------------------------------
-
-    def _use(self, info: CameraInfo) -> None:
-        known = self.info
-        if known is not None and known.camera == info.camera and np.array_equal(known.P, info.P):
-            return
-        self.processor = DepthProcessor(depth_config(self.config), info.camera, info.rectified)
-        self.info = info
 
     def _on_set_info(self, request: Any, response: Any) -> Any:
         try:
@@ -170,7 +141,7 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
                 "the camera info comes from the topic tof/camera_info: set the parameter info to a YAML file"
             )
         CameraInfoFile(info, "tof").write(Path(self.config.info).expanduser())
-        self._use(info)
+        self.stage.set_info(info)
         return f"written to {self.config.info} and in use"
 
 

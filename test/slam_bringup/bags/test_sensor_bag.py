@@ -55,21 +55,22 @@ def test_readings_are_paired_and_of_one_stamp_depth_comes_before_stereo(tmp_path
     depth, stereo = readings[4], readings[5]
     assert isinstance(depth, DepthReading)
     assert isinstance(stereo, StereoReading)
-    assert (stereo.left[0, 0], stereo.right[0, 0], stereo.stamp_ns) == (1, 101, 110)
-    assert (depth.image[0, 0], depth.image.dtype, sensors.measurement) == (1001, np.uint16, "depth")
-    assert depth.intensity is None
+    assert (stereo.pair.left[0, 0], stereo.pair.right[0, 0], stereo.stamp_ns) == (1, 101, 110)
+    assert (depth.raw.image[0, 0], depth.raw.image.dtype, sensors.measurement) == (1001, np.uint16, "depth")
+    assert depth.raw.intensity is None
     assert truth is not None
     np.testing.assert_allclose(truth.poses[2][:3, 3], 0.02)
     assert not opened.left_out
 
 
-def test_imu_readings_are_turned_into_the_axes_of_the_rig(tmp_path: Path) -> None:
+def test_imu_readings_keep_the_axes_of_the_imu(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as bag:
         write_agent(bag)
     with SensorBag(tmp_path / "bag") as opened:
         reading = next(opened.readings())
     assert isinstance(reading, ImuReading)
-    np.testing.assert_allclose(reading.sample.angular_velocity, [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(reading.sample.angular_velocity, [1.0, 0.0, 0.0])
+    assert reading.sample.frame_id == IMU_FRAME
 
 
 def test_extrinsics_and_calibration_of_every_agent(tmp_path: Path) -> None:

@@ -68,9 +68,9 @@ def test_the_bag_holds_what_was_simulated(bag: Path, scenario: Scenario) -> None
     assert [p.stamp_ns for p in pairs] == [f.stamp_ns for f in frames] == truth.stamps_ns.tolist()
     for frame, pair, scan, pose in zip(frames, pairs, scans, truth.poses, strict=True):
         assert frame.tof is not None
-        assert np.array_equal(pair.left, frame.left)
-        assert np.array_equal(pair.right, frame.right)
-        assert np.array_equal(scan.image, frame.tof.range)
+        assert np.array_equal(pair.pair.left, frame.left)
+        assert np.array_equal(pair.pair.right, frame.right)
+        assert np.array_equal(scan.raw.image, frame.tof.range)
         np.testing.assert_allclose(pose, frame.T_world_rig, atol=1e-12)
     np.testing.assert_allclose(sensors.transform("left", "tof"), simulator.T_left_tof, atol=1e-12)
     assert sensors.right is not None
@@ -93,8 +93,8 @@ def test_compact_bag_loses_less_than_the_noise(bag: Path, scenario: Scenario, tm
         pairs = [[r for r in s.readings() if isinstance(r, StereoReading)] for s in (full, small)]
         scans = [[r for r in s.readings() if isinstance(r, DepthReading)] for s in (full, small)]
     assert len(pairs[0]) == len(pairs[1]) == 6
-    assert all(np.array_equal(a.left, b.left) for a, b in zip(*pairs, strict=True))
-    difference = [a.image - b.image * 1e-3 for a, b in zip(*scans, strict=True)]
+    assert all(np.array_equal(a.pair.left, b.pair.left) for a, b in zip(*pairs, strict=True))
+    difference = [a.raw.image - b.raw.image * 1e-3 for a, b in zip(*scans, strict=True)]
     assert np.abs(difference).max() < 0.00051
 
 

@@ -70,7 +70,7 @@ def test_euroc_folders(tmp_path: Path) -> None:
         readings, sensors, truth = list(bag.readings()), bag.sensors[""], bag.ground_truth("")
     stereo = [r for r in readings if isinstance(r, StereoReading)]
     assert tuple(r.stamp_ns for r in stereo) == STAMPS
-    assert (stereo[0].left[0, 0], stereo[0].right[0, 0]) == (10, 11)
+    assert (stereo[0].pair.left[0, 0], stereo[0].pair.right[0, 0]) == (10, 11)
     assert sum(isinstance(r, ImuReading) for r in readings) == 2
     assert sensors.right is not None
     assert sensors.left is not None
@@ -116,7 +116,7 @@ def test_tum_rgbd_folders(tmp_path: Path) -> None:
     depth = readings[0]
     assert isinstance(depth, DepthReading)
     assert depth.stamp_ns == 1_305_031_102_175_304_000
-    assert (depth.image.dtype, depth.image[0, 0]) == (np.float32, 2.0)
+    assert (depth.raw.image.dtype, depth.raw.image[0, 0]) == (np.float32, 2.0)
     assert sensors.measurement == "depth"
     assert sensors.tof is not None
     assert sensors.tof.camera.fx == 525.0

@@ -75,5 +75,5 @@ def test_a_run_that_is_told_to_stop_keeps_what_it_has():
     assert 8 <= result.frames <= 12
     assert len(result.agents[0].trajectory) == result.frames
     assert len(result.landmarks.positions) > 50
-    assert len(result.dense) > 100
+    assert len(result.dense) == 0  # it would keep whoever wants the end waiting
     assert not result.dropped

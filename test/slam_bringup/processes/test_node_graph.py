@@ -43,15 +43,23 @@ def test_parameters_follow_from_the_choice_and_the_bag() -> None:
     assert 'measurement:="depth"' in arguments["tof_driver"]
     assert 'pictures:="amplitude"' in arguments["tof_driver"]
     assert 'mode:="fuse"' in arguments["feature_extractor"]
-    assert "wait_for_motion:=true" in arguments["ekf_slam"]
+    assert 'wait_for:=["motion"]' in arguments["ekf_slam"]
     assert 'registration.method:="icp_plane"' in arguments["ndt_odometry"]
     assert 'agents:=["one"]' in arguments["sjsam"]
     assert graph.filters == ("/one/ekf_slam",)
-    assert graph.finishers == ("/one/feature_extractor", "/one/ekf_slam")
+    assert graph.finishers == ("/one/ndt_odometry", "/one/feature_extractor", "/one/ekf_slam")
     assert set(graph.pace) == {
         "/one/ekf_slam=/one/stereo/left/image_raw/compressed", "/one/ndt_odometry=/one/tof/depth/image_raw"
     }  # fmt: skip
     assert "/one/tof/camera_info" in graph.played.values()
+
+
+def test_frames_wait_for_the_imu_of_a_bag_that_has_one() -> None:
+    with_imu = sensors()
+    with_imu.topics["imu"] = "/imu"
+    graph = plan_nodes(choose(load_system_config(None), "fuse", "sjsam", "ndt"), {"": with_imu}, True, "map")
+    arguments = {c.executable: " ".join(c.arguments) for c in graph.commands}
+    assert 'wait_for:=["motion", "imu"]' in arguments["ekf_slam"]
 
 
 def test_the_frames_of_an_agent_are_those_of_its_bag_or_lie_below_its_name() -> None:

@@ -11,38 +11,50 @@ from slam_core.geometry import FloatArray
 from slam_core.messages import grey_from_message, imu_from_message, picture_from_message, stamp_ns
 from slam_core.messages.base import Message
 from slam_core.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
-from slam_core.types import AnyArray, ByteArray, ImuSample
+from slam_core.types import ImuSample
+from stereo_frontend.sources import RawPair
+from tof_driver.stage import RawDepth
 
 _UNPAIRED = f"images without a partner within {1000 * PAIRING_TOLERANCE_S:g} ms of their stamp"
 
 
 @dataclass(frozen=True, eq=False)
 class StereoReading:
-    """A pair of grey images uint8 (height, width)."""
+    """A pair as recorded."""
 
     agent: str
-    stamp_ns: int
-    left: ByteArray
-    right: ByteArray
+    pair: RawPair
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the left image."""
+        return self.pair.stamp_ns
 
 
 @dataclass(frozen=True, eq=False)
 class DepthReading:
-    """Images of a ToF or depth camera as recorded (uint16 mm or float32 m), with amplitude and intensity or None."""
+    """Images of a ToF or depth camera as recorded."""
 
     agent: str
-    stamp_ns: int
-    image: AnyArray
-    amplitude: AnyArray | None
-    intensity: AnyArray | None
+    raw: RawDepth
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the range or depth image."""
+        return self.raw.stamp_ns
 
 
 @dataclass(frozen=True, eq=False)
 class ImuReading:
-    """An IMU sample in the axes of base_link."""
+    """An IMU sample in the axes of the IMU."""
 
     agent: str
     sample: ImuSample
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the sample."""
+        return self.sample.stamp_ns
 
 
 Reading = StereoReading | DepthReading | ImuReading
@@ -116,23 +128,24 @@ class AgentPairing:
 
     def _on_stereo(self, stamp: int, messages: tuple[Message, ...]) -> None:
         left, right = (grey_from_message(m) for m in messages)
-        self._hand_on(stamp, StereoReading(self._sensors.agent, stamp, left, right))
+        pair = RawPair(stamp, left, right, self._sensors.left_frame)
+        self._hand_on(StereoReading(self._sensors.agent, pair))
 
     def _on_depth(self, stamp: int, messages: tuple[Message, ...]) -> None:
         images = dict(zip(self._depth_roles, (picture_from_message(m) for m in messages), strict=True))
-        reading = DepthReading(
-            self._sensors.agent, stamp, images["depth"], images.get("amplitude"), images.get("intensity")
+        raw = RawDepth(
+            stamp, images["depth"], images.get("amplitude"), images.get("intensity"), self._sensors.tof_frame
         )
-        self._hand_on(stamp, reading)
+        self._hand_on(DepthReading(self._sensors.agent, raw))
 
     def _on_imu(self, message: Message) -> None:
         sample = imu_from_message(message)
-        R = self._sensors.frames.lookup(self._sensors.base_frame, message.header.frame_id)[:3, :3]
-        rotated = ImuSample(sample.stamp_ns, R @ sample.angular_velocity, R @ sample.linear_acceleration)
-        self._hand_on(sample.stamp_ns, ImuReading(self._sensors.agent, rotated))
+        self._sensors.frames.lookup(self._sensors.base_frame, sample.frame_id)  # unusable where that is not known
+        self._hand_on(ImuReading(self._sensors.agent, sample))
 
-    def _hand_on(self, stamp: int, reading: Reading) -> None:
+    def _hand_on(self, reading: Reading) -> None:
         """Only what is newer than all before: a message may have come twice, or time jumped back."""
+        stamp = reading.stamp_ns
         if stamp <= self._newest_ns.get(type(reading), -1):
             self._left_out["not newer than what came before"] += 1
             return

@@ -82,7 +82,7 @@ class SensorBag:
 
         What helps a frame thus comes before it, as at the node, which waits for it.
         """
-        for _, together in groupby(self._in_order_of_arrival(), key=_stamp):
+        for _, together in groupby(self._in_order_of_arrival(), key=lambda reading: reading.stamp_ns):
             yield from sorted(together, key=_rank)
 
     def _in_order_of_arrival(self) -> Iterator[Reading]:
@@ -188,10 +188,6 @@ class SensorBag:
             for transform in message.transforms:
                 tree.add(*transform_from_message(transform))
         return tree
-
-
-def _stamp(reading: Reading) -> int:
-    return reading.sample.stamp_ns if isinstance(reading, ImuReading) else reading.stamp_ns
 
 
 def _rank(reading: Reading) -> int:

@@ -47,7 +47,7 @@ def command(
     system = choose(load_system_config(config), mode, mapper, odometry)
     with OutputFolder(output, "run", bag, overwrite=overwrite) as results:
         with Interrupt() as interrupt, progress_bar() as progress:
-            task = progress.add_task(f"mapping {bag.name}", total=readings)
+            task = progress.add_task(f"mapping {bag.name}", total=2 * readings)
             result, mapping = run_bag(
                 bag, system, mapper=mapper, odometry=odometry, names=names,
                 on_reading=lambda: progress.advance(task), stopped=lambda: interrupt.asked,

@@ -15,9 +15,10 @@ from typing import Any
 import yaml
 
 from dense_mapping.dense_model import DenseConfig
-from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.stage import IMU, MOTION, FilterConfig
 from ndt_registration.odometry import OdometryConfig
 from sjsam_node.global_map import GlobalMapConfig
+from slam_bringup.bags.readings import AgentSensors
 from slam_core.config import Config, from_mapping, group
 from stereo_frontend.frontend import FrontendConfig
 from tof_driver.depth import DepthConfig
@@ -34,7 +35,7 @@ class SystemConfig(Config):
     tof_driver: DepthConfig = group(DepthConfig)
     feature_extractor: FrontendConfig = group(FrontendConfig)
     ndt_odometry: OdometryConfig = group(OdometryConfig)
-    ekf_slam: EkfSlamConfig = group(EkfSlamConfig)
+    ekf_slam: FilterConfig = group(FilterConfig)
     sjsam: GlobalMapConfig = group(GlobalMapConfig)
     dense_mapper: DenseConfig = group(DenseConfig)
 
@@ -79,6 +80,12 @@ def choose(config: SystemConfig, mode: str, mapper: str, odometry: str) -> Syste
     return replace(
         config,
         feature_extractor=replace(config.feature_extractor, mode=mode),
-        ekf_slam=replace(config.ekf_slam, submap=submap),
+        ekf_slam=replace(config.ekf_slam, submap=submap, wait_for=() if odometry == "none" else (MOTION,)),
         ndt_odometry=replace(config.ndt_odometry, registration=registration),
     )
+
+
+def filter_config(config: FilterConfig, sensors: AgentSensors) -> FilterConfig:
+    """The filter of an agent, whose frames wait for its IMU as well where it has one."""
+    imu = (IMU,) if "imu" in sensors.topics else ()
+    return replace(config, agent=sensors.agent, wait_for=(*config.wait_for, *imu))

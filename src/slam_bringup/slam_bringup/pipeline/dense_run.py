@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -12,14 +12,20 @@ from dense_mapping.stereo_depth import stereo_depth
 from slam_bringup.bags.readings import AgentSensors, DepthReading, Reading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.eyes import depth_processor
+from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray, DepthImage
-from stereo_frontend.rectify import StereoRectifier
+from stereo_frontend.stage import StereoStage
+from tof_driver.stage import DepthStage
 
 
-def dense_model(bag: SensorBag, config: SystemConfig, trajectories: Mapping[str, Trajectory]) -> DenseModel:
+def dense_model(
+    bag: SensorBag,
+    config: SystemConfig,
+    trajectories: Mapping[str, Trajectory],
+    on_reading: Callable[[], None] = lambda: None,
+) -> DenseModel:
     """The model of all agents in the map frame; its surface is not made yet."""
     model = DenseModel(config.dense_mapper)
     cameras = {
@@ -33,6 +39,7 @@ def dense_model(bag: SensorBag, config: SystemConfig, trajectories: Mapping[str,
             break
         if reading.agent in cameras:
             cameras[reading.agent].add(reading, model)
+        on_reading()
     return model
 
 
@@ -42,25 +49,27 @@ class AgentDepth:
     def __init__(self, sensors: AgentSensors, config: SystemConfig, trajectory: Trajectory) -> None:
         self._config: DenseConfig = config.dense_mapper
         self._agent, self._trajectory = sensors.agent, trajectory
-        self._depth = self._rectifier = None
+        self._depth: DepthStage | None = None
+        self._stereo: StereoStage | None = None
         if self._config.use_tof and sensors.is_mounted("tof"):
-            self._depth = depth_processor(config, sensors)
+            self._depth = depth_stage(config, sensors)
             self._T_base_tof = sensors.transform("base", "tof")
         if self._config.use_stereo and sensors.right is not None and sensors.is_mounted("left"):
-            assert sensors.left is not None
-            self._rectifier = StereoRectifier(sensors.left, sensors.right)
+            self._stereo = stereo_stage(sensors)
             self._T_base_left = sensors.transform("base", "left")
 
     def add(self, reading: Reading, model: DenseModel) -> None:
         """Put the reading into the model if it is an image of a key frame."""
         if isinstance(reading, DepthReading) and self._depth is not None:
             for camera, T in self._wanted(model, "tof", reading.stamp_ns, self._T_base_tof):
-                image = self._depth.process(reading.stamp_ns, reading.image, reading.amplitude, reading.intensity)
-                model.add(camera, T, image, self._picture(image))
-        elif isinstance(reading, StereoReading) and self._rectifier is not None:
+                self._depth.add(reading.raw)
+                for image in self._depth.ready():
+                    model.add(camera, T, image, self._picture(image))
+        elif isinstance(reading, StereoReading) and self._stereo is not None:
             for camera, T in self._wanted(model, "stereo", reading.stamp_ns, self._T_base_left):
-                images = self._rectifier(reading.stamp_ns, reading.left, reading.right)
-                model.add(camera, T, stereo_depth(images, self._config.stereo), images.left)
+                self._stereo.add(reading.pair)
+                for images in self._stereo.ready():
+                    model.add(camera, T, stereo_depth(images, self._config.stereo), images.left)
 
     def _wanted(
         self, model: DenseModel, sensor: str, stamp_ns: int, T_base_camera: FloatArray
@@ -76,6 +85,6 @@ class AgentDepth:
 
     def _picture(self, image: DepthImage) -> ByteArray | None:
         """A ToF amplitude is no picture where stereo gives one: two kinds of grey on one wall are blotches."""
-        if self._rectifier is not None or image.amplitude is None:
+        if self._stereo is not None or image.amplitude is None:
             return np.empty((0, 0, 3), dtype=np.uint8)
         return grey_levels(image.amplitude)

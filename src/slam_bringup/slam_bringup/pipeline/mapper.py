@@ -7,39 +7,19 @@ nodes would send compact submaps, their rounding is in the map here too.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
 
-from ekf_slam_node.results import EkfResult, TrackingState
-from ekf_slam_node.slam import EkfSlam
+from ekf_slam_node.stage import FilterStage, FrameResult
+from ndt_registration.stage import ScanEstimate
 from sjsam_node.global_map import GlobalMap, JoinReport
-from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.eyes import FilterInput
+from slam_bringup.bags.readings import AgentSensors
+from slam_bringup.pipeline.configuration import SystemConfig, filter_config
+from slam_bringup.pipeline.run_record import AgentRecord, RunRecord, StateChanges
+from slam_bringup.pipeline.sensor_pipeline import AgentItem
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_core.geometry import FloatArray
 from slam_core.messages import rounded
-from slam_core.types import PoseEstimate, Submap
-
-
-@dataclass(eq=False)
-class AgentRecord:
-    """What was said of one agent, frame by frame."""
-
-    filtered: list[PoseEstimate] = field(default_factory=list)
-    scans: list[PoseEstimate] = field(default_factory=list)
-    feature_counts: list[int] = field(default_factory=list)
-    events: list[str] = field(default_factory=list)
-    state: TrackingState = TrackingState.OK
-
-    def add(self, result: EkfResult, features: int) -> None:
-        """Take one frame's result; a change of state is an event."""
-        self.filtered.append(result.pose)
-        self.feature_counts.append(features)
-        if result.state is not self.state:
-            reason = f": {result.reason}" if result.reason else ""
-            self.events.append(f"{result.stamp_ns / 1e9:.3f} s, {result.state.value}{reason}")
-        self.state = result.state
+from slam_core.types import Features, ImuSample, PoseEstimate, Submap
 
 
 class Mapper:
@@ -47,61 +27,91 @@ class Mapper:
 
     Parameters
     ----------
-    T_rig_optical
-        Mounting of the camera of each agent, by name.
+    sensors
+        What each agent carries, by name.
     """
 
-    def __init__(self, config: SystemConfig, T_rig_optical: dict[str, FloatArray], times: StageTimes) -> None:
+    def __init__(self, config: SystemConfig, sensors: Mapping[str, AgentSensors], times: StageTimes) -> None:
         self._times = times
         self._compact = config.ekf_slam.submap.compact
-        self._filters = {agent: EkfSlam(replace(config.ekf_slam, agent=agent), T) for agent, T in T_rig_optical.items()}
-        self.records = {agent: AgentRecord() for agent in T_rig_optical}
+        self._filters = {
+            agent: FilterStage(filter_config(config.ekf_slam, s), s.frames, s.base_frame)
+            for agent, s in sensors.items()
+        }
+        self._frames: dict[str, list[FrameResult]] = {agent: [] for agent in sensors}
+        self._scans: dict[str, list[PoseEstimate]] = {agent: [] for agent in sensors}
         self.reports: list[JoinReport] = []
         """One per submap joined, complete after :meth:`finish`."""
         self.global_map = GlobalMap(config.sjsam)
         self._joiner = ThreadPoolExecutor(1, thread_name_prefix="joining")
         self._joins: list[Future[JoinReport]] = []
+        self._events: list[str] = []
 
-    def process(self, item: FilterInput) -> None:
+    def process(self, item: AgentItem) -> None:
         """One step of one agent's filter, and of the map where that finished a submap."""
-        ekf, record = self._filters[item.agent], self.records[item.agent]
-        if item.imu is not None:
-            ekf.process_imu(item.imu)
-        if item.scan_pose is not None:
-            record.scans.append(item.scan_pose)
-        if item.motion is not None:
-            ekf.process_motion(item.motion)
-        if item.features is not None:
-            with self._times.measure("ekf"):
-                result = ekf.process(item.features)
-            record.add(result, len(item.features))
-            self._join(result.submaps)
+        stage, value = self._filters[item.agent], item.value
+        if isinstance(value, ImuSample):
+            stage.add_imu(value)
+        elif isinstance(value, ScanEstimate):
+            self._scans[item.agent].append(value.pose)
+            stage.add_motion(value.pose.stamp_ns, value.motion)
+        elif isinstance(value, Features):
+            stage.add_features(value)
+        self._take_results(item.agent)
 
     def finish(self) -> None:
         """Close the open submaps and wait until all are joined; the map ends up the same whoever came first.
 
         A submap whose joining failed is left out of the map; the events say so.
         """
-        for ekf in self._filters.values():
-            self._join(ekf.finish())
+        for agent, stage in self._filters.items():
+            stage.give_up()
+            self._take_results(agent)
+            self._join(stage.finish())
         for join in self._joins:
             error = join.exception()
             if error is None:
                 self.reports.append(join.result())
             else:
-                next(iter(self.records.values())).events.append(f"a submap could not be joined: {error!r}")
+                self._events.append(f"a submap could not be joined: {error!r}")
         self.global_map = self.global_map.centrally()
 
     def stop(self) -> None:
         """End the thread that joins, at the latest after the submap it is at."""
         self._joiner.shutdown(cancel_futures=True)
 
+    @property
+    def has_frames(self) -> bool:
+        """Whether any filter has seen a frame."""
+        return any(self._frames.values())
+
+    def record(self, wall_s: float, dropped: Mapping[str, int], failure: str) -> RunRecord:
+        """What the run leaves behind, after :meth:`finish`."""
+        return RunRecord(
+            agents={agent: _agent_record(frames, self._scans[agent]) for agent, frames in self._frames.items()},
+            global_map=self.global_map,
+            submaps=len(self.reports),
+            loop_closures=sum(len(report.closures) for report in self.reports),
+            wall_s=wall_s,
+            dropped=dropped,
+            stage_ms=self._times.ms,
+            rejections=self.rejections(),
+            events=tuple(self._events),
+            failure=failure,
+            solver=next((r.solver for r in reversed(self.reports) if r.solver), ""),
+        )
+
     def rejections(self) -> dict[str, int]:
         """What all filters and the map rejected, by reason."""
         total: Counter[str] = Counter()
-        for counters in (*(ekf.counters for ekf in self._filters.values()), self.global_map.counters):
+        for counters in (*(stage.counters for stage in self._filters.values()), self.global_map.counters):
             total.update(counters.counts)
         return dict(sorted(total.items()))
+
+    def _take_results(self, agent: str) -> None:
+        for frame in self._times.each("ekf", self._filters[agent].ready()):
+            self._frames[agent].append(frame)
+            self._join(frame.estimate.submaps)
 
     def _join(self, submaps: Iterable[Submap]) -> None:
         self._joins += [self._joiner.submit(self._add, submap) for submap in submaps]
@@ -109,3 +119,11 @@ class Mapper:
     def _add(self, submap: Submap) -> JoinReport:
         with self._times.measure("sjsam"):
             return self.global_map.add(rounded(submap) if self._compact else submap)
+
+
+def _agent_record(frames: list[FrameResult], scans: list[PoseEstimate]) -> AgentRecord:
+    estimates = [frame.estimate for frame in frames]
+    changes = StateChanges()
+    for e in estimates:
+        changes.add(e.stamp_ns, e.state.value, e.reason)
+    return AgentRecord([e.pose for e in estimates], scans, [frame.features for frame in frames], changes.events)

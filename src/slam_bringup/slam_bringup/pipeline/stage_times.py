@@ -6,6 +6,9 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 class StageTimes:
@@ -20,3 +23,14 @@ class StageTimes:
         start = time.perf_counter()
         yield
         self.ms[stage].append(1e3 * (time.perf_counter() - start))
+
+    def each(self, stage: str, items: Iterator[T]) -> Iterator[T]:
+        """The items, the making of each timed as one call of ``stage``."""
+        while True:
+            start = time.perf_counter()
+            try:
+                item = next(items)
+            except StopIteration:
+                return
+            self.ms[stage].append(1e3 * (time.perf_counter() - start))
+            yield item

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from ekf_slam_node.stage import IMU
 from slam_bringup.bags.readings import AgentSensors
 from slam_bringup.bags.sensor_topics import is_rectified, join, nodes_name
 from slam_bringup.pipeline.configuration import SystemConfig
@@ -19,6 +20,9 @@ RESULT_TOPICS = (
     "submap/info", "submap/path", "map/landmarks", "map/path", "map/graph", "map/ellipsoids", "map/cloud", "map/marks",
 )  # fmt: skip
 """What ``slam nodes`` records, below each agent's namespace and at the root."""
+
+_FINISHERS = ("ndt_odometry", "feature_extractor", "ekf_slam")
+"""Nodes that hold frames back, front to back."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +65,15 @@ def live_nodes(
     rectified: bool = False,
     extra: Mapping[str, Mapping[str, Any]] | None = None,
     base_frames: Mapping[str, str] | None = None,
+    with_imu: Iterable[str] = (),
 ) -> list[NodeSpec]:
     """Nodes for rigs with the sensors that the mode of ``config`` needs.
 
     ``rectified``: their stereo images are. ``extra``: parameters by executable. ``base_frames``: frame of each agent's
-    rig, by default ``base_link`` below the agent's name.
+    rig, by default ``base_link`` below the agent's name. ``with_imu``: agents whose IMU is known to report; another's
+    is used as well, once it does.
     """
-    base_frames = base_frames or {}
+    base_frames, with_imu = base_frames or {}, set(with_imu)
     mode, extra, agents = config.feature_extractor.mode, extra or {}, tuple(agents)
     specs = []
     for agent in agents:
@@ -80,18 +86,9 @@ def live_nodes(
             frames = base | _below(agent, odom_frame="odom")
             specs.append(_spec("ndt_registration", "ndt_odometry", config.ndt_odometry, agent, extra, **frames))
         specs.append(_spec("stereo_frontend", "feature_extractor", config.feature_extractor, agent, extra))
-        specs.append(
-            _spec(
-                "ekf_slam_node",
-                "ekf_slam",
-                config.ekf_slam,
-                agent,
-                extra,
-                agent=agent,
-                wait_for_motion=odometry,
-                **base,
-            )
-        )
+        wait_for = (*config.ekf_slam.wait_for, *(IMU,) * (agent in with_imu))
+        own = base | {"agent": agent, "wait_for": wait_for}
+        specs.append(_spec("ekf_slam_node", "ekf_slam", config.ekf_slam, agent, extra, **own))
     specs.append(_spec("sjsam_node", "sjsam", config.sjsam, "", extra, agents=agents if any(agents) else ()))
     return specs
 
@@ -104,10 +101,9 @@ def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odomet
     specs = live_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
         extra=_bag_parameters(first, map_path), base_frames=base_frames,
+        with_imu=[agent for agent, sensor in sensors.items() if "imu" in sensor.topics],
     )  # fmt: skip
-    names = {
-        e: tuple(s.command.full_name for s in specs if s.executable == e) for e in ("feature_extractor", "ekf_slam")
-    }
+    names = {e: tuple(s.command.full_name for s in specs if s.executable == e) for e in _FINISHERS}
     recorded = {join(agent, topic) for agent in ("", *sensors) for topic in RESULT_TOPICS}
     return NodeGraph(
         commands=tuple(spec.command for spec in specs),
@@ -115,7 +111,7 @@ def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odomet
         pace=tuple(p for s in sensors.values() for p in _pace(s, mode, odometry)),
         recorded_topics=(*sorted(recorded), "/diagnostics", STATIC_TRANSFORMS_TOPIC),
         filters=names["ekf_slam"],
-        finishers=(*names["feature_extractor"], *names["ekf_slam"]),
+        finishers=tuple(name for executable in _FINISHERS for name in names[executable]),
     )
 
 

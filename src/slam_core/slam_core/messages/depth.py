@@ -31,9 +31,9 @@ DEPTH_TOPICS = {
 """Topic and type of each field of :class:`DepthMessages`, in its order."""
 
 
-def depth_messages(types: MessageTypes, image: DepthImage, frame_id: str) -> DepthMessages:
+def depth_messages(types: MessageTypes, image: DepthImage) -> DepthMessages:
     """Messages that carry ``image`` exactly, and its points, organised, NaN where there is no depth."""
-    header = header_message(types, image.stamp_ns, frame_id)
+    header = header_message(types, image.stamp_ns, image.frame_id)
 
     def picture(pixels: Float32Array | None) -> Message | None:
         return None if pixels is None else image_message(types, header, np.asarray(pixels, dtype="<f4"))
@@ -64,5 +64,5 @@ def depth_from_messages(
     return DepthImage(
         stamp_ns(depth), picture("depth", depth), picture("noise", noise), camera,
         None if amplitude is None else picture("amplitude", amplitude),
-        None if intensity is None else picture("intensity", intensity),
+        None if intensity is None else picture("intensity", intensity), depth.header.frame_id,
     )  # fmt: skip

@@ -123,7 +123,7 @@ def imu_from_message(message: Message) -> ImuSample:
         raise ValueError(f"IMU reading is not finite: {rate} rad/s, {acceleration} m/s2")
     if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
         raise ValueError("IMU message has no angular velocity or no acceleration (covariance -1)")
-    return ImuSample(stamp_ns(message), rate, acceleration)
+    return ImuSample(stamp_ns(message), rate, acceleration, message.header.frame_id)
 
 
 def _with_covariance(types: MessageTypes, estimate: PoseEstimate) -> Message:

@@ -1,0 +1,164 @@
+"""EKF-SLAM of one rig without ROS: features, motions and IMU readings in any order in, results in order of stamps out.
+
+    features ------> wait until motions and IMU have reached their stamp -> EkfSlam -> result, finished submaps
+    motions, IMU --^
+
+A stream that falls silent holds nothing up: the filter goes on without it, says so in its state, and uses it again when
+it comes back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.results import EkfResult, TrackingState
+from ekf_slam_node.slam import EkfSlam
+from slam_core.awaited_streams import PATIENCE, AwaitedStreams
+from slam_core.config import parameter
+from slam_core.frame_tree import FrameTree
+from slam_core.types import Counters, Features, ImuSample, RelativeMotion, Submap
+
+MOTION, IMU = "motion", "imu"
+
+
+@dataclass(frozen=True)
+class FilterConfig(EkfSlamConfig):
+    """The filter's parameters, and which other streams its frames wait for."""
+
+    wait_for: tuple[str, ...] = parameter(
+        (), "streams that frames wait for from the start: motion, imu; what is heard later is waited for as well"
+    )
+    patience: int = parameter(
+        PATIENCE, "frames that may wait for a stream before they go on without it", unit="frames", minimum=1
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if unknown := set(self.wait_for) - {MOTION, IMU}:
+            raise ValueError(f"parameter 'wait_for' may hold {MOTION} and {IMU}, got {', '.join(sorted(unknown))}")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameResult:
+    """What the filter says of one frame, and of how many features."""
+
+    estimate: EkfResult
+    features: int
+
+
+class FilterStage:
+    """Feeds one rig's filter in the order of the stamps.
+
+    Parameters
+    ----------
+    frames
+        Knows where the camera and the IMU sit on the rig.
+    session
+        Number of the first session; -1: the second of the first frame's stamp, which no run before had.
+    """
+
+    def __init__(
+        self, config: FilterConfig, frames: FrameTree, base_frame: str = "base_link", session: int = 0
+    ) -> None:
+        self._config = config
+        self._frames = frames
+        self._base_frame = base_frame
+        self._waiting: deque[Features] = deque()
+        self._motions: deque[RelativeMotion] = deque()
+        self._samples: deque[ImuSample] = deque()
+        self._last_sample_ns = -1
+        self._awaited = AwaitedStreams(config.wait_for, config.patience)
+        self._slam: EkfSlam | None = None
+        self._next_session = session
+
+    @property
+    def counters(self) -> Counters:
+        """What the filter accepted and rejected."""
+        return Counters() if self._slam is None else self._slam.counters
+
+    def add_features(self, features: Features) -> None:
+        """Take one frame."""
+        self._waiting.append(features)
+        self._awaited.frame(features.stamp_ns)
+
+    def add_motion(self, stamp_ns: int, motion: RelativeMotion | None) -> None:
+        """Take a motion of the rig that ended at a stamp, or word that it is not known."""
+        if motion is not None:
+            self._motions.append(motion)
+        self._awaited.heard(MOTION, stamp_ns)
+
+    def add_imu(self, sample: ImuSample) -> None:
+        """Take an IMU's reading; ValueError if it is not known where the IMU sits."""
+        R_base_imu = self._frames.lookup(self._base_frame, sample.frame_id)[:3, :3]
+        self._samples.append(sample.turned(R_base_imu, self._base_frame))
+        self._awaited.heard(IMU, sample.stamp_ns)
+
+    def ready(self) -> Iterator[FrameResult]:
+        """Results of the frames that need not wait, oldest first.
+
+        Raises
+        ------
+        ValueError
+            If the mounting of the camera is not known, or a frame is unusable; the frames after it are kept.
+        """
+        while self._waiting and not self._awaited.must_wait(self._waiting[0].stamp_ns):
+            yield self._process(self._waiting.popleft())
+
+    def give_up(self) -> None:
+        """Stop waiting for what a live node has not heard for long, until it is heard again."""
+        if self._waiting:
+            self._awaited.give_up(self._waiting[-1].stamp_ns)
+
+    def finish(self) -> tuple[Submap, ...]:
+        """Close the open submap, after the last results were taken from :meth:`ready`."""
+        return () if self._slam is None else self._slam.finish()
+
+    def reset(self) -> None:
+        """Forget everything; the mounting is looked up anew."""
+        if self._slam is not None:
+            self._next_session = self._slam.session + 1
+        self._slam = None
+        self._forget_queues()
+
+    def start_session(self) -> tuple[Submap, ...]:
+        """Close the open submap and begin anew with the next frame, whatever its stamp."""
+        self._forget_queues()
+        return () if self._slam is None else self._slam.start_session()
+
+    def _forget_queues(self) -> None:
+        self._waiting.clear()
+        self._motions.clear()
+        self._samples.clear()
+        self._last_sample_ns = -1
+        self._awaited.clear()
+
+    def _process(self, features: Features) -> FrameResult:
+        """One frame, after all that was measured up to its stamp."""
+        slam = self._filter(features)
+        self._give_aids(slam, features.stamp_ns)
+        result = slam.process(features)
+        if result.state is TrackingState.OK and (complaint := self._awaited.complaint()):
+            result = replace(result, state=TrackingState.DEGRADED, reason=complaint)
+        return FrameResult(result, len(features))
+
+    def _filter(self, features: Features) -> EkfSlam:
+        """The filter; the camera's mounting is looked up at the first frame."""
+        if self._slam is None:
+            session = self._next_session if self._next_session >= 0 else features.stamp_ns // 1_000_000_000
+            T_base_optical = self._frames.lookup(self._base_frame, features.frame_id)
+            self._slam = EkfSlam(self._config, T_base_optical, session)
+        return self._slam
+
+    def _give_aids(self, slam: EkfSlam, stamp_ns: int) -> None:
+        """The motions that began before the frame, and readings up to the first that is not older: what has come beyond
+        that depends on the speed of the replay.
+        """
+        while self._motions and self._motions[0].start_stamp_ns < stamp_ns:
+            slam.process_motion(self._motions.popleft())
+        while self._samples and self._last_sample_ns < stamp_ns:
+            sample = self._samples.popleft()
+            self._last_sample_ns = sample.stamp_ns
+            slam.process_imu(sample)

@@ -1,0 +1,131 @@
+"""What a run leaves behind, offline or through nodes, and the result that is made of it in one way."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dense_mapping.surface import Surface
+from sjsam_node.global_map import GlobalMap
+from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.dense_run import dense_model
+from slam_bringup.pipeline.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
+from slam_core.trajectory import Trajectory
+from slam_core.types import PoseEstimate
+
+_LOG = logging.getLogger(__name__)
+
+
+class StateChanges:
+    """The changes of a filter's state as lines of text."""
+
+    def __init__(self) -> None:
+        self.events: list[str] = []
+        self._state = "OK"
+
+    def add(self, stamp_ns: int, state: str, reason: str) -> None:
+        """Take the state after the frame of a stamp."""
+        if state != self._state:
+            self.events.append(f"{stamp_ns / 1e9:.3f} s, {state}{f': {reason}' if reason else ''}")
+        self._state = state
+
+
+@dataclass(frozen=True, eq=False)
+class AgentRecord:
+    """What was said of one agent, frame by frame; ``events`` are changes of its filter's state."""
+
+    filtered: Sequence[PoseEstimate] = field(default_factory=list)
+    scans: Sequence[PoseEstimate] = field(default_factory=list)
+    feature_counts: Sequence[int] = field(default_factory=list)
+    events: Sequence[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """All agents' records and the map that they were joined into. ``events`` belong to no agent."""
+
+    agents: Mapping[str, AgentRecord]
+    global_map: GlobalMap
+    submaps: int
+    loop_closures: int
+    wall_s: float
+    dropped: Mapping[str, int]
+    stage_ms: Mapping[str, list[float]]
+    rejections: Mapping[str, int] = field(default_factory=dict)
+    events: tuple[str, ...] = ()
+    solver: str = ""
+    failure: str = ""
+
+
+def run_result(
+    bag: SensorBag,
+    config: SystemConfig,
+    record: RunRecord,
+    *,
+    mapper: str,
+    odometry: str,
+    dense: bool = True,
+    on_reading: Callable[[], None] = lambda: None,
+) -> RunResult:
+    """The result of a run over a bag, with the ``dense`` model on its trajectories where it is wanted.
+
+    ``on_reading`` is called after every reading that the dense model has seen, for a progress bar.
+    """
+    trajectories = record.global_map.trajectory()
+    agents = tuple(
+        _agent_result(bag, agent, trajectories.get(agent, []), of_agent) for agent, of_agent in record.agents.items()
+    )
+    surface, failure = Surface.empty(), record.failure
+    try:
+        if dense:
+            surface = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading).surface()
+    except Exception as error:  # what was mapped is worth more than its picture
+        failure = failure or told(error, "no dense model was made")
+    landmarks = record.global_map.landmarks()
+    stamps = [agent.filtered.stamps_ns for agent in agents if len(agent.filtered)]
+    return RunResult(
+        bag=bag.reader.path.name,
+        mode=config.feature_extractor.mode,
+        mapper=mapper,
+        odometry=odometry,
+        agents=agents,
+        landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings),
+        dense=surface,
+        submaps=record.submaps,
+        loop_closures=record.loop_closures,
+        frames=sum(len(s) for s in stamps),
+        dropped=record.dropped,
+        rejections=record.rejections,
+        sensor_s=max((s[-1] - s[0]) / 1e9 for s in stamps) if stamps else 0.0,
+        wall_s=record.wall_s,
+        stage_ms=record.stage_ms,
+        events=(*(failure,) * bool(failure), *bag.warnings, *record.events, *_events(record.agents)),
+        solver=record.solver,
+        failure=failure,
+    )
+
+
+def told(error: Exception, consequence: str) -> str:
+    """An error as one line for a person; where it came from goes to the log."""
+    _LOG.debug(consequence, exc_info=error)
+    kind = "" if isinstance(error, ValueError | OSError) else f"{type(error).__name__}: "
+    return f"{consequence}: {kind}{error}"
+
+
+def _agent_result(bag: SensorBag, agent: str, poses: Sequence[PoseEstimate], record: AgentRecord) -> AgentResult:
+    return AgentResult(
+        name=agent,
+        trajectory=Trajectory.from_estimates(poses),
+        filtered=Trajectory.from_estimates(record.filtered),
+        scan_odometry=Trajectory.from_estimates(record.scans),
+        truth=bag.ground_truth(agent) or EMPTY_TRAJECTORY,
+        feature_counts=np.array(record.feature_counts, dtype=np.int64),
+    )
+
+
+def _events(agents: Mapping[str, AgentRecord]) -> list[str]:
+    return [f"{name}: {event}" if name else event for name, record in agents.items() for event in record.events]

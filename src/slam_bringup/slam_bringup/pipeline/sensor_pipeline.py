@@ -1,0 +1,130 @@
+r"""The stages of one agent's sensors, joined up without ROS: readings in, what its filter takes out.
+
+stereo -> StereoStage -> FeatureStage -> features
+depth  -> DepthStage ----^   \-> ScanOdometryStage -> motions
+IMU    -------------------------^----------------> turn rates
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from ndt_registration.stage import Scan, ScanEstimate, ScanOdometryStage
+from slam_bringup.bags.readings import AgentSensors, DepthReading, ImuReading, Reading, StereoReading
+from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.stage_times import StageTimes
+from slam_core.types import Features, ImuSample
+from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
+from tof_driver.stage import DepthStage
+
+
+@dataclass(frozen=True, eq=False)
+class AgentItem:
+    """What comes out of the sensors of ``agent``; an extracted frame has yet to be measured."""
+
+    agent: str
+    value: ExtractedFrame | Features | ScanEstimate | ImuSample
+
+
+class SensorPipeline:
+    """The stages that a mode needs, from :meth:`add` to :meth:`measure`.
+
+    Raises
+    ------
+    ValueError
+        If the agent lacks a sensor that the mode needs; the message says which mode would do.
+    """
+
+    def __init__(self, config: SystemConfig, sensors: AgentSensors, odometry: bool, times: StageTimes) -> None:
+        mode = config.feature_extractor.mode
+        self._agent = sensors.agent
+        self._times = times
+        self._uses_stereo = mode != "tof"
+        self._uses_depth = mode != "stereo" or odometry
+        self._require(mode, sensors)
+        self._stereo = stereo_stage(sensors)
+        self._depth = depth_stage(config, sensors)
+        self._features = FeatureStage(config.feature_extractor, sensors.frames)
+        self._odometry = (
+            ScanOdometryStage(config.ndt_odometry, sensors.frames, sensors.base_frame) if odometry else None
+        )
+
+    def add(self, reading: Reading) -> Iterator[AgentItem]:
+        """What a reading leads to; a stereo pair that waits for its ToF image comes out with a later reading."""
+        if isinstance(reading, ImuReading):
+            yield from self._on_imu(reading.sample)
+        elif isinstance(reading, StereoReading) and self._uses_stereo:
+            yield from self._on_pair(reading)
+        elif isinstance(reading, DepthReading) and self._uses_depth:
+            yield from self._on_depth(reading)
+
+    def finish(self) -> Iterator[AgentItem]:
+        """What still waits when the input has ended."""
+        if self._odometry is not None:
+            self._odometry.finish()
+        self._features.finish()
+        yield from self._scans()
+        yield from self._frames()
+
+    def measure(self, item: AgentItem) -> AgentItem:
+        """The features of an extracted frame, anything else as it is; may run in another thread than :meth:`add`."""
+        if not isinstance(item.value, ExtractedFrame):
+            return item
+        with self._times.measure("features"):
+            return self._item(self._features.measure(item.value))
+
+    def _on_imu(self, sample: ImuSample) -> Iterator[AgentItem]:
+        yield self._item(sample)
+        if self._odometry is not None:
+            self._odometry.add_imu(sample)
+            yield from self._scans()
+
+    def _on_pair(self, reading: StereoReading) -> Iterator[AgentItem]:
+        self._stereo.add(reading.pair)
+        for images in self._times.each("rectification", self._stereo.ready()):
+            self._features.add_images(images)
+        yield from self._frames()
+
+    def _on_depth(self, reading: DepthReading) -> Iterator[AgentItem]:
+        self._depth.add(reading.raw)
+        for depth in self._times.each("depth", self._depth.ready()):
+            if self._odometry is not None:
+                self._odometry.add_scan(Scan(depth.stamp_ns, depth.points(), depth.frame_id))
+            self._features.add_depth(depth)
+        yield from self._scans()
+        yield from self._frames()
+
+    def _scans(self) -> Iterator[AgentItem]:
+        if self._odometry is not None:
+            yield from map(self._item, self._times.each("scan odometry", self._odometry.ready()))
+
+    def _frames(self) -> Iterator[AgentItem]:
+        yield from map(self._item, self._times.each("keypoints", self._features.extracted()))
+
+    def _item(self, value: ExtractedFrame | Features | ScanEstimate | ImuSample) -> AgentItem:
+        return AgentItem(self._agent, value)
+
+    def _require(self, mode: str, sensors: AgentSensors) -> None:
+        who = f"agent '{sensors.agent}'" if sensors.agent else "the bag"
+        if self._uses_stereo and not {"left", "right"} <= sensors.topics.keys():
+            raise ValueError(f"mode '{mode}' needs stereo images, and {who} has none: try --mode tof")
+        if self._uses_depth and "depth" not in sensors.topics:
+            raise ValueError(f"mode '{mode}' or scan odometry needs ToF images, and {who} has none: try --mode stereo")
+
+
+def stereo_stage(sensors: AgentSensors) -> StereoStage:
+    """Rectification of an agent's pairs; of one without a stereo camera it gives nothing."""
+    stage = StereoStage()
+    for side, info in (("left", sensors.left), ("right", sensors.right)):
+        if info is not None:
+            stage.set_info(side, info)
+    return stage
+
+
+def depth_stage(config: SystemConfig, sensors: AgentSensors) -> DepthStage:
+    """Processing of what an agent's depth camera measures; of one without such a camera it gives nothing."""
+    stage = DepthStage(replace(config.tof_driver, measurement=sensors.measurement))
+    if sensors.tof is not None:
+        stage.set_info(sensors.tof)
+    return stage

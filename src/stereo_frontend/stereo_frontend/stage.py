@@ -1,0 +1,159 @@
+"""The stereo front end without ROS, in two stages: raw pairs to rectified ones, and these, with depth, to features.
+
+RawPair -> StereoStage -> StereoImages --> FeatureStage -> Features
+                           DepthImage -----^
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from slam_core.camera import CameraInfo
+from slam_core.frame_tree import FrameTree
+from slam_core.types import DepthImage, Features, StereoImages
+from stereo_frontend.calibrated_pairs import CalibratedPairs
+from stereo_frontend.depth_pairing import DepthPairing
+from stereo_frontend.frontend import Frontend, FrontendConfig
+from stereo_frontend.keypoints import Keypoints
+from stereo_frontend.rectify import StereoRectifier
+from stereo_frontend.sources import RawPair
+
+
+class StereoStage:
+    """Rectifies pairs, oldest first, once both camera infos are known.
+
+    Parameters
+    ----------
+    rectified
+        The pairs are rectified already and the infos' P describes them: they are checked and passed through.
+    """
+
+    def __init__(self, *, rectified: bool = False) -> None:
+        self._rectified = rectified
+        self._pairs = CalibratedPairs[RawPair]()
+        self._rectifier: StereoRectifier | None = None
+
+    @property
+    def infos(self) -> tuple[CameraInfo, CameraInfo] | None:
+        """Left and right camera info in use; None until both are known."""
+        return self._pairs.infos
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was dropped, by name."""
+        return {"pairs_without_camera_info": self._pairs.dropped}
+
+    def set_info(self, side: str, info: CameraInfo) -> None:
+        """Use a calibration of "left" or "right"."""
+        if self._pairs.set_info(side, CameraInfo(info.rectified, P=info.P) if self._rectified else info):
+            self._rectifier = None
+
+    def add(self, pair: RawPair) -> None:
+        """Take a pair; :meth:`ready` returns it rectified."""
+        self._pairs.add(pair)
+
+    def ready(self) -> Iterator[StereoImages]:
+        """The pairs whose calibration is known.
+
+        Raises
+        ------
+        ValueError
+            If the infos do not describe a stereo pair, or an image does not fit them; the pairs after it are kept.
+        """
+        while self.infos is not None and (pair := self._pairs.pop()) is not None:
+            if self._rectifier is None:
+                self._rectifier = StereoRectifier(*self.infos)
+            yield replace(self._rectifier(pair.stamp_ns, pair.left, pair.right), frame_id=pair.frame_id)
+
+    def reset(self) -> None:
+        """Forget what waits; the calibration stays."""
+        self._pairs.clear()
+
+
+@dataclass(frozen=True, eq=False)
+class ExtractedFrame:
+    """One instant whose keypoints are found but not yet measured: :meth:`FeatureStage.measure` does that."""
+
+    images: StereoImages | None
+    depth: DepthImage | None
+    keypoints: tuple[Keypoints, Keypoints] | None
+
+
+class FeatureStage:
+    """Brings pairs and depth images together as the mode asks, and finds features in them.
+
+    Parameters
+    ----------
+    frames
+        Knows where the depth camera sits beside the left one, in modes ``replace`` and ``fuse``.
+    """
+
+    def __init__(self, config: FrontendConfig, frames: FrameTree) -> None:
+        self._mode = config.mode
+        self._frames = frames
+        self._frontend = Frontend(config)
+        self._pairing = DepthPairing(config.fusion.max_age)
+        self._ready: deque[tuple[StereoImages | None, DepthImage | None]] = deque()
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was accepted and rejected, by name."""
+        return self._frontend.counters.counts
+
+    @property
+    def complaint(self) -> str:
+        """Why features lack depth that they should have, or ""."""
+        return self._pairing.complaint
+
+    def add_images(self, images: StereoImages) -> None:
+        """Take a rectified pair, which may have to wait for a depth image."""
+        if self._mode == "stereo":
+            self._ready.append((images, None))
+        elif self._mode != "tof":
+            self._ready += self._pairing.add_pair(images)
+
+    def add_depth(self, depth: DepthImage) -> None:
+        """Take a depth image."""
+        if self._mode == "tof":
+            self._ready.append((None, depth))
+        elif self._mode != "stereo":
+            self._ready += self._pairing.add_depth(depth)
+
+    def extracted(self) -> Iterator[ExtractedFrame]:
+        """What need not wait any more, with its keypoints, oldest first."""
+        while self._ready:
+            images, depth = self._ready.popleft()
+            yield ExtractedFrame(images, depth, self._frontend.extract(images))
+
+    def measure(self, frame: ExtractedFrame) -> Features:
+        """Features of an extracted frame, in the order of :meth:`extracted`; may run in another thread than that.
+
+        Raises
+        ------
+        ValueError
+            If the images contradict each other, or the mounting of the depth camera is not known.
+        """
+        images, depth = frame.images, frame.depth
+        T_left_tof = None
+        if images is not None and depth is not None:
+            T_left_tof = self._frames.lookup(images.frame_id, depth.frame_id)
+        features = self._frontend.measure(frame.keypoints, images, depth, T_left_tof)
+        source = images or depth
+        assert source is not None
+        return replace(features, frame_id=source.frame_id)
+
+    def give_up(self) -> None:
+        """Let go on what waits for a depth camera that a live node has not heard for long."""
+        self._ready += self._pairing.give_up()
+
+    def finish(self) -> None:
+        """The input has ended: nothing waits any more."""
+        self._ready += self._pairing.flush()
+
+    def reset(self) -> None:
+        """Forget thresholds, noise and what waits."""
+        self._frontend.reset()
+        self._pairing.clear()
+        self._ready.clear()

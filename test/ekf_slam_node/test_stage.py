@@ -1,0 +1,105 @@
+"""The filter's stage: the order of arrival does not matter, and a stream that dies stops nothing."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from feature_world import T_RIG_OPTICAL, loop, room
+
+from ekf_slam_node.results import TrackingState
+from ekf_slam_node.stage import IMU, MOTION, FilterConfig, FilterStage, FrameResult
+from slam_core.frame_tree import FrameTree
+from slam_core.geometry import invert_transform
+from slam_core.types import Features, ImuSample, RelativeMotion
+
+STEP_NS = 100_000_000
+FRAMES = 16
+
+
+@pytest.fixture(scope="module")
+def frames_and_motions() -> tuple[list[Features], list[RelativeMotion]]:
+    rng = np.random.default_rng(4)
+    world, poses = room(rng), loop(FRAMES)
+    frames = [world.features(T, (k + 1) * STEP_NS, rng)[0] for k, T in enumerate(poses)]
+    motions = [
+        RelativeMotion((k + 1) * STEP_NS, (k + 2) * STEP_NS, invert_transform(a) @ b, np.eye(6) * 1e-5)
+        for k, (a, b) in enumerate(pairwise(poses))
+    ]
+    return frames, motions
+
+
+def stage(frame_id: str, *wait_for: str, patience: int = 10) -> FilterStage:
+    tree = FrameTree()
+    tree.add("base_link", frame_id, T_RIG_OPTICAL)
+    tree.add("base_link", "imu_link", np.eye(4))
+    return FilterStage(FilterConfig(wait_for=wait_for, patience=patience), tree)
+
+
+def run(filter_stage: FilterStage, items: list[Features | RelativeMotion | ImuSample]) -> list[FrameResult]:
+    results = []
+    for item in items:
+        if isinstance(item, Features):
+            filter_stage.add_features(item)
+        elif isinstance(item, RelativeMotion):
+            filter_stage.add_motion(item.end_stamp_ns, item)
+        else:
+            filter_stage.add_imu(item)
+        results += list(filter_stage.ready())
+    filter_stage.give_up()
+    return results + list(filter_stage.ready())
+
+
+def stamp_of(item: Features | RelativeMotion | ImuSample) -> int:
+    return item.end_stamp_ns if isinstance(item, RelativeMotion) else item.stamp_ns
+
+
+def imu(stamps: range) -> list[ImuSample]:
+    return [ImuSample(s, np.array([0.0, 0.0, 0.01]), np.zeros(3), "imu_link") for s in stamps]
+
+
+@pytest.mark.parametrize("delay_ns", [0, 3 * STEP_NS, -3 * STEP_NS])
+def test_the_order_of_arrival_does_not_change_a_bit(frames_and_motions, delay_ns: int) -> None:
+    frames, motions = frames_and_motions
+    samples = imu(range(STEP_NS // 2, (FRAMES + 4) * STEP_NS, 7_000_000))
+    items = [*frames, *motions, *samples]
+    by_stamp = sorted(items, key=stamp_of)
+    motions_late = sorted(items, key=lambda i: stamp_of(i) + delay_ns * isinstance(i, RelativeMotion))
+    imu_late = sorted(items, key=lambda i: stamp_of(i) + delay_ns * isinstance(i, ImuSample))
+    expected = run(stage(frames[0].frame_id, MOTION, IMU), by_stamp)
+    for arrival in (motions_late, imu_late):
+        got = run(stage(frames[0].frame_id, MOTION, IMU), arrival)
+        assert len(got) == len(expected) == FRAMES
+        for a, b in zip(got, expected, strict=True):
+            np.testing.assert_array_equal(a.estimate.pose.T, b.estimate.pose.T)
+            np.testing.assert_array_equal(a.estimate.pose.covariance, b.estimate.pose.covariance)
+
+
+def test_a_source_of_motions_that_dies_degrades_and_is_used_again(frames_and_motions) -> None:
+    frames, motions = frames_and_motions
+    heard = motions[:3] + motions[11:]
+    filter_stage = stage(frames[0].frame_id, MOTION, patience=3)
+    results = run(filter_stage, sorted([*frames, *heard], key=stamp_of))
+    assert len(results) == FRAMES
+    states = [r.estimate.state for r in results]
+    assert set(states[:4]) == {TrackingState.OK}
+    assert states[8] is TrackingState.DEGRADED
+    assert "no motion since 0.400 s" in results[8].estimate.reason
+    assert states[-1] is TrackingState.OK
+    used = filter_stage.counters.counts
+    assert used["aids_used"] == len(heard)
+
+
+def test_a_source_of_motions_that_never_lived_delays_only_the_first_frames(frames_and_motions) -> None:
+    frames, _ = frames_and_motions
+    filter_stage, counts = stage(frames[0].frame_id, MOTION, patience=3), []
+    for frame in frames:
+        filter_stage.add_features(frame)
+        counts.append(len(list(filter_stage.ready())))
+    assert counts == [0, 0, 0, 4] + [1] * (FRAMES - 4)
+
+
+def test_an_unknown_stream_is_refused() -> None:
+    with pytest.raises(ValueError, match="may hold motion and imu, got wheels"):
+        FilterConfig(wait_for=("wheels",))
