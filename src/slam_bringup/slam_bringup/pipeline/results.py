@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from slam_core.evaluation import Evaluation, evaluate
 from slam_core.geometry import FloatArray
@@ -68,6 +69,7 @@ class RunResult:
     agents: tuple[AgentResult, ...]
     landmarks: LandmarkMap
     dense: Surface
+    floor_plans: tuple[FloorPlan, ...]
     submaps: int
     loop_closures: int
     frames: int
@@ -96,6 +98,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "landmarks": len(result.landmarks.positions),
         "dense_points": len(result.dense),
         "dense_triangles": len(result.dense.faces),
+        "free_floor_m2": [plan.free_m2 for plan in result.floor_plans],
         "submaps": result.submaps,
         "loop_closures": result.loop_closures,
         "path_length_m": sum(agent.trajectory.length_m for agent in result.agents),

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from sjsam_node.global_map import GlobalMap
 from slam_bringup.bags.sensor_bag import SensorBag
@@ -79,10 +80,12 @@ def run_result(
     agents = tuple(
         _agent_result(bag, agent, trajectories.get(agent, []), of_agent) for agent, of_agent in record.agents.items()
     )
-    surface, failure = Surface.empty(), record.failure
+    surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
     try:
         if dense:
-            surface = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading).surface()
+            model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading)
+            surface = model.surface()
+            plans = model.floor_plans(surface)
     except Exception as error:  # what was mapped is worth more than its picture
         failure = failure or told(error, "no dense model was made")
     landmarks = record.global_map.landmarks()
@@ -95,6 +98,7 @@ def run_result(
         agents=agents,
         landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings),
         dense=surface,
+        floor_plans=plans,
         submaps=record.submaps,
         loop_closures=record.loop_closures,
         frames=sum(len(s) for s in stamps),
