@@ -29,6 +29,8 @@ class AgentResult:
     scan_odometry: Trajectory = EMPTY_TRAJECTORY
     truth: Trajectory = EMPTY_TRAJECTORY
     feature_counts: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    rectification: Mapping[str, float | str] = field(default_factory=dict)
+    """What self-calibration found out about the stereo pair."""
 
     def evaluation(self, trajectory: Trajectory | None = None) -> Evaluation | None:
         """A trajectory (by default the smoothed one) against ground truth, or None where the two do not meet."""
@@ -117,6 +119,8 @@ def summarise(result: RunResult) -> dict[str, Any]:
             "path_length_m": first.scan_odometry.length_m,
             **_accuracy(first, first.scan_odometry),
         }
+    if first.rectification:
+        summary["rectification"] = dict(first.rectification)
     if len(first.filtered):
         summary["filtered"] = _accuracy(first, first.filtered)
     if len(result.agents) > 1:
