@@ -134,6 +134,15 @@ class PlanarEkf:
         self._move(W @ y)
         return UpdateReport(float(y @ y), len(y), True)
 
+    def innovation_nis(self, measured: FloatArray, slots: IndexArray) -> FloatArray:
+        """NIS (k,) of measurements (k, 2) of the landmarks ``slots`` (k,), each on its own; 2 degrees of freedom."""
+        z, _, joint = self._predicted(slots)
+        k = len(slots)
+        S = joint.reshape(k, 2, k, 2)[np.arange(k), :, np.arange(k)] + self._noise
+        innovation = measured - z
+        innovation[:, 1] = wrap(innovation[:, 1])
+        return np.asarray(np.einsum("ki,kij,kj->k", innovation, np.linalg.inv(S), innovation))
+
     def _predicted(self, slots: IndexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Measurements expected (k, 2), ``P H'`` and ``H P H'``."""
         z, J_pose, J_landmark = range_bearing(self.pose, self.landmarks[slots])

@@ -11,15 +11,18 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from ekf_slam_node.jcbb import IndexArray
-from ekf_slam_node.planar import POSE_DIM, PlanarConfig, move, place, range_bearing, turn, wrap
+from ekf_slam_node.planar import POSE_DIM, PlanarConfig, move, place, range_bearing, wrap
 from slam_core.geometry import FloatArray
-from slam_core.least_squares import LeastSquaresResult, levenberg_marquardt, whitening
+from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarGraph:
-    """Motions (n - 1, 3) between n poses with one covariance (3, 3); sightings: pose and landmark index (m,), z (m,
-    2).
+    """Paths of one or several robots and what they saw, all landmarks known by their index.
+
+    motions: (m, 3) from each pose to the next of the same robot; motion_covariance: one (3, 3), or each its own
+    (m, 3, 3). pose_index, landmark_index: who saw what, (k,); measured: range and bearing, (k, 2). starts: the pose at
+    which each robot's path begins; the poses of all robots are numbered through.
     """
 
     motions: FloatArray
@@ -27,6 +30,14 @@ class PlanarGraph:
     pose_index: IndexArray
     landmark_index: IndexArray
     measured: FloatArray
+    starts: tuple[int, ...] = (0,)
+
+    @property
+    def before(self) -> IndexArray:
+        """Pose that each motion starts at, (m,)."""
+        poses = len(self.motions) + len(self.starts)
+        ends = [start - 1 for start in (*self.starts[1:], poses)]
+        return np.setdiff1d(np.arange(poses), ends)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +50,8 @@ class PlanarMap:
 
 def initial_map(graph: PlanarGraph, first_pose: FloatArray) -> PlanarMap:
     """Dead reckoning, each landmark where it was first seen from."""
+    if len(graph.starts) > 1:
+        raise ValueError(f"{len(graph.starts)} paths need a start each: give smooth() an initial map")
     poses = [np.asarray(first_pose, dtype=np.float64)]
     for motion in graph.motions:
         poses.append(move(poses[-1], motion)[0])
@@ -47,9 +60,22 @@ def initial_map(graph: PlanarGraph, first_pose: FloatArray) -> PlanarMap:
     return PlanarMap(np.array(poses), np.array(landmarks))
 
 
-def smooth(graph: PlanarGraph, first_pose: FloatArray, config: PlanarConfig) -> tuple[PlanarMap, LeastSquaresResult]:
-    """The most likely poses and landmarks."""
-    return levenberg_marquardt(_Problem(graph, config), initial_map(graph, first_pose))
+def smooth(
+    graph: PlanarGraph,
+    first_pose: FloatArray,
+    config: PlanarConfig,
+    start: PlanarMap | None = None,
+    optimizer: LevenbergMarquardtConfig | None = None,
+) -> tuple[PlanarMap, LeastSquaresResult]:
+    """The most likely poses and landmarks, the first pose held fixed; from ``start``, or from dead reckoning."""
+    return levenberg_marquardt(_Problem(graph, config), start or initial_map(graph, first_pose), optimizer)
+
+
+def pose_covariances(graph: PlanarGraph, state: PlanarMap, config: PlanarConfig, poses: IndexArray) -> FloatArray:
+    """Marginal covariances (n, 3, 3) of some poses of a smoothed map; of the first pose zero."""
+    problem = _Problem(graph, config)
+    problem.linearize(state)
+    return problem.covariances(poses)
 
 
 def cost(graph: PlanarGraph, state: PlanarMap, config: PlanarConfig) -> float:
@@ -57,12 +83,20 @@ def cost(graph: PlanarGraph, state: PlanarMap, config: PlanarConfig) -> float:
     return _Problem(graph, config).cost(state)
 
 
+def sighting_nis(graph: PlanarGraph, state: PlanarMap, config: PlanarConfig) -> FloatArray:
+    """Squared whitened residual (k,) of every sighting, 2 degrees of freedom."""
+    error = _Problem(graph, config).sightings(state)
+    return np.asarray(np.sum(error**2, axis=1))
+
+
 class _Problem:
     """Whitened residuals, motions first, and their Jacobian without the first pose."""
 
     def __init__(self, graph: PlanarGraph, config: PlanarConfig) -> None:
         self._graph = graph
-        self._W = whitening(graph.motion_covariance)
+        covariance = np.broadcast_to(graph.motion_covariance, (len(graph.motions), POSE_DIM, POSE_DIM))
+        self._W = np.linalg.inv(np.linalg.cholesky(covariance))
+        self._before = graph.before
         self._sigma = np.array([config.sigma_range, config.sigma_bearing])
         self._H = sp.csc_matrix((0, 0))
         self._gradient = np.zeros(0)
@@ -71,16 +105,20 @@ class _Problem:
         motions, sightings = self._residuals(state)
         return float(np.sum(motions**2) + np.sum(sightings**2))
 
+    def sightings(self, state: PlanarMap) -> FloatArray:
+        """Whitened residuals (k, 2) of the sightings."""
+        return np.asarray(self._seen(state)[0] / self._sigma)
+
     def _residuals(self, state: PlanarMap) -> tuple[FloatArray, FloatArray]:
-        graph, before, after = self._graph, state.poses[:-1], state.poses[1:]
+        before, after = state.poses[self._before], state.poses[self._before + 1]
         c, s = np.cos(before[:, 2]), np.sin(before[:, 2])
         step = after[:, :2] - before[:, :2]
         error = np.column_stack(
             [c * step[:, 0] + s * step[:, 1], -s * step[:, 0] + c * step[:, 1], after[:, 2] - before[:, 2]]
         )
-        error -= graph.motions
+        error -= self._graph.motions
         error[:, 2] = wrap(error[:, 2])
-        return error @ self._W.T, self._seen(state)[0] / self._sigma
+        return np.einsum("kij,kj->ki", self._W, error), self.sightings(state)
 
     def _seen(self, state: PlanarMap) -> tuple[FloatArray, FloatArray, FloatArray]:
         graph = self._graph
@@ -102,17 +140,18 @@ class _Problem:
         return self._gradient
 
     def _motion_jacobian(self, state: PlanarMap) -> sp.spmatrix:
-        n = len(state.poses) - 1
-        before, after = np.empty((n, 3, 3)), np.empty((n, 3, 3))
-        for k, (a, b) in enumerate(zip(state.poses[:-1], state.poses[1:], strict=True)):
-            Rt = turn(a[2]).T
-            J = np.eye(3)
-            J[:2, :2] = Rt
-            after[k] = self._W @ J
-            J = -J
-            J[:2, 2] = np.array([[0.0, 1.0], [-1.0, 0.0]]) @ Rt @ (b - a)[:2]
-            before[k] = self._W @ J
-        return self._blocks(before, np.arange(n), state) + self._blocks(after, np.arange(1, n + 1), state)
+        n = len(self._before)
+        start, end = state.poses[self._before], state.poses[self._before + 1]
+        c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
+        Rt = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
+        after = np.tile(np.eye(POSE_DIM), (n, 1, 1))
+        after[:, :2, :2] = Rt
+        before = -after
+        moved = np.einsum("kij,kj->ki", Rt, (end - start)[:, :2])
+        before[:, 0, 2], before[:, 1, 2] = moved[:, 1], -moved[:, 0]
+        return self._blocks(self._W @ before, self._before, state) + self._blocks(
+            self._W @ after, self._before + 1, state
+        )
 
     def _sighting_jacobian(self, state: PlanarMap) -> sp.spmatrix:
         _, J_pose, J_landmark = self._seen(state)
@@ -140,6 +179,19 @@ class _Problem:
             return None
         step = factor.solve(-self._gradient)
         return np.asarray(step) if np.isfinite(step).all() else None
+
+    def covariances(self, poses: IndexArray) -> FloatArray:
+        """Blocks (n, 3, 3) of the inverse of the information at the last linearisation."""
+        factor = splu(self._H, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        out = np.zeros((len(poses), POSE_DIM, POSE_DIM))
+        for k, pose in enumerate(np.asarray(poses)):
+            if pose == 0:
+                continue
+            rows = POSE_DIM * (pose - 1) + np.arange(POSE_DIM)
+            unit = np.zeros((self._H.shape[0], POSE_DIM))
+            unit[rows, np.arange(POSE_DIM)] = 1.0
+            out[k] = factor.solve(unit)[rows]
+        return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
 
     def retract(self, state: PlanarMap, step: FloatArray) -> PlanarMap:
         split = POSE_DIM * (len(state.poses) - 1)

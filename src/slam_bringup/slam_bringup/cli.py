@@ -22,6 +22,7 @@ COMMANDS = {
     "record": "record ROS topics to a bag",
     "register": "align two point clouds (pcd, ply, vtk)",
     "join": "join text submaps of the Linear SLAM format",
+    "plane": "2D SLAM on range-bearing logs of one or several robots",
     "evaluate": "ATE, RPE and NEES of a trajectory against ground truth",
     "experiment": "the experiments of the thesis, beside its own figures",
     "calibrate": "camera_info with uncertainties from pictures of a board",

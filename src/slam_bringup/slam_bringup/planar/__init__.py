@@ -1,0 +1,1 @@
+"""Range-bearing logs of robots in the plane: read, mapped by EKF, SAM or joined submaps, compared with the truth."""
