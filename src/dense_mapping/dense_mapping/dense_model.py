@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dense_mapping.keyframes import Keyframe, KeyframeConfig, KeyframeSelector, make_keyframe
+from dense_mapping.floor_plan import FloorPlan, FloorPlanConfig, floor_plans
+from dense_mapping.keyframes import KeyframeConfig, KeyframeSelector, PlacedKeyframe, make_keyframe
 from dense_mapping.stereo_depth import StereoDepthConfig
 from dense_mapping.surface import Surface, SurfaceConfig, extract_surface
 from dense_mapping.tsdf import TsdfConfig, TsdfVolume
@@ -44,15 +45,7 @@ class DenseConfig(Config):
     stereo: StereoDepthConfig = group(StereoDepthConfig)
     tsdf: TsdfConfig = group(TsdfConfig)
     surface: SurfaceConfig = group(SurfaceConfig)
-
-
-@dataclass(eq=False)
-class PlacedKeyframe:
-    """A key frame of ``camera`` with the pose T_map_camera at which it is in the field."""
-
-    camera: str
-    keyframe: Keyframe
-    T_map_camera: FloatArray
+    floor_plan: FloorPlanConfig = group(FloorPlanConfig)
 
 
 class DenseModel:
@@ -74,6 +67,7 @@ class DenseModel:
         self.volume = TsdfVolume(self.config.tsdf)
         self._selectors: dict[str, KeyframeSelector] = {}
         self._placed: list[PlacedKeyframe] = []
+        self._specific_force = np.zeros(3)
 
     @property
     def keyframes(self) -> tuple[PlacedKeyframe, ...]:
@@ -107,6 +101,15 @@ class DenseModel:
     def surface(self) -> Surface:
         """The mesh of all key frames."""
         return extract_surface(self.volume, self.config.surface)
+
+    def add_specific_force(self, force: FloatArray) -> None:
+        """Take an accelerometer's reading (3,) m/s2, turned into the map frame: on the whole it points up."""
+        self._specific_force += force
+
+    def floor_plans(self, surface: Surface) -> tuple[FloorPlan, ...]:
+        """Plans of all storeys, lowest first; ``surface`` is that of :meth:`surface`."""
+        gravity_up = self._specific_force if self._specific_force.any() else None
+        return floor_plans(surface, self._placed, self.config.floor_plan, gravity_up)
 
     def _put(self, placed: PlacedKeyframe) -> None:
         k = placed.keyframe

@@ -76,6 +76,15 @@ class Keyframe:
         return self.sigma_units.astype(np.float32) * np.float32(_SIGMA_UNIT)
 
 
+@dataclass(eq=False)
+class PlacedKeyframe:
+    """A key frame of ``camera`` with the pose T_map_camera at which it is in the field."""
+
+    camera: str
+    keyframe: Keyframe
+    T_map_camera: FloatArray
+
+
 def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray | None = None) -> Keyframe:
     """The key frame of a depth image; ``picture`` (h, w) or (h, w, 3) uint8, by default the amplitude as grey."""
     if picture is None and image.amplitude is not None:

@@ -50,6 +50,10 @@ class RosTypes(MessageTypes):
         octets.frombytes(memoryview(np.ascontiguousarray(values).reshape(-1).view(np.uint8)))
         return octets
 
+    def signed_octets(self, values: AnyArray) -> Any:
+        """``array.array('b')``, for the same reason."""
+        return array.array("b", np.ascontiguousarray(values, dtype=np.int8).tobytes())
+
 
 def declare_config(node: Node, config_type: type[C], prefix: str = "", ignore: tuple[str, ...] = ()) -> C:
     """Declare every parameter of ``config_type`` and return the configuration with the values set from outside.

@@ -80,6 +80,10 @@ class RefinedDisparity:
         """Which alignments are trusted."""
         return np.isfinite(self.disparity)
 
+    def select(self, index: npt.NDArray[np.intp]) -> RefinedDisparity:
+        """The alignments at ``index``."""
+        return RefinedDisparity(*(getattr(self, field.name)[index] for field in dataclasses.fields(self)))
+
     @staticmethod
     def joined(first: RefinedDisparity, second: RefinedDisparity) -> RefinedDisparity:
         """The alignments of both, one after the other."""
@@ -88,18 +92,24 @@ class RefinedDisparity:
 
 
 def refine_disparity(
-    left: ByteArray, right: ByteArray, uv_left: Float32Array, u_right: Float32Array, config: DisparityConfig
+    left: ByteArray,
+    right: ByteArray,
+    uv_left: Float32Array,
+    u_right: Float32Array,
+    config: DisparityConfig,
+    row_offset: Float32Array | None = None,
 ) -> RefinedDisparity:
-    """Disparity of keypoints (n, 2) of the left image whose partners lie near column ``u_right`` (n,) of the same
-    row.
+    """Disparity of keypoints (n, 2) of the left image whose partners lie near column ``u_right`` (n,), ``row_offset``
+    (n,) px lower; by default on the same row, as rectified pairs should be.
     """
-    found = _align(left, right, uv_left, u_right, config.radius, config)
+    row_offset = np.zeros(len(uv_left), np.float32) if row_offset is None else row_offset
+    found = _align(left, right, uv_left, u_right, row_offset, config.radius, config)
     partner = uv_left - np.column_stack([found.disparity, -found.row_shift])
-    back = _align(right, left, partner, uv_left[:, 0], config.radius, config)
+    back = _align(right, left, partner, uv_left[:, 0], -row_offset, config.radius, config)
     there_and_back = found.disparity + back.disparity
     agrees = np.abs(there_and_back) <= config.max_disagreement * found.sigma
     u_inner = np.where(agrees, partner[:, 0], np.float32(np.nan))
-    inner = _align(left, right, uv_left, u_inner, config.inner_radius, config)
+    inner = _align(left, right, uv_left, u_inner, row_offset, config.inner_radius, config)
     inner_outer = found.disparity - inner.disparity
     agrees &= np.abs(inner_outer) <= config.max_disagreement * inner.sigma
     disagreement = _DISAGREEMENT_WEIGHT * np.hypot(there_and_back, inner_outer)
@@ -109,13 +119,19 @@ def refine_disparity(
 
 
 def _align(
-    template: ByteArray, image: ByteArray, uv: Float32Array, u_start: Float32Array, radius: int, config: DisparityConfig
+    template: ByteArray,
+    image: ByteArray,
+    uv: Float32Array,
+    u_start: Float32Array,
+    row_offset: Float32Array,
+    radius: int,
+    config: DisparityConfig,
 ) -> RefinedDisparity:
     """One pass over all patches of ``template``, (n, 2) px; NaN positions stay NaN."""
     slope = 1.0 / config.slope_sigma**2
     information = np.array([0.0, 1.0 / config.row_sigma**2, slope, slope])
     out = np.full((len(uv), 5), np.nan, np.float32)
-    align_patches(template, image, uv, u_start, radius, config.max_shift, information, out)
+    align_patches(template, image, uv, u_start, row_offset, radius, config.max_shift, information, out)
     out[~(out[:, 2] >= config.min_correlation)] = np.nan
     disparity, variance, correlation, row_shift, row_variance = out.T
     sigma = np.sqrt(config.sigma_scale**2 * variance + config.sigma_floor**2).astype(np.float32)

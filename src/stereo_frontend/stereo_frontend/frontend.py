@@ -8,8 +8,9 @@ sees them (11.2). ``fuse``: both depths weighted by their variances (11.4).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from stereo_frontend.disparity import DisparityConfig, RefinedDisparity, refine_
 from stereo_frontend.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.matching import (
+    Matches,
     MatchingConfig,
     disparity_bounds,
     has_candidate,
@@ -30,7 +32,9 @@ from stereo_frontend.matching import (
     swapped_share,
 )
 from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
+from stereo_frontend.self_calibration import SelfCalibrationConfig, StereoSelfCalibration
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
+from stereo_frontend.two_view_consistency import StereoView
 
 MODES = ("stereo", "tof", "replace", "fuse")
 _FEW_TRUSTED = 0.1
@@ -54,8 +58,17 @@ class FrontendConfig(Config):
     matching: MatchingConfig = group(MatchingConfig)
     disparity: DisparityConfig = group(DisparityConfig)
     noise: PixelNoiseConfig = group(PixelNoiseConfig)
+    self_calibration: SelfCalibrationConfig = group(SelfCalibrationConfig)
     fusion: FusionConfig = group(FusionConfig)
     tof: TofFeatureConfig = group(TofFeatureConfig)
+
+
+@dataclass(frozen=True)
+class FrontendReport:
+    """What the front end knows of its images: figures of the rectification, and advice to the user, a sentence each."""
+
+    rectification: Mapping[str, float | str] = field(default_factory=dict)
+    advice: tuple[str, ...] = ()
 
 
 def _more(config: FeatureConfig, factor: float) -> FeatureConfig:
@@ -75,6 +88,8 @@ class Frontend:
         self._left = FeatureExtractor(self.config.features)
         self._right = FeatureExtractor(_more(self.config.features, self.config.right_surplus))
         self._noise = PixelNoise(self.config.noise)
+        self.self_calibration = StereoSelfCalibration(self.config.self_calibration)
+        self._wide = self.self_calibration.widened(self.config.matching)
         self._tof = TofFeatures(self.config.tof, self.config.features, self.config.noise)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="second_core")
 
@@ -94,10 +109,9 @@ class Frontend:
             return None
         if images is None:
             raise ValueError(f"mode '{self.config.mode}' needs a stereo pair, got none")
-        matching = self.config.matching
-        bounds = disparity_bounds(matching, images.stereo.camera.fx * images.stereo.baseline)
+        bounds = disparity_bounds(self.config.matching, images.stereo.camera.fx * images.stereo.baseline)
         left = self._pool.submit(self._left, images.left)
-        right = self._right(images.right, lambda uv, size: has_candidate(left.result(), uv, size, matching, bounds))
+        right = self._right(images.right, lambda uv, size: has_candidate(left.result(), uv, size, self._wide, bounds))
         return left.result(), right
 
     def measure(
@@ -144,35 +158,77 @@ class Frontend:
 
     def reset(self) -> None:
         """Forget thresholds, noise and counts."""
-        for part in (self._left, self._right, self._noise, self._tof):
+        for part in (self._left, self._right, self._noise, self.self_calibration, self._tof):
             part.reset()
         self.counters = Counters()
 
+    def report(self) -> FrontendReport:
+        """What was found out about the images so far."""
+        advice = self.self_calibration.advice()
+        return FrontendReport(self.self_calibration.figures(), (advice,) if advice else ())
+
     def _stereo_depth(self, images: StereoImages, left: Keypoints, right: Keypoints) -> DepthEstimate:
-        focal_baseline = images.stereo.camera.fx * images.stereo.baseline
+        stereo, calibration = images.stereo, self.self_calibration
+        focal_baseline = stereo.camera.fx * stereo.baseline
         bounds = disparity_bounds(self.config.matching, focal_baseline)
-        matches = match_stereo(left, right, self.config.matching, bounds)
-        uv = left.uv[matches.left]
-        partner = right.uv[matches.right]
-        refined = self._refine(images, uv, partner[:, 0])
-        if refined.valid.sum() < _FEW_TRUSTED * len(left):
+        matches = self._match(images, left, right, bounds)
+        uv, partner = left.uv[matches.left], right.uv[matches.right]
+        row_error = calibration.rows(partner, uv[:, 0] - partner[:, 0])
+        refined = self._refine(images, uv, partner[:, 0], row_error)
+        trusted = refined.valid
+        if trusted.sum() < _FEW_TRUSTED * len(left):
             self._reject_swapped(left, right, bounds)
-        self._noise.learn((uv - partner)[refined.valid, 1], left.size[matches.left][refined.valid])
-        self._noise.learn_rectification(refined.row_shift[refined.valid], refined.row_sigma[refined.valid])
-        sigma = np.hypot(refined.sigma, self._noise.rectification_sigma)
-        disparity = np.where(refined.disparity >= bounds[0], refined.disparity, np.nan).astype(np.float64)
+        size = left.size[matches.left]
+        self._noise.learn((uv - partner)[trusted, 1] + row_error[trusted], size[trusted])
+        self._noise.learn_rectification((refined.row_shift - row_error)[trusted], refined.row_sigma[trusted])
+        correction, correction_sigma = calibration.columns(partner)
+        disparity = refined.disparity + correction
+        disparity[~(disparity >= bounds[0])] = np.nan
         disparity[~has_company(uv, disparity, self.config.matching.neighbours)] = np.nan
+        sigma = np.sqrt(refined.sigma**2 + self._noise.rectification_sigma**2 + correction_sigma**2)
         estimate = DepthEstimate.unknown(len(left))
-        estimate.depth[matches.left] = images.stereo.depth_from_disparity(disparity)
+        estimate.depth[matches.left] = stereo.depth_from_disparity(disparity)
         estimate.sigma[matches.left] = focal_baseline / disparity**2 * sigma
         self._count(left, right, len(matches), int(np.isfinite(disparity).sum()))
+        kept = np.flatnonzero(np.isfinite(disparity))
+        calibration.learn(self._view(images, left.select(matches.left[kept]), refined.select(kept)))
         return estimate
 
-    def _refine(self, images: StereoImages, uv: Float32Array, u_right: Float32Array) -> RefinedDisparity:
+    def _match(self, images: StereoImages, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> Matches:
+        """Matches along the rows as they are; those of a first pair are found out with a wider band."""
+        calibration = self.self_calibration
+        if not calibration.knows(images.stereo.camera):
+            wide = match_stereo(left, right, self._wide, bounds)
+            calibration.acquire(self._view_of_keypoints(images, left.select(wide.left), right.select(wide.right)))
+        error = calibration.rows(right.uv, np.zeros(len(right)))
+        aligned = dataclasses.replace(right, uv=right.uv - np.column_stack([np.zeros_like(error), error]))
+        return match_stereo(left, aligned, self.config.matching, bounds)
+
+    def _view(self, images: StereoImages, left: Keypoints, refined: RefinedDisparity) -> StereoView:
+        """What self-calibration learns from."""
+        r = refined
+        measured = (left.uv, r.disparity, r.sigma, r.row_shift, r.row_sigma, self._noise.sigma(left.size))
+        return StereoView(images.stereo, left.descriptors, *(np.asarray(v, np.float64) for v in measured))
+
+    def _view_of_keypoints(self, images: StereoImages, left: Keypoints, right: Keypoints) -> StereoView:
+        """The same of keypoints alone, before any alignment of patches."""
+        difference, sigma = left.uv - right.uv, self._noise.sigma(left.size)
+        unaligned = RefinedDisparity(difference[:, 0], sigma, np.ones_like(sigma), -difference[:, 1], sigma)
+        return self._view(images, left, unaligned)
+
+    def _refine(
+        self, images: StereoImages, uv: Float32Array, u_right: Float32Array, row_error: Float32Array
+    ) -> RefinedDisparity:
         """Half of the matches on each of two threads."""
-        half, config = len(uv) // 2, self.config.disparity
-        later = self._pool.submit(refine_disparity, images.left, images.right, uv[half:], u_right[half:], config)
-        first = refine_disparity(images.left, images.right, uv[:half], u_right[:half], config)
+
+        def part(which: slice) -> RefinedDisparity:
+            return refine_disparity(
+                images.left, images.right, uv[which], u_right[which], self.config.disparity, row_error[which]
+            )
+
+        half = len(uv) // 2
+        later = self._pool.submit(part, slice(half, None))
+        first = part(slice(half))
         return RefinedDisparity.joined(first, later.result())
 
     def _with_tof(

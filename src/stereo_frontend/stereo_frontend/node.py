@@ -113,6 +113,10 @@ class FeatureNode(SlamNode[FrontendConfig]):
 
     def _report(self, number: int) -> None:
         self.health.take(self.stage.counters | self.pairs.counters)
+        report = self.stage.report()
+        for name, value in report.rectification.items():
+            self.health.show(f"rectification_{name}", value)
+        self.health.show("advice", "; ".join(report.advice))
         few = f"only {number} features" if number < FEW_FEATURES else ""
         complaint = few or self.stage.complaint
         self.health.set(State.DEGRADED if complaint else State.OK, complaint)

@@ -18,13 +18,13 @@ _ONE = np.uintp(1)
 
 
 @njit(cache=True, nogil=True)
-def align_patches(left, right, uv_left, u_right, radius, max_shift, information, out):  # type: ignore[no-untyped-def]
+def align_patches(left, right, uv_left, u_right, row_offset, radius, max_shift, information, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (n, 5): disparity, its variance, correlation, row shift, its variance; NaN where it fails.
 
     Variances come from residual and curvature.
 
     The unknowns ``p`` are corrections of the right patch: shift in u, shift in v, slopes of the shift in u along u and
-    v. ``information`` (4,) is their prior's.
+    v. ``information`` (4,) is their prior's, ``row_offset`` (n,) px the row shift at which its mean lies.
     """
     n = (2 * radius + 1) ** 2
     template, patch = np.empty(n, np.float32), np.empty(n, np.float32)
@@ -42,7 +42,7 @@ def align_patches(left, right, uv_left, u_right, radius, max_shift, information,
         p[:] = 0.0
         length = 1.0
         for _ in range(_MOST_ITERATIONS):
-            power = _sample_patch(right, u, v, u_right[k], p, radius, line, patch)
+            power = _sample_patch(right, u, v, u_right[k], row_offset[k], p, radius, line, patch)
             if power < _LEAST_ENERGY * n or abs(p[0]) > max_shift:
                 break
             noise, correlation = _right_hand_side(template, patch, jacobian, energy, power, step)
@@ -55,7 +55,7 @@ def align_patches(left, right, uv_left, u_right, radius, max_shift, information,
                 out[k, 0] = u - u_right[k] - p[0]
                 noise *= _correlation_factor(patch, radius)
                 out[k, 2] = correlation
-                out[k, 3] = p[1]
+                out[k, 3] = row_offset[k] + p[1]
                 for i in range(2):
                     out[k, 1 + 3 * i] = noise * _diagonal_of_inverse(normal, i)
                 break
@@ -95,8 +95,9 @@ def _take_template(image, u, v, radius, template, jacobian):  # type: ignore[no-
 
 
 @njit(cache=True, nogil=True)
-def _sample_patch(image, u, v, u_right, p, radius, line, patch):  # type: ignore[no-untyped-def]
-    """Right patch under the correction ``p``, bilinear, mean removed; returns its energy, 0 at the border.
+def _sample_patch(image, u, v, u_right, row_offset, p, radius, line, patch):  # type: ignore[no-untyped-def]
+    """Right patch, ``row_offset`` px lower and under the correction ``p``, bilinear, mean removed; returns its energy,
+    0 at the border.
 
     ``line`` is room for a row of the image.
     """
@@ -106,7 +107,7 @@ def _sample_patch(image, u, v, u_right, p, radius, line, patch):  # type: ignore
     reach = radius * stretch
     n = 0
     for j in range(-radius, radius + 1):
-        y = v0 + j + p[1]
+        y = v0 + j + row_offset + p[1]
         y0 = int(np.floor(y))
         middle = u_right + (u0 - u) + p[0] + p[2] * (u0 - u) + p[3] * (v0 + j - v)
         if reach <= 0.0 or middle < reach or middle + reach >= width - 1 or y0 < 0 or y0 >= height - 1:

@@ -15,7 +15,7 @@ from slam_core.frame_tree import FrameTree
 from slam_core.types import DepthImage, Features, StereoImages
 from stereo_frontend.calibrated_pairs import CalibratedPairs
 from stereo_frontend.depth_pairing import DepthPairing
-from stereo_frontend.frontend import Frontend, FrontendConfig
+from stereo_frontend.frontend import Frontend, FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.rectify import StereoRectifier
 from stereo_frontend.sources import RawPair
@@ -101,6 +101,10 @@ class FeatureStage:
     def counters(self) -> dict[str, int]:
         """What was accepted and rejected, by name."""
         return self._frontend.counters.counts
+
+    def report(self) -> FrontendReport:
+        """What the front end found out about the images so far."""
+        return self._frontend.report()
 
     @property
     def complaint(self) -> str:

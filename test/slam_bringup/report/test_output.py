@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult
 from slam_bringup.report.output import write_results
@@ -32,6 +33,14 @@ def plate() -> Surface:
     return Surface(points, normals, colours, np.full(4, 0.01, dtype=np.float32), faces)
 
 
+def corridor() -> FloorPlan:
+    """A corridor of 4 m between two walls, its ends not yet seen."""
+    cells = np.full((40, 80), -1, dtype=np.int8)
+    cells[10:30, 5:75] = 0
+    cells[[9, 30], 5:75] = 100
+    return FloorPlan(cells, 0.05, np.eye(4))
+
+
 @pytest.fixture
 def result(rng) -> RunResult:
     truth = circle()
@@ -42,7 +51,7 @@ def result(rng) -> RunResult:
         bag="circle", mode="stereo", mapper="sjsam", odometry="none",
         agents=(AgentResult("", noisy, truth=truth, feature_counts=np.full(80, 250)),),
         landmarks=LandmarkMap(positions, covariances, np.full(200, 5)),
-        dense=plate(),
+        dense=plate(), floor_plans=(corridor(),),
         submaps=4, loop_closures=1, frames=80, dropped={"features without depth": 2}, rejections={"outlier": 3},
         sensor_s=8.0, wall_s=2.0,
         stage_ms={"features": [40.0] * 80, "ekf": [8.0] * 80}, events=("12.3 s: <lost>",),
@@ -54,7 +63,7 @@ def test_all_files_are_written_and_agree(result, tmp_path):
     names = {p.name for p in tmp_path.iterdir()}
     assert {
         "summary.json", "trajectory.tum", "trajectory_covariance.csv", "ground_truth.tum", "landmarks.ply", "map.ply",
-        "mesh.ply", "mesh.glb",
+        "mesh.ply", "mesh.glb", "floor_plan.yaml", "floor_plan.pgm",
         "map", "map.png", "report.html",
     } == names  # fmt: skip
     assert json.loads((tmp_path / "summary.json").read_text()) == json.loads(json.dumps(summary))
@@ -65,7 +74,7 @@ def test_all_files_are_written_and_agree(result, tmp_path):
     )
     html = (tmp_path / "report.html").read_text()
     assert "&lt;lost&gt;" in html
-    assert html.count("data:image/png;base64") == 4
+    assert html.count("data:image/png;base64") == 5
 
 
 def test_the_same_result_gives_the_same_bytes(result, tmp_path):
@@ -79,7 +88,7 @@ def test_the_same_result_gives_the_same_bytes(result, tmp_path):
 def test_a_run_without_anything_still_has_its_files(tmp_path):
     empty = RunResult(
         "empty", "stereo", "sjsam", "none", (AgentResult("", Trajectory.from_estimates([])),), LandmarkMap.empty(),
-        Surface.empty(), 0, 0, 0, {}, {}, 0.0, 0.0, {},
+        Surface.empty(), (), 0, 0, 0, {}, {}, 0.0, 0.0, {},
     )  # fmt: skip
     summary = write_results(tmp_path, empty)
     assert summary["end_error_m"] is None

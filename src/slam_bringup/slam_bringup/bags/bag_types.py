@@ -34,6 +34,10 @@ class BagTypes(MessageTypes):
         """A flat uint8 view of the array."""
         return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
 
+    def signed_octets(self, array: AnyArray) -> Any:
+        """A flat int8 array."""
+        return np.ascontiguousarray(array, dtype=np.int8).reshape(-1)
+
 
 def _make(type_name: str, **given: Any) -> Any:
     fields = {}

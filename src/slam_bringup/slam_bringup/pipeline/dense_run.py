@@ -9,7 +9,7 @@ import numpy as np
 from dense_mapping.dense_model import DenseConfig, DenseModel
 from dense_mapping.keyframes import grey_levels
 from dense_mapping.stereo_depth import stereo_depth
-from slam_bringup.bags.readings import AgentSensors, DepthReading, Reading, StereoReading
+from slam_bringup.bags.readings import AgentSensors, DepthReading, ImuReading, Reading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
@@ -65,6 +65,10 @@ class AgentDepth:
                 self._depth.add(reading.raw)
                 for image in self._depth.ready():
                     model.add(camera, T, image, self._picture(image))
+        elif isinstance(reading, ImuReading):
+            T_map_base = self._pose(reading.sample.stamp_ns)
+            if T_map_base is not None:
+                model.add_specific_force(T_map_base[:3, :3] @ reading.sample.linear_acceleration)
         elif isinstance(reading, StereoReading) and self._stereo is not None:
             for camera, T in self._wanted(model, "stereo", reading.stamp_ns, self._T_base_left):
                 self._stereo.add(reading.pair)
@@ -75,13 +79,17 @@ class AgentDepth:
         self, model: DenseModel, sensor: str, stamp_ns: int, T_base_camera: FloatArray
     ) -> Iterator[tuple[str, FloatArray]]:
         """Name and pose T_map_camera if the stamp lies within the trajectory and its pose makes a key frame."""
+        T_map_base = self._pose(stamp_ns)
+        camera = f"{self._agent}/{sensor}"
+        if T_map_base is not None and model.wants(camera, T_map_base @ T_base_camera):
+            yield camera, T_map_base @ T_base_camera
+
+    def _pose(self, stamp_ns: int) -> FloatArray | None:
+        """T_map_base at a stamp, or None outside the trajectory."""
         stamps = self._trajectory.stamps_ns
         if not stamps[0] <= stamp_ns <= stamps[-1]:
-            return
-        T = self._trajectory.interpolate(np.array([stamp_ns]))[0] @ T_base_camera
-        camera = f"{self._agent}/{sensor}"
-        if model.wants(camera, T):
-            yield camera, T
+            return None
+        return np.asarray(self._trajectory.interpolate(np.array([stamp_ns]))[0])
 
     def _picture(self, image: DepthImage) -> ByteArray | None:
         """A ToF amplitude is no picture where stereo gives one: two kinds of grey on one wall are blotches."""

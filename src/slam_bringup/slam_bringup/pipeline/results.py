@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from slam_core.evaluation import Evaluation, evaluate
 from slam_core.geometry import FloatArray
@@ -28,6 +29,8 @@ class AgentResult:
     scan_odometry: Trajectory = EMPTY_TRAJECTORY
     truth: Trajectory = EMPTY_TRAJECTORY
     feature_counts: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    rectification: Mapping[str, float | str] = field(default_factory=dict)
+    """What self-calibration found out about the stereo pair."""
 
     def evaluation(self, trajectory: Trajectory | None = None) -> Evaluation | None:
         """A trajectory (by default the smoothed one) against ground truth, or None where the two do not meet."""
@@ -68,6 +71,7 @@ class RunResult:
     agents: tuple[AgentResult, ...]
     landmarks: LandmarkMap
     dense: Surface
+    floor_plans: tuple[FloorPlan, ...]
     submaps: int
     loop_closures: int
     frames: int
@@ -96,6 +100,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "landmarks": len(result.landmarks.positions),
         "dense_points": len(result.dense),
         "dense_triangles": len(result.dense.faces),
+        "free_floor_m2": [plan.free_m2 for plan in result.floor_plans],
         "submaps": result.submaps,
         "loop_closures": result.loop_closures,
         "path_length_m": sum(agent.trajectory.length_m for agent in result.agents),
@@ -114,6 +119,8 @@ def summarise(result: RunResult) -> dict[str, Any]:
             "path_length_m": first.scan_odometry.length_m,
             **_accuracy(first, first.scan_odometry),
         }
+    if first.rectification:
+        summary["rectification"] = dict(first.rectification)
     if len(first.filtered):
         summary["filtered"] = _accuracy(first, first.filtered)
     if len(result.agents) > 1:

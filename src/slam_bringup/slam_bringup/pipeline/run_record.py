@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from sjsam_node.global_map import GlobalMap
 from slam_bringup.bags.sensor_bag import SensorBag
@@ -16,6 +17,7 @@ from slam_bringup.pipeline.dense_run import dense_model
 from slam_bringup.pipeline.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
+from stereo_frontend.frontend import FrontendReport
 
 _LOG = logging.getLogger(__name__)
 
@@ -36,12 +38,15 @@ class StateChanges:
 
 @dataclass(frozen=True, eq=False)
 class AgentRecord:
-    """What was said of one agent, frame by frame; ``events`` are changes of its filter's state."""
+    """What was said of one agent, frame by frame; ``events`` are changes of its filter's state, ``front_end`` what its
+    images told.
+    """
 
     filtered: Sequence[PoseEstimate] = field(default_factory=list)
     scans: Sequence[PoseEstimate] = field(default_factory=list)
     feature_counts: Sequence[int] = field(default_factory=list)
     events: Sequence[str] = field(default_factory=list)
+    front_end: FrontendReport = field(default_factory=FrontendReport)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +64,11 @@ class RunRecord:
     events: tuple[str, ...] = ()
     solver: str = ""
     failure: str = ""
+
+    def with_front_ends(self, reports: Mapping[str, FrontendReport]) -> RunRecord:
+        """The same with what the agents' front ends report, by agent."""
+        agents = {agent: replace(record, front_end=reports[agent]) for agent, record in self.agents.items()}
+        return replace(self, agents=agents)
 
 
 def run_result(
@@ -79,10 +89,12 @@ def run_result(
     agents = tuple(
         _agent_result(bag, agent, trajectories.get(agent, []), of_agent) for agent, of_agent in record.agents.items()
     )
-    surface, failure = Surface.empty(), record.failure
+    surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
     try:
         if dense:
-            surface = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading).surface()
+            model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading)
+            surface = model.surface()
+            plans = model.floor_plans(surface)
     except Exception as error:  # what was mapped is worth more than its picture
         failure = failure or told(error, "no dense model was made")
     landmarks = record.global_map.landmarks()
@@ -95,6 +107,7 @@ def run_result(
         agents=agents,
         landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings),
         dense=surface,
+        floor_plans=plans,
         submaps=record.submaps,
         loop_closures=record.loop_closures,
         frames=sum(len(s) for s in stamps),
@@ -124,8 +137,10 @@ def _agent_result(bag: SensorBag, agent: str, poses: Sequence[PoseEstimate], rec
         scan_odometry=Trajectory.from_estimates(record.scans),
         truth=bag.ground_truth(agent) or EMPTY_TRAJECTORY,
         feature_counts=np.array(record.feature_counts, dtype=np.int64),
+        rectification=record.front_end.rectification,
     )
 
 
 def _events(agents: Mapping[str, AgentRecord]) -> list[str]:
-    return [f"{name}: {event}" if name else event for name, record in agents.items() for event in record.events]
+    said = [(name, (*record.front_end.advice, *record.events)) for name, record in agents.items()]
+    return [f"{name}: {event}" if name else event for name, events in said for event in events]

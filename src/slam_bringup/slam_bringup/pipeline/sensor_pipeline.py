@@ -15,6 +15,7 @@ from slam_bringup.bags.readings import AgentSensors, DepthReading, ImuReading, R
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.types import Features, ImuSample
+from stereo_frontend.frontend import FrontendReport
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
 from tof_driver.stage import DepthStage
 
@@ -73,6 +74,10 @@ class SensorPipeline:
             return item
         with self._times.measure("features"):
             return self._item(self._features.measure(item.value))
+
+    def front_end(self) -> FrontendReport:
+        """What the front end found out about the images."""
+        return self._features.report()
 
     def _on_imu(self, sample: ImuSample) -> Iterator[AgentItem]:
         yield self._item(sample)

@@ -16,7 +16,9 @@ from slam_bringup.processes.interrupt import STOPPED
 from slam_bringup.processes.online_run import OnlineRun, unclean_ends
 from slam_core.messages import estimate_from_message
 from slam_core.types import PoseEstimate
+from stereo_frontend.frontend import FrontendReport
 
+_FIGURES = "rectification_"
 _LOSSES = ("lost_by_transport", "rejected", "unpaired")
 
 
@@ -75,9 +77,25 @@ def collect(
             stage_ms=recording.stage_ms,
             events=tuple([STOPPED] * run.stopped + unclean_ends(run)),
         )
+        record = record.with_front_ends({agent: _front_end(agent, run.diagnostics) for agent in opened.agents})
         # Who wants the end now does not want to wait for the dense model.
         result = run_result(opened, config, record, mapper=mapper, odometry=odometry, dense=not run.stopped)
     return result, global_map
+
+
+def _front_end(agent: str, diagnostics: dict[str, dict[str, str]]) -> FrontendReport:
+    """What the last diagnostics of an agent's ``feature_extractor`` say of its images."""
+    values = diagnostics.get(_topic(agent, "feature_extractor"), {})
+    figures = {key.removeprefix(_FIGURES): text for key, text in values.items() if key.startswith(_FIGURES)}
+    advice = tuple(text for text in values.get("advice", "").split("; ") if text)
+    return FrontendReport({key: _number(text) for key, text in figures.items()}, advice)
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _losses(diagnostics: dict[str, dict[str, str]]) -> dict[str, int]:

@@ -11,10 +11,12 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
+from dense_mapping.floor_plan import FREE, OCCUPIED, FloorPlan
+from dense_mapping.navigation import frontiers
 from slam_bringup.pipeline.results import AgentResult, RunResult
 from slam_core.evaluation import align, associate
 from slam_core.files import atomic_path
-from slam_core.geometry import FloatArray, boxminus
+from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
 
 matplotlib.use("Agg")
 
@@ -113,6 +115,31 @@ def _limit_to_content(axes: Axes, result: RunResult) -> None:
     margin = 0.5
     axes.set_xlim(path[:, 0].min() - margin, path[:, 0].max() + margin)
     axes.set_ylim(path[:, 1].min() - margin, path[:, 1].max() + margin)
+
+
+def floor_plan_figure(result: RunResult, plan: FloorPlan) -> Figure:
+    """A storey from above with the trajectories, and where nobody has looked yet (frontiers)."""
+    figure = Figure(figsize=(10, 8), layout="constrained")
+    axes = figure.add_subplot()
+    rows, columns = plan.cells.shape
+    shades = np.select([plan.cells == FREE, plan.cells == OCCUPIED], [255, 30], 200).astype(np.uint8)
+    extent = (0.0, columns * plan.resolution, 0.0, rows * plan.resolution)
+    axes.imshow(shades, cmap="gray", vmin=0, vmax=255, origin="lower", extent=extent, interpolation="nearest")
+    T_plan_map = invert_transform(plan.T_map_plan)
+    for agent, colour in zip(result.agents, COLOURS * len(result.agents), strict=False):
+        if len(agent.trajectory):
+            path = transform_points(T_plan_map, agent.trajectory.poses[:, :3, 3])
+            axes.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.4, label=agent.name or "trajectory")
+    borders = [f.point for f in frontiers(plan)]
+    if borders:
+        x, y, _ = transform_points(T_plan_map, np.stack(borders)).T
+        axes.scatter(x, y, s=22, c=COLOURS[0], marker="o", label="not yet seen behind", zorder=4)
+    axes.set_xlabel("x of the plan [m]")
+    axes.set_ylabel("y of the plan [m]")
+    axes.set_title(f"{plan.free_m2:.1f} m² seen free, cells of {100 * plan.resolution:.0f} cm")
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper right", framealpha=0.9)
+    return figure
 
 
 def matched_poses(agent: AgentResult, alignment: str = "se3") -> tuple[FloatArray, FloatArray, FloatArray] | None:

@@ -1,8 +1,8 @@
 """The files of a run, the same for ``slam run`` and ``slam nodes``.
 
 ``summary.json``, ``trajectory.tum`` (map frame, rig poses), ``trajectory_covariance.csv``, ``landmarks.ply``,
-``map.ply`` (dense points), ``mesh.ply`` and ``mesh.glb``, ``map/`` (loadable map), ``map.png``, ``report.html`` and
-``result.mcap``. With several agents each has its
+``map.ply`` (dense points), ``mesh.ply`` and ``mesh.glb``, ``floor_plan.yaml`` and ``.pgm`` (Nav2), ``map/`` (loadable
+map), ``map.png``, ``report.html`` and ``result.mcap``. With several agents each has its
 own ``trajectory_<agent>.tum``; ``trajectory.tum`` is then the first one's.
 """
 
@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from dense_mapping.floor_plan import FloorPlan
+from dense_mapping.plan_io import write_plan
 from dense_mapping.surface_io import write_glb, write_mesh, write_points
 from slam_bringup.pipeline.results import AgentResult, RunResult, summarise
 from slam_bringup.report.figures import map_figure, save_png
@@ -37,6 +39,7 @@ def write_results(out: Path, result: RunResult, save_map: Callable[[Path], objec
     write_points(out / "map.ply", result.dense)
     write_mesh(out / "mesh.ply", result.dense)
     write_glb(out / "mesh.glb", result.dense)
+    _write_plans(out, result.floor_plans)
     if save_map is not None:
         save_map(out / "map")
     summary = summarise(result)
@@ -44,6 +47,12 @@ def write_results(out: Path, result: RunResult, save_map: Callable[[Path], objec
     write_report(out / "report.html", result, summary)
     atomic_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
     return summary
+
+
+def _write_plans(out: Path, plans: tuple[FloorPlan, ...]) -> None:
+    """``floor_plan.yaml`` and its image; of several storeys one each, from the lowest: ``floor_plan_0.yaml`` ..."""
+    for number, plan in enumerate(plans):
+        write_plan(out / (f"floor_plan_{number}.yaml" if len(plans) > 1 else "floor_plan.yaml"), plan)
 
 
 def _write_trajectories(out: Path, agents: tuple[AgentResult, ...]) -> None:

@@ -12,7 +12,7 @@ import jinja2
 from matplotlib.figure import Figure
 
 from slam_bringup.pipeline.results import RunResult
-from slam_bringup.report.figures import error_figure, features_figure, map_figure, timing_figure
+from slam_bringup.report.figures import error_figure, features_figure, floor_plan_figure, map_figure, timing_figure
 from slam_core.files import atomic_text
 
 
@@ -33,7 +33,11 @@ def write_report(path: Path, result: RunResult, summary: dict[str, Any]) -> None
         for agent in result.agents
     ]
     html = template.render(
-        summary=summary, agents=agents, map=_embedded(map_figure(result)), timing=_embedded(timing_figure(result))
+        summary=summary,
+        agents=agents,
+        map=_embedded(map_figure(result)),
+        timing=_embedded(timing_figure(result)),
+        plans=[_embedded(floor_plan_figure(result, plan)) for plan in result.floor_plans],
     )
     atomic_text(path, html)
 

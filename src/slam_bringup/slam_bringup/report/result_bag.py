@@ -17,6 +17,7 @@ from slam_core.messages import (
     ellipsoid_markers,
     header_message,
     landmark_cloud,
+    occupancy_message,
     odometry_message,
     path_message,
     points_message,
@@ -87,6 +88,8 @@ def _map_messages(result: RunResult, stamp: int) -> list[_Stamped]:
             _TYPES, header, landmarks.positions, landmarks.covariances, ids, landmarks.sightings.astype(np.int32))),
         (stamp, "/map/ellipsoids", ellipsoid_markers(_TYPES, header, landmarks.positions, landmarks.covariances, ids)),
         (stamp, "/map/cloud", points_message(_TYPES, header, result.dense.points)),
+        *((stamp, "/map/occupancy", occupancy_message(
+            _TYPES, header, plan.cells, plan.resolution, plan.T_map_plan)) for plan in result.floor_plans[:1]),
     ]  # fmt: skip
 
 

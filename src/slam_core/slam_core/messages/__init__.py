@@ -18,6 +18,7 @@ from slam_core.messages.clouds import (
 )
 from slam_core.messages.depth import DEPTH_TOPICS, DepthMessages, depth_from_messages, depth_messages
 from slam_core.messages.features import FEATURE_TOPICS, FeatureMessages, features_from_messages, features_messages
+from slam_core.messages.grids import occupancy_from_message, occupancy_message
 from slam_core.messages.images import (
     compressed_image_message,
     grey_from_message,
@@ -77,6 +78,8 @@ __all__ = [
     "motion_from_message",
     "motion_message",
     "ns_from_time",
+    "occupancy_from_message",
+    "occupancy_message",
     "odometry_message",
     "path_from_message",
     "path_marker",

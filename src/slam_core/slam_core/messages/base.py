@@ -15,7 +15,7 @@ MESSAGE_PACKAGES = {
         "TransformStamped", "PoseWithCovariance", "PoseWithCovarianceStamped", "TwistWithCovariance",
     ),
     "sensor_msgs": ("Image", "CompressedImage", "CameraInfo", "PointCloud2", "PointField", "Imu"),
-    "nav_msgs": ("Odometry", "Path"),
+    "nav_msgs": ("Odometry", "Path", "OccupancyGrid", "MapMetaData"),
     "visualization_msgs": ("Marker", "MarkerArray"),
     "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),
     "rosgraph_msgs": ("Clock",),
@@ -45,6 +45,10 @@ class MessageTypes(ABC):
     @abstractmethod
     def octets(self, array: AnyArray) -> Any:
         """The bytes of an array as the library wants them in a ``uint8[]`` field."""
+
+    @abstractmethod
+    def signed_octets(self, array: AnyArray) -> Any:
+        """An int8 array as the library wants it in an ``int8[]`` field."""
 
 
 def ns_from_time(time: Message) -> int:

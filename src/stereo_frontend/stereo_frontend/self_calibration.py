@@ -1,0 +1,195 @@
+"""``stereo_self_calibration``: learns what the rectification of a pair is wrong by, and corrects for it where sure.
+
+Row differences of matches give the field across the rows; pairs of moments the field along them
+(:mod:`stereo_frontend.two_view_consistency`). Both are evidence on the same ten numbers
+(:mod:`stereo_frontend.rectification_error`) and add up as normal equations.
+
+Errors within a frame, and of a landmark over frames, are not independent. So the covariance is not that of the normal
+equations alone, but the sandwich estimate over groups of moments (White 1980; Liang and Zeger 1986), drawn towards the
+former while there are few groups.
+
+The rows are followed from the first frame on. Disparities are corrected only when the evidence is beyond doubt: a
+correction without need harms.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slam_core.camera import Camera
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray
+from slam_core.types import AnyArray, Float32Array
+from stereo_frontend.matching import MatchingConfig
+from stereo_frontend.rectification_error import PRIOR_SIGMA, RectificationError
+from stereo_frontend.two_view_consistency import (
+    NormalEquations,
+    StereoView,
+    consistency_equations,
+    match_views,
+    row_equations,
+)
+
+_GROUP = 4
+"""Consecutive pieces of evidence that are not independent: they share keypoints."""
+_FEW = 30
+"""Fewer matches say nothing."""
+_HYSTERESIS = 0.5
+"""A correction stays until what asks for it falls below this share of what it took to begin."""
+_PRIOR_GROUPS = 5.0
+"""Weight of the normal equations' own covariance, in groups."""
+
+
+@dataclass(frozen=True)
+class SelfCalibrationConfig(Config):
+    """When to learn and when to believe it."""
+
+    mode: str = parameter("auto", "correct where the evidence asks for it, or never", choices=("auto", "off"))
+    min_chi_square: float = parameter(
+        36.0, "evidence against a perfect calibration from which disparities are corrected", minimum=1.0
+    )
+    min_row_error: float = parameter(
+        0.25, "row differences, root mean square over the image, from which rows are corrected", unit="px", minimum=0.0
+    )
+    min_moments: int = parameter(4, "pairs of moments needed before disparities are corrected", minimum=2)
+    min_parallax: float = parameter(
+        8.0, "median motion of keypoints between two moments that are compared", unit="px", minimum=0.5
+    )
+    memory: int = parameter(400, "pairs of moments remembered", minimum=10)
+    row_floor: float = parameter(0.1, "standard deviation of a perfect match's row difference", unit="px", minimum=0.01)
+    row_reach: float = parameter(
+        2.0, "row difference looked for beyond the epipolar band while the rows are not known", unit="px", minimum=0.0
+    )
+    min_similarity: float = parameter(
+        0.85, "least scalar product of two moments' descriptors", minimum=0.0, maximum=1.0
+    )
+    max_ratio: float = parameter(0.8, "most ratio of the best to the second-best distance", minimum=0.1, maximum=1.0)
+
+
+class StereoSelfCalibration:
+    """Takes the matches of pair after pair; :attr:`error` is the estimate, :attr:`corrects` whether it is sure."""
+
+    def __init__(self, config: SelfCalibrationConfig | None = None) -> None:
+        self.config = config or SelfCalibrationConfig()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.error: RectificationError | None = None
+        self.corrects_rows = self.corrects = False
+        self._reference: StereoView | None = None
+        self._evidence: deque[NormalEquations] = deque(maxlen=self.config.memory)
+        self._moments = 0
+
+    # ---- what is known
+    def widened(self, matching: MatchingConfig) -> MatchingConfig:
+        """The matching for images whose rows are not known yet, and for keypoints that are found before that."""
+        reach = 0.0 if self.config.mode == "off" else self.config.row_reach
+        return replace(matching, epipolar_band=matching.epipolar_band + reach)
+
+    def knows(self, camera: Camera) -> bool:
+        """Whether the rows of this camera's pair are known, or not asked for."""
+        return self.config.mode == "off" or (self.error is not None and self.error.camera == camera)
+
+    def rows(self, uv_right: Float32Array, disparity: AnyArray) -> Float32Array:
+        """Error (n,) px across the rows at pixels (n, 2) of the right image; zeros where it is small or in doubt."""
+        if self.error is None or not self.corrects_rows:
+            return np.zeros(len(uv_right), np.float32)
+        return self.error.rows(uv_right, disparity).astype(np.float32)
+
+    def columns(self, uv_right: Float32Array) -> tuple[FloatArray, FloatArray]:
+        """What to add to disparities (n,) px and its standard deviation (n,) px; zeros while there is doubt."""
+        if self.error is None or not self.corrects:
+            return np.zeros(len(uv_right)), np.zeros(len(uv_right))
+        return self.error.columns(uv_right), self.error.column_sigma(uv_right)
+
+    def figures(self) -> dict[str, float | str]:
+        """What is known, for a summary; empty before the first pair."""
+        if self.error is None:
+            return {}
+        return {
+            "row_error_px": self.error.row_rms(),
+            "disparity_error_px": self.error.column_rms(),
+            "disparity_error_sigma_px": self.error.column_sigma_rms(),
+            "corrected": ", ".join(["rows"] * self.corrects_rows + ["disparities"] * self.corrects) or "nothing",
+        }
+
+    def advice(self) -> str:
+        """What a user should know and do about it, or ""."""
+        if self.error is None or not (self.corrects_rows or self.corrects):
+            return ""
+        text = f"rectification off by {self.error.row_rms():.1f} px across the rows"
+        if self.corrects:
+            sigma = self.error.column_sigma_rms()
+            text += f" and {self.error.column_rms():.2f} +- {sigma:.2f} px along them, corrected"
+        return f"{text}: recalibrate, or slam calibrate refine"
+
+    # ---- what tells of it
+    def acquire(self, view: StereoView) -> None:
+        """Learn the rows of a first pair, matched with a wide band; starts anew."""
+        self.reset()
+        if self.config.mode == "off":
+            return
+        unknown = RectificationError.unknown(view.stereo.camera)
+        rows = [row_equations(view, unknown, self.config.row_floor)] if len(view) >= _FEW else []
+        self._settle(_estimate(rows, unknown.camera))
+
+    def learn(self, view: StereoView) -> None:
+        """Take in the matches of one pair; disparities and rows as measured, without any correction."""
+        if self.error is None or len(view) < _FEW:
+            return
+        if self._reference is None:
+            self._take(view, row_equations(view, self.error, self.config.row_floor))
+            return
+        rows, columns = match_views(self._reference, view, self.config.min_similarity, self.config.max_ratio)
+        first, second = self._reference.select(rows), view.select(columns)
+        stays = len(rows) >= _FEW and np.median(np.linalg.norm(first.uv - second.uv, axis=1)) < self.config.min_parallax
+        if stays:
+            return
+        evidence = row_equations(view, self.error, self.config.row_floor)
+        consistency = consistency_equations(first, second, self.error)
+        if consistency is not None:
+            evidence = evidence + consistency
+            self._moments += 1
+        self._take(view, evidence)
+
+    def _take(self, view: StereoView, evidence: NormalEquations) -> None:
+        self._reference = view
+        self._evidence.append(evidence)
+        self._settle(_estimate(list(self._evidence), view.stereo.camera))
+
+    def _settle(self, error: RectificationError) -> None:
+        self.error = error
+        slack = _HYSTERESIS if self.corrects_rows else 1.0
+        rows = error.row_rms()
+        self.corrects_rows = rows > slack * self.config.min_row_error and rows > slack * self._doubt(
+            error.row_sigma_rms()
+        )
+        slack = _HYSTERESIS if self.corrects else 1.0
+        enough = self._moments >= self.config.min_moments
+        self.corrects = enough and error.column_rms() > slack * self._doubt(error.column_sigma_rms())
+
+    def _doubt(self, sigma: float) -> float:
+        """What an error of standard deviation ``sigma`` must exceed to be believed."""
+        return float(np.sqrt(self.config.min_chi_square)) * sigma
+
+
+def _estimate(evidence: list[NormalEquations], camera: Camera) -> RectificationError:
+    """The solution of all normal equations, with the sandwich covariance."""
+    if not evidence:
+        return RectificationError.unknown(camera)
+    information = np.array([e.information for e in evidence])
+    vectors = np.array([e.vector for e in evidence])
+    total = np.diag(1.0 / PRIOR_SIGMA**2) + information.sum(axis=0)
+    theta = np.linalg.solve(total, vectors.sum(axis=0))
+    scores = np.add.reduceat(vectors - information @ theta, np.arange(0, len(evidence), _GROUP), axis=0)
+    lower = np.linalg.cholesky(total)
+    whitened = np.linalg.solve(lower, scores.T)
+    ratio, axes = np.linalg.eigh(whitened @ whitened.T)
+    share = len(scores) / (len(scores) + _PRIOR_GROUPS)
+    # What scatters more than the equations claim is believed; what by chance scatters less is not.
+    half = np.linalg.solve(lower.T, axes) * np.sqrt(1.0 + share * np.maximum(ratio - 1.0, 0.0))
+    return RectificationError(camera, theta, half @ half.T)

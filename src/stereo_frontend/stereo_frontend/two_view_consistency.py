@@ -1,0 +1,185 @@
+"""What two moments say of the error of a stereo pair: the same points, measured twice, must fit one rigid motion.
+
+Every match of a keypoint from one frame to the next is measured as (u, v, disparity) twice. Disparities that a wrong
+calibration bends make the scene change its shape while the camera moves. The adjustment solves for the motion and the
+ten numbers of :mod:`stereo_frontend.rectification_error` together, robustly, and eliminates the motion: what remains
+are normal equations in the calibration, which add up over frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from slam_core.camera import StereoCamera
+from slam_core.geometry import FloatArray, make_transform, skew, so3_exp
+from slam_core.types import Float32Array
+from stereo_frontend.rectification_error import RectificationError, column_basis, row_basis
+
+_ITERATIONS = 6
+_ROBUST_SCALE = 9.0
+"""Squared residual, in its variance, at which a match has half its weight (Cauchy)."""
+_RANSAC_PX = 3.0
+_LEAST_INLIERS = 15
+_LEAST_DISPARITY = 0.1
+_MEDIAN_CHI_SQUARE_1, _MEDIAN_CHI_SQUARE_3 = 0.455, 2.366
+"""Of one and of three degrees of freedom."""
+
+
+@dataclass(frozen=True, eq=False)
+class StereoView:
+    """Matches of one stereo pair: uv (n, 2) px left, disparity (n,) px as measured with sigma (n,) px, row_shift (n,)
+    px right minus left with row_sigma (n,) px, sigma_uv (n,) px, descriptors (n, d).
+    """
+
+    stereo: StereoCamera
+    descriptors: Float32Array
+    uv: FloatArray
+    disparity: FloatArray
+    sigma: FloatArray
+    row_shift: FloatArray
+    row_sigma: FloatArray
+    sigma_uv: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    @property
+    def uv_right(self) -> FloatArray:
+        """Pixels (n, 2) of the partners in the right image."""
+        return self.uv - np.column_stack([self.disparity, -self.row_shift])
+
+    def select(self, index: npt.NDArray[np.intp]) -> StereoView:
+        """The matches at ``index``."""
+        names = ("uv", "disparity", "sigma", "row_shift", "row_sigma", "sigma_uv", "descriptors")
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """``information @ parameters = vector`` of one piece of evidence, (10, 10) and (10,)."""
+
+    information: FloatArray
+    vector: FloatArray
+
+    def __add__(self, other: NormalEquations) -> NormalEquations:
+        return NormalEquations(self.information + other.information, self.vector + other.vector)
+
+
+def match_views(first: StereoView, second: StereoView, min_similarity: float, max_ratio: float) -> tuple[
+    npt.NDArray[np.intp], npt.NDArray[np.intp]
+]:  # fmt: skip
+    """Indices (k,) of the matches of both that look alike: mutually best, and better than the second best."""
+    if not len(first) or not len(second) or first.descriptors.shape[1] != second.descriptors.shape[1]:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    similarity = first.descriptors @ second.descriptors.T
+    best, rows = similarity.argmax(axis=1), np.arange(len(first))
+    value = similarity[rows, best]
+    mutual = similarity.argmax(axis=0)[best] == rows
+    similarity[rows, best] = -1.0
+    distinct = (1.0 - value) <= max_ratio**2 * (1.0 - similarity.max(axis=1))
+    found = np.flatnonzero(mutual & distinct & (value >= min_similarity))
+    return found, best[found]
+
+
+def consistency_equations(first: StereoView, second: StereoView, known: RectificationError) -> NormalEquations | None:
+    """Evidence of matched views (equal length, match by match) on the calibration; None without a motion they share.
+
+    ``known`` is where the search starts and holds it; its information is not part of the result.
+    """
+    T = _first_motion(first, second, known)
+    if T is None:
+        return None
+    prior = np.linalg.inv(known.covariance)
+    theta = known.parameters
+    noise = 1.0
+    for _ in range(_ITERATIONS):
+        residual, J_motion, J_theta, covariance = _linearised(first, second, T, theta, known)
+        weight = np.linalg.inv(covariance)
+        squares = np.einsum("ni,nij,nj->n", residual, weight, residual)
+        noise = max(1.0, float(np.median(squares)) / _MEDIAN_CHI_SQUARE_3)
+        weight *= (1.0 / noise / (1.0 + squares / noise / _ROBUST_SCALE))[:, None, None]
+        H_mm, H_mt, H_tt = (np.einsum("nia,nij,njb->ab", a, weight, b) for a, b in (
+            (J_motion, J_motion), (J_motion, J_theta), (J_theta, J_theta)))  # fmt: skip
+        g_m, g_t = (np.einsum("nia,nij,nj->a", a, weight, residual) for a in (J_motion, J_theta))
+        if np.linalg.cond(H_mm) > 1e12:
+            return None
+        eliminate = np.linalg.solve(H_mm, H_mt).T
+        information, gradient = H_tt - eliminate @ H_mt, g_t - eliminate @ g_m
+        at = theta
+        step = np.linalg.solve(information + prior, -gradient + prior @ (known.parameters - theta))
+        theta = theta + step
+        turn = np.linalg.solve(H_mm, -(g_m + H_mt @ step))
+        T = make_transform(so3_exp(turn[3:]) @ T[:3, :3], T[:3, 3] + turn[:3])
+    return NormalEquations(0.5 * (information + information.T), information @ at - gradient)
+
+
+def row_equations(view: StereoView, known: RectificationError, floor_px: float) -> NormalEquations:
+    """Evidence of the row differences of one pair, robust; ``floor_px`` is the noise of a perfect match."""
+    basis = known.camera.fx * _row_jacobian(view)
+    variance = view.row_sigma**2 + floor_px**2
+    prior = np.linalg.inv(known.covariance)
+    theta: FloatArray = known.parameters
+    for _ in range(_ITERATIONS):
+        squares = (view.row_shift - basis @ theta) ** 2 / variance
+        noise = max(1.0, float(np.median(squares)) / _MEDIAN_CHI_SQUARE_1)
+        weighted = basis * (1.0 / (noise * variance) / (1.0 + squares / noise / _ROBUST_SCALE))[:, None]
+        evidence = NormalEquations(basis.T @ weighted, weighted.T @ view.row_shift)
+        theta = np.asarray(np.linalg.solve(evidence.information + prior, evidence.vector + prior @ known.parameters))
+    return evidence
+
+
+def _row_jacobian(view: StereoView) -> FloatArray:
+    c = view.stereo.camera
+    return row_basis((view.uv_right - [c.cx, c.cy]) / [c.fx, c.fy], view.disparity / c.fx)
+
+
+def _first_motion(first: StereoView, second: StereoView, known: RectificationError) -> FloatArray | None:
+    """``T_second_first`` by P3P and RANSAC; OpenCV seeds it the same every time."""
+    if len(first) < _LEAST_INLIERS:
+        return None
+    camera = first.stereo.camera
+    disparity = np.maximum(first.disparity + known.columns(first.uv_right), _LEAST_DISPARITY)
+    depth = first.stereo.depth_from_disparity(disparity)
+    ok, rotation, translation, inliers = cv2.solvePnPRansac(
+        camera.unproject(first.uv, depth), second.uv, camera.K, None, reprojectionError=_RANSAC_PX,
+        iterationsCount=200, flags=cv2.SOLVEPNP_P3P,
+    )  # fmt: skip
+    if not ok or inliers is None or len(inliers) < _LEAST_INLIERS:
+        return None
+    turn, shift = (np.asarray(v, np.float64).ravel() for v in (rotation, translation))
+    return make_transform(so3_exp(turn), shift)
+
+
+def _linearised(
+    first: StereoView, second: StereoView, T: FloatArray, theta: FloatArray, known: RectificationError
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Residuals (n, 3) px of (u, v, disparity), Jacobians by motion (n, 3, 6) and calibration (n, 3, 10), covariance
+    (n, 3, 3).
+    """
+    c, fb = first.stereo.camera, first.stereo.camera.fx * first.stereo.baseline
+    basis1, basis2 = (c.fx * column_basis((v.uv_right - [c.cx, c.cy]) / [c.fx, c.fy]) for v in (first, second))
+    d1 = np.maximum(first.disparity + basis1 @ theta, _LEAST_DISPARITY)
+    d2 = second.disparity + basis2 @ theta
+    points = c.unproject(first.uv, fb / d1) @ T[:3, :3].T
+    moved = points + T[:3, 3]
+    w = 1.0 / np.maximum(moved[:, 2], 1e-3)
+    predicted = np.column_stack([c.fx * moved[:, 0] * w + c.cx, c.fy * moved[:, 1] * w + c.cy, fb * w])
+    J = np.zeros((len(first), 3, 3))
+    J[:, 0, 0], J[:, 0, 2] = c.fx * w, -c.fx * moved[:, 0] * w * w
+    J[:, 1, 1], J[:, 1, 2] = c.fy * w, -c.fy * moved[:, 1] * w * w
+    J[:, 2, 2] = -fb * w * w
+    J_motion = np.concatenate([-J, J @ skew(points)], axis=2)
+    along = np.einsum("nij,nj->ni", J, points) * (-1.0 / d1)[:, None]
+    J_theta = -along[:, :, None] * basis1[:, None, :]
+    J_theta[:, 2] += basis2
+    covariance = along[:, :, None] * along[:, None, :] * np.square(first.sigma)[:, None, None]
+    pixel = first.sigma_uv**2 + second.sigma_uv**2
+    covariance[:, 0, 0] += pixel
+    covariance[:, 1, 1] += pixel
+    covariance[:, 2, 2] += second.sigma**2
+    residual = np.column_stack([second.uv, d2]) - predicted
+    return residual, J_motion, J_theta, covariance

@@ -1,0 +1,144 @@
+"""Floor plans of a simulated flat: walls where they are, free where one can walk, unknown where nobody looked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dense_mapping.dense_model import DenseModel
+from dense_mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
+from dense_mapping.levelling import floor_heights, level_transform, up_direction
+from dense_mapping.navigation import frontiers, way
+from slam_core.camera import Camera
+from slam_core.geometry import OPTICAL_FROM_RIG, boxplus, make_transform, rotation_from_euler, so3_exp
+from slam_core.types import DepthImage
+from slam_simulation.raycaster import camera_rays, make_view, trace
+from slam_simulation.scenario import Scenario
+from slam_simulation.surface_table import compile_world
+
+CAMERA = Camera(160, 120, 80.0, 80.0, 79.5, 59.5)
+FLAT = {
+    "seed": 5, "rate": 10.0, "frames": 10,
+    "rooms": [
+        {"name": "a", "x": [0, 4], "y": [0, 3], "style": "office"},
+        {"name": "b", "x": [4.2, 8], "y": [0, 3], "style": "office"},
+    ],
+    "doorways": [{"at": [4.1, 1.5], "width": 1.0}],
+    "agents": [{"motion": "rig", "height": 1.2, "path": [[1, 1], [3, 2, 90]]}],
+}  # fmt: skip
+
+
+def flat_model(stations: list[tuple[float, float]], tilt: np.ndarray | None = None) -> DenseModel:
+    """A model from full turns at some places; the whole map tilted by a rotation vector."""
+    table, rays = compile_world(Scenario.from_mapping("flat", FLAT).world()), camera_rays(CAMERA)
+    T_map_world = make_transform(so3_exp(np.zeros(3) if tilt is None else tilt), np.zeros(3))
+    model = DenseModel()
+    for x, y in stations:
+        for k in range(10):
+            R = rotation_from_euler(2 * np.pi * k / 10, 0.3) @ OPTICAL_FROM_RIG.T
+            T = make_transform(R, np.array([x, y, 1.2]))
+            depth = trace(make_view(table, T, rays.bounds), rays).depth
+            depth = np.where(depth > 0, depth, np.nan).astype(np.float32)
+            model.add("tof", T_map_world @ T, DepthImage(k, depth, np.full_like(depth, 0.01), CAMERA))
+    return model
+
+
+def value_at(plan: FloorPlan, *points: tuple[float, float, float]) -> list[int]:
+    rows, columns = plan.cell_of(np.array(points)).T
+    return plan.cells[rows, columns].tolist()
+
+
+@pytest.fixture(scope="module")
+def both_rooms() -> DenseModel:
+    return flat_model([(1.5, 1.5), (3.2, 1.5), (4.1, 1.5), (6.0, 1.5)])
+
+
+def plan_of(model: DenseModel) -> FloorPlan:
+    (plan,) = model.floor_plans(model.surface())
+    return plan
+
+
+def test_walls_are_occupied_rooms_and_the_door_free_and_outside_unknown(both_rooms):
+    plan = plan_of(both_rooms)
+    assert value_at(plan, (1.5, 1.5, 0), (6.0, 1.5, 0), (4.1, 1.5, 0)) == [FREE] * 3
+    row, column = plan.cell_of(np.array([[4.0, 0.5, 0]]))[0]
+    near_wall = plan.cells[row, column - 1 : column + 2]
+    assert OCCUPIED in near_wall
+    assert plan.cells[0, 0] == UNKNOWN
+    assert 12.0 < plan.free_m2 < 23.4, "23.4 m2 is both rooms without furniture"
+
+
+def test_a_room_nobody_entered_is_a_frontier_at_its_door():
+    plan = plan_of(flat_model([(1.5, 1.5), (2.5, 1.5)]))
+    beyond = sum(f.length for f in frontiers(plan) if f.point[0] > 4.0)
+    assert beyond > 1.0
+    assert way(plan, np.array([1.5, 1.5, 0]), frontiers(plan)[0].point) is not None, "and one can go there to look"
+
+
+def test_a_room_that_was_looked_into_everywhere_has_less_of_a_border(both_rooms):
+    one = sum(f.length for f in frontiers(plan_of(flat_model([(1.5, 1.5), (2.5, 1.5)]))) if f.point[0] > 4.0)
+    both = sum(f.length for f in frontiers(plan_of(both_rooms)) if f.point[0] > 4.0)
+    assert both < one
+
+
+def test_the_way_out_leads_through_the_door_and_through_no_wall(both_rooms):
+    plan = plan_of(both_rooms)
+    found = way(plan, np.array([6.0, 1.5, 1.2]), np.array([1.5, 1.5, 1.2]))
+    assert found is not None
+    assert 4.4 <= found.length < 6.0
+    assert set(value_at(plan, *map(tuple, found.points))) == {FREE}
+    at_door = found.points[np.argmin(np.abs(found.points[:, 0] - 4.1))]
+    assert 1.0 < at_door[1] < 2.0
+    assert found.clearance >= 0.1
+
+
+def test_there_is_no_way_through_what_nobody_has_seen():
+    plan = plan_of(flat_model([(1.0, 1.5)]))
+    assert way(plan, np.array([1.0, 1.5, 0]), np.array([7.5, 0.5, 0])) is None
+
+
+def test_a_map_that_starts_tilted_is_levelled_by_its_floor():
+    tilt = np.array([0.15, -0.1, 0.0])
+    plan = plan_of(flat_model([(1.5, 1.5)], tilt))
+    up = so3_exp(tilt)[:, 2]
+    assert np.degrees(np.arccos(plan.T_map_plan[:3, 2] @ up)) < 0.3
+    assert abs(plan.height_of((so3_exp(tilt) @ [1.5, 1.5, 0.0])[None])[0]) < 0.03
+
+
+def test_gravity_is_believed_where_there_is_no_level_surface():
+    model = flat_model([(1.5, 1.5)])
+    empty = DenseModel().surface()
+    np.testing.assert_allclose(up_direction(empty, np.array([[0.3, 0, 1.0]]), np.array([0, 0, 9.81])), [0, 0, 1])
+    for _ in range(50):
+        model.add_specific_force(np.array([0.05, 0.0, 9.8]))
+    assert plan_of(model).T_map_plan[2, 2] > 0.9999
+
+
+def test_two_storeys_are_two_floors():
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(0, 5, (4000, 2)), rng.normal(0, 0.01, 4000)])
+    table = np.column_stack([rng.uniform(0, 1, (500, 2)), rng.normal(0.75, 0.01, 500)])
+    points = np.concatenate([floor, table, floor + np.array([0, 0, 3.0])])
+    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    cameras = np.array([[1, 1, 1.3], [2, 2, 2.5], [1, 1, 4.3]])
+    np.testing.assert_allclose(floor_heights(points, normals, cameras, 2.0, 1.3), [0.0, 3.0], atol=0.01)
+    np.testing.assert_allclose(floor_heights(points, normals, cameras[:1], 2.0, 1.3), [0.0], atol=0.01)
+
+
+def test_levelling_turns_up_into_z(rng):
+    for up in rng.normal(size=(20, 3)):
+        up = up / np.linalg.norm(up)
+        np.testing.assert_allclose(level_transform(up)[:3, :3] @ up, [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(level_transform(np.array([0, 0, -1.0]))[:3, :3] @ [0, 0, -1], [0, 0, 1], atol=1e-12)
+
+
+def test_a_plan_that_would_fill_the_memory_is_refused_with_what_to_do(both_rooms):
+    drifted = boxplus(both_rooms.keyframes[-1].T_map_camera, np.array([5000.0, 0, 0, 0, 0, 0]))
+    model = flat_model([(1.5, 1.5)])
+    last = both_rooms.keyframes[-1].keyframe
+    model.add("tof", drifted, DepthImage(99, last.depth, last.sigma, last.camera))
+    model.add("tof", np.eye(4), DepthImage(99, last.depth, last.sigma, last.camera))
+    far = boxplus(drifted, np.array([0, 5000.0, 0, 0, 0, 0]))
+    model.add("tof", far, DepthImage(100, last.depth, last.sigma, last.camera))
+    with pytest.raises(ValueError, match="raise resolution"):
+        model.floor_plans(model.surface())
