@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ndt_registration.ndt import Layer, cost_and_derivatives, ndt_align
+from ndt_registration.ndt import Layer, Neighbours, cost_and_derivatives, ndt_align, no_neighbours
 from ndt_registration.voxel_grid import block_moments, find_block, normal_grid
 from slam_core.geometry import FloatArray, boxminus, boxplus, make_transform, transform_points
 
@@ -36,9 +36,12 @@ def numpy_cost(layer: Layer, T: FloatArray, T_cells: FloatArray | None = None) -
     return total
 
 
-def evaluate(layer: Layer, T: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+def evaluate(
+    layer: Layer, T: FloatArray, neighbours: Neighbours | None = None
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
     g, H, M = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
-    cost = cost_and_derivatives((layer,), np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), g, H, M)
+    neighbours = neighbours or no_neighbours(len(layer.points))
+    cost = cost_and_derivatives((layer,), np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), neighbours, g, H, M)
     return cost, g, H, M
 
 
@@ -46,6 +49,14 @@ def evaluate(layer: Layer, T: FloatArray) -> tuple[float, FloatArray, FloatArray
 def test_cost_agrees_with_numpy(layer: Layer, state: FloatArray) -> None:
     T = boxplus(np.eye(4), state)
     assert evaluate(layer, T)[0] == pytest.approx(numpy_cost(layer, T), rel=1e-6)
+
+
+def test_neighbours_of_the_step_before_change_nothing(layer: Layer) -> None:
+    kept = no_neighbours(len(layer.points))
+    for state in STATES * 2:
+        T = boxplus(np.eye(4), state)
+        for again, anew in zip(evaluate(layer, T, kept), evaluate(layer, T), strict=True):
+            np.testing.assert_array_equal(again, anew)
 
 
 @pytest.mark.parametrize("state", STATES)

@@ -231,7 +231,7 @@ class Ekf:
     # ------------------------------------------------------------------------------------------------------- views
     def pose_covariance(self) -> FloatArray:
         """Covariance (6, 6) of the rig's pose."""
-        return self.covariance.head(6)[:6]
+        return self.covariance.head(6)[:6].copy()
 
     @property
     def is_finite(self) -> bool:

@@ -7,6 +7,9 @@ The score of a pose is the sum over points ``x`` and over the cells that cover t
     dx'/d(translation) = I,   dx'/d(rotation) = -[p]x,   d2x'/dw_i dw_j = (e_i x (e_j x p) + e_j x (e_i x p)) / 2
 
 so gradient and Hessian (Eqs. 8.6-8.7) are exact, the second-order terms included.
+
+From one step to the next most points stay in their block, so each keeps a copy of the eight cells around it, number by
+number beside each other: the next evaluation neither looks them up nor gathers them, and computes all eight at once.
 """
 
 from __future__ import annotations
@@ -14,11 +17,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from ndt_registration.eigen import cholesky_solve6
 from ndt_registration.voxel_grid import NormalGrid, find_block
 from slam_core.geometry import FloatArray
+
+Int32Array = npt.NDArray[np.int32]
+
+_NOWHERE = -(2**31)
+"""Coordinate that no block has."""
+_FAR = 20.0
+"""Half a squared Mahalanobis distance beyond which a cell does not count."""
 
 
 class Layer(NamedTuple):
@@ -27,6 +38,17 @@ class Layer(NamedTuple):
     points: FloatArray
     grid: NormalGrid
     factor: float
+
+
+class Neighbours(NamedTuple):
+    """Cells around each of n points, from the last evaluation.
+
+    block (n, 4): integer coordinates of the block and its row in the grid, -1 where there is none. cells (n, 10, 8):
+    mean from the block's corner (3), information (6) and 1 for each of eight cells, 0 where there is none.
+    """
+
+    block: Int32Array
+    cells: FloatArray
 
 
 class NdtOptimum(NamedTuple):
@@ -46,23 +68,96 @@ class NdtOptimum(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def no_neighbours(points: int) -> Neighbours:
+    """Room for so many points, none of them looked up yet."""
+    return Neighbours(np.full((points, 4), _NOWHERE, np.int32), np.empty((points, 10, 8)))
+
+
+@njit(cache=True, nogil=True)
+def _look_up(grid: NormalGrid, ix: int, iy: int, iz: int, block: Int32Array, cells: FloatArray) -> None:
+    """Write a block, its row and its cells."""
+    row = find_block(grid.keys, grid.rows, ix, iy, iz)
+    block[0], block[1], block[2], block[3] = ix, iy, iz, row
+    if row < 0:
+        return
+    for k in range(8):
+        cell = grid.cells[row, k]
+        if cell < 0:
+            for j in range(10):
+                cells[j, k] = 0.0
+            continue
+        cells[0, k] = grid.mean[cell, 0] - ix * grid.block_size
+        cells[1, k] = grid.mean[cell, 1] - iy * grid.block_size
+        cells[2, k] = grid.mean[cell, 2] - iz * grid.block_size
+        for j in range(6):
+            cells[3 + j, k] = grid.information[cell, j]
+        cells[9, k] = 1.0
+
+
+# Sums may be reordered, which vectorising takes, but products not fused with them: a copy of this compiled into another
+# kernel would then round otherwise than one from the cache.
+@njit(cache=True, nogil=True, fastmath={"reassoc"})
+def _sum_over_cells(cells: FloatArray, x: float, y: float, z: float, factor: float, out: FloatArray) -> None:
+    """Sums over eight cells of ``w = factor exp(-1/2 q' B q)``, ``w B q``, ``w B`` and ``w B q q' B``, out (16,)."""
+    w = vx = vy = vz = bxx = bxy = bxz = byy = byz = bzz = sxx = sxy = sxz = syy = syz = szz = 0.0
+    for k in range(8):
+        qx, qy, qz = x - cells[0, k], y - cells[1, k], z - cells[2, k]
+        b0, b1, b2, b3, b4, b5 = cells[3, k], cells[4, k], cells[5, k], cells[6, k], cells[7, k], cells[8, k]
+        ux = b0 * qx + b1 * qy + b2 * qz
+        uy = b1 * qx + b3 * qy + b4 * qz
+        uz = b2 * qx + b4 * qy + b5 * qz
+        exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
+        # exp(-exponent) as a power of 16 of its Taylor series: products alone, which the compiler vectorises.
+        t = min(exponent, _FAR) * (-1.0 / 16.0)
+        e = t * (1 / 120 + t * (1 / 720 + t * (1 / 5040 + t * (1 / 40320))))
+        e = 1.0 + t * (1.0 + t * (1 / 2 + t * (1 / 6 + t * (1 / 24 + e))))
+        e *= e
+        e *= e
+        e *= e
+        e *= e
+        e = factor * e * cells[9, k] if exponent < _FAR else 0.0
+        ex, ey, ez = e * ux, e * uy, e * uz
+        w += e
+        vx += ex
+        vy += ey
+        vz += ez
+        bxx += e * b0
+        bxy += e * b1
+        bxz += e * b2
+        byy += e * b3
+        byz += e * b4
+        bzz += e * b5
+        sxx += ex * ux
+        sxy += ex * uy
+        sxz += ex * uz
+        syy += ey * uy
+        syz += ey * uz
+        szz += ez * uz
+    out[0], out[1], out[2], out[3] = w, vx, vy, vz
+    out[4], out[5], out[6], out[7], out[8], out[9] = bxx, bxy, bxz, byy, byz, bzz
+    out[10], out[11], out[12], out[13], out[14], out[15] = sxx, sxy, sxz, syy, syz, szz
+
+
+@njit(cache=True, nogil=True)
 def ndt_derivatives(
-    points: FloatArray,
+    layer: Layer,
     R: FloatArray,
     t: FloatArray,
-    grid: NormalGrid,
-    factor: float,
+    neighbours: Neighbours,
+    first: int,
     gradient: FloatArray,
     hessian: FloatArray,
     majorant: FloatArray,
 ) -> float:
-    """Cost ``-factor sum exp(...) / 8`` of points (n, 3) at the pose; adds to its gradient (6,), Hessian and majorant
-    (6, 6).
+    """Cost ``-factor sum exp(...) / 8`` of a layer's points at a pose; adds to its gradient (6,), Hessian and majorant.
 
-    The majorant is the positive semidefinite part (that of iteratively reweighted least squares): a step with it always
-    lowers the cost, also where the Hessian is indefinite.
+    ``neighbours`` are kept from one evaluation to the next, those of this layer from row ``first`` on. The majorant is
+    the positive semidefinite part (that of iteratively reweighted least squares): a step with it always lowers the
+    cost, also where the Hessian is indefinite.
     """
-    inverse_size = 1.0 / grid.block_size
+    points, size = layer.points, layer.grid.block_size
+    inverse_size, factor = 1.0 / size, 0.125 * layer.factor
+    sums = np.empty(16)
     cost = 0.0
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -70,56 +165,26 @@ def ndt_derivatives(
         py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
         pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
         mx, my, mz = px + t[0], py + t[1], pz + t[2]
-        row = find_block(
-            grid.keys,
-            grid.rows,
+        ix, iy, iz = (
             int(np.floor(mx * inverse_size)),
             int(np.floor(my * inverse_size)),
             int(np.floor(mz * inverse_size)),
         )
-        if row < 0:
+        block, cells = neighbours.block[first + i], neighbours.cells[first + i]
+        if block[0] != ix or block[1] != iy or block[2] != iz:
+            _look_up(layer.grid, ix, iy, iz, block, cells)
+        if block[3] < 0:
             continue
-        weight = 0.0
-        vx = vy = vz = 0.0
-        bxx = bxy = bxz = byy = byz = bzz = 0.0
-        sxx = sxy = sxz = syy = syz = szz = 0.0
-        for k in range(8):
-            cell = grid.cells[row, k]
-            if cell < 0:
-                continue
-            qx, qy, qz = mx - grid.mean[cell, 0], my - grid.mean[cell, 1], mz - grid.mean[cell, 2]
-            b0, b1, b2 = grid.information[cell, 0], grid.information[cell, 1], grid.information[cell, 2]
-            b3, b4, b5 = grid.information[cell, 3], grid.information[cell, 4], grid.information[cell, 5]
-            ux = b0 * qx + b1 * qy + b2 * qz
-            uy = b1 * qx + b3 * qy + b4 * qz
-            uz = b2 * qx + b4 * qy + b5 * qz
-            exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
-            if exponent > 20.0:
-                continue
-            e = 0.125 * factor * np.exp(-exponent)
-            weight += e
-            vx += e * ux
-            vy += e * uy
-            vz += e * uz
-            bxx += e * b0
-            bxy += e * b1
-            bxz += e * b2
-            byy += e * b3
-            byz += e * b4
-            bzz += e * b5
-            sxx += e * ux * ux
-            sxy += e * ux * uy
-            sxz += e * ux * uz
-            syy += e * uy * uy
-            syz += e * uy * uz
-            szz += e * uz * uz
-        if weight == 0.0:
+        _sum_over_cells(cells, mx - ix * size, my - iy * size, mz - iz * size, factor, sums)
+        if sums[0] == 0.0:
             continue
-        cost -= weight
+        cost -= sums[0]
+        vx, vy, vz = sums[1], sums[2], sums[3]
+        bxx, bxy, bxz, byy, byz, bzz = sums[4], sums[5], sums[6], sums[7], sums[8], sums[9]
         _add_point(px, py, pz, vx, vy, vz, bxx, bxy, bxz, byy, byz, bzz, majorant)
         _add_point(
             px, py, pz, vx, vy, vz,
-            bxx - sxx, bxy - sxy, bxz - sxz, byy - syy, byz - syz, bzz - szz, hessian,
+            bxx - sums[10], bxy - sums[11], bxz - sums[12], byy - sums[13], byz - sums[14], bzz - sums[15], hessian,
         )  # fmt: skip
         gradient[0] += vx
         gradient[1] += vy
@@ -143,15 +208,17 @@ def cost_and_derivatives(
     layers: tuple[Layer, ...],
     R: FloatArray,
     t: FloatArray,
+    neighbours: Neighbours,
     gradient: FloatArray,
     hessian: FloatArray,
     majorant: FloatArray,
 ) -> float:
     """Cost of all layers at a pose; writes its derivatives."""
     gradient[:], hessian[:], majorant[:] = 0.0, 0.0, 0.0
-    cost = 0.0
+    cost, first = 0.0, 0
     for layer in layers:
-        cost += ndt_derivatives(layer.points, R, t, layer.grid, layer.factor, gradient, hessian, majorant)
+        cost += ndt_derivatives(layer, R, t, neighbours, first, gradient, hessian, majorant)
+        first += layer.points.shape[0]
     for r in range(6):
         for c in range(r):
             hessian[r, c] = hessian[c, r]
@@ -240,7 +307,11 @@ def ndt_align(
     g, H, M = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     g_new, H_new, M_new = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
     R, t = rotation.copy(), translation.copy()
-    cost = cost_and_derivatives(layers, R, t, g, H, M)
+    points = 0
+    for layer in layers:
+        points += layer.points.shape[0]
+    neighbours = no_neighbours(points)
+    cost = cost_and_derivatives(layers, R, t, neighbours, g, H, M)
     step = np.zeros(6)
     scale = np.array([1.0, 1.0, 1.0, lever * lever, lever * lever, lever * lever])
     damping = 1e-6
@@ -262,7 +333,7 @@ def ndt_align(
             step *= max_step / size
         R_new = _rotated(R, step[3:])
         t_new = t + step[:3]
-        cost_new = cost_and_derivatives(layers, R_new, t_new, g_new, H_new, M_new)
+        cost_new = cost_and_derivatives(layers, R_new, t_new, neighbours, g_new, H_new, M_new)
         predicted = -(g * step).sum() - 0.5 * (step * ((H if newton else M) @ step)).sum()
         if cost_new < cost or size < tolerance:
             gain = (cost - cost_new) / max(predicted, 1e-300)
