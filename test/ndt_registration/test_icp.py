@@ -53,3 +53,19 @@ def test_planar_scans_are_registered(plane: bool, limit: float) -> None:
     assert np.linalg.norm(error[:2]) < limit
     assert abs(error[5]) < limit / 2.0
     np.testing.assert_allclose(error[2:5], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("plane", [True, False])
+def test_points_beyond_the_rejection_limit_pull_at_nothing(plane: bool) -> None:
+    """A quarter of the source lies on a thing that the target has not: with a limit it is left out."""
+    rng = np.random.default_rng(4)
+    target = corner(rng)
+    stray = np.column_stack([rng.uniform((1.0, 1.4), (2.0, 2.4), (150, 2)), np.zeros(150)])
+    source = np.concatenate([corner(rng), stray])
+    errors = []
+    for limit in (0.1, 5.0):
+        config = IcpConfig(max_distance=limit, final_spacings=limit / SPACING, trimmed=1.0)
+        outcome = icp_align(source, IcpTarget(target, config), np.eye(4), 2.0, config, plane=plane, planar=True)
+        errors.append(float(np.linalg.norm(outcome.T[:2, 3])))
+    assert errors[0] < 0.01
+    assert errors[1] > 3.0 * errors[0]
