@@ -126,6 +126,21 @@ def test_tof_alone(stereo_pair, images):
     assert np.all(np.abs(features.depth - DEPTH - 0.05) < 0.07)
 
 
+def test_any_grey_image_serves_and_range_only_where_there_is_none(stereo_pair):
+    tof = tof_image(stereo_pair())
+    grey, blank = tof.amplitude, np.zeros_like(tof.amplitude)
+    front = frontend("tof")
+    for amplitude, intensity, used in ((grey, grey, "amplitude"), (None, grey, "intensity"), (blank, grey, "intensity"),
+                                       (None, None, "range"), (blank, None, "range")):  # fmt: skip
+        front.process(None, dataclasses.replace(tof, amplitude=amplitude, intensity=intensity))
+        assert front.report().picture == used
+        assert bool(front.report().advice) == (used == "range")
+    chosen = frontend("tof", **{"tof.images": "intensity"})
+    features = chosen.process(None, dataclasses.replace(tof, intensity=grey))
+    assert chosen.report().picture == "intensity"
+    np.testing.assert_array_equal(features.uv, frontend("tof").process(None, tof).uv)
+
+
 def test_swapped_images_are_named_as_such(stereo_pair):
     pair = stereo_pair()
     swapped = dataclasses.replace(pair, left=pair.right, right=pair.left)

@@ -89,6 +89,8 @@ def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray 
     """The key frame of a depth image; ``picture`` (h, w) or (h, w, 3) uint8, by default the amplitude as grey."""
     if picture is None and image.amplitude is not None:
         picture = grey_levels(image.amplitude)
+    if picture is not None and not picture.size:
+        picture = None
     if picture is not None and picture.ndim == 2:
         picture = np.repeat(picture[..., None], 3, axis=2)
     depth, sigma, camera = image.depth, image.sigma, image.camera

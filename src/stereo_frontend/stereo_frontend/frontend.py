@@ -65,10 +65,15 @@ class FrontendConfig(Config):
 
 @dataclass(frozen=True)
 class FrontendReport:
-    """What the front end knows of its images: figures of the rectification, and advice to the user, a sentence each."""
+    """What the front end knows of its images.
+
+    rectification: figures of the stereo pair; advice: to the user, a sentence each; picture: what features are searched
+    in: "stereo", "amplitude", "intensity", "range" or "" before the first image.
+    """
 
     rectification: Mapping[str, float | str] = field(default_factory=dict)
     advice: tuple[str, ...] = ()
+    picture: str = ""
 
 
 def _more(config: FeatureConfig, factor: float) -> FeatureConfig:
@@ -164,8 +169,9 @@ class Frontend:
 
     def report(self) -> FrontendReport:
         """What was found out about the images so far."""
-        advice = self.self_calibration.advice()
-        return FrontendReport(self.self_calibration.figures(), (advice,) if advice else ())
+        advice = (self.self_calibration.advice(), self._tof.advice())
+        picture = "+".join(self._tof.used) if self.config.mode == "tof" else "stereo"
+        return FrontendReport(self.self_calibration.figures(), tuple(text for text in advice if text), picture)
 
     def _stereo_depth(self, images: StereoImages, left: Keypoints, right: Keypoints) -> DepthEstimate:
         stereo, calibration = images.stereo, self.self_calibration

@@ -66,9 +66,16 @@ class FeatureNode(SlamNode[FrontendConfig]):
 
     def _listen_to_depth(self) -> None:
         topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
-        if self.config.mode == "tof" and self.config.tof.images != "range":
-            topics["tof/amplitude/image"] = "Image"
+        picture = self._tof_picture()
+        if picture:
+            topics[f"tof/{picture}/image"] = "Image"
         self.listen_together(topics, self._on_depth)
+
+    def _tof_picture(self) -> str:
+        """Which image is needed beside depth, or ""; a node cannot know what there will be, so auto means amplitude."""
+        if self.config.mode != "tof" or self.config.tof.images == "range":
+            return ""
+        return "intensity" if self.config.tof.images == "intensity" else "amplitude"
 
     def _on_info(self, side: str, message: Message) -> None:
         self.pairs.set_info(side, camera_info_from_message(message))
@@ -79,8 +86,9 @@ class FeatureNode(SlamNode[FrontendConfig]):
         self.pairs.add(RawPair(stamp_ns(left), *pictures, left.header.frame_id))
         self._publish_ready()
 
-    def _on_depth(self, depth: Message, noise: Message, info: Message, amplitude: Message | None = None) -> None:
-        self.stage.add_depth(depth_from_messages(depth, noise, info, amplitude))
+    def _on_depth(self, depth: Message, noise: Message, info: Message, picture: Message | None = None) -> None:
+        pictures = {} if picture is None else {self._tof_picture(): picture}
+        self.stage.add_depth(depth_from_messages(depth, noise, info, **pictures))
         self._publish_ready()
 
     # -- outputs -------------------------------------------------------------------------------------------------------
@@ -108,14 +116,18 @@ class FeatureNode(SlamNode[FrontendConfig]):
         if frame.images is not None:
             return frame.images.left
         assert frame.depth is not None
-        picture = frame.depth.depth if frame.depth.amplitude is None else frame.depth.amplitude
-        return normalised_picture(picture, self.config.tof.clip, self.config.tof.gamma)
+        depth, tof = frame.depth, self.config.tof
+        grey = next((picture for picture in (depth.amplitude, depth.intensity) if picture is not None), None)
+        if grey is None:
+            return normalised_picture(depth.depth, tof.clip, 1.0)
+        return normalised_picture(grey, tof.clip, tof.gamma)
 
     def _report(self, number: int) -> None:
         self.health.take(self.stage.counters | self.pairs.counters)
         report = self.stage.report()
         for name, value in report.rectification.items():
             self.health.show(f"rectification_{name}", value)
+        self.health.show("picture", report.picture)
         self.health.show("advice", "; ".join(report.advice))
         few = f"only {number} features" if number < FEW_FEATURES else ""
         complaint = few or self.stage.complaint

@@ -1,9 +1,9 @@
-"""Features of the ToF camera alone: found on its amplitude and range images, with depth from its own range (section
-3.3).
+"""Features of the ToF camera alone: found on one of its images, with depth from its own range (section 3.3).
 
-The thesis finds range images best, amplitude useful, intensity unstable. Images are normalised, ``(I - min) / (max -
-min)`` (Eq. 3.3), with the extremes taken as quantiles so that one glaring pixel does not darken the rest. The grey
-image of an RGB-D camera serves as amplitude.
+Amplitude first: it is lit by the camera itself. Intensity, or the grey image of an RGB-D camera under either name,
+where there is no amplitude or it is blank. The range image only where there is nothing else: a smooth wall has no
+texture in it, and edges of depth move with the view. Images are normalised, ``(I - min) / (max - min)`` (Eq. 3.3), with
+the extremes taken as quantiles so that one glaring pixel does not darken the rest.
 """
 
 from __future__ import annotations
@@ -25,7 +25,12 @@ from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
 class TofFeatureConfig(Config):
     """Which images of the ToF camera give features."""
 
-    images: str = parameter("amplitude", "images searched for features", choices=("amplitude", "range", "both"))
+    images: str = parameter(
+        "auto",
+        "image searched for features; auto: amplitude, where there is none intensity, where there is neither range; "
+        "both: amplitude and range",
+        choices=("auto", "amplitude", "intensity", "range", "both"),
+    )
     clip: float = parameter(
         0.005, "share of pixels beyond the black and the white point each", minimum=0.0, maximum=0.2
     )
@@ -38,13 +43,14 @@ class TofFeatures:
 
     def __init__(self, config: TofFeatureConfig, features: FeatureConfig, noise: PixelNoiseConfig) -> None:
         self.config = config
-        self._amplitude = FeatureExtractor(features)
-        self._range = FeatureExtractor(features)
+        self._extractors = {name: FeatureExtractor(features) for name in ("amplitude", "intensity", "range")}
         self._noise = PixelNoise(noise)
+        self.used: tuple[str, ...] = ()
+        """Names of the images that the newest features come from."""
 
     def __call__(self, image: DepthImage, max_relative_sigma: float = 1.0) -> Features:
         """Features of ``image`` in the ToF optical frame; those without a single surface below them are left out."""
-        keypoints = _joined([extractor(picture) for extractor, picture in self._pictures(image)])
+        keypoints = _joined([self._extractors[name](picture) for name, picture in self._pictures(image).items()])
         samples = sample_depth(image, keypoints.uv, self.config.lookup)
         sigma_uv = self._noise.sigma(keypoints.size)
         source = np.full(len(keypoints), FeatureSource.TOF, np.uint8)
@@ -55,20 +61,49 @@ class TofFeatures:
 
     def reset(self) -> None:
         """Forget the detector thresholds."""
-        self._amplitude.reset()
-        self._range.reset()
+        for extractor in self._extractors.values():
+            extractor.reset()
+        self.used = ()
 
-    def _pictures(self, image: DepthImage) -> list[tuple[FeatureExtractor, ByteArray]]:
-        pictures = []
-        if image.amplitude is not None and self.config.images != "range":
-            pictures.append((self._amplitude, normalised_picture(image.amplitude, self.config.clip, self.config.gamma)))
-        if not pictures or self.config.images != "amplitude":
-            pictures.append((self._range, normalised_picture(image.depth, self.config.clip, 1.0)))
-        return pictures
+    def advice(self) -> str:
+        """What a user should know and do about the images used, or ""."""
+        if self.used != ("range",) or self.config.images == "range":
+            return ""
+        return (
+            "features come from range images, which show little: record tof/amplitude/image_raw, "
+            "tof/intensity/image_raw or the depth camera's grey image under one of these names"
+        )
+
+    def _pictures(self, image: DepthImage) -> dict[str, ByteArray]:
+        self.used = self._choose(image)
+        return {name: self.picture(image, name) for name in self.used}
+
+    def _choose(self, image: DepthImage) -> tuple[str, ...]:
+        wanted = self.config.images
+        order = ("amplitude", "intensity") if wanted in ("auto", "both") else (wanted,)
+        grey = next((name for name in order if _shows_something(_values(image, name))), None)
+        if grey is None:
+            return ("range",)
+        return (grey, "range") if wanted == "both" else (grey,)
+
+    def picture(self, image: DepthImage, name: str) -> ByteArray:
+        """The 8-bit picture of that name in which features are searched."""
+        values = _values(image, name)
+        assert values is not None
+        return normalised_picture(values, self.config.clip, 1.0 if name == "range" else self.config.gamma)
+
+
+def _values(image: DepthImage, name: str) -> Float32Array | None:
+    return {"amplitude": image.amplitude, "intensity": image.intensity, "range": image.depth}[name]
+
+
+def _shows_something(values: Float32Array | None) -> bool:
+    """Whether there is a picture that is not blank."""
+    return values is not None and bool(np.nanmax(values, initial=-np.inf) > np.nanmin(values, initial=np.inf))
 
 
 def normalised_picture(values: Float32Array, clip: float, gamma: float) -> ByteArray:
-    """An 8-bit picture of amplitude or range (Eq. 3.3); missing values are white, an image without contrast black."""
+    """An 8-bit picture of an image (Eq. 3.3); missing values are white, an image without contrast black."""
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return np.zeros(values.shape, np.uint8)

@@ -49,7 +49,7 @@ class TofDriverConfig(DepthConfig):
     pictures: str = parameter(
         "auto",
         "images beside range; auto: amplitude and intensity with measurement range, none with depth",
-        choices=("auto", "both", "amplitude", "none"),
+        choices=("auto", "both", "amplitude", "intensity", "none"),
     )
     info: str = parameter("", "camera_info YAML file; empty: from the topic tof/camera_info")
 
@@ -77,7 +77,7 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
         chosen = self.config.pictures
         if chosen == "auto":
             chosen = "both" if self.config.measurement == "range" else "none"
-        return {"both": ("amplitude", "intensity"), "amplitude": ("amplitude",), "none": ()}[chosen]
+        return {"both": ("amplitude", "intensity"), "none": ()}.get(chosen, (chosen,))
 
     def _advertise_outputs(self) -> tuple[str, ...]:
         """Offer the topics that this camera has; a camera info that comes from a topic is there already."""

@@ -54,6 +54,22 @@ def test_parameters_follow_from_the_choice_and_the_bag() -> None:
     assert "/one/tof/camera_info" in graph.played.values()
 
 
+def test_nodes_search_the_image_that_the_bag_has() -> None:
+    config = choose(load_system_config(None), "tof", "sjsam", "none")
+    for roles, driver, features in (
+        (("amplitude", "intensity"), "both", "amplitude"),
+        (("intensity",), "intensity", "intensity"),
+        ((), "none", "range"),
+    ):
+        bag = sensors()
+        bag.topics.pop("amplitude", None)
+        bag.topics.update({role: f"/tof/{role}/image_raw" for role in roles})
+        graph = plan_nodes(config, {"": bag}, False, "map")
+        arguments = {c.executable: " ".join(c.arguments) for c in graph.commands}
+        assert f'pictures:="{driver}"' in arguments["tof_driver"]
+        assert f'tof.images:="{features}"' in arguments["feature_extractor"]
+
+
 def test_frames_wait_for_the_imu_of_a_bag_that_has_one() -> None:
     with_imu = sensors()
     with_imu.topics["imu"] = "/imu"

@@ -93,6 +93,8 @@ class AgentDepth:
 
     def _picture(self, image: DepthImage) -> ByteArray | None:
         """A ToF amplitude is no picture where stereo gives one: two kinds of grey on one wall are blotches."""
-        if self._stereo is not None or image.amplitude is None:
-            return np.empty((0, 0, 3), dtype=np.uint8)
-        return grey_levels(image.amplitude)
+        if self._stereo is None and image.amplitude is not None:
+            return grey_levels(image.amplitude)
+        if self._stereo is None and image.intensity is not None:
+            return np.asarray(np.rint(255.0 * image.intensity), dtype=np.uint8)
+        return np.empty((0, 0, 3), dtype=np.uint8)

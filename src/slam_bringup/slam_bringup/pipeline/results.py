@@ -15,6 +15,7 @@ from dense_mapping.surface import Surface
 from slam_core.evaluation import Evaluation, evaluate
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
+from stereo_frontend.frontend import FrontendReport
 
 EMPTY_TRAJECTORY = Trajectory.from_estimates([])
 
@@ -29,8 +30,8 @@ class AgentResult:
     scan_odometry: Trajectory = EMPTY_TRAJECTORY
     truth: Trajectory = EMPTY_TRAJECTORY
     feature_counts: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    rectification: Mapping[str, float | str] = field(default_factory=dict)
-    """What self-calibration found out about the stereo pair."""
+    front_end: FrontendReport = field(default_factory=FrontendReport)
+    """What the images told."""
 
     def evaluation(self, trajectory: Trajectory | None = None) -> Evaluation | None:
         """A trajectory (by default the smoothed one) against ground truth, or None where the two do not meet."""
@@ -119,8 +120,10 @@ def summarise(result: RunResult) -> dict[str, Any]:
             "path_length_m": first.scan_odometry.length_m,
             **_accuracy(first, first.scan_odometry),
         }
-    if first.rectification:
-        summary["rectification"] = dict(first.rectification)
+    if first.front_end.picture:
+        summary["features_from"] = first.front_end.picture
+    if first.front_end.rectification:
+        summary["rectification"] = dict(first.front_end.rectification)
     if len(first.filtered):
         summary["filtered"] = _accuracy(first, first.filtered)
     if len(result.agents) > 1:

@@ -137,7 +137,7 @@ def _agent_result(bag: SensorBag, agent: str, poses: Sequence[PoseEstimate], rec
         scan_odometry=Trajectory.from_estimates(record.scans),
         truth=bag.ground_truth(agent) or EMPTY_TRAJECTORY,
         feature_counts=np.array(record.feature_counts, dtype=np.int64),
-        rectification=record.front_end.rectification,
+        front_end=record.front_end,
     )
 
 

@@ -100,7 +100,7 @@ def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odomet
     base_frames = {agent: sensor.base_frame for agent, sensor in sensors.items()}
     specs = live_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
-        extra=_bag_parameters(first, map_path), base_frames=base_frames,
+        extra=_bag_parameters(config, first, map_path), base_frames=base_frames,
         with_imu=[agent for agent, sensor in sensors.items() if "imu" in sensor.topics],
     )  # fmt: skip
     names = {e: tuple(s.command.full_name for s in specs if s.executable == e) for e in _FINISHERS}
@@ -115,14 +115,16 @@ def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odomet
     )
 
 
-def _bag_parameters(sensor: AgentSensors, map_path: str) -> dict[str, dict[str, Any]]:
+def _bag_parameters(config: SystemConfig, sensor: AgentSensors, map_path: str) -> dict[str, dict[str, Any]]:
     """What the topics of a bag ask of the nodes."""
-    pictures = {"amplitude", "intensity"} & sensor.topics.keys()
-    chosen = {0: "none", 1: "amplitude", 2: "both"}[len(pictures)]
+    pictures = [name for name in ("amplitude", "intensity") if name in sensor.topics]
+    chosen = {0: "none", 2: "both"}.get(len(pictures)) or pictures[0]
+    chooses = config.feature_extractor.mode == "tof" and config.feature_extractor.tof.images == "auto"
     compressed = sensor.topics.get("left", "").endswith("/compressed")
     return {
         "stereo_driver": {"compressed": True} if compressed else {},
         "tof_driver": {"measurement": sensor.measurement, "pictures": chosen},
+        "feature_extractor": {"tof.images": pictures[0] if pictures else "range"} if chooses else {},
         "sjsam": {"map_path": map_path},
     }
 

@@ -88,7 +88,7 @@ def _front_end(agent: str, diagnostics: dict[str, dict[str, str]]) -> FrontendRe
     values = diagnostics.get(_topic(agent, "feature_extractor"), {})
     figures = {key.removeprefix(_FIGURES): text for key, text in values.items() if key.startswith(_FIGURES)}
     advice = tuple(text for text in values.get("advice", "").split("; ") if text)
-    return FrontendReport({key: _number(text) for key, text in figures.items()}, advice)
+    return FrontendReport({key: _number(text) for key, text in figures.items()}, advice, values.get("picture", ""))
 
 
 def _number(text: str) -> float | str:

@@ -20,6 +20,8 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
         table.add_row("dropped", f"{count} x {reason}")
     table.add_row("path", f"{summary['path_length_m']:.2f} m")
     table.add_row("map", f"{summary['landmarks']} landmarks, {summary['submaps']} submaps")
+    if "features_from" in summary:
+        table.add_row("features from", f"{summary['features_from']} images")
     table.add_row("loop closures", str(summary["loop_closures"]))
     for name, part in summary.get("agents", {"": summary}).items():
         table.add_row(f"accuracy {name}".strip(), _accuracy(part))
