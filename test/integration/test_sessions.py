@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from ros_probe import Probe  # noqa: E402
 from sjsam_node.global_map import GlobalMap  # noqa: E402
+from sjsam_node.storage import is_map  # noqa: E402
 from slam_core.messages import (  # noqa: E402
     FEATURE_TOPICS,
     STATIC_TRANSFORMS_TOPIC,
@@ -53,6 +55,7 @@ class Chain(Probe):
         self.start("ekf_slam")
         self.start("sjsam")
         self.listen("odom", Odometry)
+        self.listen("pose", PoseWithCovarianceStamped)
         self.listen("map/path", PathMessage, latched=True)
         for topic, kind in FEATURE_TOPICS.items():
             self.senders[topic] = self.node.create_publisher(getattr(self.types, kind), topic, sensor_qos(100))
@@ -64,9 +67,17 @@ class Chain(Probe):
 
     def start(self, name: str) -> None:
         module = {"ekf_slam": "ekf_slam_node", "sjsam": "sjsam_node"}[name]
-        own = ["-p", f"map_path:={self.map_path}"] if name == "sjsam" else ["-p", "submap.max_frames:=8"]
-        command = [sys.executable, "-c", f"from {module}.node import main; main()", "--ros-args", *own]
+        own = {
+            "sjsam": (f"map_path:={self.map_path}", "autosave_period_s:=0.5", f"ply_path:={self.map_path}.ply"),
+            "ekf_slam": ("submap.max_frames:=8",),
+        }[name]
+        arguments = [word for parameter in own for word in ("-p", parameter)]
+        command = [sys.executable, "-c", f"from {module}.node import main; main()", "--ros-args", *arguments]
         self.processes[name] = subprocess.Popen(command, env=self.environment)
+
+    def kill(self, name: str) -> None:
+        self.processes[name].kill()
+        self.processes[name].wait()
 
     def connect(self) -> None:
         self.wait(lambda: all(s.get_subscription_count() for s in self.senders.values()), "nodes do not listen")
@@ -98,11 +109,14 @@ class Chain(Probe):
         self.wait(future.done, f"{name} does not answer")
         return future.result()
 
+    def wait_for_map(self, stamp: int) -> None:
+        paths = self.received["map/path"]
+        self.wait(lambda: any(stamp_of(p) == stamp for m in paths for p in m.poses), f"{stamp} is not in the map")
+
     def saved_keys(self, newest_ns: int) -> list[tuple[str, int, int]]:
         """Keys of the saved submaps, once the pose of a stamp is in the map."""
         assert self.call("/ekf_slam/finish").success
-        paths = self.received["map/path"]
-        self.wait(lambda: any(stamp_of(p) == newest_ns for m in paths for p in m.poses), "not in the map")
+        self.wait_for_map(newest_ns)
         answer = self.call("/sjsam/save_map")
         assert answer.success, answer.message
         return [record.key for record in GlobalMap.load(self.map_path).graph.records]
@@ -150,6 +164,52 @@ def test_odd_stamps_of_operators_and_sensors_cost_nothing_and_a_jump_begins_a_se
     assert len(first) >= 2
     assert jumped
     assert len(first) + len(jumped) == len(keys)
+
+
+def test_both_nodes_killed_and_started_again_go_on_with_the_map(chain: Chain, tmp_path: Path) -> None:
+    poses, half = loop(40), 20
+    chain.send_frames(poses[:half], START)
+    chain.wait_for_odometry(START + (half - 1) * STEP_NS)
+    assert chain.call("/ekf_slam/finish").success
+    chain.wait_for_map(START + (half - 1) * STEP_NS)
+    copy = tmp_path / "map.autosave"
+    chain.wait(lambda: is_map(copy) and len(GlobalMap.load(copy).graph.records) >= 2, "no autosave")
+    for name in ("sjsam", "ekf_slam"):
+        chain.kill(name)
+    before = [record.key for record in GlobalMap.load(copy).graph.records]
+    chain.wait(lambda: not any(s.get_subscription_count() for s in chain.senders.values()), "the dead still listen")
+    for name in ("sjsam", "ekf_slam"):
+        chain.start(name)
+    chain.connect()
+    first = START + 100 * STEP_NS
+    chain.send_frames(poses[half:], first)
+    chain.wait_for_odometry(first + 19 * STEP_NS)
+    keys = chain.saved_keys(first + 19 * STEP_NS)
+    assert keys[: len(before)] == before
+    assert len(keys) > len(before)
+    assert {session for _, session, _ in keys} == {START // 10**9, first // 10**9}
+    poses_in_map = [m for m in chain.received["pose"] if stamp_of(m) >= first]
+    assert len(poses_in_map) == len(poses) - half
+    assert all(m.header.frame_id == "map" for m in poses_in_map)
+    assert all(np.linalg.eigvalsh(np.reshape(m.pose.covariance, (6, 6))).min() > 0 for m in poses_in_map)
+
+
+def test_what_the_services_did_not_write_they_leave(chain: Chain) -> None:
+    chain.send_frames(loop(20), START)
+    chain.wait_for_odometry(START + 19 * STEP_NS)
+    assert chain.call("/ekf_slam/finish").success
+    chain.wait_for_map(START + 19 * STEP_NS)
+    chain.map_path.mkdir()
+    (chain.map_path / "photo.jpg").write_bytes(b"mine")
+    for service in ("save_map", "load_map"):
+        answer = chain.call(f"/sjsam/{service}")
+        assert not answer.success
+        assert str(chain.map_path) in answer.message
+    assert [p.name for p in chain.map_path.iterdir()] == ["photo.jpg"]
+    chain.map_path.with_name("map.ply").mkdir()
+    assert not chain.call("/sjsam/export_ply").success
+    shutil.rmtree(chain.map_path)
+    assert chain.call("/sjsam/save_map").success, "the map is still there"
 
 
 def test_an_emptied_map_is_shown_and_never_saved_over_another(chain: Chain) -> None:

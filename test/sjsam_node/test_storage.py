@@ -1,15 +1,21 @@
 from __future__ import annotations
 
+import io
 import json
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from judging import join
 from submap_world import Agent, circle, ring_world
 
+from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.localization import Localizer
+from sjsam_node.map_validation import arrays_of
 from slam_core.geometry import boxminus, boxplus, invert_transform
 from slam_core.types import PoseEstimate, Submap
 
@@ -66,7 +72,10 @@ def test_saving_replaces_and_leaves_nothing_else(agent: Agent, tmp_path: Path) -
     joined.save(tmp_path / "map")
     joined.save(tmp_path / "map")
     assert [p.name for p in tmp_path.iterdir()] == ["map"]
-    assert sorted(p.name for p in (tmp_path / "map").iterdir()) == ["arrays.npz", "manifest.json"]
+    files = sorted(p.name for p in (tmp_path / "map").iterdir())
+    assert len(files) == 2
+    assert files[0].startswith("arrays-")
+    assert files[1] == "manifest.json"
 
 
 def test_foreign_newer_and_damaged_folders_are_refused(agent: Agent, tmp_path: Path) -> None:
@@ -75,7 +84,7 @@ def test_foreign_newer_and_damaged_folders_are_refused(agent: Agent, tmp_path: P
         GlobalMap.load(folder)
     joined, _ = join(agent.submaps()[:3])
     joined.save(folder)
-    manifest, arrays = folder / "manifest.json", folder / "arrays.npz"
+    manifest, arrays = folder / "manifest.json", next(folder.glob("arrays-*.npz"))
     good, data = manifest.read_text(), arrays.read_bytes()
     for text, why in (
         ("{", "not JSON"),
@@ -92,8 +101,77 @@ def test_foreign_newer_and_damaged_folders_are_refused(agent: Agent, tmp_path: P
     with pytest.raises(ValueError, match="damaged"):
         GlobalMap.load(folder)
     arrays.unlink()
-    with pytest.raises(ValueError, match=r"arrays\.npz"):
+    with pytest.raises(ValueError, match="arrays cannot be read"):
         GlobalMap.load(folder)
+
+
+DAMAGES: dict[str, Callable[[dict[str, Any], dict[str, Any]], object]] = {
+    "a pose that is not finite": lambda m, a: a["poses"].__setitem__((1, 0, 3), np.nan),
+    "a pose that is not rigid": lambda m, a: a["poses"].__setitem__((1, 0, 0), 2.0),
+    "too few poses": lambda m, a: a.update(poses=a["poses"][:-1]),
+    "too few points": lambda m, a: a.update(points=a["points"][:-1]),
+    "too many points": lambda m, a: a.update(points=np.vstack([a["points"], [[0.0, 0.0, 0.0]]])),
+    "a component that is not there": lambda m, a: a["component_of"].__setitem__(0, 99),
+    "a missing array": lambda m, a: a.pop("submap_1/descriptors"),
+    "text instead of numbers": lambda m, a: a.update(poses=np.array(["x"])),
+    "a covariance that is not positive": lambda m, a: a["submap_1/covariance"].__setitem__((0, 0), -1.0),
+    "a link to nothing": lambda m, a: a["links/ends"].__setitem__((0, 1), 77),
+    "a pair of no landmark": lambda m, a: a["links/pairs"].__setitem__((0, 0), 9999),
+    "fewer pairs than named": lambda m, a: a.update({"links/pairs": a["links/pairs"][:-1]}),
+    "a mark at no node": lambda m, a: m["marks"].append(["find", 99, 0.0, 0.0, 0.0]),
+    "a mark of two numbers": lambda m, a: m["marks"].append(["find", 0, 0.0, 0.0]),
+    "a mark at NaN": lambda m, a: m["marks"].append(["find", 0, 0.0, 0.0, float("nan")]),
+    "a mark at a text": lambda m, a: m["marks"].append(["find", "0", 0.0, 0.0, 0.0]),
+    "a record too few": lambda m, a: m["records"].pop(),
+    "a record twice": lambda m, a: m["records"].__setitem__(2, m["records"][1]),
+    "a record that starts nowhere": lambda m, a: m["records"][1].__setitem__(3, 50),
+    "a record of words": lambda m, a: m["records"].__setitem__(0, "words"),
+    "no records": lambda m, a: m.pop("records"),
+    "arrays elsewhere": lambda m, a: m.update(arrays="../../etc/passwd"),
+    "arrays that are a number": lambda m, a: m.update(arrays=7),
+    "too few ties": lambda m, a: a.update(ties=a["ties"][:-1]),
+    "a submap of another size": lambda m, a: a.update({"submap_0/landmarks": a["submap_0/landmarks"][:-1]}),
+    "a path of another length": lambda m, a: a.update({"submap_0/path_stamps": a["submap_0/path_stamps"][:-1]}),
+}
+
+
+@pytest.fixture
+def small_map(rng: np.random.Generator, tmp_path: Path) -> Path:
+    joined, _ = join(Agent(ring_world(3.0, rng, 12.0), circle(3.0, 0.3), rng, "a").submaps()[:3])
+    joined.save(tmp_path / "map")
+    return tmp_path / "map"
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_map_that_cannot_be_true_is_refused_though_its_digests_are_right(damage: str, small_map: Path) -> None:
+    stored = storage.pack(GlobalMap.load(small_map).stored())
+    manifest, arrays = stored.manifest, {name: value.copy() for name, value in stored.arrays.items()}
+    DAMAGES[damage](manifest, arrays)
+    storage.write_packed(small_map, storage.PackedMap(manifest, arrays))
+    if ("arrays" in damage and "elsewhere" in damage) or damage == "arrays that are a number":
+        text = json.loads((small_map / "manifest.json").read_text())
+        DAMAGES[damage](text, arrays)
+        text["manifest_sha256"] = storage._digest(text)
+        (small_map / "manifest.json").write_text(json.dumps(text))
+    with pytest.raises(ValueError, match="damaged"):
+        GlobalMap.load(small_map)
+
+
+def test_arrays_that_claim_more_than_they_are_or_are_compressed_are_refused() -> None:
+    huge = io.BytesIO()
+    np.lib.format.write_array_header_1_0(huge, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    for kind, member, why in (
+        (zipfile.ZIP_STORED, huge.getvalue(), "claims"),
+        (zipfile.ZIP_DEFLATED, bytes(10**6), "compressed"),
+    ):
+        data = io.BytesIO()
+        with zipfile.ZipFile(data, "w", kind) as archive:
+            archive.writestr("poses.npy", member)
+        with pytest.raises(ValueError, match=why):
+            arrays_of(data.getvalue())
+    for data_bytes in (b"", b"PK", bytes(100)):
+        with pytest.raises(ValueError, match="npz"):
+            arrays_of(data_bytes)
 
 
 def visitor(agent: Agent, rng: np.random.Generator) -> tuple[Agent, list[Submap]]:

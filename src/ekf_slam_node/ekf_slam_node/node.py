@@ -24,7 +24,6 @@ from slam_core.messages import (
     motion_from_message,
     odometry_message,
     path_message,
-    pose_with_covariance_message,
     stamp_ns,
     submap_messages,
     transform_message,
@@ -51,7 +50,7 @@ class EkfNodeConfig(FilterConfig):
 
 
 class EkfNode(SlamNode[EkfNodeConfig]):
-    """Publishes ``odom``, ``pose``, ``path``, ``landmarks``, ``landmark_ellipsoids`` and, as they end, ``submap/*``."""
+    """Publishes ``odom``, ``path``, ``landmarks``, ``landmark_ellipsoids`` and, as they end, ``submap/*``."""
 
     def __init__(self) -> None:
         super().__init__("ekf_slam", EkfNodeConfig)
@@ -66,7 +65,6 @@ class EkfNode(SlamNode[EkfNodeConfig]):
 
     def _advertise_outputs(self) -> None:
         self.advertise("odom", "Odometry")
-        self.advertise("pose", "PoseWithCovarianceStamped")
         self.advertise("path", "Path")
         self.advertise("landmarks", "PointCloud2")
         self.advertise("landmark_ellipsoids", "MarkerArray")
@@ -120,10 +118,9 @@ class EkfNode(SlamNode[EkfNodeConfig]):
             self.health.take(self.stage.counters.counts)
 
     def _publish_result(self, result: EkfResult) -> None:
-        pose, types = result.pose, self.types
+        pose, types, twist = result.pose, self.types, (result.twist, result.twist_covariance)
         self.path.append(pose)
-        self.publish("odom", odometry_message(types, self.odom_frame, self.config.base_frame, pose))
-        self.publish("pose", pose_with_covariance_message(types, self.odom_frame, pose))
+        self.publish("odom", odometry_message(types, self.odom_frame, self.config.base_frame, pose, twist))
         self.broadcast(transform_message(types, pose.stamp_ns, self.odom_frame, self.config.base_frame, pose.T))
         if self.has_listeners("path"):
             self.publish("path", path_message(types, pose.stamp_ns, self.odom_frame, self.path))

@@ -7,6 +7,9 @@ import numpy as np
 from slam_core.geometry import FloatArray, compose_covariance, transform_points
 from slam_core.types import PoseEstimate
 
+_ORIGIN_SIGMA = 1e-6
+"""Standard deviation of the first pose (m, rad): it is the origin by definition, but no covariance may be singular."""
+
 
 class OdometryChain:
     """``T_odom_submap`` of the open submap with its covariance.
@@ -17,7 +20,7 @@ class OdometryChain:
 
     def __init__(self) -> None:
         self._T = np.eye(4)
-        self._covariance = np.zeros((6, 6))
+        self._covariance = _ORIGIN_SIGMA**2 * np.eye(6)
 
     def pose(self, stamp_ns: int, T: FloatArray, covariance: FloatArray) -> PoseEstimate:
         """T_odom_rig of a pose in the open submap."""

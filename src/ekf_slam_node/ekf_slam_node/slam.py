@@ -27,6 +27,9 @@ from slam_core.types import Counters, Features, ImuSample, PoseEstimate, Relativ
 _LONGEST_STEP_S = 10.0
 """A gap counts as no longer than this: the model says nothing about it any more, and larger variances cost digits."""
 
+_FARTHEST_M, _LARGEST_PX, _SMALLEST_SIGMA = 1e5, 1e6, 1e-6
+"""Limits of what can be a feature: depth m, pixel, standard deviation px or m."""
+
 _NO_UPDATE = UpdateReport(0.0, 0, False)
 
 
@@ -136,7 +139,8 @@ class EkfSlam:
         sigma = np.column_stack([features.sigma_uv, features.sigma_depth])
         with np.errstate(invalid="ignore"):
             usable = np.isfinite(features.uv).all(axis=1) & np.isfinite(features.depth) & np.isfinite(sigma).all(axis=1)
-            usable &= (features.depth > 0.05) & (sigma > 0.0).all(axis=1)
+            usable &= (features.depth > 0.05) & (features.depth < _FARTHEST_M) & (sigma > _SMALLEST_SIGMA).all(axis=1)
+            usable &= np.abs(features.uv).max(axis=1, initial=0.0) < _LARGEST_PX
             usable &= features.sigma_depth < limits.max_relative_depth_sigma * features.depth
             usable &= np.isfinite(features.descriptors).all(axis=1)
         self.counters.add("features_unusable", int(len(features) - usable.sum()))

@@ -17,6 +17,10 @@ _LEAST_EIGENVALUE = 1e-12
 """Share of the largest eigenvalue that rounding may reach."""
 
 
+_START_SIGMA = 1e-6
+"""Standard deviation of a submap's first pose (m, rad), exact by definition: no covariance may be singular."""
+
+
 class SubmapBuilder:
     """Collects the poses inside one submap and makes the joint Gaussian of its end.
 
@@ -32,7 +36,7 @@ class SubmapBuilder:
         self._start_stamp_ns = start_stamp_ns
         self._follows_previous = follows_previous
         self._session = session
-        self._path = [PoseEstimate(start_stamp_ns, np.eye(4), np.zeros((6, 6)))]
+        self._path = [PoseEstimate(start_stamp_ns, np.eye(4), _START_SIGMA**2 * np.eye(6))]
 
     def add_pose(self, stamp_ns: int, ekf: Ekf) -> None:
         """Add the filter's present pose to the path."""

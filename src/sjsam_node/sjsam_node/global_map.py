@@ -29,8 +29,16 @@ from sjsam_node.marks import Marks
 from sjsam_node.smoothing.smoother import Smoother, SmootherConfig
 from sjsam_node.storage import StoredMap
 from slam_core.config import Config, group, parameter
-from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
+from slam_core.geometry import FloatArray, compose_covariance, invert_transform, is_rigid_transform
 from slam_core.types import Counters, PoseEstimate, Submap
+
+ALREADY_JOINED = "already joined"
+
+FARTHEST_M = 1e6
+"""Landmarks beyond are none of a building."""
+
+SMALLEST_VARIANCE = 1e-15
+"""Of a landmark (m2) or an end pose (m2, rad2); no camera is that sure of anything."""
 
 
 @dataclass(frozen=True)
@@ -179,6 +187,10 @@ class GlobalMap:
         """Why a submap cannot be joined; empty if it can."""
         if not (np.all(np.isfinite(submap.covariance)) and np.all(np.isfinite(submap.landmarks))):
             return "not finite"
+        if np.abs(submap.landmarks).max(initial=0.0) > FARTHEST_M:
+            return f"landmarks beyond {FARTHEST_M:g} m"
+        if np.diag(submap.covariance).min() < SMALLEST_VARIANCE:
+            return f"variances below {SMALLEST_VARIANCE:g}, less than any sensor's"
         if not is_rigid_transform(submap.end_pose):
             return "end pose is not a rigid transform"
         try:
@@ -192,19 +204,19 @@ class GlobalMap:
         if held is None:
             return ""
         same = self.graph.records[held].submap.start_stamp_ns == submap.start_stamp_ns
-        return "already joined" if same else "another submap of this agent, session and index is in the map"
+        return ALREADY_JOINED if same else "another submap of this agent, session and index is in the map"
 
     def _place(self, submap: Submap) -> int:
         """Add a record at the end of its predecessor, or as a component of its own where the agent was last seen."""
         previous = self._lookup.get((submap.agent, submap.session, submap.index - 1))
         follows = submap.follows_previous and previous is not None
         start = self.graph.records[previous].end if follows and previous is not None else None
-        self.graph.append(submap, start, self._last_pose(submap.agent), self.config.ties)
+        self.graph.append(submap, start, self.last_pose(submap.agent), self.config.ties)
         new = len(self.graph.records) - 1
         self._lookup[self.graph.records[new].key] = new
         return new
 
-    def _last_pose(self, agent: str) -> FloatArray:
+    def last_pose(self, agent: str) -> FloatArray:
         """Where an agent was last; the origin for one not seen before."""
         newest = next((r for r in reversed(self.graph.records) if r.submap.agent == agent), None)
         return np.eye(4) if newest is None else self.graph.poses[newest.end]
@@ -290,15 +302,16 @@ class GlobalMap:
         own = [r for r in self.graph.records if r.submap.agent == agent]
         if not own:
             return np.eye(4)
-        return np.asarray(self.graph.poses[own[-1].end] @ invert_transform(self.odometry_pose(agent)))
+        return np.asarray(self.graph.poses[own[-1].end] @ invert_transform(self.odometry_pose(agent).T))
 
-    def odometry_pose(self, agent: str) -> FloatArray:
-        """End pose of an agent's newest submap in its own odometry frame: the chain of end poses of its current run."""
+    def odometry_pose(self, agent: str) -> PoseEstimate:
+        """End pose of an agent's newest submap in its own odometry frame: the chain of end poses of its session."""
         own = [r.submap for r in self.graph.records if r.submap.agent == agent]
-        T = np.eye(4)
+        T, P = np.eye(4), np.zeros((6, 6))
         for submap in sorted((s for s in own if s.session == own[-1].session), key=lambda s: s.index):
+            P = compose_covariance(T, P, submap.end_pose, submap.covariance[:6, :6])
             T = T @ submap.end_pose
-        return T
+        return PoseEstimate(own[-1].end_stamp_ns if own else 0, T, P)
 
     def start_pose(self, record: int) -> PoseEstimate:
         """Start pose of a record in the map frame, with covariance."""
@@ -316,11 +329,14 @@ class GlobalMap:
     def save(self, path: Path | str) -> None:
         """Write the map to a folder (see :mod:`sjsam_node.storage`), and go on from it as a map that is loaded does."""
         self.settle()
-        stored = StoredMap(
+        storage.write(Path(path), self.stored())
+        self.smoother.resume()
+
+    def stored(self) -> StoredMap:
+        """The map as it is, to be written; nothing is settled."""
+        return StoredMap(
             self.graph, self.detector.pending, self.consistency.refused, self.detector.near.compared, self.marks
         )
-        storage.write(Path(path), stored)
-        self.smoother.resume()
 
     @classmethod
     def load(cls, path: Path | str, config: GlobalMapConfig | None = None) -> GlobalMap:

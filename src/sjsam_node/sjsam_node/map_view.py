@@ -30,6 +30,9 @@ from slam_core.geometry import (
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 from slam_core.types import Float32Array, PoseEstimate, Submap
 
+_ORIGIN_SIGMA = 1e-6
+"""Standard deviation of the map's first pose (m, rad): the origin by definition, but no covariance may be singular."""
+
 
 @dataclass(frozen=True, eq=False)
 class MapLandmarks:
@@ -121,7 +124,7 @@ class MapView:
     def _widening(self, component: int) -> FloatArray:
         """What is added (6, 6) to the covariances of a component whose frame nothing ties to the map's."""
         if component == self.graph.component(0):
-            return np.zeros((6, 6))
+            return np.asarray(_ORIGIN_SIGMA**2 * np.eye(6))
         return np.diag(np.square([*[self.unlinked_sigma] * 3, np.pi, np.pi, np.pi]))
 
     def _gain(self, record: int) -> tuple[FloatArray, FloatArray]:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +16,8 @@ import numpy as np
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
-from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
+from sjsam_node.autosave import Autosave
+from sjsam_node.global_map import ALREADY_JOINED, GlobalMap, GlobalMapConfig, JoinReport
 from sjsam_node.localization import Localizer
 from sjsam_node.map_messages import (
     cloud_message,
@@ -24,30 +26,30 @@ from sjsam_node.map_messages import (
     landmarks_message,
     marks_message,
 )  # fmt: skip
+from sjsam_node.pose_tracker import PoseTracker
 from slam_core.base_node import SlamNode
 from slam_core.config import parameter
-from slam_core.geometry import FloatArray, invert_transform
 from slam_core.health import State
 from slam_core.messages import (
     SUBMAP_TOPICS,
     estimate_from_message,
     header_message,
     path_message,
-    pose_from_message,
     pose_with_covariance_message,
-    stamp_ns,
     submap_from_messages,
     transform_message,
 )
 from slam_core.messages.base import Message
 from slam_core.messages.submaps import SubmapMessages
-from slam_core.point_cloud import write_ply
+from slam_core.point_cloud import is_ply, write_ply
 from slam_core.ros import run_node
 from slam_core.stamp_guard import StampPolicy
 from slam_core.types import PoseEstimate, Submap
 
-_ODOMETRY_KEPT = 20000
 _MAP_PERIOD_S = 1.0
+_TRANSFORM_PERIOD_S = 0.05
+_LONGEST_SILENCE_S = 1.0
+"""``map_to_odom`` is stamped as if time went on for so long after the last odometry."""
 
 
 @dataclass(frozen=True)
@@ -60,33 +62,66 @@ class SjsamNodeConfig(GlobalMapConfig):
     map_path: str = parameter("map", "folder that save_map writes and load_map reads")
     ply_path: str = parameter("map_landmarks.ply", "file that export_ply writes")
     localize_only: bool = parameter(False, "locate the agents in the loaded map without changing it")
+    autosave_period_s: float = parameter(
+        10.0, "time between two copies of the map that a killed node goes on from; 0: none", unit="s", minimum=0.0
+    )
+    autosave_path: str = parameter("", "folder of that copy; empty: map_path with the ending .autosave")
+    transform_tolerance_s: float = parameter(
+        0.2, "how far ahead map_to_odom is stamped, so that a lookup at the present time works", unit="s", minimum=0.0
+    )
 
 
 class SjsamNode(SlamNode[SjsamNodeConfig]):
-    """Publishes ``pose`` and ``map_to_odom`` of each agent after each of its submaps, and the map, which costs the more
-    the larger it is, once a second at most. Neither changes the map.
+    """Publishes each agent's ``pose`` at every odometry message, ``map_to_odom`` twenty times a second, and the map,
+    which costs the more the larger it is, once a second at most. None of them changes the map.
     """
 
     def __init__(self) -> None:
         super().__init__("sjsam", SjsamNodeConfig)
         self.global_map = GlobalMap(self.config)
         self.localizers: dict[str, Localizer] = {}
-        self.odometry: dict[str, dict[int, FloatArray]] = {agent: {} for agent in self.config.agents}
+        self.map_path, self.ply_path = (Path(p).expanduser() for p in (self.config.map_path, self.config.ply_path))
+        self.autosave = self._make_autosave()
         self._stamp_ns = 0
-        self._map_is_news = False
+        self._map_is_news = self._copy_is_old = False
         self._advertise_outputs()
+        self._go_on_from_last_time()
+        self.trackers = {agent: self._make_tracker(agent) for agent in self.config.agents}
+        self._heard_at_s: dict[str, float] = {}
         for agent in self.config.agents:
             self._listen_to(agent)
-        unordered = {"required": False, "stamps": StampPolicy.ANY}
-        self.listen("clicked_point", "PointStamped", self.on_clicked_point, **unordered)
-        self.listen("initialpose", "PoseWithCovarianceStamped", self.on_initial_pose, **unordered)
-        self._serve("save_map", self.save_map)
-        self._serve("load_map", self.load_map)
-        self._serve("export_ply", self.export_ply)
-        self._serve("mark_here", self.mark_here)
-        self.create_timer(_MAP_PERIOD_S, self._publish_news, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.listen("clicked_point", "PointStamped", self.on_clicked_point, required=False)
+        self.listen(
+            "initialpose", "PoseWithCovarianceStamped", self.on_initial_pose, required=False, stamps=StampPolicy.ANY
+        )
+        for service in (self.save_map, self.load_map, self.export_ply, self.mark_here):
+            self._serve(service.__name__, service)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_MAP_PERIOD_S, self._publish_news, clock=steady)
+        self.create_timer(_TRANSFORM_PERIOD_S, self._publish_transforms, clock=steady)
+
+    def _make_autosave(self) -> Autosave:
+        path = self.config.autosave_path or f"{self.map_path}.autosave"
+        return Autosave(Path(path).expanduser(), 0.0 if self.config.localize_only else self.config.autosave_period_s)
+
+    def _go_on_from_last_time(self) -> None:
+        """The map of a node that was killed, or the one to localise in."""
         if self.config.localize_only:
             self.get_logger().info(self.load_map())
+        elif (copy := self.autosave.found()) is not None:
+            try:
+                self._replace_map(copy)
+            except ValueError as error:
+                self.get_logger().error(f"the autosaved map cannot be used, a new one begins: {error}")
+                self.autosave.put_away()
+                return
+            count = len(self.global_map.graph.records)
+            self.get_logger().warning(
+                f"a node was killed: going on from {count} submaps in {copy} (~/reset forgets them)"
+            )
+
+    def _make_tracker(self, agent: str) -> PoseTracker:
+        return PoseTracker(None if self.config.localize_only else self.global_map.last_pose(agent))
 
     def _advertise_outputs(self) -> None:
         for name in ("map/landmarks", "map/cloud"):
@@ -125,20 +160,22 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self._localize(agent, submap)
             return
         report = self.global_map.add(submap)
+        if report.reason == ALREADY_JOINED:  # sent again to a node that was started again
+            self.health.count("submaps sent again")
+            return
         if not report.accepted:
             raise ValueError(f"submap {submap.frame_id}: {report.reason}")
         self._count(report)
         pose = self.global_map.end_pose(submap.agent)
         if pose is not None:
-            self._publish_pose(agent, pose, submap)
-        self._map_is_news = True
+            self._follow(agent, pose, submap)
+        self._map_is_news = self._copy_is_old = True
 
     def on_odometry(self, agent: str, message: Message) -> None:
-        """Remember the odometry: a submap's end is one of its stamps."""
-        kept = self.odometry[agent]
-        kept[stamp_ns(message)] = pose_from_message(message.pose.pose)
-        if len(kept) > _ODOMETRY_KEPT:
-            del kept[next(iter(kept))]
+        """Where the agent is in the map at a pose of its odometry."""
+        self._heard_at_s[agent] = time.monotonic()
+        for pose in self.trackers[agent].add_odometry(estimate_from_message(message)):
+            self.publish(_below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, pose))
 
     def on_clicked_point(self, message: Message) -> None:
         """Mark a find at a point of the map frame."""
@@ -146,6 +183,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             raise ValueError(f"clicked_point must be in frame {self.config.map_frame}, got {message.header.frame_id}")
         self.global_map.marks.add(self.global_map.graph, np.array([message.point.x, message.point.y, message.point.z]))
         self._publish_marks()
+        self._copy_is_old = True
 
     def on_initial_pose(self, message: Message) -> None:
         """Where the agents are believed to be in the loaded map."""
@@ -156,11 +194,20 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def on_reset(self) -> None:
         """Forget the map; in a loaded map only where the agents are."""
         self.localizers.clear()
-        for kept in self.odometry.values():
-            kept.clear()
         if not self.config.localize_only:
             self.global_map.reset()
+            self.autosave.put_away()
+            self._copy_is_old = False
             self._publish_map()
+        self.trackers = {agent: self._make_tracker(agent) for agent in self.config.agents}
+
+    def on_shutdown(self) -> None:
+        """Write what has been mapped since the last copy, and put the copy away: nobody needs to go on from it."""
+        if self.autosave.is_on and self._copy_is_old:
+            self.autosave.wait()
+            self.autosave.save(self.global_map.stored(), time.monotonic())
+        self.autosave.put_away()
+        self.autosave.close()
 
     def _localizer(self, agent: str) -> Localizer:
         return self.localizers.setdefault(agent, Localizer(self.global_map))
@@ -172,7 +219,18 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self.health.set(State.LOST, "the place is not recognised in the map")
             return
         self.health.set(State.OK if found.matched else State.DEGRADED, "" if found.matched else "by odometry alone")
-        self._publish_pose(agent, found.pose, submap)
+        self._follow(agent, found.pose, submap)
+
+    def _follow(self, agent: str, end: PoseEstimate, submap: Submap) -> None:
+        """The end of a submap is known in the map: carry the agent's odometry on from there."""
+        tracker = self.trackers[agent]
+        if tracker.newest_ns is None:  # no odometry is heard: the ends of submaps are all that is known
+            self._heard_at_s[agent] = time.monotonic()
+            self.publish(_below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, end))
+        if tracker.has_heard(end.stamp_ns):
+            tracker.add_submap(end)
+        elif not self.config.localize_only:
+            tracker.add_submap(end, self.global_map.odometry_pose(submap.agent))
 
     def _count(self, report: JoinReport) -> None:
         self.health.count("submaps")
@@ -187,24 +245,33 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def save_map(self) -> str:
         """Write the map to ``map_path``; an empty one never over another."""
-        if not self.global_map.graph.records and Path(self.config.map_path).exists():
-            raise ValueError(f"the map is empty: {self.config.map_path} is left as it is")
-        self.global_map.save(self.config.map_path)
+        if not self.global_map.graph.records and self.map_path.exists():
+            raise ValueError(f"the map is empty: {self.map_path} is left as it is")
+        self.global_map.save(self.map_path)
         self._publish_map()
-        return f"{len(self.global_map.graph.records)} submaps written to {self.config.map_path}"
+        return f"{len(self.global_map.graph.records)} submaps written to {self.map_path}"
 
     def load_map(self) -> str:
-        """Replace the map by the one in ``map_path``."""
-        self.global_map = GlobalMap.load(self.config.map_path, self.config)
+        """Replace the map by the one in ``map_path``; where that cannot be used the map stays as it is."""
+        self._replace_map(self.map_path)
+        self.trackers = {agent: self._make_tracker(agent) for agent in self.config.agents}
+        return f"{len(self.global_map.graph.records)} submaps read from {self.map_path}"
+
+    def _replace_map(self, path: Path) -> None:
+        loaded = GlobalMap.load(path, self.config)
+        outputs = self._map_messages(loaded)  # whatever is wrong with it shows before anything changes
+        self.global_map = loaded
         self.localizers.clear()
-        self._publish_map()
-        return f"{len(self.global_map.graph.records)} submaps read from {self.config.map_path}"
+        self._copy_is_old = True
+        self._publish_all(outputs)
 
     def export_ply(self) -> str:
-        """Write the landmarks to ``ply_path``."""
+        """Write the landmarks to ``ply_path``; a file that is no PLY is not replaced."""
+        if self.ply_path.exists() and not is_ply(self.ply_path):
+            raise ValueError(f"{self.ply_path} is there and no PLY file: it is left as it is, choose another ply_path")
         positions = self.global_map.landmarks().positions
-        write_ply(Path(self.config.ply_path), positions.astype(np.float32))
-        return f"{len(positions)} landmarks written to {self.config.ply_path}"
+        write_ply(self.ply_path, positions.astype(np.float32))
+        return f"{len(positions)} landmarks written to {self.ply_path}"
 
     def mark_here(self) -> str:
         """Mark where the agent that was heard last is."""
@@ -213,6 +280,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             raise ValueError("nothing can be marked in an empty map")
         mark = self.global_map.marks.add(self.global_map.graph, self.global_map.graph.poses[records[-1].end][:3, 3])
         self._publish_marks()
+        self._copy_is_old = True
         return mark.name
 
     # -- outputs -------------------------------------------------------------------------------------------------------
@@ -220,40 +288,53 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def _publish_news(self) -> None:
         if self._map_is_news:
             self._publish_map()
+        if self._copy_is_old and self.autosave.is_due(time.monotonic()):
+            self._copy_is_old = False
+            self.autosave.save(self.global_map.stored(), time.monotonic())
 
     def _publish_map(self) -> None:
         self._map_is_news = False
-        header, landmarks = (
-            header_message(self.types, self._stamp_ns, self.config.map_frame),
-            self.global_map.landmarks(),
-        )
-        self.publish("map/landmarks", landmarks_message(self.types, header, landmarks))
-        self.publish("map/cloud", cloud_message(self.types, header, landmarks))
+        self._publish_all(self._map_messages(self.global_map))
+
+    def _publish_all(self, messages: dict[str, Message]) -> None:
+        for topic, message in messages.items():
+            self.publish(topic, message)
+
+    def _map_messages(self, global_map: GlobalMap) -> dict[str, Message]:
+        """What a map looks like, by topic."""
+        header = header_message(self.types, self._stamp_ns, self.config.map_frame)
+        landmarks, paths = global_map.landmarks(), global_map.path()
+        messages = {
+            "map/landmarks": landmarks_message(self.types, header, landmarks),
+            "map/cloud": cloud_message(self.types, header, landmarks),
+            "map/graph": graph_message(self.types, header, global_map),
+            "map/marks": marks_message(self.types, header, global_map.marks.positions(global_map.graph)),
+        }
         if self.has_listeners("map/ellipsoids"):
-            self.publish("map/ellipsoids", ellipsoids_message(self.types, header, landmarks))
-        self.publish("map/graph", graph_message(self.types, header, self.global_map))
-        self._publish_marks()
-        paths = self.global_map.path()
+            messages["map/ellipsoids"] = ellipsoids_message(self.types, header, landmarks)
         for agent in self.config.agents:
-            path = path_message(self.types, self._stamp_ns, self.config.map_frame, paths.get(agent, []))
-            self.publish(_below(agent, "map/path"), path)
+            poses = paths.get(agent, [])
+            messages[_below(agent, "map/path")] = path_message(self.types, self._stamp_ns, self.config.map_frame, poses)
+        return messages
 
     def _publish_marks(self) -> None:
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
-        self.publish(
-            "map/marks", marks_message(self.types, header, self.global_map.marks.positions(self.global_map.graph))
-        )
+        marks = self.global_map.marks.positions(self.global_map.graph)
+        self.publish("map/marks", marks_message(self.types, header, marks))
 
-    def _publish_pose(self, agent: str, pose: PoseEstimate, submap: Submap) -> None:
-        self.publish(_below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, pose))
-        T_odom_rig = self.odometry[agent].get(submap.end_stamp_ns)
-        if T_odom_rig is None:
-            T_odom_rig = self.global_map.odometry_pose(submap.agent)
-        T_map_odom = pose.T @ invert_transform(T_odom_rig)
-        odom = _below(agent, self.config.odom_frame)
-        message = transform_message(self.types, pose.stamp_ns, self.config.map_frame, odom, T_map_odom)
-        self.publish(_below(agent, "map_to_odom"), message)
-        self.broadcast(message)
+    def _publish_transforms(self) -> None:
+        """``map_to_odom`` of every agent that has odometry, stamped a little ahead of the present time."""
+        for agent, heard_at_s in self._heard_at_s.items():
+            T_map_odom = self.trackers[agent].T_map_odom
+            if T_map_odom is None or self._paused:
+                continue
+            stamp = self.trackers[agent].newest_ns or self._stamp_ns
+            gone_s = min(time.monotonic() - heard_at_s, _LONGEST_SILENCE_S)
+            ahead = stamp + round(1e9 * (gone_s + self.config.transform_tolerance_s))
+            odom = _below(agent, self.config.odom_frame)
+            message = transform_message(self.types, ahead, self.config.map_frame, odom, T_map_odom)
+            self.publish(_below(agent, "map_to_odom"), message)
+            self.broadcast(message)
 
 
 def _below(agent: str, name: str) -> str:

@@ -1,7 +1,9 @@
-"""A joined map on disk: a folder with ``manifest.json`` and ``arrays.npz``, whole or absent, exact to the last bit.
+"""A joined map on disk: a folder with ``manifest.json`` and one file of arrays, exact to the last bit.
 
-The manifest names the format, its version and a digest of the arrays, so that foreign, newer or damaged folders are
-refused with a clear line instead of giving a wrong map.
+The manifest names the format, its version, the file of arrays and its digest, and carries a digest of itself. A map
+that is there is replaced by one rename of the manifest, so that at any moment, also after a power cut, the folder holds
+the old map or the new one. Foreign, newer or damaged folders are refused with a clear line: everything is read and
+checked before anything is made of it (:mod:`sjsam_node.map_validation`).
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +21,13 @@ import numpy as np
 from sjsam_node.graph.links import Link
 from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.near_pairs import Compared
+from sjsam_node.map_validation import arrays_of, check_arrays, check_manifest
 from sjsam_node.marks import Mark, Marks
 from slam_core.files import atomic_path
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
-FORMAT, VERSION = "indoor-slam-map", 4
+FORMAT, VERSION = "indoor-slam-map", 5
+_MANIFEST = "manifest.json"
 Arrays = dict[str, AnyArray]
 
 
@@ -41,19 +46,29 @@ class StoredMap:
     marks: Marks
 
 
+@dataclass(frozen=True, eq=False)
+class PackedMap:
+    """A map as it is written; it shares nothing with the map that changes."""
+
+    manifest: dict[str, Any]
+    arrays: Arrays
+
+
 def write(folder: Path, stored: StoredMap) -> None:
     """Write a map to ``folder``; a map that is there is replaced, ValueError if there is anything else."""
+    write_packed(folder, pack(stored))
+
+
+def pack(stored: StoredMap) -> PackedMap:
+    """A copy of a map, to be written by another thread while the map goes on."""
     graph = stored.graph
-    arrays = _graph_arrays(graph)
+    arrays = {name: value.copy() for name, value in _graph_arrays(graph).items()}
     arrays.update(_link_arrays("links", graph.links))
     arrays.update(_link_arrays("pending", stored.pending))
     arrays.update(_link_arrays("refused", stored.refused))
-    arrays["compared/pairs"], arrays["compared/middles"] = stored.compared.pairs, stored.compared.seen
+    arrays["compared/pairs"], arrays["compared/middles"] = stored.compared.pairs, stored.compared.seen.copy()
     for i, record in enumerate(graph.records):
         arrays.update({f"submap_{i}/{name}": value for name, value in _submap_arrays(record.submap).items()})
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # type: ignore[arg-type]
-    data = buffer.getvalue()
     manifest = {
         "format": FORMAT, "version": VERSION, "submaps": len(graph.records),
         "agents": sorted({r.submap.agent for r in graph.records}),
@@ -61,12 +76,38 @@ def write(folder: Path, stored: StoredMap) -> None:
             [s.agent, s.index, s.session, r.start, s.follows_previous] for r in graph.records for s in [r.submap]
         ],
         "marks": [[m.name, m.node, *m.point.tolist()] for m in stored.marks.marks],
-        "sha256": hashlib.sha256(data).hexdigest(),
     }  # fmt: skip
-    with atomic_path(folder, may_replace=_is_map) as temporary:
-        temporary.mkdir()
-        (temporary / "arrays.npz").write_bytes(data)
-        (temporary / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+    return PackedMap(manifest, arrays)
+
+
+def write_packed(folder: Path, packed: PackedMap) -> None:
+    """Write a packed map, as :func:`write` does."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **packed.arrays)  # type: ignore[arg-type]
+    data = buffer.getvalue()
+    digest = hashlib.sha256(data).hexdigest()
+    name = f"arrays-{digest[:16]}.npz"
+    manifest = packed.manifest | {"arrays": name, "sha256": digest}
+    text = json.dumps(manifest | {"manifest_sha256": _digest(manifest)}, indent=1) + "\n"
+    if not is_map(folder):
+        with atomic_path(folder) as temporary:
+            temporary.mkdir()
+            _write_synced(temporary / name, data)
+            _write_synced(temporary / _MANIFEST, text.encode())
+        return
+    _write_synced(folder / name, data)
+    _write_synced(folder / f"{_MANIFEST}.part", text.encode())
+    os.replace(folder / f"{_MANIFEST}.part", folder / _MANIFEST)
+    for old in folder.glob("arrays*.npz"):
+        if old.name != name:
+            old.unlink()
+
+
+def _write_synced(path: Path, data: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def read(folder: Path) -> StoredMap:
@@ -79,36 +120,48 @@ def read(folder: Path) -> StoredMap:
     """
     manifest = _manifest(folder)
     try:
-        data = (folder / "arrays.npz").read_bytes()
+        check_manifest(manifest)
+        data = (folder / manifest["arrays"]).read_bytes()
+        if hashlib.sha256(data).hexdigest() != manifest["sha256"]:
+            raise ValueError(f"{manifest['arrays']} does not match its digest")
+        arrays = arrays_of(data)
+        check_arrays(manifest, arrays)
+        return _stored(manifest, arrays)
     except OSError as error:
-        raise ValueError(f"{folder}: map without readable arrays.npz: {error}") from error
-    if hashlib.sha256(data).hexdigest() != manifest["sha256"]:
-        raise ValueError(f"{folder}: the map is damaged: arrays.npz does not match its digest")
-    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    try:
-        graph = _graph(manifest["records"], arrays)
-        marks = Marks([Mark(str(name), int(node), np.array(point)) for name, node, *point in manifest["marks"]])
-        pending, refused = _links("pending", arrays), _links("refused", arrays)
-        compared = Compared.of(arrays["compared/pairs"], arrays["compared/middles"])
-        return StoredMap(graph, pending, refused, compared, marks)
-    except (KeyError, IndexError, TypeError) as error:
-        raise ValueError(f"{folder}: the map is incomplete: {error}") from error
+        raise ValueError(f"{folder}: the map is damaged: its arrays cannot be read: {error}") from error
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise ValueError(f"{folder}: the map is damaged: {error}") from error
 
 
-def _is_map(folder: Path) -> bool:
+def _stored(manifest: dict[str, Any], arrays: Arrays) -> StoredMap:
+    graph = _graph(manifest["records"], arrays)
+    marks = Marks([Mark(name, node, np.array(point, dtype=np.float64)) for name, node, *point in manifest["marks"]])
+    pending, refused = _links("pending", arrays), _links("refused", arrays)
+    compared = Compared.of(arrays["compared/pairs"], arrays["compared/middles"])
+    return StoredMap(graph, pending, refused, compared, marks)
+
+
+def _digest(manifest: dict[str, Any]) -> str:
+    """Digest of all that a manifest says, but its digest."""
+    said = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+def is_map(folder: Path) -> bool:
     """Whether a folder holds a map of any version, and nothing else."""
     try:
-        content = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        content = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
     is_ours = isinstance(content, dict) and content.get("format") == FORMAT
-    return is_ours and {p.name for p in folder.iterdir()} <= {"manifest.json", "arrays.npz"}
+    return is_ours and all(
+        p.name in (_MANIFEST, f"{_MANIFEST}.part") or p.match("arrays*.npz") for p in folder.iterdir()
+    )
 
 
 def _manifest(folder: Path) -> dict[str, Any]:
     try:
-        manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+        manifest = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"{folder}: not a map: {error}") from error
     except ValueError as error:
@@ -117,6 +170,8 @@ def _manifest(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{folder}: not a map of this program (format {FORMAT!r} expected)")
     if manifest.get("version") != VERSION:
         raise ValueError(f"{folder}: map version {manifest.get('version')} cannot be read, only version {VERSION}")
+    if manifest.get("manifest_sha256") != _digest(manifest):
+        raise ValueError(f"{folder}: the map is damaged: {_MANIFEST} does not match its digest")
     return manifest
 
 

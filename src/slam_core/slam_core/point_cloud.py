@@ -29,6 +29,14 @@ def write_ply(path: Path, points: Float32Array, grey: ByteArray | None = None) -
         temporary.write_bytes(header.encode("ascii") + vertices.tobytes())
 
 
+def is_ply(path: Path) -> bool:
+    """Whether a file begins as a PLY does."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(4) in (b"ply\n", b"ply\r")
+
+
 def voxel_mean(
     points: Float32Array, voxel_size: float, values: npt.NDArray[np.float32]
 ) -> tuple[Float32Array, Float32Array]:

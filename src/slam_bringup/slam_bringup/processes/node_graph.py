@@ -125,7 +125,7 @@ def _bag_parameters(config: SystemConfig, sensor: AgentSensors, map_path: str) -
         "stereo_driver": {"compressed": True} if compressed else {},
         "tof_driver": {"measurement": sensor.measurement, "pictures": chosen},
         "feature_extractor": {"tof.images": pictures[0] if pictures else "range"} if chooses else {},
-        "sjsam": {"map_path": map_path},
+        "sjsam": {"map_path": map_path, "autosave_period_s": 0.0},
     }
 
 

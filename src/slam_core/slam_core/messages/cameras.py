@@ -7,6 +7,9 @@ import numpy as np
 from slam_core.camera import Camera, CameraInfo
 from slam_core.messages.base import Message, MessageTypes
 
+MAX_PIXELS = 25_000_000
+"""More than any camera of a rig has: rectification keeps several numbers for each."""
+
 _MODEL_OF_MESSAGE = {"fisheye": "equidistant", "": "none"}
 
 
@@ -28,8 +31,11 @@ def camera_info_from_message(message: Message) -> CameraInfo:
     Raises
     ------
     ValueError
-        If the camera is not calibrated (focal length zero), a number is not finite or the distortion model unknown.
+        If the camera is not calibrated (focal length zero), a number is not finite, the distortion model unknown, or
+        the image too large to be one.
     """
+    if int(message.width) * int(message.height) > MAX_PIXELS:
+        raise ValueError(f"camera info of {message.width} x {message.height} px: more than {MAX_PIXELS} pixels")
     K = np.asarray(message.k, dtype=np.float64).reshape(3, 3)
     P = np.asarray(message.p, dtype=np.float64).reshape(3, 4)
     fx, fy, cx, cy = _uncropped(message, K)

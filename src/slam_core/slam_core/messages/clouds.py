@@ -19,6 +19,9 @@ LANDMARK_DTYPE = np.dtype(
 )
 """Fields of every landmark cloud. PointCloud2 has no 64-bit integer: FLOAT64 holds an id exactly up to 2^53."""
 
+FARTHEST_M = 1e5
+"""No range sensor sees so far."""
+
 _LARGEST_ID = 2**53
 
 
@@ -66,6 +69,8 @@ def points_message(types: MessageTypes, header: Message, points: AnyArray) -> Me
 def points_from_message(message: Message) -> Float32Array:
     """Points x, y, z (n, 3) float32 of a cloud, NaN rows kept; an organised cloud is flattened row by row.
 
+    Points beyond ``FARTHEST_M`` become NaN.
+
     Raises
     ------
     ValueError
@@ -75,7 +80,9 @@ def points_from_message(message: Message) -> Float32Array:
     names = cloud.dtype.names or ()
     if missing := [name for name in "xyz" if name not in names]:
         raise ValueError(f"point cloud has no field {', '.join(missing)}; it has {', '.join(names) or 'none'}")
-    return np.stack([cloud[name].ravel().astype(np.float32) for name in "xyz"], axis=-1)
+    points = np.stack([cloud[name].ravel().astype(np.float32) for name in "xyz"], axis=-1)
+    points[np.abs(points).max(axis=1, initial=0.0) > FARTHEST_M] = np.nan
+    return points
 
 
 def landmark_cloud(

@@ -10,6 +10,13 @@ from slam_core.geometry import FloatArray, pose7_from_transform, transform_from_
 from slam_core.messages.base import Message, MessageTypes, header_message, stamp_ns
 from slam_core.types import ImuSample, PoseEstimate, RelativeMotion
 
+FARTHEST_M = 1e6
+"""Positions beyond are no positions in a building; their squares would spoil covariances."""
+
+LARGEST_VARIANCE = 1e12
+FASTEST_RAD_S, STRONGEST_M_S2 = 1e3, 1e5
+"""Beyond what an IMU can measure."""
+
 STATIC_TRANSFORMS_TOPIC = "/static_transforms"
 """TransformStamped, latched, one message per transform: /tf_static for installations without tf2_msgs."""
 
@@ -37,21 +44,39 @@ def pose_with_covariance_message(types: MessageTypes, frame_id: str, estimate: P
     )
 
 
-def odometry_message(types: MessageTypes, frame_id: str, child_frame_id: str, estimate: PoseEstimate) -> Message:
-    """nav_msgs/Odometry of T_frame_child; the twist, which nobody estimates here, is marked unknown (covariance -1)."""
-    unknown = np.zeros(36)
-    unknown[0] = -1.0
+def odometry_message(
+    types: MessageTypes,
+    frame_id: str,
+    child_frame_id: str,
+    estimate: PoseEstimate,
+    twist: tuple[FloatArray, FloatArray] | None = None,
+) -> Message:
+    """nav_msgs/Odometry of T_frame_child.
+
+    ``twist``: linear m/s and angular rad/s (6,) in the child frame, and its covariance (6, 6); marked unknown
+    (covariance -1) where there is none.
+    """
     return types.Odometry(
         header=header_message(types, estimate.stamp_ns, frame_id), child_frame_id=child_frame_id,
-        pose=_with_covariance(types, estimate), twist=types.TwistWithCovariance(covariance=unknown),
+        pose=_with_covariance(types, estimate), twist=_twist(types, twist),
     )  # fmt: skip
+
+
+def _twist(types: MessageTypes, twist: tuple[FloatArray, FloatArray] | None) -> Message:
+    if twist is None:
+        unknown = np.zeros(36)
+        unknown[0] = -1.0
+        return types.TwistWithCovariance(covariance=unknown)
+    velocity, covariance = twist
+    parts = types.Twist(linear=_vector(types, velocity[:3]), angular=_vector(types, velocity[3:]))
+    return types.TwistWithCovariance(twist=parts, covariance=np.asarray(covariance, dtype=np.float64).ravel())
 
 
 def estimate_from_message(message: Message) -> PoseEstimate:
     """Pose with covariance of an Odometry or a PoseWithCovarianceStamped."""
     covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
-    if not np.isfinite(covariance).all():
-        raise ValueError("pose covariance is not finite")
+    if not np.abs(covariance).max() <= LARGEST_VARIANCE:
+        raise ValueError(f"pose covariance is not finite, or beyond {LARGEST_VARIANCE:g}")
     return PoseEstimate(stamp_ns(message), pose_from_message(message.pose.pose), covariance)
 
 
@@ -121,6 +146,8 @@ def imu_from_message(message: Message) -> ImuSample:
     rate, acceleration = _xyz(message.angular_velocity), _xyz(message.linear_acceleration)
     if not (np.isfinite(rate).all() and np.isfinite(acceleration).all()):
         raise ValueError(f"IMU reading is not finite: {rate} rad/s, {acceleration} m/s2")
+    if np.abs(rate).max() > FASTEST_RAD_S or np.abs(acceleration).max() > STRONGEST_M_S2:
+        raise ValueError(f"IMU reading is beyond what can be: {rate} rad/s, {acceleration} m/s2")
     if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
         raise ValueError("IMU message has no angular velocity or no acceleration (covariance -1)")
     return ImuSample(stamp_ns(message), rate, acceleration, message.header.frame_id)
@@ -136,6 +163,8 @@ def _transform(position: Message, orientation: Message) -> FloatArray:
     pose = np.array([*_xyz(position), q.x, q.y, q.z, q.w], dtype=np.float64)
     if not np.isfinite(pose).all():
         raise ValueError(f"pose is not finite: {pose.tolist()}")
+    if np.abs(pose[:3]).max() > FARTHEST_M:
+        raise ValueError(f"position is beyond {FARTHEST_M:g} m: {pose[:3].tolist()}")
     return transform_from_pose7(pose)
 
 

@@ -1,0 +1,73 @@
+"""A copy of the map on disk that is never much older than the map, so that a killed node goes on from it.
+
+While a node lives its copy is at ``path``. One that ends in order renames it to ``<path>.ended``; a copy still at
+``path`` when a node starts is therefore that of a node that was killed.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+from sjsam_node import storage
+from sjsam_node.storage import StoredMap
+from slam_core.files import remove
+
+_SHARE = 20.0
+"""Writing takes at most one part in so many of the time."""
+
+
+class Autosave:
+    """Writes copies of a map, on a thread of its own, ``period_s`` apart or more where writing takes long.
+
+    Times are those of any steady clock, s.
+    """
+
+    def __init__(self, path: Path, period_s: float) -> None:
+        self.path = path
+        self.ended = path.with_name(f"{path.name}.ended")
+        self._period_s = period_s
+        self._writer = ThreadPoolExecutor(1, thread_name_prefix="autosave")
+        self._job: Future[None] | None = None
+        self._due_s = 0.0
+        self._began_s = 0.0
+
+    @property
+    def is_on(self) -> bool:
+        """Whether copies are written at all."""
+        return self._period_s > 0.0
+
+    def found(self) -> Path | None:
+        """The copy of a node that was killed, or None."""
+        return self.path if self.is_on and storage.is_map(self.path) else None
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether to hand over the map now; what went wrong with the copy before is raised here."""
+        if self._job is not None and self._job.done():
+            job, self._job = self._job, None
+            self._due_s = max(self._due_s, now_s + _SHARE * (now_s - self._began_s) - self._period_s)
+            job.result()
+        return self.is_on and self._job is None and now_s >= self._due_s
+
+    def save(self, stored: StoredMap, now_s: float) -> None:
+        """Write a copy of the map as it is now."""
+        self._began_s, self._due_s = now_s, now_s + self._period_s
+        self._job = self._writer.submit(storage.write_packed, self.path, storage.pack(stored))
+
+    def put_away(self) -> None:
+        """Wait for the writer and rename the copy: the node ends in order, or its map was reset."""
+        self.wait()
+        if storage.is_map(self.path) and (storage.is_map(self.ended) or not self.ended.exists()):
+            remove(self.ended)
+            os.replace(self.path, self.ended)
+
+    def wait(self) -> None:
+        """Wait until the copy at hand is written."""
+        if self._job is not None:
+            self._job.exception()
+            self._job = None
+
+    def close(self) -> None:
+        """End the writer's thread."""
+        self._writer.shutdown()
