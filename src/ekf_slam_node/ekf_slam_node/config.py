@@ -59,6 +59,13 @@ class MeasurementConfig(Config):
     max_noise_factor: float = parameter(
         25.0, "largest factor on the claimed variances; 1 trusts every claim", minimum=1.0, maximum=1e4
     )
+    common_error: float = parameter(
+        2.5,
+        "error of the camera's pose, new in every frame, in multiples of what the residuals of neighbouring features"
+        " share; 0 takes the noise of every feature as its own",
+        minimum=0.0,
+        maximum=20.0,
+    )
     max_features: int = parameter(800, "the strongest features of a frame that are looked at", minimum=10)
     max_observations: int = parameter(120, "largest number of landmarks used in one update", minimum=6)
 

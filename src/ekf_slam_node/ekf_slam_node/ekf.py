@@ -81,7 +81,7 @@ class Ekf:
         self.landmarks = np.zeros((0, 3)) if landmarks is None else landmarks.copy()
         self.covariance = Covariance(covariance)
         self._invariant = invariant
-        self._offset = np.zeros(CORE_DIM)
+        self._offset = np.zeros(self.covariance.size)
 
     # ------------------------------------------------------------------------------------------------------ time
     def time_update(self, dt: float, sigma: FloatArray, T_previous_now: FloatArray | None = None) -> TimeUpdate:
@@ -129,19 +129,31 @@ class Ekf:
             return UpdateReport(nis, len(innovation), False)
         return self._update(S, np.array(step.increment[:, rows], order="F"), innovation, stay=True)
 
+    def shake(self, sigma: FloatArray) -> None:
+        """Add an independent error of standard deviations (6,) to the pose."""
+        head = self.covariance.head(6)
+        head[:6] += np.diag(sigma**2)
+        self.covariance.set_head(head)
+
     def settle(self) -> None:
         """Move the state from where it was linearised to its mean."""
         self._move(np.zeros(self.covariance.size))
 
     # --------------------------------------------------------------------------------------------------- measurement
-    def innovation_blocks(self, seen: Observation, slots: IndexArray, variance: FloatArray) -> FloatArray:
-        """Each observation's own innovation covariance S (m, 3, 3), correlations of rig and landmark included."""
+    def innovation_blocks(
+        self, seen: Observation, slots: IndexArray, variance: FloatArray, common: FloatArray
+    ) -> FloatArray:
+        """Each observation's own innovation covariance S (m, 3, 3), correlations of rig and landmark included.
+
+        ``common``: as in :meth:`update`.
+        """
         rows = CORE_DIM + 3 * np.asarray(slots)
         head = self.covariance.head(6)
         cross = np.swapaxes(head[rows[:, None] + np.arange(3)], 1, 2)
         J_pose, J_point = seen.J_pose, seen.J_point
         mixed = J_pose @ cross @ np.swapaxes(J_point, 1, 2)
-        S = J_pose @ head[:6] @ np.swapaxes(J_pose, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
+        pose = head[:6] + np.diag(common**2)
+        S = J_pose @ pose @ np.swapaxes(J_pose, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
         S += J_point @ self.covariance.blocks(rows) @ np.swapaxes(J_point, 1, 2)
         S[:, np.arange(3), np.arange(3)] += variance
         return np.asarray(S)
@@ -151,9 +163,16 @@ class Ekf:
         points = self._offset[CORE_DIM:].reshape(-1, 3)[slots]
         return np.asarray(z - seen.z - seen.J_pose @ self._offset[:6] - np.einsum("mij,mj->mi", seen.J_point, points))
 
-    def update(self, z: FloatArray, variance: FloatArray, seen: Observation, slots: IndexArray) -> UpdateReport:
+    def update(
+        self,
+        z: FloatArray,
+        variance: FloatArray,
+        seen: Observation,
+        slots: IndexArray,
+        common: FloatArray | None = None,
+    ) -> UpdateReport:
         """Measurements z (m, 3) with variances (m, 3) of the landmarks ``slots`` (m,), predicted as ``seen`` (Eqs.
-        6.16-6.21).
+        6.16-6.21), and with an error of the camera's pose of standard deviations ``common`` (6,) that all share.
 
         Without measurements, and where S cannot be factored, the state moves to its prediction and nothing is applied.
         """
@@ -166,6 +185,9 @@ class Ekf:
         k = 3 * len(rows)
         S = (seen.J_pose @ cross[:6] + seen.J_point @ points).reshape(k, k)
         S[np.arange(k), np.arange(k)] += variance.ravel()
+        if common is not None:
+            B = (seen.J_pose * common).reshape(k, 6)
+            S += B @ B.T
         return self._update(np.asfortranarray(0.5 * (S + S.T)), cross, self.innovation(z, seen, slots).ravel())
 
     def _update(self, S: FloatArray, cross: FloatArray, innovation: FloatArray, stay: bool = False) -> UpdateReport:

@@ -30,7 +30,7 @@ class Link:
     """Pairs of candidates ``rows`` and features ``columns`` (k,), and the motion they agree on.
 
     T, covariance: (4, 4) T_previous_now from these pairs alone, with its covariance (6, 6). excess: (3,) by what
-    factors the pairs' errors exceed their claimed variances.
+    factors the pairs' errors exceed their claimed variances. error: (k, 3) measured less predicted of each pair.
     """
 
     T: FloatArray
@@ -38,6 +38,7 @@ class Link:
     excess: FloatArray
     rows: IndexArray
     columns: IndexArray
+    error: FloatArray
 
 
 class Linker:
@@ -136,7 +137,7 @@ class Linker:
         # In the order of the features, not of their errors: to measure the best-fitting first would choose by noise.
         inliers = np.flatnonzero(final.inliers)
         inliers = inliers[np.argsort(columns[inliers], kind="stable")]
-        return Link(final.T, final.covariance, final.excess, rows[inliers], columns[inliers])
+        return Link(final.T, final.covariance, final.excess, rows[inliers], columns[inliers], final.error[inliers])
 
 
 def _is_usable(motion: MotionGuess) -> bool:

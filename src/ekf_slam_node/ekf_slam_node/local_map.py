@@ -104,16 +104,19 @@ class LocalMap:
         self.book.add(ids, pending.sightings[which], candidates.descriptors, self._frames)
         return slots
 
-    def measure(self, frame: Frame, sight: Sight) -> tuple[UpdateReport, Sight]:
-        """Measurement update with the sightings whose innovation is inside the gate; returns those."""
+    def measure(self, frame: Frame, sight: Sight, common: FloatArray) -> tuple[UpdateReport, Sight]:
+        """Measurement update with the sightings whose innovation is inside the gate; returns those.
+
+        ``common`` (6,): standard deviations of an error of the camera's pose that all of them share.
+        """
         seen = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
         z, claimed = frame.z[sight.columns], frame.variance[sight.columns]
         variance = claimed * self._unsteadiness(sight)
-        S = self.ekf.innovation_blocks(seen, sight.slots, variance)
+        S = self.ekf.innovation_blocks(seen, sight.slots, variance, common)
         innovation = self.ekf.innovation(z, seen, sight.slots)
         distance = squared_distances(innovation, S)
         good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > 0.05))
-        report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good])
+        report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good], common)
         after = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
         self.book.steadiness.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
         return report, sight.select(good)

@@ -32,13 +32,14 @@ _MAX_EXCESS = 25.0
 @dataclass(frozen=True, eq=False)
 class MotionGuess:
     """``T`` = T_previous_now (4, 4), covariance (6, 6) of the pairs alone, mask of the pairs that agree (n,), and by
-    what factors (3,) their errors exceed the claimed variances.
+    what factors (3,) their errors exceed the claimed variances; error (n, 3): measured less predicted, of all pairs.
     """
 
     T: FloatArray
     covariance: FloatArray
     inliers: np.ndarray
     excess: FloatArray
+    error: FloatArray
 
 
 @njit(cache=True, nogil=True)
@@ -143,7 +144,7 @@ def refine_motion(
         except np.linalg.LinAlgError:
             return None
         T = boxplus(T, covariance @ gradient)
-    return MotionGuess(T, 0.5 * (covariance + covariance.T), inliers, excess)
+    return MotionGuess(T, 0.5 * (covariance + covariance.T), inliers, excess, pairs.error)
 
 
 def _excess(error: FloatArray, S: FloatArray) -> FloatArray:

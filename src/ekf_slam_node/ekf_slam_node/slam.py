@@ -11,6 +11,7 @@ import numpy as np
 from ekf_slam_node.aids import ALL, Aid, MotionAids, aid_error, contradicts
 from ekf_slam_node.calibration import in_doubt
 from ekf_slam_node.candidates import MotionPrior, motion_prior
+from ekf_slam_node.common_error import CommonError
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import Ekf, TimeUpdate, UpdateReport
 from ekf_slam_node.landmarks import LandmarkBook, Pending
@@ -72,6 +73,7 @@ class EkfSlam:
     def _forget(self) -> None:
         self._aids = MotionAids(self.config.motion)
         self._noise = NoiseMonitor(self.config.measurement)
+        self._common = CommonError(self.config.measurement.common_error)
         self._odometry = OdometryChain()
         self._map: LocalMap | None = None
         self._builder = SubmapBuilder(self.config.agent, 0, 0, False, self.session)
@@ -172,20 +174,27 @@ class EkfSlam:
         """
         surprising = _is_surprising(link, expected, self.config.association.gate)
         frame = self._noise.learn(frame, link.excess)
+        self._common.learn(frame.z[link.columns, :2], link.error[:, :2], frame.camera.width)
+        common = self._common.sigma(frame)
         landmarks_before = len(local.book)
         sight = self._confirm(local, frame, link, surprising)
         # Linearised at the motion found, not at the predicted one: over a large step the two are far apart.
         step = local.ekf.time_update(dt, self._excused_sigma(local, link, dt) if surprising else self._sigma, link.T)
         local.ekf.apply_time_update(step)
-        if aid is not None and contradicts(aid, link.T, link.covariance, self.config.motion.aid_gate):
+        seen = link.covariance + np.diag(common**2)
+        if aid is not None and contradicts(aid, link.T, seen, self.config.motion.aid_gate):
             self.counters.add("aids_rejected")
         else:
             self._use_aid(local, step, aid, link.T)
         if aid is not None:
-            self._aids.learn_bias(aid, link.T, link.covariance, dt)
+            self._aids.learn_bias(aid, link.T, seen, dt)
         closing = self._builder.is_complete(local.ekf, self.config.submap, len(sight))
         divided = closing and self.config.submap.start == "independent"
-        report, used = local.measure(frame, sight.every_second() if divided else sight)
+        if closing:
+            # The next submap starts at the camera's pose in this frame, its error included: so does this one end there.
+            local.ekf.shake(common)
+            common = np.zeros(6)
+        report, used = local.measure(frame, sight.every_second() if divided else sight, common)
         state, reason = TrackingState.OK, ""
         if not report.applied:
             self.counters.add("updates_failed")
