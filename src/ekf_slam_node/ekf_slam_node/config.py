@@ -18,6 +18,10 @@ class MotionConfig(Config):
         2.0, "uncertainty of the speed of a rig never seen before", unit="m/s", minimum=0.0
     )
     sigma_initial_turn_rate: float = parameter(2.0, "the same for its turn rate", unit="rad/s", minimum=0.0)
+    imu: str = parameter(
+        "auto", "whether an IMU is used: where there is one, never, or always (a run without one is refused)",
+        choices=("auto", "off", "on"),
+    )  # fmt: skip
     coast_time: float = parameter(0.5, "a lost rig is assumed to stop after this time", unit="s", minimum=0.0)
     sigma_gyro: float = parameter(
         0.02, "noise of the mean turn rate of an IMU between two frames", unit="rad/s", minimum=1e-6

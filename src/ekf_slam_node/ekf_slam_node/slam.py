@@ -126,6 +126,8 @@ class EkfSlam:
 
     def process_imu(self, sample: ImuSample) -> None:
         """A reading of an IMU, in the order of the stamps, before the frames that come after it."""
+        if self.config.motion.imu == "off":
+            return
         if not self._aids.add_imu(sample):
             self.counters.add("imu_rejected")
 

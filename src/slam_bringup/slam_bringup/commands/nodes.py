@@ -29,7 +29,8 @@ from slam_core.output_folder import OutputFolder
 @mapping_options
 @click.option("--rate", type=click.FloatRange(min=0.0), default=0.0, help="speed of the replay [as fast as it goes]")
 def command(
-    bag: Path, output: Path, rate: float, mode: str | None, mapper: str, odometry: str, config: Path | None,
+    bag: Path, output: Path, rate: float, mode: str | None, mapper: str, odometry: str, imu: str | None,
+    config: Path | None,
     topics: tuple[str, ...], base_frame: str, overwrite: bool,
 ) -> None:  # fmt: skip
     """Map BAG with the nodes of the workspace: starts them, plays the bag, and writes what ``slam run`` does."""
@@ -37,7 +38,7 @@ def command(
     with SensorBag(bag, names) as opened:
         mode = mode_for(opened, mode)
         frames = sum(opened.count(agent, "depth" if mode == "tof" else "left") for agent in opened.agents)
-    system = choose(load_system_config(config), mode, mapper, odometry)
+    system = choose(load_system_config(config), mode, mapper, odometry, imu)
     with OutputFolder(output, "nodes", bag, overwrite=overwrite) as results, results.staged() as folder:
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"nodes mapping {bag.name}", total=frames)

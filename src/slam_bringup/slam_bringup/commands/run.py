@@ -32,7 +32,7 @@ FAILED = 1
 @click.command()
 @mapping_options
 def command(
-    bag: Path, output: Path, mode: str | None, mapper: str, odometry: str, config: Path | None,
+    bag: Path, output: Path, mode: str | None, mapper: str, odometry: str, imu: str | None, config: Path | None,
     topics: tuple[str, ...], base_frame: str, overwrite: bool,
 ) -> None:  # fmt: skip
     """Map BAG without ROS: same classes as the nodes, no drops, the same bytes every time.
@@ -44,7 +44,7 @@ def command(
     with SensorBag(bag, names) as opened:
         readings = sum(opened.count(agent, role) for agent in opened.agents for role in ("left", "depth", "imu"))
         mode = mode_for(opened, mode)
-    system = choose(load_system_config(config), mode, mapper, odometry)
+    system = choose(load_system_config(config), mode, mapper, odometry, imu)
     with OutputFolder(output, "run", bag, overwrite=overwrite) as results:
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"mapping {bag.name}", total=2 * readings)

@@ -69,8 +69,11 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
     return overrides
 
 
-def choose(config: SystemConfig, mode: str, mapper: str, odometry: str) -> SystemConfig:
-    """Apply the choices of the command line: where depth comes from, submaps or one filter, scan odometry or none."""
+def choose(config: SystemConfig, mode: str, mapper: str, odometry: str, imu: str | None = None) -> SystemConfig:
+    """Apply the choices of the command line: where depth comes from, submaps or one filter, scan odometry or none, and
+    whether an IMU is used (None: as configured).
+    """
+    motion = config.ekf_slam.motion
     submap = config.ekf_slam.submap
     if mapper == "ekf":
         submap = replace(submap, max_distance=1e6, max_landmarks=10**9, max_frames=10**9)
@@ -80,12 +83,25 @@ def choose(config: SystemConfig, mode: str, mapper: str, odometry: str) -> Syste
     return replace(
         config,
         feature_extractor=replace(config.feature_extractor, mode=mode),
-        ekf_slam=replace(config.ekf_slam, submap=submap, wait_for=() if odometry == "none" else (MOTION,)),
+        ekf_slam=replace(
+            config.ekf_slam,
+            submap=submap,
+            motion=motion if imu is None else replace(motion, imu=imu),
+            wait_for=() if odometry == "none" else (MOTION,),
+        ),
         ndt_odometry=replace(config.ndt_odometry, registration=registration),
     )
 
 
 def filter_config(config: FilterConfig, sensors: AgentSensors) -> FilterConfig:
-    """The filter of an agent, whose frames wait for its IMU as well where it has one."""
-    imu = (IMU,) if "imu" in sensors.topics else ()
+    """The filter of an agent, whose frames wait for its IMU as well where it has one that is used.
+
+    Raises
+    ------
+    ValueError
+        If an IMU is asked for and the agent has none.
+    """
+    if config.motion.imu == "on" and "imu" not in sensors.topics:
+        raise ValueError("an IMU is asked for (--imu on) and there is no topic imu: name it by --topic imu=/...")
+    imu = (IMU,) if "imu" in sensors.topics and config.motion.imu != "off" else ()
     return replace(config, agent=sensors.agent, wait_for=(*config.wait_for, *imu))
