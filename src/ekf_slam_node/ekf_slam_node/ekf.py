@@ -141,7 +141,7 @@ class Ekf:
 
     # --------------------------------------------------------------------------------------------------- measurement
     def innovation_blocks(
-        self, seen: Observation, slots: IndexArray, variance: FloatArray, common: FloatArray
+        self, seen: Observation, slots: IndexArray, variance: FloatArray, common: FloatArray | None = None
     ) -> FloatArray:
         """Each observation's own innovation covariance S (m, 3, 3), correlations of rig and landmark included.
 
@@ -152,7 +152,7 @@ class Ekf:
         cross = np.swapaxes(head[rows[:, None] + np.arange(3)], 1, 2)
         J_pose, J_point = seen.J_pose, seen.J_point
         mixed = J_pose @ cross @ np.swapaxes(J_point, 1, 2)
-        pose = head[:6] + np.diag(common**2)
+        pose = head[:6] if common is None else head[:6] + np.diag(common**2)
         S = J_pose @ pose @ np.swapaxes(J_pose, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
         S += J_point @ self.covariance.blocks(rows) @ np.swapaxes(J_point, 1, 2)
         S[:, np.arange(3), np.arange(3)] += variance
