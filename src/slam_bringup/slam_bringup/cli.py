@@ -25,6 +25,7 @@ COMMANDS = {
     "plane": "2D SLAM on range-bearing logs of one or several robots",
     "evaluate": "ATE, RPE and NEES of a trajectory against ground truth",
     "experiment": "the experiments of the thesis, beside its own figures",
+    "doctor": "what is wrong with a recording or a running rig, and what to do",
     "calibrate": "camera_info with uncertainties from pictures of a board",
 }
 

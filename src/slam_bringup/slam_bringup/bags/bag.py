@@ -69,11 +69,12 @@ class TopicInfo:
     best_effort: bool = False
 
 
-def offered_qos(latched: bool = False, depth: int = 1000) -> Qos:
-    """The profile a bag says its publisher offered: reliable, transient-local if ``latched``."""
+def offered_qos(latched: bool = False, depth: int = 1000, *, best_effort: bool = False) -> Qos:
+    """The profile a bag says its publisher offered: reliable unless ``best_effort``, transient-local if ``latched``."""
+    reliability = QosReliability.BEST_EFFORT if best_effort else QosReliability.RELIABLE
     durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
     return Qos(
-        QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, durability, _FOREVER, _FOREVER, QosLiveliness.AUTOMATIC,
+        QosHistory.KEEP_LAST, depth, reliability, durability, _FOREVER, _FOREVER, QosLiveliness.AUTOMATIC,
         _FOREVER, False,
     )  # fmt: skip
 
@@ -141,13 +142,16 @@ class BagWriter:
             self.declare(topic, type_name)
         self._writer.write(self._connections[topic], stamp_ns, data)
 
-    def declare(self, topic: str, type_name: str, *, latched: bool | None = None) -> None:
+    def declare(self, topic: str, type_name: str, *, latched: bool | None = None, best_effort: bool = False) -> None:
         """Make a topic known before its first message; ``latched`` follows from the name unless given."""
         latched = topic.rsplit("/", 1)[-1] in LATCHED_TOPICS if latched is None else latched
         if type_name not in typestore().fielddefs:
             raise ValueError(f"{topic}: message type {type_name} is not known")
         self._connections[topic] = self._writer.add_connection(
-            topic, type_name, typestore=typestore(), offered_qos_profiles=[offered_qos(latched)]
+            topic,
+            type_name,
+            typestore=typestore(),
+            offered_qos_profiles=[offered_qos(latched, best_effort=best_effort)],
         )
 
     def _rename(self) -> None:

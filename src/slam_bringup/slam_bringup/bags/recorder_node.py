@@ -79,7 +79,7 @@ class RecorderNode(Node):
         offers = [p.qos_profile for p in self.get_publishers_info_by_topic(topic)]
         latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in offers)
         best_effort = all(q.reliability == ReliabilityPolicy.BEST_EFFORT for q in offers)
-        self._writer.declare(topic, type_name, latched=latched)
+        self._writer.declare(topic, type_name, latched=latched, best_effort=best_effort)
         profile = sensor_qos(_DEPTH, latched, best_effort=best_effort)
         callback = self._callback(topic, type_name)
         self.create_subscription(kind, topic, callback, profile, raw=True)

@@ -16,7 +16,9 @@ from slam_bringup.commands.mapping_options import (
     progress_bar,
     require_map,
 )
-from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.doctor.examination import require_stereo
+from slam_bringup.pipeline.configuration import choose, system_config
+from slam_bringup.pipeline.overrides import Overrides, read_overrides
 from slam_bringup.processes.interrupt import INTERRUPTED, Interrupt
 from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.recorded_run import collect
@@ -38,12 +40,16 @@ def command(
     with SensorBag(bag, names) as opened:
         mode = mode_for(opened, mode)
         frames = sum(opened.count(agent, "depth" if mode == "tof" else "left") for agent in opened.agents)
-    system = choose(load_system_config(config), mode, mapper, odometry, imu)
+    overrides = read_overrides(config) if config is not None else Overrides()
+    system = choose(system_config(overrides), mode, mapper, odometry, imu)
+    if mode != "tof":
+        require_stereo(bag, names)
     with OutputFolder(output, "nodes", bag, overwrite=overwrite) as results, results.staged() as folder:
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"nodes mapping {bag.name}", total=frames)
             run = run_nodes(
                 bag, system, folder, logs=results.logs, odometry=odometry != "none", rate=rate, names=names,
+                overrides=overrides,
                 on_progress=lambda done: progress.update(task, completed=done), stopped=lambda: interrupt.asked,
             )  # fmt: skip
         result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)

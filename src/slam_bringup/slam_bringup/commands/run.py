@@ -17,6 +17,7 @@ from slam_bringup.commands.mapping_options import (
     progress_bar,
     require_map,
 )
+from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.interrupt import INTERRUPTED, STOPPED, Interrupt
@@ -45,6 +46,8 @@ def command(
         readings = sum(opened.count(agent, role) for agent in opened.agents for role in ("left", "depth", "imu"))
         mode = mode_for(opened, mode)
     system = choose(load_system_config(config), mode, mapper, odometry, imu)
+    if mode != "tof":
+        require_stereo(bag, names)
     with OutputFolder(output, "run", bag, overwrite=overwrite) as results:
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"mapping {bag.name}", total=2 * readings)

@@ -1,25 +1,27 @@
 """The configuration of the whole chain: one group per node, so that one YAML file serves ``slam run`` and the nodes.
 
-ekf_slam:
-  ros__parameters:          # this level may be left out
-    submap.max_distance: 1.5
+The form of the file: :mod:`slam_bringup.pipeline.overrides`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from dense_mapping.dense_model import DenseConfig
 from ekf_slam_node.stage import IMU, MOTION, FilterConfig
 from ndt_registration.odometry import OdometryConfig
 from sjsam_node.global_map import GlobalMapConfig
 from slam_bringup.bags.readings import AgentSensors
-from slam_core.config import Config, from_mapping, group
+from slam_bringup.pipeline.overrides import (
+    NODE_CONFIGS,
+    Overrides,
+    is_parameter_of,
+    read_overrides,
+    require_known_nodes,
+)
+from slam_core.config import Config, from_mapping, group, iterate_parameters
 from stereo_frontend.frontend import FrontendConfig
 from tof_driver.depth import DepthConfig
 
@@ -41,32 +43,35 @@ class SystemConfig(Config):
 
 
 def load_system_config(path: Path | None) -> SystemConfig:
-    """Defaults, overridden by a YAML file where one is given.
+    """Defaults, overridden by a YAML file where one is given; ValueError as :func:`system_config`."""
+    return SystemConfig() if path is None else system_config(read_overrides(path))
+
+
+def system_config(overrides: Overrides) -> SystemConfig:
+    """Defaults with the overrides of the algorithms; what only the nodes have, such as ``input.depth``, is left out.
 
     Raises
     ------
     ValueError
-        If the file is no mapping, names an unknown node or parameter, or holds a value out of range.
+        With file, node and parameter, if a node or parameter is unknown or a value out of range.
     """
-    return SystemConfig() if path is None else from_mapping(SystemConfig, read_overrides(path))
+    groups = {f.name: getattr(SystemConfig(), f.name) for f in fields(SystemConfig)}
+    require_known_nodes(overrides, {*groups, *NODE_CONFIGS})
+    known = {name: {parameter for parameter, _, _ in iterate_parameters(config)} for name, config in groups.items()}
+    for name in overrides.of_all:
+        if not any(name in k for k in known.values()) and not any(is_parameter_of(n, name) for n in NODE_CONFIGS):
+            raise ValueError(f"{overrides.origin}: no node has a parameter '{name}'")
+    parsed: dict[str, Any] = {name: _group(name, type(groups[name]), known[name], overrides) for name in groups}
+    return SystemConfig(**parsed)
 
 
-def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
-    """Parameters by node, as they stand in a YAML file, without the level ``ros__parameters``."""
+def _group(name: str, kind: type[Config], known: set[str], overrides: Overrides) -> Config:
+    values = {n: v for n, v in overrides.of_all.items() if n in known}
+    values |= {n: v for n, v in overrides.of(f"/{name}").items() if n in known or not is_parameter_of(name, n)}
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} is not YAML: {error}") from error
-    nodes = {f.name for f in fields(SystemConfig)}
-    if not isinstance(content, Mapping) or not set(content) <= nodes:
-        raise ValueError(f"{path} must hold one mapping per node ({', '.join(sorted(nodes))}), found {list(content)}")
-    overrides = {}
-    for node, values in content.items():
-        values = values or {}
-        if not isinstance(values, Mapping):
-            raise ValueError(f"{path}: the parameters of {node} must be a mapping, found {values!r}")
-        overrides[node] = dict(values.get("ros__parameters", values))
-    return overrides
+        return from_mapping(kind, values)
+    except ValueError as error:
+        raise ValueError(f"{overrides.origin}: {name}: {error}") from error
 
 
 def choose(config: SystemConfig, mode: str, mapper: str, odometry: str, imu: str | None = None) -> SystemConfig:

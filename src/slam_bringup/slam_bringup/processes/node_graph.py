@@ -10,6 +10,7 @@ from ekf_slam_node.stage import IMU
 from slam_bringup.bags.readings import AgentSensors
 from slam_bringup.bags.sensor_topics import is_rectified, join, nodes_name
 from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.overrides import Overrides, is_parameter_of
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand
 from slam_core.config import Config, iterate_parameters
@@ -23,6 +24,9 @@ RESULT_TOPICS = (
 
 _FINISHERS = ("ndt_odometry", "feature_extractor", "ekf_slam")
 """Nodes that hold frames back, front to back."""
+
+
+_MISSING = object()
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class NodeGraph:
     finishers: full names of the nodes that are told that the input has ended, in this order.
     """
 
+    specs: tuple[NodeSpec, ...]
     commands: tuple[NodeCommand, ...]
     played: dict[str, str]
     pace: tuple[str, ...]
@@ -66,12 +71,13 @@ def live_nodes(
     extra: Mapping[str, Mapping[str, Any]] | None = None,
     base_frames: Mapping[str, str] | None = None,
     with_imu: Iterable[str] = (),
+    overrides: Overrides | None = None,
 ) -> list[NodeSpec]:
     """Nodes for rigs with the sensors that the mode of ``config`` needs.
 
     ``rectified``: their stereo images are. ``extra``: parameters by executable. ``base_frames``: frame of each agent's
     rig, by default ``base_link`` below the agent's name. ``with_imu``: agents whose IMU is known to report; another's
-    is used as well, once it does.
+    is used as well, once it does. ``overrides``: what of them is not in ``config``.
     """
     base_frames, with_imu = base_frames or {}, set(with_imu)
     mode, extra, agents = config.feature_extractor.mode, extra or {}, tuple(agents)
@@ -90,22 +96,29 @@ def live_nodes(
         own = base | {"agent": agent, "wait_for": wait_for}
         specs.append(_spec("ekf_slam_node", "ekf_slam", config.ekf_slam, agent, extra, **own))
     specs.append(_spec("sjsam_node", "sjsam", config.sjsam, "", extra, agents=agents if any(agents) else ()))
-    return specs
+    return [_overridden(spec, config, overrides) for spec in specs] if overrides else specs
 
 
-def plan_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], odometry: bool, map_path: str) -> NodeGraph:
+def plan_nodes(
+    config: SystemConfig,
+    sensors: Mapping[str, AgentSensors],
+    odometry: bool,
+    map_path: str,
+    overrides: Overrides | None = None,
+) -> NodeGraph:
     """The nodes of a run over the agents of a bag."""
     mode = config.feature_extractor.mode
     first = next(iter(sensors.values()))
     base_frames = {agent: sensor.base_frame for agent, sensor in sensors.items()}
     specs = live_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
-        extra=_bag_parameters(config, first, map_path), base_frames=base_frames,
+        extra=_bag_parameters(config, first, map_path), base_frames=base_frames, overrides=overrides,
         with_imu=[agent for agent, sensor in sensors.items() if "imu" in sensor.topics],
     )  # fmt: skip
     names = {e: tuple(s.command.full_name for s in specs if s.executable == e) for e in _FINISHERS}
     recorded = {join(agent, topic) for agent in ("", *sensors) for topic in RESULT_TOPICS}
     return NodeGraph(
+        specs=tuple(specs),
         commands=tuple(spec.command for spec in specs),
         played={t: name for s in sensors.values() for t, name in _topics(s, mode, odometry).items()},
         pace=tuple(p for s in sensors.values() for p in _pace(s, mode, odometry)),
@@ -168,6 +181,17 @@ def _spec(
 def _below(agent: str, **frames: str) -> dict[str, str]:
     """Frames below an agent's name; those of a single rig keep the nodes' defaults."""
     return {parameter: f"{agent}/{frame}" for parameter, frame in frames.items()} if agent else {}
+
+
+def _overridden(spec: NodeSpec, config: SystemConfig, overrides: Overrides) -> NodeSpec:
+    """Parameters that only the node has, and those of one agent: the rest stands in ``config``, choices included."""
+    node, everyone = spec.executable, overrides.of(f"/{spec.executable}")
+    group = getattr(config, node, None)
+    in_config = {name for name, _, _ in iterate_parameters(group)} if group is not None else set()
+    own = overrides.of(spec.command.full_name)
+    own = {n: v for n, v in own.items() if n not in in_config or everyone.get(n, _MISSING) != v}
+    of_all = {n: v for n, v in overrides.of_all.items() if n not in in_config and is_parameter_of(node, n)}
+    return NodeSpec(spec.package, node, spec.namespace, spec.parameters | of_all | own)
 
 
 def _changed(config: Config) -> Iterable[tuple[str, Any]]:

@@ -16,6 +16,7 @@ from typing import Any
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.overrides import Overrides
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.node_graph import NodeGraph, plan_nodes
 from slam_bringup.processes.processes import NodeCommand, NodeGroup, PrivateDomain, ament_prefixes, node_environment
@@ -60,6 +61,7 @@ def run_nodes(
     odometry: bool,
     rate: float = 0.0,
     names: BagNames | None = None,
+    overrides: Overrides | None = None,
     on_progress: Callable[[int], None] = lambda frames: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> OnlineRun:
@@ -81,6 +83,8 @@ def run_nodes(
         Speed of the replay; 0: as fast as the nodes follow. Nothing is lost either way.
     names
         Topics and frames of the bag that are not named like the nodes' own.
+    overrides
+        Where ``config`` is from: parameters that only the nodes have, or one agent's.
     on_progress
         Called with the number of frames that the filters have processed.
     stopped
@@ -92,7 +96,7 @@ def run_nodes(
         If a node does not start, ends by itself, or does not answer; the message holds the end of its log.
     """
     with SensorBag(bag, names) as opened:
-        graph = plan_nodes(config, opened.sensors, odometry, str(out / "map"))
+        graph = plan_nodes(config, opened.sensors, odometry, str(out / "map"), overrides)
     with PrivateDomain() as domain:
         environment = node_environment(domain, fastdds_profile())
         with NodeGroup(environment, logs or out / "logs") as group, _supervisor(environment, group) as supervisor:

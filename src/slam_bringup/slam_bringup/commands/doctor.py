@@ -1,0 +1,77 @@
+"""``slam doctor``: what is wrong with a recording or a running rig, each thing in one line with what to do."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from slam_bringup.bags.sensor_topics import ROLES, BagNames, parse_topics
+from slam_bringup.commands.paths import UserPath
+from slam_bringup.doctor.examination import CHECKS, examine
+from slam_bringup.doctor.finding import Finding
+from slam_bringup.processes.node_arguments import ros_arguments
+from slam_bringup.processes.processes import NodeCommand, NodeProcess
+
+FAULTS = 1
+"""Exit code where something is wrong."""
+
+
+@click.command()
+@click.argument("bag", required=False, type=UserPath(exists=True))
+@click.option("--live", is_flag=True, help="look at the topics of the running ROS graph instead of a bag")
+@click.option(
+    "--seconds", type=click.FloatRange(min=1.0), default=10.0, show_default=True, help="how long, with --live"
+)
+@click.option(
+    "--topic", "topics", multiple=True, metavar="ROLE=TOPIC",
+    help=f"a topic that is not named like the nodes' (may be repeated); roles: {', '.join(ROLES)}",
+)  # fmt: skip
+@click.option("--base-frame", default="", metavar="FRAME", help="the rig's frame [base_link]")
+@click.option("--json", "as_json", is_flag=True, help="print the findings as JSON")
+def command(
+    bag: Path | None, live: bool, seconds: float, topics: tuple[str, ...], base_frame: str, as_json: bool
+) -> None:  # fmt: skip
+    """Check the topics, stamps, calibration, frames and images of BAG, or of what is published now (--live).
+
+    Ends with exit code 1 if anything is wrong.
+    """
+    if (bag is None) != live:
+        raise ValueError("name a bag, or say --live")
+    names = BagNames(parse_topics(topics), base_frame)
+    findings = examine(bag, names) if bag is not None else examine_live(seconds, names)
+    click.echo(json.dumps([asdict(f) for f in findings], indent=2) if as_json else _text(findings))
+    sys.exit(FAULTS if findings else 0)
+
+
+def examine_live(seconds: float, names: BagNames) -> list[Finding]:
+    """Record what is published for some seconds, then examine it as a bag.
+
+    Raises
+    ------
+    ValueError
+        If nothing with images was published, or the recorder does not start.
+    """
+    with tempfile.TemporaryDirectory(prefix="slam-doctor-") as folder:
+        bag, log = Path(folder) / "live", Path(folder) / "recorder.log"
+        recorder = NodeCommand("slam_bringup", "recorder", tuple(ros_arguments({"bag": str(bag)})))
+        process = NodeProcess.start(recorder, log, os.environ)
+        try:
+            time.sleep(seconds)
+        finally:
+            code = process.stop()
+        if code != 0 or not bag.exists():
+            raise ValueError(f"the recorder ended with code {code}:\n{process.complaint()}")
+        return examine(bag, names)
+
+
+def _text(findings: list[Finding]) -> str:
+    if not findings:
+        return f"nothing wrong found ({len(CHECKS)} groups of checks)"
+    return "\n".join(f"{number}. {finding}" for number, finding in enumerate(findings, start=1))

@@ -1,0 +1,54 @@
+"""All checks of a recording, in the order in which their faults would hide each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from slam_bringup.bags.sensor_topics import BagNames
+from slam_bringup.doctor.calibration import check_calibration
+from slam_bringup.doctor.depth_images import check_depth_images
+from slam_bringup.doctor.evidence import Evidence, gather
+from slam_bringup.doctor.finding import Finding
+from slam_bringup.doctor.frames import check_frames
+from slam_bringup.doctor.imu import check_imu
+from slam_bringup.doctor.stamps import check_stamps
+from slam_bringup.doctor.stereo_images import check_stereo_images
+from slam_bringup.doctor.topics import check_topics
+
+CHECKS: tuple[Callable[[Evidence], Iterator[Finding]], ...] = (
+    check_topics, check_stamps, check_frames, check_calibration, check_stereo_images, check_depth_images, check_imu,
+)  # fmt: skip
+_FIRST_MESSAGES = 120
+
+
+def examine(path: Path, names: BagNames | None = None) -> list[Finding]:
+    """Everything that is wrong with a bag, agent by agent; empty if nothing is.
+
+    Raises
+    ------
+    ValueError
+        If there is no bag with images to look at.
+    """
+    return [finding for evidence in gather(path, names) for check in CHECKS for finding in _named(evidence, check)]
+
+
+def require_stereo(path: Path, names: BagNames | None = None) -> None:
+    """Refuse a bag whose first images show that stereo can never work: swapped, no baseline, one camera twice.
+
+    Raises
+    ------
+    ValueError
+        With what is wrong and what to do.
+    """
+    for evidence in gather(path, names, messages=_FIRST_MESSAGES):
+        for check in (check_calibration, check_stereo_images):
+            for finding in check(evidence):
+                if finding.prevents_mapping:
+                    raise ValueError(str(finding))
+
+
+def _named(evidence: Evidence, check: Callable[[Evidence], Iterator[Finding]]) -> Iterator[Finding]:
+    for finding in check(evidence):
+        yield replace(finding, what=f"agent {evidence.agent}: {finding.what}") if evidence.agent else finding

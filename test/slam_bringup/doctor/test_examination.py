@@ -1,0 +1,78 @@
+"""The doctor on copies of the demo with one fault each, and on the demo itself, of which it says nothing.
+
+``benchmarks/doctor.py`` has many more faults, and real recordings.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from click.testing import CliRunner
+
+from slam_bringup.cli import slam
+from slam_bringup.doctor.examination import examine, require_stereo
+
+ROOT = Path(__file__).resolve().parents[3]
+DEMO = ROOT / "bags" / "demo"
+
+
+@pytest.fixture(scope="module")
+def bench() -> ModuleType:
+    """The benchmark as a module: it knows how to fault a bag."""
+    spec = importlib.util.spec_from_file_location("doctor_benchmark", ROOT / "benchmarks" / "doctor.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    module.SECONDS = 3.0
+    return module
+
+
+def test_of_a_good_bag_nothing_is_said() -> None:
+    assert examine(DEMO) == []
+    require_stereo(DEMO)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "left and right images exchanged", "baseline with the wrong sign", "right camera turned by 1.5 deg",
+        "depth in mm given as m", "right images 20 ms late", "images offered best effort", "left camera info missing",
+        "static transforms missing", "optical frames without their turn", "exposure that flickers",
+    ],
+)  # fmt: skip
+def test_each_fault_is_named_and_what_to_do(bench: ModuleType, tmp_path: Path, fault: str) -> None:
+    wanted, change = bench.FAULTS[fault]
+    bag = bench.copy(DEMO, tmp_path / "bag", change, best_effort=wanted == "best effort")
+    findings = examine(bag)
+    assert wanted in {finding.check for finding in findings}, findings
+    for finding in findings:
+        assert finding.advice
+        assert "\n" not in str(finding)
+
+
+@pytest.mark.parametrize("command", ["run", "nodes"])
+def test_a_run_that_can_never_work_says_so_at_once(bench: ModuleType, tmp_path: Path, command: str) -> None:
+    bag = bench.copy(DEMO, tmp_path / "bag", bench.FAULTS["left and right images exchanged"][1])
+    result = CliRunner().invoke(slam, [command, str(bag), "-o", str(tmp_path / "out")])
+    assert isinstance(result.exception, ValueError)
+    assert "left and right swapped" in str(result.exception)
+    assert "exchange the two image topics" in str(result.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_ends_with_one_where_something_is_wrong(bench: ModuleType, tmp_path: Path) -> None:
+    bag = bench.copy(DEMO, tmp_path / "bag", bench.FAULTS["static transforms missing"][1])
+    text, as_json = (CliRunner().invoke(slam, ["doctor", str(bag), *option]) for option in ([], ["--json"]))
+    assert (text.exit_code, as_json.exit_code) == (1, 1)
+    assert text.output.startswith("1. missing transforms: ")
+    assert json.loads(as_json.output)[0]["check"] == "missing transforms"
+    good = CliRunner().invoke(slam, ["doctor", str(DEMO)])
+    assert (good.exit_code, "nothing wrong" in good.output) == (0, True)
+    assert isinstance(CliRunner().invoke(slam, ["doctor"]).exception, ValueError)
