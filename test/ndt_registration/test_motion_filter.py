@@ -124,3 +124,17 @@ def test_a_lost_filter_takes_the_next_pose() -> None:
 def test_covariances_turn_with_the_frame() -> None:
     T = make_transform(rotation_from_euler(np.pi / 2), np.array([3.0, 0.0, 0.0]))
     np.testing.assert_allclose(np.diag(rotated(T, np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]))), [2, 1, 3, 5, 4, 6])
+
+
+def test_process_noise_is_filterpys():
+    """Of one axis: position and velocity driven by a white acceleration that is constant within a step."""
+    from filterpy.common import Q_discrete_white_noise
+
+    config = MotionConfig(acceleration_sigma=1.7, speed_sigma=0.001)
+    motion = MotionFilter(config)
+    before = motion._P.copy()
+    motion.predict(0.13)
+    F = np.array([[1.0, 0.13], [0.0, 1.0]])
+    axis = np.ix_([6, 12], [6, 12])
+    Q = Q_discrete_white_noise(2, 0.13, 1.7**2)
+    np.testing.assert_allclose(motion._P[axis], F @ before[axis] @ F.T + Q, rtol=1e-9, atol=1e-15)

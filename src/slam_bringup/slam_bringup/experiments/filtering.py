@@ -8,6 +8,7 @@ import numpy as np
 
 from slam_bringup.experiments import plots
 from slam_bringup.experiments.chain import mapped, yaw
+from slam_bringup.experiments.expected import violations
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
 from slam_bringup.experiments.job import Job, JobResult
 
@@ -48,6 +49,12 @@ def speed_comparison(result: JobResult, thesis: str) -> Comparison:
     return Comparison("time, features included", thesis, ours, "faster than real time", summary["real_time_factor"] > 1)
 
 
+def bounds_comparison(scenario: str, result: JobResult) -> Comparison:
+    """Whether the run keeps the bounds of ``bags/expected.yaml``."""
+    outside = violations(scenario, result.values["summary"])
+    return Comparison("bounds of bags/expected.yaml", "", "; ".join(outside) or "kept", "kept", not outside)
+
+
 def landmarks_comparison(result: JobResult, thesis: str) -> Comparison:
     """Number of landmarks beside the thesis's."""
     return Comparison("landmarks", thesis, str(result.values["summary"]["landmarks"]))
@@ -75,6 +82,7 @@ def _workshop(name: str, thesis_landmarks: str, sections: str, title: str, numbe
                 landmarks_comparison(run, thesis_landmarks),
                 speed_comparison(run, "135 s without features"),
                 end_comparison(run, "15 mm", 0.015),
+                bounds_comparison(name, run),
             ],
             tables=[Table("Accuracy against the simulated truth", ACCURACY_HEADER, [accuracy_row(name, run)])],
             pictures=views,
@@ -150,6 +158,7 @@ def _conference() -> Experiment:
                 landmarks_comparison(run, "351"),
                 speed_comparison(run, "162 s features and 111 s EKF"),
                 end_comparison(run, "not given", 0.015),
+                bounds_comparison("conference", run),
             ],
             tables=[Table("Accuracy", ACCURACY_HEADER, [accuracy_row("conference", run)])],
             pictures=[

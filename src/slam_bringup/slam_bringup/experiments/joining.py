@@ -11,6 +11,7 @@ from slam_bringup.experiments.chain import mapped
 from slam_bringup.experiments.filtering import (
     ACCURACY_HEADER,
     accuracy_row,
+    bounds_comparison,
     end_comparison,
     frames,
     landmarks_comparison,
@@ -82,6 +83,7 @@ def _joined(
                 Comparison("loop", thesis["end"], f"{summary['loop_closures']} closures, end error "
                            f"{1e3 * agent['joined_end_m']:.1f} mm", "closed, end error < 1 % of the way", closed)
             )  # fmt: skip
+        comparisons.append(bounds_comparison(name, run))
         drift = np.linalg.norm(np.ptp(run.arrays["0 filter poses"][:, 2, 3]))
         comparisons.append(Comparison("range of height before joining", thesis["height"], f"{drift:.2f} m"))
         return Findings(
