@@ -46,6 +46,8 @@ _PLANAR_VOXEL_SIZE = 0.18
 """Edge of the finest cells of a scan in the plane, over its scale."""
 _PLANAR_CELL_POINTS, _PLANAR_SCAN_POINTS = 4, 30
 """Fewest points of a cell, and finite ones of a scan, in the plane."""
+_COARSE_TOLERANCE = 10.0
+"""So many times the tolerance ends a coarser level: its optimum only starts the next one."""
 _ROUNDING = 4e-15
 """Variance of rounding over the trace of a covariance (6, 6): what keeps it positive definite at a long lever."""
 
@@ -266,7 +268,8 @@ def _descend(
     for level in range(min(start, len(grids) - 1), -1, -1):
         count = len(source) if level == 0 else config.coarse_points
         layers = target.pyramid.layers(source, level, count, config.rim_share)
-        optimum = ndt_align(layers, R, t, fixed, scale, config.max_iterations, config.tolerance * scale)
+        tolerance = config.tolerance * scale * (1.0 if level == 0 else _COARSE_TOLERANCE)
+        optimum = ndt_align(layers, R, t, fixed, scale, config.max_iterations, tolerance)
         R, t = optimum.rotation, optimum.translation
         iterations += optimum.iterations
     return optimum, iterations
