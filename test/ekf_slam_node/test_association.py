@@ -76,23 +76,43 @@ def test_gated_costs_are_those_of_equation_4_8(world: PointWorld, rng: np.random
     prior = np.diag(np.repeat([0.02, 0.01], 3) ** 2)
     seen = predict(candidates, SMALL_STEP, T_RIG_OPTICAL, now)
     S = innovation_covariance(seen, candidates, prior)
-    similarity = np.asarray(candidates.descriptors @ now.descriptors.T, dtype=np.float64)
+    similarity = candidates.descriptors @ now.descriptors.T
     costs = np.full(similarity.shape, np.inf)
     visible = seen.in_image(now.camera, margin_px=-50.0)
-    association._gated_costs(now.z, now.variance, seen.z, S, visible, similarity, -1.0, 16.0, 3.0, costs)
-    assert np.isfinite(costs).sum() > 100
+    rows, columns, values = association._gated_pairs(
+        now.z, now.variance, seen.z, S, visible, similarity, -1.0, 16.0, 3.0
+    )
+    assert len(rows) > 100
+    assert np.array_equal(np.lexsort((columns, rows)), np.arange(len(rows)))
+    costs[rows, columns] = values
     for i in np.flatnonzero(visible)[:40]:
         for j in range(len(now)):
             joint = S[i] + np.diag(now.variance[j])
             innovation = now.z[j] - seen.z[i]
             nis = innovation @ np.linalg.solve(joint, innovation)
-            expected = nis + np.linalg.slogdet(joint)[1] + 3.0 * (1.0 - similarity[i, j]) if nis < 16.0 else np.inf
+            expected = (
+                nis + np.linalg.slogdet(joint)[1] + 3.0 * (1.0 - float(similarity[i, j])) if nis < 16.0 else np.inf
+            )
             assert costs[i, j] == pytest.approx(expected, rel=1e-9)
+
+
+def test_there_is_room_for_every_pair(world: PointWorld, rng: np.random.Generator) -> None:
+    candidates, _, now, _ = two_views(world, SMALL_STEP, rng)
+    seen = predict(candidates, SMALL_STEP, T_RIG_OPTICAL, now)
+    S = np.tile(1e8 * np.eye(3), (len(candidates), 1, 1))
+    similarity, everywhere = np.ones((len(candidates), len(now)), np.float32), np.ones(len(candidates), bool)
+    rows, columns, values = association._gated_pairs(
+        now.z, now.variance, seen.z, S, everywhere, similarity, 0.5, 1e9, 0.0
+    )
+    assert len(rows) == similarity.size > association._ROOM
+    np.testing.assert_array_equal(rows * len(now) + columns, np.arange(similarity.size))
+    assert np.isfinite(values).all()
 
 
 def test_pairs_are_one_to_one_and_the_cheapest_wins() -> None:
     costs = np.array([[1.0, 0.5, np.inf], [0.2, 0.4, np.inf], [np.inf, np.inf, np.inf]])
-    rows, columns = association.pair_up(costs)
+    at = np.nonzero(np.isfinite(costs))
+    rows, columns = association.pair_up(*at, costs[at], costs.shape)
     assert dict(zip(rows.tolist(), columns.tolist(), strict=True)) == {1: 0, 0: 1}
 
 

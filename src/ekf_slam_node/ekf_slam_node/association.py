@@ -19,14 +19,19 @@ from ekf_slam_node.pair_kernels import first_of_both
 from slam_core.geometry import FloatArray, transform_points
 
 IndexArray = npt.NDArray[np.int64]
+Similarity = npt.NDArray[np.floating]
 
 
 @njit(cache=True, nogil=True)
-def _gated_costs(z, variance, seen_z, S, visible, similarity, threshold, gate, weight, out):  # type: ignore[no-untyped-def]
-    """Cost of Eq. 4.8 plus the descriptors' for every pair inside the gate; the others are left at infinity."""
+def _gated_pairs(z, variance, seen_z, S, visible, similarity, threshold, gate, weight):  # type: ignore[no-untyped-def]
+    """Rows, columns and costs (Eq. 4.8 plus the descriptors') of all pairs inside the gate, row by row."""
+    rows, columns, costs = np.empty(_ROOM, np.int64), np.empty(_ROOM, np.int64), np.empty(_ROOM)
+    used = 0
     for i in range(len(seen_z)):
         if not visible[i]:
             continue
+        if used + len(z) > len(rows):
+            rows, columns, costs = _doubled(rows, len(z)), _doubled(columns, len(z)), _doubled(costs, len(z))
         reach_u = np.sqrt(gate * (S[i, 0, 0] + 4.0))
         for j in range(len(z)):
             du = z[j, 0] - seen_z[i, 0]
@@ -45,34 +50,52 @@ def _gated_costs(z, variance, seen_z, S, visible, similarity, threshold, gate, w
             y2 = (dw - d * y0 - e * y1) / f
             nis = y0 * y0 + y1 * y1 + y2 * y2
             if nis < gate:
-                out[i, j] = nis + 2.0 * np.log(a * c * f) + weight * (1.0 - similarity[i, j])
+                cost = nis + 2.0 * np.log(a * c * f) + weight * (1.0 - np.float64(similarity[i, j]))
+                rows[used], columns[used], costs[used] = i, j, cost
+                used += 1
+    return rows[:used], columns[:used], costs[:used]
 
 
-def pair_up(costs: FloatArray) -> tuple[IndexArray, IndexArray]:
-    """Rows and columns of the pairs taken in the order of their finite costs, each row and column once."""
-    rows, columns = np.nonzero(np.isfinite(costs))
-    order = np.argsort(costs[rows, columns], kind="stable")
-    picked = order[first_of_both(rows[order], columns[order], *costs.shape)]
+_ROOM = 4096
+"""Pairs for which there is room at first."""
+
+
+@njit(cache=True, nogil=True)
+def _doubled(values, more):  # type: ignore[no-untyped-def]
+    """The same values with twice the room, and ``more``."""
+    out = np.empty(2 * len(values) + more, values.dtype)
+    out[: len(values)] = values
+    return out
+
+
+def pair_up(
+    rows: IndexArray, columns: IndexArray, costs: FloatArray, shape: tuple[int, ...]
+) -> tuple[IndexArray, IndexArray]:
+    """Rows and columns of the pairs (n,) taken in the order of their costs, each row and column once.
+
+    ``shape`` says how many rows and columns there are.
+    """
+    order = np.argsort(costs, kind="stable")
+    picked = order[first_of_both(rows[order], columns[order], *shape)]
     return rows[picked], columns[picked]
 
 
 def associate_mahalanobis(
-    candidates: Candidates, frame: Frame, similarity: FloatArray, T_previous_now: FloatArray,
+    candidates: Candidates, frame: Frame, similarity: Similarity, T_previous_now: FloatArray,
     motion_covariance: FloatArray, T_rig_optical: FloatArray, config: AssociationConfig,
 ) -> tuple[IndexArray, IndexArray]:  # fmt: skip
     """Algorithm 2: indices of candidates and of features, paired by normalised distance and descriptors.
 
-    ``similarity`` (n, m) are the cosines of the candidates' and the features' descriptors.
+    ``similarity`` (n, m), of any precision, are the cosines of the candidates' and the features' descriptors.
     """
     seen = predict(candidates, T_previous_now, T_rig_optical, frame)
     S = innovation_covariance(seen, candidates, motion_covariance)
     visible = seen.in_image(frame.camera, margin_px=-50.0)
-    costs = np.full(similarity.shape, np.inf)
-    _gated_costs(
+    rows, columns, costs = _gated_pairs(
         frame.z, frame.variance, seen.z, S, visible, similarity, config.descriptor_threshold, config.gate,
-        config.descriptor_weight, costs,
+        config.descriptor_weight,
     )  # fmt: skip
-    return pair_up(costs)
+    return pair_up(rows, columns, costs, similarity.shape)
 
 
 def associate_nearest(
@@ -82,15 +105,17 @@ def associate_nearest(
     points, _ = rig_points(frame, T_rig_optical)
     moved = transform_points(T_previous_now, points)
     distance = np.linalg.norm(candidates.points[:, None] - moved[None], axis=2)
-    return pair_up(np.where(distance < gate, distance, np.inf))
+    rows, columns = np.nonzero(distance < gate)
+    return pair_up(rows, columns, distance[rows, columns], distance.shape)
 
 
-def match_descriptors(similarity: FloatArray, threshold: float, ratio: float) -> tuple[IndexArray, IndexArray]:
+def match_descriptors(similarity: Similarity, threshold: float, ratio: float) -> tuple[IndexArray, IndexArray]:
     """Mutual best pairs without any motion: better than ``threshold`` and clearly better than each one's second
     best.
     """
     if min(similarity.shape) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    similarity = similarity.astype(np.float64)
     best = np.argmax(similarity, axis=1)
     rows = np.arange(len(similarity))
     value = similarity[rows, best]
@@ -103,7 +128,7 @@ def match_descriptors(similarity: FloatArray, threshold: float, ratio: float) ->
 
 
 def associate_jcbb(
-    candidates: Candidates, frame: Frame, similarity: FloatArray, T_previous_now: FloatArray,
+    candidates: Candidates, frame: Frame, similarity: Similarity, T_previous_now: FloatArray,
     motion_covariance: FloatArray, T_rig_optical: FloatArray, config: AssociationConfig,
 ) -> tuple[IndexArray, IndexArray]:  # fmt: skip
     """Pairs that are jointly compatible: the features with the fewest candidates, as many as a search can handle.
@@ -112,15 +137,16 @@ def associate_jcbb(
     """
     seen = predict(candidates, T_previous_now, T_rig_optical, frame)
     S = innovation_covariance(seen, candidates, motion_covariance)
-    costs = np.full(similarity.shape, np.inf)
-    _gated_costs(
+    compatible = np.zeros(similarity.shape, dtype=bool)
+    pairs = _gated_pairs(
         frame.z, frame.variance, seen.z, S, seen.in_image(frame.camera), similarity, config.descriptor_threshold,
-        config.gate, 0.0, costs,
+        config.gate, 0.0,
     )  # fmt: skip
-    choices = np.isfinite(costs).sum(axis=0)
+    compatible[pairs[:2]] = True
+    choices = compatible.sum(axis=0)
     columns = np.argsort(np.where(choices > 0, choices, np.iinfo(np.int64).max), kind="stable")
     columns = columns[: min(config.joint_features, int((choices > 0).sum()))]
-    rows = np.flatnonzero(np.isfinite(costs[:, columns]).any(axis=1))
+    rows = np.flatnonzero(compatible[:, columns].any(axis=1))
     J = seen.J_pose[rows].reshape(-1, 6)
     joint = J @ motion_covariance @ J.T
     own = innovation_covariance(seen, candidates, None)[rows]

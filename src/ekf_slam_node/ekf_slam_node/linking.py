@@ -10,6 +10,7 @@ import numpy as np
 
 from ekf_slam_node.association import (
     IndexArray,
+    Similarity,
     associate_jcbb,
     associate_mahalanobis,
     associate_nearest,
@@ -60,7 +61,7 @@ class Linker:
             return None
         # Seeded by the frame's own stamp: the result does not depend on what happened before.
         rng = np.random.default_rng((self._config.seed, frame.stamp_ns))
-        similarity = np.asarray(candidates.descriptors @ frame.descriptors.T, dtype=np.float64)
+        similarity = candidates.descriptors @ frame.descriptors.T
         predicted = self._by_prediction(candidates, frame, similarity, prior, rng)
         if predicted is not None and len(predicted.rows) >= _CONVINCING * min(len(candidates), len(frame)):
             return predicted
@@ -69,7 +70,7 @@ class Linker:
         return max((link for link in (predicted, guessed) if link is not None), key=_number_of_pairs, default=None)
 
     def _by_prediction(
-        self, candidates: Candidates, frame: Frame, similarity: FloatArray, prior: MotionPrior, rng: np.random.Generator
+        self, candidates: Candidates, frame: Frame, similarity: Similarity, prior: MotionPrior, rng: np.random.Generator
     ) -> Link | None:
         config = self._config
         if _image_spread(prior, frame) > config.max_gate_px:
@@ -89,7 +90,7 @@ class Linker:
         return self._settle(candidates, frame, similarity, guess, config.min_inliers)
 
     def _by_guess(
-        self, candidates: Candidates, frame: Frame, similarity: FloatArray, rng: np.random.Generator
+        self, candidates: Candidates, frame: Frame, similarity: Similarity, rng: np.random.Generator
     ) -> Link | None:
         """First with the descriptors that agree well, then with all that agree at all."""
         config = self._config
@@ -113,7 +114,7 @@ class Linker:
         return None
 
     def _associate(
-        self, candidates: Candidates, frame: Frame, similarity: FloatArray, prior: MotionPrior
+        self, candidates: Candidates, frame: Frame, similarity: Similarity, prior: MotionPrior
     ) -> tuple[IndexArray, IndexArray]:
         config = self._config
         if config.method == "nearest":
@@ -122,7 +123,7 @@ class Linker:
         return associate(candidates, frame, similarity, prior.T, prior.covariance, self._T_rig_optical, config)
 
     def _settle(
-        self, candidates: Candidates, frame: Frame, similarity: FloatArray, guess: MotionGuess, least: int
+        self, candidates: Candidates, frame: Frame, similarity: Similarity, guess: MotionGuess, least: int
     ) -> Link | None:
         """Associate once more around the motion found, where the gates are as small as they can be."""
         noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))
