@@ -176,3 +176,20 @@ def test_rigid_transforms_are_told_from_others() -> None:
     not_finite[0, 3] = np.nan
     for bad in (mirrored, scaled, not_finite, np.eye(3)):
         assert not g.is_rigid_transform(bad)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-7, 1e-3, 1.0, np.pi - 1e-9, np.pi, 3.0, 6.0])
+def test_one_rotation_is_that_of_a_batch_of_one(angle: float, rng: np.random.Generator) -> None:
+    for axis in (*np.eye(3), *rng.normal(size=(10, 3))):
+        phi = angle * axis / np.linalg.norm(axis)
+        R = g.so3_exp(phi)
+        np.testing.assert_allclose(R, g.so3_exp(phi[None])[0], rtol=0, atol=4e-15)
+        np.testing.assert_allclose(
+            g.quaternion_from_rotation(R), g.quaternion_from_rotation(R[None])[0], rtol=0, atol=4e-15
+        )
+
+
+def test_vectors_that_are_not_finite_give_no_rotation_and_no_error() -> None:
+    assert np.isnan(g.so3_exp(np.array([np.inf, 0.0, 0.0]))).all()
+    assert np.isnan(g.so3_exp(np.array([np.nan, 0.0, 0.0]))).any()
+    assert np.isnan(g.quaternion_from_rotation(np.full((3, 3), np.nan))).all()

@@ -150,5 +150,12 @@ def refine_motion(
 def _excess(error: FloatArray, S: FloatArray) -> FloatArray:
     """By how much the median squares of pixel and inverse depth errors exceed their variances (3,)."""
     ratio = error**2 / S[:, np.arange(3), np.arange(3)] / _MEDIAN_CHI2
-    pixels, depth = np.median(ratio[:, :2]), np.median(ratio[:, 2])
+    pixels, depth = _median(ratio[:, :2].ravel()), _median(ratio[:, 2])
     return np.asarray(np.clip([pixels, pixels, depth], 0.25, _MAX_EXCESS))
+
+
+def _median(values: FloatArray) -> float:
+    """``np.median`` of at least one number, without its tests and copies, which took a millisecond a frame."""
+    ordered = np.sort(values)
+    n = len(ordered)
+    return float(0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]))
