@@ -9,11 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 from matplotlib.figure import Figure
 
 from slam_bringup.pipeline.results import RunResult
+from slam_bringup.report.agent_figures import motion_figure, side_view, sigma_figure
 from slam_bringup.report.figures import error_figure, features_figure, floor_plan_figure, map_figure, timing_figure
+from slam_core.evaluation import Evaluation
 from slam_core.files import atomic_text
+
+_DISHONEST = 1.6
+"""Factor between errors and claimed sigmas from which the report warns."""
 
 
 def write_report(path: Path, result: RunResult, summary: dict[str, Any]) -> None:
@@ -27,7 +33,10 @@ def write_report(path: Path, result: RunResult, summary: dict[str, Any]) -> None
             "poses": len(agent.trajectory),
             "length": agent.trajectory.length_m,
             "evaluation": agent.evaluation(),
+            "verdict": verdict(agent.evaluation()),
             "errors": _embedded(error_figure(agent)),
+            "sigmas": _embedded(sigma_figure(agent)),
+            "motion": _embedded(motion_figure(agent)),
             "features": _embedded(features_figure(agent)) if len(agent.feature_counts) else None,
         }
         for agent in result.agents
@@ -36,10 +45,23 @@ def write_report(path: Path, result: RunResult, summary: dict[str, Any]) -> None
         summary=summary,
         agents=agents,
         map=_embedded(map_figure(result)),
+        side=_embedded(side_view(result)),
         timing=_embedded(timing_figure(result)),
         plans=[_embedded(floor_plan_figure(result, plan)) for plan in result.floor_plans],
     )
     atomic_text(path, html)
+
+
+def verdict(evaluation: Evaluation | None) -> str:
+    """What ANEES says of the claimed covariance, in words; "" without it."""
+    if evaluation is None or evaluation.anees is None:
+        return ""
+    factor = float(np.sqrt(evaluation.anees))
+    if factor > _DISHONEST:
+        return f"The errors are {factor:.1f} times what the covariance claims: do not rely on the claimed sigmas."
+    if factor < 1.0 / _DISHONEST:
+        return f"The errors are {1.0 / factor:.1f} times smaller than the covariance claims: it is too cautious."
+    return "The errors are about as large as the covariance claims."
 
 
 def _embedded(figure: Figure | None) -> str | None:
