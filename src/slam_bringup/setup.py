@@ -28,6 +28,7 @@ setup(
         "console_scripts": [
             "slam = slam_bringup.cli:main",
             "bag_player = slam_bringup.bags.bag_player_node:main",
+            "slam_composed = slam_bringup.processes.composed_node:main",
             "recorder = slam_bringup.bags.recorder_node:main",
         ]
     },

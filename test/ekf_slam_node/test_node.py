@@ -82,6 +82,7 @@ def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[FeatureProbe]:
 @pytest.fixture
 def filter_process(probe: FeatureProbe) -> Iterator[subprocess.Popen[str]]:
     command = [sys.executable, "-c", "from ekf_slam_node.node import main; main()", "--ros-args", "-p", "agent:=a"]
+    command += ["-p", "input.policy:=all"]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     process = subprocess.Popen(command, env=env, stderr=subprocess.PIPE, text=True)
     yield process

@@ -20,12 +20,10 @@ ESTIMATORS = (
     ("ekf_slam_node", "ekf_slam"),
     ("sjsam_node", "sjsam"),
 )
-TOOLS = (("slam_bringup", "bag_player"), ("slam_bringup", "recorder"))
+TOOLS = (("slam_bringup", "bag_player"), ("slam_bringup", "recorder"), ("slam_bringup", "slam_composed"))
 
 
-@pytest.mark.parametrize(
-    ("package", "executable"), [*ESTIMATORS, ("slam_bringup", "bag_player"), ("slam_bringup", "recorder")]
-)
+@pytest.mark.parametrize(("package", "executable"), [*ESTIMATORS, *TOOLS])
 def test_the_ament_index_knows_the_executable(workspace: dict[str, str], package: str, executable: str) -> None:
     command = find_executable(package, executable, workspace["AMENT_PREFIX_PATH"].split(":"))
     assert Path(command[0]).name == executable

@@ -60,12 +60,14 @@ def turn_rates(start_ns: int) -> deque[ImuSample]:
     return deque(ImuSample(int(t), rate, np.array([0.0, 0.0, 9.8])) for t, rate in zip(stamps, rates, strict=True))
 
 
-@pytest.mark.parametrize(("mode", "odometry"), [("stereo", "none"), ("fuse", "ndt")])
+@pytest.mark.parametrize(
+    ("mode", "odometry", "composed"), [("stereo", "none", False), ("fuse", "ndt", False), ("fuse", "ndt", True)]
+)
 def test_nodes_and_the_offline_pipeline_agree(
-    domain_environment: dict[str, str], short_bag: Path, tmp_path: Path, mode: str, odometry: str
+    domain_environment: dict[str, str], short_bag: Path, tmp_path: Path, mode: str, odometry: str, composed: bool
 ) -> None:
     config = choose(load_system_config(None), mode, "sjsam", odometry)
-    run = run_nodes(short_bag, config, tmp_path, odometry=odometry != "none")
+    run = run_nodes(short_bag, config, tmp_path, odometry=odometry != "none", composed=composed)
     online, _ = collect(short_bag, config, run, mapper="sjsam", odometry=odometry)
     offline, _ = run_bag(short_bag, config, odometry=odometry)
     assert set(run.exit_codes.values()) == {0}, run.exit_codes

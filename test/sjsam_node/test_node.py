@@ -48,6 +48,7 @@ class Bench:
         end = time.monotonic() + seconds
         while not condition() and time.monotonic() < end:
             self.executor.spin_once(timeout_sec=0.05)
+            self.node.work()
         return condition()
 
     def call(self, name: str) -> Any:

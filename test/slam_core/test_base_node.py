@@ -60,6 +60,8 @@ def send(node: EarNode, topic: str, *stamps: int) -> None:
     kind = {"frames": node.types.PointCloud2, "click": node.types.PointStamped}[topic]
     for stamp in stamps:
         node._receive(entry, kind(header=header_message(node.types, stamp, "")))
+        while node.work():
+            pass
 
 
 def test_odd_stamps_are_rejected_and_only_a_lasting_jump_begins_a_session(node: EarNode) -> None:
@@ -95,3 +97,37 @@ def test_a_fault_in_a_service_or_timer_is_answered_and_counted(node: EarNode) ->
     while node.health.counters["faults"] < 3:
         executor.spin_once(timeout_sec=1.0)
     executor.shutdown()
+
+
+def test_a_live_node_leaves_out_what_comes_too_fast_and_says_so(node: EarNode) -> None:
+    entry, progress = node._inputs["frames"], []
+    node._announce = progress.append  # type: ignore[method-assign]
+    for k in range(10):
+        node._receive(entry, node.types.PointCloud2(header=header_message(node.types, START + k * 100 * MS, "")))
+    while node.work():
+        pass
+    assert node.heard == [START + 800 * MS, START + 900 * MS]
+    assert len(progress) == 10  # a player need not wait for those left out
+    status = node._diagnostic_message("").status[0]
+    assert {v.key: v.value for v in status.values}["skipped"] == "8"
+    assert "8 frames left out" in status.message
+    assert "left out" not in node._diagnostic_message("").status[0].message
+
+
+def test_gaps_of_the_stamps_are_counted(node: EarNode) -> None:
+    send(node, "frames", *(START + k * 100 * MS for k in (0, 1, 2, 3, 4, 7, 8)))
+    values = {v.key: v.value for v in node._diagnostic_message("").status[0].values}
+    assert values["missing"] == "2"
+
+
+def test_a_frame_that_waits_too_long_goes_on_by_the_clock(node: EarNode, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, overdue = [100.0], []
+    monkeypatch.setattr("slam_core.base_node.time.monotonic", lambda: now[0])
+    monkeypatch.setattr(node, "oldest_waiting_ns", lambda: START)
+    monkeypatch.setattr(node, "on_overdue", lambda: overdue.append(now[0]))
+    for _ in range(8):
+        node._look_for_overdue()
+        while node.work():
+            pass
+        now[0] += 0.25
+    assert overdue[0] == 101.25

@@ -82,7 +82,7 @@ def start(probe: PairProbe) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     def run(module: str, **parameters: object) -> subprocess.Popen[str]:
         given = [a for name, value in parameters.items() for a in ("-p", f"{name}:={value}")]
         code = f"from stereo_frontend.{module} import main; main()"
-        command = [sys.executable, "-c", code, "--ros-args", *given]
+        command = [sys.executable, "-c", code, "--ros-args", "-p", "input.policy:=all", *given]
         env = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         running.append(subprocess.Popen(command, env=env, stderr=subprocess.PIPE, text=True))
         return running[-1]

@@ -64,7 +64,7 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., subprocess.
     running: list[subprocess.Popen[bytes]] = []
 
     def launch(*parameters: str) -> subprocess.Popen[bytes]:
-        arguments = ["--ros-args", *(part for p in parameters for part in ("-p", p))]
+        arguments = ["--ros-args", *(part for p in parameters for part in ("-p", p)), "-p", "input.policy:=all"]
         running.append(subprocess.Popen([sys.executable, "-c", START, *arguments], stderr=subprocess.PIPE))
         return running[-1]
 

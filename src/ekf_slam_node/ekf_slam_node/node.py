@@ -98,6 +98,15 @@ class EkfNode(SlamNode[EkfNodeConfig]):
         self._publish_submaps(self.stage.start_session())
         self.path.clear()
 
+    def oldest_waiting_ns(self) -> int | None:
+        """Stamp of the oldest frame that waits for another sensor."""
+        return self.stage.oldest_waiting_ns
+
+    def on_overdue(self) -> None:
+        """Go on without the sensor that frames wait for."""
+        self.stage.give_up()
+        self._publish_ready()
+
     def on_finish(self) -> str:
         """The input has ended: process what waits and publish the open submap."""
         self.stage.give_up()

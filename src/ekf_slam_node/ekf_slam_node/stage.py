@@ -79,6 +79,11 @@ class FilterStage:
         """What the filter accepted and rejected."""
         return Counters() if self._slam is None else self._slam.counters
 
+    @property
+    def oldest_waiting_ns(self) -> int | None:
+        """Stamp of the oldest frame that waits for another stream."""
+        return self._waiting[0].stamp_ns if self._waiting else None
+
     def add_features(self, features: Features) -> None:
         """Take one frame."""
         self._waiting.append(features)

@@ -71,6 +71,15 @@ class NdtNode(SlamNode[NdtNodeConfig]):
         self.stage.reset()
         self.path.clear()
 
+    def oldest_waiting_ns(self) -> int | None:
+        """Stamp of the oldest frame that waits for another sensor."""
+        return self.stage.oldest_waiting_ns
+
+    def on_overdue(self) -> None:
+        """Go on without the sensor that frames wait for."""
+        self.stage.give_up()
+        self._publish_ready()
+
     def on_finish(self) -> str:
         """Register the scans that still wait for the IMU."""
         self.stage.finish()

@@ -65,6 +65,11 @@ class ScanOdometryStage:
         """Since when the IMU is silent, or ""."""
         return self._awaited.complaint()
 
+    @property
+    def oldest_waiting_ns(self) -> int | None:
+        """Stamp of the oldest frame that waits for another stream."""
+        return self._scans[0].stamp_ns if self._scans else None
+
     def add_scan(self, scan: Scan) -> None:
         """Take a scan."""
         self._scans.append(scan)

@@ -16,6 +16,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 COMMANDS = {
     "run": "offline pipeline: a bag to a map and a trajectory",
     "nodes": "the same through the real ROS nodes: starts them, plays the bag, records",
+    "live": "map live: all nodes in one process, on a camera or on topics",
     "simulate": "render a scenario to a bag with ground truth",
     "convert": "a public data set (EuRoC, KITTI, RGB-D) to a bag",
     "play": "publish a bag's topics over ROS",

@@ -10,6 +10,7 @@ from typing import Any
 
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_core.config import Config, ParameterInfo, iterate_parameters
+from slam_core.input_config import InputConfig
 
 _PREAMBLE = """\
 # Parameters
@@ -30,11 +31,12 @@ def reference() -> str:
     """The page as Markdown."""
     system = SystemConfig()
     sections = [_section(f.name, getattr(system, f.name)) for f in fields(system)]
+    sections.append(_section("Every node (`--ros-args -p input.policy:=all`)", InputConfig(), "input."))
     return "\n".join([_PREAMBLE, *sections])
 
 
-def _section(name: str, config: Config) -> str:
-    rows = [_row(*entry) for entry in iterate_parameters(config)]
+def _section(name: str, config: Config, prefix: str = "") -> str:
+    rows = [_row(*entry) for entry in iterate_parameters(config, prefix)]
     return "\n".join([f"## {name}\n", "| parameter | default | range | meaning |", "|---|---|---|---|", *rows, ""])
 
 

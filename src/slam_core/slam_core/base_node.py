@@ -37,11 +37,13 @@ from rclpy.clock import Clock, ClockType
 from std_srvs.srv import SetBool, Trigger
 
 from slam_core.config import Config
+from slam_core.exchange import SharedTypes, as_ros
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
 from slam_core.health import State
+from slam_core.job_queue import Job
 from slam_core.listening_node import LATCHED_DEPTH, Input, ListeningNode
-from slam_core.messages import STATIC_TRANSFORMS_TOPIC, header_message, stamp_ns, transform_from_message
+from slam_core.messages import STATIC_TRANSFORMS_TOPIC, MessageTypes, header_message, stamp_ns, transform_from_message
 from slam_core.messages.base import Message
 from slam_core.ros import RosTypes, declare_config, has_tf2_msgs, sensor_qos
 from slam_core.stamp_guard import StampGuard, StampPolicy
@@ -65,22 +67,32 @@ class SlamNode(ListeningNode, Generic[C]):
     def __init__(self, name: str, config_type: type[C]) -> None:
         super().__init__(name)
         self.config: C = declare_config(self, config_type, ignore=("input.",))
-        self.types = RosTypes()
+        self._ros_types = RosTypes()
+        self.types: MessageTypes = self._ros_types if self._exchange is None else SharedTypes(self._ros_types)
         self.frames = FrameTree()
         self._stamps = StampGuard[Message]()
         self._synchronizers: list[StampSynchronizer[Message]] = []
         self._outputs: dict[str, Any] = {}
+        self._latched: set[str] = set()
         self._silent = False
+        self._skipped = 0
+        self._held_back = False
+        self._waiting: tuple[int | None, float] = (None, 0.0)
         self._input_stamp_ns = 0
         self._reported_state = State.OK
-        self._progress = self.create_publisher(self.types.Header, PROGRESS_TOPIC, sensor_qos(self.input_config.depth))
-        self._diagnostics = self.create_publisher(self.types.DiagnosticArray, "/diagnostics", sensor_qos(100))
+        self._progress = self.create_publisher(
+            self._ros_types.Header, PROGRESS_TOPIC, sensor_qos(self.input_config.depth)
+        )
+        self._diagnostics = self.create_publisher(self._ros_types.DiagnosticArray, "/diagnostics", sensor_qos(100))
         self._listen_to_static_transforms()
         self._tf = self._advertise_tf()
         self.create_service(Trigger, "~/reset", self._on_reset_service)
         self.create_service(SetBool, "~/pause", self._on_pause_service)
         self.create_service(Trigger, "~/finish", self._on_finish_service)
-        self.create_timer(1.0, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self._tick, clock=steady)
+        if self.input_config.policy == "newest":
+            self.create_timer(0.25 * self.input_config.overdue, self._look_for_overdue, clock=steady)
 
     # -- for the nodes -------------------------------------------------------------------------------------------------
 
@@ -102,7 +114,7 @@ class SlamNode(ListeningNode, Generic[C]):
         announce = policy is StampPolicy.FRAMES
 
         def handle(stamp: int, message: Message) -> None:
-            self._process(topic, stamp, callback, message, announce=announce)
+            self._enqueue(topic, stamp, callback, message, announce=announce, keep=latched)
 
         self._add_input(topic, type_name, handle, latched, required, policy)
 
@@ -119,7 +131,7 @@ class SlamNode(ListeningNode, Generic[C]):
         names = list(topics)
 
         def on_set(stamp: int, messages: tuple[Message, ...]) -> None:
-            self._process(" + ".join(names), stamp, callback, *messages)
+            self._enqueue(" + ".join(names), stamp, callback, *messages, keep=latched)
 
         tolerance_ns = round(self.input_config.pairing_tolerance_s * 1e9)
         pairs = StampSynchronizer[Message](names, on_set, tolerance_ns=tolerance_ns, depth=self.input_config.depth)
@@ -132,15 +144,25 @@ class SlamNode(ListeningNode, Generic[C]):
     def advertise(self, topic: str, type_name: str, *, latched: bool = False, depth: int | None = None) -> None:
         """Offer a topic: reliable; ``latched`` ones (maps) keep what they sent for those who come later."""
         depth = depth or (LATCHED_DEPTH if latched else self.input_config.depth)
-        self._outputs[topic] = self.create_publisher(getattr(self.types, type_name), topic, sensor_qos(depth, latched))
+        kind = getattr(self._ros_types, type_name)
+        self._outputs[topic] = self.create_publisher(kind, topic, sensor_qos(depth, latched))
+        self._latched |= {topic} if latched else set()
+        if self._exchange is not None:
+            self._exchange.advertise(self.resolve_topic_name(topic))
 
     def publish(self, topic: str, message: Message) -> None:
-        """Send on an advertised topic."""
-        self._outputs[topic].publish(message)
+        """Send on an advertised topic: in a composed process by reference, and outside where anybody listens."""
+        if self._exchange is None:
+            self._outputs[topic].publish(message)
+            return
+        self._exchange.publish(self.resolve_topic_name(topic), message)
+        if topic in self._latched or self._outputs[topic].get_subscription_count() > 0:
+            self._outputs[topic].publish(as_ros(message))
 
     def has_listeners(self, topic: str) -> bool:
         """Whether anybody subscribes to an advertised topic: costly pictures are made only then."""
-        return bool(self._outputs[topic].get_subscription_count() > 0)
+        inside = self._exchange is not None and self._exchange.has_listeners(self.resolve_topic_name(topic))
+        return inside or bool(self._outputs[topic].get_subscription_count() > 0)
 
     def lookup(self, target: str, source: str) -> FloatArray:
         """T_target_source (4, 4) from the static transforms; ValueError, so a counted rejection, if unknown."""
@@ -149,7 +171,7 @@ class SlamNode(ListeningNode, Generic[C]):
     def broadcast(self, *transforms: Message) -> None:
         """Send TransformStamped messages on /tf where tf2_msgs is installed."""
         if self._tf is not None:
-            self._tf.publish(self.types.TFMessage(transforms=list(transforms)))
+            self._tf.publish(self._ros_types.TFMessage(transforms=as_ros(list(transforms))))
 
     def on_reset(self) -> None:
         """Forget everything (``~/reset``); override where there is state."""
@@ -176,11 +198,11 @@ class SlamNode(ListeningNode, Generic[C]):
         required: bool,
         policy: StampPolicy,
     ) -> None:
-        kind = getattr(self.types, type_name)
+        kind = getattr(self._ros_types, type_name)
         entry = Input(self.resolve_topic_name(topic), kind, handler, latched, required, policy)
         entry.best_effort = self.input_config.reliability == "best_effort"
         self._inputs[topic] = entry
-        self._subscribe(entry)
+        self._connect(entry)
 
     def _receive(self, entry: Input, message: Message) -> None:
         entry.seen_at_s = time.monotonic()
@@ -196,9 +218,31 @@ class SlamNode(ListeningNode, Generic[C]):
         if ruling.rejected:
             self._reject(f"{entry.topic}: message rejected: {ruling.reason}", len(ruling.rejected))
         if ruling.new_session:
-            self.start_session(f"{ruling.reason} on {entry.topic}")
+            self._flush()
+            why = f"{ruling.reason} on {entry.topic}"
+            self._jobs.add(Job("session", lambda: self.start_session(why)))
+        self._held_back = len(ruling.released) > 1
         for released_ns, released in ruling.released:
+            if starts:
+                entry.gaps.add(released_ns)
             entry.handler(released_ns, released)
+
+    def _enqueue(
+        self,
+        source: str,
+        stamp: int,
+        callback: Callable[..., None],
+        *messages: Message,
+        announce: bool = True,
+        keep: bool = False,
+    ) -> None:
+        """Have the callback run in its turn; frames may be left out unless one is to ``keep`` them.
+
+        Nor are those that came at once because their stamps had to be confirmed.
+        """
+        skip = None if keep or not announce or self._held_back else lambda: self._announce(stamp)
+        job = Job(source, lambda: self._process(source, stamp, callback, *messages, announce=announce), skip)
+        self._jobs.add(job)
 
     def _process(
         self, source: str, stamp: int, callback: Callable[..., None], *messages: Message, announce: bool = True
@@ -214,7 +258,11 @@ class SlamNode(ListeningNode, Generic[C]):
         if announce:
             self._input_stamp_ns = stamp
             self._report_change()
-            self._progress.publish(header_message(self.types, stamp, self.get_fully_qualified_name()))
+            self._announce(stamp)
+
+    def _announce(self, stamp: int) -> None:
+        """Tell a player that the frame of a stamp needs no more waiting for."""
+        self._progress.publish(header_message(self._ros_types, stamp, self.get_fully_qualified_name()))
 
     def _reject(self, why: str, number: int = 1) -> None:
         self.health.count("rejected", number)
@@ -223,10 +271,9 @@ class SlamNode(ListeningNode, Generic[C]):
     # -- reset, pause, finish ------------------------------------------------------------------------------------------
 
     def start_session(self, why: str) -> None:
-        """Flush the queues and go on in a new session: nothing that is mapped is forgotten."""
+        """Go on in a new session: nothing that is mapped is forgotten."""
         self.get_logger().warning(f"new session: {why}", throttle_duration_sec=1.0)
         self.health.count("sessions")
-        self._flush()
         self.on_new_session()
         self.health.set(State.OK, f"new session: {why}")
 
@@ -235,6 +282,7 @@ class SlamNode(ListeningNode, Generic[C]):
         self.get_logger().warning(f"reset: {why}", throttle_duration_sec=1.0)
         self.health.count("resets")
         self._flush()
+        self._jobs.clear()
         self._stamps.restart()
         self.on_reset()
         self.health.set(State.OK, f"reset: {why}")
@@ -242,6 +290,8 @@ class SlamNode(ListeningNode, Generic[C]):
     def _flush(self) -> None:
         for synchronizer in self._synchronizers:
             synchronizer.clear()
+        for entry in self._inputs.values():
+            entry.gaps.restart()
 
     def _on_reset_service(self, _: Any, response: Any) -> Any:
         self.reset("asked by service")
@@ -254,6 +304,8 @@ class SlamNode(ListeningNode, Generic[C]):
         return response
 
     def _on_finish_service(self, _: Any, response: Any) -> Any:
+        while self.work():  # what has come so far belongs to the input
+            pass
         try:
             response.success, response.message = True, self.on_finish()
         except ValueError as error:
@@ -278,18 +330,44 @@ class SlamNode(ListeningNode, Generic[C]):
 
     def _diagnostic_message(self, silence: str) -> Message:
         self.health.counters["unpaired"] = sum(s.unpaired for s in self._synchronizers)
+        self.health.counters["skipped"] = self._jobs.skipped.total()
+        self.health.counters["missing"] = max((entry.gaps.missing for entry in self._inputs.values()), default=0)
+        late = self._lateness()
         values = self.health.report(time.monotonic())
         values["unconnected"] = " ".join(self._unconnected())
         values["input_stamp_ns"] = str(self._input_stamp_ns)
         level = max(int(self.health.state), int(State.DEGRADED) if silence else 0)
-        status = self.types.DiagnosticStatus(
+        status = self._ros_types.DiagnosticStatus(
             level=bytes([level]),
             name=self.get_fully_qualified_name(),
-            message=silence or self.health.reason or "OK",
-            values=[self.types.KeyValue(key=key, value=value) for key, value in values.items()],
+            message="; ".join(filter(None, (silence, self.health.reason, late))) or "OK",
+            values=[self._ros_types.KeyValue(key=key, value=value) for key, value in values.items()],
         )
-        header = self.types.Header(stamp=self.get_clock().now().to_msg())
-        return self.types.DiagnosticArray(header=header, status=[status])
+        header = self._ros_types.Header(stamp=self.get_clock().now().to_msg())
+        return self._ros_types.DiagnosticArray(header=header, status=[status])
+
+    def _lateness(self) -> str:
+        """How many frames were left out since the last report because the node is too slow, or ""."""
+        skipped = self._jobs.skipped.total()
+        new, self._skipped = skipped - self._skipped, skipped
+        return f"{new} frames left out: they come faster than they are processed" if new else ""
+
+    # -- frames that wait ----------------------------------------------------------------------------------------------
+
+    def oldest_waiting_ns(self) -> int | None:
+        """Stamp of the frame that has waited longest for another sensor; override where frames wait."""
+        return None
+
+    def on_overdue(self) -> None:
+        """Go on without the sensor that frames wait for; override where frames wait."""
+
+    def _look_for_overdue(self) -> None:
+        """The clock's part in patience, for live nodes: the stages count frames, which may have ended as well."""
+        waiting, now = self.oldest_waiting_ns(), time.monotonic()
+        if waiting is None or waiting != self._waiting[0]:
+            self._waiting = (waiting, now)
+        elif now - self._waiting[1] > self.input_config.overdue:
+            self._jobs.add(Job("overdue", self.on_overdue))
 
     def _unconnected(self) -> list[str]:
         static = [] if any(s.get_publisher_count() for s in self._static_inputs) else [STATIC_TRANSFORMS_TOPIC]
@@ -299,13 +377,13 @@ class SlamNode(ListeningNode, Generic[C]):
 
     def _listen_to_static_transforms(self) -> None:
         profile = sensor_qos(LATCHED_DEPTH, latched=True)
-        kind = self.types.TransformStamped
+        kind = self._ros_types.TransformStamped
         self._static_inputs = [
             self.create_subscription(kind, STATIC_TRANSFORMS_TOPIC, self._on_static_transform, profile)
         ]
         if has_tf2_msgs():
             self._static_inputs.append(
-                self.create_subscription(self.types.TFMessage, "/tf_static", self._on_tf_static, profile)
+                self.create_subscription(self._ros_types.TFMessage, "/tf_static", self._on_tf_static, profile)
             )
 
     def _on_tf_static(self, message: Message) -> None:
@@ -320,6 +398,6 @@ class SlamNode(ListeningNode, Generic[C]):
 
     def _advertise_tf(self) -> Any:
         if has_tf2_msgs():
-            return self.create_publisher(self.types.TFMessage, "/tf", sensor_qos(100))
+            return self.create_publisher(self._ros_types.TFMessage, "/tf", sensor_qos(100))
         self.get_logger().info("tf2_msgs is not installed: transforms are published as TransformStamped topics only")
         return None

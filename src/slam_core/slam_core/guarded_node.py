@@ -19,6 +19,8 @@ class GuardedNode(Node):
 
     def __init__(self, name: str, **options: Any) -> None:
         self.health = Health()
+        self.calls = 0
+        """Callbacks called so far: as long as it grows there may be more to receive."""
         super().__init__(name, **options)
 
     def create_subscription(
@@ -37,6 +39,7 @@ class GuardedNode(Node):
         """As rclpy's, guarded: a request that fails is answered with the reason."""
 
         def answer(request: Any, response: Any) -> Any:
+            self.calls += 1
             try:
                 return callback(request, response)
             except Exception as error:
@@ -45,8 +48,18 @@ class GuardedNode(Node):
 
         return super().create_service(srv_type, srv_name, answer, *rest, **options)
 
+    @property
+    def has_work(self) -> bool:
+        """Whether something waits that :meth:`work` would do."""
+        return False
+
+    def work(self) -> bool:
+        """Do a piece of what waits; False if nothing does. Whoever spins the node calls it between messages."""
+        return False
+
     def _guarded(self, source: str, callback: Callable[..., None]) -> Callable[..., None]:
         def call(*arguments: Any) -> None:
+            self.calls += 1
             try:
                 callback(*arguments)
             except Exception:

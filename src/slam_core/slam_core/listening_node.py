@@ -6,40 +6,28 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-from slam_core.config import Config, parameter
+from slam_core.exchange import Exchange
 from slam_core.guarded_node import GuardedNode
+from slam_core.input_config import InputConfig
+from slam_core.job_queue import JobQueue
 from slam_core.messages.base import Message
 from slam_core.ros import declare_config, incompatibility, sensor_qos
+from slam_core.stamp_gaps import StampGaps
 from slam_core.stamp_guard import StampPolicy
-from slam_core.synchronizer import PAIRING_TOLERANCE_S
 
 WATCHDOG_S = 5.0
 QUIET_S = 1.0
 """An input that has been quiet for so long may be subscribed to anew without losing anything."""
 
 LATCHED_DEPTH = 1000
-
-
-@dataclass(frozen=True)
-class InputConfig(Config):
-    """How a node subscribes and pairs; parameters ``input.*`` of every node."""
-
-    reliability: str = parameter(
-        "match",
-        "reliability of subscriptions; match: what the publisher offers",
-        choices=("match", "reliable", "best_effort"),
-    )
-    depth: int = parameter(200, "messages kept per topic while the node is busy", minimum=1)
-    pairing_tolerance_s: float = parameter(
-        PAIRING_TOLERANCE_S, "largest difference of stamps that belong together", unit="s", minimum=0.0
-    )
 
 
 @dataclass
@@ -56,20 +44,56 @@ class Input:
     best_effort: bool = False
     volatile: bool = False
     seen_at_s: float | None = None
+    gaps: StampGaps = field(default_factory=StampGaps)
+
+    @property
+    def has_publisher(self) -> bool:
+        """Whether anybody publishes the topic; what comes from this process has no subscription."""
+        return self.subscription is None or bool(self.subscription.get_publisher_count())
 
 
 class ListeningNode(GuardedNode):
-    """Keeps the subscriptions; what arrives goes to :meth:`_receive`."""
+    """Keeps the subscriptions; what arrives goes to :meth:`_receive`, which makes jobs for :meth:`work` of it."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        self._exchange = Exchange.current
+        options = {} if self._exchange is None else self._exchange.node_options
+        super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
         self.input_config = declare_config(self, InputConfig, "input.")
         self._inputs: dict[str, Input] = {}
+        self._jobs = JobQueue(self.input_config.policy, self.input_config.waiting)
+        self._inbox: deque[tuple[Input, Message]] = deque()
+        self._wake = self.create_guard_condition(self._guarded("inbox", self._empty_inbox))
         self._paused = False
         self._started_at_s = time.monotonic()
 
     def _receive(self, entry: Input, message: Message) -> None:
         raise NotImplementedError
+
+    @property
+    def has_work(self) -> bool:
+        """Whether a job waits."""
+        return len(self._jobs) > 0
+
+    def work(self) -> bool:
+        """Do the next job that waits; False if there is none."""
+        return self._jobs.run_one()
+
+    def _connect(self, entry: Input) -> None:
+        """Listen to a node of this process where one publishes the topic, else to the network."""
+        if self._exchange is None or not self._exchange.has_publisher(entry.topic):
+            self._subscribe(entry)
+            return
+        self._exchange.listen(entry.topic, lambda message: self._put_in_inbox(entry, message))
+
+    def _put_in_inbox(self, entry: Input, message: Message) -> None:
+        """Take a message from the thread of the node that made it."""
+        self._inbox.append((entry, message))
+        self._wake.trigger()
+
+    def _empty_inbox(self) -> None:
+        while self._inbox:
+            self._receive(*self._inbox.popleft())
 
     def _subscribe(self, entry: Input) -> None:
         if entry.subscription is not None:
@@ -87,7 +111,7 @@ class ListeningNode(GuardedNode):
     def _unconnected(self) -> list[str]:
         """Required topics that no publisher has been matched with."""
         inputs = self._inputs.values()
-        return [entry.topic for entry in inputs if entry.required and not entry.subscription.get_publisher_count()]
+        return [entry.topic for entry in inputs if entry.required and not entry.has_publisher]
 
     def _silence(self) -> str:
         """Which required topics have been silent for five seconds and why, or "" if none has."""
@@ -98,6 +122,8 @@ class ListeningNode(GuardedNode):
         return "; ".join(texts)
 
     def _publishers_text(self, entry: Input) -> str:
+        if entry.subscription is None:
+            return "published in this process"
         publishers = self.get_publishers_info_by_topic(entry.topic)
         if not publishers:
             return "it has no publisher"
@@ -117,7 +143,8 @@ class ListeningNode(GuardedNode):
         quiet_since_s = time.monotonic() - QUIET_S
         for entry in self._inputs.values():
             quiet = entry.seen_at_s is None or entry.seen_at_s < quiet_since_s
-            publishers = self.get_publishers_info_by_topic(entry.topic) if quiet else []
+            from_network = entry.subscription is not None
+            publishers = self.get_publishers_info_by_topic(entry.topic) if quiet and from_network else []
             if not publishers:
                 continue
             best_effort = all(p.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for p in publishers)

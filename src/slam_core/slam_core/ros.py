@@ -26,6 +26,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 
 from slam_core.config import Config, ParameterInfo, from_mapping, iterate_parameters
+from slam_core.guarded_node import GuardedNode
 from slam_core.messages import MessageTypes
 from slam_core.messages.base import Message
 from slam_core.process_life import end_with_parent, on_request_to_end
@@ -148,6 +149,23 @@ class RunnableNode(Protocol):
         """As rclpy's."""
 
 
+def spin(node: RunnableNode, executor: SingleThreadedExecutor, stopped: threading.Event) -> None:
+    """Receive messages and do the node's work until asked to stop.
+
+    All that has come is received before the next job is done, so that the node itself knows what waits and what to
+    leave out, not the transport.
+    """
+    while rclpy.ok(context=executor.context) and not stopped.is_set():
+        if not isinstance(node, GuardedNode):
+            executor.spin_once(timeout_sec=_SIGNAL_PERIOD_S)
+            continue
+        calls = -1
+        while calls != node.calls and not stopped.is_set():
+            calls = node.calls
+            executor.spin_once(timeout_sec=0.0 if node.has_work else _SIGNAL_PERIOD_S)
+        node.work()
+
+
 def run_node(node_type: Callable[[], RunnableNode], args: list[str] | None = None) -> None:
     """Run a node until SIGINT, SIGTERM, SIGHUP or shutdown: exit code 0; a bad parameter ends it with one line and 2.
 
@@ -164,8 +182,7 @@ def run_node(node_type: Callable[[], RunnableNode], args: list[str] | None = Non
         node = node_type()
         executor.add_node(node)
         node.get_logger().info("ready")
-        while rclpy.ok() and not stopped.is_set():
-            executor.spin_once(timeout_sec=_SIGNAL_PERIOD_S)
+        spin(node, executor, stopped)
     except ExternalShutdownException:
         pass
     except ValueError as error:

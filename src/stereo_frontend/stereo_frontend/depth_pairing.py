@@ -41,6 +41,11 @@ class DepthPairing:
         """Since when the depth camera is silent, or ""."""
         return self._awaited.complaint()
 
+    @property
+    def oldest_waiting_ns(self) -> int | None:
+        """Stamp of the oldest pair that waits for a depth image."""
+        return self._pairs[0].stamp_ns if self._pairs else None
+
     def add_pair(self, images: StereoImages) -> list[Paired]:
         """Take a pair; returns what is complete, oldest first."""
         self._pairs.append(images)

@@ -52,6 +52,15 @@ class FeatureNode(SlamNode[FrontendConfig]):
         self.stage.reset()
         self.pairs.reset()
 
+    def oldest_waiting_ns(self) -> int | None:
+        """Stamp of the oldest frame that waits for another sensor."""
+        return self.stage.oldest_waiting_ns
+
+    def on_overdue(self) -> None:
+        """Go on without the sensor that frames wait for."""
+        self.stage.give_up()
+        self._publish_ready()
+
     def on_finish(self) -> str:
         """Process the pairs that still wait for a depth image."""
         self.stage.finish()

@@ -111,6 +111,11 @@ class FeatureStage:
         """Why features lack depth that they should have, or ""."""
         return self._pairing.complaint
 
+    @property
+    def oldest_waiting_ns(self) -> int | None:
+        """Stamp of the oldest pair that waits for a depth image."""
+        return self._pairing.oldest_waiting_ns
+
     def add_images(self, images: StereoImages) -> None:
         """Take a rectified pair, which may have to wait for a depth image."""
         if self._mode == "stereo":

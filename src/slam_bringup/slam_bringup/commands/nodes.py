@@ -30,10 +30,10 @@ from slam_core.output_folder import OutputFolder
 @click.command()
 @mapping_options
 @click.option("--rate", type=click.FloatRange(min=0.0), default=0.0, help="speed of the replay [as fast as it goes]")
+@click.option("--composed", is_flag=True, help="all nodes in one process, on a thread each")
 def command(
     bag: Path, output: Path, rate: float, mode: str | None, mapper: str, odometry: str, imu: str | None,
-    config: Path | None,
-    topics: tuple[str, ...], base_frame: str, overwrite: bool,
+    config: Path | None, topics: tuple[str, ...], base_frame: str, overwrite: bool, composed: bool,
 ) -> None:  # fmt: skip
     """Map BAG with the nodes of the workspace: starts them, plays the bag, and writes what ``slam run`` does."""
     names = BagNames(parse_topics(topics), base_frame)
@@ -48,8 +48,8 @@ def command(
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"nodes mapping {bag.name}", total=frames)
             run = run_nodes(
-                bag, system, folder, logs=results.logs, odometry=odometry != "none", rate=rate, names=names,
-                overrides=overrides,
+                bag, system, folder, logs=results.logs, odometry=odometry != "none", composed=composed, rate=rate,
+                names=names, overrides=overrides,
                 on_progress=lambda done: progress.update(task, completed=done), stopped=lambda: interrupt.asked,
             )  # fmt: skip
         result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ekf_slam_node.stage import IMU
@@ -24,6 +24,9 @@ RESULT_TOPICS = (
 
 _FINISHERS = ("ndt_odometry", "feature_extractor", "ekf_slam")
 """Nodes that hold frames back, front to back."""
+
+_REPLAY = {"input.policy": "all"}
+"""The player waits for the nodes: they need not leave anything out."""
 
 
 _MISSING = object()
@@ -113,8 +116,9 @@ def plan_nodes(
     specs = live_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
         extra=_bag_parameters(config, first, map_path), base_frames=base_frames, overrides=overrides,
-        with_imu=[agent for agent, sensor in sensors.items() if "imu" in sensor.topics],
+        with_imu=[a for a, s in sensors.items() if "imu" in s.topics and config.ekf_slam.motion.imu != "off"],
     )  # fmt: skip
+    specs = [replace(spec, parameters=spec.parameters | _REPLAY) for spec in specs]
     names = {e: tuple(s.command.full_name for s in specs if s.executable == e) for e in _FINISHERS}
     recorded = {join(agent, topic) for agent in ("", *sensors) for topic in RESULT_TOPICS}
     return NodeGraph(

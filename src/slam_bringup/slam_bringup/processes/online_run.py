@@ -6,6 +6,7 @@ private domain -> nodes ready and connected -> recorder -> player -> input has e
 from __future__ import annotations
 
 import importlib
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from slam_bringup.pipeline.overrides import Overrides
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.node_graph import NodeGraph, plan_nodes
 from slam_bringup.processes.processes import NodeCommand, NodeGroup, PrivateDomain, ament_prefixes, node_environment
+from slam_core.files import atomic_text
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC
 
 START_TIMEOUT_S = 180.0
@@ -59,6 +61,7 @@ def run_nodes(
     *,
     logs: Path | None = None,
     odometry: bool,
+    composed: bool = False,
     rate: float = 0.0,
     names: BagNames | None = None,
     overrides: Overrides | None = None,
@@ -79,6 +82,8 @@ def run_nodes(
         Folder for the nodes' logs; by default ``logs`` in ``out``.
     odometry
         Whether scan odometry runs as well.
+    composed
+        Whether all nodes share one process instead of having one each.
     rate
         Speed of the replay; 0: as fast as the nodes follow. Nothing is lost either way.
     names
@@ -101,7 +106,7 @@ def run_nodes(
         environment = node_environment(domain, fastdds_profile())
         with NodeGroup(environment, logs or out / "logs") as group, _supervisor(environment, group) as supervisor:
             run = _Choreography(group, supervisor, graph, out, stopped)
-            run.start_nodes()
+            run.start_nodes(composed=composed)
             started = time.monotonic()
             run.play(bag, rate, on_progress)
             run.finish()
@@ -138,12 +143,19 @@ class _Choreography:
         self._recording = out / "result.mcap"
         self._stopped = stopped
 
-    def start_nodes(self) -> None:
+    def start_nodes(self, *, composed: bool) -> None:
         """All nodes, then the recorder; returns when every topic has reached whoever listens to it."""
-        for command in self._graph.commands:
+        for command in (self._composed(),) if composed else self._graph.commands:
             self._group.start(command)
         self._wait_until_ready(from_outside=(*self._graph.played.values(), STATIC_TRANSFORMS_TOPIC))
         self._start_recorder()
+
+    def _composed(self) -> NodeCommand:
+        """The process that is all nodes, which it finds in a file."""
+        nodes = [(c.package, c.executable, c.arguments, c.namespace) for c in self._graph.commands]
+        path = self._group.logs / "nodes.json"
+        atomic_text(path, json.dumps(nodes, indent=1))
+        return NodeCommand("slam_bringup", "slam_composed", ("--nodes", str(path)))
 
     def _wait_until_ready(self, from_outside: tuple[str, ...]) -> None:
         """All nodes have reported themselves with all inputs connected, but those that come ``from_outside``."""

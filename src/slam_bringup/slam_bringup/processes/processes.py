@@ -23,6 +23,7 @@ _MODULES = {
     ("ndt_registration", "ndt_odometry"): "ndt_registration.node",
     ("ekf_slam_node", "ekf_slam"): "ekf_slam_node.node",
     ("sjsam_node", "sjsam"): "sjsam_node.node",
+    ("slam_bringup", "slam_composed"): "slam_bringup.processes.composed_node",
     ("slam_bringup", "bag_player"): "slam_bringup.bags.bag_player_node",
     ("slam_bringup", "recorder"): "slam_bringup.bags.recorder_node",
 }
@@ -184,7 +185,7 @@ class NodeGroup:
 
     def __init__(self, environment: Mapping[str, str], logs: Path) -> None:
         self._environment = environment
-        self._logs = logs
+        self.logs = logs
         self.nodes: list[NodeProcess] = []
         self.exit_codes: dict[str, int] = {}
         """Exit code by full node name, once stopped."""
@@ -198,7 +199,7 @@ class NodeGroup:
     def start(self, command: NodeCommand) -> NodeProcess:
         """Start one more node."""
         name = command.full_name.strip("/").replace("/", "_")
-        node = NodeProcess.start(command, self._logs / f"{name}.log", self._environment)
+        node = NodeProcess.start(command, self.logs / f"{name}.log", self._environment)
         self.nodes.append(node)
         return node
 

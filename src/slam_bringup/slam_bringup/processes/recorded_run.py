@@ -19,7 +19,7 @@ from slam_core.types import PoseEstimate
 from stereo_frontend.frontend import FrontendReport
 
 _FIGURES = "rectification_"
-_LOSSES = ("lost_by_transport", "rejected", "unpaired")
+_LOSSES = ("lost_by_transport", "rejected", "skipped", "unpaired")
 
 
 class Recording:

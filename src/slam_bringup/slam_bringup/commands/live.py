@@ -1,0 +1,51 @@
+"""``slam live``: all nodes of a rig in one process, on a live camera or on topics."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import click
+
+from slam_bringup.pipeline.configuration import MODES, ODOMETRIES, choose, load_system_config
+from slam_bringup.processes.node_graph import live_nodes
+
+
+@click.command()
+@click.argument("camera", required=False)
+@click.option("--topics", is_flag=True, help="the sensors publish topics; instead of CAMERA")
+@click.option("--left-info", type=click.Path(exists=True, dir_okay=False), help="camera_info YAML of its left half")
+@click.option("--right-info", type=click.Path(exists=True, dir_okay=False), help="the same of its right half")
+@click.option("--mode", type=click.Choice(MODES), default="stereo", show_default=True, help="where depth comes from")
+@click.option("--odometry", type=click.Choice(ODOMETRIES), default="none", show_default=True, help="of ToF scans")
+@click.option("--agents", default="", help="names of the agents, comma-separated [one rig]")
+@click.option(
+    "--config", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="YAML, one group per node, as in docs/parameters.md",
+)  # fmt: skip
+def command(
+    camera: str | None, topics: bool, left_info: str | None, right_info: str | None, mode: str, odometry: str,
+    agents: str, config: Path | None,
+) -> None:  # fmt: skip
+    """Map live, until Ctrl-C: CAMERA is a side-by-side stereo camera (number or device), or --topics are there.
+
+    The map is saved by the service ~/save_map of sjsam, as with separate nodes.
+    """
+    if topics == (camera is not None):
+        raise ValueError("say what to map: a CAMERA, or --topics of the sensors' drivers")
+    system = choose(load_system_config(config), mode, "sjsam", odometry)
+    names = [name.strip() for name in agents.split(",")]
+    extra = {} if camera is None else {"stereo_driver": _camera_parameters(camera, left_info, right_info)}
+    specs = live_nodes(system, names, odometry=odometry != "none", extra=extra)
+    try:
+        composed = importlib.import_module("slam_bringup.processes.composed_node")
+    except ImportError as error:
+        raise ValueError(f"live mapping needs ROS 2 Jazzy ({error}): source an installation, or use ./slam") from error
+    composed.run_composed([spec.command for spec in specs])
+
+
+def _camera_parameters(camera: str, left_info: str | None, right_info: str | None) -> dict[str, Any]:
+    if not (left_info and right_info):
+        raise ValueError("a camera needs --left-info and --right-info, as slam calibrate stereo makes them")
+    return {"source": "camera", "path": camera, "left_info": left_info, "right_info": right_info}

@@ -1,0 +1,34 @@
+"""How every node subscribes, pairs and keeps up: the parameters ``input.*``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam_core.config import Config, parameter
+from slam_core.job_queue import POLICIES
+from slam_core.synchronizer import PAIRING_TOLERANCE_S
+
+
+@dataclass(frozen=True)
+class InputConfig(Config):
+    """How a node subscribes and pairs; parameters ``input.*`` of every node."""
+
+    reliability: str = parameter(
+        "match",
+        "reliability of subscriptions; match: what the publisher offers",
+        choices=("match", "reliable", "best_effort"),
+    )
+    policy: str = parameter(
+        "newest",
+        "frames that come faster than they are processed; newest: only the newest wait, the others are left out and"
+        " counted; all: every frame is processed, however late",
+        choices=POLICIES,
+    )
+    waiting: int = parameter(2, "frames of an input that may wait with policy newest", unit="frames", minimum=1)
+    depth: int = parameter(200, "messages kept per topic until received, and until paired", minimum=1)
+    overdue: float = parameter(
+        1.0, "with policy newest: longest wait of a frame for another sensor", unit="s", minimum=0.05
+    )
+    pairing_tolerance_s: float = parameter(
+        PAIRING_TOLERANCE_S, "largest difference of stamps that belong together", unit="s", minimum=0.0
+    )
