@@ -1,10 +1,10 @@
-"""Where a cloud lies on cells: what errors of normals feign, and the pulls of blocks."""
+"""Fit of a cloud to cells: curvature made by errors of normals, gradients of blocks."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ndt_registration.matching import block_pulls, fit_to_grid
+from ndt_registration.matching import block_gradients, fit_to_grid
 from ndt_registration.ndt import Layer, ndt_align
 from ndt_registration.voxel_grid import block_moments, normal_grid
 from slam_core.geometry import FloatArray
@@ -28,25 +28,28 @@ def noisy_layer(rng: np.random.Generator) -> Layer:
     return Layer(noisy_plane(rng), grid, 1.0)
 
 
-def test_a_plane_holds_points_along_itself_by_the_friction_of_its_normals(rng: np.random.Generator) -> None:
-    """All of the curvature along a plane is feigned. Friction is a little more: both directions along count as the
-    narrower of a cell's two spreads.
+def test_a_plane_holds_points_along_itself_by_the_errors_of_its_normals(rng: np.random.Generator) -> None:
+    """All of the curvature along a plane is spurious.
+
+    What is taken off is a little more: both directions along count as the narrower of a cell's two spreads.
     """
-    feigned, curvature = np.zeros((2, 6, 6)), np.zeros((2, 6, 6))
+    spurious, curvature = np.zeros((2, 6, 6)), np.zeros((2, 6, 6))
     for _ in range(8):
         layer = noisy_layer(rng)
         there = ndt_align((layer,), np.eye(3), np.zeros(3), np.zeros(6), 1.0, 0, 0.0)
         fit = fit_to_grid(layer.points, np.eye(3), np.zeros(3), layer.grid, 0.3)
-        feigned += np.stack([fit.friction, fit.majorant_friction])
+        spurious += np.stack([fit.spurious_hessian, fit.spurious_majorant])
         curvature += np.stack([there.hessian, there.majorant])
     along = [0, 1, 5]  # both translations, and the turn about the normal
-    ratio = np.diagonal(curvature, axis1=1, axis2=2)[:, along] / np.diagonal(feigned, axis1=1, axis2=2)[:, along]
+    ratio = np.diagonal(curvature, axis1=1, axis2=2)[:, along] / np.diagonal(spurious, axis1=1, axis2=2)[:, along]
     assert np.all((ratio > 0.6) & (ratio < 1.0))
 
 
 def test_pulls_of_the_blocks_add_up_to_the_gradient(rng: np.random.Generator) -> None:
     layer, t = noisy_layer(rng), np.array([0.01, 0.0, 0.003])
     there = ndt_align((layer,), np.eye(3), t, np.zeros(6), 1.0, 0, 0.0)
-    pulls = block_pulls(layer, np.eye(3), t)
-    np.testing.assert_allclose(pulls.sum(axis=0), there.gradient, rtol=1e-6, atol=1e-6 * np.abs(there.gradient).max())
-    assert len(pulls) > 250
+    gradients = block_gradients(layer, np.eye(3), t)
+    np.testing.assert_allclose(
+        gradients.sum(axis=0), there.gradient, rtol=1e-6, atol=1e-6 * np.abs(there.gradient).max()
+    )
+    assert len(gradients) > 250

@@ -10,7 +10,7 @@ from stereo_frontend.matching import (
     MatchingConfig,
     disparity_bounds,
     has_candidate,
-    has_company,
+    has_consistent_neighbour,
     match_stereo,
     swapped_share,
 )
@@ -124,14 +124,14 @@ def test_a_match_that_slipped_by_a_repeat_stands_alone(rng):
     disparity = 8.0 + uv[:, 0] / 300.0
     disparity[[3, 70]] = 31.0
     disparity[5] = np.nan
-    alone = ~has_company(uv, disparity, 16)
+    alone = ~has_consistent_neighbour(uv, disparity, 16)
     assert set(np.flatnonzero(alone)) == {3, 5, 70}
-    assert set(np.flatnonzero(~has_company(uv, disparity, 0))) == {5}
+    assert set(np.flatnonzero(~has_consistent_neighbour(uv, disparity, 0))) == {5}
 
 
-def test_an_object_with_several_matches_keeps_company(rng):
+def test_an_object_with_several_matches_is_consistent(rng):
     uv = rng.uniform([0, 0], [600, 400], (200, 2)).astype(np.float32)
     uv[:4] = [[300, 200], [305, 204], [298, 210], [310, 199]]
     disparity = np.full(200, 8.0)
     disparity[:4] = 30.0
-    assert has_company(uv, disparity, 16).all()
+    assert has_consistent_neighbour(uv, disparity, 16).all()

@@ -1,4 +1,4 @@
-"""How a moved cloud lies on the cells of another: the share that fits, how closely, and how each block pulls."""
+"""Fit of a moved cloud to the cells of another: inliers, their distances, gradients of the cost by block."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ class Fit(NamedTuple):
     """Share of points on the target's surfaces, their root mean square distance (m), their centroid (3,) about the
     target's axes and their root mean square distance from it.
 
-    friction (6, 6): expected part of the cost's Hessian that errors of the cells' normals alone make; majorant_friction
-    (6, 6): that of its majorant. A normal from ``n`` points is off by ``sqrt(variance / (n spread))``, so that a plane
-    seems to hold points along itself with an information of ``1 / (n spread)``, of which the Hessian keeps the more the
-    better a point fits.
+    spurious_hessian (6, 6): expected part of the cost's Hessian that errors of the cells' normals alone make;
+    spurious_majorant (6, 6): that of its majorant. A normal from ``n`` points is off by ``sqrt(variance / (n
+    spread))``, so that a plane seems to hold points along itself with an information of ``1 / (n spread)``, of which
+    the Hessian keeps the more the better a point fits.
     """
 
     overlap: float
     inlier_rmse: float
     centre: FloatArray
     radius: float
-    friction: FloatArray
-    majorant_friction: FloatArray
+    spurious_hessian: FloatArray
+    spurious_majorant: FloatArray
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add_drag(px, py, pz, drag, sums):  # type: ignore[no-untyped-def]
-    """Add a point's drag and its first and second moments to ``sums`` (10,)."""
-    x, y, z = drag * px, drag * py, drag * pz
-    sums[0] += drag
+def _add_moments(px, py, pz, weight, sums):  # type: ignore[no-untyped-def]
+    """Add a point's weight and its weighted first and second moments to ``sums`` (10,)."""
+    x, y, z = weight * px, weight * py, weight * pz
+    sums[0] += weight
     sums[1] += x
     sums[2] += y
     sums[3] += z
@@ -47,8 +47,8 @@ def _add_drag(px, py, pz, drag, sums):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _friction(sums: FloatArray) -> FloatArray:
-    """Sum of ``drag J' J`` with ``J = [I, -[p]x]`` from the moments of the drags."""
+def _hessian_of_weights(sums: FloatArray) -> FloatArray:
+    """Sum of ``weight J' J`` with ``J = [I, -[p]x]`` from the weighted moments of the points."""
     s, x, y, z = sums[0], sums[1], sums[2], sums[3]
     xx, xy, xz, yy, yz, zz = sums[4], sums[5], sums[6], sums[7], sums[8], sums[9]
     return np.array(
@@ -80,7 +80,7 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
     of its plane.
     """
     n = points.shape[0]
-    drags, majorant_drags = np.zeros(10), np.zeros(10)
+    hessian_moments, majorant_moments = np.zeros(10), np.zeros(10)
     inliers = 0
     squares = 0.0
     cx = cy = cz = second = 0.0
@@ -93,7 +93,7 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
         row = find_block(grid.keys, grid.rows, int(np.floor(mx * s)), int(np.floor(my * s)), int(np.floor(mz * s)))
         if row < 0:
             continue
-        weight = drag = hold = 0.0
+        weight = majorant_weight = hessian_weight = 0.0
         best, distance = 4.5, 0.0
         for k in range(8):
             cell = grid.cells[row, k]
@@ -108,8 +108,8 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
             spread = grid.variance[cell, 2] if flat else grid.variance[cell, 1]
             b = grid.information[cell]
             information = e * min(1.0 / max(grid.counts[cell] * spread, 1e-300), b[0] + b[3] + b[5])
-            drag += information
-            hold += information * (1.0 - 2.0 * min(exponent, 30.0))
+            majorant_weight += information
+            hessian_weight += information * (1.0 - 2.0 * min(exponent, 30.0))
             if exponent < best:
                 best = exponent
                 distance = abs(qx * grid.normal[cell, 0] + qy * grid.normal[cell, 1] + qz * grid.normal[cell, 2])
@@ -122,20 +122,27 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
             second += px * px + py * py + pz * pz
         if weight == 0.0:
             continue
-        _add_drag(px, py, pz, drag, majorant_drags)
-        _add_drag(px, py, pz, hold, drags)
+        _add_moments(px, py, pz, majorant_weight, majorant_moments)
+        _add_moments(px, py, pz, hessian_weight, hessian_moments)
     centre = np.array([cx, cy, cz]) / max(inliers, 1)
     radius = np.sqrt(max(second / max(inliers, 1) - (centre * centre).sum(), 1e-12))
     rmse = np.sqrt(squares / max(inliers, 1))
-    return Fit(inliers / max(n, 1), rmse, centre, radius, _friction(drags), _friction(majorant_drags))
+    return Fit(
+        inliers / max(n, 1),
+        rmse,
+        centre,
+        radius,
+        _hessian_of_weights(hessian_moments),
+        _hessian_of_weights(majorant_moments),
+    )
 
 
 @njit(cache=True, nogil=True)
-def block_pulls(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
+def block_gradients(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
     """Gradient (b, 6) of the cost of one layer at a pose, summed over each of the grid's blocks, half a cell's edge."""
     grid, n = layer.grid, layer.points.shape[0]
-    pulls = np.zeros((grid.cells.shape[0], 6))
-    pulled = np.zeros(grid.cells.shape[0], np.bool_)
+    gradients = np.zeros((grid.cells.shape[0], 6))
+    touched = np.zeros(grid.cells.shape[0], np.bool_)
     s = 1.0 / grid.block_size
     for i in range(n):
         x, y, z = layer.points[i, 0], layer.points[i, 1], layer.points[i, 2]
@@ -156,11 +163,11 @@ def block_pulls(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
             vx += e * ux
             vy += e * uy
             vz += e * uz
-        pulled[row] = True
-        pulls[row, 0] += vx
-        pulls[row, 1] += vy
-        pulls[row, 2] += vz
-        pulls[row, 3] += py * vz - pz * vy
-        pulls[row, 4] += pz * vx - px * vz
-        pulls[row, 5] += px * vy - py * vx
-    return pulls[pulled]
+        touched[row] = True
+        gradients[row, 0] += vx
+        gradients[row, 1] += vy
+        gradients[row, 2] += vz
+        gradients[row, 3] += py * vz - pz * vy
+        gradients[row, 4] += pz * vx - px * vz
+        gradients[row, 5] += px * vy - py * vx
+    return gradients[touched]

@@ -29,7 +29,7 @@ ODOMETRY_REGISTRATION = RegistrationConfig(
     start_level=1,
     rim_share=0.2,
     grid=GridConfig(flatness=0.0, levels=3),
-    uncertainty=UncertaintyConfig(least_loss=0.06, score_noise=0.05),
+    uncertainty=UncertaintyConfig(least_loss=0.06, loss_noise=0.05),
 )
 """From a near guess. Cells keep their own normals: what is rough in them holds a scan of a wall where it started, while
 on perfect planes it would slide. That is little knowledge of the pose: a determined one must lose more, and how far one

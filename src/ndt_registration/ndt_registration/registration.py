@@ -14,11 +14,11 @@ import numpy.typing as npt
 
 from ndt_registration.ambiguity import AmbiguityConfig, reason_of_doubt
 from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare, viewpoint
-from ndt_registration.holding import Holding
 from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
-from ndt_registration.matching import block_pulls, fit_to_grid
+from ndt_registration.matching import block_gradients, fit_to_grid
 from ndt_registration.ndt import NdtOptimum, ndt_align
 from ndt_registration.pyramid import GridConfig, Pyramid
+from ndt_registration.score_loss import ScoreLoss
 from ndt_registration.search import Candidate, SearchConfig, Views, judge, planar_constraint, search
 from ndt_registration.uncertainty import (
     Curvature,
@@ -287,12 +287,12 @@ def _result(
     grid = target.pyramid.grids[0]
     fit = fit_to_grid(source.points, optimum.rotation, optimum.translation, grid, 3.0 * grid.block_size)
     layers = target.pyramid.layers(source, 0, len(source), config.rim_share)
-    pulls = [block_pulls(layer, optimum.rotation, optimum.translation) for layer in layers]
+    gradients = [block_gradients(layer, optimum.rotation, optimum.translation) for layer in layers]
     uncertainty = sandwich(
-        Curvature(optimum.hessian, optimum.majorant, fit.friction, fit.majorant_friction),
-        gradient_scatter(pulls, len(source) / len(target.cloud)),
+        Curvature(optimum.hessian, optimum.majorant, fit.spurious_hessian, fit.spurious_majorant),
+        gradient_scatter(gradients, len(source) / len(target.cloud)),
         Extent(fit.centre, max(fit.radius, _LEAST_RADIUS * scale)),
-        Holding(target.pyramid.layers(source, 0, config.coarse_points, config.rim_share), _pose(optimum)).loss,
+        ScoreLoss(target.pyramid.layers(source, 0, config.coarse_points, config.rim_share), _pose(optimum)).loss,
         scale,
         planar_constraint(source.planar) > 0.0,
         config.uncertainty,

@@ -1,4 +1,4 @@
-"""How well a registration determines the pose: covariance from the scatter of the blocks' pulls, and directions
+"""How well a registration determines the pose: covariance from the scatter of the blocks' gradients, and directions
 left free.
 """
 
@@ -25,7 +25,7 @@ class UncertaintyConfig(Config):
     least_loss: float = parameter(
         0.015, "share of its fit that a determined pose loses by that", minimum=0.0, maximum=1.0
     )
-    score_noise: float = parameter(
+    loss_noise: float = parameter(
         1.0,
         "loss that chance makes up for: a free direction is known to the probe times this over its loss",
         minimum=0.0,
@@ -46,14 +46,14 @@ class Uncertainty(NamedTuple):
 
 
 class Curvature(NamedTuple):
-    """Second derivatives of the cost at the optimum (6, 6): exact, its semidefinite majorant, and what errors of
-    normals feign of either.
+    """Second derivatives of the cost at the optimum (6, 6): exact, its semidefinite majorant, and the part of either
+    that errors of the cells' normals alone make.
     """
 
     hessian: FloatArray
     majorant: FloatArray
-    friction: FloatArray
-    majorant_friction: FloatArray
+    spurious_hessian: FloatArray
+    spurious_majorant: FloatArray
 
 
 class Extent(NamedTuple):
@@ -75,7 +75,7 @@ def sandwich(
     """Covariance ``A^-1 C A^-1`` of an M-estimate: curvature ``A``, covariance ``C`` of its gradient (White 1982).
 
     A direction is free where the score hardly falls when the pose is moved along it by much more than the noise; no
-    curvature shows that alone, because the small errors of many normals feign one. What they feign in the mean is taken
+    curvature shows that alone, because the small errors of many normals make some. What they make in the mean is taken
     off the curvature, else the directions that little determines would seem far better known than they are. How far
     the pose may be off along a free direction follows from the loss: chance makes up for so much of it.
 
@@ -93,29 +93,29 @@ def sandwich(
     scale
         Free directions get ``free_sigma`` times this, m.
     fixed
-        Components of the pose error that were held, shape (6,); their variance is that of the floor.
+        Components of the pose error that were constrained, shape (6,); their variance is that of the floor.
     config
         Settings.
     """
     to_pose = np.eye(6)
     to_pose[:3, 3:] = skew(extent.centre) / extent.radius
     to_pose[3:, 3:] /= extent.radius
-    H, M, F, feigned, C = (to_pose.T @ A @ to_pose for A in (*curvature, scatter))
-    for A in (H, M, F, feigned, C):
+    H, M, F, spurious, C = (to_pose.T @ A @ to_pose for A in (*curvature, scatter))
+    for A in (H, M, F, spurious, C):
         A[fixed], A[:, fixed] = 0.0, 0.0
     vectors = np.linalg.eigh(M)[1]
-    held = np.abs(vectors[fixed]).sum(axis=0) > 0.5
+    constrained = np.abs(vectors[fixed]).sum(axis=0) > 0.5
     free, sigma = np.zeros(6, dtype=bool), np.zeros(6)
-    for k in np.flatnonzero(~held):
+    for k in np.flatnonzero(~constrained):
         v = vectors[:, k]
         step = config.probe * scale * (to_pose @ v)
-        least = config.least_loss * (_FEIGNED_FACTOR if v @ H @ v < v @ feigned @ v else 1.0)
+        least = config.least_loss * (_SPURIOUS_FACTOR if v @ H @ v < v @ spurious @ v else 1.0)
         lost = min(loss(step), loss(-step))
-        free[k] = v @ M @ v <= v @ feigned @ v or lost < least
-        sigma[k] = scale * min(config.free_sigma, config.probe * config.score_noise / max(lost, 1e-9))
-        if not free[k] and lost > _PLAINLY_HELD * config.least_loss:
+        free[k] = v @ M @ v <= v @ spurious @ v or lost < least
+        sigma[k] = scale * min(config.free_sigma, config.probe * config.loss_noise / max(lost, 1e-9))
+        if not free[k] and lost > _WELL_DETERMINED * config.least_loss:
             break
-    known = vectors[:, ~free & ~held]
+    known = vectors[:, ~free & ~constrained]
     covariance = (config.sigma_floor * scale) ** 2 * np.eye(6)
     if known.shape[1]:
         inverse = _inverse(known.T @ (H - F) @ known, known.T @ M @ known)
@@ -125,10 +125,10 @@ def sandwich(
     return Uncertainty(0.5 * (covariance + covariance.T), vectors[:, free].T)
 
 
-def gradient_scatter(pulls: Iterable[FloatArray], density_ratio: float) -> FloatArray:
-    """Covariance (6, 6) of the cost's gradient from the pulls (b, 6) of the small blocks of each layer.
+def gradient_scatter(block_gradients: Iterable[FloatArray], density_ratio: float) -> FloatArray:
+    """Covariance (6, 6) of the cost's gradient from those (b, 6) of the small blocks of each layer.
 
-    The pulls vanish in sum at the optimum; their scatter contains the noise of the source's points, discretisation and
+    They vanish in sum at the optimum; their scatter contains the noise of the source's points, discretisation and
     wrong matches alike. Points of one block share much of their errors (neighbouring pixels, one and the same edge),
     blocks of half a cell little. The target's points err as much as the source's and move the optimum as far, but
     alike for all blocks that meet one plane, so that little of it shows in the scatter: it is counted as the source's,
@@ -138,7 +138,7 @@ def gradient_scatter(pulls: Iterable[FloatArray], density_ratio: float) -> Float
     is seen only as far as blocks disagree about it: a fifth to a third more than the noise is claimed, too little where
     one small thing holds a direction (``covariance.py`` among the benchmarks).
     """
-    each = np.vstack(tuple(pulls))
+    each = np.vstack(tuple(block_gradients))
     return np.asarray((1.0 + density_ratio) * len(each) / max(len(each) - 6, 1) * (each.T @ each))
 
 
@@ -154,10 +154,10 @@ def _inverse(hessian: FloatArray, majorant: FloatArray) -> FloatArray:
 
 
 _LEAST_RELATIVE_CURVATURE = 0.05
-_PLAINLY_HELD = 10.0
+_WELL_DETERMINED = 10.0
 """So many times the least loss: directions of more curvature than one that loses this need not be tried."""
-_FEIGNED_FACTOR = 2.0
-"""So many times the loss is asked for where the curvature is no more than what the normals' errors feign."""
+_SPURIOUS_FACTOR = 2.0
+"""So many times the loss is asked for where the curvature is no more than what errors of the normals make."""
 
 
 def unknown(scale: float, config: UncertaintyConfig) -> FloatArray:

@@ -27,7 +27,7 @@ from stereo_frontend.matching import (
     MatchingConfig,
     disparity_bounds,
     has_candidate,
-    has_company,
+    has_consistent_neighbour,
     match_stereo,
     swapped_share,
 )
@@ -190,7 +190,7 @@ class Frontend:
         correction, correction_sigma = calibration.columns(partner)
         disparity = refined.disparity + correction
         disparity[~(disparity >= bounds[0])] = np.nan
-        disparity[~has_company(uv, disparity, self.config.matching.neighbours)] = np.nan
+        disparity[~has_consistent_neighbour(uv, disparity, self.config.matching.neighbours)] = np.nan
         sigma = np.sqrt(refined.sigma**2 + self._noise.rectification_sigma**2 + correction_sigma**2)
         estimate = DepthEstimate.unknown(len(left))
         estimate.depth[matches.left] = stereo.depth_from_disparity(disparity)

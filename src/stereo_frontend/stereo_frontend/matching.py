@@ -150,22 +150,22 @@ def swapped_share(
     return mirrored / max(proper + mirrored, 1), proper + mirrored
 
 
-def has_company(uv: Float32Array, disparity: FloatArray, neighbours: int) -> npt.NDArray[np.bool_]:
+def has_consistent_neighbour(uv: Float32Array, disparity: FloatArray, neighbours: int) -> npt.NDArray[np.bool_]:
     """Which positions (n, 2) px share their disparity (n,) px, within 20 % or 2 px, with one of their neighbours.
 
     On brickwork and drawers a match can slip by whole repeats and still look perfect; then it stands alone in its
-    depth. NaN disparities are no neighbours and have no company.
+    depth. NaN disparities are no neighbours and have none.
     """
     known = np.flatnonzero(np.isfinite(disparity))
-    company = np.zeros(len(uv), bool)
+    consistent = np.zeros(len(uv), bool)
     if neighbours == 0 or len(known) <= neighbours:
-        company[known] = True
-        return company
+        consistent[known] = True
+        return consistent
     d = disparity[known]
     _, nearest = cKDTree(uv[known]).query(uv[known], k=neighbours + 1)
     difference = np.abs(d[nearest[:, 1:]] - d[:, None])
-    company[known] = np.any(difference <= np.maximum(2.0, 0.2 * d)[:, None], axis=1)
-    return company
+    consistent[known] = np.any(difference <= np.maximum(2.0, 0.2 * d)[:, None], axis=1)
+    return consistent
 
 
 def _matches(left: npt.ArrayLike, right: npt.ArrayLike, similarity: npt.ArrayLike) -> Matches:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ndt_registration.cloud import prepare
-from ndt_registration.holding import Holding
 from ndt_registration.registration import RegistrationConfig, Target
+from ndt_registration.score_loss import ScoreLoss
 from slam_core.geometry import FloatArray
 
 STEP = 0.1
@@ -20,8 +20,8 @@ def losses(scan: FloatArray, target: FloatArray, T: FloatArray) -> FloatArray:
     config = RegistrationConfig()
     map_ = Target.build(target, config)
     cloud = prepare(scan, 2000, planar=False, centre=np.zeros(3))
-    holding = Holding(map_.pyramid.layers(cloud, 0, 2000, config.rim_share), T)
-    return np.array([min(holding.loss(s * STEP * np.eye(6)[k]) for s in (1.0, -1.0)) for k in range(3)])
+    score_loss = ScoreLoss(map_.pyramid.layers(cloud, 0, 2000, config.rim_share), T)
+    return np.array([min(score_loss.loss(s * STEP * np.eye(6)[k]) for s in (1.0, -1.0)) for k in range(3)])
 
 
 def test_a_blank_wall_holds_across_only(empty_room: Any, at: Callable[..., FloatArray]) -> None:
@@ -42,4 +42,4 @@ def test_nothing_is_lost_where_nothing_moves(room: Any, start: FloatArray) -> No
     scan = room.scan(start, rng)
     cloud = prepare(scan, 2000, planar=False, centre=np.zeros(3))
     layers = Target.build(scan, config).pyramid.layers(cloud, 0, 2000, config.rim_share)
-    assert Holding(layers, np.eye(4)).loss(np.zeros(6)) == 0.0
+    assert ScoreLoss(layers, np.eye(4)).loss(np.zeros(6)) == 0.0

@@ -1,4 +1,4 @@
-"""How firmly a scan holds its pose: what the fit loses when the pose is moved.
+"""Loss of score when a pose is moved: how well a scan determines it.
 
 Only points that lie on the map before and after count, each by its mean over the cells that are there. Else every view
 would seem to hold itself: where it ends, points leave the map with any motion, before a blank wall as well as before a
@@ -15,7 +15,7 @@ from ndt_registration.voxel_grid import find_block
 from slam_core.geometry import FloatArray, boxplus
 
 
-class Holding:
+class ScoreLoss:
     """The fit at a pose T_target_source (4, 4), to be compared with the fit near it; surfaces and rims as layers."""
 
     def __init__(self, layers: tuple[Layer, Layer], T: FloatArray) -> None:
