@@ -15,6 +15,7 @@ from slam_bringup.experiments.catalogue import EXPERIMENTS, chosen
 from slam_bringup.experiments.page import write_page
 from slam_bringup.experiments.planar import filter_run, graph_of
 from slam_bringup.experiments.registration import register_motions
+from slam_bringup.experiments.survey import cost_of_a_step
 from slam_simulation.planar import PlanarConfig, simulate_planar
 
 
@@ -87,6 +88,13 @@ def test_true_pairs_are_found_and_counted(tmp_path):
     assert best["precision"] > 0.98
     assert best["recall"] > 0.9
     assert found["Algorithm 1: nearest"]["recall"] < best["recall"]
+
+
+@pytest.mark.parametrize("technique", ["one_filter", "batch", "submaps"])
+def test_every_technique_of_the_survey_maps_the_same_world(tmp_path, technique):
+    values, _ = cost_of_a_step(tmp_path, [], technique, 80)
+    assert values["rmse_m"] < 0.2
+    assert values["seconds"] > 0.0
 
 
 @pytest.mark.slow

@@ -11,12 +11,13 @@ from slam_bringup.experiments import (
     joining,
     planar,
     registration,
+    survey,
 )
 from slam_bringup.experiments.findings import Experiment
 
 EXPERIMENTS: dict[str, Experiment] = {
     experiment.name: experiment
-    for module in (planar, calibration, features, association, filtering, joining, registration, fusion)
+    for module in (planar, survey, calibration, features, association, filtering, joining, registration, fusion)
     for experiment in module.EXPERIMENTS
 }
 

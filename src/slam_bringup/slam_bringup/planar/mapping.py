@@ -217,7 +217,7 @@ def _graph(log: PlanarLog, drives: list[_Drive], ids: Indices) -> PlanarGraph:
 
 
 @dataclass(frozen=True, eq=False)
-class _Submap:
+class PlanarSubmap:
     """A stretch of the drive in the frame of its first pose: poses in it, the map that is joined, sightings' ids."""
 
     poses: FloatArray
@@ -227,7 +227,7 @@ class _Submap:
 
 def _joined(robot: RobotLog, config: PlanarConfig, known: bool = True) -> _Drive:
     """Submaps of one robot, each by a filter of its own, joined by sparse least squares (chapter 7)."""
-    submaps = list(_submaps(robot, config))
+    submaps = list(submaps_of(robot, config))
     result = join_text_maps([s.text for s in submaps], 2)
     origin = _start(robot)
     at = dict(zip(result.pose_ids.tolist(), _placed(origin, result.poses), strict=True))
@@ -241,7 +241,7 @@ def _joined(robot: RobotLog, config: PlanarConfig, known: bool = True) -> _Drive
     return _Drive(poses, np.empty((0, 3, 3)), landmarks[order], ids, rows, result.chi2, freedom)
 
 
-def _submaps(robot: RobotLog, config: PlanarConfig) -> Iterator[_Submap]:
+def submaps_of(robot: RobotLog, config: PlanarConfig) -> Iterator[PlanarSubmap]:
     """Stretches of ``_SUBMAP_STEPS`` steps; what is seen at the last pose of one belongs to the next alone."""
     steps = len(robot.observations)
     edges = [*range(0, max(steps - 1, 1), _SUBMAP_STEPS), steps - 1]
@@ -263,7 +263,7 @@ def _submaps(robot: RobotLog, config: PlanarConfig) -> Iterator[_Submap]:
             number, np.array([number + 1]), ekf.pose[None].copy(), np.array(ekf.ids, dtype=np.int64),
             ekf.landmarks.copy(), np.asarray(np.linalg.inv(ekf.covariance.dense()), dtype=np.float64),
         )  # fmt: skip
-        yield _Submap(np.array(poses), text, seen)
+        yield PlanarSubmap(np.array(poses), text, seen)
 
 
 def _placed(frame: FloatArray, poses: FloatArray) -> FloatArray:

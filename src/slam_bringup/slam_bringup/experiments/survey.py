@@ -1,0 +1,188 @@
+"""Sections 6.3 to 6.6: what a step of each technique costs as the map grows, on the same planar worlds.
+
+One EKF updates the covariance of all landmarks at every step. Batch smoothing solves for everything whenever it is
+asked. iSAM2 (GTSAM, where it is installed) relinearises what changed. Joined submaps filter in maps of bounded size and
+join each when it is full. The survey's other techniques are not built: SEIF and its kin trade consistency for time
+by dropping links; conditionally independent submaps keep the cost of joining, which is the smaller part here; FastSLAM
+forgets the correlations that close large loops.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ekf_slam_node.planar import PlanarConfig, PlanarEkf
+from ekf_slam_node.planar_sam import smooth
+from sjsam_node.linear_slam.text_joining import join_text_maps
+from slam_bringup.experiments import plots
+from slam_bringup.experiments.chain import Kept
+from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
+from slam_bringup.experiments.job import RENDERING, Job, JobResult
+from slam_bringup.experiments.planar import filter_run, graph_of
+from slam_bringup.planar.log import PlanarLog, RobotLog
+from slam_bringup.planar.mapping import map_log, submaps_of
+from slam_core.geometry import FloatArray
+from slam_simulation.planar import PlanarConfig as WorldConfig
+from slam_simulation.planar import PlanarRun, simulate_planar
+
+MODULE = "slam_bringup.experiments.survey"
+TECHNIQUES = {
+    "one EKF": "one_filter",
+    "batch SAM": "batch",
+    "iSAM2 (GTSAM)": "isam2",
+    "joined submaps (ours)": "submaps",
+}
+_LAST_STEPS = 20
+_BATCHES = 3
+
+
+def world(size: int) -> WorldConfig:
+    """A drive once round among ``size`` landmarks of the same density, a step about as long whatever the size."""
+    scale = float(np.sqrt(size / 40.0))
+    return replace(
+        WorldConfig(), landmarks=size, size=10.0 * scale, radius=3.0 * scale, samples=max(50, round(60 * scale)),
+        sigma_turn=0.005,
+    )  # fmt: skip
+
+
+def cost_of_a_step(folder: Path, before: list[Path], technique: str, size: int) -> Kept:
+    """Processor seconds of a step at the end of a drive among ``size`` landmarks, and how good the map is."""
+    run = simulate_planar(world(size), np.random.default_rng(size))
+    if technique == "isam2" and importlib.util.find_spec("gtsam") is None:
+        return {"missing": "gtsam is not installed"}, {}
+    seconds, poses, numbers = {"one_filter": _one_filter, "batch": _batch, "isam2": _isam2, "submaps": _submaps}[
+        technique
+    ](run)
+    error = float(np.sqrt(np.mean(np.sum((poses - run.poses)[:, :2] ** 2, axis=1))))
+    return {"seconds": seconds, "rmse_m": error, "numbers": numbers}, {}
+
+
+def _one_filter(run: PlanarRun) -> tuple[float, FloatArray, int]:
+    config, Q = _noise(run)
+    ekf = PlanarEkf(config, run.poses[0], np.diag([1e-9, 1e-9, 1e-9]))
+    poses, elapsed = [], []
+    for k, seen in enumerate(run.observations):
+        began = time.process_time()
+        if k:
+            ekf.predict(run.odometry[k - 1], Q)
+        ekf.process(np.column_stack([seen.ranges, seen.bearings]), seen.ids)
+        elapsed.append(time.process_time() - began)
+        poses.append(ekf.pose.copy())
+    return float(np.mean(elapsed[-_LAST_STEPS:])), np.array(poses), ekf.covariance.dense().size
+
+
+def _batch(run: PlanarRun) -> tuple[float, FloatArray, int]:
+    ekf, _, slots = filter_run(run, known=True)
+    graph, elapsed = graph_of(run, slots), []
+    for _ in range(_BATCHES):
+        began = time.process_time()
+        smoothed = smooth(graph, run.poses[0], ekf.config)[0]
+        elapsed.append(time.process_time() - began)
+    return float(np.median(elapsed)), smoothed.poses, 9 * len(graph.motions) + 10 * len(graph.measured)
+
+
+def _submaps(run: PlanarRun) -> tuple[float, FloatArray, int]:
+    """All submaps are joined anew, in batch, whenever one is full; the mean over the whole drive."""
+    config, Q = _noise(run)
+    n = len(run.odometry)
+    robot = RobotLog(
+        "robot", np.arange(float(n + 1)), run.odometry, np.broadcast_to(Q, (n, 3, 3)),
+        tuple(np.column_stack([o.ranges, o.bearings]) for o in run.observations),
+        tuple(o.ids for o in run.observations), run.poses,
+    )  # fmt: skip
+    began = time.process_time()
+    texts = []
+    for submap in submaps_of(robot, config):
+        texts.append(submap.text)
+        join_text_maps(texts, 2)
+    elapsed = time.process_time() - began
+    log = PlanarLog("survey", (robot,), config.sigma_range, config.sigma_bearing)
+    poses = map_log(log, "submaps").paths[0].poses
+    return elapsed / (n + 1), poses, sum(text.information.size for text in texts)
+
+
+def _isam2(run: PlanarRun) -> tuple[float, FloatArray, int]:
+    import gtsam  # a peer, not a dependency
+
+    c = run.config
+    isam, elapsed, pose = gtsam.ISAM2(), [], gtsam.Pose2(*run.poses[0])
+    X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
+    motion_noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([c.sigma_step, c.sigma_step, c.sigma_turn]))
+    seen_noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([c.sigma_bearing, c.sigma_range]))
+    known: set[int] = set()
+    for k, seen in enumerate(run.observations):
+        began = time.process_time()
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        if k:
+            motion = gtsam.Pose2(*run.odometry[k - 1])
+            graph.add(gtsam.BetweenFactorPose2(X(k - 1), X(k), motion, motion_noise))
+            pose = pose.compose(motion)
+        else:
+            graph.add(gtsam.PriorFactorPose2(X(0), pose, gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)))
+        values.insert(X(k), pose)
+        for i, r, b in zip(seen.ids.tolist(), seen.ranges, seen.bearings, strict=True):
+            graph.add(gtsam.BearingRangeFactor2D(X(k), L(i), gtsam.Rot2(b), r, seen_noise))
+            if i not in known:
+                known.add(i)
+                values.insert(L(i), pose.transformFrom(np.array([r * np.cos(b), r * np.sin(b)])))
+        isam.update(graph, values)
+        pose = isam.calculateEstimatePose2(X(k))
+        elapsed.append(time.process_time() - began)
+    estimate = isam.calculateEstimate()
+    poses = [estimate.atPose2(X(k)) for k in range(len(run.observations))]
+    array = np.array([[p.x(), p.y(), p.theta()] for p in poses])
+    return float(np.mean(elapsed[-_LAST_STEPS:])), array, int(isam.getFactorsUnsafe().size())
+
+
+def _noise(run: PlanarRun) -> tuple[PlanarConfig, FloatArray]:
+    c = run.config
+    Q = np.diag(np.array([c.sigma_step, c.sigma_step, c.sigma_turn]) ** 2)
+    return PlanarConfig(sigma_range=c.sigma_range, sigma_bearing=c.sigma_bearing), Q
+
+
+def _experiment() -> Experiment:
+    def jobs(quick: bool) -> Mapping[str, Job]:
+        sizes = (40, 160) if quick else (40, 160, 640, 1280, 2560)
+        packages = (*RENDERING, "ekf_slam_node", "sjsam_node", "slam_bringup.planar")
+        return {
+            f"{name}|{size}": Job(f"{MODULE}:cost_of_a_step", {"technique": technique, "size": size}, packages)
+            for name, technique in TECHNIQUES.items() for size in sizes
+        }  # fmt: skip
+
+    def report(results: Mapping[str, JobResult]) -> Findings:
+        sizes = sorted({int(key.split("|")[1]) for key in results})
+        figure, axes = plots.new_figure(7, 4)
+        rows, exponents = [], {}
+        for name in TECHNIQUES:
+            found = [results[f"{name}|{size}"].values for size in sizes]
+            if "missing" in found[0]:
+                rows.append([name, found[0]["missing"], *[""] * len(sizes)])
+                continue
+            ms = np.array([1e3 * v["seconds"] for v in found])
+            exponents[name] = float(np.polyfit(np.log(sizes[-3:]), np.log(ms[-3:]), 1)[0])
+            axes.loglog(sizes, ms, "o-", label=f"{name}, n^{exponents[name]:.1f}")
+            cells = [f"{t:.2f}, {v['rmse_m']:.2f}" for t, v in zip(ms, found, strict=True)]
+            rows.append([name, *cells, f"{exponents[name]:.2f}"])
+        axes.set(xlabel="landmarks", ylabel="processor time of a step [ms]")
+        axes.legend(fontsize=8)
+        ours, ekf = exponents["joined submaps (ours)"], exponents["one EKF"]
+        header = ("technique", *(f"{size} landmarks: ms, RMSE m" for size in sizes), "exponent of time")
+        return Findings(
+            [Comparison("growth of a step's time with the map: one EKF, joined submaps", "quadratic; close to constant",
+                        f"n^{ekf:.1f}, n^{ours:.1f}", "submaps grow more slowly", ours < ekf)],
+            [Table("A step at the end of a drive, and the error of the whole path", header, rows)],
+            [Picture(figure, "", "Processor time of a step against the size of the map.")],
+            "One filter pays for every landmark at every step; joined submaps pay for those of the open submap and, "
+            "once per submap, for the joining.",
+        )  # fmt: skip
+
+    return Experiment("survey", "6.3-6.6", "What a step costs as the map grows", jobs, report)
+
+
+EXPERIMENTS = (_experiment(),)
