@@ -30,6 +30,7 @@ setup(
             "bag_player = slam_bringup.bags.bag_player_node:main",
             "slam_composed = slam_bringup.processes.composed_node:main",
             "recorder = slam_bringup.bags.recorder_node:main",
+            "viewer = slam_bringup.viewer.viewer_node:main",
         ]
     },
 )

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dense_mapping.floor_plan import FloorPlan, FloorPlanConfig, floor_plans
-from dense_mapping.keyframes import KeyframeConfig, KeyframeSelector, PlacedKeyframe, make_keyframe
+from dense_mapping.keyframes import Keyframe, KeyframeConfig, KeyframeSelector, PlacedKeyframe, make_keyframe
 from dense_mapping.stereo_depth import StereoDepthConfig
 from dense_mapping.surface import Surface, SurfaceConfig, extract_surface
 from dense_mapping.tsdf import TsdfConfig, TsdfVolume
@@ -81,7 +81,11 @@ class DenseModel:
 
     def add(self, camera: str, T_map_camera: FloatArray, image: DepthImage, picture: ByteArray | None = None) -> None:
         """Put a key frame into the field; ``picture`` (h, w[, 3]) uint8 of its camera, by default the amplitude."""
-        placed = PlacedKeyframe(camera, make_keyframe(image, self.config.keyframe, picture), T_map_camera)
+        self.add_keyframe(camera, T_map_camera, make_keyframe(image, self.config.keyframe, picture))
+
+    def add_keyframe(self, camera: str, T_map_camera: FloatArray, keyframe: Keyframe) -> None:
+        """Put a key frame that is made already into the field."""
+        placed = PlacedKeyframe(camera, keyframe, T_map_camera)
         self._put(placed)
         self._placed.append(placed)
         del self._placed[: -self.config.max_keyframes]

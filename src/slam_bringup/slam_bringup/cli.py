@@ -19,6 +19,7 @@ COMMANDS = {
     "live": "map live: all nodes in one process, on a camera or on topics",
     "simulate": "render a scenario to a bag with ground truth",
     "convert": "a public data set (EuRoC, KITTI, RGB-D) to a bag",
+    "view": "show a finished run, or the nodes at work, in the browser",
     "play": "publish a bag's topics over ROS",
     "record": "record ROS topics to a bag",
     "register": "align two point clouds (pcd, ply, vtk)",

@@ -48,7 +48,7 @@ class AgentDepth:
 
     def __init__(self, sensors: AgentSensors, config: SystemConfig, trajectory: Trajectory) -> None:
         self._config: DenseConfig = config.dense_mapper
-        self._agent, self._trajectory = sensors.agent, trajectory
+        self._agent, self._trajectory, self._sensors = sensors.agent, trajectory, sensors
         self._depth: DepthStage | None = None
         self._stereo: StereoStage | None = None
         if self._config.use_tof and sensors.is_mounted("tof"):
@@ -68,7 +68,8 @@ class AgentDepth:
         elif isinstance(reading, ImuReading):
             T_map_base = self._pose(reading.sample.stamp_ns)
             if T_map_base is not None:
-                model.add_specific_force(T_map_base[:3, :3] @ reading.sample.linear_acceleration)
+                R_base_imu = self._sensors.frames.lookup(self._sensors.base_frame, reading.sample.frame_id)[:3, :3]
+                model.add_specific_force(T_map_base[:3, :3] @ R_base_imu @ reading.sample.linear_acceleration)
         elif isinstance(reading, StereoReading) and self._stereo is not None:
             for camera, T in self._wanted(model, "stereo", reading.stamp_ns, self._T_base_left):
                 self._stereo.add(reading.pair)

@@ -26,6 +26,8 @@ _MODULES = {
     ("slam_bringup", "slam_composed"): "slam_bringup.processes.composed_node",
     ("slam_bringup", "bag_player"): "slam_bringup.bags.bag_player_node",
     ("slam_bringup", "recorder"): "slam_bringup.bags.recorder_node",
+    ("slam_bringup", "viewer"): "slam_bringup.viewer.viewer_node",
+    ("dense_mapping", "dense_mapper"): "dense_mapping.node",
 }
 """Where each executable's ``main`` is, for a workspace that has not been built."""
 

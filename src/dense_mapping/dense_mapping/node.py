@@ -1,0 +1,202 @@
+"""The ``dense_mapper`` node: depth and stereo images and the joined trajectory in, dense model and floor plan out."""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
+from std_srvs.srv import Trigger
+
+from dense_mapping.dense_model import DenseConfig
+from dense_mapping.keyframes import Keyframe, make_keyframe
+from dense_mapping.live_mapper import LiveMapper
+from dense_mapping.plan_io import write_plan
+from dense_mapping.stereo_depth import stereo_depth
+from dense_mapping.surface import Surface
+from dense_mapping.surface_io import write_mesh
+from slam_core.base_node import SlamNode
+from slam_core.config import parameter
+from slam_core.health import State
+from slam_core.messages import (
+    camera_info_from_message,
+    cloud_message,
+    depth_from_messages,
+    grey_from_message,
+    header_message,
+    occupancy_message,
+    path_from_message,
+    pose_from_message,
+    stamp_ns,
+)
+from slam_core.messages.base import Message
+from slam_core.ros import run_node
+from slam_core.types import AnyArray
+from stereo_frontend.calibrated_pairs import SIDES
+from stereo_frontend.sources import RawPair
+from stereo_frontend.stage import StereoStage
+
+
+@dataclass(frozen=True)
+class DenseNodeConfig(DenseConfig):
+    """The dense model's parameters and the node's own."""
+
+    agents: tuple[str, ...] = parameter(("",), "namespaces of the agents whose cameras make the model")
+    map_frame: str = parameter("map", "frame of the map")
+    base_frame: str = parameter("base_link", "frame of each agent's rig, below its namespace")
+    publish_period_s: float = parameter(5.0, "least time from one model published to the next", unit="s", minimum=0.5)
+    output_path: str = parameter("dense", "folder that ~/save writes: mesh.ply, floor_plan*.yaml and .pgm")
+
+
+class DenseMapperNode(SlamNode[DenseNodeConfig]):
+    """Publishes ``map/dense_cloud`` and ``map/occupancy`` (lowest storey; then ``map/occupancy_1`` ...), latched."""
+
+    def __init__(self) -> None:
+        super().__init__("dense_mapper", DenseNodeConfig)
+        self.mapper = LiveMapper(self.config)
+        self._pairs = {agent: StereoStage(rectified=True) for agent in self.config.agents}
+        self._stamp_ns = 0
+        self._is_news = False
+        self.advertise("map/dense_cloud", "PointCloud2", latched=True, depth=1)
+        self._storeys = 0
+        self._advertise_storeys(1)
+        for agent in self.config.agents:
+            self._listen_to(agent)
+        self.create_service(Trigger, "~/save", self._on_save)
+        self.create_timer(
+            self.config.publish_period_s, self._publish_news, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
+
+    def on_reset(self) -> None:
+        """Forget the model."""
+        self.mapper.reset()
+        self._is_news = False
+
+    def on_finish(self) -> str:
+        """Move and publish everything now."""
+        self._publish_model()
+        return f"{len(self.mapper.model.keyframes)} key frames in the model, {self.mapper.waiting} without a pose"
+
+    # -- inputs --------------------------------------------------------------------------------------------------------
+
+    def _listen_to(self, agent: str) -> None:
+        below = partial(_below, agent)
+        self.listen(below("odom"), "Odometry", partial(self._on_odometry, agent))
+        self.listen(below("map/path"), "Path", partial(self._on_path, agent), latched=True)
+        if self.config.use_tof:
+            topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
+            topics = {below(topic): kind for topic, kind in topics.items()}
+            self.listen_together(topics, partial(self._on_depth, agent), required=False)
+        if self.config.use_stereo:
+            for side in SIDES:
+                topic = below(f"stereo/{side}/camera_info")
+                self.listen(topic, "CameraInfo", partial(self._on_info, agent, side), required=False)
+            pairs = {below(f"stereo/{side}/image_rect"): "Image" for side in SIDES}
+            self.listen_together(pairs, partial(self._on_pair, agent), required=False)
+
+    def _on_odometry(self, agent: str, message: Message) -> None:
+        self.mapper.add_odometry(agent, pose_from_message(message.pose.pose))
+
+    def _on_depth(self, agent: str, depth: Message, noise: Message, info: Message) -> None:
+        T_base_camera = self.lookup(_below(agent, self.config.base_frame), depth.header.frame_id)
+
+        def make() -> Keyframe:
+            nothing = np.empty((0, 0, 3), dtype=np.uint8)
+            return make_keyframe(depth_from_messages(depth, noise, info), self.config.keyframe, nothing)
+
+        self.mapper.add_image(agent, "tof", T_base_camera, make)
+
+    def _on_info(self, agent: str, side: str, message: Message) -> None:
+        self._pairs[agent].set_info(side, camera_info_from_message(message))
+
+    def _on_pair(self, agent: str, left: Message, right: Message) -> None:
+        T_base_camera = self.lookup(_below(agent, self.config.base_frame), left.header.frame_id)
+        stage = self._pairs[agent]
+        stage.add(RawPair(stamp_ns(left), grey_from_message(left), grey_from_message(right), left.header.frame_id))
+        for images in stage.ready():
+
+            def make() -> Keyframe:
+                depth = stereo_depth(images, self.config.stereo)  # noqa: B023 - called before the next turn
+                return make_keyframe(depth, self.config.keyframe, images.left)  # noqa: B023
+
+            self.mapper.add_image(agent, "stereo", T_base_camera, make)
+
+    def _on_path(self, agent: str, message: Message) -> None:
+        self._stamp_ns = max(self._stamp_ns, stamp_ns(message))
+        if self.mapper.set_path(agent, path_from_message(message)):
+            self._is_news = True
+        self.health.take({
+            "key frames": len(self.mapper.model.keyframes), "waiting for a pose": self.mapper.waiting,
+            "dropped without a pose": self.mapper.dropped, "key frames moved": self.mapper.model.moved,
+            "blocks refused": self.mapper.model.volume.refused_blocks,
+        })  # fmt: skip
+        full = self.mapper.model.volume.refused_blocks > 0
+        self.health.set(State.DEGRADED if full else State.OK, "the grid is full (tsdf.max_blocks)" if full else "")
+
+    # -- outputs -------------------------------------------------------------------------------------------------------
+
+    def _publish_news(self) -> None:
+        if self._is_news:
+            self._publish_model()
+
+    def _publish_model(self) -> None:
+        self._is_news = False
+        surface = self.mapper.model.surface()
+        header = header_message(self.types, self._stamp_ns, self.config.map_frame)
+        self.publish("map/dense_cloud", cloud_message(self.types, header, cloud_of(surface)))
+        plans = self.mapper.model.floor_plans(surface)
+        self._advertise_storeys(len(plans))
+        for number, plan in enumerate(plans):
+            grid = occupancy_message(self.types, header, plan.cells, plan.resolution, plan.T_map_plan)
+            self.publish(_storey_topic(number), grid)
+
+    def _advertise_storeys(self, count: int) -> None:
+        for number in range(self._storeys, count):
+            self.advertise(_storey_topic(number), "OccupancyGrid", latched=True, depth=1)
+        self._storeys = max(self._storeys, count)
+
+    def _on_save(self, _: object, response: Message) -> Message:
+        folder, surface = Path(self.config.output_path), self.mapper.model.surface()
+        try:
+            write_mesh(folder / "mesh.ply", surface)
+            plans = self.mapper.model.floor_plans(surface)
+            for number, plan in enumerate(plans):
+                write_plan(folder / (f"floor_plan_{number}.yaml" if len(plans) > 1 else "floor_plan.yaml"), plan)
+            response.success, response.message = True, f"{len(surface)} points, {len(plans)} storeys in {folder}"
+        except (ValueError, OSError) as error:
+            response.success, response.message = False, str(error)
+        return response
+
+
+CLOUD_DTYPE = np.dtype([(name, "<f4") for name in ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "sigma")])
+"""Fields of ``map/dense_cloud``; ``rgb`` as PCL and RViz pack it."""
+
+
+def cloud_of(surface: Surface) -> AnyArray:
+    """Structured array (n,) of :data:`CLOUD_DTYPE`."""
+    cloud = np.empty(len(surface), dtype=CLOUD_DTYPE)
+    for axis, name in enumerate("xyz"):
+        cloud[name], cloud[f"normal_{name}"] = surface.points[:, axis], surface.normals[:, axis]
+    red, green, blue = surface.colours.astype(np.uint32).T
+    cloud["rgb"] = ((red << 16) | (green << 8) | blue).astype("<u4").view("<f4")
+    cloud["sigma"] = surface.sigma
+    return cloud
+
+
+def _storey_topic(number: int) -> str:
+    return f"map/occupancy_{number}" if number else "map/occupancy"
+
+
+def _below(agent: str, name: str) -> str:
+    """A topic or frame below an agent's namespace."""
+    return f"{agent}/{name}" if agent else name
+
+
+def main() -> None:
+    """Entry point of ``ros2 run dense_mapping dense_mapper``."""
+    run_node(DenseMapperNode)

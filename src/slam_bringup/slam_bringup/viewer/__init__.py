@@ -1,0 +1,1 @@
+"""The viewer: a web page, served by viser, that shows a finished run or the nodes at work."""

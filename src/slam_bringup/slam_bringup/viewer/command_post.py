@@ -1,0 +1,69 @@
+"""The command post: of every agent the way back out with its uncertainty, and where nobody has looked yet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from dense_mapping.floor_plan import FloorPlan
+from dense_mapping.navigation import Frontier, Way, frontiers, way
+from slam_core.geometry import FloatArray
+from slam_core.types import PoseEstimate
+
+_CONFIDENCE = 0.995
+
+
+@dataclass(frozen=True, eq=False)
+class WayOut:
+    """An agent's way back to the exit, or None through what was seen; ``radius``: the agent stands within so many
+    metres of where the way begins, with 99.5 %.
+    """
+
+    agent: str
+    way: Way | None
+    radius: float
+
+    @property
+    def label(self) -> str:
+        """The length alone, for the scene."""
+        return "" if self.way is None else f"{self.way.length:.1f} m to the exit"
+
+    @property
+    def text(self) -> str:
+        """The same in words."""
+        if self.way is None:
+            return "no way out through what was seen free"
+        narrow = f", {2 * self.way.clearance:.1f} m wide at its narrowest" if self.way.clearance < 0.5 else ""
+        return f"{self.way.length:.1f} m to the exit{narrow}, position ±{self.radius:.2f} m (99.5 %)"
+
+
+def storey_at(plans: Sequence[FloorPlan], point: FloatArray) -> FloorPlan | None:
+    """The plan of the storey that a point (3,) of the map is on: the highest floor below it."""
+    heights = [(float(plan.height_of(point[None])[0]), i) for i, plan in enumerate(plans)]
+    above = [(height, i) for height, i in heights if height > -0.3]
+    return plans[min(above)[1]] if above else (plans[0] if plans else None)
+
+
+def ways_out(
+    plans: Sequence[FloorPlan], agents: Mapping[str, PoseEstimate], exits: Mapping[str, FloatArray]
+) -> list[WayOut]:
+    """The way of each agent to its exit (3,) m; who is on another storey than the exit gets none."""
+    out = []
+    for name, pose in agents.items():
+        plan, target = storey_at(plans, pose.T[:3, 3]), storey_at(plans, exits[name])
+        found = way(plan, pose.T[:3, 3], exits[name]) if plan is not None and plan is target else None
+        out.append(WayOut(name, found, position_radius(pose)))
+    return out
+
+
+def position_radius(pose: PoseEstimate) -> float:
+    """Radius (m) of the circle on the floor that holds the agent with 99.5 %, by the largest axis of its ellipse."""
+    return float(np.sqrt(chi2.ppf(_CONFIDENCE, 2) * max(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1], 0.0)))
+
+
+def unseen(plans: Sequence[FloorPlan], most: int = 30) -> list[Frontier]:
+    """Where nobody has looked yet, on all storeys, the longest borders first."""
+    return sorted((f for plan in plans for f in frontiers(plan)), key=lambda f: -f.length)[:most]

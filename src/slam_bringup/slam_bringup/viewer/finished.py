@@ -1,0 +1,124 @@
+"""A finished run on the page, with a time line to scrub."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from slam_bringup.viewer.command_post import position_radius, unseen, ways_out
+from slam_bringup.viewer.page import AgentRow, ViewerPage
+from slam_bringup.viewer.pictures import Picture
+from slam_bringup.viewer.run_folder import RunFolder
+from slam_core.geometry import FloatArray
+from slam_core.trajectory import Trajectory
+from slam_core.types import PoseEstimate
+
+_STEP_S = 0.05
+"""Step of the time line."""
+
+
+class FinishedView:
+    """Shows a run; :meth:`show_until` shows it as it was known at a stamp, on its final map.
+
+    Parameters
+    ----------
+    picture_at
+        The camera's picture of an agent at a stamp with its caption, or None, where there are pictures.
+    """
+
+    def __init__(
+        self, page: ViewerPage, run: RunFolder, picture_at: Callable[[str, int], Picture | None] | None = None
+    ) -> None:
+        self.page, self.run, self._picture_at = page, run, picture_at
+        self._show_map()
+        first, last = run.span_ns
+        with page.overview:
+            duration = np.ceil(max((last - first) / 1e9, 0.1) / _STEP_S) * _STEP_S
+            self.slider = page.server.gui.add_slider("time [s]", 0.0, duration, _STEP_S, duration)
+            self.post = page.server.gui.add_markdown("")
+        self.slider.on_update(lambda _: self.show_until(first + round(self.slider.value * 1e9)))
+        self.show_until(last)
+
+    def _show_map(self) -> None:
+        page, run = self.page, self.run
+        landmarks = run.global_map.landmarks()
+        page.show_headline(_headline(run))
+        page.show_mesh(run.surface)
+        page.show_points(run.surface.points, run.surface.colours)
+        for number, plan in enumerate(run.plans):
+            page.show_plan(plan, number)
+        page.show_landmarks(landmarks.positions[landmarks.linked], landmarks.covariances[landmarks.linked])
+        marks = run.global_map.marks
+        page.show_marks([m.name for m in marks.marks], marks.positions(run.global_map.graph))
+        borders = unseen(run.plans)
+        page.show_frontiers(np.array([f.point for f in borders]).reshape(-1, 3), [f.length for f in borders])
+        ways = [t.poses[:, :3, 3] for t in run.trajectories.values() if len(t)]
+        page.look_at(np.concatenate([*ways, run.surface.points[::50].astype(np.float64)]) if ways else np.empty((0, 3)))
+
+    def show_until(self, stamp_ns: int) -> None:
+        """Where everybody was at a stamp, how they had come there, and how they would have come out."""
+        with self.page.server.atomic():
+            lines = self.run.submap_lines(stamp_ns)
+            self.page.show_submaps(lines[:, 0], lines[:, 1])
+            self.page.show_closures(self.run.closure_lines(stamp_ns))
+            poses = self._show_agents(stamp_ns)
+            self._show_ways_out(poses)
+
+    def _show_agents(self, stamp_ns: int) -> dict[str, PoseEstimate]:
+        rows, poses = [], {}
+        for index, (agent, trajectory) in enumerate(self.run.trajectories.items()):
+            so_far = trajectory.select(trajectory.stamps_ns <= stamp_ns)
+            if not len(so_far):
+                rows.append(AgentRow(agent, "not yet there"))
+                continue
+            self.page.show_trajectory(agent, index, so_far.poses)
+            poses[agent] = _last(so_far)
+            self.page.show_agent(agent, index, so_far.poses[-1])
+            rows.append(AgentRow(agent, _state(so_far, stamp_ns), _way_text(so_far, poses[agent])))
+            self._show_picture(agent, stamp_ns, so_far.poses[-1])
+        self.page.show_agent_table(rows)
+        return poses
+
+    def _show_picture(self, agent: str, stamp_ns: int, T_map_base: FloatArray) -> None:
+        picture = self._picture_at(agent, stamp_ns) if self._picture_at is not None else None
+        if picture is not None:
+            self.page.show_picture(picture.image, picture.caption)
+            self.page.show_camera(T_map_base, picture.image)
+
+    def _show_ways_out(self, poses: dict[str, PoseEstimate]) -> None:
+        exits = {agent: t.poses[0, :3, 3] for agent, t in self.run.trajectories.items() if len(t)}
+        texts = []
+        for out in ways_out(self.run.plans, poses, exits):
+            index = list(self.run.trajectories).index(out.agent)
+            points = np.empty((0, 3)) if out.way is None else out.way.points
+            self.page.show_way(out.agent, index, points, out.label)
+            texts.append(f"- **{out.agent or 'rig'}**: {out.text}")
+        unseen_count = len(unseen(self.run.plans)) if self.run.plans else 0
+        text = "\n".join(["#### Way back out", *texts, "", f"{unseen_count} places where nobody has looked yet."])
+        self.post.content = text if self.run.plans else "No floor plan in this run."
+
+
+def _headline(run: RunFolder) -> str:
+    s = run.summary
+    accuracy = f", ATE {1000 * s['ate_rmse_m']:.1f} mm" if s.get("ate_rmse_m") is not None else ""
+    note = f"\n\n{run.note}" if run.note else ""
+    return (
+        f"### {s.get('bag', run.path.name)}\n{s.get('path_length_m', 0.0):.1f} m, {s.get('landmarks', 0)} landmarks, "
+        f"{s.get('submaps', 0)} submaps, {s.get('loop_closures', 0)} closures{accuracy}{note}"
+    )
+
+
+def _last(trajectory: Trajectory) -> PoseEstimate:
+    covariance = np.zeros((6, 6)) if trajectory.covariances is None else trajectory.covariances[-1]
+    return PoseEstimate(int(trajectory.stamps_ns[-1]), trajectory.poses[-1], covariance)
+
+
+def _state(so_far: Trajectory, stamp_ns: int) -> str:
+    silent_s = (stamp_ns - int(so_far.stamps_ns[-1])) / 1e9
+    return f"silent for {silent_s:.0f} s" if silent_s > 2.0 else "OK"
+
+
+def _way_text(so_far: Trajectory, pose: PoseEstimate) -> str:
+    x, y, z = pose.T[:3, 3]
+    return f"{so_far.length_m:.1f} m walked, at ({x:.1f}, {y:.1f}, {z:.1f}) m ±{position_radius(pose):.2f} m"

@@ -1,0 +1,105 @@
+"""What the viewer shows of a finished run: the files of its folder, read back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dense_mapping.floor_plan import FloorPlan
+from dense_mapping.plan_io import read_plan
+from dense_mapping.surface import Surface
+from dense_mapping.surface_io import read_mesh
+from sjsam_node.global_map import GlobalMap
+from slam_core.geometry import FloatArray
+from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class RunFolder:
+    """A finished run. ``note``: what could not be read, in words, or empty."""
+
+    path: Path
+    summary: dict[str, Any]
+    trajectories: dict[str, Trajectory]
+    global_map: GlobalMap
+    surface: Surface
+    plans: tuple[FloorPlan, ...]
+    note: str = ""
+
+    @classmethod
+    def read(cls, path: Path) -> RunFolder:
+        """The run in a folder.
+
+        Raises
+        ------
+        ValueError
+            If the folder holds no finished run, or a damaged one.
+        """
+        if not (path / "summary.json").is_file():
+            raise ValueError(f"{path} holds no finished run (no summary.json): slam run BAG -o {path} makes one")
+        try:
+            summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{path / 'summary.json'} is damaged: {error}") from error
+        mesh = path / "mesh.ply"
+        global_map, note = _map(path / "map")
+        return cls(
+            path=path,
+            summary=summary,
+            trajectories=_trajectories(path),
+            global_map=global_map,
+            surface=read_mesh(mesh) if mesh.is_file() else Surface.empty(),
+            plans=tuple(read_plan(file) for file in sorted(path.glob("floor_plan*.yaml"))),
+            note=note,
+        )
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last stamp of all trajectories."""
+        stamps = [t.stamps_ns for t in self.trajectories.values() if len(t)]
+        return (min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps)) if stamps else (0, 0)
+
+    def submap_lines(self, until_ns: int | None = None) -> FloatArray:
+        """Start and end (n, 2, 3) m of the submaps that were finished by a stamp."""
+        graph = self.global_map.graph
+        records = [r for r in graph.records if until_ns is None or r.submap.end_stamp_ns <= until_ns]
+        return np.array([graph.poses[[r.start, r.end], :3, 3] for r in records]).reshape(-1, 2, 3)
+
+    def closure_lines(self, until_ns: int | None = None) -> FloatArray:
+        """Ends (n, 2, 3) m of the closures between submaps that were finished by a stamp."""
+        graph = self.global_map.graph
+        pairs = [(graph.records[k.first], graph.records[k.second]) for k in graph.links if k.is_closure]
+        lines = [
+            graph.poses[[a.start, b.start], :3, 3]
+            for a, b in pairs
+            if until_ns is None or max(a.submap.end_stamp_ns, b.submap.end_stamp_ns) <= until_ns
+        ]
+        return np.array(lines).reshape(-1, 2, 3)
+
+
+def _map(path: Path) -> tuple[GlobalMap, str]:
+    """The map, or an empty one and why: a run of another version still has all its other files to show."""
+    try:
+        return GlobalMap.load(path), ""
+    except ValueError as error:
+        return GlobalMap(), f"landmarks and submaps are not shown: {error}"
+
+
+def _trajectories(path: Path) -> dict[str, Trajectory]:
+    """By agent; with their covariances where they are there."""
+    several = sorted(p for p in path.glob("trajectory_*.tum"))
+    files = {p.stem.removeprefix("trajectory_"): p for p in several} or {"": path / "trajectory.tum"}
+    out = {}
+    for agent, file in files.items():
+        trajectory = read_trajectory(file) if file.is_file() and file.stat().st_size else Trajectory.from_estimates([])
+        covariances = file.with_name(f"{file.stem}_covariance.csv")
+        if covariances.is_file() and len(trajectory):
+            stamps, P = read_covariance_csv(covariances)
+            if np.array_equal(stamps, trajectory.stamps_ns):
+                trajectory = Trajectory(stamps, trajectory.poses, P)
+        out[agent] = trajectory
+    return out
