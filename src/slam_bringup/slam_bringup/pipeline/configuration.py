@@ -20,6 +20,7 @@ from slam_bringup.pipeline.overrides import (
     is_parameter_of,
     read_overrides,
     require_known_nodes,
+    require_known_parameters,
 )
 from slam_core.config import Config, from_mapping, group, iterate_parameters
 from stereo_frontend.frontend import FrontendConfig
@@ -61,6 +62,8 @@ def system_config(overrides: Overrides) -> SystemConfig:
     for name in overrides.of_all:
         if not any(name in k for k in known.values()) and not any(is_parameter_of(n, name) for n in NODE_CONFIGS):
             raise ValueError(f"{overrides.origin}: no node has a parameter '{name}'")
+    for node in NODE_CONFIGS.keys() - groups.keys():
+        require_known_parameters(overrides, node)
     parsed: dict[str, Any] = {name: _group(name, type(groups[name]), known[name], overrides) for name in groups}
     return SystemConfig(**parsed)
 

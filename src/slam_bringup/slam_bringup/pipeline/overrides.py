@@ -99,6 +99,16 @@ def require_known_nodes(overrides: Overrides, known: set[str]) -> None:
             raise ValueError(f"{overrides.origin}: no node '{node}' ({hint}); it must hold one mapping per node")
 
 
+def require_known_parameters(overrides: Overrides, node: str) -> None:
+    """Refuse rules for a node with a name that it does not have, where its names can be known (ROS is installed)."""
+    known = _parameters_of(node)
+    for name in overrides.of(f"/{node}") if known else ():
+        if not is_parameter_of(node, name):
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise ValueError(f"{overrides.origin}: {node}: unknown parameter '{name}'{hint}")
+
+
 def parse_assignments(text: str) -> dict[str, dict[str, Any]]:
     """Parameters by node, of a text like ``ekf_slam.submap.max_distance=1.5, stereo_driver.compressed=true``."""
     found: dict[str, dict[str, Any]] = {}

@@ -1,0 +1,142 @@
+"""What ``slam.launch.py`` starts, from the texts of its arguments: for a live rig, or to play a bag.
+
+    arguments, YAML -> configuration -> nodes with their parameters, names of topics, a player
+
+Free of ROS's launch, so that it can be tested without; the launch file only hands these on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.bags.sensor_topics import BagNames, nodes_name, parse_topics
+from slam_bringup.pipeline.configuration import MODES, ODOMETRIES, choose, system_config
+from slam_bringup.pipeline.overrides import Overrides, overrides_of, parse_assignments, read_overrides
+from slam_bringup.processes.node_graph import NodeGraph, NodeSpec, live_nodes, plan_nodes
+
+AUTO = "auto"
+_BOOLEANS = ("true", "false")
+_WAIT_FOR_SUBSCRIBERS_S = 60.0
+
+
+@dataclass(frozen=True)
+class LaunchArgument:
+    """One argument of the launch file."""
+
+    name: str
+    default: str
+    description: str
+    choices: tuple[str, ...] = ()
+
+
+ARGUMENTS = (
+    LaunchArgument("agents", "", "names of the agents, comma-separated; empty: one rig"),
+    LaunchArgument("mode", AUTO, "where depth comes from; auto: stereo, or what the bag has", (AUTO, *MODES)),
+    LaunchArgument("odometry", "none", "of ToF scans", ODOMETRIES),
+    LaunchArgument("config", "", "YAML of parameters: groups named after the nodes, or ROS's form"),
+    LaunchArgument("set", "", "parameters in one line: ekf_slam.submap.max_distance=1.5, tof_driver.pictures=both"),
+    LaunchArgument("topics", "", "topics that are named otherwise: left=/cam/left/image_raw, right_info=/..."),
+    LaunchArgument("base_frame", "", "frame of the rig [base_link, below the agent's name]"),
+    LaunchArgument("rectified", "false", "the stereo images are rectified: image_rect", _BOOLEANS),
+    LaunchArgument("compressed", "false", "the stereo images are compressed: image_raw/compressed", _BOOLEANS),
+    LaunchArgument("pictures", AUTO, "ToF pictures beside depth: auto, none, amplitude, both"),
+    LaunchArgument("measurement", AUTO, "what the ToF camera measures", (AUTO, "range", "depth")),
+    LaunchArgument("map_path", "", "folder that save_map writes and load_map reads"),
+    LaunchArgument("localize_only", "false", "locate the agents in the loaded map without changing it", _BOOLEANS),
+    LaunchArgument("bag", "", "a bag to play; topics, frames and sensors are then the bag's"),
+    LaunchArgument("rate", "1.0", "speed of the bag; 0: as fast as the nodes follow"),
+    LaunchArgument("use_sim_time", "false", "take time from /clock", _BOOLEANS),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LaunchPlan:
+    """Nodes to start, and (name of the nodes, name outside) of topics."""
+
+    nodes: tuple[NodeSpec, ...]
+    remappings: tuple[tuple[str, str], ...] = ()
+
+
+def plan_launch(values: Mapping[str, str]) -> LaunchPlan:
+    """The plan for the texts of :data:`ARGUMENTS` by name; one that is left out has its default.
+
+    Raises
+    ------
+    ValueError
+        If a parameter, topic or file is wrong; the message says which.
+    """
+    values = {argument.name: argument.default for argument in ARGUMENTS} | dict(values)
+    overrides = _overrides(values)
+    topics = parse_topics(part.strip() for part in values["topics"].split(",") if part.strip())
+    names = BagNames(topics, values["base_frame"])
+    plan = _for_bag(values, overrides, names) if values["bag"] else _for_rig(values, overrides, names)
+    if values["use_sim_time"] != "true":
+        return plan
+    timed = (NodeSpec(s.package, s.executable, s.namespace, {**s.parameters, "use_sim_time": True}) for s in plan.nodes)
+    return LaunchPlan(tuple(timed), plan.remappings)
+
+
+def _overrides(values: Mapping[str, str]) -> Overrides:
+    """Of the file, then of the arguments with a name of their own, then of ``set``."""
+    origin = values["config"] or "launch arguments"
+    rules = read_overrides(Path(values["config"]).expanduser()).rules if values["config"] else ()
+    own: dict[str, dict[str, Any]] = {"sjsam": {}}
+    if values["map_path"]:
+        own["sjsam"]["map_path"] = str(Path(values["map_path"]).expanduser())
+    if values["localize_only"] == "true":
+        own["sjsam"]["localize_only"] = True
+    given = {node: p for node, p in own.items() if p}
+    line = overrides_of(parse_assignments(values["set"]), "set").rules
+    return Overrides(origin, (*rules, *overrides_of(given, origin).rules, *line))
+
+
+def _for_rig(values: Mapping[str, str], overrides: Overrides, names: BagNames) -> LaunchPlan:
+    agents = tuple(name.strip() for name in values["agents"].split(",")) if values["agents"] else ("",)
+    if any(agents) and names.topics:
+        raise ValueError("topics can be given for one rig; with several agents remap them in their drivers")
+    mode = "stereo" if values["mode"] == AUTO else values["mode"]
+    config = choose(system_config(overrides), mode, "sjsam", values["odometry"])
+    chosen = {k: values[k] for k in ("pictures", "measurement") if values[k] != AUTO}
+    specs = live_nodes(
+        config, agents, odometry=values["odometry"] != "none", rectified=values["rectified"] == "true",
+        extra={"tof_driver": chosen, "stereo_driver": {"compressed": True} if values["compressed"] == "true" else {}},
+        base_frames=dict.fromkeys(agents, names.base_frame) if names.base_frame else None, overrides=overrides,
+    )  # fmt: skip
+    return LaunchPlan(tuple(specs), tuple(_remapped(names.topics)))
+
+
+def _remapped(topics: Mapping[str, str]) -> list[tuple[str, str]]:
+    """What the nodes call the topics of a rig, and what they are called."""
+    found = []
+    for role, topic in topics.items():
+        measurement = role if role in ("range", "depth") else "range"
+        own = nodes_name("", "depth" if role == "range" else role, topic, measurement)
+        found.append((own, topic))
+    return found
+
+
+def _for_bag(values: Mapping[str, str], overrides: Overrides, names: BagNames) -> LaunchPlan:
+    path = Path(values["bag"]).expanduser().resolve()
+    with SensorBag(path, names) as bag:
+        has_stereo = bool(bag.count(bag.agents[0], "left"))
+        mode = ("stereo" if has_stereo else "tof") if values["mode"] == AUTO else values["mode"]
+        config = choose(system_config(overrides), mode, "sjsam", values["odometry"])
+        map_path = values["map_path"] or "map"
+        graph = plan_nodes(config, bag.sensors, values["odometry"] != "none", map_path, overrides)
+    return LaunchPlan((*graph.specs, _player(path, graph, values)))
+
+
+def _player(path: Path, graph: NodeGraph, values: Mapping[str, str]) -> NodeSpec:
+    parameters = {
+        "bag": str(path), "rate": float(yaml.safe_load(values["rate"])), "topics": tuple(graph.played),
+        "pace": graph.pace, "rename": tuple(f"{topic}={name}" for topic, name in graph.played.items() if name != topic),
+        "wait_for_subscribers": _WAIT_FOR_SUBSCRIBERS_S,
+    }  # fmt: skip
+    parameters = {name: value for name, value in parameters.items() if value != ()}
+    return NodeSpec("slam_bringup", "bag_player", "", parameters)
