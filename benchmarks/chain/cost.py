@@ -127,7 +127,7 @@ def write_first(source: Path, target: Path, frames: int) -> None:
 
 
 def make_rig(target: Path) -> None:
-    slam(["simulate", "workshop_rig", "-o", str(target)], standalone_mode=False)
+    slam(["simulate", "workshop_rig", "--profile", "ideal", "-o", str(target)], standalone_mode=False)
 
 
 def make_mh01(target: Path) -> None:

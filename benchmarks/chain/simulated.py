@@ -139,7 +139,8 @@ def bag_of(name: str, folder: Path) -> Path:
     scenario, _, every = name.partition("/")
     bag = folder / f"{name.replace('/', '_every_')}.mcap"
     if not bag.exists():
-        command = ["simulate", scenario, "-o", str(bag), "--images", "jpeg", "--compact", "--every", every or "1"]
+        command = ["simulate", scenario, "--profile", "ideal", "-o", str(bag), "--images", "jpeg", "--compact"]
+        command += ["--every", every or "1"]
         slam(command, standalone_mode=False)
     return bag
 

@@ -5,6 +5,7 @@ seed: 16
 rate: 10.0                       # frames per second
 frames: 414
 sensors: [stereo, tof, imu]
+profile: ideal                   # or real: what real rooms and sensors add; single effects: realism: {...}
 rooms:
   - {name: office, x: [0, 5], y: [0, 4], style: office}
 doorways:
@@ -29,12 +30,15 @@ from slam_core.config import Config, from_mapping, group, parameter
 from slam_simulation.building import WALL_GAP, Doorway, Room, build_doorways, build_shell, room_walls
 from slam_simulation.furniture import Spot, chair, furnish_wall, pillar, table
 from slam_simulation.imu import ImuSensorConfig
+from slam_simulation.moving import add_moving
+from slam_simulation.profiles import PROFILES, REAL, REAL_STEREO, RealismConfig
 from slam_simulation.stereo_sensor import StereoSensorConfig
 from slam_simulation.tof_sensor import TofSensorConfig
 from slam_simulation.trajectory import MOTION_STYLES, Path, SplinePath, StationPath, resolve_waypoints
 from slam_simulation.world import World
 
 SENSORS = ("stereo", "tof", "imu")
+_SUITE = (*SENSORS, "realism")
 SCENARIO_FOLDERS = (FilePath("bags/scenarios"), FilePath(__file__).resolve().parents[4] / "bags/scenarios")
 
 
@@ -77,6 +81,7 @@ class SensorSuite(Config):
     stereo: StereoSensorConfig = group(StereoSensorConfig)
     tof: TofSensorConfig = group(TofSensorConfig)
     imu: ImuSensorConfig = group(ImuSensorConfig)
+    realism: RealismConfig = group(RealismConfig)
     start_stamp_s: float = parameter(1000.0, "header stamp of the first frame", unit="s", minimum=0.0)
 
 
@@ -97,6 +102,8 @@ class Scenario:
     suite: SensorSuite = field(default_factory=SensorSuite)
     full_frames: int = 0
     """Frames of the whole motion, if ``frames`` has been cut."""
+    profile: str = ""
+    """How hard it is, see :mod:`slam_simulation.profiles`; "" is ``ideal`` as long as nobody chooses."""
 
     def __post_init__(self) -> None:
         if self.rate <= 0.0 or self.frames < 1:
@@ -134,14 +141,31 @@ class Scenario:
     @classmethod
     def from_mapping(cls, name: str, values: Mapping[str, Any]) -> Scenario:
         """A scenario from the YAML file's contents."""
-        plain = {k: v for k, v in values.items() if k not in ("rooms", "agents", "doorways", "objects", *SENSORS)}
-        suite = {key: values[key] for key in SENSORS if key in values}
+        own = ("rooms", "agents", "doorways", "objects", "profile", *_SUITE)
+        plain = {k: v for k, v in values.items() if k not in own}
+        suite = {key: values[key] for key in _SUITE if key in values}
         for key in ("rooms", "agents", "doorways", "objects"):
             kind = {"rooms": Room, "agents": Agent, "doorways": Doorway, "objects": FurnitureObject}[key]
             plain[key] = tuple(_make(kind, row, name) for row in values.get(key, ()))
         plain["sensors"] = tuple(plain.get("sensors", SENSORS))
         made: Scenario = _make(cls, {**plain, "name": name, "suite": from_mapping(SensorSuite, suite)}, name)
-        return made
+        return made.with_profile(str(values["profile"])) if "profile" in values else made
+
+    def with_profile(self, profile: str) -> Scenario:
+        """The scenario under a profile; what it sets of ``realism`` itself stays under ``ideal``.
+
+        Raises
+        ------
+        ValueError
+            If there is no such profile.
+        """
+        if profile not in PROFILES:
+            raise ValueError(f"unknown profile '{profile}', known: {', '.join(PROFILES)}")
+        if profile == "ideal":
+            return replace(self, profile=profile)
+        harder = {name: max(value, getattr(self.suite.stereo, name)) for name, value in REAL_STEREO.items()}
+        stereo = replace(self.suite.stereo, **harder)
+        return replace(self, profile=profile, suite=replace(self.suite, stereo=stereo, realism=REAL))
 
     def shortened(self, frames: int) -> Scenario:
         """The same scenario, cut off after ``frames`` frames; the motion stays as it was."""
@@ -162,6 +186,7 @@ class Scenario:
         build_doorways(world, list(self.doorways), [wall for walls in everything for wall in walls])
         for item in self.objects:
             self._place(world, item, rng)
+        add_moving(world, self.suite.realism.moving, self.path(), self.rooms)
         return world
 
     def _place(self, world: World, item: FurnitureObject, rng: np.random.Generator) -> None:

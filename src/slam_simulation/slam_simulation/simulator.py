@@ -16,7 +16,9 @@ import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
 from slam_core.types import ByteArray, Float32Array, ImuSample
+from slam_simulation.finishes import finished
 from slam_simulation.imu import ImuSensor
+from slam_simulation.moving import MovingThings
 from slam_simulation.raycaster import Rays, camera_rays, make_view, trace
 from slam_simulation.scenario import Scenario
 from slam_simulation.stereo_sensor import StereoSensor
@@ -90,10 +92,13 @@ class Simulator:
                 f"scenario '{scenario.name}' has {len(scenario.agents)} agents, there is no number {agent}"
             )
         self.scenario, self.agent = scenario, agent
-        self.world = compile_world(scenario.world()) if world is None else world
+        realism = scenario.suite.realism
+        world = compile_world(scenario.world()) if world is None else world
+        self.world = finished(world, realism.finishes, scenario.seed)
+        self._moving = MovingThings(realism.moving, scenario.path())
         self.path = scenario.path(agent)
-        self.stereo = StereoSensor(scenario.suite.stereo, scenario.seed, rectified=rectified)
-        self.tof = TofSensor(scenario.suite.tof, scenario.seed)
+        self.stereo = StereoSensor(scenario.suite.stereo, scenario.seed, rectified=rectified, realism=realism)
+        self.tof = TofSensor(scenario.suite.tof, scenario.seed, realism)
         self.imu = ImuSensor(scenario.suite.imu, (scenario.seed, 9, agent))
         self.threads = threads or os.cpu_count() or 1
         self._truth_rays = camera_rays(self.stereo.stereo.camera) if truth else None
@@ -136,10 +141,11 @@ class Simulator:
     def _frame(self, k: int, pool: ThreadPoolExecutor | None, every: int = 1) -> SimulatedFrame:
         scenario, t = self.scenario, k / self.scenario.rate
         T = self.path.pose(t)
-        left, right = self._stereo(k, t, T, pool)
+        world = self._moving.at(self.world, t)
+        left, right = self._stereo(k, t, T, world, pool)
         tof = None
         if "tof" in scenario.sensors:
-            tof = self.tof.capture(self.world, T, self._rng(k, 3), pool)
+            tof = self.tof.capture(world, T, self._rng(k, 3), pool)
         jitter = scenario.suite.stereo.stamp_jitter_us * 1e3 * self._rng(k, 4).standard_normal()
         return SimulatedFrame(
             index=k,
@@ -151,19 +157,19 @@ class Simulator:
             right=right,
             tof=tof,
             imu=self._imu_samples(t - every / scenario.rate, t),
-            truth=None if self._truth_rays is None else self._truth(T, self._truth_rays, pool),
+            truth=None if self._truth_rays is None else self._truth(T, world, self._truth_rays, pool),
         )
 
     def _rng(self, k: int, sensor: int) -> np.random.Generator:
         return np.random.default_rng([self.scenario.seed, 5, self.agent, k, sensor])
 
     def _stereo(
-        self, k: int, t: float, T: FloatArray, pool: ThreadPoolExecutor | None
+        self, k: int, t: float, T: FloatArray, world: SurfaceTable, pool: ThreadPoolExecutor | None
     ) -> tuple[ByteArray | None, ByteArray | None]:
         if "stereo" not in self.scenario.sensors:
             return None, None
         rng = self._rng(k, 2)
-        pair = self.stereo.capture(self.world, T, rig_twist(self.path, t), rng, pool)
+        pair = self.stereo.capture(world, T, rig_twist(self.path, t), rng, pool)
         return (None, None) if rng.random() < self.scenario.suite.stereo.drop_probability else pair
 
     def _imu_samples(self, previous: float, t: float) -> tuple[ImuSample, ...]:
@@ -172,8 +178,8 @@ class Simulator:
         # The first frame brings the sample of its own moment.
         return self.imu.read(self.path, max(previous, -1e-6), t, self.stamp_ns(0))
 
-    def _truth(self, T: FloatArray, rays: Rays, pool: ThreadPoolExecutor | None) -> DepthTruth:
-        view = make_view(self.world, T @ self.T_rig_left, rays.bounds)
+    def _truth(self, T: FloatArray, world: SurfaceTable, rays: Rays, pool: ThreadPoolExecutor | None) -> DepthTruth:
+        view = make_view(world, T @ self.T_rig_left, rays.bounds)
         hits = trace(view, rays, pool)
         return DepthTruth(hits.depth, np.where(hits.surface >= 0, view.ids[hits.surface], -1).astype(np.int32))
 

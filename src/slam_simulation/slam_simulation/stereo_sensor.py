@@ -18,8 +18,11 @@ from slam_core.camera import Camera, CameraInfo, StereoCamera
 from slam_core.config import Config, parameter
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, make_transform, so3_exp
 from slam_core.types import ByteArray, Float32Array
+from slam_simulation.profiles import RealismConfig
 from slam_simulation.raycaster import TILE, Rays, camera_rays, for_tile_rows, make_view, trace
 from slam_simulation.shading import render
+from slam_simulation.shutter import rolled, stepped
+from slam_simulation.smoke import seen_through
 from slam_simulation.surface_table import SurfaceTable
 
 SIDES = ("left", "right")
@@ -74,8 +77,16 @@ class StereoSensorConfig(Config):
 class StereoSensor:
     """Renders raw pairs. Keeps the state of the exposure control, so frames must be taken in order."""
 
-    def __init__(self, config: StereoSensorConfig, seed: int = 0, *, rectified: bool = False) -> None:
+    def __init__(
+        self,
+        config: StereoSensorConfig,
+        seed: int = 0,
+        *,
+        rectified: bool = False,
+        realism: RealismConfig | None = None,
+    ) -> None:
         self.config = c = config
+        self._realism = realism or RealismConfig()
         rng = np.random.default_rng([seed, 78])
         self.infos = tuple(camera_info(c, side, rectified=rectified) for side in SIDES)
         self.stereo = StereoCamera(self.infos[0].rectified, c.baseline)
@@ -100,7 +111,8 @@ class StereoSensor:
         lag = self.config.exposure_lag if self._gain > 0.0 else 0.0
         self._gain = lag * self._gain + (1.0 - lag) * wanted
         flicker = 1.0 + self.config.gain_jitter * rng.standard_normal()
-        gains = (self._gain * flicker, self._gain * flicker * (1.0 + self.config.gain_mismatch))
+        gain = stepped(self._gain, self._realism.exposure_step_ev) * flicker
+        gains = (gain, gain * (1.0 + self.config.gain_mismatch))
         left, right = (expose(image, gain, self.config, rng) for image, gain in zip(light, gains, strict=True))
         return left, right
 
@@ -112,8 +124,11 @@ class StereoSensor:
         view = make_view(world, T_world_camera, rays.bounds)
         hits = trace(view, rays, pool)
         image = render(world, view, rays, hits, T_world_camera, pool)
+        image = seen_through(image, hits.depth, self._realism.smoke)
+        velocity = camera_twist(twist, self.T_rig_raw[k])
+        image = rolled(image, hits.depth, rays, velocity, self._realism.readout_ms * 1e-3)
         if self.config.exposure_ms > 0.0:
-            shift = camera_twist(twist, self.T_rig_raw[k]) * (self.config.exposure_ms * 1e-3)
+            shift = velocity * (self.config.exposure_ms * 1e-3)
             image = motion_blur(image, hits.depth, rays, shift, pool)
         image *= self._shading[k]
         if self.config.blur_px > 0.0:

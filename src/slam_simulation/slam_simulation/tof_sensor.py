@@ -19,9 +19,12 @@ from slam_core.camera import Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, make_transform, so3_exp
 from slam_core.types import ByteArray, Float32Array
+from slam_simulation.profiles import RealismConfig
 from slam_simulation.raycaster import TILE, Hits, Rays, View, camera_rays, for_tile_rows, make_view, trace
 from slam_simulation.shading import EDGE_RAYS, is_edge, reflectance, split_pixel, surface_light
+from slam_simulation.smoke import echo_through
 from slam_simulation.surface_table import Look, SurfaceTable
+from slam_simulation.tof_errors import wiggle, with_indirect_light
 
 INFRARED = Look.INFRARED
 
@@ -63,8 +66,9 @@ class TofImages:
 class TofSensor:
     """Renders the ToF camera's three images."""
 
-    def __init__(self, config: TofSensorConfig, seed: int) -> None:
+    def __init__(self, config: TofSensorConfig, seed: int, realism: RealismConfig | None = None) -> None:
         self.config = c = config
+        self._realism = realism or RealismConfig()
         centre = (c.size - 1) / 2
         self.camera = Camera(
             c.size, c.size, c.focal_length, c.focal_length, centre + 0.8, centre - 1.3, "plumb_bob", c.distortion
@@ -94,6 +98,7 @@ class TofSensor:
         noisy = phasor + sigma * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
         amplitude = np.abs(noisy)
         distance = np.mod(np.angle(noisy) / (2.0 * np.pi), 1.0) * c.ambiguity_range + self._offset
+        distance += wiggle(distance, c.ambiguity_range, self._realism.tof)
         distance = np.mod(distance, c.ambiguity_range)
         intensity = ambient + amplitude + np.sqrt(ambient + amplitude) * 0.5 * rng.standard_normal(shape)
         saturated = amplitude + ambient > c.saturation
@@ -118,7 +123,15 @@ class TofSensor:
             lambda first, last: _phasor_rows(first, last, world, view, self.rays, hits, wave, out),
         )
         scale = self._illumination * self.config.amplitude_scale
-        return np.asarray(scale * (out[..., 0] + 1j * out[..., 1])), np.asarray(self.config.ambient_scale * out[..., 2])
+        direct = np.asarray(scale * (out[..., 0] + 1j * out[..., 1]))
+        return self._disturbed(direct, hits), np.asarray(self.config.ambient_scale * out[..., 2])
+
+    def _disturbed(self, phasor: FloatArray, hits: Hits) -> FloatArray:
+        """What reaches the sensor of the light of the surfaces, smoke and other ways of light counted in."""
+        c, r = self.config, self._realism
+        distance = hits.depth * np.sqrt(1.0 + (self.rays.rays[..., :2] ** 2).sum(axis=-1))
+        phasor = echo_through(phasor, distance, c.ambiguity_range, c.amplitude_scale, r.smoke)
+        return with_indirect_light(phasor, c.ambiguity_range, r.tof)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

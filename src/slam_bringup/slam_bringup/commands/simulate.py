@@ -33,6 +33,7 @@ from slam_core.geometry import FloatArray
 from slam_core.messages import compressed_image_message, header_message, transform_message
 from slam_core.types import ByteArray
 from slam_simulation import Scenario, SimulatedFrame, Simulator
+from slam_simulation.profiles import PROFILES
 from slam_simulation.stereo_sensor import SIDES
 from slam_simulation.surface_table import compile_world
 from slam_simulation.tof_sensor import TofImages
@@ -65,6 +66,13 @@ class BagOptions:
 @click.option("--every", type=click.IntRange(1), default=1, show_default=True, help="take only every n-th frame")
 @click.option("--frames", type=click.IntRange(1), help="render only the first frames")
 @click.option("--seed", type=click.IntRange(0), help="another seed than the scenario's: same plan, other building")
+@click.option(
+    "--profile",
+    type=click.Choice(PROFILES),
+    default="real",
+    show_default=True,
+    help="real: with calibration errors, exposure steps, blur, people, ToF errors and haze; ideal: without",
+)
 @click.option("--storage", type=click.Choice(("mcap", "sqlite3")), default="mcap", show_default=True, help="bag format")
 @click.option("--images", type=click.Choice(IMAGE_FORMATS), default="raw", show_default=True, help="stereo images")
 @click.option("--compact", is_flag=True, help="ToF images in 16 bits, no intensity")
@@ -75,12 +83,13 @@ class BagOptions:
 )
 @overwrite_option("a bag that slam wrote")
 def command(
-    scenario: str, output: Path, every: int, frames: int | None, seed: int | None, storage: str, images: str, compact:
-    bool, rectified: bool, truth: bool, threads: int | None, overwrite: bool,
+    scenario: str, output: Path, every: int, frames: int | None, seed: int | None, profile: str | None, storage: str,
+    images: str, compact: bool, rectified: bool, truth: bool, threads: int | None, overwrite: bool,
 ) -> None:  # fmt: skip
     """Render SCENARIO (a YAML file, or a name of bags/scenarios) to a bag with ground truth."""
     require_free(output, overwrite=overwrite)
     plan = Scenario.load(scenario)
+    plan = plan.with_profile(profile or plan.profile or "real")
     if seed is not None:
         plan = replace(plan, seed=seed)
     if frames is not None:
