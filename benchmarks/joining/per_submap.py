@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -52,13 +53,12 @@ def main() -> None:
 
 
 def measure(path: Path, is_read: bool, every: bool, most: int) -> None:
-    recording = load(path)
-    submaps = recording.submaps[:most]
-    warm_up(recording)
+    recording, submaps = load(path)
+    warm_up(path)
     global_map = GlobalMap()
     adding, reading, memory = [], [], []
     reports: list[JoinReport] = []
-    for submap in submaps:
+    for submap in islice(submaps, most):
         began = time.process_time()
         reports.append(global_map.add(submap))
         added = time.process_time()
@@ -87,11 +87,11 @@ def print_row(name: str, recording: Recording, final: GlobalMap, reports: list[J
     ate, anees, filtered = accuracy(recording, final)
     growth = (memory[-1] - memory[40]) / max(len(memory) - 41, 1) if len(memory) > 60 else np.nan
     total = float(adding.sum() + reading.sum() + finish)
-    span = recording.sensor_s * len(adding) / len(recording.submaps)
-    features = recording.features_s * len(adding) / len(recording.submaps)
+    span = recording.sensor_s * len(adding) / recording.count
+    features = recording.features_s * len(adding) / recording.count
     cells = (
         name, len(adding), len(final.landmarks().ids), f"{1e3 * adding.mean():.0f}", f"{1e3 * reading.mean():.0f}",
-        f"{ms.mean():.0f}", f"{np.percentile(ms, 95):.0f}", f"{ms.max():.0f}", f"{ms[20:40].mean():.0f}",
+        f"{ms.mean():.0f}", f"{np.percentile(ms, 95):.0f}", f"{ms.max():.0f}", f"{stretch(ms, 20, 40):.0f}",
         f"{ms[-20:].mean():.0f}", f"{growth:.2f}", f"{finish:.2f}", f"{100 * total / span:.1f}",
         f"{total / features:.2f}", f"{sum(len(r.closures) for r in reports)}, {live}, {closed(final)}",
         final.components, "{:.0f}/{}".format(*final.smoother.totals()),
@@ -100,6 +100,10 @@ def print_row(name: str, recording: Recording, final: GlobalMap, reports: list[J
     )  # fmt: skip
     print(" | ".join(HEADINGS))
     print(" | ".join(map(str, cells)), flush=True)
+
+
+def stretch(ms: np.ndarray, first: int, last: int) -> float:
+    return float(ms[first:last].mean()) if len(ms) >= last else np.nan
 
 
 def closed(global_map: GlobalMap) -> int:
@@ -129,10 +133,10 @@ def publish(global_map: GlobalMap, agent: str) -> None:
     np.array([graph.poses[[r.start, r.end], :3, 3] for r in graph.records])
 
 
-def warm_up(recording: Recording) -> None:
+def warm_up(path: Path) -> None:
     """Load the compiled kernels."""
     global_map = GlobalMap()
-    for submap in recording.submaps[:3]:
+    for submap in islice(load(path)[1], 3):
         global_map.add(submap)
         publish(global_map, submap.agent)
     global_map.settle()

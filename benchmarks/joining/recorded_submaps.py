@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import pickle
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from unittest.mock import patch
@@ -26,20 +27,20 @@ from slam_core.types import Features, Submap
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Submaps in the order in which they were finished, ground truth of every agent, and the filter's own poses.
+    """Ground truth of every agent, the filter's own poses, and the number of submaps.
 
     sensor_s: duration of the recording. features_s: time that its features took, by the wall.
     """
 
-    submaps: list[Submap]
+    count: int
     truth: dict[str, Trajectory]
     filtered: dict[str, Trajectory]
     sensor_s: float
     features_s: float
 
 
-def record(bag: Path, mode: str, odometry: str) -> Recording:
-    """Submaps of a bag, which nothing joins."""
+def record(bag: Path, mode: str, odometry: str) -> tuple[Recording, list[Submap]]:
+    """Submaps of a bag in the order in which they were finished, which nothing joins."""
     submaps: list[Submap] = []
 
     def store(_: GlobalMap, submap: Submap) -> JoinReport:
@@ -51,10 +52,10 @@ def record(bag: Path, mode: str, odometry: str) -> Recording:
     features_s = 1e-3 * sum(sum(result.stage_ms.get(stage, [])) for stage in ("keypoints", "features"))
     truth = {agent.name: agent.truth for agent in result.agents}
     filtered = {agent.name: agent.filtered for agent in result.agents}
-    return Recording(submaps, truth, filtered, result.sensor_s, features_s)
+    return Recording(len(submaps), truth, filtered, result.sensor_s, features_s), submaps
 
 
-def record_to_and_fro(bag: Path, mode: str, count: int) -> Recording:
+def record_to_and_fro(bag: Path, mode: str, count: int) -> tuple[Recording, list[Submap]]:
     """``count`` submaps of a bag whose features are seen forwards, backwards, forwards again and so on."""
     seen: list[tuple[EkfSlam, Features]] = []
     process = EkfSlam.process
@@ -64,7 +65,7 @@ def record_to_and_fro(bag: Path, mode: str, count: int) -> Recording:
         return process(ekf, features)
 
     with patch.object(EkfSlam, "process", remember):
-        once = record(bag, mode, "none")
+        once, _ = record(bag, mode, "none")
     features = [f for _, f in seen]
     ekf = EkfSlam(seen[0][0].config, seen[0][0]._T_rig_optical)
     stamps = np.array([f.stamp_ns for f in features])
@@ -86,14 +87,22 @@ def record_to_and_fro(bag: Path, mode: str, count: int) -> Recording:
     filtered = Trajectory.from_estimates(estimates)
     passes = len(stamps_ns) / len(features)
     sensor_s = 1e-9 * (stamps_ns[-1] - stamps_ns[0])
-    return Recording(submaps, {agent: walked}, {agent: filtered}, sensor_s, passes * once.features_s)
+    return Recording(len(submaps), {agent: walked}, {agent: filtered}, sensor_s, passes * once.features_s), submaps
 
 
-def load(path: Path) -> Recording:
-    """A recording that :func:`main` wrote."""
-    with path.open("rb") as file:
-        loaded: Recording = pickle.load(file)
-    return loaded
+def load(path: Path) -> tuple[Recording, Iterator[Submap]]:
+    """A recording that :func:`store` wrote; its submaps are read as they are asked for."""
+    file = path.open("rb")
+    recording: Recording = pickle.load(file)
+    return recording, (pickle.load(file) for _ in range(recording.count))
+
+
+def store(path: Path, recording: Recording, submaps: list[Submap]) -> None:
+    """Write a recording, then its submaps one by one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        for part in (recording, *submaps):
+            pickle.dump(part, file)
 
 
 def main() -> None:
@@ -105,13 +114,11 @@ def main() -> None:
     parser.add_argument("--to-and-fro", type=int, default=0, metavar="SUBMAPS")
     arguments = parser.parse_args()
     if arguments.to_and_fro:
-        recording = record_to_and_fro(arguments.bag, arguments.mode, arguments.to_and_fro)
+        recording, submaps = record_to_and_fro(arguments.bag, arguments.mode, arguments.to_and_fro)
     else:
-        recording = record(arguments.bag, arguments.mode, arguments.odometry)
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    with arguments.output.open("wb") as file:
-        pickle.dump(recording, file)
-    print(f"{arguments.output}: {len(recording.submaps)} submaps of {recording.sensor_s:.1f} s")
+        recording, submaps = record(arguments.bag, arguments.mode, arguments.odometry)
+    store(arguments.output, recording, submaps)
+    print(f"{arguments.output}: {recording.count} submaps of {recording.sensor_s:.1f} s")
 
 
 if __name__ == "__main__":

@@ -52,11 +52,11 @@ class GlobalMapConfig(Config):
         2, "pairs of submaps that a closure has brought near each other, compared with each new submap", minimum=0
     )
     compared_at_settling: int = parameter(2, "the same per submap when the map settles", minimum=0)
-    ties: int = parameter(48, "landmarks by which two submaps are tied together, at most", minimum=3)
+    ties: int = parameter(24, "landmarks by which two submaps are tied together, at most", minimum=3)
     redundant_share: float = parameter(
         0.6, "share of a submap's landmarks that closures match from which on it shows nothing new", minimum=0.0
     )
-    redundant_ties: int = parameter(12, "landmarks that tie such a submap to each other one, at most", minimum=3)
+    redundant_ties: int = parameter(8, "landmarks that tie such a submap to each other one, at most", minimum=3)
     smoothing: SmootherConfig = group(SmootherConfig)
     closure: ClosureConfig = group(ClosureConfig)
     consistency: ConsistencyConfig = group(ConsistencyConfig)
@@ -68,7 +68,8 @@ class JoinReport:
 
     accepted with reason otherwise; matched: its landmarks already in the map; new_landmarks; closures: links accepted
     now, as (agent, index) of the older submap; dropped: matches let go; components: parts of the map that hang
-    together; chi2, variance_factor, iterations, converged and solver of the update; redundant: it shows nothing new.
+    together; chi2, variance_factor, iterations, converged and solver of the update; redundant: it shows nothing new;
+    is_strained: the submaps contradict each other by more than ``consistency.max_variance_factor``.
     """
 
     accepted: bool
@@ -84,6 +85,7 @@ class JoinReport:
     converged: bool = True
     solver: str = ""
     redundant: bool = False
+    is_strained: bool = False
 
 
 class GlobalMap:
@@ -135,6 +137,8 @@ class GlobalMap:
         self._judge_redundancy(new, found)
         result, verdict = self.consistency.update(found, new)
         self._account(verdict, len(found))
+        surprising = any(k.status is not Status.CONSISTENT for k in found) and bool(verdict.accepted)
+        self._has_moved = surprising or bool(verdict.removed) or (self._has_moved and bool(found))
         if not self.graph.redundant[new]:
             self.detector.index.add(new, submap.descriptors)
         self._put_away(new - self.config.closure.window)
@@ -142,6 +146,7 @@ class GlobalMap:
             True, "", matched, len(submap.landmarks) - self._matched(new), self._named(verdict.accepted),
             verdict.dropped, self.components, result.cost, result.variance_factor, result.iterations, result.converged,
             result.solver, bool(self.graph.redundant[new]),
+            result.variance_factor > self.config.consistency.max_variance_factor,
         )  # fmt: skip
 
     def _judge_redundancy(self, new: int, found: list[Link]) -> None:
@@ -161,7 +166,6 @@ class GlobalMap:
             if amount:
                 self.counters.add(name, amount)
         self.detector.near.forget({i for k in verdict.removed for i in k.ends})
-        self._has_moved = self._has_moved or bool(verdict.accepted)
 
     def _named(self, links: tuple[Link, ...]) -> tuple[tuple[str, int], ...]:
         older = [self.graph.records[link.first].submap for link in links]

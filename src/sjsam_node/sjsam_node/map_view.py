@@ -50,6 +50,21 @@ class MapLandmarks:
     linked: BoolArray
 
 
+@dataclass(frozen=True, eq=False)
+class _Stacked:
+    """The poses inside all submaps so far, how many each has, and the gains of their ends."""
+
+    count: list[int]
+    poses: FloatArray
+    gains: FloatArray
+
+    def with_one(self, submap: Submap, gains: FloatArray) -> _Stacked:
+        own = np.array([p.T for p in submap.path])
+        return _Stacked(
+            [*self.count, len(own)], np.concatenate([self.poses, own]), np.concatenate([self.gains, gains])
+        )  # fmt: skip
+
+
 @dataclass
 class MapView:
     """Pictures of the estimate as of the last update; looking changes nothing."""
@@ -57,6 +72,7 @@ class MapView:
     smoother: Smoother
     unlinked_sigma: float
     _gains: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    _stacked: _Stacked = field(default_factory=lambda: _Stacked([], np.empty((0, 4, 4)), np.empty((0, 6, 6))))
 
     @property
     def graph(self) -> MapGraph:
@@ -65,22 +81,19 @@ class MapView:
 
     def path(self) -> dict[str, list[PoseEstimate]]:
         """Poses of every agent in the order of their stamps, with no more covariance than inside their submaps."""
-        records = self.graph.records
-        for i in range(len(self._gains), len(records)):
-            self._gain(i)
+        records, stacked = self.graph.records, self._stacked
+        for i in range(len(stacked.count), len(records)):
+            stacked = self._stacked = stacked.with_one(records[i].submap, self._gain(i)[0])
         if not records:
             return {}
+        of = np.repeat(np.arange(len(records)), stacked.count)
+        poses = _on_skeleton(self.graph, records, of, stacked.poses, stacked.gains)
+        parts: dict[str, list[PoseEstimate]] = {}
         inside = [p for r in records for p in r.submap.path]
-        count = [len(r.submap.path) for r in records]
-        gains = np.concatenate([self._gains[i][0] for i in range(len(records))])
-        poses = _on_skeleton(self.graph, records, np.repeat(np.arange(len(records)), count), inside, gains)
-        out: dict[str, list[PoseEstimate]] = {}
-        first = 0
-        for n, r in zip(count, records, strict=True):
-            own = zip(r.submap.path, poses[first : first + n], strict=True)
-            out.setdefault(r.submap.agent, []).extend(PoseEstimate(p.stamp_ns, T, p.covariance) for p, T in own)
-            first += n
-        return {agent: _unique_stamps(poses) for agent, poses in sorted(out.items())}
+        agents = [r.submap.agent for r, n in zip(records, stacked.count, strict=True) for _ in range(n)]
+        for agent, p, T in zip(agents, inside, poses, strict=True):
+            parts.setdefault(agent, []).append(PoseEstimate(p.stamp_ns, T, p.covariance))
+        return {agent: _unique_stamps(part) for agent, part in sorted(parts.items())}
 
     def trajectory(self) -> dict[str, list[PoseEstimate]]:
         """Poses of every agent, in the order of their stamps, with covariances.
@@ -158,17 +171,17 @@ def _descriptors(graph: MapGraph, rows: IntArray) -> Float32Array:
 
 def _unique_stamps(poses: list[PoseEstimate]) -> list[PoseEstimate]:
     """Sorted by stamp; where a submap ends and the next begins, the pose is given once."""
-    return [poses[i] for i in np.unique([p.stamp_ns for p in poses], return_index=True)[1]]
+    return [poses[i] for i in np.unique(np.array([p.stamp_ns for p in poses]), return_index=True)[1]]
 
 
 def _on_skeleton(
-    graph: MapGraph, records: Sequence[Record], of: IntArray, inside: Sequence[PoseEstimate], gains: FloatArray
+    graph: MapGraph, records: Sequence[Record], of: IntArray, inside: FloatArray, gains: FloatArray
 ) -> FloatArray:
     """Poses inside submaps, on the joined skeleton, (n, 4, 4); ``of`` which of the records each is in."""
     T_start, T_end = (graph.poses[[getattr(r, end) for r in records]] for end in ("start", "end"))
     end_poses = np.array([r.submap.end_pose for r in records])
     correction = boxminus(np.linalg.inv(T_start) @ T_end, end_poses)
-    T = boxplus(np.array([p.T for p in inside]), (gains @ correction[of][..., None])[..., 0])
+    T = boxplus(inside, (gains @ correction[of][..., None])[..., 0])
     return np.asarray(T_start[of] @ T)
 
 
@@ -178,7 +191,7 @@ def _with_covariances(
     """The poses inside record ``i`` with their covariances (n, 6, 6)."""
     record, joint = graph.records[i], marginals.ends(i)
     T_start, T_end = graph.poses[record.start], graph.poses[record.end]
-    inside, T_inverse = record.submap.path, invert_transform(T_start)
+    inside, T_inverse = np.array([p.T for p in record.submap.path]), invert_transform(T_start)
     poses = _on_skeleton(graph, [record], np.zeros(len(inside), dtype=np.int64), inside, gains)
     J_inverse, J_end = compose_jacobians(T_inverse, T_end)
     D = np.concatenate([J_inverse @ inverse_jacobian(T_start), J_end], axis=1)

@@ -238,8 +238,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self.health.counters["components"] = report.components
         for name, count in self.global_map.counters.counts.items():
             self.health.counters[name] = count
-        linked = report.components == 1
-        self.health.set(State.OK if linked else State.DEGRADED, "" if linked else f"{report.components} separate parts")
+        reasons = [f"{report.components} separate parts"] if report.components > 1 else []
+        if report.is_strained:
+            reasons.append(f"submaps contradict each other {report.variance_factor:.0f} times more than they claim")
+        self.health.set(State.DEGRADED if reasons else State.OK, ", ".join(reasons))
 
     # -- services ------------------------------------------------------------------------------------------------------
 

@@ -72,15 +72,16 @@ class MapGraph:
     component_of: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _fusion: Fusion = field(default_factory=Fusion)
     _ending_at: dict[int, int] = field(default_factory=dict)
-    _way: dict[int, float] = field(default_factory=dict)
-    _chained: dict[int, FloatArray] = field(default_factory=dict)
-    _stretch: dict[int, int] = field(default_factory=dict)
+    _way: FloatArray = field(default_factory=lambda: np.empty(0))
+    _chained: FloatArray = field(default_factory=lambda: np.empty((0, 4, 4)))
+    _stretch: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _middles: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     starts: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     point_covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
     ties: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     redundant: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     is_complete: bool = False
+    _pairs: dict[Link, IntArray] = field(default_factory=dict)
     _rank: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _variable_of: IntArray | None = None
 
@@ -125,12 +126,12 @@ class MapGraph:
         ``ties`` landmarks, at most, tie it to each other one.
         """
         if start is None:
-            start = self._new_node(guess, len(self.poses))
-        T = self.poses[start]
-        end = self._new_node(T @ submap.end_pose, int(self.component_of[start]))
-        self._stretch[end] = self._stretch.setdefault(start, start)
-        self._chained[end] = self._chained.setdefault(start, np.eye(4)) @ submap.end_pose
-        self._way[end] = self._way.setdefault(start, 0.0) + float(np.linalg.norm(submap.end_pose[:3, 3]))
+            start = self._new_node(guess, len(self.poses), len(self.poses), np.eye(4), 0.0)
+        T, step = self.poses[start], float(np.linalg.norm(submap.end_pose[:3, 3]))
+        end = self._new_node(
+            T @ submap.end_pose, int(self.component_of[start]), int(self._stretch[start]),
+            self._chained[start] @ submap.end_pose, float(self._way[start]) + step,
+        )  # fmt: skip
         record = Record(submap, start, end, len(self.points))
         self.points = np.concatenate([self.points, submap.landmarks @ T[:3, :3].T + T[:3, 3]])
         n, k = len(submap.landmarks), np.arange(len(submap.landmarks))
@@ -147,9 +148,11 @@ class MapGraph:
         self.records.append(record)
         return record
 
-    def _new_node(self, T: FloatArray, component: int) -> int:
-        self.poses = np.concatenate([self.poses, T[None]])
-        self.component_of = np.append(self.component_of, component)
+    def _new_node(self, T: FloatArray, component: int, stretch: int, chained: FloatArray, way: float) -> int:
+        """Add a node at pose ``T``; by odometry it is at ``chained`` after a ``way`` (m) from node ``stretch``."""
+        self.poses, self.component_of = np.concatenate([self.poses, T[None]]), np.append(self.component_of, component)
+        self._chained, self._way = np.concatenate([self._chained, chained[None]]), np.append(self._way, way)
+        self._stretch = np.append(self._stretch, stretch)
         return len(self.poses) - 1
 
     def component(self, record: int) -> int:
@@ -164,14 +167,16 @@ class MapGraph:
         """Length of the way that an agent went between two records, m; of both ways where they belong to two runs."""
         a, b = self.records[first], self.records[second]
         ways = self._way[a.start], self._way[b.start]
-        return abs(ways[1] - ways[0]) if a.key[:2] == b.key[:2] else sum(ways)
+        return float(abs(ways[1] - ways[0]) if a.key[:2] == b.key[:2] else sum(ways))
 
-    def odometry_between(self, first: int, second: int) -> FloatArray | None:
-        """T_first_second of two records' starts by the end poses between them; None where nothing chains them."""
-        a, b = self.records[first].start, self.records[second].start
-        if self._stretch[a] != self._stretch[b]:
-            return None
-        return np.asarray(invert_transform(self._chained[a]) @ self._chained[b])
+    def odometry_between(self, first: IntArray, second: IntArray) -> tuple[FloatArray, FloatArray]:
+        """T_first_second (n, 4, 4) of the starts of records by the end poses between them, NaN where nothing chains
+        them; and the length of the way, (n,) m.
+        """
+        a, b = self.starts[first], self.starts[second]
+        T = np.linalg.inv(self._chained[a]) @ self._chained[b]
+        T[self._stretch[a] != self._stretch[b]] = np.nan
+        return T, np.abs(self._way[b] - self._way[a])
 
     def middles(self, records: IntArray) -> FloatArray:
         """Middle of the landmarks of some records in the map frame, (n, 3); the start pose where there are none."""
@@ -199,8 +204,11 @@ class MapGraph:
 
     def _observed(self, link: Link) -> IntArray:
         """The observations that a link's pairs name, (k, 2)."""
-        first = np.array([self.records[i].first_observation for i in (link.first, link.second)])
-        return np.asarray(link.pairs + first)
+        known = self._pairs.get(link)
+        if known is None:
+            first = np.array([self.records[i].first_observation for i in link.ends])
+            known = self._pairs[link] = np.asarray(link.pairs + first)
+        return known
 
     def _merge(self, link: Link) -> None:
         first, second = self.component(link.first), self.component(link.second)
@@ -229,6 +237,7 @@ class MapGraph:
     def replace_links(self, links: Iterable[Link]) -> None:
         """Believe exactly these links (of those there were): landmarks are fused anew from them."""
         self.links = list(links)
+        self._pairs = {k: self._observed(k) for k in self.links}
         self._variable_of = None
         self._fusion.separate()
         if self.links:

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sjsam_node.graph.links import Link, Status
+from sjsam_node.graph.map_graph import BoolArray
 from sjsam_node.loop_closure.association import variance_factor
 from sjsam_node.loop_closure.verification import ClosureConfig
 from sjsam_node.smoothing.estimator import local_residual, observation_nis
@@ -25,6 +26,7 @@ from sjsam_node.smoothing.smoother import Smoother, UpdateResult
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.least_squares import chi_square_bound
+from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,10 @@ class ConsistencyConfig(Config):
         "a map whose submaps seem too sure of themselves by more than this factor holds false closures",
         minimum=1.0,
     )
+    retry: float = parameter(
+        1.2, "how many times the landmarks of closures that were refused must speak for them to be tried again",
+        minimum=1.0,
+    )  # fmt: skip
     waiting: int = parameter(40, "refused closures that are remembered", minimum=1)
 
 
@@ -74,13 +80,14 @@ class Consistency:
     config: ConsistencyConfig = field(default_factory=ConsistencyConfig)
     drift: ClosureConfig = field(default_factory=ClosureConfig)
     refused: list[Link] = field(default_factory=list)
+    _refused_support: int = 0
 
     def update(self, found: Sequence[Link], newest: int) -> tuple[UpdateResult, Verdict]:
         """Update the map with the closures that it can live with; the others wait.
 
         ``newest`` is the record whose component is joined, with or without closures.
         """
-        found = [k for k in found if not self._is_against_odometry(k)]
+        found = [k for k, is_off in zip(found, self._are_against_odometry(found), strict=True) if not is_off]
         added, removed = self._selected(found)
         self._wait(k for k in found if not _is_in(k, added))
         if not added and not removed:
@@ -88,13 +95,16 @@ class Consistency:
         before, checkpoint = self.smoother.totals(), self.smoother.checkpoint()
         offered = [*self.smoother.graph.links, *added]
         result = self.smoother.update(newest, added, removed)
-        result = self._evaluate(newest, result, self.config.rounds)
+        result, outliers = self._evaluate(newest, result, self.config.rounds)
         verdict = self._verdict(added, offered)
-        if self._is_better(verdict, before, newest):
+        if self._is_better(verdict, before, newest, outliers):
             self.refused = [k for k in self.refused if not _is_in(k, added)]
+            self._refused_support = 0
             return result, verdict
         self.smoother.restore(checkpoint)
         self._wait(added)
+        if len(added) > len(found):
+            self._refused_support = self._support(added)
         return self.smoother.update(newest), Verdict()
 
     def settle(self, newest: int) -> Verdict:
@@ -111,18 +121,30 @@ class Consistency:
     # -- pairwise ------------------------------------------------------------------------------------------------------
 
     def _selected(self, found: list[Link]) -> tuple[list[Link], list[Link]]:
-        """Closures to add and to remove: of those that exclude each other the set that most landmarks speak for."""
+        """Closures to add and to remove: of those that exclude each other the set that most landmarks speak for.
+
+        What the map could judge, and found consistent, excludes nothing that it holds.
+        """
         held = self._closures()
-        consistent = [k for k in found if k.status is Status.CONSISTENT]
         if not found:
-            return [], [k for k in held if self._is_against_odometry(k)]
-        best = max(consistent or found, key=lambda k: len(k.pairs))
-        agreeing = [k for k in [*found, *self.refused] if k is best or not self._exclude(k, best)]
-        rivals = [k for k in held if any(self._exclude(k, other) for other in agreeing)]
-        group = agreeing if rivals or not consistent else [k for k in agreeing if _is_in(k, consistent)]
-        enough = len(group) > len(found) or bool(consistent)
-        if rivals:
-            enough = self._support(group) >= self._support(rivals)
+            return [], [k for k, is_off in zip(held, self._are_against_odometry(held), strict=True) if is_off]
+        consistent = [k for k in found if k.status is Status.CONSISTENT]
+        if len(consistent) == len(found):
+            return consistent, []
+        sure = [k for k in found if k.status is not Status.INCONSISTENT]
+        best = max(sure or found, key=lambda k: len(k.pairs))
+        ends = {k.ends for k in found}
+        offered = [*found, *(k for k in self.refused if k.ends not in ends)]
+        agreeing = [
+            k for k, is_off in zip(offered, self._excluded(best, offered), strict=True) if k is best or not is_off
+        ]
+        excluded = np.any([self._excluded(k, held) for k in agreeing], axis=0) if held else []
+        rivals = [k for k, is_off in zip(held, excluded, strict=True) if is_off]
+        group = agreeing if rivals or not sure else [k for k in agreeing if _is_in(k, sure)]
+        support = self._support(group)
+        enough = support >= self._support(rivals) if rivals else bool(sure) or len(group) > len(found)
+        if not sure:  # what was refused is tried again once clearly more speaks for it
+            enough = enough and support > self.config.retry * self._refused_support
         return ([k.with_status(Status.CONSISTENT) for k in group], rivals) if enough else ([], [])
 
     def _support(self, links: Sequence[Link]) -> int:
@@ -136,38 +158,51 @@ class Consistency:
     def _closures(self) -> list[Link]:
         return [link for link in self.smoother.graph.links if link.is_closure]
 
-    def _is_against_odometry(self, link: Link) -> bool:
-        graph = self.smoother.graph
-        T = graph.odometry_between(link.first, link.second)
-        return T is not None and self._is_off(link, T, link.covariance, graph.way_between(link.first, link.second))
+    def _are_against_odometry(self, links: Sequence[Link]) -> BoolArray:
+        """Whether each of some links contradicts the odometry between its records."""
+        if not links:
+            return np.empty(0, dtype=bool)
+        ends = np.array([k.ends for k in links])
+        T, way = self.smoother.graph.odometry_between(ends[:, 0], ends[:, 1])
+        return self._are_off(T, np.array([k.T for k in links]), np.array([k.covariance for k in links]), way)
 
-    def _exclude(self, one: Link, other: Link) -> bool:
-        """Whether two links say different things of the same two stretches of way."""
-        graph = self.smoother.graph
-        for link in (other, other.inverted()):
-            before = graph.odometry_between(one.first, link.first)
-            after = graph.odometry_between(link.second, one.second)
-            if before is not None and after is not None:
-                way = graph.way_between(one.first, link.first) + graph.way_between(link.second, one.second)
-                return self._is_off(one, before @ link.T @ after, one.covariance + link.covariance, way)
-        return False
+    def _excluded(self, one: Link, others: Sequence[Link]) -> BoolArray:
+        """Whether each of some links says something else than ``one`` of the same two stretches of way."""
+        if not others:
+            return np.empty(0, dtype=bool)
+        out = np.zeros(len(others), dtype=bool)
+        for links in (others, [k.inverted() for k in others]):
+            ends = np.array([k.ends for k in links])
+            before, way = self.smoother.graph.odometry_between(np.full(len(links), one.first), ends[:, 0])
+            after, way_back = self.smoother.graph.odometry_between(ends[:, 1], np.full(len(links), one.second))
+            T = before @ np.array([k.T for k in links]) @ after
+            covariance = one.covariance + np.array([k.covariance for k in links])
+            out |= self._are_off(T, np.broadcast_to(one.T, T.shape), covariance, way + way_back)
+        return out
 
-    def _is_off(self, link: Link, T: FloatArray, covariance: FloatArray, way: float) -> bool:
-        """Whether a link is further from ``T`` than odometry drifts on a ``way`` (m)."""
-        error, drift = boxminus(link.T, T), self.drift
-        turn = drift.drift_angle * way
-        shift = drift.drift * way + turn * float(np.linalg.norm(T[:3, 3]))
-        expected = covariance + np.diag([shift**2 + 1e-4] * 3 + [turn**2 + 1e-4] * 3)
-        return float(error @ np.linalg.solve(expected, error)) > chi_square_bound(self.config.closure_probability, 6)
+    def _are_off(self, T: FloatArray, T_claimed: FloatArray, covariance: FloatArray, way: FloatArray) -> BoolArray:
+        """Whether each claimed pose (n, 4, 4) is further from ``T`` than odometry drifts on a ``way`` (n,) m; not where
+        ``T`` is NaN.
+        """
+        known, drift = np.isfinite(T[:, 0, 0]), self.drift
+        error = boxminus(T_claimed[known], T[known])
+        turn = drift.drift_angle * way[known]
+        shift = drift.drift * way[known] + turn * np.linalg.norm(T[known][:, :3, 3], axis=1)
+        spread = np.repeat(np.stack([shift**2, turn**2], axis=1) + 1e-4, 3, axis=1)
+        expected = covariance[known] + spread[:, :, None] * np.eye(6)
+        nis = np.einsum("ni,ni->n", error, np.linalg.solve(expected, error[..., None])[..., 0])
+        out = np.zeros(len(T), dtype=bool)
+        out[known] = nis > chi_square_bound(self.config.closure_probability, 6)
+        return out
 
     # -- in the joined map ---------------------------------------------------------------------------------------------
 
-    def _is_better(self, verdict: Verdict, before: tuple[float, int], newest: int) -> bool:
+    def _is_better(self, verdict: Verdict, before: tuple[float, int], newest: int, outliers: float) -> bool:
         """Whether chi2 has risen no more than true matches make it rise, or fallen by more than the loss of true
-        matches makes it fall. ``before``: chi2 and redundancy.
+        matches makes it fall. ``before``: chi2 and redundancy; ``outliers``: what matches that were let go since cost.
         """
         cost, redundancy = self.smoother.totals()
-        rise, dof = cost - before[0], redundancy - before[1]
+        rise, dof = cost - before[0] - outliers, redundancy - before[1]
         if not verdict.accepted:
             return bool(verdict.removed) and self._excess(-rise, -dof, newest) > 0.0
         # Closures that contradict the covariances, but not the drift to expect, move the map once for all of them.
@@ -184,17 +219,22 @@ class Consistency:
         factor = min(max(1.0, factor), self.config.max_variance_factor)
         return float(rise - factor * chi_square_bound(self.config.closure_probability, max(dof, 1)))
 
-    def _evaluate(self, newest: int, result: UpdateResult, rounds: int) -> UpdateResult:
-        """Let go what the joined map contradicts: whole closures with an update each, single matches with the next."""
+    def _evaluate(self, newest: int, result: UpdateResult, rounds: int) -> tuple[UpdateResult, float]:
+        """Let go what the joined map contradicts: whole closures with an update each, single matches with the next.
+
+        Also returns by how much chi2 will fall without these matches.
+        """
         for _ in range(rounds):
             nis = self._nis(self.smoother.graph.component(newest))
             gate = self._gate(nis)
-            worst = max(self._closures(), key=lambda k: self._median_nis(k, nis), default=None)
+            beyond = np.nonzero(np.nan_to_num(nis) > gate)[0]
+            suspects = set(self.smoother.graph.record_of[beyond].tolist())
+            closures = [k for k in self._closures() if not suspects.isdisjoint(k.ends)]
+            worst = max(closures, key=lambda k: self._median_nis(k, nis), default=None)
             if worst is None or self._median_nis(worst, nis) <= gate:
-                self._drop_outliers(nis, gate, newest)
-                break
+                return result, self._drop_outliers(beyond, nis)
             result = self.smoother.update(newest, removed=[worst])
-        return result
+        return result, 0.0
 
     def _gate(self, nis: FloatArray) -> float:
         """Squared error beyond which a match is none, in units of the map's own variance factor."""
@@ -219,19 +259,28 @@ class Consistency:
         sides = [nis[records[link.ends[k]].first_observation + link.pairs[:, k]] for k in (0, 1)]
         return max((float(np.median(s[np.isfinite(s)])) for s in sides if np.isfinite(s).any()), default=0.0)
 
-    def _drop_outliers(self, nis: FloatArray, gate: float, newest: int) -> None:
-        """Let go the worst matches of each record that are beyond the gate; the next update goes without them."""
+    def _drop_outliers(self, beyond: IntArray, nis: FloatArray) -> float:
+        """Let go the worst matches of each record of those ``beyond`` the gate; the next update goes without them.
+
+        Returns by how much chi2 falls: by the squared error of each landmark's worst observation.
+        """
         graph = self.smoother.graph
-        beyond = np.nonzero(np.nan_to_num(nis) > gate)[0]
         outliers: set[int] = set()
-        for i in np.unique(graph.record_of[beyond]).tolist():
+        suspects = np.unique(graph.record_of[beyond]).tolist()
+        for i in suspects:
             rows = graph.records[i].observations
             allowed = max(1, int(self.config.outlier_share * np.isfinite(nis[rows]).sum()))
             own = beyond[graph.record_of[beyond] == i]
             outliers.update(own[np.argsort(-nis[own], kind="stable")[:allowed]].tolist())
         if outliers:
-            smaller = [(k, self._without(k, outliers)) for k in graph.links]
+            touched = [k for k in graph.links if not set(suspects).isdisjoint(k.ends)]
+            smaller = [(k, self._without(k, outliers)) for k in touched]
+            rows = np.array(sorted(outliers))
+            worst = np.zeros(len(graph.points))
+            np.maximum.at(worst, graph.landmark_of[rows], nis[rows])
             self.smoother.replace([k for k, s in smaller if s is not k], [s for k, s in smaller if s and s is not k])
+            return float(worst.sum())
+        return 0.0
 
     def _without(self, link: Link, observations: set[int]) -> Link | None:
         """The link without pairs that name any of the observations; None for a closure with fewer than three left."""

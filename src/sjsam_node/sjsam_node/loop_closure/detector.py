@@ -8,7 +8,7 @@ is compared with a bounded number of submaps, and with none that show nothing ne
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -75,13 +75,30 @@ class LoopDetector:
         graph, recent = self.graph, {*range(new, len(self.graph.records)), *chain[: self.config.window]}
         near = self._near(new, recent)
         known = self._novelty()
-        found = self._verified([(old, new) for old in near], known, by_looks=False)
+        found = self._around(near, new, known)
         if known.is_known(new):  # the map knows where it is: looks would tell nothing more
             return found
         looks = self.index.query(graph.records[new].submap.descriptors, recent | set(near))
         second = at_start(graph.records[new])
         alike = [old for old in looks if self.verifier.is_alike(at_start(graph.records[old]), second)]
         return found + self._verified([(old, new) for old in alike[: self.config.alike_candidates]], known)
+
+    def _around(self, near: list[int], new: int, known: Novelty) -> list[Link]:
+        """Links of record ``new`` to those near it, as long as they tell of landmarks that none has told of yet."""
+        found: list[Link] = []
+        count, left = (
+            len(self.graph.records[new].observations),
+            np.ones(len(self.graph.records[new].observations), bool),
+        )
+        for old in near:
+            more = self._verified([(old, new)], known, by_looks=False)
+            found += more
+            told = sum(int(left[k.pairs[:, 1]].sum()) for k in more)
+            for k in more:
+                left[k.pairs[:, 1]] = False
+            if more and told < self.config.least_news * count:
+                break
+        return found
 
     def missed(self, chain: Chain, most: int) -> list[Link]:
         """Links between records that have come near each other since they were compared, if ever they were; of ``most``
@@ -150,7 +167,7 @@ class LoopDetector:
             return []
         group_ = [*agreeing, link]
         self.pending = [p for p in self.pending if not any(p is g for g in group_)]
-        return [replace(g, status=Status.CONSISTENT) for g in group_]
+        return group_
 
 
 def _same_loop(graph: MapGraph, a: Link, b: Link) -> bool:

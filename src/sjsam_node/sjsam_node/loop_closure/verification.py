@@ -35,6 +35,9 @@ class ClosureConfig(Config):
         3.0, "distance between the middles of submaps that are tried as near", unit="m", minimum=0.0
     )
     near_candidates: int = parameter(3, "near submaps tried per new one", minimum=0)
+    least_news: float = parameter(
+        0.1, "share of a submap's landmarks that a near one must tell of for the next to be tried", minimum=0.0
+    )
     alike_candidates: int = parameter(2, "submaps that look alike tried per new one", minimum=0)
     informative_sigma: float = parameter(
         0.5, "largest standard deviation of a relative position that can tell two places apart", unit="m", minimum=0.0
@@ -107,18 +110,17 @@ class Verifier:
         return guess, Status.UNINFORMATIVE
 
     def _around(self, first: PointSet, second: PointSet, prior: Prior) -> Alignment:
-        """Match around a prior, then around what that found, as long as it finds more.
+        """Match around a prior, then around what that found.
 
         A map too sure of itself admits only matches that agree with its error; further ones show where they lead.
         """
         assert prior.covariance is not None
         found = match(first, second, prior, self.config.association)
+        if len(found.pairs) < 3:
+            return found
         loose = self.config.association.max_variance_factor * prior.covariance
-        while True:
-            more = match(first, second, Prior(found.T, loose), self.config.association)
-            if len(more.pairs) <= len(found.pairs):
-                return found
-            found = more
+        more = match(first, second, Prior(found.T, loose), self.config.association)
+        return more if len(more.pairs) > len(found.pairs) else found
 
     def _by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
         """Alignment from descriptors alone, refined with all landmarks around it."""

@@ -15,6 +15,7 @@ import numpy as np
 from sjsam_node.graph.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.joining import JoiningProblem, map_residual
+from sjsam_node.smoothing.parking import Parked
 from sjsam_node.smoothing.problem import LocalMap, State, block_rows, flatten
 from sjsam_node.smoothing.regions import Region
 from sjsam_node.smoothing.robust import RobustConfig, RobustJoining, closing_rows, predicted
@@ -40,6 +41,7 @@ class EstimatorConfig(Config):
     live_tolerance: float = parameter(
         1e-4, "the same while submaps come in; the map is brought to its optimum when it settles", minimum=0.0
     )
+    live_iterations: int = parameter(6, "iterations of an update while submaps come in, at most", minimum=1)
     robust: RobustConfig = group(RobustConfig)
 
     @property
@@ -97,16 +99,24 @@ class Assembled:
     problem: JoiningProblem
     state: State
     dropped: list[IntArray]
+    parked: Parked = field(default_factory=Parked)
 
     @property
     def size(self) -> int:
-        """Number of records, those inside the regions included."""
-        return len(self.records) + sum(len(r.records) for r in self.regions)
+        """Number of records, parked ones and those inside the regions included."""
+        return len(self.records) + len(self.parked) + sum(len(r.records) for r in self.regions)
 
     @property
     def redundancy(self) -> int:
         """Rows beyond the unknowns, those inside the regions included."""
         return self.problem.rows - self.problem.layout.pattern.n + sum(r.redundancy for r in self.regions)
+
+    def moving_with(self, node: int) -> tuple[int, FloatArray, FloatArray] | None:
+        """The reference of a node that was not estimated by itself, T_reference_node and its covariance (6, 6)."""
+        for region in self.regions:
+            if node in region.inner:
+                return region.reference, *region.node(node)
+        return self.parked.node(node)
 
     def covariance(self, nodes: Sequence[int]) -> FloatArray:
         """Joint covariance (6k, 6k) of nodes that are not inside a region, from the last factor."""
@@ -125,12 +135,14 @@ class Estimator:
         graph: MapGraph,
         component: int,
         regions: Sequence[Region] = (),
+        parked: Parked | None = None,
     ) -> Assembled:
         """Pose the joining problem of a component, its frame fixed at the start of its oldest record.
 
-        ``regions`` stand for their records.
+        ``regions`` stand for their records; ``parked`` ones are left out.
         """
-        inside = {i for region in regions for i in region.records.tolist()}
+        parked = parked or Parked()
+        inside = {i for region in regions for i in region.records.tolist()} | set(parked.records.tolist())
         records = [i for i in graph.records_of(component) if i not in inside]
         is_shared = graph.tying()
         reduced = [self._reduced(graph, i, is_shared) for i in records]
@@ -152,7 +164,9 @@ class Estimator:
         constant = sum(region.constant for region in regions)
         problem = JoiningProblem(flatten(maps), state, anchor, kernels.TANGENT, self.config.solver, None, constant)
         nothing = [np.empty(0, dtype=np.int64)] * len(records)
-        return Assembled(records, tuple(regions), nodes, landmarks, reduced, maps, problem, state, nothing)
+        return Assembled(
+            records, tuple(regions), nodes, landmarks, reduced, maps, problem, state, nothing, parked
+        )  # fmt: skip
 
     def local_maps(self, graph: MapGraph, records: list[int], nodes: IntArray, landmarks: IntArray) -> list[LocalMap]:
         """Reduced records over sorted lists of nodes and landmarks."""
@@ -169,15 +183,22 @@ class Estimator:
         return known[1]
 
     def optimize(
-        self, graph: MapGraph, component: int, regions: Sequence[Region] = (), *, coarse: bool = False
+        self,
+        graph: MapGraph,
+        component: int,
+        regions: Sequence[Region] = (),
+        parked: Parked | None = None,
+        *,
+        coarse: bool = False,
     ) -> tuple[Assembled, LeastSquaresResult]:
         """Bring a component to its optimum and write it back to the graph, but for what is inside the ``regions``.
 
         ``coarse``: to where a step promises less than ``live_tolerance``.
         """
-        assembled = self.assemble(graph, component, regions)
+        assembled = self.assemble(graph, component, regions, parked)
         tolerance = self.config.live_tolerance if coarse else self.config.relative_tolerance
-        optimizer = LevenbergMarquardtConfig(self.config.iterations, tolerance)
+        most = min(self.config.iterations, self.config.live_iterations) if coarse else self.config.iterations
+        optimizer = LevenbergMarquardtConfig(most, tolerance)
         state, result = assembled.problem.optimize(assembled.state, optimizer, keep_factor=coarse)
         if self.config.robust.loss != "none":
             state, result, assembled = self._robust(assembled, state, optimizer)
@@ -185,6 +206,7 @@ class Estimator:
         graph.points[assembled.landmarks] = state.landmarks
         for i, reduced, dropped in zip(assembled.records, assembled.reduced, assembled.dropped, strict=True):
             self._recover(graph, graph.records[i], reduced, dropped)
+        assembled.parked.carry(graph, assembled.nodes)
         return replace(assembled, state=state), result
 
     def _robust(

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 
 from sjsam_node.graph.links import Prior
 from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.smoothing.estimator import Assembled
 from sjsam_node.smoothing.joining import Marginals
-from sjsam_node.smoothing.regions import Region
 from slam_core.geometry import FloatArray, compose_jacobians, inverse_jacobian, invert_transform, skew
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
@@ -26,13 +26,14 @@ class ComponentMarginals:
 
     def __init__(self, graph: MapGraph, assembled: Assembled, factor: float) -> None:
         self.factor, self._graph, self._assembled = factor, graph, assembled
-        self._region_of = {int(i): region for region in assembled.regions for i in region.records}
+        self._held = set(assembled.records)
         self._poses = graph.poses.copy()
 
     @property
     def records(self) -> list[int]:
         """Records of the last update, those inside regions included, ascending."""
-        return sorted([*self._assembled.records, *self._region_of])
+        inside = [i for region in self._assembled.regions for i in region.records.tolist()]
+        return sorted([*self._held, *inside, *self._assembled.parked.records.tolist()])
 
     @cached_property
     def _marginals(self) -> Marginals:
@@ -44,25 +45,25 @@ class ComponentMarginals:
 
     def ends(self, record: int) -> FloatArray:
         """Joint covariance (12, 12) of the start and end of a record."""
-        r, region = self._graph.records[record], self._region_of.get(record)
-        if region is None:
-            return self.factor * self._of_nodes([r.start, r.end])
-        return self.factor * self._inside(region, [r.start, r.end])
+        r = self._graph.records[record]
+        of = self._of_nodes if record in self._held else self._hung
+        return self.factor * of([r.start, r.end])
 
     def _of_nodes(self, nodes: Sequence[int]) -> FloatArray:
         return self._marginals.covariance(np.searchsorted(self._assembled.nodes, nodes))
 
-    def _inside(self, region: Region, nodes: Sequence[int]) -> FloatArray:
-        """Joint covariance of nodes of a region: they move with its reference, each with an error of its own."""
-        T_reference = self._poses[region.reference]
-        jacobians, own = [], np.zeros((6 * len(nodes), 6 * len(nodes)))
+    def _hung(self, nodes: Sequence[int]) -> FloatArray:
+        """Joint covariance of nodes that move with a reference, each with an error of its own."""
+        jacobians, own, references = [], np.zeros((6 * len(nodes), 6 * len(nodes))), []
         for k, node in enumerate(nodes):
-            T, covariance = region.node(node)
-            J_reference, J_node = compose_jacobians(T_reference, T)
+            moving = self._assembled.moving_with(node)
+            reference, T, covariance = (node, np.eye(4), np.zeros((6, 6))) if moving is None else moving
+            J_reference, J_node = compose_jacobians(self._poses[reference], T)
             jacobians.append(J_reference)
+            references.append(reference)
             own[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = J_node @ covariance @ J_node.T
-        J = np.concatenate(jacobians)
-        return np.asarray(J @ self._of_nodes([region.reference]) @ J.T + own)
+        J = scipy.linalg.block_diag(*jacobians)
+        return np.asarray(J @ self._of_nodes(references) @ J.T + own)
 
     def landmarks(self, observations: IntArray) -> FloatArray:
         """Covariance (n, 3, 3) in the map frame of the landmarks of some observations."""

@@ -5,8 +5,9 @@
 
 What is read is const: it comes from the last update's factor, and is as fresh as that. Every update joins in batch,
 warm from the estimate, with the old submaps that nothing new touches condensed to regions
-(:mod:`sjsam_node.smoothing.regions`) and a selection of the shared landmarks (:mod:`sjsam_node.graph.selection`), so
-that it costs what is near the new submap.
+(:mod:`sjsam_node.smoothing.regions`), without those that are redundant and left behind
+(:mod:`sjsam_node.smoothing.parking`), and with a selection of the shared landmarks
+(:mod:`sjsam_node.graph.selection`): it costs what is near the new submap.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from sjsam_node.graph.links import Link, Prior
 from sjsam_node.graph.map_graph import MapGraph, Snapshot
 from sjsam_node.smoothing.estimator import Assembled, Estimator, EstimatorConfig
 from sjsam_node.smoothing.marginals import ComponentMarginals, prior_of_pair, relative_pose, seen_from
+from sjsam_node.smoothing.parking import Parked, anchor_of, is_tied
 from sjsam_node.smoothing.regions import Region, RegionConfig, Regions
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, compose_covariance
@@ -72,6 +74,7 @@ class Checkpoint:
     graph: Snapshot
     solved: dict[int, _Solved]
     regions: tuple[Region, ...]
+    parked: Parked
 
 
 @dataclass
@@ -82,7 +85,7 @@ class Smoother:
     config: SmootherConfig = field(default_factory=SmootherConfig)
     estimator: Estimator = field(init=False)
     regions: Regions = field(init=False)
-    updates: int = 0
+    parked: Parked = field(default_factory=Parked)
     _solved: dict[int, _Solved] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -114,13 +117,34 @@ class Smoother:
     def condense(self, new: int, busy: Sequence[int]) -> None:
         """Join old submaps that nothing touches to regions; ``busy`` records stay as they are."""
         if self.config.estimator.linearises:
-            self.regions.close(self.graph, self.graph.component(new), {new, *busy})
+            past = np.nonzero(self.graph.redundant)[0]
+            for record in past[~np.isin(past, [*self.parked.records.tolist(), *busy, new])].tolist():
+                self._park(record)
+            busy = [new, *busy, *self.parked.records.tolist()]
+            self.regions.close(self.graph, self.graph.component(new), set(busy))
+
+    def _park(self, record: int) -> None:
+        """Leave a redundant record out from here on, if the estimate does not need it."""
+        graph, r = self.graph, self.graph.records[record]
+        reference, solved = anchor_of(graph, record), self._solved.get(graph.component(record))
+        following = np.nonzero(graph.starts == r.end)[0].tolist()
+        if reference is None or solved is None or not all(is_tied(graph, i) for i in following):
+            return
+        nodes = [reference, r.start, r.end]
+        if not np.isin(nodes, solved.assembled.nodes).all():
+            return
+        joint, covariances = solved.assembled.covariance(nodes), np.empty((2, 6, 6))
+        for k, node in enumerate(nodes[1:]):
+            rows = np.append(np.arange(6), 6 * k + 6 + np.arange(6))
+            covariances[k] = relative_pose(graph.poses[reference], graph.poses[node], joint[np.ix_(rows, rows)])[1]
+        self.parked = self.parked.with_one(graph, record, reference, covariances)
 
     def settle(self) -> None:
         """Bring all to its optimum, with every submap on its own and all shared landmarks, where that is affordable."""
         self.graph.use_all_ties(True)
         if self._work() > self.config.settled_work:
             self.graph.use_all_ties(False)
+        self.parked = Parked()
         self.regions.open(self.regions.closed, len(self.graph.records))
         for component in np.unique(self.graph.component_of).tolist():
             self._solve(component, coarse=False)
@@ -131,6 +155,7 @@ class Smoother:
         if self._work() > self.config.settled_work:
             self.graph.use_all_ties(False)
         self._solved.clear()
+        self.parked = Parked()
         self.regions = Regions(self.estimator.local_maps, self.config.region)
         for component in np.unique(self.graph.component_of).tolist():
             assembled = self.estimator.assemble(self.graph, component)
@@ -139,13 +164,14 @@ class Smoother:
 
     def checkpoint(self) -> Checkpoint:
         """Everything that an update changes, to come back to."""
-        return Checkpoint(self.graph.snapshot(), dict(self._solved), tuple(self.regions.closed))
+        return Checkpoint(self.graph.snapshot(), dict(self._solved), tuple(self.regions.closed), self.parked)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Back to a checkpoint taken since the last submap was added."""
         self.graph.restore(checkpoint.graph)
         self._solved = dict(checkpoint.solved)
         self.regions.closed = list(checkpoint.regions)
+        self.parked = checkpoint.parked
 
     def _work(self) -> float:
         """Entries of the information matrices that the selected landmarks make."""
@@ -156,15 +182,21 @@ class Smoother:
         """Optimise a component; regions that this bends are opened."""
         while True:
             regions = self.regions.fitting(self.graph, component)
-            assembled, found = self.estimator.optimize(self.graph, component, regions, coarse=coarse)
+            parked = self._parked_in(component)
+            assembled, found = self.estimator.optimize(self.graph, component, regions, parked, coarse=coarse)
             bent = [r for r in regions if r.carry(self.graph) > self.config.region.relinearize]
             if not bent:
                 break
             self.regions.open(bent, len(self.graph.records))
-        self.updates += 1
         result = _result_of(assembled, found.cost, found.iterations, found.converged)
         self._solved[component] = _Solved(assembled, result)
         return result
+
+    def _parked_in(self, component: int) -> Parked:
+        """Parked records of a component; those whose reference is in another one by now are taken back."""
+        own = self.graph.component_of[self.parked.nodes[:, 0]]
+        self.parked = self.parked.at(np.nonzero(own == self.graph.component_of[self.parked.reference])[0])
+        return self.parked.at(np.nonzero(self.graph.component_of[self.parked.nodes[:, 0]] == component)[0])
 
     def _solve_changed(self) -> None:
         """Forget components that are no more, and solve those that have other records than when they were solved."""
@@ -219,10 +251,10 @@ class Smoother:
         graph, nodes = self.graph, self.assembled(component).nodes
         node, T, covariance = graph.records[record].start, np.eye(4), np.zeros((6, 6))
         while node not in nodes:
-            region = next((r for r in self.assembled(component).regions if node in r.inner), None)
-            if region is not None:
-                T_node, own = region.node(node)
-                return region.reference, T_node @ T, compose_covariance(T_node, own, T, covariance)
+            found = self.assembled(component).moving_with(node)
+            if found is not None:
+                reference, T_node, own = found
+                return reference, T_node @ T, compose_covariance(T_node, own, T, covariance)
             before = graph.record_ending_at(node)
             if before is None:
                 return None, T, covariance
