@@ -44,7 +44,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("INDOOR_SLAM_DATA", ROOT.parent / "shared" / "data"))
 _TRUTH_GAP_S = 0.1
 """True poses are interpolated between neighbours at most this far apart."""
-_RATIO, _LEAST_INLIERS = 0.8, 20
+_RATIO, _LEAST_INLIERS, _LARGEST_STEP_M = 0.8, 20, 3.0
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,8 @@ def _pnp(name: str, bag: Path, recording: Recording) -> Row:
 def _points(reading: Reading, sensors: AgentSensors) -> tuple | None:
     """SIFT keypoints, descriptors, points in the optical frame (nan where unknown) and K of one frame."""
     if isinstance(reading, DepthReading):
-        grey = reading.amplitude if reading.amplitude is not None else reading.intensity
+        raw = reading.raw
+        grey = raw.amplitude if raw.amplitude is not None else raw.intensity
         if grey is None:
             return None
         grey = cv2.normalize(grey.astype(np.float32), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
@@ -197,7 +198,7 @@ def _points(reading: Reading, sensors: AgentSensors) -> tuple | None:
     if isinstance(reading, StereoReading):
         from stereo_frontend.rectify import StereoRectifier
 
-        pair = StereoRectifier(sensors.left, sensors.right)(reading.stamp_ns, reading.left, reading.right)
+        pair = StereoRectifier(sensors.left, sensors.right)(reading.stamp_ns, reading.pair.left, reading.pair.right)
         from ground_truth import stereo_points
 
         uv, points, descriptors = stereo_points(pair)
@@ -207,7 +208,8 @@ def _points(reading: Reading, sensors: AgentSensors) -> tuple | None:
 
 def _metres(reading: DepthReading) -> FloatArray:
     """Depth along z, m; nan where there is none."""
-    depth = np.asarray(reading.image, dtype=np.float64) * (1e-3 if reading.image.dtype == np.uint16 else 1.0)
+    image = reading.raw.image
+    depth = np.asarray(image, dtype=np.float64) * (1e-3 if image.dtype == np.uint16 else 1.0)
     return np.where(depth > 0.1, depth, np.nan)
 
 
@@ -226,6 +228,8 @@ def _solve(before: tuple, now: tuple) -> FloatArray | None:
         return None
     chosen = inliers.ravel()
     turn, shift = cv2.solvePnPRefineLM(points[chosen], pixels[chosen], now[3], None, turn, shift)
+    if np.linalg.norm(shift) > _LARGEST_STEP_M:
+        return None
     return invert_transform(make_transform(cv2.Rodrigues(turn)[0], shift.ravel()))
 
 

@@ -263,7 +263,7 @@ def test_an_update_that_fails_is_counted_and_the_run_goes_on(
     slam, poses = EkfSlam(EkfSlamConfig()), loop(30)
     update = Ekf.update
 
-    def without_rows(ekf: Ekf, z: FloatArray, variance: FloatArray, seen: Observation, slots: np.ndarray):
+    def without_rows(ekf: Ekf, z: FloatArray, variance: FloatArray, seen: Observation, slots: np.ndarray, *_: object):
         nobody = np.zeros(0, dtype=np.int64)
         return update(ekf, z[:0], variance[:0], seen.select(nobody), slots[:0])
 
@@ -317,3 +317,26 @@ def test_features_out_of_all_proportion_do_not_end_a_run(world: PointWorld, seed
         assert np.isfinite(result.pose.covariance).all()
     for submap in slam.finish():
         assert np.linalg.eigvalsh(submap.covariance)[0] > 0.0
+
+
+def test_a_rig_that_stands_maps_nothing_and_goes_on_when_it_moves(world: PointWorld, rng: np.random.Generator) -> None:
+    course = loop(60)
+    poses, slam = course[:10] + [course[9]] * 60 + course[10:30], EkfSlam(EkfSlamConfig())
+    results = run(slam, world, poses, rng)
+    assert slam.counters.counts["frames_standing"] > 40
+    held = [r for r in results[20:69] if not len(r.landmark_ids)]
+    assert len(held) > 40
+    drift = [np.linalg.norm(r.pose.T[:3, 3] - held[0].pose.T[:3, 3]) for r in held]
+    assert max(drift) < 0.003
+    assert not any(r.submaps for r in results[20:69])
+    assert results[-1].state is TrackingState.OK
+    assert np.linalg.norm(error_of(results[-1], poses, 89)[:3]) < 0.05
+
+
+def test_a_rig_that_creeps_is_not_held_back(world: PointWorld, rng: np.random.Generator) -> None:
+    start = loop(2)[0]
+    poses = [start @ make_transform(np.eye(3), np.array([0.0005 * k, 0.0, 0.0])) for k in range(200)]
+    slam = EkfSlam(EkfSlamConfig())
+    results = run(slam, world, poses, rng)
+    errors = [np.linalg.norm(error_of(result, poses, k)[:3]) for k, result in enumerate(results)]
+    assert max(errors) < 0.01

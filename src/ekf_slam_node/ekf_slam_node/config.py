@@ -18,6 +18,10 @@ class MotionConfig(Config):
         2.0, "uncertainty of the speed of a rig never seen before", unit="m/s", minimum=0.0
     )
     sigma_initial_turn_rate: float = parameter(2.0, "the same for its turn rate", unit="rad/s", minimum=0.0)
+    standing_frames: int = parameter(
+        5, "frames without motion after which the rig counts as standing: nothing is mapped until it moves; 0: never",
+        minimum=0,
+    )  # fmt: skip
     imu: str = parameter(
         "auto", "whether an IMU is used: where there is one, never, or always (a run without one is refused)",
         choices=("auto", "off", "on"),

@@ -129,6 +129,15 @@ class Ekf:
             return UpdateReport(nis, len(innovation), False)
         return self._update(S, np.array(step.increment[:, rows], order="F"), innovation, stay=True)
 
+    def stop(self, sigma: FloatArray) -> None:
+        """Replace what is known of the velocities by zero with standard deviations (6,)."""
+        self.velocity = np.zeros(6)
+        head = self.covariance.head(CORE_DIM)
+        head[:, 6:] = 0.0
+        head[6:CORE_DIM] = 0.0
+        head[6:CORE_DIM, 6:] = np.diag(sigma**2)
+        self.covariance.set_head(head)
+
     def shake(self, sigma: FloatArray) -> None:
         """Add an independent error of standard deviations (6,) to the pose."""
         head = self.covariance.head(6)

@@ -10,28 +10,31 @@ import numpy as np
 
 from ekf_slam_node.aids import ALL, Aid, MotionAids, aid_error, contradicts
 from ekf_slam_node.calibration import in_doubt
-from ekf_slam_node.candidates import MotionPrior, motion_prior
+from ekf_slam_node.candidates import motion_prior
 from ekf_slam_node.common_error import CommonError
 from ekf_slam_node.config import EkfSlamConfig
-from ekf_slam_node.ekf import Ekf, TimeUpdate, UpdateReport
+from ekf_slam_node.ekf import Ekf, TimeUpdate
 from ekf_slam_node.landmarks import LandmarkBook, Pending
 from ekf_slam_node.linking import Link, Linker
 from ekf_slam_node.local_map import LocalMap, Sight, inheriting, pending_of
 from ekf_slam_node.models import CORE_DIM, Frame, frame_from_features, relative_motion
+from ekf_slam_node.motion_checks import aided, is_still, is_surprising, widened
 from ekf_slam_node.noise_monitor import NoiseMonitor
 from ekf_slam_node.odometry import OdometryChain
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
+from ekf_slam_node.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submap_builder import SubmapBuilder, conditional_start
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, boxminus, is_rigid_transform, make_transform
 from slam_core.types import Counters, Features, ImuSample, PoseEstimate, RelativeMotion, Submap
+
+_STANDING_VELOCITY = np.repeat([0.02, np.radians(0.5)], 3)
+"""Standard deviations (m/s, rad/s) of the velocities of a rig that stands."""
 
 _LONGEST_STEP_S = 10.0
 """A gap counts as no longer than this: the model says nothing about it any more, and larger variances cost digits."""
 
 _FARTHEST_M, _LARGEST_PX, _SMALLEST_SIGMA = 1e5, 1e6, 1e-6
 """Limits of what can be a feature: depth m, pixel, standard deviation px or m."""
-
-_NO_UPDATE = UpdateReport(0.0, 0, False)
 
 
 class EkfSlam:
@@ -84,6 +87,7 @@ class EkfSlam:
         self._is_finished = False
         self._missed: Frame | None = None
         self._lost_frames = 0
+        self._still_frames = 0
 
     # --------------------------------------------------------------------------------------------------------- input
     def process(self, features: Features, motion: RelativeMotion | None = None) -> EkfResult:
@@ -154,80 +158,116 @@ class EkfSlam:
 
     # --------------------------------------------------------------------------------------------------- frame by frame
     def _advance(self, local: LocalMap, frame: Frame) -> EkfResult:
+        """Algorithm 3: link, augment, predict, update, then maintain the landmarks or close the submap."""
         dt = _seconds(self._stamp_ns, frame.stamp_ns)
         aid = self._aids.between(self._stamp_ns, frame.stamp_ns)
-        expected = self._expected_motion(local, dt)
-        link = self._linker.link(local.candidates(), frame, _aided(expected, aid))
-        if link is not None:
-            return self._follow(local, frame, dt, link, expected, aid)
-        if aid is not None and aid.rows == ALL:
-            return self._coast(local, frame, dt, aid)
-        return self._miss(local, frame, dt)
+        linked = self._link(local, frame, dt, aid)
+        if linked is None:
+            return self._miss(frame) if aid is None or aid.rows != ALL else self._coast(local, frame, dt, aid)
+        if self._is_standing(linked):
+            return self._stand(local, linked)
+        landmarks_before = len(local.book)
+        seen = self._augment(local, linked)
+        self._predict(local, linked)
+        updated = self._update(local, linked, seen)
+        submaps: tuple[Submap, ...] = ()
+        if updated.closes:
+            submaps = self._close(local, linked.frame, seen, updated)
+        else:
+            local.remember(linked.frame, updated.measured, linked.link, landmarks_before)
+            local.tidy(linked.frame, updated.measured)
+        return self._report(frame.stamp_ns, *updated.state, submaps, updated)
 
-    def _expected_motion(self, local: LocalMap, dt: float) -> MotionPrior:
+    def _link(self, local: LocalMap, frame: Frame, dt: float, aid: Aid | None) -> LinkedFrame | None:
+        """Associate a frame with what is known, and learn its noise from the pairs; None if nothing fits."""
         velocity_covariance = local.ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:]
-        return motion_prior(local.ekf.velocity, velocity_covariance, self._sigma, dt)
-
-    def _follow(
-        self, local: LocalMap, frame: Frame, dt: float, link: Link, expected: MotionPrior, aid: Aid | None
-    ) -> EkfResult:
-        """The frame is linked: augmentation at the previous pose, time update, measurement update, perhaps a new
-        submap.
-        """
-        surprising = _is_surprising(link, expected, self.config.association.gate)
+        expected = motion_prior(local.ekf.velocity, velocity_covariance, self._sigma, dt)
+        link = self._linker.link(local.candidates(), frame, aided(expected, aid))
+        if link is None:
+            return None
         frame = self._noise.learn(frame, link.excess)
         self._common.learn(frame.z[link.columns, :2], link.error[:, :2], frame.camera.width)
+        surprising = is_surprising(link, expected, self.config.association.gate)
         common = self._common.sigma(frame)
-        landmarks_before = len(local.book)
-        sight = self._confirm(local, frame, link, surprising)
-        # Linearised at the motion found, not at the predicted one: over a large step the two are far apart.
-        step = local.ekf.time_update(dt, self._excused_sigma(local, link, dt) if surprising else self._sigma, link.T)
+        return LinkedFrame(frame, dt, link, None if aid is None else widened(aid, common), common, surprising)
+
+    def _augment(self, local: LocalMap, linked: LinkedFrame) -> Sight:
+        """Add the landmarks that the frame confirms, at the previous pose; returns all landmarks that it sees."""
+        # A surprising motion rests on these pairs alone: all of them are worth their cost.
+        config = self.config
+        wanted = config.measurement.max_observations if linked.surprising else config.landmark.target_in_view
+        new_ids = np.arange(self._next_id, self._next_id + len(linked.link.rows))
+        self._next_id += len(new_ids)
+        return local.confirm(linked.frame, linked.link, wanted, new_ids)
+
+    def _predict(self, local: LocalMap, linked: LinkedFrame) -> None:
+        """Time update, linearised at the motion found, and measurement of the motion by other sensors.
+
+        Over a large step the motion found and the predicted one are far apart.
+        """
+        link, aid = linked.link, linked.aid
+        sigma = self._explaining_sigma(local, link, linked.dt) if linked.surprising else self._sigma
+        step = local.ekf.time_update(linked.dt, sigma, link.T)
         local.ekf.apply_time_update(step)
-        seen = link.covariance + np.diag(common**2)
-        if aid is not None and contradicts(aid, link.T, seen, self.config.motion.aid_gate):
+        if aid is None:
+            return
+        if contradicts(aid, link.T, linked.motion_covariance, self.config.motion.aid_gate):
             self.counters.add("aids_rejected")
         else:
             self._use_aid(local, step, aid, link.T)
-        if aid is not None:
-            self._aids.learn_bias(aid, link.T, seen, dt)
-        closing = self._builder.is_complete(local.ekf, self.config.submap, len(sight))
-        divided = closing and self.config.submap.start == "independent"
-        if closing:
+        self._aids.learn_bias(aid, link.T, linked.motion_covariance, linked.dt)
+
+    def _update(self, local: LocalMap, linked: LinkedFrame, seen: Sight) -> UpdatedFrame:
+        """Measurement update; in a submap's last frame with half of the landmarks, the others start the next one."""
+        closes = self._builder.is_complete(local.ekf, self.config.submap, len(seen))
+        common, chosen = linked.common, seen
+        if closes:
             # The next submap starts at the camera's pose in this frame, its error included: so does this one end there.
             local.ekf.shake(common)
             common = np.zeros(6)
-        report, used = local.measure(frame, sight.every_second() if divided else sight, common)
-        state, reason = TrackingState.OK, ""
+            chosen = seen.every_second() if self.config.submap.start == "independent" else seen
+        report, measured = local.measure(linked.frame, chosen, common)
         if not report.applied:
             self.counters.add("updates_failed")
-            state, reason = TrackingState.DEGRADED, "no landmark could be measured, moved by the prediction alone"
-        self._builder.add_pose(frame.stamp_ns, local.ekf)
-        self._reached(frame)
-        submaps = self._closed() if closing else ()
-        ids, index = local.book.ids[used.slots], frame.index[used.columns]
-        if closing:
-            self._succeed(local, frame, sight, used)
-        else:
-            local.remember(frame, used, link, landmarks_before)
-            local.tidy(frame, used)
-        return self._report(frame.stamp_ns, state, reason, submaps, report, ids, index)
+        self._builder.add_pose(linked.frame.stamp_ns, local.ekf)
+        self._reached(linked.frame)
+        ids, index = local.book.ids[measured.slots], linked.frame.index[measured.columns]
+        return UpdatedFrame(report, measured, closes, ids, index)
 
-    def _confirm(self, local: LocalMap, frame: Frame, link: Link, surprising: bool) -> Sight:
-        # A surprising motion rests on these pairs alone: all of them are worth their cost.
-        wanted = self.config.measurement.max_observations if surprising else self.config.landmark.target_in_view
-        new_ids = np.arange(self._next_id, self._next_id + len(link.rows))
-        self._next_id += len(link.rows)
-        return local.confirm(frame, link, wanted, new_ids)
+    def _close(self, local: LocalMap, frame: Frame, seen: Sight, updated: UpdatedFrame) -> tuple[Submap, ...]:
+        """Finish the submap and open the one that follows, at the rig's pose in this frame."""
+        submaps = self._closed()
+        self._succeed(local, frame, seen, updated.measured)
+        return submaps
 
-    def _excused_sigma(self, local: LocalMap, link: Link, dt: float) -> FloatArray:
+    def _explaining_sigma(self, local: LocalMap, link: Link, dt: float) -> FloatArray:
         """Acceleration noise with which the model can explain the motion found."""
         needed = 2.0 * boxminus(link.T, relative_motion(local.ekf.velocity, dt)) / dt**2
         sizes = np.repeat(np.linalg.norm(needed.reshape(2, 3), axis=1), 3)
         return np.asarray(np.maximum(self._sigma, sizes))
 
-    def _use_aid(self, local: LocalMap, step: TimeUpdate, aid: Aid | None, T_previous_now: FloatArray) -> None:
-        if aid is None:
-            return
+    # ------------------------------------------------------------------------------------------------------- standing
+    def _is_standing(self, linked: LinkedFrame) -> bool:
+        """Whether the rig has not moved for some frames, this one included."""
+        still = is_still(linked, self.config.association.gate)
+        self._still_frames = self._still_frames + 1 if still else 0
+        return 0 < self.config.motion.standing_frames < self._still_frames
+
+    def _stand(self, local: LocalMap, linked: LinkedFrame) -> EkfResult:
+        """The rig stands: neither pose nor map change.
+
+        If it creeps, the frames link to the landmarks at an ever larger motion, which ends the standing.
+        """
+        local.ekf.stop(_STANDING_VELOCITY)
+        if linked.aid is not None:
+            self._aids.learn_bias(linked.aid, linked.link.T, linked.motion_covariance, linked.dt)
+        self.counters.add("frames_standing")
+        self._builder.add_pose(linked.frame.stamp_ns, local.ekf, standing=True)
+        self._reached(linked.frame)
+        return self._report(linked.frame.stamp_ns, TrackingState.OK, "")
+
+    def _use_aid(self, local: LocalMap, step: TimeUpdate, aid: Aid, T_previous_now: FloatArray) -> None:
+        """Measure the step just predicted, unless the aid contradicts the prediction."""
         rotation = step.T[:3, :3] @ T_previous_now[:3, :3].T
         error, covariance = aid_error(aid, T_previous_now, rotation)
         if local.ekf.update_increment(step, error, covariance, aid.rows, self.config.motion.aid_gate).applied:
@@ -253,7 +293,7 @@ class EkfSlam:
         local.pending = pending_of(frame, self._T_rig_optical)
         return self._report(frame.stamp_ns, TrackingState.DEGRADED, "no visual association, moved by odometry alone")
 
-    def _miss(self, local: LocalMap, frame: Frame, dt: float) -> EkfResult:
+    def _miss(self, frame: Frame) -> EkfResult:
         """No link: nothing is mapped. The filter stays at the last linked frame, so that the old map can be found
         again.
         """
@@ -362,15 +402,20 @@ class EkfSlam:
 
     def _report(
         self, stamp_ns: int, state: TrackingState, reason: str, submaps: tuple[Submap, ...] = (),
-        update: UpdateReport = _NO_UPDATE, ids: np.ndarray | None = None, index: np.ndarray | None = None,
+        updated: UpdatedFrame | None = None,
     ) -> EkfResult:  # fmt: skip
         assert self._map is not None
-        ekf, nobody = self._map.ekf, np.zeros(0, dtype=np.int64)
-        return EkfResult(
+        ekf = self._map.ekf
+        result = EkfResult(
             stamp_ns, in_doubt(self._pose(stamp_ns), self.config.calibration), ekf.velocity,
-            ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:], state, reason, submaps, self._landmark_view(), update.nis,
-            update.dof, nobody if ids is None else ids, nobody if index is None else index,
+            ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:], state, reason, submaps, self._landmark_view(),
         )  # fmt: skip
+        if updated is None:
+            return result
+        report = updated.report
+        return replace(
+            result, nis=report.nis, nis_dof=report.dof, landmark_ids=updated.ids, feature_index=updated.index
+        )
 
     def _landmark_view(self) -> LandmarkView:
         assert self._map is not None
@@ -382,27 +427,3 @@ class EkfSlam:
 
 def _seconds(start_stamp_ns: int, end_stamp_ns: int) -> float:
     return min((end_stamp_ns - start_stamp_ns) * 1e-9, _LONGEST_STEP_S)
-
-
-def _is_surprising(link: Link, expected: MotionPrior, gate: float) -> bool:
-    """Whether the motion found contradicts constant velocity, by the gate of one feature.
-
-    What a motion within this gate moves a feature by lies within the same gate of that feature: the normalised length
-    of an error cannot grow when it is seen in three coordinates. With a wider gate here than there a motion would pass
-    whose features are all refused.
-    """
-    error = boxminus(link.T, expected.T)
-    return float(error @ np.linalg.solve(expected.covariance + link.covariance, error)) > gate
-
-
-def _aided(expected: MotionPrior, aid: Aid | None) -> MotionPrior:
-    """What to expect of the next frame where something else has measured the motion, or its rotation."""
-    if aid is None:
-        return expected
-    T, covariance = expected.T.copy(), expected.covariance.copy()
-    if aid.rows == ALL:
-        return MotionPrior(aid.T, aid.covariance)
-    T[:3, :3] = aid.T[:3, :3]
-    covariance[3:, :] = covariance[:, 3:] = 0.0
-    covariance[3:, 3:] = aid.covariance
-    return MotionPrior(T, covariance)

@@ -37,9 +37,11 @@ class SubmapBuilder:
         self._follows_previous = follows_previous
         self._session = session
         self._path = [PoseEstimate(start_stamp_ns, np.eye(4), _START_SIGMA**2 * np.eye(6))]
+        self._standing = 0
 
-    def add_pose(self, stamp_ns: int, ekf: Ekf) -> None:
-        """Add the filter's present pose to the path."""
+    def add_pose(self, stamp_ns: int, ekf: Ekf, standing: bool = False) -> None:
+        """Add the filter's present pose to the path; one of a rig that stands does not make the submap older."""
+        self._standing += standing
         self._path.append(PoseEstimate(stamp_ns, ekf.T.copy(), ekf.pose_covariance()))
 
     def is_complete(self, ekf: Ekf, config: SubmapConfig, shared: int) -> bool:
@@ -51,7 +53,7 @@ class SubmapBuilder:
         size = max(
             float(np.linalg.norm(ekf.T[:3, 3])) / config.max_distance,
             len(ekf.landmarks) / config.max_landmarks,
-            len(self._path) / config.max_frames,
+            (len(self._path) - self._standing) / config.max_frames,
         )
         limit = 1.0 if shared >= config.min_shared else 2.0
         return len(self._path) >= config.min_frames and size > limit

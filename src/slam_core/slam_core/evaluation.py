@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from slam_core.body_frame import body_offset
 from slam_core.geometry import FloatArray, both_halves, boxminus, invert_transform, skew, so3_log
 from slam_core.rigid_alignment import umeyama
 from slam_core.trajectory import Trajectory
@@ -189,6 +190,9 @@ class Evaluation:
     anees: float | None
     anees_low: float | None
     anees_high: float | None
+    body_offset: list[list[float]] | None = None
+    """T_estimate_truth (4, 4) between body frames that differ by a constant; None where they are the same."""
+    body_aligned: bool = False
 
 
 def evaluate(
@@ -200,13 +204,18 @@ def evaluate(
     max_difference_s: float = 0.01,
     interpolate: bool = False,
     accuracy: TruthAccuracy = EXACT_TRUTH,
+    align_body: bool = False,
 ) -> Evaluation:
     """Compare a trajectory with ground truth.
 
+    A constant difference of the body frames is found where there is one, and taken off the truth with ``align_body``.
     ``drift_percent`` is the end error relative to the true path length. The ANEES bounds assume independent poses,
     which those of one run are not: over one run it is an indication, over many runs a test.
     """
     matched, true_poses = associate(estimate, truth, max_difference_s, interpolate)
+    offset = body_offset(matched.poses, true_poses)
+    if align_body and offset is not None:
+        true_poses = true_poses @ invert_transform(offset)
     aligned = align(matched.poses, true_poses, alignment)
     distance, angle = absolute_errors(aligned, true_poses)
     step, turn = relative_errors(matched.poses, true_poses, min(delta, len(matched) - 1))
@@ -228,4 +237,6 @@ def evaluate(
         anees=anees,
         anees_low=low,
         anees_high=high,
+        body_offset=None if offset is None else offset.tolist(),
+        body_aligned=align_body and offset is not None,
     )

@@ -11,7 +11,9 @@ from rich.console import Console
 from rich.table import Table
 
 from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_core.body_frame import describe
 from slam_core.evaluation import ALIGNMENTS, ErrorStatistics, Evaluation, TruthAccuracy, evaluate
+from slam_core.geometry import FloatArray
 from slam_core.output_file import OutputFile
 from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajectory
 
@@ -36,11 +38,13 @@ from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajector
     "--truth-sigma", nargs=2, type=click.FloatRange(0.0), default=(0.0, 0.0), show_default=True, metavar="M DEG",
     help="standard deviations of ground truth, position [m] and orientation [deg] per axis, for the NEES",
 )  # fmt: skip
+@click.option("--align-body", is_flag=True, help="take a constant difference of the two body frames off the truth")
 @click.option("-o", "--output", type=UserPath(dir_okay=False), help="write the figures as JSON")
 @overwrite_option("figures of other trajectories")
 def command(
     estimate: Path, ground_truth: Path, alignment: str, delta: int, max_difference: float, interpolate: bool,
-    covariance: Path | None, truth_sigma: tuple[float, float], output: Path | None, overwrite: bool,
+    covariance: Path | None, truth_sigma: tuple[float, float], align_body: bool, output: Path | None,
+    overwrite: bool,
 ) -> None:  # fmt: skip
     """ATE, RPE and NEES of the trajectory ESTIMATE against GROUND_TRUTH (TUM, KITTI or EuRoC files)."""
     trajectories = f"{estimate.resolve()} {ground_truth.resolve()}"
@@ -55,10 +59,18 @@ def command(
         max_difference_s=max_difference,
         interpolate=interpolate,
         accuracy=TruthAccuracy(truth_sigma[0], float(np.radians(truth_sigma[1]))),
+        align_body=align_body,
     )
     Console().print(evaluation_table(result))
+    if result.body_offset is not None:
+        click.echo(_body_note(np.array(result.body_offset), align_body))
     if file is not None:
         file.write(asdict(result))
+
+
+def _body_note(T_estimate_truth: FloatArray, aligned: bool) -> str:
+    difference = f"ground truth is of another body frame: {describe(T_estimate_truth)} from the estimate's"
+    return f"{difference}, taken off" if aligned else f"{difference}; try --align-body"
 
 
 def _with_covariances(trajectory: Trajectory, path: Path) -> Trajectory:

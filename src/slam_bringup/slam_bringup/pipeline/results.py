@@ -150,5 +150,6 @@ def _accuracy(agent: AgentResult, trajectory: Trajectory) -> dict[str, Any]:
         "ate_rmse_m": evaluation.ate.rmse,
         "rpe": {"translation_m": evaluation.rpe.rmse, "rotation_deg": evaluation.rpe_rotation_deg.rmse},
         "anees": evaluation.anees,
+        "body_offset": evaluation.body_offset,
         "chi2": None if evaluation.anees is None else [evaluation.anees_low, evaluation.anees_high],
     }

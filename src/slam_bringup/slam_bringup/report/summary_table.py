@@ -44,7 +44,9 @@ def _accuracy(part: dict[str, Any]) -> str:
     if "ate_rmse_m" not in part:
         return "no ground truth"
     anees = f", ANEES {part['anees']:.1f}" if part.get("anees") is not None else ""
+    # Poses of an IMU or a marker, say: slam evaluate takes the difference off.
+    other = "; truth is of another body frame: slam evaluate --align-body" if part.get("body_offset") else ""
     return (
         f"ATE {part['ate_rmse_m'] * 1000:.1f} mm, end error {part['end_error_m'] * 1000:.1f} mm "
-        f"({part['drift_percent']:.2f} %){anees}"
+        f"({part['drift_percent']:.2f} %){anees}{other}"
     )

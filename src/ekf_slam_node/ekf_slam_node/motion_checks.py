@@ -1,0 +1,56 @@
+"""What a frame's motion is compared with: the prediction, other sensors, and no motion at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ekf_slam_node.aids import ALL, Aid
+from ekf_slam_node.candidates import MotionPrior
+from ekf_slam_node.linking import Link
+from ekf_slam_node.steps import LinkedFrame
+from slam_core.geometry import FloatArray, boxminus
+
+_STANDING_SIGMA = np.repeat([0.002, np.radians(0.05)], 3)
+"""Motions (m, rad) must be known as well as this for a rig to be seen standing."""
+
+
+def is_surprising(link: Link, expected: MotionPrior, gate: float) -> bool:
+    """Whether the motion found contradicts constant velocity, by the gate of one feature.
+
+    What a motion within this gate moves a feature by lies within the same gate of that feature: the normalised length
+    of an error cannot grow when it is seen in three coordinates. With a wider gate here than there a motion would pass
+    whose features are all refused.
+    """
+    error = boxminus(link.T, expected.T)
+    return float(error @ np.linalg.solve(expected.covariance + link.covariance, error)) > gate
+
+
+def is_still(linked: LinkedFrame, gate: float) -> bool:
+    """Whether the motion found is none, as far as a good look can tell."""
+    # The landmarks' errors are correlated, so that a motion from them is known a little less well than it says.
+    covariance = linked.motion_covariance + np.diag((0.25 * _STANDING_SIGMA) ** 2)
+    error = boxminus(linked.link.T, np.eye(4))
+    known = bool((np.sqrt(np.diag(linked.link.covariance)) < _STANDING_SIGMA).all())
+    return known and float(error @ np.linalg.solve(covariance, error)) < gate
+
+
+def aided(expected: MotionPrior, aid: Aid | None) -> MotionPrior:
+    """What to expect of the next frame where something else has measured the motion, or its rotation."""
+    if aid is None:
+        return expected
+    T, covariance = expected.T.copy(), expected.covariance.copy()
+    if aid.rows == ALL:
+        return MotionPrior(aid.T, aid.covariance)
+    T[:3, :3] = aid.T[:3, :3]
+    covariance[3:, :] = covariance[:, 3:] = 0.0
+    covariance[3:, 3:] = aid.covariance
+    return MotionPrior(T, covariance)
+
+
+def widened(aid: Aid, common: FloatArray) -> Aid:
+    """A motion from scans as seen by the picture: at both ends the two differ by the pose error (6,) of a frame."""
+    if aid.rows != ALL:
+        return aid
+    return replace(aid, covariance=aid.covariance + 2.0 * np.diag(common**2))

@@ -1,0 +1,56 @@
+"""What the steps of Algorithm 3 hand on to each other within one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekf_slam_node.aids import Aid
+from ekf_slam_node.ekf import UpdateReport
+from ekf_slam_node.linking import Link
+from ekf_slam_node.local_map import Sight
+from ekf_slam_node.models import Frame
+from ekf_slam_node.results import TrackingState
+from slam_core.geometry import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class LinkedFrame:
+    """A frame that is associated with the map.
+
+    dt: since the previous linked frame, s. aid: motion from other sensors, if any. common: (6,) standard deviations of
+    the pose error that all its features share. surprising: its motion contradicts constant velocity.
+    """
+
+    frame: Frame
+    dt: float
+    link: Link
+    aid: Aid | None
+    common: FloatArray
+    surprising: bool
+
+    @property
+    def motion_covariance(self) -> FloatArray:
+        """Covariance (6, 6) of the motion that the pairs show, with the error that they share."""
+        return np.asarray(self.link.covariance + np.diag(self.common**2))
+
+
+@dataclass(frozen=True, eq=False)
+class UpdatedFrame:
+    """Outcome of a measurement update: landmarks ``measured``, whether the submap ``closes`` with this frame, and who
+    was measured: ids (k,) of the landmarks, index (k,) of the features.
+    """
+
+    report: UpdateReport
+    measured: Sight
+    closes: bool
+    ids: np.ndarray
+    index: np.ndarray
+
+    @property
+    def state(self) -> tuple[TrackingState, str]:
+        """State of the filter after the frame, and its reason."""
+        if self.report.applied:
+            return TrackingState.OK, ""
+        return TrackingState.DEGRADED, "no landmark could be measured, moved by the prediction alone"
