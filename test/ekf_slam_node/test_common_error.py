@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, loop, room
 
+from ekf_slam_node.aids import ALL, ROTATION, Aid
 from ekf_slam_node.common_error import CommonError
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import Ekf
 from ekf_slam_node.models import observe
+from ekf_slam_node.motion_checks import widened
 from ekf_slam_node.slam import EkfSlam
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray, boxminus, boxplus
@@ -84,3 +86,10 @@ def test_smooth_errors_widen_the_poses_of_a_run(rng: np.random.Generator) -> Non
             result = slam.process(features)
         sizes[size] = float(np.sqrt(np.trace(result.pose.covariance[:3, :3])))
     assert sizes[1.0] > 1.3 * sizes[0.0]
+
+
+def test_a_scan_motion_is_as_sure_as_the_frames_it_joins() -> None:
+    common = np.repeat([0.003, 0.002], 3)
+    scan, gyro = Aid(np.eye(4), 1e-6 * np.eye(6), ALL), Aid(np.eye(4), 1e-6 * np.eye(3), ROTATION)
+    np.testing.assert_allclose(np.diag(widened(scan, common).covariance), 1e-6 + 2.0 * common**2)
+    np.testing.assert_array_equal(widened(gyro, common).covariance, gyro.covariance)
