@@ -58,6 +58,12 @@ def test_an_agent_behind_a_wall_without_a_door_has_no_way_out():
     assert out.text == "no way out through what was seen free"
 
 
+def test_a_position_that_nothing_ties_to_the_map_is_not_told_in_metres():
+    lost = {"one": agent_at(1.0, 1.0, sigma=100.0)}
+    (out,) = ways_out([drawn_plan()], lost, {"one": np.array([5.5, 1.0, 0.0])})
+    assert "not tied to the map" in out.text
+
+
 def test_each_agent_is_on_the_highest_floor_below_it():
     plans = [drawn_plan(0.0), drawn_plan(3.0)]
     assert storey_at(plans, np.array([1.0, 1.0, 1.2])) is plans[0]

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from browser import Browser, find_chromium
 from dense_mapping.floor_plan import FloorPlan
@@ -103,6 +104,17 @@ def test_the_page_has_no_link_to_another_host():
 
     index = (Path(viser.__file__).parent / "client/build/index.html").read_text(encoding="utf-8", errors="replace")
     assert not re.findall(r"<(?:script|link|img)[^>]+(?:src|href)=[\"']?https?://", index)
+
+
+def test_a_large_mesh_is_made_coarser_not_torn():
+    from slam_bringup.viewer.page import _coarser
+
+    fine = hill()
+    points, faces, colours = _coarser(fine, 0.3)
+    assert len(faces) < len(fine.faces) / 2
+    assert len(colours) == len(points)
+    area = trimesh.Trimesh(points, faces, process=False).area
+    assert abs(area / trimesh.Trimesh(fine.points, fine.faces, process=False).area - 1.0) < 0.2
 
 
 def test_a_port_that_is_taken_is_named(page):

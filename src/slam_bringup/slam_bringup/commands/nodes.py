@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import sys
 from pathlib import Path
 
@@ -26,14 +27,18 @@ from slam_bringup.report.output import write_results
 from slam_bringup.report.summary_table import summary_table
 from slam_core.output_folder import OutputFolder
 
+_PAGE_PORT = 8080
+"""Port of the page, where it is free."""
+
 
 @click.command()
 @mapping_options
 @click.option("--rate", type=click.FloatRange(min=0.0), default=0.0, help="speed of the replay [as fast as it goes]")
+@click.option("--view", is_flag=True, help="show the nodes at work on a page in the browser")
 @click.option("--composed", is_flag=True, help="all nodes in one process, on a thread each")
 def command(
     bag: Path, output: Path, rate: float, mode: str | None, mapper: str, odometry: str, imu: str | None,
-    config: Path | None, topics: tuple[str, ...], base_frame: str, overwrite: bool, composed: bool,
+    config: Path | None, topics: tuple[str, ...], base_frame: str, overwrite: bool, composed: bool, view: bool,
 ) -> None:  # fmt: skip
     """Map BAG with the nodes of the workspace: starts them, plays the bag, and writes what ``slam run`` does."""
     names = BagNames(parse_topics(topics), base_frame)
@@ -44,12 +49,13 @@ def command(
     system = choose(system_config(overrides), mode, mapper, odometry, imu)
     if mode != "tof":
         require_stereo(bag, names)
+    port = _page(view)
     with OutputFolder(output, "nodes", bag, overwrite=overwrite) as results, results.staged() as folder:
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"nodes mapping {bag.name}", total=frames)
             run = run_nodes(
                 bag, system, folder, logs=results.logs, odometry=odometry != "none", composed=composed, rate=rate,
-                names=names, overrides=overrides,
+                names=names, overrides=overrides, view_port=port,
                 on_progress=lambda done: progress.update(task, completed=done), stopped=lambda: interrupt.asked,
             )  # fmt: skip
         result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)
@@ -58,3 +64,19 @@ def command(
     Console().print(summary_table(summary, output))
     if run.stopped:
         sys.exit(INTERRUPTED)
+
+
+def _page(view: bool) -> int:
+    """The port of the page, told to the user; 0 where none is wanted."""
+    if not view:
+        return 0
+    for wanted in (_PAGE_PORT, 0):
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", wanted))
+            except OSError:
+                continue
+            port = int(probe.getsockname()[1])
+            break
+    click.echo(f"the nodes at work: http://localhost:{port}", err=True)
+    return port

@@ -132,6 +132,14 @@ def plan_nodes(
     )
 
 
+def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port: int) -> list[NodeSpec]:
+    """The dense model and the page that shows it, beside the nodes of :func:`plan_nodes`."""
+    agents = tuple(sensors) if any(sensors) else ()
+    model = _spec("dense_mapping", "dense_mapper", config.dense_mapper, "", {}, agents=agents)
+    page = _spec("slam_bringup", "viewer", None, "", {}, agents=agents, port=port)
+    return [model, page]
+
+
 def _bag_parameters(config: SystemConfig, sensor: AgentSensors, map_path: str) -> dict[str, dict[str, Any]]:
     """What the topics of a bag ask of the nodes."""
     pictures = [name for name in ("amplitude", "intensity") if name in sensor.topics]

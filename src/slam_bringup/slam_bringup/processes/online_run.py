@@ -19,7 +19,7 @@ from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.overrides import Overrides
 from slam_bringup.processes.node_arguments import ros_arguments
-from slam_bringup.processes.node_graph import NodeGraph, plan_nodes
+from slam_bringup.processes.node_graph import NodeGraph, plan_nodes, viewer_nodes
 from slam_bringup.processes.processes import NodeCommand, NodeGroup, PrivateDomain, ament_prefixes, node_environment
 from slam_core.files import atomic_text
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC
@@ -65,6 +65,7 @@ def run_nodes(
     rate: float = 0.0,
     names: BagNames | None = None,
     overrides: Overrides | None = None,
+    view_port: int = 0,
     on_progress: Callable[[int], None] = lambda frames: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> OnlineRun:
@@ -90,6 +91,8 @@ def run_nodes(
         Topics and frames of the bag that are not named like the nodes' own.
     overrides
         Where ``config`` is from: parameters that only the nodes have, or one agent's.
+    view_port
+        Port of a page that shows the nodes at work, with the dense model; 0: none.
     on_progress
         Called with the number of frames that the filters have processed.
     stopped
@@ -102,11 +105,14 @@ def run_nodes(
     """
     with SensorBag(bag, names) as opened:
         graph = plan_nodes(config, opened.sensors, odometry, str(out / "map"), overrides)
+        viewers = viewer_nodes(config, opened.sensors, view_port) if view_port else []
     with PrivateDomain() as domain:
         environment = node_environment(domain, fastdds_profile())
         with NodeGroup(environment, logs or out / "logs") as group, _supervisor(environment, group) as supervisor:
             run = _Choreography(group, supervisor, graph, out, stopped)
             run.start_nodes(composed=composed)
+            for viewer in viewers:
+                group.start(viewer.command)
             started = time.monotonic()
             run.play(bag, rate, on_progress)
             run.finish()

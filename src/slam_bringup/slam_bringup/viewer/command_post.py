@@ -14,6 +14,8 @@ from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate
 
 _CONFIDENCE = 0.995
+_NOWHERE_M = 20.0
+"""A stretch that nothing ties to the map yet has a standard deviation of a hundred metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +39,7 @@ class WayOut:
         if self.way is None:
             return "no way out through what was seen free"
         narrow = f", {2 * self.way.clearance:.1f} m wide at its narrowest" if self.way.clearance < 0.5 else ""
-        return f"{self.way.length:.1f} m to the exit{narrow}, position ±{self.radius:.2f} m (99.5 %)"
+        return f"{self.way.length:.1f} m to the exit{narrow}, {radius_text(self.radius)}"
 
 
 def storey_at(plans: Sequence[FloorPlan], point: FloatArray) -> FloorPlan | None:
@@ -62,6 +64,13 @@ def ways_out(
 def position_radius(pose: PoseEstimate) -> float:
     """Radius (m) of the circle on the floor that holds the agent with 99.5 %, by the largest axis of its ellipse."""
     return float(np.sqrt(chi2.ppf(_CONFIDENCE, 2) * max(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1], 0.0)))
+
+
+def radius_text(radius: float) -> str:
+    """How well a position is known, in words."""
+    if radius > _NOWHERE_M:
+        return "position not tied to the map"
+    return f"position ±{radius:.2f} m (99.5 %)"
 
 
 def unseen(plans: Sequence[FloorPlan], most: int = 30) -> list[Frontier]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from slam_bringup.viewer.command_post import position_radius, unseen, ways_out
+from slam_bringup.viewer.command_post import position_radius, radius_text, unseen, ways_out
 from slam_bringup.viewer.page import AgentRow, ViewerPage
 from slam_bringup.viewer.pictures import Picture
 from slam_bringup.viewer.run_folder import RunFolder
@@ -121,4 +121,4 @@ def _state(so_far: Trajectory, stamp_ns: int) -> str:
 
 def _way_text(so_far: Trajectory, pose: PoseEstimate) -> str:
     x, y, z = pose.T[:3, 3]
-    return f"{so_far.length_m:.1f} m walked, at ({x:.1f}, {y:.1f}, {z:.1f}) m ±{position_radius(pose):.2f} m"
+    return f"{so_far.length_m:.1f} m walked, at ({x:.1f}, {y:.1f}, {z:.1f}) m, {radius_text(position_radius(pose))}"

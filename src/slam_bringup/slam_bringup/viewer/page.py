@@ -10,8 +10,10 @@ import contextlib
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import trimesh
 import viser
 from scipy.stats import chi2
@@ -95,14 +97,16 @@ class ViewerPage:
         self.server.stop()
 
     def look_at(self, points: FloatArray) -> None:
-        """Start every browser's view from above and aside, so that most of the points (n, 3) are in it."""
+        """Turn every view, those to come too, so that it shows most of the points (n, 3) from above and aside."""
         if not len(points):
             return
         low, high = np.percentile(points, [2, 98], axis=0)
         middle, size = (low + high) / 2, float(np.linalg.norm((high - low)[:2])) + 1.0
-        self.server.initial_camera.look_at = tuple(middle)
-        self.server.initial_camera.position = tuple(middle + size * np.array([-0.18, -0.45, 0.62]))
-        self.server.initial_camera.up = (0.0, 0.0, 1.0)
+        cameras: list[Any] = [self.server.initial_camera, *(c.camera for c in self.server.get_clients().values())]
+        for camera in cameras:
+            camera.up = (0.0, 0.0, 1.0)
+            camera.position = tuple(middle + size * np.array([-0.18, -0.45, 0.62]))
+            camera.look_at = tuple(middle)
 
     # -- words ---------------------------------------------------------------------------------------------------------
 
@@ -129,10 +133,12 @@ class ViewerPage:
         """The dense model as a mesh, without faces seen from behind, so that one looks into rooms from outside."""
         if not len(surface.faces):
             return
-        step = max(1, -(-len(surface.faces) // _MOST_FACES))
-        mesh = trimesh.Trimesh(
-            surface.points, surface.faces[::step], vertex_colors=_brightened(surface.colours), process=False
-        )
+        points, faces, colours = surface.points, surface.faces, surface.colours
+        size = 0.03
+        while len(faces) > _MOST_FACES:
+            size *= 1.5
+            points, faces, colours = _coarser(surface, size)
+        mesh = trimesh.Trimesh(points, faces, vertex_colors=_brightened(colours), process=False)
         self.server.scene.add_mesh_trimesh("/mesh/model", mesh, cast_shadow=False, receive_shadow=False)
 
     def show_points(self, points: Float32Array, colours: ByteArray | None = None) -> None:
@@ -284,6 +290,20 @@ class ViewerPage:
 def _wxyz(rotation: FloatArray) -> FloatArray:
     """Quaternions (..., 4) in viser's order, w first."""
     return np.asarray(quaternion_from_rotation(rotation)[..., [3, 0, 1, 2]])
+
+
+def _coarser(surface: Surface, size: float) -> tuple[Float32Array, npt.NDArray[np.int32], ByteArray]:
+    """Points, faces and colours of a mesh with one vertex in each cell of ``size`` m (Rossignac and Borrel 1993)."""
+    _, first, cell, count = np.unique(
+        np.floor(surface.points / size).astype(np.int64), axis=0, return_index=True, return_inverse=True,
+        return_counts=True,
+    )  # fmt: skip
+    cell = cell.ravel()
+    mean = np.stack([np.bincount(cell, axis) for axis in surface.points.T], axis=1) / count[:, None]
+    faces = cell[surface.faces].astype(np.int32)
+    a, b, c = faces.T
+    faces = np.unique(faces[(a != b) & (b != c) & (c != a)], axis=0)
+    return mean.astype(np.float32), faces, surface.colours[first]
 
 
 def _chain(points: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 
 from dense_mapping.floor_plan import FloorPlan
-from slam_bringup.viewer.command_post import position_radius, unseen, ways_out
+from slam_bringup.viewer.command_post import position_radius, radius_text, unseen, ways_out
 from slam_bringup.viewer.page import AgentRow, ViewerPage
 from slam_core.base_node import SlamNode
 from slam_core.config import Config, parameter
@@ -102,11 +102,12 @@ class ViewerNode(SlamNode[ViewerConfig]):
         # Markers have no stamp of their own, which the inputs of estimators need.
         for topic, show in (("map/graph", self._on_graph), ("map/marks", self._on_marks)):
             self.create_subscription(self.types.MarkerArray, topic, show, sensor_qos(1, latched=True))
+        # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
+        self.create_subscription(self.types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
         self.listen("map/dense_cloud", "PointCloud2", self._on_dense_cloud, latched=True, required=False)
         for number in range(_STOREYS):
             topic = f"map/occupancy_{number}" if number else "map/occupancy"
             self.listen(topic, "OccupancyGrid", partial(self._on_plan, number), latched=True, required=False)
-        self.listen("/diagnostics", "DiagnosticArray", self._on_diagnostics, required=False)
 
     # -- agents --------------------------------------------------------------------------------------------------------
 
@@ -130,9 +131,6 @@ class ViewerNode(SlamNode[ViewerConfig]):
         matrices = np.stack([T for _, T in poses])
         self._agents[agent].exit = matrices[0, :3, 3]
         self.page.show_trajectory(agent, index, matrices)
-        if not self._looked:
-            self._looked = True
-            self.page.look_at(matrices[:, :3, 3])
 
     def _on_picture(self, agent: str, message: Message) -> None:
         own, now = self._agents[agent], self._now_ns()
@@ -181,6 +179,9 @@ class ViewerNode(SlamNode[ViewerConfig]):
         colours = np.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
         self.page.show_layer("dense points")
         self.page.show_points(points, colours)
+        if not self._looked and len(points):
+            self._looked = True
+            self.page.look_at(points.astype(np.float64))
 
     def _on_plan(self, number: int, message: Message) -> None:
         plan = FloorPlan(*occupancy_from_message(message))
@@ -212,7 +213,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
         state = f"silent for {silent_s:.0f} s" if own.heard_at_ns and silent_s > _SILENT_S else own.state
         note = own.reason if own.reason not in ("", "OK") else ""
         if own.pose is not None:
-            note = " ".join(filter(None, (note, f"position ±{position_radius(own.pose):.2f} m (99.5 %)")))
+            note = " ".join(filter(None, (note, radius_text(position_radius(own.pose)))))
         return AgentRow(agent, state, note)
 
     def _on_click(self, origin: FloatArray, direction: FloatArray) -> None:

@@ -1,0 +1,105 @@
+"""The ``dense_mapper`` node over real topics: nothing before the path, then a cloud and a plan, moved with the path."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+
+from dense_mapping.floor_plan import OCCUPIED  # noqa: E402
+from dense_mapping.node import DenseMapperNode  # noqa: E402
+from slam_core.camera import Camera  # noqa: E402
+from slam_core.geometry import OPTICAL_FROM_RIG, make_transform  # noqa: E402
+from slam_core.messages import (  # noqa: E402
+    depth_messages,
+    occupancy_from_message,
+    odometry_message,
+    path_message,
+    points_from_message,
+)
+from slam_core.ros import RosTypes  # noqa: E402
+from slam_core.types import DepthImage, PoseEstimate  # noqa: E402
+
+pytestmark = pytest.mark.ros
+
+CAMERA = Camera(80, 60, 50.0, 50.0, 39.5, 29.5)
+TYPES = RosTypes()
+
+
+@pytest.fixture
+def node():
+    rclpy.init(args=["--ros-args", "-p", "surface.min_images:=1", "-p", "keyframe.distance:=0.1"])
+    made = DenseMapperNode()
+    sent: dict[str, list] = {}
+    made.publish = lambda topic, message: sent.setdefault(topic, []).append(message)
+    made.sent = sent
+    made.frames.add("base_link", "tof_optical_frame", make_transform(OPTICAL_FROM_RIG.T, np.array([0, 0, 0.0])))
+    executor = SingleThreadedExecutor()
+    executor.add_node(made)
+    yield made
+    executor.shutdown(timeout_sec=2.0)
+    made.destroy_node()
+    rclpy.try_shutdown()
+
+
+def estimate(stamp: int, x: float) -> PoseEstimate:
+    return PoseEstimate(stamp, make_transform(np.eye(3), np.array([x, 0.0, 1.2])), 1e-6 * np.eye(6))
+
+
+def wall_image(stamp: int, distance: float) -> DepthImage:
+    """A wall across the rig's way."""
+    depth = np.full((60, 80), distance, dtype=np.float32)
+    return DepthImage(stamp, depth, np.full_like(depth, 0.01), CAMERA, frame_id="tof_optical_frame")
+
+
+def drive(node: DenseMapperNode, shift: float = 0.0) -> list[PoseEstimate]:
+    """Three metres before a wall at x = 3, and towards it in steps."""
+    poses = [estimate((k + 1) * 10**8, 0.15 * k) for k in range(5)]
+    for pose in poses:
+        node._on_odometry("", odometry_message(TYPES, "odom", "base_link", pose))
+        messages = depth_messages(TYPES, wall_image(pose.stamp_ns, 3.0 - float(pose.T[0, 3])))
+        node._on_depth("", messages.depth, messages.noise, messages.camera_info)
+    return poses
+
+
+def test_key_frames_wait_for_the_path_and_move_with_it(node):
+    poses = drive(node)
+    assert node.mapper.waiting == 5
+    node._on_path("", path_message(TYPES, poses[-1].stamp_ns, "map", poses))
+    assert node.mapper.waiting == 0
+    node._publish_news()
+    points = points_from_message(node.sent["map/dense_cloud"][-1])
+    assert len(points) > 100
+    assert abs(np.median(points[:, 0]) - 3.0) < 0.01
+    cells, resolution, T_map_plan = occupancy_from_message(node.sent["map/occupancy"][-1])
+    row, column = np.argwhere(cells == OCCUPIED)[0]
+    place = T_map_plan @ [(column + 0.5) * resolution, (row + 0.5) * resolution, 0.0, 1.0]
+    assert abs(place[0] - 3.0) < 0.06
+
+    moved = [estimate(p.stamp_ns, float(p.T[0, 3]) + 0.5) for p in poses]
+    node._on_path("", path_message(TYPES, poses[-1].stamp_ns, "map", moved))
+    node._publish_news()
+    points = points_from_message(node.sent["map/dense_cloud"][-1])
+    assert abs(np.median(points[:, 0]) - 3.5) < 0.01, "the wall moved with the trajectory"
+    assert np.all(points[:, 0] > 3.3), "and nothing of it stayed where it was"
+
+
+def test_an_image_of_a_camera_nobody_mounted_is_rejected(node):
+    image = wall_image(10**8, 2.0)
+    messages = depth_messages(TYPES, DepthImage(10**8, image.depth, image.sigma, CAMERA, frame_id="elsewhere"))
+    with pytest.raises(ValueError, match="elsewhere"):
+        node._on_depth("", messages.depth, messages.noise, messages.camera_info)
+
+
+def test_reset_forgets_the_model_and_save_writes_it(node, tmp_path):
+    poses = drive(node)
+    node._on_path("", path_message(TYPES, poses[-1].stamp_ns, "map", poses))
+    object.__setattr__(node.config, "output_path", str(tmp_path / "dense"))
+    response = node._on_save(None, type("Response", (), {})())
+    assert response.success, response.message
+    assert {p.name for p in (tmp_path / "dense").iterdir()} == {"mesh.ply", "floor_plan.yaml", "floor_plan.pgm"}
+    node.on_reset()
+    assert not node.mapper.model.keyframes
