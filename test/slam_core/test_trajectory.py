@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -71,3 +73,14 @@ def test_interpolation_is_exact_for_a_constant_screw_free_motion():
     got = trajectory.interpolate(np.array([50, 100, 175]))
     want = np.stack([boxplus(np.eye(4), k * step) for k in (0.5, 1.0, 1.75)])
     np.testing.assert_allclose(invert_transform(want) @ got, np.tile(np.eye(4), (3, 1, 1)), atol=1e-9)
+
+
+def test_truth_in_nanoseconds_with_eight_columns_is_read_as_euroc_writes_it(tmp_path: Path) -> None:
+    path = tmp_path / "truth.csv"
+    path.write_text("#timestamp [ns],x,y,z,qw,qx,qy,qz\n1403636579763555584,1,2,3,1,0,0,0\n")
+    read = read_trajectory(path)
+    assert read.stamps_ns.tolist() == [1403636579763555584]
+    np.testing.assert_array_equal(read.poses[0, :3, :3], np.eye(3))
+    path.write_text("1e30 1 2 3 0 0 0 1\n")
+    with pytest.raises(ValueError, match="line 1"):
+        read_trajectory(path)

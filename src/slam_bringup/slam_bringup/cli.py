@@ -13,6 +13,9 @@ import click
 # means one order of summation, hence the same bytes.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+VERSION = "0.1.0"
+"""That of the packages, see package.xml."""
+
 COMMANDS = {
     "run": "offline pipeline: a bag to a map and a trajectory",
     "nodes": "the same through the real ROS nodes: starts them, plays the bag, records",
@@ -49,6 +52,7 @@ class _LazyGroup(click.Group):
 
 
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(VERSION, prog_name="slam")
 def slam() -> None:
     """Map indoor areas with a stereo camera and a time-of-flight camera."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,25 @@ from slam_core.files import atomic_path
 from slam_core.types import ByteArray, Float32Array
 
 
-def write_ply(path: Path, points: Float32Array, grey: ByteArray | None = None) -> None:
-    """Write points (n, 3) m, with grey values (n,) as colour where given, as a binary PLY of float32 coordinates."""
+def write_ply(
+    path: Path,
+    points: Float32Array,
+    grey: ByteArray | None = None,
+    scalars: Mapping[str, npt.NDArray[np.generic]] | None = None,
+) -> None:
+    """Write points (n, 3) m as a binary PLY of float32 coordinates.
+
+    grey: values (n,) to be its colour. scalars: further properties by name, (n,) each, as float32.
+    """
     fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     names = {"<f4": "float", "u1": "uchar"}
     if grey is not None:
         fields += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    scalars = scalars or {}
+    fields += [(name, "<f4") for name in scalars]
     vertices = np.empty(len(points), dtype=fields)
+    for name, values in scalars.items():
+        vertices[name] = values
     for axis, name in enumerate("xyz"):
         vertices[name] = points[:, axis]
     if grey is not None:

@@ -74,6 +74,10 @@ class Trajectory:
         return interpolate_transform(self.poses[before], self.poses[after], fraction)
 
 
+_FEWEST_NS = 10**14
+"""A whole number this large is no time in seconds: nanoseconds since 1970, as EuRoC has them."""
+
+
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write ``stamp tx ty tz qx qy qz qw`` lines; the stamp in seconds with all nine decimals."""
     lines = [
@@ -84,7 +88,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a TUM (8 columns), KITTI (12 columns, the line number as seconds) or EuRoC ground truth file (csv, ns).
+    """Read a TUM (8 columns), KITTI (12 columns, the line number as seconds) or EuRoC file (8 or 17 columns, ns).
 
     Stamps stay exact to the nanosecond; of equal stamps the first counts.
 
@@ -119,10 +123,12 @@ def _parse_pose(fields: list[str], index: int) -> tuple[int, list[float]]:
         return index * 10**9, [*M[:, 3], *quaternion_from_rotation(M[:, :3])]
     if len(fields) not in (8, 17):
         raise ValueError(f"{len(fields)} columns")
-    scale = 10**9 if len(fields) == 8 else 1
-    stamp = int((Decimal(fields[0]) * scale).to_integral_value())
+    is_euroc = len(fields) == 17 or (fields[0].isdigit() and int(fields[0]) >= _FEWEST_NS)
+    stamp = int((Decimal(fields[0]) * (1 if is_euroc else 10**9)).to_integral_value())
+    if abs(stamp) >= 2**63:
+        raise ValueError(f"stamp {fields[0]}")
     row = [float(v) for v in fields[1:8]]
-    if len(fields) == 17:  # EuRoC: position, then the quaternion as w x y z
+    if is_euroc:  # position, then the quaternion as w x y z
         row = [*row[:3], *row[4:7], row[3]]
     if not np.all(np.isfinite(row)):
         raise ValueError("not finite")

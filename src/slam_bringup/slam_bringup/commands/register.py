@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from pathlib import Path
 
 import click
 import numpy as np
 import yaml
+from rich.console import Console
+from rich.table import Table
 
 from ndt_registration.cloud import finite_points
 from ndt_registration.cloud_io import read_cloud
@@ -16,9 +19,18 @@ from ndt_registration.registration import RegistrationConfig, RegistrationResult
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.config import from_mapping
 from slam_core.files import atomic_text
-from slam_core.geometry import FloatArray, make_transform, rotation_from_euler, transform_from_pose7, transform_points
+from slam_core.geometry import (
+    FloatArray,
+    make_transform,
+    rotation_from_euler,
+    so3_log,
+    transform_from_pose7,
+    transform_points,
+)
 from slam_core.output_folder import OutputFolder
 
+NOT_REGISTERED = 1
+"""Exit code where the clouds could not be registered; the result is printed and written all the same."""
 PICTURE_POINTS = 8000
 UNIT_RATIO = 20.0
 """Clouds whose extents differ by more are hardly in the same unit."""
@@ -34,12 +46,16 @@ UNIT_RATIO = 20.0
 )
 @click.option("--config", "config_file", type=UserPath(), help="YAML with RegistrationConfig values")
 @click.option("-o", "--output", type=UserPath(), help="folder for result.json and registration.png")
+@click.option("--json", "as_json", is_flag=True, help="print JSON on a terminal as well")
 @overwrite_option("results of other clouds, or results that were changed since")
 def command(
     source: Path, target: Path, method: str, initial_guess: str | None, config_file: Path | None, output: Path | None,
-    overwrite: bool,
+    as_json: bool, overwrite: bool,
 ) -> None:  # fmt: skip
-    """Align SOURCE to TARGET (pcd, ply, vtk)."""
+    """Align SOURCE to TARGET (pcd, ply, vtk).
+
+    Prints a table on a terminal and one JSON object elsewhere. Ends with exit code 1 if the clouds were not registered.
+    """
     values = yaml.safe_load(config_file.read_text(encoding="utf-8")) or {} if config_file else {}
     config = from_mapping(RegistrationConfig, {**values, "method": method})
     source_points, target_points = (_read(path) for path in (source, target))
@@ -47,7 +63,10 @@ def command(
     folder = _output_folder(output, source, target, overwrite)
     result = register(source_points, target_points, guess, config)
     text = json.dumps(result_as_json(result), indent=2)
-    click.echo(text)
+    if as_json or not sys.stdout.isatty():
+        click.echo(text)
+    else:
+        Console().print(result_table(result))
     if not result.converged:
         advice = next_step(source_points, target_points, config, guessed=guess is not None)
         click.echo(f"slam register: not registered: {result.reason}. {advice}", err=True)
@@ -55,6 +74,8 @@ def command(
         with folder, folder.staged() as staged:
             atomic_text(staged / "result.json", text + "\n")
             draw_before_after(staged / "registration.png", source_points, target_points, result)
+    if not result.converged:
+        sys.exit(NOT_REGISTERED)
 
 
 def _output_folder(output: Path | None, source: Path, target: Path, overwrite: bool) -> OutputFolder | None:
@@ -98,6 +119,21 @@ def result_as_json(result: RegistrationResult) -> dict[str, object]:
         "degenerate": list(result.degenerate),
         "reason": result.reason,
     }
+
+
+def result_table(result: RegistrationResult) -> Table:
+    """The pose with its standard deviations, and how well the clouds agree."""
+    table = Table(title="registered" if result.converged else f"not registered: {result.reason}")
+    for heading in ("", "x", "y", "z"):
+        table.add_column(heading, justify="left" if not heading else "right")
+    deviations = np.sqrt(np.diag(result.covariance))
+    angles = np.degrees(so3_log(result.T_target_source[:3, :3]))
+    table.add_row("translation m", *(f"{v:.4f}" for v in result.T_target_source[:3, 3]))
+    table.add_row("standard deviation m", *(f"{v:.4f}" for v in deviations[:3]))
+    table.add_row("rotation vector deg", *(f"{v:.4f}" for v in angles))
+    table.add_row("standard deviation deg", *(f"{v:.4f}" for v in np.degrees(deviations[3:])))
+    table.add_row("overlap", f"{result.overlap:.0%}", "inlier rmse m", f"{result.inlier_rmse:.4f}")
+    return table
 
 
 def parse_guess(text: str) -> FloatArray:

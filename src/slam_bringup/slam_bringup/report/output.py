@@ -18,7 +18,7 @@ import numpy as np
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.plan_io import write_plan
 from dense_mapping.surface_io import write_glb, write_mesh, write_points
-from slam_bringup.pipeline.results import AgentResult, RunResult, summarise
+from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult, summarise
 from slam_bringup.report.figures import map_figure, save_png
 from slam_bringup.report.report import write_report
 from slam_core.files import atomic_text
@@ -35,7 +35,7 @@ def write_results(out: Path, result: RunResult, save_map: Callable[[Path], objec
     out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
     _write_trajectories(out, result.agents)
-    write_ply(out / "landmarks.ply", result.landmarks.positions.astype(np.float32))
+    _write_landmarks(out / "landmarks.ply", result.landmarks)
     write_points(out / "map.ply", result.dense)
     write_mesh(out / "mesh.ply", result.dense)
     write_glb(out / "mesh.glb", result.dense)
@@ -53,6 +53,12 @@ def _write_plans(out: Path, plans: tuple[FloorPlan, ...]) -> None:
     """``floor_plan.yaml`` and its image; of several storeys one each, from the lowest: ``floor_plan_0.yaml`` ..."""
     for number, plan in enumerate(plans):
         write_plan(out / (f"floor_plan_{number}.yaml" if len(plans) > 1 else "floor_plan.yaml"), plan)
+
+
+def _write_landmarks(path: Path, landmarks: LandmarkMap) -> None:
+    """Positions with the upper triangle of each covariance, m2, and the number of sightings."""
+    entries = {f"cov_{'xyz'[i]}{'xyz'[j]}": landmarks.covariances[:, i, j] for i in range(3) for j in range(i, 3)}
+    write_ply(path, landmarks.positions.astype(np.float32), scalars={**entries, "sightings": landmarks.sightings})
 
 
 def _write_trajectories(out: Path, agents: tuple[AgentResult, ...]) -> None:

@@ -15,7 +15,7 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
     table = Table(title=f"{summary['bag']} ({summary['mode']}, {summary['mapper']})", show_header=False)
     table.add_column(style="bold")
     table.add_column()
-    table.add_row("frames", f"{summary['frames']}{'' if summary['dropped'] else ', none dropped'}")
+    table.add_row("frames", f"{summary['frames']}, {_lost(summary)}")
     for reason, count in summary["dropped_by_reason"].items():
         table.add_row("dropped", f"{count} x {reason}")
     table.add_row("path", f"{summary['path_length_m']:.2f} m")
@@ -38,6 +38,12 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
         table.add_row("events", "\n".join(summary["events"][:_SHOWN_EVENTS] + [f"and {more} more"] * (more > 0)))
     table.add_row("results", str(out))
     return table
+
+
+def _lost(summary: dict[str, Any]) -> str:
+    """The share of what came that was not used."""
+    dropped = summary["dropped"]
+    return f"lost {dropped / max(dropped + summary['frames'], 1):.0%} of the messages" if dropped else "none dropped"
 
 
 def _accuracy(part: dict[str, Any]) -> str:
