@@ -8,6 +8,8 @@ import sys
 
 import click
 
+import slam_core.process_life  # noqa: F401  # its clock starts with the program
+
 # The stages of a run have threads of their own: BLAS threads beside them only wait for each other, spinning. NumPy and
 # SciPy read this when they are loaded, here and in the nodes that are started from here. One number of threads also
 # means one order of summation, hence the same bytes.
@@ -31,6 +33,7 @@ COMMANDS = {
     "evaluate": "ATE, RPE and NEES of a trajectory against ground truth",
     "experiment": "the experiments of the thesis, beside its own figures",
     "doctor": "what is wrong with a recording or a running rig, and what to do",
+    "warmup": "compile all kernels once (./slam setup does it)",
     "calibrate": "camera_info with uncertainties from pictures of a board",
 }
 

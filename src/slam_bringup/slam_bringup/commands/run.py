@@ -58,7 +58,7 @@ def command(
         require_map(result)
         if interrupt.asked:
             result = replace(result, events=(STOPPED, *result.events))
-        with results.staged() as folder:
+        with results.staged() as folder, Console(stderr=True).status(f"writing {output}"):
             write_result_bag(folder / "result.mcap", result)
             summary = write_results(folder, result, mapping.global_map.save)
     Console().print(summary_table(summary, output))

@@ -9,6 +9,7 @@ own ``trajectory_<agent>.tum``; ``trajectory.tum`` is then the first one's.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from slam_bringup.report.figures import map_figure, save_png
 from slam_bringup.report.report import write_report
 from slam_core.files import atomic_text
 from slam_core.point_cloud import write_ply
+from slam_core.process_life import STARTED_S
 from slam_core.trajectory import write_covariance_csv, write_tum
 
 
@@ -44,9 +46,16 @@ def write_results(out: Path, result: RunResult, save_map: Callable[[Path], objec
         save_map(out / "map")
     summary = summarise(result)
     save_png(out / "map.png", map_figure(result))
-    write_report(out / "report.html", result, summary)
+    write_report(out / "report.html", result, summary | _in_all(result))
+    summary |= _in_all(result)
     atomic_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
     return summary
+
+
+def _in_all(result: RunResult) -> dict[str, float]:
+    """The time that the user waits: from the start of the program until now, dense model and files included."""
+    total_s = time.monotonic() - STARTED_S
+    return {"total_s": total_s, "total_real_time_factor": result.sensor_s / total_s}
 
 
 def _write_plans(out: Path, plans: tuple[FloorPlan, ...]) -> None:
