@@ -65,7 +65,10 @@ def main() -> None:
 
 def one_run(checkout: Path, bag: Path, options: list[str], scratch: Path) -> Row:
     """One ``slam run`` of a checkout in a process of its own."""
-    report, output = scratch / "cost.json", scratch / "out"
+    report, output = (
+        scratch / "cost.json",
+        Path(tempfile.mkdtemp(dir=scratch)) / "out",
+    )  # slam replaces no other's files
     packages = os.pathsep.join(str(p) for p in sorted((checkout / "src").iterdir()))
     script = str(Path(__file__).with_name("cost_of_run.py"))
     command = [sys.executable, script, str(report), str(bag), "-o", str(output), *options]
