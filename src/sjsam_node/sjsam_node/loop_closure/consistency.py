@@ -108,9 +108,14 @@ class Consistency:
         return self.smoother.update(newest), Verdict()
 
     def settle(self, newest: int) -> Verdict:
-        """Let go what the settled map contradicts, until nothing is left or it has been evaluated often enough."""
-        offered = list(self.smoother.graph.links)
-        self._evaluate(newest, self.smoother.result(self.smoother.graph.component(newest)), self.config.settling_rounds)
+        """Let go what the settled map contradicts, until nothing is left or it has been evaluated often enough.
+
+        Without a closure there is nothing that could be false but the filter's own submaps: these are left as they are.
+        """
+        if not self._closures():
+            return Verdict()
+        offered, result = list(self.smoother.graph.links), self.smoother.result(self.smoother.graph.component(newest))
+        self._evaluate(newest, result, self.config.settling_rounds)
         return self._verdict([], offered)
 
     def _wait(self, links: Iterable[Link]) -> None:
