@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,113 +13,12 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 pytestmark = pytest.mark.ros
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1] / name) for name in ("ekf_slam_node", "sjsam_node")]
+from feature_world import loop  # noqa: E402
+from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped  # noqa: E402
 
-from feature_world import T_RIG_OPTICAL, loop, room  # noqa: E402
-from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped, TransformStamped  # noqa: E402
-from nav_msgs.msg import Odometry  # noqa: E402
-from nav_msgs.msg import Path as PathMessage  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
-
-from ros_probe import Probe  # noqa: E402
+from feature_chain import HOUR, START, STEP_NS, Chain, stamp_of  # noqa: E402
 from sjsam_node.global_map import GlobalMap  # noqa: E402
 from sjsam_node.storage import is_map  # noqa: E402
-from slam_core.messages import (  # noqa: E402
-    FEATURE_TOPICS,
-    STATIC_TRANSFORMS_TOPIC,
-    features_messages,
-    transform_message,
-)
-from slam_core.ros import sensor_qos  # noqa: E402
-from slam_core.types import Features  # noqa: E402
-
-STEP_NS = 100_000_000
-START = 1_700_000_000 * 10**9
-HOUR = 3600 * 10**9
-
-
-class Chain(Probe):
-    """``ekf_slam`` and ``sjsam`` as processes, and who sends features and reads the map's path."""
-
-    def __init__(self, context: Any, domain: int, folder: Path) -> None:
-        super().__init__(context)
-        self.environment = {
-            **os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)
-        }  # fmt: skip
-        self.map_path = folder / "map"
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        self.start("ekf_slam")
-        self.start("sjsam")
-        self.listen("odom", Odometry)
-        self.listen("pose", PoseWithCovarianceStamped)
-        self.listen("map/path", PathMessage, latched=True)
-        for topic, kind in FEATURE_TOPICS.items():
-            self.senders[topic] = self.node.create_publisher(getattr(self.types, kind), topic, sensor_qos(100))
-        for topic, kind in (("clicked_point", PointStamped), ("initialpose", PoseWithCovarianceStamped)):
-            self.senders[topic] = self.node.create_publisher(kind, topic, sensor_qos(10))
-        self.mounting = self.node.create_publisher(TransformStamped, STATIC_TRANSFORMS_TOPIC, sensor_qos(10, True))
-        self.rng = np.random.default_rng(4)
-        self.world = room(self.rng)
-
-    def start(self, name: str) -> None:
-        module = {"ekf_slam": "ekf_slam_node", "sjsam": "sjsam_node"}[name]
-        own = {
-            "sjsam": (f"map_path:={self.map_path}", "autosave_period_s:=0.5", f"ply_path:={self.map_path}.ply"),
-            "ekf_slam": ("submap.max_frames:=8",),
-        }[name]
-        arguments = [word for parameter in own for word in ("-p", parameter)]
-        command = [sys.executable, "-c", f"from {module}.node import main; main()", "--ros-args", *arguments]
-        self.processes[name] = subprocess.Popen(command, env=self.environment)
-
-    def kill(self, name: str) -> None:
-        self.processes[name].kill()
-        self.processes[name].wait()
-
-    def connect(self) -> None:
-        self.wait(lambda: all(s.get_subscription_count() for s in self.senders.values()), "nodes do not listen")
-        self.wait(lambda: self.node.get_publishers_info_by_topic("odom") != [], "no filter")
-        self.mounting.publish(
-            transform_message(self.types, 0, "base_link", self.features(loop(2)[0], 0).frame_id, T_RIG_OPTICAL)
-        )
-        self._let_others_find_us()
-
-    def features(self, T: np.ndarray, stamp: int) -> Features:
-        return self.world.features(T, stamp, self.rng)[0]
-
-    def send_frames(self, poses: list[np.ndarray], first_ns: int) -> None:
-        for k, T in enumerate(poses):
-            self.send_frame(T, first_ns + k * STEP_NS)
-
-    def send_frame(self, T: np.ndarray, stamp: int) -> None:
-        for topic, message in zip(FEATURE_TOPICS, features_messages(self.types, self.features(T, stamp)), strict=True):
-            self.send(topic, message)
-
-    def wait_for_odometry(self, stamp: int) -> None:
-        stamps = self.received["odom"]
-        self.wait(lambda: any(stamp_of(m) == stamp for m in stamps), f"no odometry at {stamp}")
-
-    def call(self, name: str) -> Any:
-        client = self.node.create_client(Trigger, name)
-        self.wait(client.service_is_ready, f"no service {name}")
-        future = client.call_async(Trigger.Request())
-        self.wait(future.done, f"{name} does not answer")
-        return future.result()
-
-    def wait_for_map(self, stamp: int) -> None:
-        paths = self.received["map/path"]
-        self.wait(lambda: any(stamp_of(p) == stamp for m in paths for p in m.poses), f"{stamp} is not in the map")
-
-    def saved_keys(self, newest_ns: int) -> list[tuple[str, int, int]]:
-        """Keys of the saved submaps, once the pose of a stamp is in the map."""
-        assert self.call("/ekf_slam/finish").success
-        self.wait_for_map(newest_ns)
-        answer = self.call("/sjsam/save_map")
-        assert answer.success, answer.message
-        return [record.key for record in GlobalMap.load(self.map_path).graph.records]
-
-
-def stamp_of(message: Any) -> int:
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
 @pytest.fixture
@@ -134,11 +29,7 @@ def chain(tmp_path: Path) -> Iterator[Chain]:
     chain = Chain(context, domain, tmp_path)
     chain.connect()
     yield chain
-    for process in chain.processes.values():
-        process.send_signal(signal.SIGINT)
-    codes = [process.wait(30) for process in chain.processes.values()]
-    chain.executor.shutdown()
-    chain.node.destroy_node()
+    codes = chain.end()
     rclpy.shutdown(context=context)
     assert codes == [0, 0]
 
@@ -177,7 +68,7 @@ def test_both_nodes_killed_and_started_again_go_on_with_the_map(chain: Chain, tm
     for name in ("sjsam", "ekf_slam"):
         chain.kill(name)
     before = [record.key for record in GlobalMap.load(copy).graph.records]
-    chain.wait(lambda: not any(s.get_subscription_count() for s in chain.senders.values()), "the dead still listen")
+    chain.wait_until_dead_are_forgotten()
     for name in ("sjsam", "ekf_slam"):
         chain.start(name)
     chain.connect()

@@ -12,10 +12,11 @@ rclpy = pytest.importorskip("rclpy", reason="needs ROS")
 pytestmark = pytest.mark.ros
 
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from slam_core.base_node import SlamNode  # noqa: E402
-from slam_core.config import Config  # noqa: E402
+from slam_core.config import Config, parameter  # noqa: E402
 from slam_core.messages import header_message, stamp_ns  # noqa: E402
 
 START = 1_700_000_000 * 10**9
@@ -23,15 +24,20 @@ MS = 10**6
 
 
 @dataclass(frozen=True)
-class NoConfig(Config):
-    """No parameters."""
+class EarConfig(Config):
+    """Two parameters."""
+
+    patience: int = parameter(3, "may change", minimum=0)
+    fixed: int = parameter(1, "may not")
 
 
-class EarNode(SlamNode[NoConfig]):
+class EarNode(SlamNode[EarConfig]):
     """Remembers what it was given and what was made of it."""
 
+    CHANGEABLE = ("patience",)
+
     def __init__(self) -> None:
-        super().__init__("ear", NoConfig)
+        super().__init__("ear", EarConfig)
         self.heard: list[int] = []
         self.sessions = self.resets = 0
         self.listen("frames", "PointCloud2", lambda m: self.heard.append(stamp_ns(m)))
@@ -131,3 +137,27 @@ def test_a_frame_that_waits_too_long_goes_on_by_the_clock(node: EarNode, monkeyp
             pass
         now[0] += 0.25
     assert overdue[0] == 101.25
+
+
+def test_a_node_is_managed_and_starts_active(node: EarNode) -> None:
+    assert node._state_machine.current_state[1] == "active"
+    node.trigger_deactivate()
+    send(node, "frames", START)
+    assert node.heard == []
+    node.trigger_activate()
+    send(node, "frames", START)
+    assert node.heard == [START]
+    node.trigger_deactivate()
+    node.trigger_cleanup()
+    assert node.resets == 1
+
+
+def test_parameters_change_at_run_time_where_they_can_and_say_why_where_not(node: EarNode) -> None:
+    for value, changed in ((5, True), (-1, False), ("many", False)):
+        result = node.set_parameters([Parameter("patience", value=value)])[0]
+        assert result.successful == changed
+        assert changed or "patience" in result.reason
+    assert node.config.patience == 5
+    refused = node.set_parameters([Parameter("fixed", value=2)])[0]
+    assert not refused.successful
+    assert "fixed" in refused.reason

@@ -52,6 +52,8 @@ class EkfNodeConfig(FilterConfig):
 class EkfNode(SlamNode[EkfNodeConfig]):
     """Publishes ``odom``, ``path``, ``landmarks``, ``landmark_ellipsoids`` and, as they end, ``submap/*``."""
 
+    CHANGEABLE = ("path_length",)
+
     def __init__(self) -> None:
         super().__init__("ekf_slam", EkfNodeConfig)
         self.stage = FilterStage(self.config, self.frames, self.config.base_frame, self.config.session)
@@ -85,6 +87,10 @@ class EkfNode(SlamNode[EkfNodeConfig]):
         """A reading of the IMU."""
         self.stage.add_imu(imu_from_message(message))
         self._publish_ready()
+
+    def on_config(self, config: EkfNodeConfig) -> None:
+        """The path may become longer or shorter."""
+        self.path = deque(self.path, maxlen=config.path_length)
 
     def on_reset(self) -> None:
         """Forget everything; the mounting is looked up anew."""

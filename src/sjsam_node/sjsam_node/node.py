@@ -76,11 +76,12 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     which costs the more the larger it is, once a second at most. None of them changes the map.
     """
 
+    CHANGEABLE = ("map_path", "ply_path", "transform_tolerance_s")
+
     def __init__(self) -> None:
         super().__init__("sjsam", SjsamNodeConfig)
         self.global_map = GlobalMap(self.config)
         self.localizers: dict[str, Localizer] = {}
-        self.map_path, self.ply_path = (Path(p).expanduser() for p in (self.config.map_path, self.config.ply_path))
         self.autosave = self._make_autosave()
         self._stamp_ns = 0
         self._map_is_news = self._copy_is_old = False
@@ -99,6 +100,16 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_MAP_PERIOD_S, self._publish_news, clock=steady)
         self.create_timer(_TRANSFORM_PERIOD_S, self._publish_transforms, clock=steady)
+
+    @property
+    def map_path(self) -> Path:
+        """Folder of the saved map."""
+        return Path(self.config.map_path).expanduser()
+
+    @property
+    def ply_path(self) -> Path:
+        """File of the exported landmarks."""
+        return Path(self.config.ply_path).expanduser()
 
     def _make_autosave(self) -> Autosave:
         path = self.config.autosave_path or f"{self.map_path}.autosave"
@@ -201,7 +212,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self._publish_map()
         self.trackers = {agent: self._make_tracker(agent) for agent in self.config.agents}
 
-    def on_shutdown(self) -> None:
+    def on_close(self) -> None:
         """Write what has been mapped since the last copy, and put the copy away: nobody needs to go on from it."""
         if self.autosave.is_on and self._copy_is_old:
             self.autosave.wait()

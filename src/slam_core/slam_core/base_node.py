@@ -31,8 +31,9 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from std_srvs.srv import SetBool, Trigger
 
@@ -45,7 +46,7 @@ from slam_core.job_queue import Job
 from slam_core.listening_node import LATCHED_DEPTH, Input, ListeningNode
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC, MessageTypes, header_message, stamp_ns, transform_from_message
 from slam_core.messages.base import Message
-from slam_core.ros import RosTypes, declare_config, has_tf2_msgs, sensor_qos
+from slam_core.ros import RosTypes, changed_config, declare_config, has_tf2_msgs, sensor_qos
 from slam_core.stamp_guard import StampGuard, StampPolicy
 from slam_core.synchronizer import StampSynchronizer
 
@@ -64,9 +65,13 @@ PROGRESS_TOPIC = "/progress"
 class SlamNode(ListeningNode, Generic[C]):
     """Base of all nodes, see the example above. ``config`` is the checked configuration, ``types`` makes messages."""
 
+    CHANGEABLE: ClassVar[tuple[str, ...]] = ()
+    """Parameters that may change while the node runs."""
+
     def __init__(self, name: str, config_type: type[C]) -> None:
         super().__init__(name)
-        self.config: C = declare_config(self, config_type, ignore=("input.",))
+        self.config: C = declare_config(self, config_type, ignore=("input.",), changeable=self.CHANGEABLE)
+        self.add_on_set_parameters_callback(self._on_set_parameters)
         self._ros_types = RosTypes()
         self.types: MessageTypes = self._ros_types if self._exchange is None else SharedTypes(self._ros_types)
         self.frames = FrameTree()
@@ -184,8 +189,21 @@ class SlamNode(ListeningNode, Generic[C]):
         """The input has ended: publish what is still open. Override where there is any; returns a line for the log."""
         return "nothing open"
 
-    def on_shutdown(self) -> None:
+    def on_close(self) -> None:
         """The node ends; override to close files."""
+
+    def on_config(self, config: C) -> None:
+        """Parameters of ``CHANGEABLE`` are about to change; override where something is made from them."""
+
+    def _on_set_parameters(self, parameters: list[Any]) -> Any:
+        own = [p for p in parameters if p.name in self.CHANGEABLE]
+        try:
+            config = changed_config(self.config, own)
+            self.on_config(config)
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self.config = config
+        return SetParametersResult(successful=True)
 
     # -- inputs --------------------------------------------------------------------------------------------------------
 

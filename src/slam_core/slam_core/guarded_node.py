@@ -1,4 +1,8 @@
-"""A node that no callback can end: what a subscription, timer or service raises is logged and counted."""
+"""A managed node that no callback can end: what a subscription, timer or service raises is logged and counted.
+
+It is a lifecycle node of ROS 2 that starts by itself: active when it is ready. ``deactivate`` pauses it, ``activate``
+goes on, ``cleanup`` resets it.
+"""
 
 # rclpy is annotated in part only.
 # mypy: allow-untyped-calls, disable-error-code="attr-defined,union-attr,arg-type,misc"
@@ -9,19 +13,41 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from slam_core.health import Health
 
 
-class GuardedNode(Node):
+class GuardedNode(LifecycleNode):
     """rclpy's node; subscriptions, timers and services made through it are guarded. ``health`` counts ``faults``."""
 
     def __init__(self, name: str, **options: Any) -> None:
         self.health = Health()
         self.calls = 0
         """Callbacks called so far: as long as it grows there may be more to receive."""
+        self._paused = False
         super().__init__(name, **options)
+        self.trigger_configure()
+        self.trigger_activate()
+
+    def reset(self, why: str) -> None:
+        """Forget everything."""
+        raise NotImplementedError
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take messages."""
+        self._paused = False
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Leave messages aside, as after ``~/pause``."""
+        self._paused = True
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As ``~/reset``."""
+        self.reset("cleaned up")
+        return super().on_cleanup(state)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], *rest: Any, **options: Any

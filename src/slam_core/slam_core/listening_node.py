@@ -64,7 +64,6 @@ class ListeningNode(GuardedNode):
         self._jobs = JobQueue(self.input_config.policy, self.input_config.waiting)
         self._inbox: deque[tuple[Input, Message]] = deque()
         self._wake = self.create_guard_condition(self._guarded("inbox", self._empty_inbox))
-        self._paused = False
         self._started_at_s = time.monotonic()
 
     def _receive(self, entry: Input, message: Message) -> None:

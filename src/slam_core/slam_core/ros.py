@@ -13,7 +13,7 @@ import importlib
 import importlib.util
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -56,10 +56,17 @@ class RosTypes(MessageTypes):
         return array.array("b", np.ascontiguousarray(values, dtype=np.int8).tobytes())
 
 
-def declare_config(node: Node, config_type: type[C], prefix: str = "", ignore: tuple[str, ...] = ()) -> C:
+def declare_config(
+    node: Node,
+    config_type: type[C],
+    prefix: str = "",
+    ignore: tuple[str, ...] = (),
+    changeable: tuple[str, ...] = (),
+) -> C:
     """Declare every parameter of ``config_type`` and return the configuration with the values set from outside.
 
-    The node must declare parameters from overrides automatically, so that unknown names are seen and refused.
+    The node must declare parameters from overrides automatically, so that unknown names are seen and refused. All but
+    the ``changeable`` ones are read-only from then on.
 
     Raises
     ------
@@ -70,12 +77,18 @@ def declare_config(node: Node, config_type: type[C], prefix: str = "", ignore: t
     foreign = ("use_sim_time", "start_type_description_service", "qos_overrides.", *ignore)
     config = from_mapping(config_type, {k: v for k, v in given.items() if prefix or not k.startswith(foreign)})
     for name, value, info in iterate_parameters(config, prefix):
-        _declare(node, name, list(value) if isinstance(value, tuple) else value, info)
+        descriptor = _descriptor(name, value, info, name not in changeable)
+        _declare(node, name, list(value) if isinstance(value, tuple) else value, descriptor)
     return config
 
 
-def _declare(node: Node, name: str, value: Any, info: ParameterInfo) -> None:
-    descriptor = _descriptor(name, value, info)
+def changed_config(config: C, parameters: Iterable[Parameter]) -> C:
+    """The configuration with some parameters changed at run time; ValueError says why one cannot be so."""
+    changes = {p.name: _plain(p.value) for p in parameters}
+    return from_mapping(type(config), {name: value for name, value, _ in iterate_parameters(config)} | changes)
+
+
+def _declare(node: Node, name: str, value: Any, descriptor: Message) -> None:
     if node.has_parameter(name):
         node.set_parameters([Parameter(name, value=value)])
         node.set_descriptor(name, descriptor)
@@ -83,8 +96,9 @@ def _declare(node: Node, name: str, value: Any, info: ParameterInfo) -> None:
         node.declare_parameter(name, value, descriptor)
 
 
-def _descriptor(name: str, value: Any, info: ParameterInfo) -> Message:
-    descriptor = ParameterDescriptor(name=name, description=info.text(), read_only=True, dynamic_typing=True)
+def _descriptor(name: str, value: Any, info: ParameterInfo, read_only: bool) -> Message:
+    description = info.text() + (" (read when the node starts)" if read_only else "")
+    descriptor = ParameterDescriptor(name=name, description=description, read_only=read_only, dynamic_typing=True)
     low, high = info.minimum, info.maximum
     if low is None and high is None:
         return descriptor
@@ -139,7 +153,7 @@ def message_class(type_name: str) -> Any:
 class RunnableNode(Protocol):
     """What :func:`run_node` needs of a node beside rclpy's own."""
 
-    def on_shutdown(self) -> None:
+    def on_close(self) -> None:
         """Close what is open."""
 
     def destroy_node(self) -> None:
@@ -197,6 +211,6 @@ def run_node(node_type: Callable[[], RunnableNode], args: list[str] | None = Non
     finally:
         executor.shutdown(timeout_sec=2.0)
         if node is not None:
-            node.on_shutdown()
+            node.on_close()
             node.destroy_node()
         rclpy.try_shutdown()

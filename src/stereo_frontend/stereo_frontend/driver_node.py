@@ -75,7 +75,7 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
         """Forget what waits."""
         self.stage.reset()
 
-    def on_shutdown(self) -> None:
+    def on_close(self) -> None:
         """Let go of the camera."""
         if self.source is not None:
             self.source.close()

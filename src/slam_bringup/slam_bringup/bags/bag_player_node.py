@@ -80,7 +80,7 @@ class BagPlayerNode(Node):
         self._thread = threading.Thread(target=self._run, name="player")
         self._thread.start()
 
-    def on_shutdown(self) -> None:
+    def on_close(self) -> None:
         """Stop playing and close the bag."""
         self._stop.set()
         self._start.set()

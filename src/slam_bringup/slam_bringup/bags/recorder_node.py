@@ -59,7 +59,7 @@ class RecorderNode(Node):
         path = Path(self.config.bag).expanduser()
         return BagWriter(path, self.config.storage, overwrite=self.config.overwrite).__enter__()
 
-    def on_shutdown(self) -> None:
+    def on_close(self) -> None:
         """Complete the bag."""
         self._writer.__exit__(None, None, None)
         print(f"recorded {self._count} messages to {self._writer.path}", flush=True)

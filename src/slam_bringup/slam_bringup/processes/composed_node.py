@@ -72,7 +72,7 @@ def run_composed(commands: Sequence[NodeCommand], ros_arguments: Sequence[str] =
             thread.join(_JOIN_S)
     finally:
         for node in nodes:
-            node.on_shutdown()
+            node.on_close()
             node.destroy_node()
         rclpy.try_shutdown()
 
