@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +35,15 @@ from slam_core.types import Features  # noqa: E402
 STEP_NS = 100_000_000
 START = 1_700_000_000 * 10**9
 HOUR = 3600 * 10**9
+PATIENCE_S = 240.0
 
 
 class Chain(Probe):
     """``ekf_slam`` of each agent and ``sjsam`` as processes; topics, names and frames below the agents' names."""
 
-    def __init__(self, context: Any, domain: int, folder: Path, agents: tuple[str, ...] = ("",)) -> None:
+    def __init__(
+        self, context: Any, domain: int, folder: Path, agents: tuple[str, ...] = ("",), *, joiner: bool = True
+    ) -> None:
         super().__init__(context)
         self.environment = {
             **os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)
@@ -55,10 +59,15 @@ class Chain(Probe):
             self.listen(below(agent, "map/path"), PathMessage, latched=True)
             for topic, kind in FEATURE_TOPICS.items():
                 self._offer(below(agent, topic), getattr(self.types, kind))
-        self.start("sjsam")
+        if joiner:
+            self.start("sjsam")
         for topic, kind in (("clicked_point", PointStamped), ("initialpose", PoseWithCovarianceStamped)):
             self._offer(topic, kind)
         self.mounting = self.node.create_publisher(TransformStamped, STATIC_TRANSFORMS_TOPIC, sensor_qos(10, True))
+
+    def wait(self, condition: Callable[[], bool], why: str, seconds: float = PATIENCE_S) -> None:
+        """As the probe's, for machines that have much else to do."""
+        super().wait(condition, why, seconds)
 
     def _offer(self, topic: str, kind: Any) -> None:
         self.senders[topic] = self.node.create_publisher(kind, topic, sensor_qos(100))
@@ -116,10 +125,10 @@ class Chain(Probe):
         for topic, message in zip(FEATURE_TOPICS, features_messages(self.types, features), strict=True):
             self.send(below(agent, topic), message)
 
-    def wait_for_odometry(self, stamp: int, agent: str = "", seconds: float = 60.0) -> None:
+    def wait_for_odometry(self, stamp: int, agent: str = "") -> None:
         """Until the filter has spoken of a frame."""
         messages = self.received[below(agent, "odom")]
-        self.wait(lambda: any(stamp_of(m) == stamp for m in messages), f"no odometry at {stamp}", seconds)
+        self.wait(lambda: any(stamp_of(m) == stamp for m in messages), f"no odometry at {stamp}")
 
     def call(self, name: str) -> Any:
         """Answer of a service; a client of its own each time, because a killed node's never answers."""
