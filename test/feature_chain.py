@@ -52,6 +52,7 @@ class Chain(Probe):
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.rng = np.random.default_rng(4)
         self.world = room(self.rng)
+        self.listen("/diagnostics", self.types.DiagnosticArray)
         for agent in agents:
             self.start(below(agent, "ekf_slam"))
             self.listen(below(agent, "odom"), Odometry)
@@ -101,11 +102,19 @@ class Chain(Probe):
     def connect(self) -> None:
         """Wait until all nodes listen and are heard, and tell them the camera's mounting."""
         self.wait(lambda: all(s.get_subscription_count() for s in self.senders.values()), "nodes do not listen")
-        odometries = [below(agent, "odom") for agent in self.agents]
-        self.wait(lambda: all(self.node.get_publishers_info_by_topic(t) for t in odometries), "no filter")
+        self.wait(lambda: all(s.get_publisher_count() for s in self._subscriptions), "nodes do not speak")
+        names = [f"/{below(agent, 'ekf_slam')}" for agent in self.agents]
+        self.received["/diagnostics"].clear()
+        self.wait(lambda: all(self._is_connected(name) for name in names), "filters are not connected")
         frame_id = self.features(loop(2)[0], 0).frame_id
         self.mounting.publish(transform_message(self.types, 0, "base_link", frame_id, T_RIG_OPTICAL))
         self._let_others_find_us()
+
+    def _is_connected(self, name: str) -> bool:
+        """Whether a node has lately said that all its inputs have been found, but the static transforms."""
+        said = [s for m in self.received["/diagnostics"] for s in m.status if s.name == name]
+        values = {v.key: v.value for v in said[-1].values} if said else {"unconnected": "features"}
+        return "features" not in values["unconnected"]
 
     def features(self, T: np.ndarray, stamp: int) -> Features:
         """What a rig at a pose sees."""

@@ -115,6 +115,10 @@ def test_poses_and_submaps_are_those_of_the_offline_filter(probe: FeatureProbe, 
     for message, result in zip(probe.received["odom"], expected, strict=True):
         np.testing.assert_allclose(estimate_from_message(message).T, result.pose.T, atol=1e-12)
         np.testing.assert_array_equal(estimate_from_message(message).covariance, result.pose.covariance)
+        twist = message.twist.twist
+        linear, angular = (np.array([v.x, v.y, v.z]) for v in (twist.linear, twist.angular))
+        np.testing.assert_allclose(np.concatenate([linear, angular]), result.twist, atol=1e-12)
+        np.testing.assert_array_equal(np.reshape(message.twist.covariance, (6, 6)), result.twist_covariance)
     assert message.child_frame_id == "base_link"
     for k, submap in enumerate(submaps):
         got = submap_from_messages(SubmapMessages(*(messages[k] for messages in sets)))

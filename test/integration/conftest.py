@@ -37,7 +37,7 @@ def domain_environment(workspace: dict[str, str], monkeypatch: pytest.MonkeyPatc
     for name in ("AMENT_PREFIX_PATH", "PYTHONPATH"):
         monkeypatch.setenv(name, workspace.get(name, ""))
     with PrivateDomain() as domain:
-        yield node_environment(domain, None) | {"PATH": workspace.get("PATH", os.environ["PATH"])}
+        yield node_environment(domain) | {"PATH": workspace.get("PATH", os.environ["PATH"])}
 
 
 @pytest.fixture(scope="session")

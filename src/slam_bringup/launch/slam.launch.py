@@ -30,9 +30,8 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(a.name, default_value=a.default, description=a.description, choices=a.choices or None)
         for a in ARGUMENTS
     ]
-    profile = SetEnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", str(SHARE / "config" / "fastdds.xml"))
     threads = SetEnvironmentVariable("OPENBLAS_NUM_THREADS", "1")  # every node has its core; more fight for it
-    return LaunchDescription([*arguments, RVIZ, profile, threads, OpaqueFunction(function=_nodes)])
+    return LaunchDescription([*arguments, RVIZ, threads, OpaqueFunction(function=_nodes)])
 
 
 def _nodes(context: LaunchContext) -> list[Node]:

@@ -11,9 +11,11 @@ from __future__ import annotations
 import array
 import importlib
 import importlib.util
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -34,6 +36,7 @@ from slam_core.types import AnyArray
 
 C = TypeVar("C", bound=Config)
 
+_PROFILE_VARIABLES = {"FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"}
 _SIGNAL_PERIOD_S = 0.1
 """Longest time that a node without traffic takes to notice a signal."""
 
@@ -150,6 +153,12 @@ def message_class(type_name: str) -> Any:
         return None
 
 
+def use_fast_dds_profile() -> None:
+    """Let Fast DDS carry large messages through shared memory, unless the environment says what it shall do."""
+    if not _PROFILE_VARIABLES & os.environ.keys():
+        os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(Path(__file__).with_name("fastdds.xml"))
+
+
 class RunnableNode(Protocol):
     """What :func:`run_node` needs of a node beside rclpy's own."""
 
@@ -186,6 +195,7 @@ def run_node(node_type: Callable[[], RunnableNode], args: list[str] | None = Non
     A signal only asks for the end: rclpy's own handlers would shut the context down under a callback that still
     publishes. The message in hand is finished first.
     """
+    use_fast_dds_profile()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()
     on_request_to_end(lambda *_: stopped.set())

@@ -40,7 +40,7 @@ def test_the_ament_index_comes_before_the_modules(tmp_path: Path) -> None:
 def start(tmp_path: Path, script: str, monkeypatch: pytest.MonkeyPatch) -> NodeProcess:
     install(tmp_path, "pkg", "node", script)
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
-    return NodeProcess.start(NodeCommand("pkg", "node"), tmp_path / "node.log", node_environment(1, None))
+    return NodeProcess.start(NodeCommand("pkg", "node"), tmp_path / "node.log", node_environment(1))
 
 
 def wait_for(node: NodeProcess, text: str) -> None:
@@ -69,7 +69,7 @@ def test_a_node_is_stopped_by_sigint_and_only_once(tmp_path: Path, monkeypatch: 
 def test_a_node_that_died_is_reported_with_the_end_of_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path, "pkg", "node", "raise SystemExit('no camera')")
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
-    with NodeGroup(node_environment(1, None), tmp_path / "logs") as group:
+    with NodeGroup(node_environment(1), tmp_path / "logs") as group:
         group.start(NodeCommand("pkg", "node")).process.wait(20)
         with pytest.raises(ValueError, match=r"node /node ended with code 1:\nno camera"):
             group.check()

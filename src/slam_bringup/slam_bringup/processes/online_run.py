@@ -20,7 +20,7 @@ from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.overrides import Overrides
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.node_graph import NodeGraph, plan_nodes, viewer_nodes
-from slam_bringup.processes.processes import NodeCommand, NodeGroup, PrivateDomain, ament_prefixes, node_environment
+from slam_bringup.processes.processes import NodeCommand, NodeGroup, PrivateDomain, node_environment
 from slam_core.files import atomic_text
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC
 
@@ -107,7 +107,7 @@ def run_nodes(
         graph = plan_nodes(config, opened.sensors, odometry, str(out / "map"), overrides)
         viewers = viewer_nodes(config, opened.sensors, view_port) if view_port else []
     with PrivateDomain() as domain:
-        environment = node_environment(domain, fastdds_profile())
+        environment = node_environment(domain)
         with NodeGroup(environment, logs or out / "logs") as group, _supervisor(environment, group) as supervisor:
             run = _Choreography(group, supervisor, graph, out, stopped)
             run.start_nodes(composed=composed)
@@ -129,12 +129,6 @@ def _supervisor(environment: dict[str, str], group: NodeGroup) -> Any:
     except ImportError as error:
         raise ValueError(f"the nodes need ROS 2 Jazzy ({error}): source an installation, or use ./slam") from error
     return module.Supervisor(environment, group.check)
-
-
-def fastdds_profile() -> Path | None:
-    """The Fast DDS profile of this package: installed, or in the source tree."""
-    folders = [Path(p) / "share/slam_bringup" for p in ament_prefixes()] + [Path(__file__).resolve().parents[2]]
-    return next((f / "config/fastdds.xml" for f in folders if (f / "config/fastdds.xml").exists()), None)
 
 
 class _Choreography:

@@ -74,8 +74,8 @@ def ament_prefixes() -> list[str]:
     return [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
 
 
-def node_environment(domain_id: int, profile: Path | None) -> dict[str, str]:
-    """Environment of the nodes: a private domain on this machine only, and the Fast DDS profile for large messages."""
+def node_environment(domain_id: int) -> dict[str, str]:
+    """Environment of the nodes: a private domain on this machine only."""
     environment = dict(os.environ)
     environment |= {
         "ROS_DOMAIN_ID": str(domain_id),
@@ -84,8 +84,6 @@ def node_environment(domain_id: int, profile: Path | None) -> dict[str, str]:
         "RCUTILS_LOGGING_USE_STDOUT": "1",
         "RCUTILS_COLORIZED_OUTPUT": "0",
     }
-    if profile is not None:
-        environment["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(profile)
     return environment
 
 
