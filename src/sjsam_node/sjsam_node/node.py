@@ -272,6 +272,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def _replace_map(self, path: Path) -> None:
         loaded = GlobalMap.load(path, self.config)
+        self._stamp_ns = max((r.submap.end_stamp_ns for r in loaded.graph.records), default=self._stamp_ns)
         outputs = self._map_messages(loaded)  # whatever is wrong with it shows before anything changes
         self.global_map = loaded
         self.localizers.clear()

@@ -1,0 +1,49 @@
+"""Each package names what it imports, for pip (setup.py) and for ROS (package.xml)."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+SRC = Path(__file__).resolve().parent.parent / "src"
+PACKAGES = sorted(path.name for path in SRC.iterdir() if (path / "setup.py").exists())
+PIP_NAME = {"cv2": "opencv-python-headless", "yaml": "PyYAML", "jinja2": "Jinja2", "mcubes": "PyMCubes"}
+ROSDEP_KEY = {
+    **{name: f"python3-{name}" for name in ("numpy", "scipy", "numba", "click", "rich", "jinja2", "matplotlib", "yaml")},
+    "cv2": "python3-opencv", "cvxopt": "python3-cvxopt", "rosbags": "python3-rosbags-pip",
+}  # fmt: skip
+"""Of the others there is no key in rosdep."""
+
+FROM_ROS = re.compile(
+    r"rclpy|launch(_ros)?|ament_index_python|rosidl_\w+|std_srvs|rcl_interfaces|\w+_msgs|builtin_interfaces"
+)
+BROUGHT_BY_ANOTHER = {"llvmlite": "numba", "mpl_toolkits": "matplotlib", "dask": "distributed", "rosidl_runtime_py": ""}
+
+
+def imported(package: str) -> set[str]:
+    names: set[str] = set()
+    for path in (SRC / package / package).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                names.add((node.module or "").split(".")[0])
+    return names - set(sys.stdlib_module_names) - {package}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_setup_and_package_xml_name_every_import(package: str) -> None:
+    setup, manifest = ((SRC / package / name).read_text(encoding="utf-8") for name in ("setup.py", "package.xml"))
+    required = set(re.findall(r'"([^"]+)"', re.search(r"install_requires=\[(.*?)\]", setup, re.DOTALL).group(1)))
+    named = set(re.findall(r"<(?:exec_)?depend>([^<]+)<", manifest))
+    for name in imported(package):
+        if FROM_ROS.fullmatch(name):
+            assert name in named, f"package.xml of {package} lacks {name}"
+        elif name not in BROUGHT_BY_ANOTHER:
+            assert PIP_NAME.get(name, name) in required, f"setup.py of {package} lacks {name}"
+            key = name if name in PACKAGES else ROSDEP_KEY.get(name)
+            assert key is None or key in named, f"package.xml of {package} lacks {key}"
