@@ -13,15 +13,14 @@ SRC = Path(__file__).resolve().parent.parent / "src"
 PACKAGES = sorted(path.name for path in SRC.iterdir() if (path / "setup.py").exists())
 PIP_NAME = {"cv2": "opencv-python-headless", "yaml": "PyYAML", "jinja2": "Jinja2", "mcubes": "PyMCubes"}
 ROSDEP_KEY = {
-    **{name: f"python3-{name}" for name in ("numpy", "scipy", "numba", "click", "rich", "jinja2", "matplotlib", "yaml")},
-    "cv2": "python3-opencv", "cvxopt": "python3-cvxopt", "rosbags": "python3-rosbags-pip",
+    **{name: f"python3-{name}" for name in ("numpy", "scipy", "numba", "click", "rich", "jinja2", "yaml")},
+    "matplotlib": "python3-matplotlib", "cv2": "python3-opencv", "cvxopt": "python3-cvxopt",
+    "rosbags": "python3-rosbags-pip",
 }  # fmt: skip
 """Of the others there is no key in rosdep."""
 
-FROM_ROS = re.compile(
-    r"rclpy|launch(_ros)?|ament_index_python|rosidl_\w+|std_srvs|rcl_interfaces|\w+_msgs|builtin_interfaces"
-)
-BROUGHT_BY_ANOTHER = {"llvmlite": "numba", "mpl_toolkits": "matplotlib", "dask": "distributed", "rosidl_runtime_py": ""}
+FROM_ROS = re.compile(r"rclpy|launch(_ros)?|ament_index_python|std_srvs|rcl_interfaces|\w+_msgs|builtin_interfaces")
+BROUGHT_BY_ANOTHER = {"llvmlite": "numba", "mpl_toolkits": "matplotlib", "dask": "distributed"}
 
 
 def imported(package: str) -> set[str]:

@@ -39,16 +39,15 @@ from std_srvs.srv import SetBool, Trigger
 
 from slam_core.config import Config
 from slam_core.exchange import SharedTypes, as_ros
-from slam_core.frame_tree import FrameTree
-from slam_core.geometry import FloatArray
 from slam_core.health import State
 from slam_core.job_queue import Job
-from slam_core.listening_node import LATCHED_DEPTH, Input, ListeningNode
-from slam_core.messages import STATIC_TRANSFORMS_TOPIC, MessageTypes, header_message, stamp_ns, transform_from_message
+from slam_core.listening_node import LATCHED_DEPTH, Input
+from slam_core.messages import MessageTypes, header_message, stamp_ns
 from slam_core.messages.base import Message
-from slam_core.ros import RosTypes, changed_config, declare_config, has_tf2_msgs, sensor_qos
+from slam_core.ros import changed_config, declare_config, sensor_qos
 from slam_core.stamp_guard import StampGuard, StampPolicy
 from slam_core.synchronizer import StampSynchronizer
+from slam_core.transform_node import TransformNode
 
 C = TypeVar("C", bound=Config)
 
@@ -62,7 +61,7 @@ _POLICIES = {
 PROGRESS_TOPIC = "/progress"
 
 
-class SlamNode(ListeningNode, Generic[C]):
+class SlamNode(TransformNode, Generic[C]):
     """Base of all nodes, see the example above. ``config`` is the checked configuration, ``types`` makes messages."""
 
     CHANGEABLE: ClassVar[tuple[str, ...]] = ()
@@ -72,9 +71,7 @@ class SlamNode(ListeningNode, Generic[C]):
         super().__init__(name)
         self.config: C = declare_config(self, config_type, ignore=("input.",), changeable=self.CHANGEABLE)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self._ros_types = RosTypes()
         self.types: MessageTypes = self._ros_types if self._exchange is None else SharedTypes(self._ros_types)
-        self.frames = FrameTree()
         self._stamps = StampGuard[Message]()
         self._synchronizers: list[StampSynchronizer[Message]] = []
         self._outputs: dict[str, Any] = {}
@@ -89,8 +86,6 @@ class SlamNode(ListeningNode, Generic[C]):
             self._ros_types.Header, PROGRESS_TOPIC, sensor_qos(self.input_config.depth)
         )
         self._diagnostics = self.create_publisher(self._ros_types.DiagnosticArray, "/diagnostics", sensor_qos(100))
-        self._listen_to_static_transforms()
-        self._tf = self._advertise_tf()
         self.create_service(Trigger, "~/reset", self._on_reset_service)
         self.create_service(SetBool, "~/pause", self._on_pause_service)
         self.create_service(Trigger, "~/finish", self._on_finish_service)
@@ -168,15 +163,6 @@ class SlamNode(ListeningNode, Generic[C]):
         """Whether anybody subscribes to an advertised topic: costly pictures are made only then."""
         inside = self._exchange is not None and self._exchange.has_listeners(self.resolve_topic_name(topic))
         return inside or bool(self._outputs[topic].get_subscription_count() > 0)
-
-    def lookup(self, target: str, source: str) -> FloatArray:
-        """T_target_source (4, 4) from the static transforms; ValueError, so a counted rejection, if unknown."""
-        return self.frames.lookup(target, source)
-
-    def broadcast(self, *transforms: Message) -> None:
-        """Send TransformStamped messages on /tf where tf2_msgs is installed."""
-        if self._tf is not None:
-            self._tf.publish(self._ros_types.TFMessage(transforms=as_ros(list(transforms))))
 
     def on_reset(self) -> None:
         """Forget everything (``~/reset``); override where there is state."""
@@ -282,10 +268,6 @@ class SlamNode(ListeningNode, Generic[C]):
         """Tell a player that the frame of a stamp needs no more waiting for."""
         self._progress.publish(header_message(self._ros_types, stamp, self.get_fully_qualified_name()))
 
-    def _reject(self, why: str, number: int = 1) -> None:
-        self.health.count("rejected", number)
-        self.get_logger().warning(why, throttle_duration_sec=1.0)
-
     # -- reset, pause, finish ------------------------------------------------------------------------------------------
 
     def start_session(self, why: str) -> None:
@@ -386,36 +368,3 @@ class SlamNode(ListeningNode, Generic[C]):
             self._waiting = (waiting, now)
         elif now - self._waiting[1] > self.input_config.overdue:
             self._jobs.add(Job("overdue", self.on_overdue))
-
-    def _unconnected(self) -> list[str]:
-        static = [] if any(s.get_publisher_count() for s in self._static_inputs) else [STATIC_TRANSFORMS_TOPIC]
-        return super()._unconnected() + static
-
-    # -- transforms ----------------------------------------------------------------------------------------------------
-
-    def _listen_to_static_transforms(self) -> None:
-        profile = sensor_qos(LATCHED_DEPTH, latched=True)
-        kind = self._ros_types.TransformStamped
-        self._static_inputs = [
-            self.create_subscription(kind, STATIC_TRANSFORMS_TOPIC, self._on_static_transform, profile)
-        ]
-        if has_tf2_msgs():
-            self._static_inputs.append(
-                self.create_subscription(self._ros_types.TFMessage, "/tf_static", self._on_tf_static, profile)
-            )
-
-    def _on_tf_static(self, message: Message) -> None:
-        for transform in message.transforms:
-            self._on_static_transform(transform)
-
-    def _on_static_transform(self, message: Message) -> None:
-        try:
-            self.frames.add(*transform_from_message(message))
-        except ValueError as error:
-            self._reject(f"static transform rejected: {error}")
-
-    def _advertise_tf(self) -> Any:
-        if has_tf2_msgs():
-            return self.create_publisher(self._ros_types.TFMessage, "/tf", sensor_qos(100))
-        self.get_logger().info("tf2_msgs is not installed: transforms are published as TransformStamped topics only")
-        return None
