@@ -16,6 +16,7 @@ setup(
     install_requires=[
         "setuptools",
         "slam_core",
+        "stereo_frontend",
         "numba",
         "numpy",
         "opencv-python-headless",

@@ -39,6 +39,8 @@ setup(
         "rich",
         "rosbags",
         "scipy",
+        "trimesh",
+        "viser",
     ],
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",
