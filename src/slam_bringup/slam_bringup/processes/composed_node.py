@@ -30,7 +30,7 @@ from slam_bringup.processes.node_graph import live_nodes
 from slam_bringup.processes.processes import NodeCommand
 from slam_core.exchange import Exchange
 from slam_core.process_life import end_with_parent, on_request_to_end
-from slam_core.ros import spin
+from slam_core.ros import spin, use_fast_dds_profile
 
 _NODES = {
     "stereo_driver": "stereo_frontend.driver_node:StereoDriverNode",
@@ -53,6 +53,7 @@ def run_composed(commands: Sequence[NodeCommand], ros_arguments: Sequence[str] =
     ValueError
         If a node refuses its parameters.
     """
+    use_fast_dds_profile()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()
     on_request_to_end(lambda *_: stopped.set())
