@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam_core.camera import Camera, StereoCamera
+from slam_core.camera import Camera, CameraInfo, StereoCamera
 from slam_core.config import from_mapping
-from slam_core.geometry import make_transform, so3_exp
+from slam_core.geometry import make_transform, so3_exp, so3_log
 from slam_core.types import StereoImages
+from stereo_frontend.corrected_info import corrected_right
 from stereo_frontend.frontend import Frontend, FrontendConfig
 from stereo_frontend.rectification_error import NAMES, RectificationError
+from stereo_frontend.rectify import rectification_map
 from stereo_frontend.self_calibration import SelfCalibrationConfig, StereoSelfCalibration
 from stereo_frontend.two_view_consistency import StereoView, match_views
 
@@ -161,3 +163,22 @@ def test_another_camera_begins_anew(stereo_pair):
     other = StereoCamera(Camera(320, 240, 210.0, 210.0, 160.0, 120.0), pair.stereo.baseline)
     frontend.process(StereoImages(pair.stamp_ns + 1, pair.left, pair.right, other))
     assert frontend.self_calibration.error.camera == other.camera
+
+
+def test_a_corrected_camera_info_takes_the_error_out():
+    raw = Camera(640, 480, 470.0, 471.0, 322.0, 238.0, "plumb_bob", (-0.28, 0.07, 0.0004, -0.0003, 0.0))
+    P = np.hstack([STEREO.camera.K, [[-400.0 * 0.12], [0.0], [0.0]]])
+    info = CameraInfo(raw, so3_exp(np.array([0.004, -0.006, 0.005])), P)
+    error = RectificationError(STEREO.camera, linear_error(TURN / 3.0), np.eye(len(NAMES)))
+    corrected, left_over = corrected_right(info, error)
+    assert left_over < 0.02
+    np.testing.assert_array_equal(corrected.P, info.P)
+    turned = corrected.R @ info.R.T
+    assert np.linalg.norm(so3_log(turned)) == pytest.approx(np.linalg.norm(TURN / 3.0), rel=0.6)
+    pixels = np.array([[100.0, 80.0], [320.0, 240.0], [600.0, 400.0]])
+    before, after = (rectification_map(i, STEREO.camera) for i in (info, corrected))
+    shifts = np.column_stack([error.columns(pixels), error.rows(pixels, np.zeros(3))])
+    for (u, v), shift in zip(pixels.astype(int), shifts, strict=True):
+        moved = STEREO.camera.unproject(np.array([[u, v]]) + shift, np.ones(1)) @ info.R
+        np.testing.assert_allclose(after[v, u], raw.project(moved)[0], atol=0.03)
+        assert np.abs(after[v, u] - before[v, u]).max() > 0.05

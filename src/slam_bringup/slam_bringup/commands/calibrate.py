@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_bringup.commands.refine import refine, write_refined
 from slam_bringup.report.figures import save_png
 from slam_calibration.board import Board, parse_board
 from slam_calibration.bundle import BundleResult
@@ -39,11 +40,12 @@ FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_fr
 
 
 @click.command()
-@click.argument("kind", type=click.Choice(list(CAMERAS)))
+@click.argument("kind", type=click.Choice([*CAMERAS, "refine"]))
 @click.argument("images", nargs=-1, required=True)
 @click.option(
-    "--board", "board_text", required=True,
-    help="chessboard:9x6:0.025 (inner corners, square in m), aprilgrid:6x6:0.088:0.3 (tags, edge in m, gap over edge) "
+    "--board", "board_text",
+    help="not for refine. chessboard:9x6:0.025 (inner corners, square in m), aprilgrid:6x6:0.088:0.3 (tags, edge in m, "
+    "gap over edge) "
     "or charuco:11x8:0.03:0.022 (squares, square and marker in m)",
 )  # fmt: skip
 @click.option(
@@ -57,14 +59,20 @@ FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_fr
 @click.option("-o", "--output", required=True, type=UserPath(file_okay=False), help="folder to write")
 @overwrite_option("results of other images, or results that were changed since")
 def command(
-    kind: str, images: tuple[str, ...], board_text: str, model: str, left_info: Path | None, output: Path,
+    kind: str, images: tuple[str, ...], board_text: str | None, model: str, left_info: Path | None, output: Path,
     overwrite: bool,
 ) -> None:  # fmt: skip
     """Calibrate one camera (mono), a stereo pair, or a stereo camera's left eye with a ToF camera (stereo-tof).
 
     IMAGES are files, folders or quoted patterns; for two cameras one folder or pattern each, or all files of the first
-    followed by those of the second.
+    followed by those of the second. With refine IMAGES is a bag: its stereo calibration is corrected by what its own
+    pairs show.
     """
+    if kind == "refine":
+        _refine(images, output, overwrite)
+        return
+    if board_text is None:
+        raise ValueError(f"calibrate {kind} needs --board, for instance --board chessboard:9x6:0.025")
     names, board = CAMERAS[kind], parse_board(board_text)
     lenses = _lenses(model, len(names))
     results = OutputFolder(output, "calibrate", f"{kind} {' '.join(images)}", overwrite=overwrite)
@@ -77,6 +85,20 @@ def command(
             _write(folder, kind, result, board, views, _infos(kind, result, rectified_left))
     click.echo(tables(result, names))
     click.echo(f"written to {output}")
+
+
+def _refine(bags: tuple[str, ...], output: Path, overwrite: bool) -> None:
+    if len(bags) != 1:
+        raise ValueError(f"calibrate refine takes one bag, got {len(bags)}")
+    results = OutputFolder(output, "calibrate", f"refine {bags[0]}", overwrite=overwrite)
+    with results:
+        infos, figures = refine(Path(bags[0]).expanduser())
+        with results.staged() as folder:
+            write_refined(folder, infos, figures)
+    click.echo(
+        f"rows were off by {figures['row_error_px']:.2f} px, disparities by {figures['disparity_error_px']:.2f} +- "
+        f"{figures['disparity_error_sigma_px']:.2f} px; left.yaml and right.yaml written to {output}"
+    )
 
 
 def _lenses(model: str, cameras: int) -> list[str]:
