@@ -103,3 +103,12 @@ def test_reset_forgets_the_model_and_save_writes_it(node, tmp_path):
     assert {p.name for p in (tmp_path / "dense").iterdir()} == {"mesh.ply", "floor_plan.yaml", "floor_plan.pgm"}
     node.on_reset()
     assert not node.mapper.model.keyframes
+
+
+def test_a_new_session_keeps_what_is_in_the_model(node):
+    poses = drive(node)
+    node._on_path("", path_message(TYPES, poses[-1].stamp_ns, "map", poses))
+    drive(node)
+    node.on_new_session()
+    assert len(node.mapper.model.keyframes) == 5
+    assert node.mapper.waiting == 0

@@ -55,6 +55,13 @@ class LiveMapper:
         self._mounts: dict[str, tuple[str, FloatArray]] = {}
         self._waiting: deque[_Waiting] = deque()
 
+    def begin_session(self) -> None:
+        """The clock has begun anew: drop what waits for a pose of the old time; the model stays."""
+        self.dropped += len(self._waiting)
+        self._waiting.clear()
+        self._selectors.clear()
+        self._odometry.clear()
+
     @property
     def waiting(self) -> int:
         """Key frames whose pose is not known yet."""

@@ -36,6 +36,7 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.ros import run_node
+from slam_core.stamp_guard import StampPolicy
 from slam_core.types import AnyArray
 from stereo_frontend.calibrated_pairs import SIDES
 from stereo_frontend.sources import RawPair
@@ -77,6 +78,10 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         self.mapper.reset()
         self._is_news = False
 
+    def on_new_session(self) -> None:
+        """Keep the model; what waits for a pose of the old time will get none."""
+        self.mapper.begin_session()
+
     def on_finish(self) -> str:
         """Move and publish everything now."""
         self._publish_model()
@@ -87,7 +92,7 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
     def _listen_to(self, agent: str) -> None:
         below = partial(_below, agent)
         self.listen(below("odom"), "Odometry", partial(self._on_odometry, agent))
-        self.listen(below("map/path"), "Path", partial(self._on_path, agent), latched=True)
+        self.listen(below("map/path"), "Path", partial(self._on_path, agent), latched=True, stamps=StampPolicy.ANY)
         if self.config.use_tof:
             topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
             topics = {below(topic): kind for topic, kind in topics.items()}

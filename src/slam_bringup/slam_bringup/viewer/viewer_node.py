@@ -29,6 +29,7 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.ros import run_node, sensor_qos
+from slam_core.stamp_guard import StampPolicy
 from slam_core.types import ByteArray, PoseEstimate
 
 _SILENT_S = 3.0
@@ -89,25 +90,58 @@ class ViewerNode(SlamNode[ViewerConfig]):
 
     def _listen_to(self, index: int, agent: str) -> None:
         below = partial(_below, agent)
-        self.listen(below("odom"), "Odometry", partial(self._on_odometry, index, agent), required=False)
         self.listen(
-            below("map_to_odom"), "TransformStamped", partial(self._on_map_to_odom, agent), latched=True, required=False
+            below("odom"), "Odometry", partial(self._on_odometry, index, agent), required=False, stamps=StampPolicy.ANY
         )
-        self.listen(below("pose"), "PoseWithCovarianceStamped", partial(self._on_pose, agent), required=False)
-        self.listen(below("map/path"), "Path", partial(self._on_path, index, agent), latched=True, required=False)
-        self.listen(below("features/image"), "Image", partial(self._on_picture, agent), required=False)
+        self.listen(
+            below("map_to_odom"),
+            "TransformStamped",
+            partial(self._on_map_to_odom, agent),
+            latched=True,
+            required=False,
+            stamps=StampPolicy.ANY,
+        )
+        self.listen(
+            below("pose"),
+            "PoseWithCovarianceStamped",
+            partial(self._on_pose, agent),
+            required=False,
+            stamps=StampPolicy.ANY,
+        )
+        self.listen(
+            below("map/path"),
+            "Path",
+            partial(self._on_path, index, agent),
+            latched=True,
+            required=False,
+            stamps=StampPolicy.ANY,
+        )
+        self.listen(
+            below("features/image"), "Image", partial(self._on_picture, agent), required=False, stamps=StampPolicy.ANY
+        )
 
     def _listen_to_map(self) -> None:
-        self.listen("map/landmarks", "PointCloud2", self._on_landmarks, latched=True, required=False)
+        self.listen(
+            "map/landmarks", "PointCloud2", self._on_landmarks, latched=True, required=False, stamps=StampPolicy.ANY
+        )
         # Markers have no stamp of their own, which the inputs of estimators need.
         for topic, show in (("map/graph", self._on_graph), ("map/marks", self._on_marks)):
             self.create_subscription(self.types.MarkerArray, topic, show, sensor_qos(1, latched=True))
         # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
         self.create_subscription(self.types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
-        self.listen("map/dense_cloud", "PointCloud2", self._on_dense_cloud, latched=True, required=False)
+        self.listen(
+            "map/dense_cloud", "PointCloud2", self._on_dense_cloud, latched=True, required=False, stamps=StampPolicy.ANY
+        )
         for number in range(_STOREYS):
             topic = f"map/occupancy_{number}" if number else "map/occupancy"
-            self.listen(topic, "OccupancyGrid", partial(self._on_plan, number), latched=True, required=False)
+            self.listen(
+                topic,
+                "OccupancyGrid",
+                partial(self._on_plan, number),
+                latched=True,
+                required=False,
+                stamps=StampPolicy.ANY,
+            )
 
     # -- agents --------------------------------------------------------------------------------------------------------
 
