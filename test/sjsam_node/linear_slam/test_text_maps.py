@@ -163,6 +163,7 @@ def test_the_command_writes_summary_poses_and_features(rows: str, rng: np.random
     assert summary["features"] == len((out / "features.txt").read_text().splitlines())
     assert len((out / "poses.txt").read_text().splitlines()) == 9
     assert summary["chi2"] > 0.0
+    assert summary["degrees_of_freedom"] == sum(len(m.information) for m in maps) - 8 * 3 - 2 * summary["features"]
     assert summary["wall_s"] > 0.0
     assert sorted(p.name for p in out.iterdir()) == [".slam.json", "features.txt", "poses.txt", "summary.json"]
 

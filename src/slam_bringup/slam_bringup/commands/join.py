@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import click
 from rich.progress import Progress
 
 from sjsam_node.linear_slam.text_joining import ROWS, TextJoiningConfig, TextJoiningResult, join_text_maps
-from sjsam_node.linear_slam.text_maps import find_maps, read_maps, write_values
+from sjsam_node.linear_slam.text_maps import TextMap, find_maps, read_maps, write_values
 from sjsam_node.smoothing.robust import LOSSES
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.config import from_mapping
@@ -45,7 +46,7 @@ def command(
             result = join_text_maps(
                 maps, dimension, config, lambda done, total: bar.update(task, completed=done, total=total)
             )
-        summary = _summary(result, len(maps), dimension, rows, time.perf_counter() - began)
+        summary = _summary(result, maps, dimension, rows, time.perf_counter() - began)
         with results.staged() as staged:
             _write(staged, result, summary)
     click.echo(json.dumps(summary))
@@ -64,13 +65,24 @@ def _yaml(path: Path | None) -> dict[str, Any]:
     return values
 
 
-def _summary(result: TextJoiningResult, submaps: int, dimension: int, rows: str, wall_s: float) -> dict[str, Any]:
+def _summary(
+    result: TextJoiningResult, maps: Sequence[TextMap], dimension: int, rows: str, wall_s: float
+) -> dict[str, Any]:
     return {
-        "chi2": result.chi2, "submaps": submaps, "features": len(result.feature_ids), "wall_s": round(wall_s, 3),
+        "chi2": result.chi2, "degrees_of_freedom": _degrees_of_freedom(result, maps), "submaps": len(maps),
+        "features": len(result.feature_ids), "wall_s": round(wall_s, 3),
         "poses": len(result.pose_ids), "dimension": dimension, "rows": rows, "chi2_chained_start": result.start_chi2,
         "start": result.start, "iterations": result.iterations, "converged": result.converged, "solver": result.solver,
         "dropped": result.dropped,
     }  # fmt: skip
+
+
+def _degrees_of_freedom(result: TextJoiningResult, maps: Sequence[TextMap]) -> int | None:
+    """Values of all submaps less the unknowns, the first pose being given; None where closures were left out."""
+    if result.dropped:
+        return None
+    observed = sum(len(submap.information) for submap in maps)
+    return int(observed - (result.poses.size - result.poses.shape[1] + result.features.size))
 
 
 def _write(output: Path, result: TextJoiningResult, summary: dict[str, Any]) -> None:
