@@ -7,11 +7,12 @@ While a node lives its copy is at ``path``. One that ends in order renames it to
 from __future__ import annotations
 
 import os
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from sjsam_node import storage
-from sjsam_node.storage import StoredMap
+from sjsam_node.storage import PackedMap, StoredMap
 from slam_core.files import remove
 
 _SHARE = 20.0
@@ -29,7 +30,7 @@ class Autosave:
         self.ended = path.with_name(f"{path.name}.ended")
         self._period_s = period_s
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="autosave")
-        self._job: Future[None] | None = None
+        self._job: Future[float] | None = None
         self._due_s = 0.0
         self._began_s = 0.0
 
@@ -46,14 +47,19 @@ class Autosave:
         """Whether to hand over the map now; what went wrong with the copy before is raised here."""
         if self._job is not None and self._job.done():
             job, self._job = self._job, None
-            self._due_s = max(self._due_s, now_s + _SHARE * (now_s - self._began_s) - self._period_s)
-            job.result()
+            self._due_s = max(self._due_s, self._began_s + _SHARE * job.result())
         return self.is_on and self._job is None and now_s >= self._due_s
 
     def save(self, stored: StoredMap, now_s: float) -> None:
         """Write a copy of the map as it is now."""
         self._began_s, self._due_s = now_s, now_s + self._period_s
-        self._job = self._writer.submit(storage.write_packed, self.path, storage.pack(stored))
+        self._job = self._writer.submit(self._write, storage.pack(stored))
+
+    def _write(self, packed: PackedMap) -> float:
+        """Write a copy; the time it took, s."""
+        started = time.perf_counter()
+        storage.write_packed(self.path, packed)
+        return time.perf_counter() - started
 
     def put_away(self) -> None:
         """Wait for the writer and rename the copy: the node ends in order, or its map was reset."""
