@@ -1,4 +1,4 @@
-"""From rendered pictures to the calibration: does it recover the cameras that took them?
+"""Calibrate from rendered pictures and compare with the cameras that took them.
 
     python benchmarks/calibration/rendered.py [--views 16]
 

@@ -34,8 +34,9 @@ _OUTLIER = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Sightings of one landmark: residuals (n, 3) of u, v and inverse depth over their sigmas; arms (n, 3) m from the
-    point to the camera.
+    """Sightings of one landmark: residuals (n, 3) of u, v and inverse depth over their sigmas.
+
+    Arms (n, 3) m from the point to the camera.
     """
 
     residuals: FloatArray

@@ -1,5 +1,6 @@
-"""Are the standard deviations true? (measured - true) / sigma of u, v and depth over simulated frames, and fused
-against both.
+"""Tell whether the standard deviations are true.
+
+(measured - true) / sigma of u, v and depth over simulated frames, and fused against both.
 
 Depth: per mode and source. Pixels: a keypoint of one frame against its partner 0.3 s later, whose true place is known;
 both standard deviations count. "std" is that of normalised errors below 5 (what is beyond is listed: edges, where a

@@ -1,5 +1,6 @@
-"""The joining problem of block rows in Ceres (pyceres), with pycolmap's compiled residuals: point alignment and
-relative pose.
+"""The joining problem of block rows in Ceres (pyceres), with pycolmap's compiled residuals.
+
+Point alignment and relative pose.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Tables 10.1 and 10.2 and beyond: 15 scans per motion, one setting, no initial guess; share of points, time,
-iterations.
+"""Tables 10.1 and 10.2 and beyond: 15 scans per motion, one setting, no initial guess.
+
+Share of points, time, iterations.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""The same scans by PCL's NDT and ICP, small_gicp, Open3D, and ours: successes (5 cm, 1 deg) and milliseconds, build
-and align.
+"""The same scans by PCL's NDT and ICP, small_gicp, Open3D, and ours.
+
+Successes (5 cm, 1 deg) and milliseconds, build and align.
 
 PCL is built here from pcl.cpp (Debian: libpcl-dev); small_gicp and Open3D are imported where they are installed.
 """

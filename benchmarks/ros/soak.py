@@ -1,4 +1,4 @@
-"""An hour of bag time through the filter and the joiner, moving and standing: do memory and latency grow?
+"""Growth of memory and latency over an hour of bag time through filter and joiner, moving and standing.
 
     python benchmarks/ros/soak.py [MINUTES]         60 by default, of bag time for each of the two
 

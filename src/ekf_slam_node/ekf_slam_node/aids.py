@@ -70,8 +70,9 @@ class MotionAids:
         )
 
     def learn_bias(self, aid: Aid, T_previous_now: FloatArray, covariance: FloatArray, dt: float) -> None:
-        """Compare an aid that came from turn rates with the motion that the images alone have shown, covariance (6, 6)
-        along the axes of the previous frame, dt (s).
+        """Compare an aid from turn rates with the motion that the images alone have shown.
+
+        covariance: (6, 6) along the axes of the previous frame; dt: s.
         """
         if aid.rows != ROTATION:
             return

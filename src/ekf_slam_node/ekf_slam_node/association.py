@@ -110,8 +110,9 @@ def associate_nearest(
 
 
 def match_descriptors(similarity: Similarity, threshold: float, ratio: float) -> tuple[IndexArray, IndexArray]:
-    """Mutual best pairs without any motion: better than ``threshold`` and clearly better than each one's second
-    best.
+    """Mutual best pairs without any motion.
+
+    Better than ``threshold`` and clearly better than each one's second best.
     """
     if min(similarity.shape) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)

@@ -1,5 +1,6 @@
-"""What a frame may be associated with: landmarks and features of the previous frame, as the previous rig pose has them
-around it.
+"""What a frame may be associated with.
+
+Landmarks and features of the previous frame, as the previous rig pose has them around it.
 
 In this robot-centred form a landmark of the filter and a feature that is not yet a landmark are the same thing: a
 point in the previous rig frame, its covariance and its descriptor. What separates the frames is one relative motion

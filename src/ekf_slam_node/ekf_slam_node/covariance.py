@@ -118,8 +118,9 @@ class Covariance:
         blas.add_product(self._state, np.asfortranarray(A), np.asfortranarray(B))
 
     def append(self, cross: FloatArray, block: FloatArray) -> None:
-        """Add rows: their covariance with the state, ``cross`` (k, n), and among themselves, ``block`` (k, k) (Eq.
-        6.23).
+        """Add rows.
+
+        Their covariance with the state, ``cross`` (k, n), and among themselves, ``block`` (k, k) (Eq. 6.23).
         """
         n, k = self.size, len(block)
         self._reserve(n + k)
@@ -128,8 +129,9 @@ class Covariance:
         self.size = n + k
 
     def remove(self, first: int, width: int) -> None:
-        """Drop rows ``first .. first + width`` (marginalise); the last ``width`` rows of the state move into their
-        place.
+        """Drop rows ``first .. first + width`` (marginalise).
+
+        The last ``width`` rows of the state move into their place.
         """
         last = self.size - width
         if first != last:

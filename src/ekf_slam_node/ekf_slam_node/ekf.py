@@ -58,8 +58,9 @@ class TimeUpdate:
 
 
 class Ekf:
-    """State and covariance of a rig (frame ``T``, body ``velocity``) and landmarks (m, 3), all in the frame of the
-    submap.
+    """State and covariance of a rig and its landmarks, in the frame of the submap.
+
+    The rig has a frame ``T`` and a body ``velocity``; landmarks are (m, 3).
 
     Parameters
     ----------
@@ -85,8 +86,9 @@ class Ekf:
 
     # ------------------------------------------------------------------------------------------------------ time
     def time_update(self, dt: float, sigma: FloatArray, T_previous_now: FloatArray | None = None) -> TimeUpdate:
-        """Predict dt (s) ahead with acceleration noise sigma (6,); with a motion guess, linearised there (iterated
-        EKF).
+        """Predict dt (s) ahead with acceleration noise sigma (6,).
+
+        With a motion guess, linearised there (iterated EKF).
         """
         at = self.velocity if T_previous_now is None else velocity_of_motion(T_previous_now, dt)
         F, R = motion_jacobian(self.T, at, dt), self.T[:3, :3]
@@ -113,8 +115,9 @@ class Ekf:
     def update_increment(
         self, step: TimeUpdate, error: FloatArray, covariance: FloatArray, rows: slice, gate: float
     ) -> UpdateReport:
-        """Measure the motion of the step just applied: error (k,) of its rows (translation, rotation) in the map's
-        axes.
+        """Measure the motion of the step just applied.
+
+        Error (k,) of its rows (translation, rotation) in the map's axes.
 
         Not applied if its NIS is beyond the gate. The state stays where it is linearised, at the motion found from the
         landmarks: an update by them must follow, or :meth:`settle`.
@@ -180,8 +183,10 @@ class Ekf:
         slots: IndexArray,
         common: FloatArray | None = None,
     ) -> UpdateReport:
-        """Measurements z (m, 3) with variances (m, 3) of the landmarks ``slots`` (m,), predicted as ``seen`` (Eqs.
-        6.16-6.21), and with an error of the camera's pose of standard deviations ``common`` (6,) that all share.
+        """Update with measurements z (m, 3) of variances (m, 3) of the landmarks ``slots`` (m,).
+
+        They are predicted as ``seen`` (Eqs. 6.16-6.21). ``common`` (6,): standard deviations of an error of the
+        camera's pose that all share.
 
         Without measurements, and where S cannot be factored, the state moves to its prediction and nothing is applied.
         """
@@ -236,8 +241,9 @@ class Ekf:
 
     # -------------------------------------------------------------------------------------------------- augmentation
     def augment(self, points: FloatArray, covariances: FloatArray) -> IndexArray:
-        """Add landmarks measured at (k, 3) in the rig frame with covariances (k, 3, 3); returns their slots (Eqs.
-        6.22-6.24).
+        """Add landmarks measured at (k, 3) in the rig frame with covariances (k, 3, 3).
+
+        Returns their slots (Eqs. 6.22-6.24).
         """
         k, R = len(points), self.T[:3, :3]
         arm = points @ R.T

@@ -25,8 +25,9 @@ class GyroBias:
         self._walk = config.sigma_gyro_bias_walk**2
 
     def learn(self, error: FloatArray, noise: FloatArray, dt: float) -> None:
-        """Take in by how much (3,) rad/s the corrected turn rate over dt (s) exceeds the one seen; noise (3, 3) of
-        both.
+        """Take in by how much (3,) rad/s the corrected turn rate over dt (s) exceeds the one seen.
+
+        Noise (3, 3) of both.
         """
         self.covariance = self.covariance + np.eye(3) * (self._walk * dt)
         S = self.covariance + noise

@@ -21,8 +21,9 @@ UNPAIRED = -1
 
 @dataclass(frozen=True, eq=False)
 class JointPrediction:
-    """What L landmarks will look like: ``z`` (L, d) and the joint covariance ``H P H'`` (L d, L d), correlations
-    included.
+    """What L landmarks will look like.
+
+    ``z`` (L, d) and the joint covariance ``H P H'`` (L d, L d), correlations included.
     """
 
     z: FloatArray

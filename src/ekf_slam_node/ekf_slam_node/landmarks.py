@@ -71,8 +71,9 @@ class LandmarkBook:
         return book
 
     def count(self, seen: IndexArray, descriptors: Float32Array, expected: np.ndarray) -> None:
-        """Count the sightings of slots ``seen`` with their new descriptors; ``expected`` masks those that are in
-        view.
+        """Count the sightings of slots ``seen`` with their new descriptors.
+
+        ``expected`` masks those that are in view.
         """
         self.sightings[seen] += 1
         self._hits[seen] += 1
@@ -82,8 +83,9 @@ class LandmarkBook:
         self.descriptors[seen] = blended / np.maximum(np.linalg.norm(blended, axis=1, keepdims=True), 1e-6)
 
     def unreliable(self, frame: int, config: LandmarkConfig) -> IndexArray:
-        """Slots to be removed, highest first: too few sightings in their first frames, or missed where they should be
-        seen.
+        """Slots to be removed, highest first.
+
+        Too few sightings in their first frames, or missed where they should be seen.
         """
         probation = (frame - self._first_frame >= config.probation_frames) & (self.sightings < config.min_sightings)
         missed = (self._expected >= config.min_expected) & (self._hits < config.min_hit_ratio * self._expected)

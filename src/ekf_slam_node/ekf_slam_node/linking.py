@@ -1,5 +1,6 @@
-"""Linking a frame to what is known: association under the prediction, or under a motion guess where the prediction
-fails.
+"""Linking a frame to what is known.
+
+Association under the prediction, or under a motion guess where the prediction fails.
 """
 
 from __future__ import annotations

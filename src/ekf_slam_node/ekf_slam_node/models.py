@@ -97,8 +97,9 @@ def frame_from_features(features: Features, usable: np.ndarray, min_sigma_px: fl
 
 
 def project(points: FloatArray, camera: Camera) -> FloatArray:
-    """Measurements (n, 3) of points (n, 3) in the optical frame; depths are kept away from zero, see the visibility
-    test.
+    """Measurements (n, 3) of points (n, 3) in the optical frame.
+
+    Depths are kept away from zero, see the visibility test.
     """
     w = 1.0 / _safe_depth(points[:, 2])
     return np.column_stack([camera.fx * points[:, 0] * w + camera.cx, camera.fy * points[:, 1] * w + camera.cy, w])
@@ -153,8 +154,9 @@ def observe(T_parent_rig: FloatArray, T_rig_optical: FloatArray, points: FloatAr
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Predicted measurements (n, 3), depths (n,) m, Jacobians with respect to the rig's pose (n, 3, 6) and the points
-    (n, 3, 3).
+    """Predicted measurements (n, 3), depths (n,) m, and Jacobians.
+
+    The Jacobians are with respect to the rig's pose (n, 3, 6) and the points (n, 3, 3).
     """
 
     z: FloatArray

@@ -31,8 +31,11 @@ _MAX_EXCESS = 25.0
 
 @dataclass(frozen=True, eq=False)
 class MotionGuess:
-    """``T`` = T_previous_now (4, 4), covariance (6, 6) of the pairs alone, mask of the pairs that agree (n,), and by
-    what factors (3,) their errors exceed the claimed variances; error (n, 3): measured less predicted, of all pairs.
+    """A motion guessed from pairs, and the pairs that agree with it.
+
+    T: T_previous_now (4, 4); covariance: (6, 6), of the pairs alone; inliers: mask of the pairs that agree (n,); the
+    factors (3,) by which their errors exceed the claimed variances; error: (n, 3), measured less predicted, of all
+    pairs.
     """
 
     T: FloatArray

@@ -34,8 +34,9 @@ class NoiseMonitor:
         return frame.with_larger_noise(self.factor)
 
     def learn(self, frame: Frame, ratio: FloatArray) -> Frame:
-        """Take in by how much (3,) a corrected frame's errors exceed its variances; the frame itself, if far off,
-        corrected.
+        """Take in by how much (3,) a corrected frame's errors exceed its variances.
+
+        The frame itself, if far off, corrected.
         """
         limit = np.log(self._config.max_noise_factor)
         applied = np.log(self.factor)

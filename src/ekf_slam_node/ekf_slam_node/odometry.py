@@ -31,8 +31,9 @@ class OdometryChain:
         self._T, self._covariance = end.T, end.covariance
 
     def points(self, points: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 3) of the open submap in the odom frame with covariances (n, 3, 3) relative to the submap's
-        start.
+        """Points (n, 3) of the open submap in the odom frame, with covariances (n, 3, 3).
+
+        The covariances are relative to the submap's start.
         """
         R = self._T[:3, :3]
         return transform_points(self._T, points), R @ covariances @ R.T

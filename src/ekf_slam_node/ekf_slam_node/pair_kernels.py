@@ -1,5 +1,6 @@
-"""Compiled kernels for pairs of a point and its measurement under a motion: errors, covariances, gates, normal
-equations, and who is paired first.
+"""Compiled kernels for pairs of a point and its measurement under a motion.
+
+Errors, covariances, gates, normal equations, and who is paired first.
 
 They are what :func:`ekf_slam_node.models.observe` and :mod:`ekf_slam_node.candidates` say in NumPy, for the loops that
 run many times per frame.
@@ -17,8 +18,9 @@ from slam_core.geometry import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class PairErrors:
-    """error (n, 3): measured less predicted; S (n, 3, 3) its covariance; J (n, 3, 6) with respect to the motion's
-    error; depth (n,) predicted, m.
+    """error (n, 3): measured less predicted.
+
+    S (n, 3, 3) its covariance; J (n, 3, 6) with respect to the motion's error; depth (n,) predicted, m.
     """
 
     error: FloatArray
@@ -84,8 +86,9 @@ def _factor(S, scale, L):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def gated(error, S, depth, scale, gate):  # type: ignore[no-untyped-def]
-    """Which pairs (n,) lie inside the gate, with standard deviations multiplied by ``scale`` (3,), and before the
-    camera.
+    """Mask (n,) of the pairs that lie inside the gate and before the camera.
+
+    Standard deviations are multiplied by ``scale`` (3,).
     """
     out = np.zeros(len(error), np.bool_)
     L = np.zeros((3, 3))

@@ -59,8 +59,9 @@ def move(pose: FloatArray, motion: FloatArray) -> tuple[FloatArray, FloatArray, 
 
 
 def range_bearing(pose: FloatArray, landmarks: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Ranges and bearings (n, 2) of landmarks (n, 2), Jacobians with respect to pose (n, 2, 3) and landmark (n, 2,
-    2).
+    """Ranges and bearings (n, 2) of landmarks (n, 2), with Jacobians.
+
+    The Jacobians are with respect to pose (n, 2, 3) and landmark (n, 2, 2).
     """
     delta = landmarks - pose[:2]
     squared = np.einsum("ni,ni->n", delta, delta)

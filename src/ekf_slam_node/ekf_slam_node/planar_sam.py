@@ -1,5 +1,6 @@
-"""Smoothing in the plane (thesis 1.7, 6.5): all poses and landmarks at once, by sparse least squares on the
-measurements.
+"""Smoothing in the plane (thesis 1.7, 6.5).
+
+All poses and landmarks at once, by sparse least squares on the measurements.
 """
 
 from __future__ import annotations

@@ -21,8 +21,9 @@ class TrackingState(Enum):
 
 @dataclass(frozen=True, eq=False)
 class LandmarkView:
-    """Landmarks of the open submap in the odom frame: ids (n,), positions (n, 3), covariances (n, 3, 3), sightings
-    (n,), descriptors.
+    """Landmarks of the open submap in the odom frame.
+
+    Ids (n,), positions (n, 3), covariances (n, 3, 3), sightings (n,), descriptors.
     """
 
     ids: np.ndarray

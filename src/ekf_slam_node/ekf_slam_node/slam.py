@@ -1,5 +1,6 @@
-"""EKF-SLAM from frame to frame: features in, poses, landmarks and finished submaps out (thesis chapter 6, Algorithm
-3).
+"""EKF-SLAM from frame to frame.
+
+Features in, poses, landmarks and finished submaps out (thesis chapter 6, Algorithm 3).
 """
 
 from __future__ import annotations
@@ -294,8 +295,9 @@ class EkfSlam:
         return self._report(frame.stamp_ns, TrackingState.DEGRADED, "no visual association, moved by odometry alone")
 
     def _miss(self, frame: Frame) -> EkfResult:
-        """No link: nothing is mapped. The filter stays at the last linked frame, so that the old map can be found
-        again.
+        """No link: nothing is mapped.
+
+        The filter stays at the last linked frame, so that the old map can be found again.
         """
         self.counters.add("frames_lost")
         self._lost_frames += 1
@@ -389,8 +391,9 @@ class EkfSlam:
 
     # -------------------------------------------------------------------------------------------------------- output
     def _pose(self, stamp_ns: int) -> PoseEstimate:
-        """T_odom_rig at a stamp not before the filter's: beyond it the rig is assumed to go on for a while and then to
-        stop.
+        """T_odom_rig at a stamp not before the filter's.
+
+        Beyond it the rig is assumed to go on for a while and then to stop.
         """
         assert self._map is not None
         ekf = self._map.ekf

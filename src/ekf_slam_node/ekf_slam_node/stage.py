@@ -158,8 +158,9 @@ class FilterStage:
         return self._slam
 
     def _give_aids(self, slam: EkfSlam, stamp_ns: int) -> None:
-        """The motions that began before the frame, and readings up to the first that is not older: what has come beyond
-        that depends on the speed of the replay.
+        """The motions that began before the frame, and readings up to the first that is not older.
+
+        What has come beyond that depends on the speed of the replay.
         """
         while self._motions and self._motions[0].start_stamp_ns < stamp_ns:
             slam.process_motion(self._motions.popleft())

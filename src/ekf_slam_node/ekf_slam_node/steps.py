@@ -38,8 +38,10 @@ class LinkedFrame:
 
 @dataclass(frozen=True, eq=False)
 class UpdatedFrame:
-    """Outcome of a measurement update: landmarks ``measured``, whether the submap ``closes`` with this frame, and who
-    was measured: ids (k,) of the landmarks, index (k,) of the features.
+    """Outcome of a measurement update.
+
+    Landmarks ``measured``, whether the submap ``closes`` with this frame, and who was measured: ids (k,) of the
+    landmarks, index (k,) of the features.
     """
 
     report: UpdateReport

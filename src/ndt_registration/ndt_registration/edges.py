@@ -23,8 +23,9 @@ MAX_IMAGE_SIZE = 512
 
 @njit(cache=True, nogil=True)
 def _sorted_by_bin(points: FloatArray, size: int) -> tuple[FloatArray, FloatArray, Int32Array, Int32Array]:
-    """Unit directions (n, 3) and ranges (n,) in the order of their bins, bin of each, and first of each bin (size^2 +
-    1,).
+    """Unit directions (n, 3) and ranges (n,) in the order of their bins.
+
+    Also the bin of each, and the first of each bin (size^2 + 1,).
     """
     n = points.shape[0]
     bins = np.empty(n, np.int32)

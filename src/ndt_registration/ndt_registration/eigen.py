@@ -1,5 +1,6 @@
-"""Small dense linear algebra for the compiled kernels: symmetric 3x3 eigenvalues and 6x6 Cholesky, without LAPACK's
-overhead.
+"""Small dense linear algebra for the compiled kernels.
+
+Symmetric 3x3 eigenvalues and 6x6 Cholesky, without LAPACK's overhead.
 """
 
 from __future__ import annotations
@@ -128,8 +129,9 @@ def _sort3(vectors: FloatArray, values: FloatArray) -> None:
 
 @njit(cache=True, nogil=True)
 def cholesky_solve6(H: FloatArray, damping: FloatArray, g: FloatArray, x: FloatArray) -> bool:
-    """Write the solution of ``(H + diag(damping)) x = -g`` (6 unknowns); False where that matrix is not positive
-    definite.
+    """Write the solution of ``(H + diag(damping)) x = -g`` (6 unknowns).
+
+    False where that matrix is not positive definite.
     """
     L = np.empty((6, 6))
     for i in range(6):

@@ -1,5 +1,6 @@
-"""The last few keyframe scans as one cloud: what a new scan is registered to, so that small errors do not add up scan
-by scan.
+"""The last few keyframe scans as one cloud.
+
+What a new scan is registered to, so that small errors do not add up scan by scan.
 """
 
 from __future__ import annotations

@@ -13,8 +13,10 @@ from slam_core.geometry import FloatArray
 
 
 class Fit(NamedTuple):
-    """Share of points on the target's surfaces, their root mean square distance (m), their centroid (3,) about the
-    target's axes and their root mean square distance from it.
+    """How a cloud fits the target's surfaces.
+
+    Share of points on the surfaces, their root mean square distance (m), their centroid (3,) about the target's axes
+    and their root mean square distance from it.
 
     spurious_hessian (6, 6): expected part of the cost's Hessian that errors of the cells' normals alone make;
     spurious_majorant (6, 6): that of its majorant. A normal from ``n`` points is off by ``sqrt(variance / (n
@@ -76,8 +78,9 @@ def _offset(grid, cell, x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGrid, max_distance: float) -> Fit:
-    """Fit of points (n, 3) at a pose; a point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m
-    of its plane.
+    """Fit of points (n, 3) at a pose.
+
+    A point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m of its plane.
     """
     n = points.shape[0]
     hessian_moments, majorant_moments = np.zeros(10), np.zeros(10)

@@ -44,8 +44,10 @@ class MotionConfig(Config):
 
 
 class MotionFilter:
-    """Kalman filter of the errors of (pose before, pose, velocity): poses along the axes of the odometry's frame, the
-    velocity along the sensor's, in which one who walks and turns moves steadily.
+    """Kalman filter of the errors of (pose before, pose, velocity).
+
+    Poses along the axes of the odometry's frame, the velocity along the sensor's, in which one who walks and turns
+    moves steadily.
     """
 
     def __init__(self, config: MotionConfig) -> None:
@@ -124,8 +126,9 @@ class MotionFilter:
         return inverse @ self.T, _with_second_order(0.5 * (covariance + covariance.T))
 
     def _update(self, R: FloatArray) -> FloatArray:
-        """Gain (18, 6) of a measured pose with covariance R (6, 6); the covariance in Joseph's form, which stays
-        positive definite whatever the range of R's eigenvalues.
+        """Gain (18, 6) of a measured pose with covariance R (6, 6).
+
+        The covariance in Joseph's form, which stays positive definite whatever the range of R's eigenvalues.
         """
         H = np.zeros((6, 18))
         H[:, NOW] = np.eye(6)

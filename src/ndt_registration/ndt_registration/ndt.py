@@ -52,8 +52,9 @@ class Neighbours(NamedTuple):
 
 
 class NdtOptimum(NamedTuple):
-    """Pose, mean score per point in [0, 1], iterations, whether the step became small; derivatives of the *cost*
-    (-score, summed over the points), and how many points.
+    """Pose, mean score per point in [0, 1], iterations, whether the step became small.
+
+    Derivatives of the *cost* (-score, summed over the points), and how many points.
     """
 
     rotation: FloatArray

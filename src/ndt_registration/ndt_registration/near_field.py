@@ -13,8 +13,9 @@ from slam_core.geometry import FloatArray
 
 
 class NearField(NamedTuple):
-    """Nearness (n, n, n) from 0 to ``FULL`` in voxels of ``edge`` m of the cube of half-edge ``reach`` m around the
-    origin.
+    """Nearness (n, n, n), from 0 to ``FULL``, around the origin.
+
+    In voxels of ``edge`` m of the cube of half-edge ``reach`` m.
     """
 
     values: npt.NDArray[np.uint8]

@@ -1,5 +1,6 @@
-"""The ``ndt_odometry`` node: point clouds of one sensor, and an IMU where there is one, in, the rig's odometry and
-motions out.
+"""The ``ndt_odometry`` node.
+
+Point clouds of one sensor, and an IMU where there is one, in, the rig's odometry and motions out.
 """
 
 # rclpy is annotated in part only.

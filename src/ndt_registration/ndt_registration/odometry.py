@@ -1,5 +1,7 @@
-"""Scan odometry: each scan is registered to a local map of the last keyframes, starting from constant velocity, and
-fused with that prediction.
+"""Scan odometry.
+
+Each scan is registered to a local map of the last keyframes, starting from constant velocity, and fused with that
+prediction.
 
 A failed registration is never integrated: the pose moves on by the prediction alone, its covariance grows, no relative
 motion is handed out, and when the scans keep failing the map starts anew where the prediction has brought us.
@@ -72,8 +74,9 @@ class OdometryStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class OdometryResult:
-    """Pose T_odom_sensor with covariance (6, 6); motion since the previous scan, None if either of the two failed;
-    status.
+    """Pose T_odom_sensor with covariance (6, 6).
+
+    Motion since the previous scan, None if either of the two failed; status.
     """
 
     stamp_ns: int

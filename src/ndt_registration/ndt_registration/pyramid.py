@@ -75,8 +75,9 @@ class Pyramid:
         return Pyramid(tuple(surface_grids), tuple(rim_grids))
 
     def layers(self, source: Cloud, level: int, count: int, rim_share: float) -> tuple[Layer, Layer]:
-        """What NDT needs on a level: at most ``count`` source points and their rims, which together weigh
-        ``rim_share``.
+        """What NDT needs on a level.
+
+        At most ``count`` source points and their rims, which together weigh ``rim_share``.
         """
         points, rims = source.sample(count), source.sample_rims(count)
         factor = rim_share * len(points) / max(len(rims), _FEW_RIMS)

@@ -1,5 +1,6 @@
-"""Registration of one cloud to another: ``register(source, target) -> RegistrationResult``, one setting for every
-motion.
+"""Registration of one cloud to another.
+
+``register(source, target) -> RegistrationResult``, one setting for every motion.
 
 Without an initial guess the pose is searched globally (:mod:`ndt_registration.search`), each promising pose is refined
 by NDT from coarse to fine, and the one that respects best what the target has seen, surfaces and free space, wins.
@@ -100,8 +101,9 @@ class RegistrationResult:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A cloud that others are registered to, with everything that can be computed beforehand; ``centre`` is its
-    origin.
+    """A cloud that others are registered to, with everything that can be computed beforehand.
+
+    ``centre`` is its origin.
     """
 
     cloud: Cloud
@@ -344,8 +346,9 @@ def _shifted(T: FloatArray, centre: FloatArray) -> FloatArray:
 
 
 def _shifted_covariance(covariance: FloatArray, rotated_centre: FloatArray) -> FloatArray:
-    """Covariance where the frame's origin is ``-rotated_centre`` (3,) away; a lever of kilometres costs digits that
-    positive definiteness needs.
+    """Covariance where the frame's origin is ``-rotated_centre`` (3,) away.
+
+    A lever of kilometres costs digits that positive definiteness needs.
     """
     J = np.eye(6)
     J[:3, 3:] = skew(rotated_centre)

@@ -1,5 +1,6 @@
-"""Global search for a pose: rotations from the normals, translations from a lattice, then NDT in rounds that keep ever
-fewer poses.
+"""Global search for a pose.
+
+Rotations from the normals, translations from a lattice, then NDT in rounds that keep ever fewer poses.
 
 What makes a pose good is the same throughout: the scans' points must not lie in space that the other has looked
 through, and must lie on its surfaces. Free space alone is blind where little is shared, and fit alone pulls a scan over

@@ -1,5 +1,6 @@
-"""How well a registration determines the pose: covariance from the scatter of the blocks' gradients, and directions
-left free.
+"""How well a registration determines the pose.
+
+Covariance from the scatter of the blocks' gradients, and directions left free.
 """
 
 from __future__ import annotations
@@ -37,8 +38,9 @@ class UncertaintyConfig(Config):
 
 
 class Uncertainty(NamedTuple):
-    """Covariance (6, 6) of the pose error; unit directions (k, 6) that are not determined, rotations about the matched
-    points.
+    """Covariance (6, 6) of the pose error.
+
+    Unit directions (k, 6) that are not determined, rotations about the matched points.
     """
 
     covariance: FloatArray
@@ -46,8 +48,9 @@ class Uncertainty(NamedTuple):
 
 
 class Curvature(NamedTuple):
-    """Second derivatives of the cost at the optimum (6, 6): exact, its semidefinite majorant, and the part of either
-    that errors of the cells' normals alone make.
+    """Second derivatives of the cost at the optimum (6, 6).
+
+    Exact, its semidefinite majorant, and the part of either that errors of the cells' normals alone make.
     """
 
     hessian: FloatArray
@@ -143,8 +146,9 @@ def gradient_scatter(block_gradients: Iterable[FloatArray], density_ratio: float
 
 
 def _inverse(hessian: FloatArray, majorant: FloatArray) -> FloatArray:
-    """Inverse of the exact curvature, in directions where that is (nearly) none or less that of a share of the
-    majorant.
+    """Inverse of the exact curvature, bounded where that says nearly nothing.
+
+    In directions where it is (nearly) none or less, that of a share of the majorant.
     """
     root = np.linalg.cholesky(majorant + 1e-9 * np.trace(majorant) * np.eye(len(majorant)))
     whitened = np.linalg.solve(root, np.linalg.solve(root, hessian).T)

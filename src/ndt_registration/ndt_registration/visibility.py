@@ -16,8 +16,9 @@ from slam_core.geometry import FloatArray
 
 
 class RangeImage(NamedTuple):
-    """Nearest and farthest range (size * size,) m by direction, in the octahedral map (Meyer et al. 2010); 0 where
-    unseen.
+    """Nearest and farthest range (size * size,) m by direction, in the octahedral map (Meyer et al. 2010).
+
+    0 where unseen.
     """
 
     size: int
@@ -68,8 +69,9 @@ def range_image(points: FloatArray, size: int) -> RangeImage:
 
 @njit(cache=True, nogil=True)
 def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolerance: float, prices: Prices) -> float:
-    """Mean cost of points (n, 3), moved by ``t`` (3,); deviations grow from 0 to the full price between 1 and 2
-    tolerances.
+    """Mean cost of points (n, 3), moved by ``t`` (3,).
+
+    Deviations grow from 0 to the full price between 1 and 2 tolerances.
 
     Where hardly anything matches nothing can be said: below a share ``LEAST_MATCH`` of matches the cost rises towards
     1.

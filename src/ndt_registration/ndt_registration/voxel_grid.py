@@ -26,8 +26,9 @@ MAX_CELLS_PER_AXIS = _OFFSET - 4
 
 
 class Moments(NamedTuple):
-    """Sums over the points of each block: corner (m, 3) in blocks, counts (m,), sums (m, 3), outers (m, 6) xx xy xz yy
-    yz zz.
+    """Sums over the points of each block.
+
+    Corner (m, 3) in blocks, counts (m,), sums (m, 3), outers (m, 6) xx xy xz yy yz zz.
     """
 
     corner: IntArray

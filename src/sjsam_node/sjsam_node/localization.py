@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Localization:
-    """Pose at the end of a submap in the map frame, None while unknown; matched: landmarks of the map that were
-    recognised.
+    """Pose at the end of a submap in the map frame, None while unknown.
+
+    Matched: landmarks of the map that were recognised.
     """
 
     pose: PoseEstimate | None

@@ -36,8 +36,9 @@ _ORIGIN_SIGMA = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class MapLandmarks:
-    """Landmarks of the map frame: ids (n,), positions (n, 3) m, covariances (n, 3, 3), descriptors (n, d), sightings
-    (n,).
+    """Landmarks of the map frame.
+
+    Ids (n,), positions (n, 3) m, covariances (n, 3, 3), descriptors (n, d), sightings (n,).
 
     ``linked`` (n,) bool: whether the landmark hangs on the map's own component; the frame of others is arbitrary.
     """

@@ -1,5 +1,6 @@
-"""Finds that somebody marks in the map; a mark hangs on the nearest pose of the skeleton and moves with it at a
-closure.
+"""Finds that somebody marks in the map.
+
+A mark hangs on the nearest pose of the skeleton and moves with it at a closure.
 """
 
 from __future__ import annotations

@@ -72,8 +72,10 @@ class SjsamNodeConfig(GlobalMapConfig):
 
 
 class SjsamNode(SlamNode[SjsamNodeConfig]):
-    """Publishes each agent's ``pose`` at every odometry message, ``map_to_odom`` twenty times a second, and the map,
-    which costs the more the larger it is, once a second at most. None of them changes the map.
+    """Publishes each agent's pose, ``map_to_odom`` and the map.
+
+    ``pose`` comes with every odometry message, ``map_to_odom`` twenty times a second, and the map, which costs the more
+    the larger it is, once a second at most. None of them changes the map.
     """
 
     CHANGEABLE = ("map_path", "ply_path", "transform_tolerance_s")

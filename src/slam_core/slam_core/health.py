@@ -16,8 +16,9 @@ class State(IntEnum):
 
 
 class Health:
-    """State with reason, counters since the start, values of the newest input, rate and duration since the last
-    report.
+    """State of a node with its reason, and what it has counted and measured.
+
+    Counters since the start, values of the newest input, rate and duration since the last report.
     """
 
     def __init__(self) -> None:
@@ -47,8 +48,10 @@ class Health:
         self.values[what] = str(value)
 
     def processed(self, duration_s: float, *, is_frame: bool = True) -> None:
-        """One input was processed in ``duration_s``: a frame, or what accompanies frames (an IMU's reading, a motion
-        that a frame has waited for). The rate is that of frames; the mean latency is all the work there was per frame.
+        """One input was processed in ``duration_s``.
+
+        A frame, or what accompanies frames (an IMU's reading, a motion that a frame has waited for). The rate is that
+        of frames; the mean latency is all the work there was per frame.
         """
         self.count("processed")
         self._durations.append(duration_s)

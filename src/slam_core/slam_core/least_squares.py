@@ -79,8 +79,9 @@ class LeastSquaresProblem(Protocol[State]):
 
 @runtime_checkable
 class ReusableProblem(LeastSquaresProblem[State], Protocol[State]):
-    """A problem whose last factor can be used at other states: what is left of a step once the factor is there costs
-    a fraction of a new one.
+    """A problem whose last factor can be used at other states.
+
+    What is left of a step once the factor is there costs a fraction of a new one.
     """
 
     def gradient(self, state: State) -> FloatArray:

@@ -118,8 +118,9 @@ class RelativeMotion:
 
 @dataclass(frozen=True, eq=False)
 class ImuSample:
-    """An IMU reading along the axes of ``frame_id``: angular_velocity (3,) rad/s, linear_acceleration (3,) m/s2 with
-    gravity.
+    """An IMU reading along the axes of ``frame_id``.
+
+    Angular_velocity (3,) rad/s, linear_acceleration (3,) m/s2 with gravity.
     """
 
     stamp_ns: int

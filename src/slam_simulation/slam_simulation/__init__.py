@@ -1,5 +1,6 @@
-"""A simulated building and the rig that moves through it: worlds of textured surfaces, a ray caster, cameras and
-motion.
+"""A simulated building and the rig that moves through it.
+
+Worlds of textured surfaces, a ray caster, cameras and motion.
 
     scenario = Scenario.load("small_room")
     for frame in simulate(scenario):

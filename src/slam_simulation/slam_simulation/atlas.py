@@ -19,8 +19,9 @@ from slam_core.types import ByteArray
 
 
 class TextureTable(NamedTuple):
-    """What the kernels read: ``texels`` flat uint8; ``entries`` int64 (n, 4) = offset, log2 width, log2 height,
-    clamp.
+    """What the kernels read: ``texels`` flat uint8.
+
+    ``entries`` int64 (n, 4) = offset, log2 width, log2 height, clamp.
     """
 
     texels: ByteArray
@@ -43,8 +44,9 @@ class TextureAtlas:
         return self._ids[name]
 
     def add(self, name: str, image: FloatArray, *, clamp: bool) -> int:
-        """Number of the texture of reflectance ``image`` (h, w) in [0, 1]; ``clamp`` for pictures, False for
-        patterns.
+        """Number of the texture of reflectance ``image`` (h, w) in [0, 1].
+
+        ``clamp`` for pictures, False for patterns.
         """
         bytes_ = np.clip(np.round(image * 255.0), 0, 255).astype(np.uint8)
         height, width = bytes_.shape

@@ -154,8 +154,9 @@ def _scatter(frames: FloatArray, density: float, rng: np.random.Generator) -> tu
 def in_sight(
     eye: FloatArray, points: FloatArray, owners: npt.NDArray[np.int64], frames: FloatArray
 ) -> npt.NDArray[np.bool_]:
-    """Whether nothing stands between ``eye`` (3,) and each point (n, 3) on the front of its own surface ``owners``
-    (n,).
+    """Mask (n,) of the points that nothing hides from ``eye`` (3,).
+
+    Each point (n, 3) lies on the front of its own surface ``owners`` (n,).
 
     ``frames``: (m, 3, 3) = origin, edge_u, edge_v of every surface.
     """

@@ -21,8 +21,9 @@ SIDE = "side"
 
 @dataclass(frozen=True)
 class WallItem:
-    """A kind of thing at a wall: how to build it at ``s`` along the wall, its width (least, greatest) and how deep
-    it is.
+    """A kind of thing at a wall.
+
+    How to build it at ``s`` along the wall, its width (least, greatest) and how deep it is.
     """
 
     build: Callable[[World, Wall, float, float, Generator], None]

@@ -162,8 +162,9 @@ def _irradiance(
     lamps: FloatArray,
     directions: FloatArray,
 ) -> None:  # pragma: no cover - compiled
-    """Fill the grid of one surface; ``frame`` = origin, edge_u, edge_v and ``axes`` = unit edges and normal, (3, 3)
-    each.
+    """Fill the grid of one surface.
+
+    ``frame`` = origin, edge_u, edge_v and ``axes`` = unit edges and normal, (3, 3) each.
     """
     columns, rows = shape
     for row in range(rows):

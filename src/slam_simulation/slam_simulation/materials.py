@@ -26,8 +26,9 @@ class Pattern:
 
 
 def noise(rng: np.random.Generator, cells: tuple[int, int], octaves: int, persistence: float = 0.55) -> FloatArray:
-    """Tileable multi-octave value noise (SIZE, SIZE), zero mean, unit spread; ``cells`` (x, y) in the coarsest
-    octave.
+    """Tileable multi-octave value noise (SIZE, SIZE), zero mean, unit spread.
+
+    ``cells`` (x, y) in the coarsest octave.
     """
     total = np.zeros((SIZE, SIZE))
     for octave in range(octaves):

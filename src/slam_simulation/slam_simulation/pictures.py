@@ -38,8 +38,9 @@ def _rectangle(canvas: Float32Array, x: float, y: float, w: float, h: float, val
 def _text(
     canvas: Float32Array, box: tuple[float, float, float, float], rng: np.random.Generator, ink: float, size: float
 ) -> None:
-    """Lines of made-up letters in ``box`` (x, y, w, h fractions); ``size`` is the height of a letter, fraction of
-    the canvas.
+    """Lines of made-up letters in ``box`` (x, y, w, h fractions).
+
+    ``size`` is the height of a letter, fraction of the canvas.
     """
     H, W = canvas.shape
     alphabet = rng.random((26, 7, 5)) < 0.45

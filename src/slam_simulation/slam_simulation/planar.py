@@ -1,5 +1,6 @@
-"""The 2D world of the thesis (1.7, 5.1, 6.5): landmarks on a plane, a rig that drives a loop, range, bearing and
-odometry.
+"""The 2D world of the thesis (1.7, 5.1, 6.5).
+
+Landmarks on a plane, a rig that drives a loop, range, bearing and odometry.
 
     run = simulate_planar(PlanarConfig(), np.random.default_rng(1))
     run.poses, run.odometry, run.observations[k].ids

@@ -29,8 +29,9 @@ from slam_simulation.trajectory import rig_twist
 
 @dataclass(frozen=True, eq=False)
 class DepthTruth:
-    """True depth of the *rectified* left image: float32 (h, w) m along z, and the surface of each pixel, int32 (h,
-    w).
+    """True depth of the *rectified* left image.
+
+    Float32 (h, w) m along z, and the surface of each pixel, int32 (h, w).
     """
 
     depth: Float32Array

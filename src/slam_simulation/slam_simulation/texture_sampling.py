@@ -69,8 +69,9 @@ def sample_texture(
     bu: float,
     bv: float,
 ) -> float:  # pragma: no cover - compiled
-    """Mean of texture ``t``, 0 to 1, over the parallelogram of sides (au, av), (bu, bv) around (u, v), in
-    repetitions.
+    """Mean of texture ``t``, 0 to 1, over a parallelogram around (u, v).
+
+    Its sides are (au, av), (bu, bv), in repetitions.
     """
     width, height = float(1 << index[t, 1]), float(1 << index[t, 2])
     a = np.sqrt((au * width) ** 2 + (av * height) ** 2)

@@ -148,8 +148,9 @@ def _echo(
     texels: ByteArray,
     index: npt.NDArray[np.int64],
 ) -> tuple[float, float, float, float, float]:  # pragma: no cover - compiled
-    """Distance, amplitude, infrared reflectance and place (u, v) where the ray (x, y, 1) meets row ``q`` of the
-    view.
+    """Distance, amplitude, infrared reflectance and place where a ray meets a row of the view.
+
+    The ray is (x, y, 1), the row ``q``, the place (u, v).
     """
     p = planes
     z = 1.0 / (p[q, 0] * x + p[q, 1] * y + p[q, 2])

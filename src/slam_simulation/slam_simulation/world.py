@@ -31,8 +31,9 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One rectangle: ``origin`` (3,) m, ``edge_u``, ``edge_v`` (3,) m, orthogonal; ``room`` for the light it
-    receives.
+    """One rectangle: ``origin`` (3,) m, ``edge_u``, ``edge_v`` (3,) m, orthogonal.
+
+    ``room`` for the light it receives.
     """
 
     origin: FloatArray

@@ -1,5 +1,6 @@
-"""A picture of what the front end sees: features over the image, coloured by depth, shaped by where the depth came
-from.
+"""A picture of what the front end sees.
+
+Features over the image, coloured by depth, shaped by where the depth came from.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ _NEAR, _FAR = 0.5, 8.0
 
 
 def annotated_image(image: ByteArray, features: Features) -> ByteArray:
-    """Colour picture (height, width, 3), BGR, of a grey image and its features: stereo circles, ToF squares, fused
-    both.
+    """Colour picture (height, width, 3), BGR, of a grey image and its features.
+
+    Stereo circles, ToF squares, fused both.
     """
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     colours = _depth_colours(features.depth)

@@ -14,8 +14,9 @@ from stereo_frontend.keypoints import Keypoints
 
 @dataclass(frozen=True, eq=False)
 class DepthEstimate:
-    """Depth of keypoints: depth (n,) m along z, NaN where unknown; sigma (n,) m; source (n,), see
-    :class:`FeatureSource`.
+    """Depth of keypoints: depth (n,) m along z, NaN where unknown.
+
+    Sigma (n,) m; source (n,), see :class:`FeatureSource`.
     """
 
     depth: FloatArray

@@ -99,8 +99,10 @@ def refine_disparity(
     config: DisparityConfig,
     row_offset: Float32Array | None = None,
 ) -> RefinedDisparity:
-    """Disparity of keypoints (n, 2) of the left image whose partners lie near column ``u_right`` (n,), ``row_offset``
-    (n,) px lower; by default on the same row, as rectified pairs should be.
+    """Disparity of keypoints (n, 2) of the left image.
+
+    Their partners lie near column ``u_right`` (n,), ``row_offset`` (n,) px lower; by default on the same row, as
+    rectified pairs should be.
     """
     row_offset = np.zeros(len(uv_left), np.float32) if row_offset is None else row_offset
     found = _align(left, right, uv_left, u_right, row_offset, config.radius, config)

@@ -113,8 +113,9 @@ class FeatureExtractor:
         return keypoints, candidates
 
     def _adapt(self, candidates: int) -> None:
-        """Move the threshold so that the next image gives ``surplus * target`` candidates (their number falls as
-        1/threshold).
+        """Move the threshold so that the next image gives ``surplus * target`` candidates.
+
+        Their number falls as 1/threshold.
         """
         ratio = np.clip(candidates / (self.config.surplus * self.config.target), 0.25, 4.0)
         self.threshold = float(np.clip(self.threshold * ratio**self.config.adaptation, *_THRESHOLD_RANGE))

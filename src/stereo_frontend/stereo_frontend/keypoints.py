@@ -42,8 +42,9 @@ class Detector(Protocol):
     """Finds and describes keypoints."""
 
     def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
-        """Keypoints of ``image`` above ``threshold`` (1.0 is the detector's customary one), thinned out by
-        ``select``.
+        """Keypoints of ``image`` above ``threshold``, thinned out by ``select``.
+
+        A threshold of 1.0 is the detector's customary one.
         """
         ...
 

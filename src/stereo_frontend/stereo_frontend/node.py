@@ -32,8 +32,9 @@ FEW_FEATURES = 20
 
 
 class FeatureNode(SlamNode[FrontendConfig]):
-    """Publishes ``features``, ``features/descriptors``, ``features/camera_info`` and, where heard,
-    ``features/image``.
+    """Publishes features, their descriptors and camera info.
+
+    ``features/image`` is published where somebody hears it.
     """
 
     def __init__(self) -> None:

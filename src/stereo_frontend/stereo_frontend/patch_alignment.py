@@ -69,8 +69,9 @@ def align_patches(left, right, uv_left, u_right, row_offset, radius, max_shift, 
 
 @njit(cache=True, nogil=True)
 def _take_template(image, u, v, radius, template, jacobian):  # type: ignore[no-untyped-def]
-    """Patch around the whole pixel nearest to (u, v), its Jacobian, means removed; returns its energy, 0 at the
-    border.
+    """Patch around the whole pixel nearest to (u, v), its Jacobian, means removed.
+
+    Returns its energy, 0 at the border.
     """
     height, width = image.shape
     u0, v0 = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
@@ -96,8 +97,9 @@ def _take_template(image, u, v, radius, template, jacobian):  # type: ignore[no-
 
 @njit(cache=True, nogil=True)
 def _sample_patch(image, u, v, u_right, row_offset, p, radius, line, patch):  # type: ignore[no-untyped-def]
-    """Right patch, ``row_offset`` px lower and under the correction ``p``, bilinear, mean removed; returns its energy,
-    0 at the border.
+    """Right patch, ``row_offset`` px lower and under the correction ``p``, bilinear, mean removed.
+
+    Returns its energy, 0 at the border.
 
     ``line`` is room for a row of the image.
     """
@@ -154,8 +156,9 @@ def _normal_matrix(jacobian, hessian):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _right_hand_side(template, patch, jacobian, energy, power, out):  # type: ignore[no-untyped-def]
-    """Turn ``patch`` into the residual r after the best gain, fill ``out`` with ``J^T r``; its variance and
-    correlation.
+    """Turn ``patch`` into the residual r after the best gain, fill ``out`` with ``J^T r``.
+
+    Its variance and correlation.
     """
     cross = _dot(template, patch)
     gain = cross / power

@@ -22,8 +22,9 @@ _MAD_TO_SIGMA = 1.4826
 
 @dataclass(frozen=True)
 class PixelNoiseConfig(Config):
-    """Position: ``factor * sqrt(floor^2 + (slope * size)^2)``; rows of a clean pair: the same form without the
-    factor.
+    """Position: ``factor * sqrt(floor^2 + (slope * size)^2)``.
+
+    Rows of a clean pair: the same form without the factor.
     """
 
     floor: float = parameter(
@@ -58,8 +59,9 @@ class PixelNoise:
         return np.asarray(self.factor * np.hypot(self.config.floor, self.config.slope * size), np.float32)
 
     def learn(self, row_difference: Float32Array, size: Float32Array) -> None:
-        """Take in the row differences (n,) px of the matches of one pair, left minus right, of diameter ``size`` (n,)
-        px.
+        """Take in the row differences (n,) px of the matches of one pair, left minus right.
+
+        ``size``: (n,) px, diameters of the keypoints.
 
         Their median is an error of rectification, not of the detector, and is removed.
         """

@@ -1,5 +1,6 @@
-"""Rectification of a raw stereo pair from its two camera infos (thesis section 2.4, Hartley and Zisserman section
-11.12).
+"""Rectification of a raw stereo pair from its two camera infos.
+
+Thesis section 2.4, Hartley and Zisserman section 11.12.
 
 After it, both images have one camera model without distortion, corresponding points lie on the same row and
 ``disparity = u_left - u_right`` is positive. The maps are computed once per calibration.
@@ -96,8 +97,9 @@ class StereoRectifier:
 
 
 def rectification_map(info: CameraInfo, target: Camera) -> FloatArray:
-    """Raw pixel (u, v) of every pixel of the rectified image ``target``; shape (height, width, 2), NaN behind the
-    camera.
+    """Raw pixel (u, v) of every pixel of the rectified image ``target``.
+
+    Shape (height, width, 2), NaN behind the camera.
     """
     u, v = np.meshgrid(np.arange(target.width, dtype=np.float64), np.arange(target.height, dtype=np.float64))
     rays = target.unproject(np.column_stack([u.ravel(), v.ravel()]), np.ones(u.size)) @ info.R

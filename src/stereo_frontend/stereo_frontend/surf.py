@@ -1,5 +1,6 @@
-"""SURF-128 (Bay, Ess, Tuytelaars, Van Gool: Speeded-Up Robust Features, CVIU 2008), the thesis's choice of feature (ch.
-3).
+"""SURF-128 (Bay, Ess, Tuytelaars, Van Gool.
+
+Speeded-Up Robust Features, CVIU 2008), the thesis's choice of feature (ch. 3).
 
 Extended descriptor. Oriented by default: on rigs that stay level the upright one matches a sixth more, but where the
 camera rolls by 15 degrees and more it fails. On EuRoC's key frames, half of whose motions roll, mapping lost 8 of 50

@@ -163,8 +163,9 @@ def _box(integral, x, y, reach):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def find_maxima(integral, threshold, found):  # type: ignore[no-untyped-def]
-    """Write maxima of 3x3x3 neighbourhoods above ``threshold`` to ``found`` rows u, v, scale, response; return their
-    number.
+    """Write maxima of 3x3x3 neighbourhoods above ``threshold`` to ``found`` rows u, v, scale, response.
+
+    Return their number.
 
     Both middle layers are filtered row by row and searched right behind, while their last rows are in the cache.
     """
@@ -186,8 +187,9 @@ def find_maxima(integral, threshold, found):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _find_in_row(integral, layers, place, y, threshold, marks, cube, found):  # type: ignore[no-untyped-def]
-    """Maxima of one row of one layer; their position and scale are those of the vertex of the parabola through the
-    neighbourhood (Brown and Lowe 2002).
+    """Maxima of one row of one layer.
+
+    Their position and scale are those of the vertex of the parabola through the neighbourhood (Brown and Lowe 2002).
     """
     size, outer, border = FILTER_SIZES[place + 1], FILTER_SIZES[3 * place], _BORDERS[place]
     rows = ((y - 1) % _KEPT_ROWS, y % _KEPT_ROWS, (y + 1) % _KEPT_ROWS)

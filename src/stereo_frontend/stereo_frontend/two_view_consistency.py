@@ -31,8 +31,10 @@ _MEDIAN_CHI_SQUARE_1, _MEDIAN_CHI_SQUARE_3 = 0.455, 2.366
 
 @dataclass(frozen=True, eq=False)
 class StereoView:
-    """Matches of one stereo pair: uv (n, 2) px left, disparity (n,) px as measured with sigma (n,) px, row_shift (n,)
-    px right minus left with row_sigma (n,) px, sigma_uv (n,) px, descriptors (n, d).
+    """Matches of one stereo pair.
+
+    Uv (n, 2) px left, disparity (n,) px as measured with sigma (n,) px, row_shift (n,) px right minus left with
+    row_sigma (n,) px, sigma_uv (n,) px, descriptors (n, d).
     """
 
     stereo: StereoCamera
@@ -157,8 +159,9 @@ def _first_motion(first: StereoView, second: StereoView, known: RectificationErr
 def _linearised(
     first: StereoView, second: StereoView, T: FloatArray, theta: FloatArray, known: RectificationError
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Residuals (n, 3) px of (u, v, disparity), Jacobians by motion (n, 3, 6) and calibration (n, 3, 10), covariance
-    (n, 3, 3).
+    """Residuals (n, 3) px of (u, v, disparity), with Jacobians and covariance.
+
+    Jacobians by motion (n, 3, 6) and calibration (n, 3, 10); covariance (n, 3, 3).
     """
     c, fb = first.stereo.camera, first.stereo.camera.fx * first.stereo.baseline
     basis1, basis2 = (c.fx * column_basis((v.uv_right - [c.cx, c.cy]) / [c.fx, c.fy]) for v in (first, second))

@@ -24,8 +24,9 @@ def _none() -> IntArray:
 
 @dataclass
 class Fusion:
-    """Landmark of every observation (n,), named after its oldest one; the next observation of the same landmark, in a
-    ring; and the submap that each observation belongs to.
+    """Landmark of every observation (n,), named after its oldest one.
+
+    The next observation of the same landmark, in a ring; and the submap that each observation belongs to.
     """
 
     landmark_of: IntArray = field(default_factory=_none)
@@ -40,8 +41,9 @@ class Fusion:
         self.record_of = np.concatenate([self.record_of, np.full(count, record, dtype=np.int64)])
 
     def unite(self, pairs: IntArray) -> int:
-        """Fuse pairs (k, 2) of observations in order, but for those that would let a submap see a landmark twice; the
-        number of pairs that are one landmark now.
+        """Fuse pairs (k, 2) of observations in order, but for those that would let a submap see a landmark twice.
+
+        The number of pairs that are one landmark now.
         """
         return int(_unite(pairs, self.landmark_of, self.following, self.record_of))
 

@@ -97,8 +97,10 @@ class MapGraph:
 
     @property
     def variable_of(self) -> IntArray:
-        """Variable of the estimate that each observation is of, (observations,): one for all those of a landmark that
-        tie submaps together (:mod:`sjsam_node.graph.selection`), named after the oldest of them, else its own.
+        """Variable of the estimate that each observation is of, (observations,).
+
+        One for all those of a landmark that tie submaps together (:mod:`sjsam_node.graph.selection`), named after the
+        oldest of them, else its own.
         """
         if self._variable_of is None:
             counts = np.array([len(k.pairs) for k in self.links], dtype=np.int64)
@@ -122,7 +124,8 @@ class MapGraph:
             self.is_complete, self._variable_of = use, None
 
     def append(self, submap: Submap, start: int | None, guess: FloatArray, ties: int = _ALL) -> Record:
-        """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own;
+        """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own.
+
         ``ties`` landmarks, at most, tie it to each other one.
         """
         if start is None:
@@ -170,8 +173,9 @@ class MapGraph:
         return float(abs(ways[1] - ways[0]) if a.key[:2] == b.key[:2] else sum(ways))
 
     def odometry_between(self, first: IntArray, second: IntArray) -> tuple[FloatArray, FloatArray]:
-        """T_first_second (n, 4, 4) of the starts of records by the end poses between them, NaN where nothing chains
-        them; and the length of the way, (n,) m.
+        """T_first_second (n, 4, 4) of the starts of records by the end poses between them.
+
+        NaN where nothing chains them; also the length of the way, (n,) m.
         """
         a, b = self.starts[first], self.starts[second]
         T = np.linalg.inv(self._chained[a]) @ self._chained[b]

@@ -22,8 +22,9 @@ from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 @dataclass(frozen=True, eq=False)
 class TextMap:
-    """One file: reference pose id, ids and values of the poses (k, 3 | 6) and features (n, 2 | 3), information (m,
-    m).
+    """One file.
+
+    Reference pose id, ids and values of the poses (k, 3 | 6) and features (n, 2 | 3), information (m, m).
     """
 
     reference: int

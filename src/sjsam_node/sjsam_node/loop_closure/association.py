@@ -72,8 +72,9 @@ class PointSet:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Matched landmarks of two sets: index pairs (k, 2), T_first_second with covariance, chi2 and its degrees of
-    freedom.
+    """Matched landmarks of two sets.
+
+    Index pairs (k, 2), T_first_second with covariance, chi2 and its degrees of freedom.
     """
 
     pairs: IntArray

@@ -186,8 +186,9 @@ class Consistency:
         return out
 
     def _are_off(self, T: FloatArray, T_claimed: FloatArray, covariance: FloatArray, way: FloatArray) -> BoolArray:
-        """Whether each claimed pose (n, 4, 4) is further from ``T`` than odometry drifts on a ``way`` (n,) m; not where
-        ``T`` is NaN.
+        """Whether each claimed pose (n, 4, 4) is further from ``T`` than odometry drifts on a ``way`` (n,) m.
+
+        Not where ``T`` is NaN.
         """
         known, drift = np.isfinite(T[:, 0, 0]), self.drift
         error = boxminus(T_claimed[known], T[known])
@@ -203,8 +204,10 @@ class Consistency:
     # -- in the joined map ---------------------------------------------------------------------------------------------
 
     def _is_better(self, verdict: Verdict, before: tuple[float, int], newest: int, outliers: float) -> bool:
-        """Whether chi2 has risen no more than true matches make it rise, or fallen by more than the loss of true
-        matches makes it fall. ``before``: chi2 and redundancy; ``outliers``: what matches that were let go since cost.
+        """Tell whether chi2 has changed by no more than true matches make it change.
+
+        It may rise by what true matches add, or fall by more than the loss of true matches makes it fall. ``before``:
+        chi2 and redundancy.
         """
         cost, redundancy = self.smoother.totals()
         rise, dof = cost - before[0] - outliers, redundancy - before[1]
@@ -216,8 +219,10 @@ class Consistency:
         return outweighed and self._excess((rise - known) / self.config.view_change, dof, newest) <= 0.0
 
     def _excess(self, rise: float, dof: int, newest: int) -> float:
-        """How far chi2 rose above what true matches explain. Submaps that are too sure of themselves make every
-        closure look bad: the bound is in units of the map's own variance factor (Baarda 1968), never below one.
+        """How far chi2 rose above what true matches explain.
+
+        Submaps that are too sure of themselves make every closure look bad: the bound is in units of the map's own
+        variance factor (Baarda 1968), never below one.
         """
         result = self.smoother.result(self.smoother.graph.component(newest))
         factor = (result.cost - max(rise, 0.0)) / max(result.redundancy, 1)
@@ -247,7 +252,8 @@ class Consistency:
         return factor * chi_square_bound(self.config.outlier_probability, 3)
 
     def _nis(self, component: int) -> FloatArray:
-        """Squared error of every observation as the rest of its submap predicts it, NaN where it ties nothing;
+        """Squared error of every observation as the rest of its submap predicts it, NaN where it ties nothing.
+
         (observations,), 3 degrees of freedom each.
         """
         graph, assembled = self.smoother.graph, self.smoother.assembled(component)

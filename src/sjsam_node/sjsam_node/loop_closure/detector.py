@@ -47,8 +47,9 @@ class LoopDetector:
         return self.smoother.graph
 
     def sequential(self, chain: list[int], new: int) -> list[Link]:
-        """Links of record ``new`` to the records ``chain`` before it, newest first, by their odometry; to each by what
-        the newer ones have not linked already.
+        """Links of record ``new`` to the records ``chain`` before it, newest first, by their odometry.
+
+        To each by what the newer ones have not linked already.
         """
         graph, links = self.graph, []
         T, covariance = np.eye(4), np.zeros((6, 6))
@@ -101,8 +102,9 @@ class LoopDetector:
         return found
 
     def missed(self, chain: Chain, most: int) -> list[Link]:
-        """Links between records that have come near each other since they were compared, if ever they were; of ``most``
-        pairs, the nearest.
+        """Links between records that have come near each other since they were compared, if ever they were.
+
+        Of ``most`` pairs, the nearest.
         """
         due = self.near.due(self.graph, chain)
         return self._verified(due[:most], self._novelty())

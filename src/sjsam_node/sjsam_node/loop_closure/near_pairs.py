@@ -28,8 +28,9 @@ _SHIFT = 32
 
 @dataclass
 class Compared:
-    """Pairs of records (first < second) as numbers (k,), ascending, and where the second's middle was when they were
-    compared, seen from the first (k, 3).
+    """Pairs of records (first < second) that have been compared.
+
+    Numbers (k,), ascending, and where the second's middle was when they were compared, seen from the first (k, 3).
     """
 
     codes: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -93,8 +94,9 @@ class NearPairs:
             self.compared.forget(records)
 
     def due(self, graph: MapGraph, chain: Chain) -> list[tuple[int, int]]:
-        """Pairs without a link, near in the map, that were not compared yet or lay elsewhere when they were; nearest
-        first.
+        """Pairs without a link, near in the map, that were not compared yet or lay elsewhere when they were.
+
+        Nearest first.
         """
         near = self._near(graph)
         linked = np.sort(np.array([(k.first, k.second) for k in graph.links], dtype=np.int64).reshape(-1, 2), axis=1)

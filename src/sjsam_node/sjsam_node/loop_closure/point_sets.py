@@ -20,8 +20,9 @@ def at_start(record: Record) -> PointSet:
 
 
 def at_end(record: Record, index: IntArray | None = None) -> PointSet:
-    """Landmarks of a record, or those at ``index``, as seen from its end pose, with the exact joint covariance of both
-    (Eq. 7.2 applied to it), which is made of those that are selected.
+    """Landmarks of a record, or those at ``index``, as seen from its end pose.
+
+    With the exact joint covariance of both (Eq. 7.2 applied to it).
     """
     submap = record.submap
     index = np.arange(len(submap.landmarks)) if index is None else index

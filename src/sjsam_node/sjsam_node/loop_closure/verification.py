@@ -1,5 +1,7 @@
-"""Compares two submaps: enough landmarks, spread in space, must agree on one rigid alignment within both submaps' joint
-covariance, and that must agree with what the map already knows of the two poses.
+"""Compares two submaps.
+
+Enough landmarks, spread in space, must agree on one rigid alignment within both submaps' joint covariance, and that
+must agree with what the map already knows of the two poses.
 """
 
 from __future__ import annotations
@@ -89,8 +91,9 @@ class Verifier:
         return (found, Status.CONSISTENT) if found is not None else self.verify_alike(first, second, prior, way, *key)
 
     def verify_near(self, first: PointSet, second: PointSet, prior: Prior | None) -> Alignment | None:
-        """The alignment of two submaps around a prior; None where it is not informative, or geometry does not support
-        it.
+        """The alignment of two submaps around a prior.
+
+        None where it is not informative, or geometry does not support it.
         """
         if prior is None or largest_sigma(prior.covariance) >= self.config.informative_sigma:
             return None

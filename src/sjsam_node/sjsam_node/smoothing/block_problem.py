@@ -1,5 +1,6 @@
-"""Joining with the thesis's rows (Algorithm 4): every landmark of a submap with its own covariance, uncorrelated with
-the rest.
+"""Joining with the thesis's rows (Algorithm 4).
+
+Every landmark of a submap with its own covariance, uncorrelated with the rest.
 
 Then no landmark is coupled to another, and all of them are eliminated one by one before the sparse solver sees the
 problem (:mod:`sjsam_node.smoothing.sighting_kernels`), which is left with the poses alone.
@@ -62,8 +63,9 @@ def flatten_rows(maps: Sequence[LocalMap], pose_size: int, d: int) -> FlatRows:
 
 
 class Sightings(NamedTuple):
-    """Landmarks as seen from reference poses, sorted by landmark, those of one landmark as their poses are eliminated:
-    pose (o,), mean (o, d), information (o, d, d), landmark (o,).
+    """Landmarks as seen from reference poses, sorted by landmark, those of one landmark as their poses are eliminated.
+
+    Pose (o,), mean (o, d), information (o, d, d), landmark (o,).
     """
 
     landmark_ptr: IntArray

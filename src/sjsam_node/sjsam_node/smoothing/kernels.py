@@ -1,5 +1,6 @@
-"""Compiled inner loops of the joining problem: residuals and normal equations of local maps, written for 2D and 3D
-alike.
+"""Compiled inner loops of the joining problem.
+
+Residuals and normal equations of local maps, written for 2D and 3D alike.
 
 A local map holds, in the frame of its reference pose ``(R_i, t_i)``, other poses and landmarks. Its measurement
 function is ``h = R_i^T (l - t_i)`` for a landmark (Eq. 7.2) and ``(R_i^T (t_j - t_i), angle(R_i^T R_j))`` for a pose

@@ -143,8 +143,9 @@ def _mix(values: IntArray) -> npt.NDArray[np.uint64]:
 
 
 def _pairs(group_ptr: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """All pairs (first >= second) of local groups of each map, row by row of a lower triangle, and where each map
-    starts.
+    """All pairs (first >= second) of local groups of each map.
+
+    Row by row of a lower triangle, and where each map starts.
     """
     sizes = np.diff(group_ptr)
     local = np.arange(group_ptr[-1]) - np.repeat(group_ptr[:-1], sizes)

@@ -26,7 +26,9 @@ def _none() -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class Parked:
-    """Records (n,) with poses (n, 2, 4, 4) and covariances (n, 2, 6, 6) of their start and end ``nodes`` (n, 2), in the
+    """Records that are parked, with their poses relative to records that stay.
+
+    Records (n,) with poses (n, 2, 4, 4) and covariances (n, 2, 6, 6) of their start and end ``nodes`` (n, 2), in the
     frames of the nodes ``reference`` (n,).
     """
 

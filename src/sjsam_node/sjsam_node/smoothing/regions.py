@@ -131,8 +131,9 @@ class Region:
         )  # fmt: skip
 
     def carry(self, graph: MapGraph) -> float:
-        """Move what is inside with the reference, after that and the separator were estimated; how far the separator
-        turned (rad, or m per m).
+        """Move what is inside with the reference, after that and the separator were estimated.
+
+        How far the separator turned (rad, or m per m).
 
         Inside nothing is estimated until the region is opened, or the whole map is asked for.
         """
@@ -171,8 +172,9 @@ class Regions:
         self.closed = [r for r in self.closed if not any(r is other for other in regions)]
 
     def close(self, graph: MapGraph, component: int, busy: set[int]) -> None:
-        """Join the submaps that have been quiet for longest to one region, if more than enough are open; ``busy`` ones
-        stay. Small regions nearby become part of it.
+        """Join the submaps that have been quiet for longest to one region, if more than enough are open.
+
+        ``busy`` ones stay. Small regions nearby become part of it.
         """
         now = len(graph.records)
         inside = {i for r in self.closed for i in r.records.tolist()}

@@ -101,8 +101,10 @@ def widened(information: FloatArray, rows: IntArray, factor: float) -> FloatArra
 
 @dataclass(frozen=True, eq=False)
 class RobustResult:
-    """State, the maps with full weight but without the dropped rows, the scalar rows dropped of each map, and how many
-    poses and landmarks these are.
+    """A state, the maps that it was found with, and what was dropped.
+
+    The maps have full weight but lack the dropped rows; the scalar rows dropped of each map, and how many poses and
+    landmarks these are.
     """
 
     state: State
@@ -147,8 +149,9 @@ class RobustJoining:
         return worst
 
     def _weighted(self, k: int, state: State, excess: float) -> LocalMap:
-        """A map whose closing rows have the weights of the loss, its bound ``excess`` times as wide: first each row,
-        then all of them together, which may agree among themselves and be wrong.
+        """A map whose closing rows have the weights of the loss, its bound ``excess`` times as wide.
+
+        First each row, then all of them together, which may agree among themselves and be wrong.
         """
         if not self.rows[k]:
             return self.maps[k]

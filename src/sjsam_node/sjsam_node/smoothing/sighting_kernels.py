@@ -212,8 +212,9 @@ def make_kernels(d: int) -> SightingKernels:
 
     @njit(cache=True, nogil=True, fastmath={"contract"})
     def reduce(sightings, pair_ptr, pair, stride, v, F, values):
-        """Take ``J_j^T (F_j F_i^T) J_i`` from the block of every two poses that see a landmark; ``pair`` says where it
-        is. Columns belong to the pose that is eliminated first.
+        """Take ``J_j^T (F_j F_i^T) J_i`` from the block of every two poses that see a landmark.
+
+        ``pair`` says where it is. Columns belong to the pose that is eliminated first.
         """
         landmark_ptr, pose = sightings[0], sightings[1]
         for landmark in range(len(landmark_ptr) - 1):
@@ -363,8 +364,10 @@ def pose_pairs(landmark_ptr, by_landmark, pose_ptr, by_pose, pose, landmark):
 
 @njit(cache=True, nogil=True)
 def pair_positions(landmark_ptr, landmark, pose, pose_ptr, by_pose, block, column_ptr, rows, base):
-    """For every sighting and those behind it of the same landmark (sorted by elimination), where the block of their
-    poses starts among the sparse values; -1 for fixed poses. ``block`` (P,) is a pose's block, -1 for a fixed one.
+    """Where the block of each pair of sightings starts among the sparse values.
+
+    Of every sighting and those behind it of the same landmark (sorted by elimination); -1 for fixed poses. ``block``
+    (P,) is a pose's block, -1 for a fixed one.
     """
     pair_ptr = np.zeros(len(pose) + 1, np.int64)
     for o in range(len(pose)):

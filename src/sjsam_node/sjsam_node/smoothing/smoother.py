@@ -231,8 +231,10 @@ class Smoother:
         return solved.marginals
 
     def relative_pose(self, first: int, second: int) -> Prior | None:
-        """What the map knows of T_first_second (starts of two records, the second one the newer); None across
-        components. What the last factor does not hold counts with its odometry alone, which is never too sure.
+        """What the map knows of T_first_second (starts of two records, the second one the newer).
+
+        None across components. What the last factor does not hold counts with its odometry alone, which is never too
+        sure.
         """
         graph, component = self.graph, self.graph.component(first)
         if component != graph.component(second):

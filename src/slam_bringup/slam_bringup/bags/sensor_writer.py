@@ -67,8 +67,10 @@ class SensorWriter:
     def depth(
         self, stamp_ns: int, image: AnyArray, info: CameraInfo, *, measurement: str, **pictures: AnyArray | None
     ) -> None:
-        """A raw image of a depth camera: ``measurement`` "range" (along the ray) or "depth" (along z), uint16 mm or
-        float32 m; further pictures by name (``amplitude``, ``intensity``) where there are any.
+        """A raw image of a depth camera.
+
+        ``measurement`` "range" (along the ray) or "depth" (along z), uint16 mm or float32 m; further pictures by name
+        (``amplitude``, ``intensity``) where there are any.
         """
         self.picture(f"tof/{measurement}/image_raw", stamp_ns, TOF_FRAME, image)
         for name, picture in pictures.items():

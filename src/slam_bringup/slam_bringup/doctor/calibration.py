@@ -1,4 +1,4 @@
-"""Do the camera infos describe cameras, a pair, and these images?"""
+"""Checks that the camera infos describe cameras, a pair, and these images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Is depth in metres, there at all, and where the other images say it is?"""
+"""Checks that depth is there, in metres, and where the other images say it is."""
 
 from __future__ import annotations
 

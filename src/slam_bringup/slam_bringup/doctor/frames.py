@@ -1,4 +1,4 @@
-"""Is it known where every sensor sits, in the axes of REP-103?"""
+"""Checks that it is known where every sensor sits, in the axes of REP-103."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does the IMU report m/s2 and rad/s, with gravity where down is?"""
+"""Checks that the IMU reports m/s2 and rad/s, with gravity where down is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Do the stamps go forward at an even rate, on one clock, and together where images belong together?"""
+"""Checks that stamps go forward at an even rate, on one clock, and together where images belong together."""
 
 from __future__ import annotations
 

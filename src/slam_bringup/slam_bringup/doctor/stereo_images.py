@@ -1,4 +1,4 @@
-"""Do left and right see the same, on the same rows, the right one from the right; and are they fit to be looked at?"""
+"""Checks that left and right see the same on the same rows, the right one from the right, and are sharp enough."""
 
 from __future__ import annotations
 

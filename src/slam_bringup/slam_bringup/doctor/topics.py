@@ -1,4 +1,4 @@
-"""Is everything there, readable, and offered so that it arrives?"""
+"""Checks that everything is there, readable, and offered so that it arrives."""
 
 from __future__ import annotations
 

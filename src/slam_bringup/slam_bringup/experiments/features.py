@@ -101,7 +101,7 @@ def mutual_matches(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, np.
 
 
 def compare_tof_pictures(folder: Path, before: list[Path], frames: int) -> Kept:
-    """Section 3.3: how repeatable are features of amplitude, range and intensity pictures?"""
+    """Section 3.3: repeatability of features of amplitude, range and intensity pictures."""
     views = [view for view in simulated_frames("small_room", frames, 3) if view.depth is not None]
     values = {kind: _tof_found_again(views, kind) for kind in _KINDS}
     depth = views[0].depth

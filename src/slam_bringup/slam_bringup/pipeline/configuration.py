@@ -78,8 +78,10 @@ def _group(name: str, kind: type[Config], known: set[str], overrides: Overrides)
 
 
 def choose(config: SystemConfig, mode: str, mapper: str, odometry: str, imu: str | None = None) -> SystemConfig:
-    """Apply the choices of the command line: where depth comes from, submaps or one filter, scan odometry or none, and
-    whether an IMU is used (None: as configured).
+    """Apply the choices of the command line.
+
+    Where depth comes from, submaps or one filter, scan odometry or none, and whether an IMU is used (None: as
+    configured).
     """
     motion = config.ekf_slam.motion
     submap = config.ekf_slam.submap

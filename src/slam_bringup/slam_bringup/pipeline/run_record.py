@@ -38,8 +38,9 @@ class StateChanges:
 
 @dataclass(frozen=True, eq=False)
 class AgentRecord:
-    """What was said of one agent, frame by frame; ``events`` are changes of its filter's state, ``front_end`` what its
-    images told.
+    """What was said of one agent, frame by frame.
+
+    ``events`` are changes of its filter's state, ``front_end`` what its images told.
     """
 
     filtered: Sequence[PoseEstimate] = field(default_factory=list)

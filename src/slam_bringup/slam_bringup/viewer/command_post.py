@@ -20,8 +20,9 @@ _NOWHERE_M = 20.0
 
 @dataclass(frozen=True, eq=False)
 class WayOut:
-    """An agent's way back to the exit, or None through what was seen; ``radius``: the agent stands within so many
-    metres of where the way begins, with 99.5 %.
+    """An agent's way back to the exit, or None through what was seen.
+
+    ``radius``: the agent stands within so many metres of where the way begins, with 99.5 %.
     """
 
     agent: str

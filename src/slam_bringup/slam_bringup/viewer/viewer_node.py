@@ -63,8 +63,9 @@ class _Agent:
 
 
 class ViewerNode(SlamNode[ViewerConfig]):
-    """Shows agents, map, model and floor plan; a click on the page, once asked for, is published as
-    ``clicked_point``.
+    """Shows agents, map, model and floor plan.
+
+    A click on the page, once asked for, is published as ``clicked_point``.
     """
 
     def __init__(self) -> None:

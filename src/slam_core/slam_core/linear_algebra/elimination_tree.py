@@ -96,8 +96,9 @@ def inverse_stack_size(symbolic: Symbolic) -> int:
 
 @njit(cache=True, nogil=True)
 def _fill(column_ptr, rows):
-    """Parent of every block column and its rows below the diagonal in the factor (unsorted): those of the matrix and
-    of its children.
+    """Parent of every block column and its rows below the diagonal in the factor (unsorted).
+
+    Those of the matrix and of its children.
     """
     n = len(column_ptr) - 1
     parent, mark = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
@@ -161,8 +162,10 @@ def _postorder(parent, largest_first):
 
 @njit(cache=True, nogil=True)
 def _supernodes(parent, width, below):
-    """Where supernodes start, in postorder: columns of the same rows, then relaxed (Ashcraft and Grimes 1989): a
-    supernode joins its parent behind it where that stores few zeros, since larger fronts are worth some.
+    """Where supernodes start, in postorder.
+
+    Columns of the same rows, then relaxed (Ashcraft and Grimes 1989): a supernode joins its parent behind it where that
+    stores few zeros, since larger fronts are worth some.
     """
     n = len(parent)
     starts = np.empty(n + 1, np.int64)

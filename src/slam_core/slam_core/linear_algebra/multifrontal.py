@@ -44,16 +44,18 @@ class Multifrontal:
         return np.asarray(columns.T[self._position].reshape(rhs.shape))
 
     def inverse_block(self, variables: IntArray) -> FloatArray:
-        """Dense block (k, k) of ``A^-1``: with ``W = L^-1 E`` it is ``W^T W``, and W differs from zero only above the
-        variables in the elimination tree.
+        """Dense block (k, k) of ``A^-1``.
+
+        With ``W = L^-1 E`` it is ``W^T W``, and W differs from zero only above the variables in the elimination tree.
         """
         position = self._position[variables]
         W = kernels.unit_columns(self.symbolic, self._panels, position)
         return np.asarray(W.T @ W)
 
     def marginal_information(self, variables: IntArray) -> FloatArray:
-        """What eliminating all others leaves of ``variables`` (k,), which must be those that are eliminated last: with
-        their rows and columns of L it is ``L L^T``.
+        """What eliminating all others leaves of ``variables`` (k,), which must be those that are eliminated last.
+
+        With their rows and columns of L it is ``L L^T``.
         """
         symbolic = self.symbolic
         place = np.full(len(self._order), -1, dtype=np.int64)

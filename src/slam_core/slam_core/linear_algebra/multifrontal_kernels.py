@@ -174,8 +174,9 @@ def solve(symbolic, panels, x):
 
 @njit(cache=True, nogil=True)
 def unit_columns(symbolic, panels, position):
-    """``L^-1 E`` for unit columns E at some positions, without the rows that stay zero: only supernodes above the
-    positions in the tree are touched.
+    """``L^-1 E`` for unit columns E at some positions, without the rows that stay zero.
+
+    Only supernodes above the positions in the tree are touched.
     """
     _, _, width, start, column_ptr, row_ptr, rows, size, eliminated, panel_ptr, parent = symbolic
     active = np.zeros(len(size), np.bool_)
@@ -216,8 +217,10 @@ def unit_columns(symbolic, panels, position):
 
 @njit(cache=True, nogil=True)
 def invert(symbolic, panels, inverse, stack):
-    """Panels of the inverse, from the root down: with ``Y = L_IJ L_JJ^-1`` the front of the inverse is
-    ``Z_IJ = -Z_II Y`` and ``Z_JJ = L_JJ^-T L_JJ^-1 - Y^T Z_IJ``; ``Z_II`` is part of the parent's front.
+    """Panels of the inverse, from the root down.
+
+    With ``Y = L_IJ L_JJ^-1`` the front of the inverse is ``Z_IJ = -Z_II Y`` and ``Z_JJ = L_JJ^-T L_JJ^-1 - Y^T Z_IJ``;
+    ``Z_II`` is part of the parent's front.
     """
     _, _, width, start, column_ptr, row_ptr, rows, size, eliminated, panel_ptr, parent = symbolic
     supernodes = len(size)
