@@ -66,6 +66,13 @@ def test_the_markdown_page_holds_every_comparison(planar_run):
     assert "slam experiment planar" in page
 
 
+def test_a_folder_of_others_is_refused(tmp_path):
+    (tmp_path / "experiments.html").write_text("mine")
+    result = CliRunner().invoke(slam, ["experiment", "planar", "-o", str(tmp_path), "--quick"])
+    assert result.exit_code != 0
+    assert (tmp_path / "experiments.html").read_text() == "mine"
+
+
 def test_an_unmet_mark_is_said(planar_run, tmp_path):
     out, (entry,) = planar_run
     failed = {**entry, "quick": False, "comparisons": [{**entry["comparisons"][0], "met": False}]}

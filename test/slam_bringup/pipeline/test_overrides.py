@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from slam_bringup.pipeline.configuration import load_system_config, system_config
+from ndt_registration.odometry import OdometryConfig
+from ndt_registration.registration import RegistrationConfig
+from slam_bringup.pipeline.configuration import SystemConfig, choose, load_system_config, system_config
 from slam_bringup.pipeline.overrides import overrides_of, parse_assignments, read_overrides
 from slam_bringup.processes.node_graph import live_nodes
 
@@ -90,3 +92,12 @@ def test_parameters_in_one_line() -> None:
     }  # fmt: skip
     with pytest.raises(ValueError, match=r"is not NODE.PARAMETER=VALUE"):
         parse_assignments("max_distance=1.5")
+
+
+@pytest.mark.parametrize(
+    ("odometry", "configured", "method"),
+    [("ndt", "ndt", "ndt"), ("ndt", "icp", "ndt"), ("icp", "ndt", "icp_plane"), ("icp", "icp", "icp")],
+)
+def test_icp_is_point_to_plane_unless_point_to_point_is_configured(odometry, configured, method):
+    config = SystemConfig(ndt_odometry=OdometryConfig(registration=RegistrationConfig(method=configured)))
+    assert choose(config, "tof", "sjsam", odometry).ndt_odometry.registration.method == method

@@ -11,39 +11,47 @@ from rich.console import Console
 from rich.table import Table
 
 from slam_bringup.commands.mapping_options import progress_bar
+from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.experiments.catalogue import EXPERIMENTS, chosen
 from slam_bringup.experiments.findings import as_json
 from slam_bringup.experiments.job import in_order
 from slam_bringup.experiments.page import write_markdown, write_page
 from slam_bringup.experiments.runner import run_jobs
 from slam_core.files import atomic_text
+from slam_core.output_folder import OutputFolder
 
 
 @click.command(epilog="Experiments: " + ", ".join(EXPERIMENTS))
 @click.argument("names", nargs=-1, required=True, metavar="NAME...|all")
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="folder to write")
+@click.option("-o", "--output", metavar="OUT", required=True, type=UserPath(file_okay=False), help="folder to write")
 @click.option("--quick", is_flag=True, help="short runs that show that everything works; held to no mark")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="processes on this machine")
 @click.option("--scheduler", help="address of a Dask scheduler, tcp://HOST:8786; its workers must see OUT")
-def command(names: tuple[str, ...], output: Path, quick: bool, workers: int, scheduler: str | None) -> None:
+@overwrite_option("results that were changed since they were written")
+def command(
+    names: tuple[str, ...], output: Path, quick: bool, workers: int, scheduler: str | None, overwrite: bool
+) -> None:
     """Run the experiments NAME of the thesis, or all of them.
 
     OUT holds experiments.html, .md and .json, the figures, and in OUT/cache what was computed: a second run redoes
     only what depends on changed code.
     """
     experiments = chosen(names)
+    folder = OutputFolder(output, "experiment", overwrite=overwrite, last="experiments.json")
     wanted = {e.name: e.jobs(quick) for e in experiments}
     jobs = list({job.digest: job for needed in wanted.values() for job in needed.values()}.values())
-    with progress_bar() as progress:
-        task = progress.add_task("experiments", total=len(in_order(jobs)))
-        results = run_jobs(jobs, output / "cache", workers, scheduler, lambda job: progress.advance(task))
-    findings = []
-    for experiment in experiments:
-        found = experiment.report({name: results[job] for name, job in wanted[experiment.name].items()})
-        findings.append(as_json(experiment, found, output, quick=quick))
-    atomic_text(output / "experiments.json", json.dumps(findings, indent=1) + "\n")
-    write_page(output / "experiments.html", findings)
-    write_markdown(output / "experiments.md", findings)
+    with folder:
+        with progress_bar() as progress:
+            task = progress.add_task("experiments", total=len(in_order(jobs)))
+            results = run_jobs(jobs, output / "cache", workers, scheduler, lambda job: progress.advance(task))
+        with folder.staged() as staged:
+            findings = []
+            for experiment in experiments:
+                found = experiment.report({name: results[job] for name, job in wanted[experiment.name].items()})
+                findings.append(as_json(experiment, found, staged, quick=quick))
+            atomic_text(staged / "experiments.json", json.dumps(findings, indent=1) + "\n")
+            write_page(staged / "experiments.html", findings)
+            write_markdown(staged / "experiments.md", findings)
     Console().print(_table(findings))
     Console().print(f"written to {output / 'experiments.html'}")
     if any(c["met"] is False for entry in findings for c in entry["comparisons"]):

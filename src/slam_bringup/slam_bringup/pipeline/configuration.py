@@ -89,7 +89,7 @@ def choose(config: SystemConfig, mode: str, mapper: str, odometry: str, imu: str
         submap = replace(submap, max_distance=1e6, max_landmarks=10**9, max_frames=10**9)
     registration = config.ndt_odometry.registration
     if odometry != "none":
-        registration = replace(registration, method={"ndt": "ndt", "icp": "icp_plane"}[odometry])
+        registration = replace(registration, method=_method(odometry, registration.method))
     return replace(
         config,
         feature_extractor=replace(config.feature_extractor, mode=mode),
@@ -115,3 +115,10 @@ def filter_config(config: FilterConfig, sensors: AgentSensors) -> FilterConfig:
         raise ValueError("an IMU is asked for (--imu on) and there is no topic imu: name it by --topic imu=/...")
     imu = (IMU,) if "imu" in sensors.topics and config.motion.imu != "off" else ()
     return replace(config, agent=sensors.agent, wait_for=(*config.wait_for, *imu))
+
+
+def _method(odometry: str, configured: str) -> str:
+    """Registration method of a choice of the command line; ICP is point to plane unless point to point is configured."""
+    if odometry == "ndt":
+        return "ndt"
+    return "icp" if configured == "icp" else "icp_plane"
