@@ -118,7 +118,7 @@ def filter_config(config: FilterConfig, sensors: AgentSensors) -> FilterConfig:
 
 
 def _method(odometry: str, configured: str) -> str:
-    """Registration method of a choice of the command line; ICP is point to plane unless point to point is configured."""
+    """Registration method of a choice of the command line; ICP is point to plane unless configured otherwise."""
     if odometry == "ndt":
         return "ndt"
     return "icp" if configured == "icp" else "icp_plane"
