@@ -103,10 +103,10 @@ def consistency_equations(first: StereoView, second: StereoView, known: Rectific
         weight = np.linalg.inv(covariance)
         squares = np.einsum("ni,nij,nj->n", residual, weight, residual)
         noise = max(1.0, float(np.median(squares)) / _MEDIAN_CHI_SQUARE_3)
-        weight *= (1.0 / noise / (1.0 + squares / noise / _ROBUST_SCALE))[:, None, None]
-        H_mm, H_mt, H_tt = (np.einsum("nia,nij,njb->ab", a, weight, b) for a, b in (
-            (J_motion, J_motion), (J_motion, J_theta), (J_theta, J_theta)))  # fmt: skip
-        g_m, g_t = (np.einsum("nia,nij,nj->a", a, weight, residual) for a in (J_motion, J_theta))
+        robust = 1.0 / noise / (1.0 + squares / noise / _ROBUST_SCALE)
+        J = np.concatenate([J_motion, J_theta], axis=2)
+        H, g = _normal(J, np.asarray(robust[:, None, None] * weight), residual)
+        H_mm, H_mt, H_tt, g_m, g_t = H[:6, :6], H[:6, 6:], H[6:, 6:], g[:6], g[6:]
         if np.linalg.cond(H_mm) > 1e12:
             return None
         eliminate = np.linalg.solve(H_mm, H_mt).T
@@ -114,9 +114,15 @@ def consistency_equations(first: StereoView, second: StereoView, known: Rectific
         at = theta
         step = np.linalg.solve(information + prior, -gradient + prior @ (known.parameters - theta))
         theta = theta + step
-        turn = np.linalg.solve(H_mm, -(g_m + H_mt @ step))
+        turn = np.asarray(np.linalg.solve(H_mm, -(g_m + H_mt @ step)))
         T = make_transform(so3_exp(turn[3:]) @ T[:3, :3], T[:3, 3] + turn[:3])
     return NormalEquations(0.5 * (information + information.T), information @ at - gradient)
+
+
+def _normal(J: FloatArray, weight: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Sums ``J^T W J`` (k, k) and ``J^T W r`` (k,) of Jacobians (n, 3, k), weights (n, 3, 3), residuals (n, 3)."""
+    rows, weighted = J.reshape(-1, J.shape[2]), (weight @ J).reshape(-1, J.shape[2])
+    return rows.T @ weighted, weighted.T @ residual.ravel()
 
 
 def row_equations(view: StereoView, known: RectificationError, floor_px: float) -> NormalEquations:
