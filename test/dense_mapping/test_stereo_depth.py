@@ -28,9 +28,11 @@ def shifted_texture(rng: np.random.Generator, disparity: float) -> StereoImages:
     return StereoImages(0, noisy[0], noisy[1], STEREO)
 
 
+@pytest.mark.parametrize("max_pixels", [320 * 240, 320 * 240 - 1])
 @pytest.mark.parametrize("disparity", [6.0, 9.37, 14.5])
-def test_a_textured_wall_is_measured_to_a_fraction_of_a_pixel(rng, disparity):
-    image = stereo_depth(shifted_texture(rng, disparity), StereoDepthConfig())
+def test_a_textured_wall_is_measured_to_a_fraction_of_a_pixel(rng, disparity, max_pixels):
+    """Also where the images are halved for matching."""
+    image = stereo_depth(shifted_texture(rng, disparity), StereoDepthConfig(max_pixels=max_pixels))
     known = np.isfinite(image.depth)
     found = 200.0 * 0.1 / image.depth[known]
     assert known[20:-20, 40:-20].mean() > 0.9

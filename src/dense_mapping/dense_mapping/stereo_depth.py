@@ -1,6 +1,7 @@
 r"""Dense depth of a stereo pair with the standard deviation of every pixel.
 
-    semi-global matching, both ways -> left-right check -> sub-pixel step -> sigma from residual and texture
+    halved images -> semi-global matching, both ways -> left-right check
+    full images   -> sub-pixel step -> sigma from residual and texture
 
 Semi-global matching (Hirschmueller 2008, OpenCV) fills textureless walls with whatever is smooth. What tells a
 measured disparity from a guessed one is the image itself: the right image, warped by the disparity, leaves a residual
@@ -29,10 +30,16 @@ _FAR_PX = 1e6
 
 @dataclass(frozen=True)
 class StereoDepthConfig(Config):
-    """Semi-global matching and the noise of its disparities."""
+    """Semi-global matching and the noise of its disparities.
+
+    Pixels of the matching, up to ``jump``, are those of the halved images.
+    """
 
     min_depth: float = parameter(0.3, "nearest depth that is searched", unit="m", minimum=0.05)
-    block_size: int = parameter(9, "window that is compared, odd", unit="px", minimum=3, maximum=21)
+    max_pixels: int = parameter(
+        240000, "larger images are halved for matching until they have no more pixels", unit="px", minimum=1000
+    )
+    block_size: int = parameter(7, "window that is compared, odd", unit="px", minimum=3, maximum=21)
     uniqueness_percent: int = parameter(
         5, "how much better the best disparity must be than the second best", unit="%", minimum=0, maximum=100
     )
@@ -41,7 +48,7 @@ class StereoDepthConfig(Config):
     )
     speckle_size: int = parameter(200, "islands of disparity up to this size are dropped", unit="px", minimum=0)
     edge_radius: int = parameter(
-        4, "pixels so near a jump of disparity are dropped: the matcher widens near objects", unit="px", minimum=0
+        2, "pixels so near a jump of disparity are dropped: the matcher widens near objects", unit="px", minimum=0
     )
     jump: float = parameter(
         3.0, "difference of disparities within ``edge_radius`` that is a jump", unit="px", minimum=0.1
@@ -77,15 +84,25 @@ def _disparity(images: StereoImages, config: StereoDepthConfig) -> tuple[Float32
 
 def _checked_disparity(images: StereoImages, config: StereoDepthConfig) -> Float32Array:
     """Disparity by matching both ways, NaN where the two disagree or near a jump."""
-    stereo = images.stereo
-    largest = stereo.camera.fx * stereo.baseline / config.min_depth
-    steps = 16 * max(1, int(np.ceil(min(largest, images.left.shape[1] / 3.0) / 16.0)))
-    left = _match(images.left, images.right, steps, config)
-    mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (images.right, images.left)]
-    right = _match(mirrored[0], mirrored[1], steps, config)[:, ::-1]
-    left[_disagrees(left, right, config.max_left_right)] = np.nan
-    left[_near_jump(left, config)] = np.nan
-    return left
+    left, right = (_halved(image, config.max_pixels) for image in (images.left, images.right))
+    height, width = images.left.shape
+    scale = left.shape[1] / width
+    largest = scale * images.stereo.camera.fx * images.stereo.baseline / config.min_depth
+    steps = 16 * max(1, int(np.ceil(min(largest, left.shape[1] / 3.0) / 16.0)))
+    disparity = _match(left, right, steps, config)
+    mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (right, left)]
+    back = _match(mirrored[0], mirrored[1], steps, config)[:, ::-1]
+    disparity[_disagrees(disparity, back, config.max_left_right)] = np.nan
+    disparity[_near_jump(disparity, config)] = np.nan
+    # Linear: nearest neighbours would make steps of every slanted wall. What has an unknown neighbour gets unknown.
+    return np.asarray(cv2.resize(disparity / np.float32(scale), (width, height), interpolation=cv2.INTER_LINEAR))
+
+
+def _halved(image: ByteArray, max_pixels: int) -> ByteArray:
+    """The image, halved until it has no more than so many pixels: matching costs the cube of the width."""
+    while image.size > max_pixels:
+        image = np.asarray(cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA))
+    return image
 
 
 def _match(image: ByteArray, other: ByteArray, steps: int, config: StereoDepthConfig) -> Float32Array:

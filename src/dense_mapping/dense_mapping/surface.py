@@ -20,7 +20,7 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import ByteArray, Float32Array
 
-_CHUNK = 8
+_CHUNK = 6
 """Blocks along the edge of a cube that marching cubes runs over at once."""
 
 
@@ -85,16 +85,17 @@ def voxel_statistics(voxels: Float32Array, config: SurfaceConfig) -> tuple[Float
     The spread of the images about their mean widens what their sigmas claim, and never narrows it; a share of the
     variance, ``correlation``, stays however many images there are, because neighbours see a place with equal errors.
     """
-    weighted, weight, squared, number = np.moveaxis(voxels.astype(np.float64), -1, 0)
+    weighted, weight, squared, number = np.moveaxis(voxels, -1, 0)
     seen = (number >= config.min_images - 0.5) & (weight > 0.0)
-    safe, count = np.where(seen, weight, 1.0), np.where(seen, number, 1.0)
-    mean = weighted / safe
-    spread = np.maximum(squared - weighted * mean, 0.0) / np.maximum(count - 1.0, 1.0)
-    factor = np.maximum(spread, 1.0)
-    variance = factor * (1.0 + (count - 1.0) * config.correlation) / safe + config.sigma_floor**2
-    sigma = np.sqrt(variance)
-    known = seen & (sigma <= config.max_sigma)
-    return np.where(known, mean, np.nan).astype(np.float32), np.where(known, sigma, np.nan).astype(np.float32)
+    w, count = weight[seen].astype(np.float64), number[seen].astype(np.float64)
+    seen_mean = weighted[seen] / w
+    spread = np.maximum(squared[seen] - weighted[seen] * seen_mean, 0.0) / np.maximum(count - 1.0, 1.0)
+    variance = np.maximum(spread, 1.0) * (1.0 + (count - 1.0) * config.correlation) / w + config.sigma_floor**2
+    seen_sigma = np.sqrt(variance)
+    known = seen_sigma <= config.max_sigma
+    mean, sigma = (np.full(seen.shape, np.nan, dtype=np.float32) for _ in range(2))
+    mean[seen], sigma[seen] = np.where(known, seen_mean, np.nan), np.where(known, seen_sigma, np.nan)
+    return mean, sigma
 
 
 def _chunks(volume: TsdfVolume) -> npt.NDArray[np.int64]:
@@ -112,10 +113,10 @@ def _chunk_surface(
     sigma = np.full((size, size, size), np.nan, dtype=np.float32)
     colours = np.zeros((size, size, size, 3), dtype=np.uint8)
     inside = np.flatnonzero(((volume.coordinates >= corner) & (volume.coordinates <= corner + _CHUNK)).all(axis=1))
-    for row in inside:
+    means, sigmas = voxel_statistics(volume.voxels[inside], config)
+    for row, mean, uncertain in zip(inside, means, sigmas, strict=True):
         x, y, z = ((volume.coordinates[row] - corner) * BLOCK).tolist()
         place = np.s_[x : x + BLOCK, y : y + BLOCK, z : z + BLOCK]
-        mean, uncertain = voxel_statistics(volume.voxels[row], config)
         distance[place], sigma[place] = mean.reshape((BLOCK,) * 3), uncertain.reshape((BLOCK,) * 3)
         colours[place] = volume.colours[row, :, :3].reshape(BLOCK, BLOCK, BLOCK, 3)
     edge = _CHUNK * BLOCK + 1

@@ -10,20 +10,25 @@ import trimesh
 
 from dense_mapping.surface import Surface
 from slam_core.files import atomic_path
-from slam_core.types import AnyArray
 
 
 def write_points(path: Path, surface: Surface) -> None:
     """Write the vertices as a binary PLY: x y z, nx ny nz, red green blue, sigma (m)."""
-    _write(path, [plyfile.PlyElement.describe(_vertices(surface), "vertex")])
+    with atomic_path(path) as temporary:
+        plyfile.PlyData([_vertex_element(surface)], byte_order="<").write(str(temporary))
 
 
 def write_mesh(path: Path, surface: Surface) -> None:
     """Write vertices, as :func:`write_points`, and triangles as a binary PLY."""
     faces = np.empty(len(surface.faces), dtype=[("vertex_indices", "<i4", (3,))])
-    faces["vertex_indices"] = surface.faces
-    elements = [(_vertices(surface), "vertex"), (faces, "face")]
-    _write(path, [plyfile.PlyElement.describe(data, name) for data, name in elements])
+    ply = plyfile.PlyData([_vertex_element(surface), plyfile.PlyElement.describe(faces, "face")], byte_order="<")
+    # plyfile writes lists face by face, in Python; triangles all have one size.
+    rows = np.empty(len(surface.faces), dtype=[("size", "u1"), ("corners", "<i4", (3,))])
+    rows["size"], rows["corners"] = 3, surface.faces
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(f"{ply.header}\n".encode("ascii"))
+        file.write(ply["vertex"].data.tobytes())
+        file.write(rows.tobytes())
 
 
 def write_glb(path: Path, surface: Surface) -> None:
@@ -62,7 +67,7 @@ def read_mesh(path: Path) -> Surface:
     return Surface(points, normals, colours, sigma, faces.astype(np.int32))
 
 
-def _vertices(surface: Surface) -> AnyArray:
+def _vertex_element(surface: Surface) -> plyfile.PlyElement:
     names = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4")]
     names += [("red", "u1"), ("green", "u1"), ("blue", "u1"), ("sigma", "<f4")]
     out = np.empty(len(surface), dtype=names)
@@ -71,9 +76,4 @@ def _vertices(surface: Surface) -> AnyArray:
         out[("nx", "ny", "nz")[axis]] = surface.normals[:, axis]
         out[("red", "green", "blue")[axis]] = surface.colours[:, axis]
     out["sigma"] = surface.sigma
-    return out
-
-
-def _write(path: Path, elements: list[plyfile.PlyElement]) -> None:
-    with atomic_path(path) as temporary:
-        plyfile.PlyData(elements, byte_order="<").write(str(temporary))
+    return plyfile.PlyElement.describe(out, "vertex")

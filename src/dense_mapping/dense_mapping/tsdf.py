@@ -8,6 +8,7 @@ The sums are linear: an image whose pose has changed is taken away where it was 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,7 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray, Float32Array
 
+Scalar = TypeVar("Scalar", bound=np.generic)
 VOXELS = BLOCK**3
 _KEY_RANGE = 1 << 20
 """Block coordinates lie within plus and minus half of this."""
@@ -138,10 +140,17 @@ class TsdfVolume:
         capacity = len(self._voxels)
         if wanted <= capacity:
             return
-        extra = max(wanted, 2 * capacity, 1024) - capacity
-        self._coordinates = np.concatenate([self._coordinates, np.zeros((extra, 3), dtype=np.int64)])
-        self._voxels = np.concatenate([self._voxels, np.zeros((extra, VOXELS, 4), dtype=np.float32)])
-        self._colours = np.concatenate([self._colours, np.zeros((extra, VOXELS, 4), dtype=np.uint8)])
+        size = max(wanted, 2 * capacity, 1024)
+        self._coordinates = _extended(self._coordinates, size)
+        self._voxels = _extended(self._voxels, size)
+        self._colours = _extended(self._colours, size)
+
+
+def _extended(rows: npt.NDArray[Scalar], size: int) -> npt.NDArray[Scalar]:
+    """The rows, and zeros after them up to ``size``: of zeros that nothing is written to no memory is taken."""
+    out = np.zeros((size, *rows.shape[1:]), dtype=rows.dtype)
+    out[: len(rows)] = rows
+    return out
 
 
 def _keys(cells: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -75,14 +75,18 @@ def integrate(
     has_picture = picture.shape[0] > 0
     for b in blocks:
         for i in range(BLOCK * BLOCK * BLOCK):
-            x = origins[b, 0] + (i // (BLOCK * BLOCK) + 0.5) * voxel_size
-            y = origins[b, 1] + ((i // BLOCK) % BLOCK + 0.5) * voxel_size
+            if i % BLOCK == 0:  # the next column of voxels along z
+                x = origins[b, 0] + (i // (BLOCK * BLOCK) + 0.5) * voxel_size
+                y = origins[b, 1] + ((i // BLOCK) % BLOCK + 0.5) * voxel_size
+                column_x = T[0, 0] * x + T[0, 1] * y + T[0, 3]
+                column_y = T[1, 0] * x + T[1, 1] * y + T[1, 3]
+                column_z = T[2, 0] * x + T[2, 1] * y + T[2, 3]
             z = origins[b, 2] + (i % BLOCK + 0.5) * voxel_size
-            pz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            pz = column_z + T[2, 2] * z
             if pz < 0.05:
                 continue
-            px = (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / pz
-            py = (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / pz
+            px = (column_x + T[0, 2] * z) / pz
+            py = (column_y + T[1, 2] * z) / pz
             u, v = fx * px + cx, fy * py + cy
             measured = _look_up(u, v, depth, truncation)
             if not measured > 0.0:

@@ -40,6 +40,8 @@ def dense_model(
         if reading.agent in cameras:
             cameras[reading.agent].add(reading, model)
         on_reading()
+    for camera in cameras.values():
+        camera.finish(model)
     return model
 
 
@@ -51,6 +53,7 @@ class AgentDepth:
         self._agent, self._trajectory, self._sensors = sensors.agent, trajectory, sensors
         self._depth: DepthStage | None = None
         self._stereo: StereoStage | None = None
+        self._forces: list[tuple[int, FloatArray]] = []
         if self._config.use_tof and sensors.is_mounted("tof"):
             self._depth = depth_stage(config, sensors)
             self._T_base_tof = sensors.transform("base", "tof")
@@ -66,15 +69,22 @@ class AgentDepth:
                 for image in self._depth.ready():
                     model.add(camera, T, image, self._picture(image))
         elif isinstance(reading, ImuReading):
-            T_map_base = self._pose(reading.sample.stamp_ns)
-            if T_map_base is not None:
-                R_base_imu = self._sensors.frames.lookup(self._sensors.base_frame, reading.sample.frame_id)[:3, :3]
-                model.add_specific_force(T_map_base[:3, :3] @ R_base_imu @ reading.sample.linear_acceleration)
+            R_base_imu = self._sensors.frames.lookup(self._sensors.base_frame, reading.sample.frame_id)[:3, :3]
+            self._forces.append((reading.sample.stamp_ns, R_base_imu @ reading.sample.linear_acceleration))
         elif isinstance(reading, StereoReading) and self._stereo is not None:
             for camera, T in self._wanted(model, "stereo", reading.stamp_ns, self._T_base_left):
                 self._stereo.add(reading.pair)
                 for images in self._stereo.ready():
                     model.add(camera, T, stereo_depth(images, self._config.stereo), images.left)
+
+    def finish(self, model: DenseModel) -> None:
+        """Give the model what the accelerometer read along the trajectory, all at once: poses are dear one by one."""
+        stamps = self._trajectory.stamps_ns
+        inside = [(stamp, force) for stamp, force in self._forces if stamps[0] <= stamp <= stamps[-1]]
+        if inside:
+            poses = self._trajectory.interpolate(np.array([stamp for stamp, _ in inside]))
+            forces = np.array([force for _, force in inside])
+            model.add_specific_force(np.einsum("nij,nj->i", poses[:, :3, :3], forces))
 
     def _wanted(
         self, model: DenseModel, sensor: str, stamp_ns: int, T_base_camera: FloatArray
