@@ -46,7 +46,8 @@ def write_results(out: Path, result: RunResult, save_map: Callable[[Path], objec
         save_map(out / "map")
     summary = summarise(result)
     save_png(out / "map.png", map_figure(result))
-    write_report(out / "report.html", result, summary | _in_all(result))
+    map_png = (out / "map.png").read_bytes()  # drawn once: it is the dearest of the figures
+    write_report(out / "report.html", result, summary | _in_all(result), map_png)
     summary |= _in_all(result)
     atomic_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
     return summary

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from slam_bringup.pipeline.results import RunResult
 from slam_bringup.report.agent_figures import motion_figure, side_view, sigma_figure
-from slam_bringup.report.figures import error_figure, features_figure, floor_plan_figure, map_figure, timing_figure
+from slam_bringup.report.figures import error_figure, features_figure, floor_plan_figure, timing_figure
 from slam_core.evaluation import Evaluation
 from slam_core.files import atomic_text
 
@@ -22,8 +22,8 @@ _DISHONEST = 1.6
 """Factor between errors and claimed sigmas from which the report warns."""
 
 
-def write_report(path: Path, result: RunResult, summary: dict[str, Any]) -> None:
-    """Write the page; it needs no other file and no network."""
+def write_report(path: Path, result: RunResult, summary: dict[str, Any], map_png: bytes) -> None:
+    """Write the page, with the map's picture as it is; it needs no other file and no network."""
     template = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
         resources.files("slam_bringup.report").joinpath("report.html.j2").read_text(encoding="utf-8")
     )
@@ -44,7 +44,7 @@ def write_report(path: Path, result: RunResult, summary: dict[str, Any]) -> None
     html = template.render(
         summary=summary,
         agents=agents,
-        map=_embedded(map_figure(result)),
+        map=_as_url(map_png),
         side=_embedded(side_view(result)),
         timing=_embedded(timing_figure(result)),
         plans=[_embedded(floor_plan_figure(result, plan)) for plan in result.floor_plans],
@@ -69,4 +69,8 @@ def _embedded(figure: Figure | None) -> str | None:
         return None
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return _as_url(buffer.getvalue())
+
+
+def _as_url(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
