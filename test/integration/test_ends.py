@@ -84,7 +84,7 @@ def test_a_run_that_is_asked_to_end_writes_what_is_mapped(run: Run, number: sign
     if number == signal.SIGHUP:
         run.process.stdout.close()  # a terminal that is closed takes no more words
     run.process.send_signal(number)
-    assert run.process.wait(60.0) == 130
+    assert run.process.wait(240.0) == 130
     assert not run.nodes()
     summary = json.loads((run.out / "summary.json").read_text())
     assert 0 < summary["frames"] < 52
