@@ -52,6 +52,9 @@ class GlobalMapConfig(Config):
         2, "pairs of submaps that a closure has brought near each other, compared with each new submap", minimum=0
     )
     compared_at_settling: int = parameter(2, "the same per submap when the map settles", minimum=0)
+    joined_at_once: int = parameter(
+        12, "closures found when the map settles that are joined, and refused, together", minimum=1
+    )
     ties: int = parameter(24, "landmarks by which two submaps are tied together, at most", minimum=3)
     redundant_share: float = parameter(
         0.6, "share of a submap's landmarks that closures match from which on it shows nothing new", minimum=0.0
@@ -269,10 +272,10 @@ class GlobalMap:
         if not self.graph.records:
             return
         newest = len(self.graph.records) - 1
-        self.smoother.settle()
-        found = self.detector.missed(self._chain, self.config.compared_at_settling * len(self.graph.records))
-        if found:
+        missed = self.detector.missed(self._chain, self.config.compared_at_settling * len(self.graph.records))
+        for found in _grouped(missed, self.config.joined_at_once):
             self._account(self.consistency.update(found, newest)[1], len(found))
+        self.smoother.settle()
         self._account(self.consistency.settle(newest), 0)
         self.smoother.settle()
         self._has_moved = False
@@ -358,3 +361,12 @@ class GlobalMap:
             loaded._put_away(i)
         loaded.smoother.resume()
         return loaded
+
+
+def _grouped(found: list[Link], size: int) -> list[list[Link]]:
+    """Links in groups of a ``size``: a false one takes few true ones with it. Those that the map finds consistent come
+    first, by themselves, and exclude nothing that it holds.
+    """
+    consistent = [k for k in found if k.status is Status.CONSISTENT]
+    others = [k for k in found if k.status is not Status.CONSISTENT]
+    return [links[i : i + size] for links in (consistent, others) for i in range(0, len(links), size)]

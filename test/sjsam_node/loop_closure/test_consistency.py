@@ -7,10 +7,12 @@ import pytest
 from judging import ate, errors, join
 from submap_world import Agent, Sensor, World, path_through, room
 
-from sjsam_node.global_map import GlobalMap
-from sjsam_node.graph.links import Link, Prior
+from sjsam_node.global_map import GlobalMap, GlobalMapConfig
+from sjsam_node.graph.links import Link, Prior, Status
 from sjsam_node.loop_closure.association import match
+from sjsam_node.loop_closure.consistency import Verdict
 from sjsam_node.loop_closure.point_sets import at_start
+from sjsam_node.smoothing.smoother import UpdateResult
 from slam_core.geometry import boxminus, invert_transform
 
 BACK_AND_FORTH = [
@@ -100,3 +102,21 @@ def test_agents_joined_by_rooms_that_look_alike_are_told_apart_by_what_they_see_
     assert joined.counters.counts["closures let go"] > 0
     assert joined.components == 1
     assert error(joined) < 0.3
+
+
+def test_closures_found_when_the_map_settles_are_judged_in_groups_consistent_ones_by_themselves(
+    agent: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that a false one takes few true ones with it."""
+    joined, _ = join(agent.submaps()[:3], GlobalMap(GlobalMapConfig(joined_at_once=2)))
+    link, offered = joined.graph.links[0], []
+
+    def update(found: list[Link], newest: int) -> tuple[UpdateResult, Verdict]:
+        offered.append([k.status for k in found])
+        return joined.smoother.update(newest), Verdict()
+
+    missed = [link.with_status(Status.INCONSISTENT), *[link.with_status(Status.CONSISTENT)] * 3]
+    monkeypatch.setattr(joined.detector, "missed", lambda *_: missed)
+    monkeypatch.setattr(joined.consistency, "update", update)
+    joined.settle()
+    assert offered == [[Status.CONSISTENT] * 2, [Status.CONSISTENT], [Status.INCONSISTENT]]
