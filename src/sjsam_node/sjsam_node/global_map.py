@@ -364,8 +364,9 @@ class GlobalMap:
 
 
 def _grouped(found: list[Link], size: int) -> list[list[Link]]:
-    """Links in groups of a ``size``: a false one takes few true ones with it. Those that the map finds consistent come
-    first, by themselves, and exclude nothing that it holds.
+    """Links in groups of a ``size``, so that a false one takes few true ones with it.
+
+    Those that the map finds consistent come first, by themselves, and exclude nothing that it holds.
     """
     consistent = [k for k in found if k.status is Status.CONSISTENT]
     others = [k for k in found if k.status is not Status.CONSISTENT]
