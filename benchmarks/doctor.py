@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What ``slam doctor`` says of faulted copies of a good bag, and of good bags, of which it must say nothing.
 
     python benchmarks/doctor.py [BAG] [--rgbd BAG] [--good BAG ...]

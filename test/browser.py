@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A headless Chromium for tests, driven over its debugging port: pages, console, requests, screenshots."""
 
 from __future__ import annotations

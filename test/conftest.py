@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shared fixtures: the public data sets (skipped with a reason where absent) and seeded random numbers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Filters and joiner as real processes, and who sends them features of a simulated world: for tests and benchmarks."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node for tests: sends messages to a process under test and collects what comes back."""
 
 from __future__ import annotations

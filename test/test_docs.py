@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pages name commands, options, files and figures that exist."""
 
 from __future__ import annotations

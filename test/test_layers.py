@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rules of the architecture: imports point down, none in a circle, and ROS stays in the nodes."""
 
 from __future__ import annotations

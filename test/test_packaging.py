@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each package names what it imports, for pip (setup.py) and for ROS (package.xml)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Format, lint and types of the whole tree, as pyproject.toml asks for them."""
 
 from __future__ import annotations

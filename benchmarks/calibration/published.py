@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibration of the public boards against their published results (data: $INDOOR_SLAM_DATA or ../shared/data).
 
 python benchmarks/calibration/published.py

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibrate from rendered pictures and compare with the cameras that took them.
 
     python benchmarks/calibration/rendered.py [--views 16]

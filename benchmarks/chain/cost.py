@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a frame costs: CPU time of every stage and of the whole of ``slam run``, real-time factors, peak memory.
 
     python benchmarks/chain/cost.py [CASE ...] [--against CHECKOUT] [--runs N] [--frames N] [--keep FOLDER]

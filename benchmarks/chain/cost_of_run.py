@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One ``slam run`` that also says what CPU time each stage took; ``cost.py`` starts it with a checkout in PYTHONPATH.
 
     python benchmarks/chain/cost_of_run.py JSON BAG -o OUT [OPTION of slam run ...]

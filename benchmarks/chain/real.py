@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole chain on public recordings: convert, map offline, compare with ground truth.
 
     python benchmarks/chain/real.py [NAME ...] [--keep FOLDER]

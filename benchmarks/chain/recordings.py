@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every real recording in one table: accuracy and honesty, alone, with scan odometry, with and without the IMU.
 
     python benchmarks/chain/recordings.py [NAME ...] [--json FILE] [--keep FOLDER] [--no-peers]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Self-calibration of the stereo pair, off and auto: scale and accuracy of joined maps.
 
     python benchmarks/chain/self_calibration.py BAG ...

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dense model against the true surfaces, on true poses or on estimated ones.
 
     python benchmarks/dense/accuracy.py BAG [BAG ...] [--camera tof|stereo|both] [--frames N] [--run OUT]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dense model of a finished run against the model of the same recording on its true poses.
 
     python benchmarks/dense/real.py BAG OUT

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Are the covariances true? Monte-Carlo over simulated features: NEES of poses, landmarks and whole submaps, NIS.
 
     python benchmarks/ekf/consistency.py [RUNS [PART OF A CASE'S NAME]]

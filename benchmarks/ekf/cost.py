@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Milliseconds per update against the number of landmarks, beside what the arithmetic alone takes on this machine.
 
     python benchmarks/ekf/cost.py

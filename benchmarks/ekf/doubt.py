@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What else errs on recordings, beside the estimate: ground truth and calibration."""
 
 from __future__ import annotations

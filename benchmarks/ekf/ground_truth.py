@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who errs, the filter or the ground truth? KITTI's and EuRoC's truth against two estimates that share no code.
 
     python benchmarks/ekf/ground_truth.py [kitti] [euroc]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How far do keypoints leave their surface points as the view changes? Tracks of simulated bags under the true poses.
 
     python benchmarks/ekf/keypoints.py BAG [BAG ...]

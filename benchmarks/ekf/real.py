@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """EKF-SLAM on real images with ground truth: KITTI (51 pairs, 10 Hz) and EuRoC V1_01 (50 key frames, about 1 s apart).
 
     python benchmarks/ekf/real.py [kitti] [euroc]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """EKF-SLAM on real stereo tracks with known association: KITTI raw drives tracked by KLT (Clement et al. 2015).
 
     python benchmarks/ekf/stereo_tracks.py [DRIVES]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real stereo pairs for the feature benchmarks, rectified: EuRoC V1_01 and KITTI."""
 
 from __future__ import annotations

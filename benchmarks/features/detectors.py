@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Table 3.1 of the thesis again: time and number of features per detector and resolution, then how well they match.
 
 Times: processor time of one thread, median of repeats, all detectors in turn in one process. Matching: mutual best

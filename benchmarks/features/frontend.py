@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time of the whole stereo front end per pair and how it splits; simulated 640x480 pairs, EuRoC and KITTI.
 
 Left and right image are extracted on two threads, disparities refined half on each. The parts are processor time of one

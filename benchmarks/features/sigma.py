@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tell whether the standard deviations are true.
 
 (measured - true) / sigma of u, v and depth over simulated frames, and fused against both.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Size and shape of the source tree: lines, names, parameters, constants, circles, function lengths.
 
     python benchmarks/house/structure.py [CHECKOUT ...]

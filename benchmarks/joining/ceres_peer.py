@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The joining problem of block rows in Ceres (pyceres), with pycolmap's compiled residuals.
 
 Point alignment and relative pose.

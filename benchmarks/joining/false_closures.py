@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What false matches and look-alike places do to the joined map.
 
     python benchmarks/joining/false_closures.py

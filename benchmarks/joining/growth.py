@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the time per submap grows with the map: exploring without closures, and lap after lap with them.
 
     python benchmarks/joining/growth.py [--submaps 500] [--laps 4]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The joining problem of block rows in GTSAM's own factors: batch LM, joint covariances, iSAM2."""
 
 from __future__ import annotations

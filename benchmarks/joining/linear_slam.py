@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joins every set of Linear SLAM text submaps in a folder, and simulated ones of the sizes that are not at hand.
 
     python benchmarks/joining/linear_slam.py [FOLDER] [--seeds 1]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Peak memory of a stretch of a process (Linux): what was free before goes back to the system first."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Our joining against GTSAM and Ceres on the same problems, in one run: time, chi2, covariances, memory.
 
     python benchmarks/joining/peers.py [--sizes 34 500 2000] [--repeat 3] [--incremental] [--node]

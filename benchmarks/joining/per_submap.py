@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What joining costs submap by submap, with all that the node publishes, and what comes of it.
 
     python benchmarks/joining/per_submap.py RECORDING.pickle ... [--unread] [--every]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joining problems of any size with known association, shared by the benchmarks: submaps of about 60 landmarks each.
 
 An agent walks a ring road lap after lap, so that every lap closes over the one before. The submaps come from the

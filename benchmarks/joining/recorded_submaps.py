@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Submaps of real and rendered bags, filtered once and kept, so that joining is measured without the rest.
 
     python benchmarks/joining/recorded_submaps.py BAG OUT.pickle [--mode stereo] [--odometry none] [--to-and-fro 200]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Public clouds without an initial guess: ETH apartment, PCL pairs, vehicle lidar, five RGB-D views (slambook).
 
 Where a data set has a transform, the difference from it is printed, and how far the registration leaves it when it

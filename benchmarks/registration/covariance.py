@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """NEES of many noisy registrations per motion: a mean of 6 is exact, far above 6 is a promise not kept.
 
 In one place, all that differs from run to run is the noise. Noise and place stand for two parts of NEES by the mean

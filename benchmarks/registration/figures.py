@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables 10.1 and 10.2 and Figs. 10.1-10.17 again: the thesis's plain ICP beside our ICP and NDT, 15 scans per motion.
 
     python benchmarks/registration/figures.py -o FOLDER [--bag TOF_TURNS]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables 10.1 and 10.2 and beyond: 15 scans per motion, one setting, no initial guess.
 
 Share of points, time, iterations.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """2D laser logs: wheel odometry, scan odometry on top of it, and loops closed by the same registration.
 
 aces is judged by its 1279 manual relations, which stand on a grid of 5 cm; intel has none, so it is judged by how far

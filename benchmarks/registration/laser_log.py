@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """CARMEN logs of planar laser scans with wheel odometry, and the manual relations between their scans."""
 
 from __future__ import annotations

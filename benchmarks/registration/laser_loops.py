@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Loops in the plane: a trajectory cut into nodes, places seen again found by registration, the graph of all optimised.
 
 A node's cloud is merged from the scans of half a metre around it, a candidate's from some metres, so that one who comes

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scan odometry of depth cameras against the truth, beside GICP from frame to frame (small_gicp, where there is one).
 
     python benchmarks/registration/odometry.py [--bags BAG ...] [--redkitchen FOLDER] [--set name=value ...]

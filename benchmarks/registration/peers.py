@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The same scans by PCL's NDT and ICP, small_gicp, Open3D, and ours.
 
 Successes (5 cm, 1 deg) and milliseconds, build and align.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The thesis's plain ICP (10.2): nearest neighbours within one rejection limit, point to point, no more."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A pose graph in the plane: poses (x, y, yaw) joined by relative measurements, loops with a robust loss."""
 
 from __future__ import annotations

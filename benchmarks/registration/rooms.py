@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rooms that nobody chose: of random size, style and furniture, with places in them; and two that leave a scan free."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults at filters and joiner as real processes: who survives, what is lost, and how soon it goes on.
 
     python benchmarks/ros/faults.py [NAME ...]

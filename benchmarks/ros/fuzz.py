@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Random messages on every topic of every node as real processes: nobody dies, all is counted, the map stays.
 
     python benchmarks/ros/fuzz.py [MESSAGES]        100 000 by default

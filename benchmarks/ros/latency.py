@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How late are poses, and how many frames are left out, live? Separate nodes and one process, at a rate and beyond it.
 
     python benchmarks/ros/latency.py BAG [--rate 1.0] [--mode fuse] [--odometry ndt] [--composed] [--seconds 60]

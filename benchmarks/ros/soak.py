@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Growth of memory and latency over an hour of bag time through filter and joiner, moving and standing.
 
     python benchmarks/ros/soak.py [MINUTES]         60 by default, of bag time for each of the two

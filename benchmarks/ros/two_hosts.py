@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A filter on one host and the joiner on another, over a link that loses packets and breaks: the same map after.
 
     sudo python benchmarks/ros/two_hosts.py         needs ip, tc and unshare

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sample frames of every scenario in one picture.
 
 python benchmarks/simulation/contact_sheet.py docs/images/scenarios.png

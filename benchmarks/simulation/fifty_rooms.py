@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Writes bags/scenarios/fifty_rooms.yaml: 50 rooms along two corridors that two passages join to a ring.
 
     python benchmarks/simulation/fifty_rooms.py

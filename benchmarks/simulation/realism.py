@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Is the simulation as hard as reality? The same measurements on simulated and on real recordings.
 
     python benchmarks/simulation/realism.py [--data FOLDER] [--frames N]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames per second of the simulation, on one and two threads, and what each stage costs.
 
 python benchmarks/simulation/speed.py [SCENARIO ...]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ToF noise against distance and reflectance, measured on a wall, beside what the sensor is specified to have.
 
 python benchmarks/simulation/tof_noise.py

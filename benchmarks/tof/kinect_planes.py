@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Noise of a real structured-light camera on flat surfaces against the driver's sigma (7-Scenes redkitchen, Kinect v1).
 
     python benchmarks/tof/kinect_planes.py

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Is the ToF driver's sigma honest? (measured - true) / sigma over simulated frames, against the rendered depth.
 
     python benchmarks/tof/noise.py [SCENARIO ...] [--frames 12]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build of ekf_slam_node (ament_python)."""
 
 from setuptools import find_packages, setup

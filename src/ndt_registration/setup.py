@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build of ndt_registration (ament_python)."""
 
 from setuptools import find_packages, setup

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build of slam_bringup (ament_python)."""
 
 from glob import glob

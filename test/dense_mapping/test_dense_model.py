@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dense model of a simulated room against its true walls: a wrong scale or mounting must show."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Floor plans of a simulated flat: walls where they are, free where one can walk, unknown where nobody looked."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``dense_mapper`` node over real topics: nothing before the path, then a cloud and a plan, moved with the path."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of floor plans, read by the rules of Nav2's map_server."""
 
 from __future__ import annotations

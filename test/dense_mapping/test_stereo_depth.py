@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Dense stereo depth against the truth of the simulator: honest sigma, no guessed walls."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of a surface: read back by us, and by another program."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Makes the feature-level simulator importable by this folder's tests."""
 
 import sys

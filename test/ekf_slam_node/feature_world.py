@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A world of points with descriptors, seen by a stereo camera as features: the measurement model of the filter and its
 noise.
 

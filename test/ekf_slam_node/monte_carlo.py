@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Monte-Carlo runs of the estimator on simulated features, and what its errors say about its covariances."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The 2D experiment of the thesis (1.7, 5.1): a robot drives a loop among landmarks, 50 samples."""
 
 from __future__ import annotations

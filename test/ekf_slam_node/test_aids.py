@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion from scans and turn rates from an IMU: chained, interpolated, gated, and worth what they claim."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Association and motion guess against the simulated truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the calibration leaves unknown: its effect on poses, and covariances that own up to it."""
 
 from __future__ import annotations

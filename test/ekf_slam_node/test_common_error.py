@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The error that all features of a frame share: found where it is, zero where noise is fresh, and believed by the
 filter.
 """

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Monte-Carlo through the whole estimator, association and submaps included: are its covariances true?
 
 The full figures, with more runs and more cases, are printed by ``benchmarks/ekf/consistency.py``.

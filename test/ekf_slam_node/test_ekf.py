@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The filter against independent implementations: dense algebra, filterpy, and the statistics of its own errors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Unstable landmarks are removed (section 4.4), and Eq. 7.1's start is what conditioning says."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Jacobians of the models against central differences, and inverses against their originals."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``ekf_slam`` as a real process over real topics: the poses and submaps of the offline filter, and health in words."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compiled kernels of the motion guess against the filter's NumPy models."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The 2D twin: models, consistency, association known and unknown, JCBB, and smoothing beside filtering."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The estimator frame by frame on simulated features: accuracy, submaps, loss, rejection of what is wrong."""
 
 from __future__ import annotations

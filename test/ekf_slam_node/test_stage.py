@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The filter's stage: the order of arrival does not matter, and a stream that dies stops nothing."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each landmark's own share of the noise: nothing where all are alike, the truth where they differ."""
 
 from __future__ import annotations

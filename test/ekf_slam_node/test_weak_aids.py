@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Aids at low frame rates, where the motion model knows little: a weak one does no harm, a wrong one is outvoted."""
 
 from __future__ import annotations

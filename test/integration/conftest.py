@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The built workspace, a small bag, and a private ROS domain for tests with real processes."""
 
 from __future__ import annotations

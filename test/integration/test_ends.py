@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How a run of nodes ends: with its terminal, with its starter, on Ctrl-C, and at once where its input cannot work."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What ``ros2 run`` would start: found through the ament index, ready, heard, and ended by SIGINT without a word."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenarios keep the bounds of ``bags/expected.yaml``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A part of ``benchmarks/ros/fuzz.py``: random messages end no node, and the map stays as it was."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The real ``ros2 launch`` on the committed bag, where it can be installed (ros2cli, launch, launch_ros)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bag in bags/ with an IMU, through the nodes and offline: the same trajectory and map, nothing lost."""
 
 from __future__ import annotations

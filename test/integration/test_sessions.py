@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Odd stamps and jumping clocks at the filter and the joiner as real processes: no submap is ever forgotten."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A room of axis-aligned boxes and a range camera in it, cast by slabs in NumPy."""
 
 from __future__ import annotations

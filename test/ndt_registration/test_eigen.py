@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Eigenvalues in closed form against LAPACK, near equal eigenvalues and flat cells included."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Turns from angular velocities: exact for a steady one, refused where samples are missing, and of use to odometry."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ICP in the plane: normals lie in it, also where rounding has lifted points off it, and a corner is registered."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fit of a cloud to cells: curvature made by errors of normals, gradients of blocks."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The filter of pose and velocity: honest over many runs, blind directions filled by the prediction, exact limits."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam register`` on small files."""
 
 from __future__ import annotations

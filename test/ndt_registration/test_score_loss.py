@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a scan loses when its pose is moved: much across a wall, nothing along it, although its view ends."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scan odometry's stage: the motion of the rig, and a scan waits for the IMU that is to predict its turn."""
 
 from __future__ import annotations

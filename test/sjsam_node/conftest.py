@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Maps built from the feature-level world, and how far they are from the truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compares joined maps of the feature-level world with its truth."""
 
 from __future__ import annotations

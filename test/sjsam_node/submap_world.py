@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A world of landmarks and the submaps a consistent EKF would build in it: exact Gaussians, to judge joining by.
 
 Every submap is the posterior of a small estimation problem of its own: a few rig poses with odometry between them,

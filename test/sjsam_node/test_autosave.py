@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The copy of the map that a killed node goes on from."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The process of ``sjsam`` is killed after it saved its map; another one loads the map and goes on."""
 
 from __future__ import annotations

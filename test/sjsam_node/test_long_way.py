@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A long way without a closure: what is far from the fixed end is as exact as what is near."""
 
 from __future__ import annotations

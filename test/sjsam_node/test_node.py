@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node as its neighbours see it: submaps over topics in, map, path, transform and services out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pose in the map between submaps: exact composition, honest covariance, and odometry that begins anew."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every form and library that can be chosen: the map is the same whatever solves it, and the report says what did."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Text submaps in the Linear SLAM format from simulated walks, 2D or 3D, so that sizes not at hand can be tried.
 
 ``ring``: laps along a ring with a wavy floor. ``park``: one step per map through a park with few trees, by ways that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The parameter reference in docs/ says what the code says."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bundle's parts: derivatives of the residuals, robustness, and the covariance against a dense solution."""
 
 from __future__ import annotations

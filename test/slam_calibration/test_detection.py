@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Corners found in rendered boards, against where they were drawn."""
 
 from __future__ import annotations

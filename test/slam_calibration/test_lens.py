@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lens functions: the same pixels as the camera models, derivatives as central differences."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which picture belongs to which view; faults of the files are named."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rectification: rows are epipolar lines, disparity gives depth, and the same geometry as OpenCV's stereoRectify."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibration of simulated rigs against the truth, on public pictures against published values, and what it refuses."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A frame waits for every stream that lives, for none that is silent, and again for one that has come back."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a node does with odd stamps, with faults of its callbacks, and with jumps of its inputs' clock."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A constant difference of two body frames: found where it is, not imagined where the frames are the same."""
 
 from __future__ import annotations

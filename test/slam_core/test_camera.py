@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Camera models against OpenCV's projection, and the exact inverse."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """camera_info YAML: what ROS tools write is read, what is written is read back, faults are named."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Typed configuration: defaults, ranges, groups, and errors that help."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ATE and RPE against evo's published figures, NEES against its chi-square law, alignment by properties."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What nodes of one process hand each other refers to the same memory, and becomes an equal message outside."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files are whole or absent, and no folder is removed that is not known to be ours."""
 
 from __future__ import annotations

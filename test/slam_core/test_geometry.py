@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Geometry against scipy's Rotation (a second implementation), its own algebra, and central differences."""
 
 from __future__ import annotations

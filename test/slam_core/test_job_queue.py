@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What waits is done in order; a live queue never holds more frames of a source than it may."""
 
 from __future__ import annotations

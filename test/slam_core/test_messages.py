@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every conversion there and back over real CDR bytes, and every contradiction named."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motions of a sensor become motions of its rig; their covariances by Monte-Carlo."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is not ours survives everything; what is ours is whole, also when the program is killed at any step."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Alignment of point sets: exactness, weights, reflections, outliers, determinism."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Missing frames are counted by the stamps of those that came."""
 
 from __future__ import annotations

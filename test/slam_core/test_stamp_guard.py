@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which stamps are outliers, gaps and jumps: by properties over random streams."""
 
 from __future__ import annotations

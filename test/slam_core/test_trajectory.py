@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectory files: exact stamps, formats, and what is said of broken ones."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The data types that cross package borders: shapes are checked where they are made."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One furnished room, compiled once for all tests of the simulation."""
 
 from __future__ import annotations

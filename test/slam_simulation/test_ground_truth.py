@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The circle closes: depth, poses, disparities and ranges of the simulation agree with each other and with the
 images.
 """

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the profile ``real`` adds, effect by effect, and that ``ideal`` stays what it was."""
 
 from __future__ import annotations

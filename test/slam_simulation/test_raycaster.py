@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ray caster against a plain NumPy one, and the camera's own projection."""
 
 import numpy as np

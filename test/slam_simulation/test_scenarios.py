@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every shipped scenario loads, keeps clear of the furniture and has the size its experiment asks for."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the sensors add: noise of the stated size, wrapping, saturation, flying pixels, blur, and the IMU's readings."""
 
 from dataclasses import replace

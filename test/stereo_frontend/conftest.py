@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Synthetic images with exact sub-pixel geometry: a sum of random waves can be evaluated anywhere."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ToF depth seen from the left camera: parallax, gate, variances, stamps."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Depth between pixels: exact on planes, refused at edges, honest about noise."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stereo pairs and depth images of different stamps meet in the same way whatever the order of arrival."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sub-pixel disparity on textures whose shift is known exactly."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The feature interface: coverage, threshold tracking, unit norm, refusals."""
 
 from __future__ import annotations

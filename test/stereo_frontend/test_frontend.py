@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole front end on synthetic frames with known depth, in every mode, and on bad frames."""
 
 from __future__ import annotations

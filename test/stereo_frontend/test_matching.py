@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stereo matching of constructed keypoints."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``stereo_driver`` and ``feature_extractor`` as real processes over real topics: the features of the offline front
 end.
 """

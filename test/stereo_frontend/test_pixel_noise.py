@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The noise of keypoint positions is learnt from the rows of matches."""
 
 from __future__ import annotations

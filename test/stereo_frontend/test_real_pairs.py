@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The front end on real pairs: EuRoC and KITTI."""
 
 from __future__ import annotations

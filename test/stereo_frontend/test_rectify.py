@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rectification against the camera model itself, and its refusals."""
 
 from __future__ import annotations

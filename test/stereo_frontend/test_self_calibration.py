@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Self-calibration of a pair whose right camera is turned out of its calibration by a known rotation."""
 
 from __future__ import annotations

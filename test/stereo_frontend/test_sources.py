@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pairs from folders and side-by-side videos."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SURF's compiled kernels against plain NumPy that follows the paper word by word."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The whole way from a raw image to a depth image, and what is refused."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driver's sigma against the true depth of the simulated building, seen by the simulated CamCube."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which pixels are believed: each reason on its own, and the kernel against a plain NumPy twin."""
 
 from __future__ import annotations

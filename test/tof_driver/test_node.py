@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``tof_driver`` process over real topics: the same depth as offline, and bad messages survived."""
 
 from __future__ import annotations

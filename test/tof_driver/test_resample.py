@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rectification of depth: exact on planes, no mixture of surfaces, the variance of what was averaged."""
 
 from __future__ import annotations

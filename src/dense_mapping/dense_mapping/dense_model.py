@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dense model: key frames of all cameras fused in one TSDF, moved when the trajectory is corrected.
 
     model = DenseModel(DenseConfig())

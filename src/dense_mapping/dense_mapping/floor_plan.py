@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Floor plans of a dense model: what is free, occupied, and not yet known, one for each storey.
 
 A cell is occupied where the model has surface between knee and head, free where a ray from a camera went through it low

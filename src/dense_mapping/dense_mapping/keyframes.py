@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Key frames: which images make the dense model, and how they are kept to be moved when a loop closes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which way is up in the map, and at which heights its floors lie.
 
 The map's Z axis is that of the first rig pose, and a handheld rig starts at an angle. Up is first what gravity says,

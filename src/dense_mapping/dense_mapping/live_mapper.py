@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dense model while the map grows: key frames wait for the trajectory to reach them, and follow it when it moves.
 
 Images come at once, the joined trajectory only with the next submap. Key frames are chosen by the odometry, made small,

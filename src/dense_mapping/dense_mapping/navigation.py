@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """On a floor plan: where nobody has looked yet, and the way through free space from one place to another."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``dense_mapper`` node: depth and stereo images and the joined trajectory in, dense model and floor plan out."""
 
 # rclpy is annotated in part only.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Floor plans as files of Nav2's map_server: an image (PGM) and a YAML file that says where it lies.
 
 The image's first row is the plan's last: Y points up in the picture. Of the trinary mode's pixels, 254 is free, 0 is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Dense depth of a stereo pair with the standard deviation of every pixel.
 
     halved images -> semi-global matching, both ways -> left-right check

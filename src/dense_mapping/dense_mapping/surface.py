@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The surface of a TSDF as a triangle mesh whose vertices know their normal, colour and standard deviation.
 
 Marching cubes (Lorensen and Cline 1987; PyMCubes) runs over cubes of blocks. A voxel that was not seen well enough is

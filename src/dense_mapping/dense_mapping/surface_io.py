@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A surface as files: PLY with normals, colours and sigma (plyfile), GLB for every viewer (trimesh)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A truncated signed distance field in sparse blocks of voxels (Curless and Levoy 1996; Niessner et al. 2013).
 
 Every voxel near a surface keeps the mean of its distance to the surface along the rays that saw it, weighted by the

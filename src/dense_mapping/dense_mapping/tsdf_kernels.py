@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compiled part of the TSDF: one depth image into the voxels of the blocks that it can see."""
 
 from __future__ import annotations

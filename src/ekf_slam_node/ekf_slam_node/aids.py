@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion from elsewhere: scan registration between two frames, the turn rate of an IMU (thesis 9.4.1)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Association of features with candidates under a known motion (thesis chapter 4).
 
 Gate first: a pair must lie within the chi-square gate of its innovation covariance S and its descriptors must agree.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the calibration leaves unknown: errors that stay the same over a run and so never average out.
 
 A filter takes its noise as fresh in every frame. A wrong baseline (or range scale of a ToF camera) instead stretches

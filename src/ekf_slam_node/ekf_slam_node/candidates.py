@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a frame may be associated with.
 
 Landmarks and features of the previous frame, as the previous rig pose has them around it.

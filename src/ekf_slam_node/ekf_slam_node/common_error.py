@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The error that all features of a frame have in common, learnt from what neighbouring residuals share.
 
 Pixel noise is fresh in every keypoint, so that eighty of them average it out. On real cameras a part is not: the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every parameter of the EKF: names, defaults, units and ranges (the node declares its ROS parameters from here)."""
 
 from __future__ import annotations

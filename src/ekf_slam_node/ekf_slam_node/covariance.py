@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The covariance of a state that grows and shrinks: one class owns the matrix and every operation on it.
 
 Only the lower triangle is kept true, which halves the cost of the update (BLAS dsyrk, Eq. 6.20). The buffer is larger

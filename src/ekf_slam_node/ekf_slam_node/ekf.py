@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The filter: one joint Gaussian of the rig and its landmarks, its time update, augmentation and measurement update.
 
 Error state: position, rotation, velocities (see ``models``), then three coordinates per landmark, all in the map frame.

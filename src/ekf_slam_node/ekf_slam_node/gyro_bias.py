@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The constant error of a gyroscope, learnt from the turns that the images show.
 
 Taken for fresh noise, a bias of 0.2 degrees per second pulls every frame the same way, and its small weight beside the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint compatibility branch and bound (Neira and Tardos 2001): the largest set of pairs that fit together.
 
 A pair may pass its own gate and yet contradict the others: their errors share the error of the pose. The joint test

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Linking a frame to what is known.
 
 Association under the prediction, or under a motion guess where the prediction fails.

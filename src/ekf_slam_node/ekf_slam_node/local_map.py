@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The map under construction: filter, landmarks' book and the last frame's other features, kept in step."""
 
 from __future__ import annotations

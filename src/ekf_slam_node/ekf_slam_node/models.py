@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The two models of the filter: how the rig moves, how it sees a landmark, each with its Jacobians.
 
 Core state of the rig, 12 error coordinates: position and rotation in the map frame (error of ``slam_core.geometry``),

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a frame's motion is compared with: the prediction, other sensors, and no motion at all."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The motion between two frames from paired points: random samples, then least squares on what agrees.
 
 Used in two ways. With pairs that a prediction has gated it rejects what moves on its own, reflections and repeated

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``ekf_slam`` node: features in, odometry, landmarks and finished submaps out."""
 
 # rclpy is annotated in part only.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How much larger the measurement noise is than the features claim.
 
 Keypoints wander when the viewpoint changes, calibrations are never exact, images blur: real errors exceed what a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The chain of submaps in the odom frame, smooth from frame to frame."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled kernels for pairs of a point and its measurement under a motion.
 
 Errors, covariances, gates, normal equations, and who is paired first.

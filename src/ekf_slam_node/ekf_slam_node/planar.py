@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The 2D twin (thesis 1.7, 5.1): EKF-SLAM of a wheeled robot that measures ranges and bearings of landmarks.
 
 State: x, y, heading, then two coordinates per landmark. It shares the covariance, the Cholesky update, the invariant

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Smoothing in the plane (thesis 1.7, 6.5).
 
 All poses and landmarks at once, by sparse least squares on the measurements.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the filter reports for each frame."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """EKF-SLAM from frame to frame.
 
 Features in, poses, landmarks and finished submaps out (thesis chapter 6, Algorithm 3).

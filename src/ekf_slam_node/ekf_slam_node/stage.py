@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """EKF-SLAM of one rig without ROS: features, motions and IMU readings in any order in, results in order of stamps out.
 
     features ------> wait until motions and IMU have reached their stamp -> EkfSlam -> result, finished submaps

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Some keypoints are steadier than others: each landmark's own share of the noise, learnt from its residuals.
 
 A detector claims the same standard deviation for all keypoints of one size. Seen again and again, the centre of a

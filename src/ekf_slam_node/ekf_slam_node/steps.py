@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the steps of Algorithm 3 hand on to each other within one frame."""
 
 from __future__ import annotations

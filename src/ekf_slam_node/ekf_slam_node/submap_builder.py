@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The submap that is being built (section 7.1): when it ends, what it hands over, how it chains to the one before."""
 
 from __future__ import annotations

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """NDT and ICP registration of point clouds, and scan odometry."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether the answer of a global search is the only one: the other poses that the search refined are its witnesses.
 
 Where two scans share little, a wrong pose can look as good as the true one. An answer is doubted where another pose

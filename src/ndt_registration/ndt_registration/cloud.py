@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A cloud made ready for registration: finite, thinned, shuffled, near its sensor, with its own scale."""
 
 from __future__ import annotations

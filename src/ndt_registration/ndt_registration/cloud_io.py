@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Point clouds from files: PCD (ascii, binary, binary_compressed), PLY and legacy VTK (ascii and binary)."""
 
 from __future__ import annotations

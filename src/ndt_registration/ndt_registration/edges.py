@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rims of things that stand before a farther background: the features that fix a scan of walls along the walls.
 
 A point is on a rim where, in the direction of view, the surface ends beside it and the view goes on behind. Where the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small dense linear algebra for the compiled kernels.
 
 Symmetric 3x3 eigenvalues and 6x6 Cholesky, without LAPACK's overhead.

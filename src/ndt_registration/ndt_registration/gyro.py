@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The turn between two scans from an IMU's angular velocities: an optional aid to the prediction of scan odometry."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Iterative closest points, point to point and point to plane: kd-tree, trimmed, with a rejection limit that shrinks.
 
 Kept as the baseline that the thesis compares with (10.2) and for clouds too thin for cells of points. One setting

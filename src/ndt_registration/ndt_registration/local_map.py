@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The last few keyframe scans as one cloud.
 
 What a new scan is registered to, so that small errors do not add up scan by scan.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decompression of LZF, the format of compressed PCD files (Marc Lehmann's liblzf)."""
 
 from __future__ import annotations

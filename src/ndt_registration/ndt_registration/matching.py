@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fit of a moved cloud to the cells of another: inliers, their distances, gradients of the cost by block."""
 
 from __future__ import annotations

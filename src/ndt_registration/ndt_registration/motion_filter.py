@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pose and velocity of a sensor by white acceleration (thesis Eq. 5.6), with the pose before kept beside them.
 
 Each registration is joined with what the motion so far lets expect, each by its covariance: along a corridor, where a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Normal Distributions Transform: score, exact gradient and Hessian, and the damped Newton ascent (thesis 8.2, 10.5).
 
 The score of a pose is the sum over points ``x`` and over the cells that cover the moved point ``x' = R x + t`` of

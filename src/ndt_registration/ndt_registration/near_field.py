@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A dense map of nearness to a scan's surfaces, and the cost of many poses at once: the first, cheap look at a pose."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``ndt_odometry`` node.
 
 Point clouds of one sensor, and an IMU where there is one, in, the rig's odometry and motions out.

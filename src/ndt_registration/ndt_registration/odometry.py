@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scan odometry.
 
 Each scan is registered to a local map of the last keyframes, starting from constant velocity, and fused with that

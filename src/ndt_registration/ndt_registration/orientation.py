@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which rotations turn the surfaces of one scan into those of another: the normals alone say it, wherever the scan is.
 
 Two scans of one place show much the same set of surface directions, and a rotation matches the sets however far the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Grids of normal distributions from fine to coarse over one cloud."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Registration of one cloud to another.
 
 ``register(source, target) -> RegistrationResult``, one setting for every motion.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Loss of score when a pose is moved: how well a scan determines it.
 
 Only points that lie on the map before and after count, each by its mean over the cells that are there. Else every view

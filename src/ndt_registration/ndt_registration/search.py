@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Global search for a pose.
 
 Rotations from the normals, translations from a lattice, then NDT in rounds that keep ever fewer poses.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scan odometry without ROS: scans of one sensor, and readings of an IMU, in; the rig's poses and motions out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How well a registration determines the pose.
 
 Covariance from the scatter of the blocks' gradients, and directions left free.

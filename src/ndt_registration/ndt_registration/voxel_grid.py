@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Overlapping cells of normal distributions over a point cloud, found through a hash table.
 
 The eight grids of the thesis (8.2.2), shifted by half a cell, are together all cubes of edge ``h`` whose corner lies on

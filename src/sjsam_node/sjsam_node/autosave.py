@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A copy of the map on disk that is never much older than the map, so that a killed node goes on from it.
 
 While a node lives its copy is at ``path``. One that ends in order renames it to ``<path>.ended``; a copy still at

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The map of all agents: submaps go in one by one, a consistent map and trajectories with covariances come out.
 
     global_map = GlobalMap(GlobalMapConfig())

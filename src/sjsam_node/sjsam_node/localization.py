@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where is an agent in a map that is not to change: an initial pose or a look at the surroundings, then tracking.
 
 A new submap is matched to the stored submaps around its predicted pose, or, without prediction, to those that look

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The joined map as messages, written without ROS like all conversions."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether what a stored map says can be true: types, sizes, references, finite numbers, rigid poses, covariances.
 
 A map is a file that somebody else may have touched. Everything is checked before anything is made of it; each check

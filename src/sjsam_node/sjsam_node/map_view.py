@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The joined map as others want it: paths, trajectories and landmarks with marginal covariances.
 
 The poses inside a submap hang on the joined skeleton: what joining changed at the submap's end moves each pose by the

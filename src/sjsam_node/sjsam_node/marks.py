@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Finds that somebody marks in the map.
 
 A mark hangs on the nearest pose of the skeleton and moves with it at a closure.

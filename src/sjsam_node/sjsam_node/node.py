@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``sjsam`` node: submaps of one or several agents in, one map and every agent's place in it out."""
 
 # rclpy is annotated in part only.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where an agent is in the map at every pose of its odometry: the end of its newest joined submap, carried on.
 
     T_map_rig = T_map_end * (T_odom_end^-1 * T_odom_rig)

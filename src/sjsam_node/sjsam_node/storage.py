@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A joined map on disk: a folder with ``manifest.json`` and one file of arrays, exact to the last bit.
 
 The manifest names the format, its version, the file of arrays and its digest, and carries a digest of itself. A map

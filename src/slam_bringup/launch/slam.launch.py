@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All nodes of one or several agents, and the map that joins them; or a bag through them.
 
     ros2 launch slam_bringup slam.launch.py                                        one rig, stereo

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``slam`` command line: a table of names; a command is loaded when it is called, so ``slam --help`` is instant."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reference of all parameters, ``docs/parameters.md``, made from the configuration classes themselves.
 
 python -m slam_bringup.parameter_reference > docs/parameters.md

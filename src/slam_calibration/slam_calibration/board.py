@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibration boards: where their corners lie on the flat board.
 
 A corner has an id; ``points[id]`` is its place on the board (m), z = 0. Written on the command line as

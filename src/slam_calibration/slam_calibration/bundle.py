@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One least-squares problem over all pictures: lenses, camera positions in the rig, and the board's pose in each view.
 
 Minimises the reprojection error of every corner under Huber's loss by Levenberg-Marquardt. A board pose touches the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Finding a board's corners in a picture, to a fraction of a pixel."""
 
 from __future__ import annotations

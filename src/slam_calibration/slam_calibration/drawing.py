@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of boards: to print, and to photograph with simulated cameras."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A first guess for the bundle: focal length, board poses, camera positions."""
 
 from __future__ import annotations

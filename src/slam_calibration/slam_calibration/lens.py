@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Camera models as functions of their parameters, with derivatives: what the bundle adjusts.
 
 A lens is named by what is estimated: ``none``, ``plumb_bob4`` (k3 = 0), ``plumb_bob``, ``rational_polynomial``,

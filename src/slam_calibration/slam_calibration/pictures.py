@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which picture belongs to which camera and view, and what of the board each shows."""
 
 from __future__ import annotations

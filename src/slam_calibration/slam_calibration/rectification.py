@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a calibrated pair to the R and P of both camera infos: the rotation that makes rows epipolar lines.
 
 Works for every lens model. Both rectified cameras get the same focal length and principal point, so that a point at

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibration of a rig of cameras from what they saw of a board: the order of the steps, and what is refused.
 
 each camera alone: first lens -> board poses -> bundle  |  all together: camera positions -> joint bundle -> checks

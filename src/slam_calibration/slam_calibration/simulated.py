@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A rig looking at a board: exact corners plus noise, to try a calibration where the truth is known."""
 
 from __future__ import annotations

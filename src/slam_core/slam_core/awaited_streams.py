@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decides which streams a frame still has to wait for, by stamps alone, so that a stream that dies stops nothing.
 
 A frame waits until every stream has reached its stamp: results then do not depend on the order in which messages happen

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What every node shares: typed parameters, guarded inputs, diagnostics, watchdog, reset and pause, and a clean end.
 
     class NdtNode(SlamNode[NdtNodeConfig]):

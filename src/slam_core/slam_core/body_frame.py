@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Is the estimate of another body frame than ground truth: a constant rotation and offset between the two.
 
 A data set gives the poses of its IMU or of a marker, an estimate those of the camera. Then ``truth = W estimate X``

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Camera models: pinhole with the ROS distortion models, and the rectified stereo rig.
 
 Pixels are (u, v), u to the right, v down, the centre of the top-left pixel at (0, 0). The optical frame is REP-103's:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """camera_info YAML files as ROS tools read them (camera_calibration_parsers), with uncertainties in extra keys.
 
 ROS readers look up the keys they know, so ``standard_deviations`` travels along unseen by them.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Typed configuration: one frozen dataclass per algorithm, the only place for names, defaults, ranges, descriptions.
 
     @dataclass(frozen=True)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How good is a trajectory, and does its covariance tell the truth: ATE, RPE, drift and NEES.
 
 ATE and RPE follow Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), as evo computes

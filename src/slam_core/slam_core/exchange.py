@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hands messages from node to node of one process by reference: no copy, no serialisation, no transport.
 
 A node publishes as ever; its message, which refers to the arrays it was made of, goes to the nodes of the process that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files that are either whole or absent: written under a temporary name, then renamed.
 
 Nothing here removes a folder that is not known to be ours: who replaces one says how to recognise it.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rigid transforms between the frames of a rig, from ``tf_static``; a missing one is never identity."""
 
 from __future__ import annotations

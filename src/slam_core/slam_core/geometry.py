@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rotations, rigid transforms and how uncertainty travels through them.
 
 Conventions, used by every package:

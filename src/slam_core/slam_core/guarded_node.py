@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A managed node that no callback can end: what a subscription, timer or service raises is logged and counted.
 
 It is a lifecycle node of ROS 2 that starts by itself: active when it is ready. ``deactivate`` pauses it, ``activate``

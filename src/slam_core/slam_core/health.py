@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node's own condition: state, counters, rate and time per message; the content of ``/diagnostics``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How every node subscribes, pairs and keeps up: the parameters ``input.*``."""
 
 from __future__ import annotations

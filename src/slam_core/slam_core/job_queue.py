@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The work that waits in a node, and what is left out when it comes faster than it is done.
 
 ``all`` keeps every job in the order of arrival: for a replay, whose player waits. ``newest`` keeps the newest jobs of

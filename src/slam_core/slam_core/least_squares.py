@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nonlinear least squares: whitening and Levenberg-Marquardt over any problem that can linearise itself.
 
 The sparse factors and their marginals are in :mod:`slam_core.linear_algebra.sparse_cholesky`. Costs are plain sums of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node's subscriptions: quality of service as the publishers offer it, and who is silent and why."""
 
 # rclpy is annotated in part only.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Poses and motions of a sensor as poses and motions of the rig that carries it."""
 
 from __future__ import annotations

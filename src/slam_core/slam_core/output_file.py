@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A JSON file of results that says which command wrote it, so that no other file is ever replaced."""
 
 from __future__ import annotations

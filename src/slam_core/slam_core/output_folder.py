@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A folder of results in which only what this program wrote is ever replaced or removed.
 
     with OutputFolder(path, "run", source=bag) as output:  # ValueError if the folder is not ours

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Point clouds as PLY files and on voxel grids."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When a process ends: with the one that started it, and by which signals it is asked to."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Closed-form and robust alignment of corresponding point sets (Umeyama 1991; Fischler and Bolles 1981)."""
 
 from __future__ import annotations

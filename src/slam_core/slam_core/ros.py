@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The bridge to rclpy: message classes, parameters from a :class:`Config`, quality of service, and a node's life.
 
 The node base class is :class:`slam_core.base_node.SlamNode`.

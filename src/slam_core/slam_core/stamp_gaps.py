@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Counts the frames missing in a stream by its stamps alone, whoever lost them: camera, driver or transport."""
 
 from __future__ import annotations

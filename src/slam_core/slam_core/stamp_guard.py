@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tells a message with an odd stamp from a clock that has jumped, without any clock but the stamps themselves.
 
 Each stream (topic) of an agent's sensors runs forward in small steps. A stamp that does not go on from the one before

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pairs what belongs to one instant by header stamp: exactly by default, within a tolerance where one is given.
 
 Used by the nodes on messages and by the offline pipeline on a bag: both see the same sets and count the same losses.

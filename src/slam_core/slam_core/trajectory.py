@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A trajectory: stamped poses, with or without covariances, and its TUM and CSV files."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A node's transforms: static ones in, ``/tf`` out where tf2_msgs is installed."""
 
 # rclpy is annotated in part only.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The data that crosses package borders. Every array's shape, unit and frame stands here and nowhere else.
 
 All objects are immutable by convention: arrays are handed over, never changed afterwards. Times are header stamps in

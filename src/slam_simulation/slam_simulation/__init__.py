@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A simulated building and the rig that moves through it.
 
 Worlds of textured surfaces, a ray caster, cameras and motion.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Texture atlas: every texture with its mip chain in one flat byte array, ready for the compiled sampler.
 
 A texture is a grey image of reflectance, 0 to 255 for 0 to 1, with sides that are powers of two. The mip chain

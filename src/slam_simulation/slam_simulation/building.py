@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a floor plan to surfaces: rooms with walls, floors, ceilings and lamps, joined by doorways.
 
 Rooms are axis-aligned rectangles on one floor; a doorway is given by a point between two rooms (or on the wall of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Features without images: landmarks on the surfaces of a scenario's building, observed with known association.
 
 For Monte-Carlo runs of the estimators: the same building, path and cameras as the images, but the measurement of a

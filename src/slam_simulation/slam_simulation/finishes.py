@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Surfaces that cameras dislike: dark ones, which give a ToF camera little light, and shiny ones with highlights."""
 
 from __future__ import annotations

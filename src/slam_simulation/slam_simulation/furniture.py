@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Furnishing: what stands along the walls and hangs on them, chosen by the room's style from the world's seed.
 
 Every kind is one function that adds surfaces at a place on a wall, or freely in the room. Objects on walls stand a few

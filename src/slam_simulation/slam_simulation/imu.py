@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The inertial sensor: angular velocity and specific force of the rig with bias and white noise.
 
 Differentiated numerically from the trajectory, which has continuous second derivatives.

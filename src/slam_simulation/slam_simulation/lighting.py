@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Baked light: irradiance on a grid of every surface from the lamps of its room, with shadows and darker corners.
 
 Each node of the grid sums over a few points of each lamp, ``power cos(at lamp) cos(at node) / distance^2`` where

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Patterns that repeat: plaster, brick, wood, tiles, carpet. Each is a tileable reflectance image made from a seed.
 
 One pattern covers ``extent`` metres; walls lay a second, larger one over it so that no two places look alike.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What does not stay where it is: people who walk through the view, and a chair that somebody moves.
 
 Moving things are the last surfaces of the world, drawn where they stand at first; :class:`MovingThings` takes them to

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures that occur once: posters, book spines, doors, screens, windows, notices. Each is drawn from a seed.
 
 A picture fills a whole surface; its reflectance image has sides that are powers of two, chosen from the surface's

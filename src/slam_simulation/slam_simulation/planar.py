@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The 2D world of the thesis (1.7, 5.1, 6.5).
 
 Landmarks on a plane, a rig that drives a loop, range, bearing and odometry.

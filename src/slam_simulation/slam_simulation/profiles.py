@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How hard a simulated recording is: ``ideal`` rendering, or ``real`` with what real rooms and sensors add.
 
 Every effect is a small module of its own with a configuration here; all of them are off in ``ideal``, whose bytes they

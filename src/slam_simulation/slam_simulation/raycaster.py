@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which surface does each pixel see? A tiled ray caster over rectangles.
 
 All geometry is brought into the camera's frame once per view, where pixel rays are fixed. The image is cut into tiles

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A scenario: a building, who walks through it and what they carry, as one YAML file under ``bags/scenarios``.
 
 description: one room, once round, both cameras

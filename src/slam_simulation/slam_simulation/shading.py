@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What does a pixel see? Radiance of the traced image: filtered textures, baked light, highlights, smooth edges.
 
 Textures are averaged over the parallelogram that a pixel's ray derivatives span on the surface. Pixels at the border of

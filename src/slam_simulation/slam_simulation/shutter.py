@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rolling shutter and exposure in steps: what the readout of a camera adds to its light."""
 
 from __future__ import annotations

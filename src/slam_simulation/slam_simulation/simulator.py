@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frame by frame: what every sensor of a rig reports while it moves through a scenario's building.
 
 Every random number is drawn from (scenario seed, agent, frame, sensor), so a frame is the same whatever else is

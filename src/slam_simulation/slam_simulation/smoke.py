@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Smoke: contrast falls with distance, and the light of a ToF camera is lost on both ways and scattered back.
 
 Homogeneous smoke attenuates light by ``exp(-density z)`` and adds as much of the air's own light (Koschmieder 1924).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The stereo camera: Bumblebee2 geometry, and what lens, exposure and sensor do to the light.
 
 Both raw cameras are turned a little out of the rectified frame and have barrel distortion, so that rectification

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How far points are from the surfaces of a world, and which of its surfaces a camera has seen: truth for models."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The world as arrays for the compiled ray caster: geometry, looks, textures and baked light, one row per surface."""
 
 from __future__ import annotations

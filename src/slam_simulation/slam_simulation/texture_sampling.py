@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reading a texture over a pixel's footprint: bilinear, trilinear, and several trilinear samples along the longer side.
 
 A pixel's footprint on a surface is a parallelogram. The texture is read along its longer side with several trilinear

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors of a time-of-flight camera that are no noise: multipath and wiggling.
 
 Multipath: light that reaches a pixel by way of other surfaces, or scattered inside the lens, adds a phasor that is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The time-of-flight camera: CamCube geometry, and range by the phase of modulated light.
 
 Each pixel measures a phasor ``A exp(j 4 pi f r / c)``: amplitude A from reflectance, angle and distance, phase from

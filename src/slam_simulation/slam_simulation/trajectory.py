@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the rig moves: a smooth path through way points, and what a walking person adds to it.
 
 Position, heading and pitch are cubic splines of time with zero velocity at both ends (twice continuously

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A world of textured rectangles: what the ray caster draws.
 
 A surface is a rectangle given by a corner and two orthogonal edges; it is seen from the side to which ``edge_u x

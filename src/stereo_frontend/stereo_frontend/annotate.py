@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A picture of what the front end sees.
 
 Features over the image, coloured by depth, shaped by where the depth came from.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keypoints plus depth become :class:`slam_core.types.Features`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Holds stereo pairs back until both camera infos are known, so that the first frames of a recording are not lost."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera info that a pair should have had, from what self-calibration says its rectification is wrong by."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Depth of stereo features from the ToF camera beside it: replaced or fused (thesis sections 11.2-11.4).
 
 A left pixel is mapped into the ToF image through the extrinsics (11.3). The mapping needs the depth that is looked for:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Depth at sub-pixel positions of a depth image, safe at edges.
 
 Over a plane the *inverse* depth is affine in the pixel, whatever the slant. So a plane of inverse depth is fitted to

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Brings stereo pairs and depth images of other stamps together, in the same way online and offline.
 
 A pair waits until the depth camera has reached its stamp, then takes the nearest depth image. Only stamps decide, so

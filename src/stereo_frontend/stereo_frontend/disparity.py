@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sub-pixel disparity by aligning a small patch along the epipolar line, with its variance from what is measured.
 
 Each left patch is registered onto the right image by Gauss-Newton on the template's gradient (Baker and Matthews 2004),

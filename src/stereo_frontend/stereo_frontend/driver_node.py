@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``stereo_driver`` node: raw pairs from a camera, a video, a folder or topics; rectified pairs out.
 
 With ``source: topics`` raw images and camera infos of any vendor's driver (or a bag) come in on

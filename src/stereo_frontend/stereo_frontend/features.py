@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Features of one image: keypoints spread over a grid, with unit-norm descriptors, behind one interface.
 
 Every detector runs the same way: it returns all keypoints above a threshold; a grid keeps the strongest of each cell,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The front end: a stereo pair, a depth image or both become features with depth and honest standard deviations.
 
 ``stereo``: features of both images, matched, disparity refined, ``d = f b / (u_left - u_right)`` (Eqs. 4.3-4.4).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keypoints of one image and their spread over it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stereo matching of described keypoints: the normalised scalar product (Eq. 3.1) within the epipolar band.
 
 ``argmax_j  delta_i . delta_j >= alpha`` for unit-norm descriptors; a match must be the best of both sides, lie in the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``feature_extractor`` node: rectified stereo pair and ToF depth in, features with depth out."""
 
 # rclpy is annotated in part only.

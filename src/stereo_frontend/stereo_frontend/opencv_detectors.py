@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """OpenCV's detectors behind the one detector interface; binary descriptors become unit-norm float vectors.
 
 A binary string of n bits becomes a vector of +-1/sqrt(n), so that the scalar product (Eq. 3.1) is ``1 - 2 hamming / n``

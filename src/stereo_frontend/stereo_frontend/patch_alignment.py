@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled kernels that register patches of the left image onto the right one; see :mod:`stereo_frontend.disparity`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How well keypoints and disparities are placed, from their size and from what a stereo pair shows anyway.
 
 Seen again from elsewhere, a keypoint lies off the surface point it was first found on by an error that grows with its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a rectified stereo pair is still wrong by: a smooth field of small errors of the right image against the left.
 
 A calibration errs in a few numbers of the right camera: where its axis points, its focal length, its lens. Each of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rectification of a raw stereo pair from its two camera infos.
 
 Thesis section 2.4, Hartley and Zisserman section 11.12.

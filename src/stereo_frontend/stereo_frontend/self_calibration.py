@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``stereo_self_calibration``: learns what the rectification of a pair is wrong by, and corrects for it where sure.
 
 Row differences of matches give the field across the rows; pairs of moments the field along them

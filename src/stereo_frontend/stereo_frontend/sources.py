@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stereo pairs from a side-by-side camera, a video file or a folder of images, without ROS.
 
 A side-by-side UVC camera delivers both images in one frame, left half and right half; so does its recorded video. A

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The stereo front end without ROS, in two stages: raw pairs to rectified ones, and these, with depth, to features.
 
 RawPair -> StereoStage -> StereoImages --> FeatureStage -> Features

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """CenSurE keypoints (Agrawal, Konolige and Blas 2008), which OpenCV calls Star, described as SURF-128.
 
 OpenCV has the detector only; the authors describe its keypoints with a modified upright SURF.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SURF-128 (Bay, Ess, Tuytelaars, Van Gool.
 
 Speeded-Up Robust Features, CVIU 2008), the thesis's choice of feature (ch. 3).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled kernels of the SURF-128 descriptor (Bay et al. 2008, section 4).
 
 A square of 20 x 20 samples, one per scale unit s, is covered by Haar wavelets of size 2s. Each of 4 x 4 subregions sums

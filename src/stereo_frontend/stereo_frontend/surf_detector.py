@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled kernels that find SURF keypoints: box-filter Hessian on the integral image (Bay et al. 2008, section 3).
 
 A filter of size S stands for a Gaussian of scale ``1.2 S / 9``. An octave is an image of half the size of the one

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled kernels that read Haar wavelets around a keypoint from the integral image.
 
 The integral image is read with bilinear interpolation at corners one scale unit s apart, which makes every box sum

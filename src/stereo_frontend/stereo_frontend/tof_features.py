@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Features of the ToF camera alone: found on one of its images, with depth from its own range (section 3.3).
 
 Amplitude first: it is lit by the camera itself. Intensity, or the grey image of an RGB-D camera under either name,

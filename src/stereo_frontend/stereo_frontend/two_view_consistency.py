@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What two moments say of the error of a stereo pair: the same points, measured twice, must fit one rigid motion.
 
 Every match of a keypoint from one frame to the next is measured as (u, v, disparity) twice. Disparities that a wrong

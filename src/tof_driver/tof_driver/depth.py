@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From what a range camera measures to a rectified depth image that knows how good each pixel is.
 
     metres -> judge each pixel -> sigma -> reject flying pixels -> depth along z -> rectify

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which range pixels can be believed, and the reason for each one that cannot.
 
 A pixel is judged alone first (no reading, too dark, saturated, out of range, wrapped round the ambiguity range), then

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``tof_driver`` node: raw images of a ToF or any depth camera in, rectified depth with its noise and points out.
 
     tof/range/image_raw (or tof/depth/image_raw), tof/{amplitude,intensity}/image_raw, tof/camera_info

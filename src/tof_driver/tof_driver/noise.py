@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Standard deviation of a range measurement from what the sensor tells with it.
 
 Time of flight (continuous-wave modulation): the phase noise is inversely proportional to the amplitude of the returned

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The point cloud of a depth image: organised like the image, each point with the standard deviation of its depth."""
 
 from __future__ import annotations

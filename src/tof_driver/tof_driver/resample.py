@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From the distorted pixel grid of a lens to the pinhole grid of the same camera without distortion.
 
 Depth is interpolated as inverse depth, which is linear over the image of a plane, and only within one surface: the

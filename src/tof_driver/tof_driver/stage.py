@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ToF driver without ROS: raw images in, rectified depth with its noise out, once the calibration is known."""
 
 from __future__ import annotations

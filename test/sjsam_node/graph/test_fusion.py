@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fusing of observations against sets of them, as one would write it down."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Few, well spread landmarks tie submaps together, and the same ones tie each to all others."""
 
 from __future__ import annotations

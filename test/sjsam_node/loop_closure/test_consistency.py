@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Closures that later ones contradict: a false one that was believed goes, a false one that comes late is refused."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What was missed because a place was seen before the map knew where: found when the map knows, in any order."""
 
 from __future__ import annotations

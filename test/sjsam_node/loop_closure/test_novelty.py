@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Comparisons that can tell nothing new are left out, and only those."""
 
 from __future__ import annotations

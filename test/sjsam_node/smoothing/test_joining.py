@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The joining problem against dense algebra: Jacobians, optimum, marginals, both backends, all three models."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A place that is seen again and again adds nothing to the estimate, and settling forgets nothing."""
 
 from __future__ import annotations

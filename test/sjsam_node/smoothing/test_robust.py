@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joining with a robust loss: what it does to a Gaussian, and that false closures leave no trace."""
 
 from __future__ import annotations

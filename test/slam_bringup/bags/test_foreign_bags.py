@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags as users have them: other names, other storages, messages that are broken, late or double."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam calibrate``: the files it writes feed the drivers, and bad input ends with one clear error."""
 
 from __future__ import annotations

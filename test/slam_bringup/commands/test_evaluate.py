@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam evaluate``: the accuracy of ground truth reaches the NEES."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """No command removes or replaces what it did not write: one clear line, exit code 2, and every byte still there."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam run`` on the committed bag: accurate, complete, the same bytes every time, and clear about bad input."""
 
 from __future__ import annotations

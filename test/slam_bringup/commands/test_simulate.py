@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam simulate``: topics, times, calibration and truth of a simulated bag, and the same bytes every time."""
 
 from dataclasses import replace

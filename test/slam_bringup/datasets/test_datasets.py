@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Data sets in miniature, made here; and the public ones where they are."""
 
 from __future__ import annotations

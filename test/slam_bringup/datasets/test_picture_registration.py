@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A picture taken from beside the depth camera lands where the depth camera sees the same points."""
 
 from __future__ import annotations

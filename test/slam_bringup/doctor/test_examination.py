@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The doctor on copies of the demo with one fault each, and on the demo itself, of which it says nothing.
 
 ``benchmarks/doctor.py`` has many more faults, and real recordings.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every experiment is complete and names what it shows; the quick ones run and mean what they say."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The stages of a run: each a thread ahead of the next, none lost, none left running."""
 
 import threading

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One YAML file for all nodes, in ROS's own form or ours: who gets what, and what is refused with file and name."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Range-bearing logs: read, mapped by every method, and refused where they are broken."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the launch file starts, without ROS's launch: the bag's own topics and frames, and every parameter."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The files of a run: complete, consistent with each other, and readable by other programs."""
 
 from __future__ import annotations

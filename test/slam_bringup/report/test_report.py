@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The report warns of a dishonest covariance and shows what needs no ground truth."""
 
 from __future__ import annotations

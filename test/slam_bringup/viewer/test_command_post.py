@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command post on a drawn floor plan: ways out, storeys, what nobody has seen."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A finished run of the demo bag on the page: read back, scrubbed, and refused where it is none."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page in a real browser: it loads, draws, complains of nothing and asks no other machine."""
 
 from __future__ import annotations

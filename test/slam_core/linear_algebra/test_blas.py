@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The routines that give the interpreter lock away do what NumPy does."""
 
 import numpy as np

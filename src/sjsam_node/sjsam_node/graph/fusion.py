@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which observations are one landmark: pairs are fused one after the other, and no submap sees a landmark twice.
 
 The observations of a landmark form a ring, each naming the next one, so that fusing two landmarks costs what these two

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Links between submaps: which of their landmarks are the same, and what the map says of that."""
 
 from __future__ import annotations

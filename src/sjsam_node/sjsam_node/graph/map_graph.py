@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What has been joined so far: submaps, the poses between them, and which of their landmarks are the same.
 
 *Nodes* are the poses at which submaps start and end (the skeleton of chapter 7). An *observation* is one landmark of

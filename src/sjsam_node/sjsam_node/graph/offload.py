@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Large arrays of old submaps on disk, in one file that nobody else sees and that ends with the process."""
 
 from __future__ import annotations

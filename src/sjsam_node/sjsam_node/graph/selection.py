@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which of the landmarks that submaps share tie them together in the estimate.
 
 A few dozen well spread landmarks say nearly all that two submaps can say of each other's pose. The others are the same

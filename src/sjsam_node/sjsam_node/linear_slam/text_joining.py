@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joins text submaps to one map: the problem, a start, and the optimum.
 
 The start is what each map says, chained. From there the optimum is approached in different ways, since any of them can

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Text submaps of Linear SLAM (Zhao, Huang and Dissanayake, IROS 2013), 2D and 3D, with landmarks or as pose graphs.
 
 A file ``localmap_<k>.txt`` holds: ``Ref``, the id of the pose whose frame the map is in; N; N lines ``id value``; the

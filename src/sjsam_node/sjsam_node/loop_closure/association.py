@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which landmarks of two submaps are the same (chapter 4, 7.5 and 9.4.1).
 
 Three ways, weakest first: *nearest* neighbour within a Euclidean gate (Algorithm 1, as chapter 7 uses it),

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which loop closures the map holds: those that agree with the odometry, with each other, and with the joined map.
 
 Two closures over the same stretches of way are compared pairwise by the odometry between them (pairwise consistency,

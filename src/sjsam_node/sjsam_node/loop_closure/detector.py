@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Links between submaps: to the ones just before, to ones the estimate says are near, and to ones that look alike.
 
 Candidates come from where the map believes the new submap to be and from what it looks like; geometry verifies them

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which submaps the map says are near each other and have not been compared there yet.
 
 A new submap is compared with the old ones around it where the map then believes it to be. Later closures move it, and

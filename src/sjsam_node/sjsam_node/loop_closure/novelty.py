@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether comparing two submaps can tell anything that the map does not know.
 
 Where many laps or agents went, a new submap lies beside many old ones that see the same landmarks. Once it is linked to

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Finds earlier submaps that look like a new one, however far the estimate has drifted.
 
 A vocabulary tree (Nister and Stewenius 2006) quantises landmark descriptors to words; an inverted file with tf-idf

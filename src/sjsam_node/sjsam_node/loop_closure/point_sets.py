@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A submap's landmarks as seen from its start, or from its end, with their joint covariance."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compares two submaps.
 
 Enough landmarks, spread in space, must agree on one rigid alignment within both submaps' joint covariance, and that

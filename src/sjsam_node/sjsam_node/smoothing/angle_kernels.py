@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled rotations of the joining problem: exponential, logarithm, and the error of a measured angle.
 
 ``model`` says how an angle residual is measured: 0 planar (one wrapped angle), 1 rotation vector ``Log(R_h R_z^T)``,

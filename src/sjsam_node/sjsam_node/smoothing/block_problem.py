@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joining with the thesis's rows (Algorithm 4).
 
 Every landmark of a submap with its own covariance, uncorrelated with the rest.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From the map graph to the joining problem and back: reduce, optimise, judge, recover.
 
 A landmark that ties no submaps together constrains nothing. It is marginalised out of its submap before joining (a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joining local maps by sparse least squares: the whole of chapter 7 as one nonlinear problem.
 
     problem = JoiningProblem(flatten(maps), state, fixed, model)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled inner loops of the joining problem.
 
 Residuals and normal equations of local maps, written for 2D and 3D alike.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where each variable stands in the normal equations: the symbolic part of the joining problem.
 
 Landmarks that are seen by exactly the same local maps have the same neighbours in the elimination graph. They form one

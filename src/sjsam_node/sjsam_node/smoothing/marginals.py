@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Marginal covariances of the last update, read from its factor; nothing here changes the estimate.
 
 What the last update did not hold is answered conservatively from what it did: nodes and landmarks inside a region, and

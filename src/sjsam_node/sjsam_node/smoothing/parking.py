@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Redundant submaps of the past, out of the estimate: a place that is seen again and again costs what it did at first.
 
 A submap that shows nothing new, and has been left behind, is *parked*: its information is not used any more, and its

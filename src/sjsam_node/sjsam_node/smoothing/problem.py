@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is joined: local maps, each one Gaussian in the frame of its reference pose, and the state they share."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Old submaps condensed to larger submaps, so that an update relinearises and refactors only what is new.
 
 A *region* is some submaps that lie together, joined to one Gaussian over what the rest of the map shares with them: its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robust joining: rows of local maps that contradict all others lose their weight, and then their say.
 
 A *row* is one pose or landmark of a local map; those in question are the ones that close something, because an older

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled inner loops of the landmark Schur complement: landmarks that are seen one by one from poses.
 
 With the residual turned to map axes, ``e = v - R z`` where ``v = l - t``, its information is ``M = R Omega R^T`` and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The only writer of the estimate: it takes what was added and removed, and brings the map to its optimum.
 
     result = smoother.update(newest, added, removed)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reading and writing rosbag2 bags (mcap and sqlite3) without ROS; bags of ROS 1 are read as well.
 
 A bag is a folder with ``metadata.yaml``, as ``ros2 bag`` makes it; a path that ends in ``.mcap`` is a single file, as

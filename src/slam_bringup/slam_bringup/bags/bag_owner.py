@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which bags this program wrote: their metadata say so, and only these may be replaced.
 
 A folder's are in ``metadata.yaml``; those of a single mcap file are the same text in its record "rosbag2" (MCAP

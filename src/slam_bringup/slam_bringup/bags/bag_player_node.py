@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node ``bag_player``: publishes a bag's messages as they are, at a rate or as fast as the nodes can follow.
 
 In an installation without tf2_msgs, /tf_static is published as ``static_transforms``, one TransformStamped each.

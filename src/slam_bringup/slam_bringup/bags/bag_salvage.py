@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is left of an mcap file that a killed recorder did not close: its whole records, behind which an end is written.
 
 Records are an opcode (1 byte), a length (8 bytes) and the content (MCAP specification, section Records).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages of bags: rosbags classes with defaults and numpy fields, behind the :class:`MessageTypes` of slam_core."""
 
 from __future__ import annotations

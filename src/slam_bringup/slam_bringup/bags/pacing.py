@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How a player waits for those who process: the stamps on their way to each node, and the clock of a replay."""
 
 from __future__ import annotations

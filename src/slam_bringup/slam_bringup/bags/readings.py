@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the messages of one agent become: readings of its sensors, paired by stamp and decoded."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node ``recorder``: writes topics to a bag as they come, with the quality of service their publishers offer.
 
 Topics are discovered while it runs. The bag is complete only when the node has ended; it is renamed to its name then.

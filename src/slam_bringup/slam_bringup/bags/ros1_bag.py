@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags of ROS 1 (``.bag``) with the face of the rosbag2 reader: messages come as the CDR bytes of their ROS 2 types."""
 
 from __future__ import annotations

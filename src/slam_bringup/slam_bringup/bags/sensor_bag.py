@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a bag holds for the estimators: per agent, paired and decoded images, depth, IMU, extrinsics, ground truth.
 
     with SensorBag(path) as bag:

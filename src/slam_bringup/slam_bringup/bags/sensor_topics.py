@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which topic of a bag is which sensor: the nodes' own names below each agent's namespace, or names that a user gives.
 
 A role is what a topic is for ("left", "depth", "imu", ...). The camera info of an image stands beside it, as

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Writes what a rig's sensors report to a bag, on the topics and frames of the nodes; counterpart of ``sensor_bag``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Transforms for a recording made without tf2_msgs: /tf and /tf_static from the topics that carry the same.
 
 tf2_msgs has no wheel on PyPI, so in a pip installation the nodes publish TransformStamped only; the bag gets /tf

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam calibrate``: camera_info files with uncertainties from pictures of a board."""
 
 from __future__ import annotations

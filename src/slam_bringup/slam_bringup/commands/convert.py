@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam convert``: a public data set becomes a bag."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam doctor``: what is wrong with a recording or a running rig, each thing in one line with what to do."""
 
 from __future__ import annotations

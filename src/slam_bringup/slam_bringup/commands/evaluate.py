@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam evaluate``: ATE, RPE and NEES of a trajectory against ground truth."""
 
 from __future__ import annotations

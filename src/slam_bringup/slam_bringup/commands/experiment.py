@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam experiment``: the thesis's experiments on simulated rooms, beside the thesis's own figures."""
 
 from __future__ import annotations

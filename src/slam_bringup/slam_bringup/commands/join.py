@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam join``: joins text submaps of the Linear SLAM format, 2D and 3D."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam live``: all nodes of a rig in one process, on a live camera or on topics."""
 
 from __future__ import annotations

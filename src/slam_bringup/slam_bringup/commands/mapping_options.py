@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What ``slam run`` and ``slam nodes`` have in common: arguments, options, and the progress bar."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam nodes``: the pipeline through the real ROS nodes."""
 
 from __future__ import annotations

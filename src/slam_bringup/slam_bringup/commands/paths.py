@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Paths as users write them, and the option to write where results of ours are already."""
 
 from __future__ import annotations

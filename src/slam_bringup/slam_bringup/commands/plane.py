@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam plane``: SLAM in the plane on range-bearing logs, by EKF, SAM or joined submaps."""
 
 from __future__ import annotations

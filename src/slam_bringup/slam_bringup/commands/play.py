@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam play``: publish a bag's topics; the node ``bag_player`` behind a friendlier command line."""
 
 from __future__ import annotations

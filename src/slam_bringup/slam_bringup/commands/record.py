@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam record``: write ROS topics to a bag; the node ``recorder`` behind a friendlier command line."""
 
 from __future__ import annotations

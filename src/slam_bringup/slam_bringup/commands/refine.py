@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam calibrate refine``: corrects a stereo calibration by what a recording shows of it, without a board."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam register``: align two clouds and print one JSON object; with ``-o``, a picture before and after."""
 
 from __future__ import annotations

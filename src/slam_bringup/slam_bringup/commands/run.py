@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam run``: the offline pipeline."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam simulate``: renders a scenario to a bag with ground truth.
 
 Topics are those that the drivers publish and read, below each agent's namespace. The bag's times are header stamps,

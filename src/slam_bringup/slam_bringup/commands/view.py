@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam view``: the page that shows a finished run, or the nodes at work."""
 
 from __future__ import annotations

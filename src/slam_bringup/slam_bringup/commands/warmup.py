@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam warmup``: compiles all kernels once, so that no first run and no node has to wait for it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """EuRoC MAV (Burri et al. 2016): stereo and IMU with ground truth of the IMU body.
 
 Two layouts: the ASL folders (``mav0/cam0/data/*.png``, ``data.csv``, ``sensor.yaml``, ``imu0``,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the readers of all data sets share: images from files, and a source of readings."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """KITTI odometry (Geiger et al. 2012): rectified stereo pairs, ``calib.txt``, ``times.txt``, poses of the left camera.
 
 Image folders ``image_0``/``image_1`` (grey) or ``image_2``/``image_3`` (colour), also named ``image_l``/``image_r``;

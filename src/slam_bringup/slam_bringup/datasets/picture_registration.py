@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Brings the colour camera's picture into the depth camera's image, where the two are different cameras.
 
 An unregistered Kinect sees the same point some 20 pixels apart in its two images: a feature of the picture would get

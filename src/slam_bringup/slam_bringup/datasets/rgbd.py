@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """RGB-D sequences as a depth camera with a grey picture: 7-Scenes, TUM RGB-D, and plain folders.
 
 - 7-Scenes (Shotton et al. 2013): ``frame-000000.color.png``, ``.depth.png`` (mm; 0 and 65535 are invalid),

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks that the camera infos describe cameras, a pair, and these images."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks that depth is there, in metres, and where the other images say it is."""
 
 from __future__ import annotations

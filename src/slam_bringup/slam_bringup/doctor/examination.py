@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All checks of a recording, in the order in which their faults would hide each other."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One thing that is wrong with a recording."""
 
 from __future__ import annotations

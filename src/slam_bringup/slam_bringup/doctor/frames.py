@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks that it is known where every sensor sits, in the axes of REP-103."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks that the IMU reports m/s2 and rad/s, with gravity where down is."""
 
 from __future__ import annotations

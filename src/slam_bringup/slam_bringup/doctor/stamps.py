@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks that stamps go forward at an even rate, on one clock, and together where images belong together."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks that left and right see the same on the same rows, the right one from the right, and are sharp enough."""
 
 from __future__ import annotations

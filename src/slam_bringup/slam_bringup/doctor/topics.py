@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks that everything is there, readable, and offered so that it arrives."""
 
 from __future__ import annotations

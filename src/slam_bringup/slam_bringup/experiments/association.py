@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sections 4.2 to 4.5: which features belong to which landmarks, by nearest neighbour or by Mahalanobis distance."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Section 2.4: calibration of the stereo camera, the laser camera and both together; Tables 2.1 to 2.3."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All experiments, in the order of the thesis."""
 
 from __future__ import annotations

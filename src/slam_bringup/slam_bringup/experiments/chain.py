@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Jobs that render a scenario and map the bag with the whole chain, and what they keep of a run."""
 
 from __future__ import annotations

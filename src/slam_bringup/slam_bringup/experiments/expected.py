@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bounds that each scenario must keep, from ``bags/expected.yaml``."""
 
 from __future__ import annotations

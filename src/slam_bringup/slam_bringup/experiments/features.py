@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chapter 3: SURF against SIFT and others on stereo pictures, and features on the laser camera's pictures."""
 
 from __future__ import annotations

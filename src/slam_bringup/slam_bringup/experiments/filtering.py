@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Section 9.1: the stereo camera alone, round the workshop, from a corner, in a sweep, round a table."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chapter 11 and section 1.3: what the laser camera adds to the stereo camera, and several firemen in one map."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A piece of work of an experiment, whose result is kept and used again until something that it depends on changes.
 
     bag = Job("slam_bringup.experiments.chain:render", {"scenario": "sweep"}, RENDERING)

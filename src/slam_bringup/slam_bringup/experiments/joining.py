@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sections 9.1.6 and 9.2: one filter over two rooms, and the submaps that take its place."""
 
 from __future__ import annotations

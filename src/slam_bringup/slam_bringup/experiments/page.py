@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``experiments.html``: one self-contained page with every experiment's comparisons, tables and figures."""
 
 from __future__ import annotations

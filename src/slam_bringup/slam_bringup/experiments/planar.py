@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sections 1.7, 5.1 and 6.5: EKF-SLAM and SAM in the plane, with known and with unknown association."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures as the thesis draws them: maps from above and from the side, standard deviations, submaps, scans."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chapter 10: ICP and NDT register scans of the laser camera; Tables 10.1 and 10.2, Figs. 10.1 to 10.18."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Runs the jobs of experiments: here, on several processes, or on a Dask cluster whose scheduler's address is given."""
 
 from __future__ import annotations

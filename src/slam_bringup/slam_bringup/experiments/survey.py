@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sections 6.3 to 6.6: what a step of each technique costs as the map grows, on the same planar worlds.
 
 One EKF updates the covariance of all landmarks at every step. Batch smoothing solves for everything whenever it is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated time-of-flight scans at chosen poses in a scenario's building, and the motions of the thesis."""
 
 from __future__ import annotations

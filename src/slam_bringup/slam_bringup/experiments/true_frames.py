@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames of a simulated room with true depth and poses, and what they say about features."""
 
 from __future__ import annotations

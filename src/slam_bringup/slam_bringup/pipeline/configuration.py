@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The configuration of the whole chain: one group per node, so that one YAML file serves ``slam run`` and the nodes.
 
 The form of the file: :mod:`slam_bringup.pipeline.overrides`.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The dense model of a bag on the trajectories of a finished run: depth of the ToF camera and of stereo, fused."""
 
 from __future__ import annotations

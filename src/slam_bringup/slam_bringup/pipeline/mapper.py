@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The filters of all agents and the one map that their submaps are joined into.
 
 Joining runs on a thread of its own, submap after submap: no filter waits for the map, which it does not need. Where the

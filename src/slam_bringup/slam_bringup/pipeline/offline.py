@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The chain of the launch file without ROS: the same classes, called frame by frame.
 
     readings of a bag -> depth -> features ----------> EKF-SLAM -> submaps -> SJSAM -> trajectory and map

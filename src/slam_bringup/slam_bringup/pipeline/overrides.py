@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters from a YAML file, by node: groups named after the nodes, or ROS's own form with names of nodes.
 
     /**:                        every node that has the parameter

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a run ends with, the same for ``slam run`` and ``slam nodes``, and its summary."""
 
 from __future__ import annotations

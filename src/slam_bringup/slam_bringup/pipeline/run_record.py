@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a run leaves behind, offline or through nodes, and the result that is made of it in one way."""
 
 from __future__ import annotations

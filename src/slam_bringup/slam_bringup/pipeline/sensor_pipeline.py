@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The stages of one agent's sensors, joined up without ROS: readings in, what its filter takes out.
 
 stereo -> StereoStage -> FeatureStage -> features

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How long every stage takes: for the report only, no estimator sees it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A range-bearing log of one or several robots, as the planar estimators take it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Maps a range-bearing log: by one EKF, by smoothing everything at once, or by joined submaps.
 
 All poses and landmarks of a result are in the frame of the first robot's first pose, which is held at the truth where

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What ``slam plane`` writes: summary, paths with covariances, landmarks and a picture."""
 
 from __future__ import annotations

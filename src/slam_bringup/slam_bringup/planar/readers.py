@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reads range-bearing logs: UTIAS MRCLAM (a folder), Lost in the Woods (.mat) and Victoria Park in GTSAM's text."""
 
 from __future__ import annotations

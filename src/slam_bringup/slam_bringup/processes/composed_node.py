@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``slam_composed``: all nodes of a rig in one process, on a thread each, handing messages over by reference.
 
     ros2 run slam_bringup slam_composed --mode fuse --odometry ndt

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ctrl-C as a wish: a long run ends early and keeps what it has, instead of losing it.
 
 So does a terminal that is closed; what the run still has to say then goes nowhere.

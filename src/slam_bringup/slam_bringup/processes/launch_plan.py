@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What ``slam.launch.py`` starts, from the texts of its arguments: for a live rig, or to play a bag.
 
     arguments, YAML -> configuration -> nodes with their parameters, names of topics, a player

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command-line arguments that set a node's parameters, namespace and name, as ``ros2 run`` takes them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which nodes a run needs, with which parameters, and who has to keep up with which topic."""
 
 from __future__ import annotations

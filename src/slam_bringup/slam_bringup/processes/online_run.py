@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bag through the real nodes: start them, play the bag no faster than they follow, record, stop, collect.
 
 private domain -> nodes ready and connected -> recorder -> player -> input has ended -> map saved -> nodes stopped

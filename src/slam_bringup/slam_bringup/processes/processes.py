@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starting and stopping nodes as processes, without ``ros2launch``: found in the ament index, ended by SIGINT."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From what the nodes published and saved to the same result that ``slam run`` ends with."""
 
 from __future__ import annotations

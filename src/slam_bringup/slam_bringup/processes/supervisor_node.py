@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node ``supervisor`` of ``slam nodes``: hears when nodes are ready and how far they are, and calls their services."""
 
 # rclpy is annotated in part only.

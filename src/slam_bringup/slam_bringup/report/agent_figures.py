@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures of one agent that need no ground truth: side view, standard deviations, angles and velocities, in time."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pictures of a run: the map from above, errors and standard deviations over time, time per frame."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The files of a run, the same for ``slam run`` and ``slam nodes``.
 
 ``summary.json``, ``trajectory.tum`` (map frame, rig poses), ``trajectory_covariance.csv``, ``landmarks.ply``,

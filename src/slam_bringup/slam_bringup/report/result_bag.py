@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``result.mcap`` of an offline run: the topics and transforms of the nodes, for Foxglove, RViz and evo.
 
 map -> odom is the one of the finished map, so that the trajectory shown is the smoothed one.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command post: of every agent the way back out with its uncertainty, and where nobody has looked yet."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A finished run on the page, with a time line to scrub."""
 
 from __future__ import annotations

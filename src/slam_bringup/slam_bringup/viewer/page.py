@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page: named layers of one 3D scene, a panel with what is shown, and an overview of the agents.
 
 Whoever has news calls ``show_...``; a layer that comes again is replaced. The page is viser's: it is served from this

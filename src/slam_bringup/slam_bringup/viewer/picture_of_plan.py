@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A floor plan as a picture with transparency: it lies over the model without hiding it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera's pictures of a bag beside a finished run, with the map's landmarks drawn where they should appear."""
 
 from __future__ import annotations

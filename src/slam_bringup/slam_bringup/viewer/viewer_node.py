@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``viewer`` node: what the other nodes publish, live on the page."""
 
 # rclpy is annotated in part only.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """BLAS and LAPACK routines that let other threads run meanwhile.
 
 ``scipy.linalg.blas`` holds the global interpreter lock while it computes, which stops every other thread of the process

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """BLAS and LAPACK inside compiled kernels, in place, where ``np.dot`` makes a new array each time.
 
 The routines (SciPy's, see :mod:`slam_core.linear_algebra.blas`) are made known to the compiler by name, so that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sparsity of a symmetric matrix of dense blocks: what the normal equations of poses and landmarks are.
 
 Everything symbolic (order, elimination tree, fill) is done on the blocks, which are far fewer than the unknowns.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The symbolic part of a multifrontal factor: elimination tree, fill, supernodes, and how much memory they need.
 
 Block columns whose factors have the same rows form a *supernode*; its *front* is the dense matrix over its own columns

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sparse Cholesky factor of a block matrix by the multifrontal method (Duff and Reid 1983; Liu 1992).
 
 Everything symbolic is done on blocks (:mod:`slam_core.linear_algebra.elimination_tree`) and nearly everything numeric

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled numeric part of a multifrontal factor.
 
 ``symbolic`` is a :class:`~slam_core.linear_algebra.elimination_tree.Symbolic`.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sparse Cholesky factors of symmetric positive definite block matrices: order, factor, solve, entries of the inverse.
 
 Backends, chosen by name: ``multifrontal`` (:mod:`slam_core.linear_algebra.multifrontal`, which ``auto`` takes),

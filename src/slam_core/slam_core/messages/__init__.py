@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Conversions between the data types of ``slam_core`` and ROS messages, written once and without ROS.
 
 Messages are read by attribute (duck typing) and made through a :class:`MessageTypes`, so that the same code serves the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How messages are made, whatever library they belong to, and their stamps and headers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Camera calibrations: sensor_msgs/CameraInfo from and to :class:`slam_core.camera.CameraInfo`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Point clouds: sensor_msgs/PointCloud2 from and to structured arrays."""
 
 from __future__ import annotations

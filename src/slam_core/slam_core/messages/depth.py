@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``tof/*`` topics that the ToF driver publishes: rectified depth, its standard deviation, pictures and points."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``features`` topics: a point cloud, the descriptors as an image, and the rectified camera, all of one stamp."""
 
 from __future__ import annotations

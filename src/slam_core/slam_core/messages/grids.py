@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Occupancy grids: nav_msgs/OccupancyGrid from and to arrays."""
 
 from __future__ import annotations

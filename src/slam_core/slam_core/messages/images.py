@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Images: sensor_msgs/Image and CompressedImage from and to arrays, with every inconsistency named."""
 
 from __future__ import annotations

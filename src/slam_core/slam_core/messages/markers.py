@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures for RViz and Foxglove: covariance ellipsoids and paths as visualization_msgs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Poses, motions and IMU readings. Covariances need no conversion: see the tangent order of ``slam_core.geometry``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A submap's Gaussian as one matrix; Gaussian and descriptors compact, in a quarter of the bytes.
 
 Compact, the covariance goes out as its Cholesky factor in 32 bits: whatever rounding does to a factor, factor times

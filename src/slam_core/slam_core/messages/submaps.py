@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``submap/*`` topics: one submap as a set of messages of one stamp (its end) in the frame ``<agent>/submap_<k>``.
 
 ==========================  =================================================================================
