@@ -9,7 +9,7 @@ PACKAGE = "slam_bringup"
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version="0.2.0",
     packages=find_packages(),
     package_data={"": ["py.typed", "*.j2"]},
     data_files=[

@@ -7,7 +7,7 @@ PACKAGE = "slam_simulation"
 
 setup(
     name=PACKAGE,
-    version="0.1.0",
+    version="0.2.0",
     packages=find_packages(),
     package_data={"": ["py.typed"]},
     data_files=[

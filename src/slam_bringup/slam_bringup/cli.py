@@ -16,7 +16,7 @@ import slam_core.process_life  # noqa: F401  # its clock starts with the program
 # means one order of summation, hence the same bytes.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-VERSION = "0.1.0"
+VERSION = "0.2.0"
 """That of the packages, see package.xml."""
 
 COMMANDS = {
