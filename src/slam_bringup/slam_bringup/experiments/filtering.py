@@ -77,7 +77,6 @@ def _workshop(name: str, thesis_landmarks: str, sections: str, title: str, numbe
             ),
             Picture(plots.standard_deviations(run.arrays), numbers[3], "The same of the joined map."),
         ]  # fmt: skip
-        end = run.values["agents"][0]["joined_end_m"]
         return Findings(
             comparisons=[
                 landmarks_comparison(run, thesis_landmarks),
@@ -87,7 +86,6 @@ def _workshop(name: str, thesis_landmarks: str, sections: str, title: str, numbe
             ],
             tables=[Table("Accuracy against the simulated truth", ACCURACY_HEADER, [accuracy_row(name, run)])],
             pictures=views,
-            answer=f"The loop closes with {1e3 * end:.1f} mm at its end.",
         )
 
     return Experiment(name, sections, title, jobs, report)

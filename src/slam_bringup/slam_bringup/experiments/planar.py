@@ -49,10 +49,9 @@ def monte_carlo(folder: Path, before: list[Path], sigma_bearing: float, known: b
             ]
         )  # fmt: skip
         if seed == 0:
-            open_loop = simulate_planar(WorldConfig(sigma_bearing=sigma_bearing), np.random.default_rng(0))
             arrays = {"truth": run.poses, "world": run.landmarks, "filter poses": poses, "filter map": ekf.landmarks,
                       "smoothed poses": smoothed.poses, "smoothed map": smoothed.landmarks,
-                      **_before_closure(open_loop, known)}  # fmt: skip
+                      **_before_closure(run, known)}  # fmt: skip
     names = ("nees", "filter rmse", "smoother rmse", "filter cost", "smoother cost", "wrong", "landmarks")
     return {"runs": runs}, arrays | {name: np.array(column) for name, column in zip(names, np.transpose(rows),
                                                                                    strict=True)}  # fmt: skip
@@ -153,7 +152,6 @@ def _experiment() -> Experiment:
                 Picture(_drawn(arrays, "smoothed"), "6.6", "SAM after the loop closed."),
                 Picture(_drawn(arrays, "filter"), "6.1", "The filter on the same drive."),
             ],
-            "Filter and smoother close the loop; the smoother corrects the whole path, the filter only its end.",
         )
 
     return Experiment("planar", "1.7, 5.1, 6.5", "EKF-SLAM and SAM in the plane", jobs, report)

@@ -179,8 +179,6 @@ def _experiment() -> Experiment:
                         f"n^{ekf:.1f}, n^{ours:.1f}", "submaps grow more slowly", ours < ekf)],
             [Table("A step at the end of a drive, and the error of the whole path", header, rows)],
             [Picture(figure, "", "Processor time of a step against the size of the map.")],
-            "One filter pays for every landmark at every step; joined submaps pay for those of the open submap and, "
-            "once per submap, for the joining.",
         )  # fmt: skip
 
     return Experiment("survey", "6.3-6.6", "What a step costs as the map grows", jobs, report)
