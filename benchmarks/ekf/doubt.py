@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ekf_slam_node.calibration import CalibrationConfig, in_doubt
+from ekf_slam_node.calibration import CalibrationConfig, widened_by_calibration
 from slam_core.evaluation import TruthAccuracy
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
@@ -34,4 +34,6 @@ def doubted(trajectory: Trajectory) -> Trajectory:
     if trajectory.covariances is None:
         raise ValueError("a trajectory without covariances has none to widen")
     poses = zip(trajectory.stamps_ns, trajectory.poses, trajectory.covariances, strict=True)
-    return Trajectory.from_estimates([in_doubt(PoseEstimate(int(s), T, C), CALIBRATION) for s, T, C in poses])
+    return Trajectory.from_estimates(
+        [widened_by_calibration(PoseEstimate(int(s), T, C), CALIBRATION) for s, T, C in poses]
+    )

@@ -17,6 +17,7 @@ from numba import njit
 from dense_mapping.keyframes import PlacedKeyframe
 from dense_mapping.levelling import floor_heights, level_transform, storey_of, up_direction
 from dense_mapping.surface import Surface
+from slam_core.camera import MIN_DEPTH
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, make_transform, transform_points
 
@@ -126,7 +127,7 @@ def _rays(placed: PlacedKeyframe, T_level_camera: FloatArray, step: int) -> Floa
     k, camera = placed.keyframe, placed.keyframe.camera
     depth, sigma = k.depth[::step, ::step], k.sigma[::step, ::step]
     v, u = np.nonzero(depth > 0.0)
-    z = np.maximum(depth[v, u] - 2.0 * sigma[v, u], 0.05).astype(np.float64)
+    z = np.maximum(depth[v, u] - 2.0 * sigma[v, u], MIN_DEPTH).astype(np.float64)
     directions = np.column_stack(
         [(step * u - camera.cx) / camera.fx, (step * v - camera.cy) / camera.fy, np.ones(len(u))]
     )

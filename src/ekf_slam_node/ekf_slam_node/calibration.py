@@ -50,7 +50,7 @@ def pose_sensitivity(T: FloatArray) -> FloatArray:
     return J
 
 
-def in_doubt(pose: PoseEstimate, config: CalibrationConfig) -> PoseEstimate:
+def widened_by_calibration(pose: PoseEstimate, config: CalibrationConfig) -> PoseEstimate:
     """A pose relative to the start of everything, its covariance widened."""
     if config.is_exact:
         return pose

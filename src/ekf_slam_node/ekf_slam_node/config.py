@@ -5,8 +5,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from ekf_slam_node.calibration import CalibrationConfig
 from slam_core.config import Config, group, parameter
+from slam_core.geometry import FloatArray
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,16 @@ class MotionConfig(Config):
     aid_stamp_tolerance: float = parameter(
         0.005, "largest difference of the stamps of a motion aid and of the frames it joins", unit="s", minimum=0.0
     )
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations (6,) of the accelerations, m/s2 and rad/s2."""
+        return np.repeat([self.sigma_acceleration, self.sigma_angular_acceleration], 3)
+
+    @property
+    def initial_variance(self) -> FloatArray:
+        """Variances (6,) of the velocities of a rig never seen before."""
+        return np.repeat([self.sigma_initial_velocity, self.sigma_initial_turn_rate], 3) ** 2
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,7 @@ class Ekf:
         Error (k,) of its rows (translation, rotation) in the map's axes.
 
         Not applied if its NIS is beyond the gate. The state stays where it is linearised, at the motion found from the
-        landmarks: an update by them must follow, or :meth:`settle`.
+        landmarks: an update by them must follow, or :meth:`move_to_mean`.
 
         The previous pose is no part of the state: its place is taken by the covariance of everything with the step
         (stochastic cloning, Roumeliotis and Burdick 2002, with the clone marginalised at once).
@@ -142,13 +142,13 @@ class Ekf:
         head[6:CORE_DIM, 6:] = np.diag(sigma**2)
         self.covariance.set_head(head)
 
-    def shake(self, sigma: FloatArray) -> None:
+    def add_pose_noise(self, sigma: FloatArray) -> None:
         """Add an independent error of standard deviations (6,) to the pose."""
         head = self.covariance.head(6)
         head[:6] += np.diag(sigma**2)
         self.covariance.set_head(head)
 
-    def settle(self) -> None:
+    def move_to_mean(self) -> None:
         """Move the state from where it was linearised to its mean."""
         self._move(np.zeros(self.covariance.size))
 
@@ -192,7 +192,7 @@ class Ekf:
         Without measurements, and where S cannot be factored, the state moves to its prediction and nothing is applied.
         """
         if not len(z):
-            self.settle()
+            self.move_to_mean()
             return UpdateReport(0.0, 0, False)
         rows = CORE_DIM + 3 * np.asarray(slots, dtype=np.int64)
         cross = self.covariance.cross_covariance(seen.J_pose, seen.J_point, rows)
@@ -209,7 +209,7 @@ class Ekf:
         whitened = whiten(S, cross, innovation)
         if whitened is None or not np.isfinite(whitened[1]).all():
             if not stay:
-                self.settle()
+                self.move_to_mean()
             return UpdateReport(np.nan, len(innovation), False)
         W, y = whitened
         self.covariance.subtract_square(W)

@@ -14,6 +14,7 @@ from ekf_slam_node.ekf import Ekf, UpdateReport
 from ekf_slam_node.landmarks import LandmarkBook, Pending, spread_choice
 from ekf_slam_node.linking import Link
 from ekf_slam_node.models import Frame, observe, rig_points
+from slam_core.camera import MIN_DEPTH
 from slam_core.geometry import FloatArray
 
 
@@ -116,7 +117,7 @@ class LocalMap:
         S = self.ekf.innovation_blocks(seen, sight.slots, variance, common)
         innovation = self.ekf.innovation(z, seen, sight.slots)
         distance = squared_distances(innovation, S)
-        good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > 0.05))
+        good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > MIN_DEPTH))
         report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good], common)
         after = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
         self.book.steadiness.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])

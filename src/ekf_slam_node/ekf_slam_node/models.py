@@ -15,12 +15,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_core.camera import Camera
+from slam_core.camera import MIN_DEPTH, Camera
 from slam_core.geometry import FloatArray, make_transform, skew, so3_exp, so3_left_jacobian, so3_log
 from slam_core.types import Features
 
 CORE_DIM = 12
 """Error coordinates of the rig: position 3, rotation 3, linear and angular velocity 3 + 3."""
+
+
+_LONGEST_STEP_S = 10.0
+"""A gap counts as no longer than this: the model says nothing about it any more, and larger variances cost digits."""
+
+
+def seconds_between(start_stamp_ns: int, end_stamp_ns: int) -> float:
+    """Time step of the motion model, s; long gaps count as :data:`_LONGEST_STEP_S`."""
+    return min((end_stamp_ns - start_stamp_ns) * 1e-9, _LONGEST_STEP_S)
 
 
 # ---- motion
@@ -178,4 +187,4 @@ class Observation:
             & (v >= margin_px)
             & (v <= camera.height - 1 - margin_px)
         )
-        return np.asarray(inside & (self.depth > 0.05))
+        return np.asarray(inside & (self.depth > MIN_DEPTH))

@@ -10,6 +10,7 @@ import numpy as np
 from ekf_slam_node.aids import ALL, Aid
 from ekf_slam_node.candidates import MotionPrior
 from ekf_slam_node.linking import Link
+from ekf_slam_node.models import relative_motion
 from ekf_slam_node.steps import LinkedFrame
 from slam_core.geometry import FloatArray, boxminus
 
@@ -35,6 +36,27 @@ def is_still(linked: LinkedFrame, gate: float) -> bool:
     error = boxminus(linked.link.T, np.eye(4))
     known = bool((np.sqrt(np.diag(linked.link.covariance)) < _STANDING_SIGMA).all())
     return known and float(error @ np.linalg.solve(covariance, error)) < gate
+
+
+class StandingDetector:
+    """Counts frames without motion; after ``frames`` of them the rig stands (0: never)."""
+
+    def __init__(self, frames: int, gate: float) -> None:
+        self._frames = frames
+        self._gate = gate
+        self._still = 0
+
+    def add(self, linked: LinkedFrame) -> bool:
+        """Take a frame; returns True if the rig has not moved for some frames, this one included."""
+        self._still = self._still + 1 if is_still(linked, self._gate) else 0
+        return 0 < self._frames < self._still
+
+
+def explaining_sigma(T_previous_now: FloatArray, velocity: FloatArray, sigma: FloatArray, dt: float) -> FloatArray:
+    """Acceleration noise (6,) with which the model can explain a motion: sigma (6,), larger where it must be."""
+    needed = 2.0 * boxminus(T_previous_now, relative_motion(velocity, dt)) / dt**2
+    sizes = np.repeat(np.linalg.norm(needed.reshape(2, 3), axis=1), 3)
+    return np.asarray(np.maximum(sigma, sizes))
 
 
 def aided(expected: MotionPrior, aid: Aid | None) -> MotionPrior:

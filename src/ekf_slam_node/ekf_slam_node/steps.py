@@ -21,7 +21,8 @@ class LinkedFrame:
     """A frame that is associated with the map.
 
     dt: since the previous linked frame, s. aid: motion from other sensors, if any. common: (6,) standard deviations of
-    the pose error that all its features share. surprising: its motion contradicts constant velocity.
+    the pose error that all its features share. surprising: its motion contradicts constant velocity. landmarks: how
+    many there were to link to; rows of the link beyond them are features of the previous frame.
     """
 
     frame: Frame
@@ -30,6 +31,7 @@ class LinkedFrame:
     aid: Aid | None
     common: FloatArray
     surprising: bool
+    landmarks: int
 
     @property
     def motion_covariance(self) -> FloatArray:

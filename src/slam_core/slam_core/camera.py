@@ -13,6 +13,9 @@ import numpy as np
 
 from slam_core.geometry import FloatArray
 
+MIN_DEPTH = 0.05
+"""Nearest depth, m, at which a point counts as in front of a camera."""
+
 DISTORTION_MODELS = ("none", "plumb_bob", "rational_polynomial", "equidistant")
 
 

@@ -11,12 +11,12 @@ import numpy as np
 from slam_bringup.doctor.evidence import Evidence
 from slam_bringup.doctor.finding import Finding
 from slam_bringup.doctor.stereo_images import match_pairs
-from slam_core.camera import Camera
+from slam_core.camera import MIN_DEPTH, Camera
 from slam_core.geometry import FloatArray, transform_points
 from slam_core.types import AnyArray
 from stereo_frontend.rectify import stereo_camera_from_infos
 
-_FARTHEST_M, _NEAREST_M, _FEWEST_VALID = 40.0, 0.05, 0.02
+_FARTHEST_M, _NEAREST_M, _FEWEST_VALID = 40.0, MIN_DEPTH, 0.02
 _FEWEST, _SCALE, _SPREAD = 40, 0.1, 0.045
 """Matches, and limits of the ratio of depths: of its median from one, and between its quartiles."""
 _SURE_DISPARITY_PX = 6.0
