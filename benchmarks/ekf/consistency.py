@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from ekf_slam_node.config import AssociationConfig, EkfSlamConfig
+from ekf_slam_node.config import EkfSlamConfig, FeatureAssociationConfig
 from slam_core.config import from_mapping
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray
@@ -96,7 +96,7 @@ def line(name: str, case: Case, runs: list[Run]) -> str:
     bounds = "[{:.2f} {:.2f}]".format(*anees_bounds(6, len(runs)))
     first = np.mean([run.submaps[0].pose_nees for run in runs]) / 6
     end = np.mean([nees(run.end_error, run.end_covariance) for run in runs]) / 6
-    nis, low, high = mean_nis(runs, AssociationConfig().gate, case.make_poses is walk)
+    nis, low, high = mean_nis(runs, FeatureAssociationConfig().gate, case.make_poses is walk)
     claimed, wrong = ([value(r) for r in runs] for value in (_heading_variance, _squared_heading_error))
     cells = (
         f"{first:6.3f} {bounds}", _mean([s.landmark_nees / 3 for s in submaps]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ekf_slam_node.calibration import CalibrationConfig, widened_by_calibration
+from ekf_slam_node.calibration import CalibrationErrorConfig, widened_by_calibration
 from slam_core.evaluation import TruthAccuracy
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
@@ -25,7 +25,7 @@ TRUTH = {
 }
 """Of ground truth as its makers say, or as measured."""
 
-CALIBRATION = CalibrationConfig(sigma_scale=0.005, sigma_mounting=float(np.radians(0.3)))
+CALIBRATION = CalibrationErrorConfig(sigma_scale=0.005, sigma_mounting=float(np.radians(0.3)))
 """By as much as calibrations of one camera differ; the frame of the ground truth is another's."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from slam_simulation.surface_table import SurfaceTable, compile_world
 from slam_simulation.tof_sensor import TofSensor, TofSensorConfig
-from slam_simulation.world import Material, Surface, World
+from slam_simulation.world import Material, Rectangle, World
 
 SCANS = 20
 MIDDLE = slice(82, 122)
@@ -20,9 +20,9 @@ def wall(distance: float, brightness: float) -> SurfaceTable:
     """A plastered wall across the x axis."""
     world = World(1)
     y, z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    lamp = Surface(np.array([1.0, -0.2, 4.0]), np.array([0.4, 0.0, 0.0]), -0.4 * y, Material("metal"))
+    lamp = Rectangle(np.array([1.0, -0.2, 4.0]), np.array([0.4, 0.0, 0.0]), -0.4 * y, Material("metal"))
     world.add_lamp(lamp, 1.0)
-    world.add(Surface(np.array([distance, 9.0, -6.0]), -18.0 * y, 12.0 * z, Material("plaster", brightness)))
+    world.add(Rectangle(np.array([distance, 9.0, -6.0]), -18.0 * y, 12.0 * z, Material("plaster", brightness)))
     return compile_world(world)
 
 

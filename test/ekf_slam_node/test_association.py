@@ -9,7 +9,7 @@ from feature_world import T_RIG_OPTICAL, PointWorld, room
 
 from ekf_slam_node import association
 from ekf_slam_node.candidates import Candidates, MotionPrior, innovation_covariance, motion_prior, predict
-from ekf_slam_node.config import AssociationConfig
+from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.linking import Linker
 from ekf_slam_node.models import Frame, frame_from_features, relative_motion, rig_points
 from ekf_slam_node.motion_guess import guess_motion
@@ -47,7 +47,7 @@ LARGE_STEP = relative_motion(np.array([0.5, -0.3, 0.1, 0.05, 0.1, 0.6]), 1.0)
 def test_small_step_is_associated_rightly(world: PointWorld, rng: np.random.Generator, method: str) -> None:
     candidates, first, now, second = two_views(world, SMALL_STEP, rng)
     prior = motion_prior(np.zeros(6), np.zeros((6, 6)), np.repeat([6.0, 6.0], 3), 0.1)
-    config = AssociationConfig(method=method)
+    config = FeatureAssociationConfig(method=method)
     link = Linker(config, T_RIG_OPTICAL).link(candidates, now, MotionPrior(SMALL_STEP, prior.covariance))
     assert link is not None
     right = first[link.rows] == second[link.columns]
@@ -63,7 +63,7 @@ def test_descriptors_are_needed_where_the_prediction_is_vague(world: PointWorld,
     similarity = np.asarray(candidates.descriptors @ now.descriptors.T, dtype=np.float64)
     shares = []
     for threshold in (0.75, -1.0):
-        config = AssociationConfig(descriptor_threshold=threshold, descriptor_weight=0.0)
+        config = FeatureAssociationConfig(descriptor_threshold=threshold, descriptor_weight=0.0)
         rows, columns = association.associate_mahalanobis(
             candidates, now, similarity, np.eye(4), vague, T_RIG_OPTICAL, config
         )
@@ -148,7 +148,7 @@ def test_excess_tells_how_much_noisier_the_features_are(world: PointWorld, rng: 
 def test_large_step_is_linked_and_a_foreign_place_is_not(world: PointWorld, rng: np.random.Generator) -> None:
     candidates, first, now, second = two_views(world, LARGE_STEP, rng)
     prior = MotionPrior(np.eye(4), np.diag(np.repeat([0.02, 0.02], 3) ** 2))
-    linker = Linker(AssociationConfig(), T_RIG_OPTICAL)
+    linker = Linker(FeatureAssociationConfig(), T_RIG_OPTICAL)
     link = linker.link(candidates, now, prior)
     assert link is not None
     assert (first[link.rows] == second[link.columns]).mean() > 0.99
@@ -159,4 +159,4 @@ def test_large_step_is_linked_and_a_foreign_place_is_not(world: PointWorld, rng:
 def test_few_features_are_not_linked(world: PointWorld, rng: np.random.Generator) -> None:
     candidates, _, now, _ = two_views(world, SMALL_STEP, rng)
     prior = MotionPrior(SMALL_STEP, 1e-4 * np.eye(6))
-    assert Linker(AssociationConfig(), T_RIG_OPTICAL).link(candidates, now.select(np.arange(5)), prior) is None
+    assert Linker(FeatureAssociationConfig(), T_RIG_OPTICAL).link(candidates, now.select(np.arange(5)), prior) is None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from feature_world import T_RIG_OPTICAL, loop, room
 
-from ekf_slam_node.calibration import CalibrationConfig, pose_sensitivity
+from ekf_slam_node.calibration import CalibrationErrorConfig, pose_sensitivity
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.slam import EkfSlam
@@ -18,7 +18,7 @@ from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, 
 from slam_core.types import Submap
 
 RUNS = 12
-DOUBT = CalibrationConfig(sigma_scale=0.02, sigma_mounting=0.01)
+DOUBT = CalibrationErrorConfig(sigma_scale=0.02, sigma_mounting=0.01)
 
 
 def distorted(T: FloatArray, error: FloatArray) -> FloatArray:
@@ -36,7 +36,7 @@ def test_sensitivity_is_the_derivative(rng: np.random.Generator) -> None:
         np.testing.assert_allclose(pose_sensitivity(T)[:, k], change, atol=1e-8)
 
 
-def badly_calibrated(seed: int, calibration: CalibrationConfig) -> tuple[EkfResult, list[Submap], FloatArray]:
+def badly_calibrated(seed: int, calibration: CalibrationErrorConfig) -> tuple[EkfResult, list[Submap], FloatArray]:
     """A run with a scale and a mounting that are wrong by DOUBT's standard deviations; the true last pose."""
     rng = np.random.default_rng(seed)
     world, poses = room(rng), loop(30, 10.0, 1.5, 0.3, handheld=0.02)
@@ -54,8 +54,8 @@ def badly_calibrated(seed: int, calibration: CalibrationConfig) -> tuple[EkfResu
     return result, submaps, invert_transform(poses[0]) @ poses[-1]
 
 
-@pytest.mark.parametrize(("calibration", "honest"), [(DOUBT, True), (CalibrationConfig(), False)])
-def test_poses_of_a_badly_calibrated_rig(calibration: CalibrationConfig, honest: bool) -> None:
+@pytest.mark.parametrize(("calibration", "honest"), [(DOUBT, True), (CalibrationErrorConfig(), False)])
+def test_poses_of_a_badly_calibrated_rig(calibration: CalibrationErrorConfig, honest: bool) -> None:
     values = []
     for seed in range(RUNS):
         result, submaps, truth = badly_calibrated(seed, calibration)
@@ -67,6 +67,6 @@ def test_poses_of_a_badly_calibrated_rig(calibration: CalibrationConfig, honest:
 
 
 def test_submaps_do_not_take_a_common_error_for_their_own() -> None:
-    exact, doubted = (badly_calibrated(0, c)[1][0] for c in (CalibrationConfig(), DOUBT))
+    exact, doubted = (badly_calibrated(0, c)[1][0] for c in (CalibrationErrorConfig(), DOUBT))
     np.testing.assert_array_equal(doubted.covariance, exact.covariance)
     np.testing.assert_array_equal(doubted.path[-1].covariance, exact.path[-1].covariance)

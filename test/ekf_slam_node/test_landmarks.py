@@ -8,7 +8,7 @@ from feature_world import T_RIG_OPTICAL, loop, room
 
 from ekf_slam_node.association import associate_jcbb, associate_mahalanobis, associate_nearest
 from ekf_slam_node.candidates import Candidates
-from ekf_slam_node.config import AssociationConfig, EkfSlamConfig, LandmarkConfig, SubmapConfig
+from ekf_slam_node.config import EkfSlamConfig, FeatureAssociationConfig, LandmarkConfig, SubmapConfig
 from ekf_slam_node.ekf import Ekf
 from ekf_slam_node.landmarks import LandmarkBook
 from ekf_slam_node.models import CORE_DIM, frame_from_features, rig_points
@@ -88,7 +88,7 @@ def test_every_algorithm_pairs_what_is_the_same(rng):
     (before, first), (now, second) = [(frame_from_features(f, np.arange(len(f)), 0.01, 1e-5), i) for f, i in views]
     candidates = Candidates(*rig_points(before, T_RIG_OPTICAL), before.descriptors)
     similarity = np.asarray(candidates.descriptors @ now.descriptors.T, dtype=np.float64)
-    config, covariance = AssociationConfig(), 1e-4 * np.eye(6)
+    config, covariance = FeatureAssociationConfig(), 1e-4 * np.eye(6)
     common = len(np.intersect1d(first, second))
     for associate, share in ((associate_mahalanobis, 0.95), (associate_jcbb, 0.2)):
         rows, columns = associate(candidates, now, similarity, np.eye(4), covariance, T_RIG_OPTICAL, config)

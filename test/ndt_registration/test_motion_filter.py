@@ -6,10 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ndt_registration.motion_filter import MotionConfig, MotionFilter, rotated
+from ndt_registration.motion_filter import MotionFilter, MotionFilterConfig, rotated
 from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, make_transform, rotation_from_euler
 
-CONFIG = MotionConfig(acceleration_sigma=0.5, angular_acceleration_sigma=0.5, speed_sigma=0.3, angular_speed_sigma=0.3)
+CONFIG = MotionFilterConfig(
+    acceleration_sigma=0.5, angular_acceleration_sigma=0.5, speed_sigma=0.3, angular_speed_sigma=0.3
+)
 DT = 0.1
 SIGMA = np.repeat([0.004, 0.002], 3)
 BLIND = np.array([1.0, 0.0, 0.0])
@@ -131,7 +133,7 @@ def test_process_noise_is_filterpys():
     """Of one axis: position and velocity driven by a white acceleration that is constant within a step."""
     from filterpy.common import Q_discrete_white_noise
 
-    config = MotionConfig(acceleration_sigma=1.7, speed_sigma=0.001)
+    config = MotionFilterConfig(acceleration_sigma=1.7, speed_sigma=0.001)
     motion = MotionFilter(config)
     before = motion._P.copy()
     motion.predict(0.13)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from slam_core.job_queue import Job, JobQueue
+from slam_core.job_queue import JobQueue, QueuedCall
 
 
 def fill(queue: JobQueue, count: int = 5) -> tuple[list[str], list[str]]:
@@ -14,8 +14,8 @@ def fill(queue: JobQueue, count: int = 5) -> tuple[list[str], list[str]]:
     left_out: list[str] = []
     for k in range(count):
         name = f"a{k}"
-        queue.add(Job("a", lambda n=name: done.append(n), lambda n=name: left_out.append(n)))  # type: ignore[misc]
-        queue.add(Job("imu", lambda n=name: done.append(f"imu after {n}")))  # type: ignore[misc]
+        queue.add(QueuedCall("a", lambda n=name: done.append(n), lambda n=name: left_out.append(n)))  # type: ignore[misc]
+        queue.add(QueuedCall("imu", lambda n=name: done.append(f"imu after {n}")))  # type: ignore[misc]
     while queue.run_one():
         pass
     return done, left_out
@@ -39,7 +39,7 @@ def test_a_live_queue_keeps_the_newest_frames_and_all_that_is_no_frame() -> None
 def test_sources_do_not_push_each_other_out() -> None:
     queue, done = JobQueue("newest", waiting=1), []
     for name in ("a0", "b0", "a1"):
-        queue.add(Job(name[0], lambda n=name: done.append(n), lambda: None))
+        queue.add(QueuedCall(name[0], lambda n=name: done.append(n), lambda: None))
     while queue.run_one():
         pass
     assert done == ["b0", "a1"]

@@ -8,7 +8,7 @@ import pytest
 
 from slam_core.geometry import FloatArray
 from slam_simulation import Scenario
-from slam_simulation.world import Surface
+from slam_simulation.world import Rectangle
 
 FOLDER = Path(__file__).resolve().parents[2] / "bags" / "scenarios"
 FRAMES = {
@@ -26,7 +26,7 @@ def positions(scenario: Scenario, agent: int = 0) -> FloatArray:
     return np.array([path.pose(k / scenario.rate)[:3, 3] for k in range(scenario.frames)])
 
 
-def clearance(points: FloatArray, surfaces: list[Surface]) -> float:
+def clearance(points: FloatArray, surfaces: list[Rectangle]) -> float:
     """Least distance (m) of the points to any surface."""
     least = np.inf
     for s in surfaces:

@@ -22,17 +22,17 @@ from slam_simulation.stereo_sensor import (
 from slam_simulation.surface_table import SurfaceTable, compile_world
 from slam_simulation.tof_sensor import TofSensor, TofSensorConfig
 from slam_simulation.trajectory import StationPath, rig_twist
-from slam_simulation.world import Material, Surface, World
+from slam_simulation.world import Material, Rectangle, World
 
 
 def wall_at(*distances: float) -> SurfaceTable:
     """Walls across the x axis; each farther one is seen to the left of the edge of the nearer one."""
     world = World(1)
-    lamp = Surface([1.0, -0.2, 4.0], [0.4, 0.0, 0.0], [0.0, -0.4, 0.0], Material("metal"))
+    lamp = Rectangle([1.0, -0.2, 4.0], [0.4, 0.0, 0.0], [0.0, -0.4, 0.0], Material("metal"))
     world.add_lamp(lamp, 1.0)
     for k, x in enumerate(distances):
         left = 8.0 if k == len(distances) - 1 else 0.0
-        world.add(Surface([x, left, -5.0], [0.0, -8.0 - left, 0.0], [0.0, 0.0, 10.0], Material("plaster")))
+        world.add(Rectangle([x, left, -5.0], [0.0, -8.0 - left, 0.0], [0.0, 0.0, 10.0], Material("plaster")))
     return compile_world(world)
 
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from numba import njit
 
 from ekf_slam_node.candidates import Candidates, innovation_covariance, predict
-from ekf_slam_node.config import AssociationConfig
+from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.jcbb import JointPrediction, jcbb
 from ekf_slam_node.models import Frame, rig_points
 from ekf_slam_node.pair_kernels import first_of_both
@@ -83,7 +83,7 @@ def pair_up(
 
 def associate_mahalanobis(
     candidates: Candidates, frame: Frame, similarity: Similarity, T_previous_now: FloatArray,
-    motion_covariance: FloatArray, T_rig_optical: FloatArray, config: AssociationConfig,
+    motion_covariance: FloatArray, T_rig_optical: FloatArray, config: FeatureAssociationConfig,
 ) -> tuple[IndexArray, IndexArray]:  # fmt: skip
     """Algorithm 2: indices of candidates and of features, paired by normalised distance and descriptors.
 
@@ -131,7 +131,7 @@ def match_descriptors(similarity: Similarity, threshold: float, ratio: float) ->
 
 def associate_jcbb(
     candidates: Candidates, frame: Frame, similarity: Similarity, T_previous_now: FloatArray,
-    motion_covariance: FloatArray, T_rig_optical: FloatArray, config: AssociationConfig,
+    motion_covariance: FloatArray, T_rig_optical: FloatArray, config: FeatureAssociationConfig,
 ) -> tuple[IndexArray, IndexArray]:  # fmt: skip
     """Pairs that are jointly compatible: the features with the fewest candidates, as many as a search can handle.
 

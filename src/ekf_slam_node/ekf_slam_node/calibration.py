@@ -23,7 +23,7 @@ from slam_core.types import PoseEstimate
 
 
 @dataclass(frozen=True)
-class CalibrationConfig(Config):
+class CalibrationErrorConfig(Config):
     """Standard deviations of a calibration, as the calibration itself reports them."""
 
     sigma_scale: float = parameter(
@@ -50,7 +50,7 @@ def pose_sensitivity(T: FloatArray) -> FloatArray:
     return J
 
 
-def widened_by_calibration(pose: PoseEstimate, config: CalibrationConfig) -> PoseEstimate:
+def widened_by_calibration(pose: PoseEstimate, config: CalibrationErrorConfig) -> PoseEstimate:
     """A pose relative to the start of everything, its covariance widened."""
     if config.is_exact:
         return pose
@@ -58,5 +58,5 @@ def widened_by_calibration(pose: PoseEstimate, config: CalibrationConfig) -> Pos
     return replace(pose, covariance=pose.covariance + J @ J.T)
 
 
-def _sigmas(config: CalibrationConfig) -> FloatArray:
+def _sigmas(config: CalibrationErrorConfig) -> FloatArray:
     return np.array([config.sigma_scale, *[config.sigma_mounting] * 3])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekf_slam_node.calibration import CalibrationConfig
+from ekf_slam_node.calibration import CalibrationErrorConfig
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray
 
@@ -93,7 +93,7 @@ class MeasurementConfig(Config):
 
 
 @dataclass(frozen=True)
-class AssociationConfig(Config):
+class FeatureAssociationConfig(Config):
     """How features find their landmarks (thesis chapter 4)."""
 
     method: str = parameter(
@@ -183,7 +183,7 @@ class EkfSlamConfig(Config):
     )
     motion: MotionConfig = group(MotionConfig)
     measurement: MeasurementConfig = group(MeasurementConfig)
-    association: AssociationConfig = group(AssociationConfig)
+    association: FeatureAssociationConfig = group(FeatureAssociationConfig)
     landmark: LandmarkConfig = group(LandmarkConfig)
     submap: SubmapConfig = group(SubmapConfig)
-    calibration: CalibrationConfig = group(CalibrationConfig)
+    calibration: CalibrationErrorConfig = group(CalibrationErrorConfig)

@@ -10,7 +10,7 @@ import numpy as np
 from ekf_slam_node.candidates import Candidates
 from ekf_slam_node.config import LandmarkConfig
 from ekf_slam_node.covariance import IndexArray
-from ekf_slam_node.steadiness import Steadiness
+from ekf_slam_node.landmark_noise import LandmarkNoise
 from slam_core.geometry import FloatArray
 from slam_core.types import Float32Array
 
@@ -47,7 +47,7 @@ class LandmarkBook:
         self.ids = np.zeros(0, dtype=np.int64)
         self.sightings = np.zeros(0, dtype=np.int32)
         self.descriptors: Float32Array = np.zeros((0, descriptor_size), dtype=np.float32)
-        self.steadiness = Steadiness.unknown(0)
+        self.noise = LandmarkNoise.unknown(0)
         self._first_frame = np.zeros(0, dtype=np.int64)
         self._expected = np.zeros(0, dtype=np.int64)
         self._hits = np.zeros(0, dtype=np.int64)
@@ -60,7 +60,7 @@ class LandmarkBook:
         self.ids = np.concatenate([self.ids, ids])
         self.sightings = np.concatenate([self.sightings, sightings.astype(np.int32)])
         self.descriptors = np.concatenate([self.descriptors, descriptors])
-        self.steadiness = self.steadiness.extended(len(ids))
+        self.noise = self.noise.extended(len(ids))
         self._first_frame = np.concatenate([self._first_frame, np.full(len(ids), frame)])
         self._expected = np.concatenate([self._expected, np.zeros(len(ids), dtype=np.int64)])
         self._hits = np.concatenate([self._hits, np.zeros(len(ids), dtype=np.int64)])
@@ -98,7 +98,7 @@ class LandmarkBook:
             values = getattr(self, name)
             values[slot] = values[-1]
             setattr(self, name, values[:-1])
-        self.steadiness.remove(slot)
+        self.noise.remove(slot)
 
 
 def spread_choice(points_px: FloatArray, occupied_px: FloatArray, amount: int, size: tuple[int, int]) -> IndexArray:

@@ -19,7 +19,7 @@ from ekf_slam_node.association import (
     match_descriptors,
 )  # fmt: skip
 from ekf_slam_node.candidates import Candidates, MotionPrior
-from ekf_slam_node.config import AssociationConfig
+from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.models import Frame
 from ekf_slam_node.motion_guess import MotionGuess, guess_motion, refine_motion
 from slam_core.geometry import FloatArray
@@ -29,7 +29,7 @@ _CONVINCING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
+class FrameLink:
     """Pairs of candidates ``rows`` and features ``columns`` (k,), and the motion they agree on.
 
     T, covariance: (4, 4) T_previous_now from these pairs alone, with its covariance (6, 6). excess: (3,) by what
@@ -53,11 +53,11 @@ class Linker:
         Mounting of the camera, (4, 4).
     """
 
-    def __init__(self, config: AssociationConfig, T_rig_optical: FloatArray) -> None:
+    def __init__(self, config: FeatureAssociationConfig, T_rig_optical: FloatArray) -> None:
         self._config = config
         self._T_rig_optical = T_rig_optical
 
-    def link(self, candidates: Candidates, frame: Frame, prior: MotionPrior) -> Link | None:
+    def link(self, candidates: Candidates, frame: Frame, prior: MotionPrior) -> FrameLink | None:
         """Pairs of candidates and features and their motion; None if the frame cannot be linked."""
         if min(len(candidates), len(frame)) < self._config.min_inliers:
             return None
@@ -73,7 +73,7 @@ class Linker:
 
     def _by_prediction(
         self, candidates: Candidates, frame: Frame, similarity: Similarity, prior: MotionPrior, rng: np.random.Generator
-    ) -> Link | None:
+    ) -> FrameLink | None:
         config = self._config
         if _image_spread(prior, frame) > config.max_gate_px:
             return None
@@ -93,7 +93,7 @@ class Linker:
 
     def _by_guess(
         self, candidates: Candidates, frame: Frame, similarity: Similarity, rng: np.random.Generator
-    ) -> Link | None:
+    ) -> FrameLink | None:
         """First with the descriptors that agree well, then with all that agree at all."""
         config = self._config
         strict = match_descriptors(similarity, config.descriptor_threshold, config.guess_ratio)
@@ -126,7 +126,7 @@ class Linker:
 
     def _settle(
         self, candidates: Candidates, frame: Frame, similarity: Similarity, guess: MotionGuess, least: int
-    ) -> Link | None:
+    ) -> FrameLink | None:
         """Associate once more around the motion found, where the gates are as small as they can be."""
         noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))
         rows, columns = associate_mahalanobis(
@@ -140,7 +140,7 @@ class Linker:
         # In the order of the features, not of their errors: to measure the best-fitting first would choose by noise.
         inliers = np.flatnonzero(final.inliers)
         inliers = inliers[np.argsort(columns[inliers], kind="stable")]
-        return Link(final.T, final.covariance, final.excess, rows[inliers], columns[inliers], final.error[inliers])
+        return FrameLink(final.T, final.covariance, final.excess, rows[inliers], columns[inliers], final.error[inliers])
 
 
 def _is_usable(motion: MotionGuess) -> bool:
@@ -149,7 +149,7 @@ def _is_usable(motion: MotionGuess) -> bool:
     return bool(finite) and bool(np.linalg.eigvalsh(motion.covariance)[0] > 0.0)
 
 
-def _number_of_pairs(link: Link) -> int:
+def _number_of_pairs(link: FrameLink) -> int:
     return len(link.rows)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from ekf_slam_node.candidates import motion_prior
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.linking import Linker
-from ekf_slam_node.local_map import pending_of
 from ekf_slam_node.models import Frame, seconds_between
+from ekf_slam_node.open_submap import pending_of
 from slam_core.geometry import FloatArray
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ekf_slam_node.aids import ALL, Aid
 from ekf_slam_node.candidates import MotionPrior
-from ekf_slam_node.linking import Link
+from ekf_slam_node.linking import FrameLink
 from ekf_slam_node.models import relative_motion
 from ekf_slam_node.steps import LinkedFrame
 from slam_core.geometry import FloatArray, boxminus
@@ -18,7 +18,7 @@ _STANDING_SIGMA = np.repeat([0.002, np.radians(0.05)], 3)
 """Motions (m, rad) must be known as well as this for a rig to be seen standing."""
 
 
-def is_surprising(link: Link, expected: MotionPrior, gate: float) -> bool:
+def is_surprising(link: FrameLink, expected: MotionPrior, gate: float) -> bool:
     """Whether the motion found contradicts constant velocity, by the gate of one feature.
 
     What a motion within this gate moves a feature by lies within the same gate of that feature: the normalised length

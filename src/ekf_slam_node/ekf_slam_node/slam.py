@@ -17,11 +17,11 @@ from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import TimeUpdate
 from ekf_slam_node.frame_input import frame_of_strongest, usable_features
 from ekf_slam_node.linking import Linker
-from ekf_slam_node.local_map import Sight, pending_of
 from ekf_slam_node.missed_frames import MissedFrames
 from ekf_slam_node.models import CORE_DIM, Frame, seconds_between
 from ekf_slam_node.motion_checks import StandingDetector, aided, explaining_sigma, is_surprising, widened
 from ekf_slam_node.noise_monitor import NoiseMonitor
+from ekf_slam_node.open_submap import Sight, pending_of
 from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submap_chain import SubmapChain
@@ -133,7 +133,7 @@ class EkfSlam:
 
     # ----------------------------------------------------------------------------------------------------- Algorithm 3
     def _advance(self, frame: Frame) -> EkfResult:
-        """Link, augment, predict, update, then maintain the landmarks or close the submap."""
+        """FrameLink, augment, predict, update, then maintain the landmarks or close the submap."""
         dt = seconds_between(self._chain.stamp_ns, frame.stamp_ns)
         aid = self._aids.between(self._chain.stamp_ns, frame.stamp_ns)
         linked = self._link(frame, dt, aid)

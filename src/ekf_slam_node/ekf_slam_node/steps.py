@@ -9,9 +9,9 @@ import numpy as np
 
 from ekf_slam_node.aids import Aid
 from ekf_slam_node.ekf import UpdateReport
-from ekf_slam_node.linking import Link
-from ekf_slam_node.local_map import Sight
+from ekf_slam_node.linking import FrameLink
 from ekf_slam_node.models import Frame
+from ekf_slam_node.open_submap import Sight
 from ekf_slam_node.results import TrackingState
 from slam_core.geometry import FloatArray
 
@@ -27,7 +27,7 @@ class LinkedFrame:
 
     frame: Frame
     dt: float
-    link: Link
+    link: FrameLink
     aid: Aid | None
     common: FloatArray
     surprising: bool

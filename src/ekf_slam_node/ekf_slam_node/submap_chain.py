@@ -11,9 +11,9 @@ from ekf_slam_node.calibration import widened_by_calibration
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import Ekf
 from ekf_slam_node.landmarks import LandmarkBook, Pending
-from ekf_slam_node.local_map import LocalMap, Sight, inheriting, pending_of
 from ekf_slam_node.models import CORE_DIM, Frame, relative_motion, seconds_between
 from ekf_slam_node.odometry import OdometryChain
+from ekf_slam_node.open_submap import OpenSubmap, Sight, inheriting, pending_of
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.steps import UpdatedFrame
 from ekf_slam_node.submap_builder import SubmapBuilder, conditional_start
@@ -37,7 +37,7 @@ class SubmapChain:
         self._T_rig_optical = T_rig_optical
         self._session = session
         self._odometry = OdometryChain()
-        self._local: LocalMap | None = None
+        self._local: OpenSubmap | None = None
         self._builder = SubmapBuilder(config.agent, 0, 0, False, session)
         self._next_index = 0
         self._is_finished = False
@@ -55,13 +55,13 @@ class SubmapChain:
         return self.has_begun and not self._is_finished
 
     @property
-    def local(self) -> LocalMap:
+    def local(self) -> OpenSubmap:
         """The open submap, or the last one if none is open."""
         assert self._local is not None
         return self._local
 
     # ------------------------------------------------------------------------------------------------------- opening
-    def start(self, frame: Frame, pose: PoseEstimate | None = None) -> LocalMap:
+    def start(self, frame: Frame, pose: PoseEstimate | None = None) -> OpenSubmap:
         """Open a submap at a frame of which nothing is known before: position zero, velocity unknown.
 
         ``pose``: T_odom_rig at the frame, or None to start where the chain has ended.
@@ -74,7 +74,7 @@ class SubmapChain:
         local = self._empty_map(frame, np.zeros(6), self._config.motion.initial_variance, pending)
         return self._open(local, frame, follows=False)
 
-    def follow(self, frame: Frame, seen: Sight, measured: Sight) -> LocalMap:
+    def follow(self, frame: Frame, seen: Sight, measured: Sight) -> OpenSubmap:
         """Open the submap that follows the one just closed, at the rig's pose in this frame."""
         local = self.local
         self._odometry.advance(self.pose(frame.stamp_ns))
@@ -87,15 +87,15 @@ class SubmapChain:
         ekf = conditional_start(local.ekf, measured.slots, self._config.error == "invariant")
         pending = pending_of(frame, self._T_rig_optical).without(measured.columns)
         book = local.book.select(measured.slots)
-        return self._open(LocalMap(self._config, self._T_rig_optical, ekf, book, pending), frame, follows=True)
+        return self._open(OpenSubmap(self._config, self._T_rig_optical, ekf, book, pending), frame, follows=True)
 
-    def _empty_map(self, frame: Frame, velocity: FloatArray, variance: FloatArray, pending: Pending) -> LocalMap:
+    def _empty_map(self, frame: Frame, velocity: FloatArray, variance: FloatArray, pending: Pending) -> OpenSubmap:
         covariance = np.zeros((CORE_DIM, CORE_DIM))
         covariance[6:, 6:] = np.diag(variance)
         ekf = Ekf(velocity, covariance, self._config.error == "invariant")
-        return LocalMap(self._config, self._T_rig_optical, ekf, LandmarkBook(frame.descriptors.shape[1]), pending)
+        return OpenSubmap(self._config, self._T_rig_optical, ekf, LandmarkBook(frame.descriptors.shape[1]), pending)
 
-    def _open(self, local: LocalMap, frame: Frame, follows: bool) -> LocalMap:
+    def _open(self, local: OpenSubmap, frame: Frame, follows: bool) -> OpenSubmap:
         self._local = local
         self._is_finished = False
         self._builder = SubmapBuilder(self._config.agent, self._next_index, frame.stamp_ns, follows, self._session)

@@ -35,7 +35,7 @@ _LOST_SIGMA = 100.0
 
 
 @dataclass(frozen=True)
-class MotionConfig(Config):
+class MotionFilterConfig(Config):
     """How a sensor moves between scans."""
 
     acceleration_sigma: float = parameter(2.0, "acceleration between scans", unit="m/s2", minimum=1e-3)
@@ -51,7 +51,7 @@ class MotionFilter:
     moves steadily.
     """
 
-    def __init__(self, config: MotionConfig) -> None:
+    def __init__(self, config: MotionFilterConfig) -> None:
         self._acceleration = np.repeat([config.acceleration_sigma, config.angular_acceleration_sigma], 3)
         self._speed = np.repeat([config.speed_sigma, config.angular_speed_sigma], 3)
         self.start(np.eye(4))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scan odometry.
+"""ScanPoints odometry.
 
 Each scan is registered to a local map of the last keyframes, starting from constant velocity, and fused with that
 prediction.
@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ndt_registration.gyro import Gyro, GyroConfig
-from ndt_registration.local_map import LocalMap, Scan
-from ndt_registration.motion_filter import MotionConfig, MotionFilter, rotated
+from ndt_registration.keyframe_window import KeyframeWindow, ScanPoints
+from ndt_registration.motion_filter import MotionFilter, MotionFilterConfig, rotated
 from ndt_registration.pyramid import GridConfig
 from ndt_registration.registration import RegistrationConfig, RegistrationResult, for_dimension, register
 from ndt_registration.uncertainty import UncertaintyConfig
@@ -42,7 +42,7 @@ that is not may be off follows from what it loses.
 
 @dataclass(frozen=True)
 class OdometryConfig(Config):
-    """Scan odometry."""
+    """ScanPoints odometry."""
 
     keyframes: int = parameter(10, "keyframes in the local map", minimum=1)
     keyframe_overlap: float = parameter(
@@ -59,7 +59,7 @@ class OdometryConfig(Config):
         1, "failures after which the pose is searched globally, if no other source knows the motion", minimum=0
     )
     restart_after: int = parameter(5, "failures after which the map starts anew", minimum=1)
-    motion: MotionConfig = group(MotionConfig)
+    motion: MotionFilterConfig = group(MotionFilterConfig)
     gyro: GyroConfig = group(GyroConfig)
     registration: RegistrationConfig = field(default_factory=lambda: ODOMETRY_REGISTRATION)
 
@@ -94,7 +94,7 @@ class ScanOdometry:
 
     def __init__(self, config: OdometryConfig | None = None) -> None:
         self._config = config or OdometryConfig()
-        self._map = LocalMap(self._config.keyframes)
+        self._map = KeyframeWindow(self._config.keyframes)
         self._filter = MotionFilter(self._config.motion)
         self._gyro = Gyro(self._config.gyro)
         self.reset()
@@ -114,7 +114,7 @@ class ScanOdometry:
         ``prior`` is the motion of the sensor since the previous scan from another source, such as wheels; without it
         constant velocity is assumed, with the turn of an IMU where there is one.
         """
-        scan = Scan.of(points)
+        scan = ScanPoints.of(points)
         if self._map.target is None:
             return self._start(stamp_ns, scan, self._filter.covariance)
         if stamp_ns <= self._stamp_ns:
@@ -127,7 +127,7 @@ class ScanOdometry:
         """Take an IMU's angular velocity (3,) rad/s, along the axes of the scanning sensor, ahead of later scans."""
         self._gyro.add(stamp_ns, rate)
 
-    def _start(self, stamp_ns: int, scan: Scan, covariance: FloatArray) -> OdometryResult:
+    def _start(self, stamp_ns: int, scan: ScanPoints, covariance: FloatArray) -> OdometryResult:
         """Begin a map with a scan that is where the filter is, known so well."""
         self._stamp_ns, T = stamp_ns, self._filter.T
         try:
@@ -149,10 +149,10 @@ class ScanOdometry:
         if turn is not None:
             self._filter.turn(turn, self._gyro.sigma(seconds))
 
-    def _registration(self, scan: Scan) -> RegistrationConfig:
+    def _registration(self, scan: ScanPoints) -> RegistrationConfig:
         return for_dimension(self._config.registration, planar=scan.planar)
 
-    def _register(self, scan: Scan, *, lost: bool) -> RegistrationResult:
+    def _register(self, scan: ScanPoints, *, lost: bool) -> RegistrationResult:
         """The scan's pose in the newest keyframe."""
         target = self._map.target
         assert target is not None
@@ -178,7 +178,7 @@ class ScanOdometry:
         T_odom_key = self._map.newest.T
         return T_odom_key @ result.T_target_source, rotated(T_odom_key, result.covariance)
 
-    def _track(self, scan: Scan, result: RegistrationResult) -> OdometryResult:
+    def _track(self, scan: ScanPoints, result: RegistrationResult) -> OdometryResult:
         self._filter.fuse(*self._in_odometry(result))
         covariance = self._covariance()
         motion = None if self._failures else self._motion()
@@ -200,7 +200,7 @@ class ScanOdometry:
         J = compose_jacobians(keyframe.T, T_key_now)[0]
         return np.asarray(J @ keyframe.covariance @ J.T + self._filter.covariance)
 
-    def _add_keyframe(self, covariance: FloatArray, scan: Scan) -> None:
+    def _add_keyframe(self, covariance: FloatArray, scan: ScanPoints) -> None:
         self._map.add(self._filter.T, covariance, scan, self._registration(scan))
         self._best_overlap = 0.0
 
@@ -213,14 +213,14 @@ class ScanOdometry:
             or np.rad2deg(np.linalg.norm(moved[3:])) > c.keyframe_angle_deg
         )
 
-    def _fail(self, scan: Scan, result: RegistrationResult) -> OdometryResult:
+    def _fail(self, scan: ScanPoints, result: RegistrationResult) -> OdometryResult:
         self._failures += 1
         if self._failures >= self._config.restart_after and len(scan.points) >= self._registration(scan).min_points:
             return self._restart(scan, result)
         T, covariance = self._filter.T, self._covariance()
         return OdometryResult(self._stamp_ns, T, covariance, None, OdometryStatus.FAILED, result.reason, result)
 
-    def _restart(self, scan: Scan, result: RegistrationResult) -> OdometryResult:
+    def _restart(self, scan: ScanPoints, result: RegistrationResult) -> OdometryResult:
         covariance = self._covariance()
         self._map.clear()
         self._filter.start(self._filter.T)

@@ -41,7 +41,7 @@ from std_srvs.srv import SetBool, Trigger
 from slam_core.config import Config
 from slam_core.exchange import SharedTypes, as_ros
 from slam_core.health import State
-from slam_core.job_queue import Job
+from slam_core.job_queue import QueuedCall
 from slam_core.listening_node import LATCHED_DEPTH, Input
 from slam_core.messages import MessageTypes, header_message, stamp_ns
 from slam_core.messages.base import Message
@@ -225,7 +225,7 @@ class SlamNode(TransformNode, Generic[C]):
         if ruling.new_session:
             self._flush()
             why = f"{ruling.reason} on {entry.topic}"
-            self._jobs.add(Job("session", lambda: self.start_session(why)))
+            self._jobs.add(QueuedCall("session", lambda: self.start_session(why)))
         self._held_back = len(ruling.released) > 1
         for released_ns, released in ruling.released:
             if starts:
@@ -246,7 +246,7 @@ class SlamNode(TransformNode, Generic[C]):
         Nor are those that came at once because their stamps had to be confirmed.
         """
         skip = None if keep or not announce or self._held_back else lambda: self._announce(stamp)
-        job = Job(source, lambda: self._process(source, stamp, callback, *messages, announce=announce), skip)
+        job = QueuedCall(source, lambda: self._process(source, stamp, callback, *messages, announce=announce), skip)
         self._jobs.add(job)
 
     def _process(
@@ -368,4 +368,4 @@ class SlamNode(TransformNode, Generic[C]):
         if waiting is None or waiting != self._waiting[0]:
             self._waiting = (waiting, now)
         elif now - self._waiting[1] > self.input_config.overdue:
-            self._jobs.add(Job("overdue", self.on_overdue))
+            self._jobs.add(QueuedCall("overdue", self.on_overdue))

@@ -16,7 +16,7 @@ POLICIES = ("newest", "all")
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class QueuedCall:
     """``run`` does the work; ``skip`` is called instead where it is left out, None for what is never left out."""
 
     source: str
@@ -40,7 +40,7 @@ class JobQueue:
             raise ValueError(f"jobs need a policy of {', '.join(POLICIES)} and room for one, got {policy}, {waiting}")
         self._policy = policy
         self._limit = waiting
-        self._jobs: deque[Job] = deque()
+        self._jobs: deque[QueuedCall] = deque()
         self._lock = threading.Lock()
         self.skipped: Counter[str] = Counter()
         """Jobs left out, by source."""
@@ -48,9 +48,9 @@ class JobQueue:
     def __len__(self) -> int:
         return len(self._jobs)
 
-    def add(self, job: Job) -> None:
+    def add(self, job: QueuedCall) -> None:
         """Take a job; leaves out the oldest of its source where more wait than may."""
-        surplus: Job | None = None
+        surplus: QueuedCall | None = None
         with self._lock:
             self._jobs.append(job)
             if job.skip is not None and self._policy == "newest":
@@ -72,7 +72,7 @@ class JobQueue:
         with self._lock:
             self._jobs.clear()
 
-    def _surplus(self, source: str) -> Job | None:
+    def _surplus(self, source: str) -> QueuedCall | None:
         same = [job for job in self._jobs if job.source == source and job.skip is not None]
         if len(same) <= self._limit:
             return None

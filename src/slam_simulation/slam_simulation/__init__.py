@@ -13,7 +13,7 @@ Worlds of textured surfaces, a ray caster, cameras and motion.
 """
 
 from slam_simulation.feature_level import FeatureFrame, FeatureLevelConfig, FeatureSimulator, simulate_features
-from slam_simulation.planar import PlanarConfig, PlanarRun, simulate_planar
+from slam_simulation.planar import PlanarRun, PlanarWorldConfig, simulate_planar
 from slam_simulation.scenario import Scenario
 from slam_simulation.simulator import SimulatedFrame, Simulator, simulate
 
@@ -21,8 +21,8 @@ __all__ = [
     "FeatureFrame",
     "FeatureLevelConfig",
     "FeatureSimulator",
-    "PlanarConfig",
     "PlanarRun",
+    "PlanarWorldConfig",
     "Scenario",
     "SimulatedFrame",
     "Simulator",

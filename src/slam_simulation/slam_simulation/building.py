@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_core.geometry import FloatArray
-from slam_simulation.world import Material, Surface, World
+from slam_simulation.world import Material, Rectangle, World
 
 WALL_GAP = 0.35
 """A doorway opens the walls that are no farther from it than this, m."""
@@ -94,10 +94,10 @@ class Wall:
         """The place ``s`` m along the wall, ``z`` m up and ``out`` m into the room, (3,)."""
         return np.array([*(self.start + s * self.along + out * self.inward), z])
 
-    def panel(self, s: tuple[float, float], z: tuple[float, float], material: Material, out: float = 0.0) -> Surface:
+    def panel(self, s: tuple[float, float], z: tuple[float, float], material: Material, out: float = 0.0) -> Rectangle:
         """A rectangle on the wall over the intervals ``s`` and ``z``, ``out`` m before it."""
         edge_u = np.array([*(self.along * (s[1] - s[0])), 0.0])
-        return Surface(self.point(s[0], z[0], out), edge_u, UP * (z[1] - z[0]), material, self.room)
+        return Rectangle(self.point(s[0], z[0], out), edge_u, UP * (z[1] - z[0]), material, self.room)
 
 
 def room_walls(index: int, room: Room, doorways: list[Doorway]) -> list[Wall]:
@@ -127,8 +127,8 @@ def build_shell(world: World, index: int, room: Room, walls: list[Wall]) -> None
     """Add floor, ceiling, walls, skirting and lamps of a room."""
     style, (x0, x1), (y0, y1) = STYLES[room.style], room.x, room.y
     width, depth = np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0])
-    world.add(Surface(np.array([x0, y0, 0.0]), width, depth, style.floor, index))
-    world.add(Surface(np.array([x0, y1, room.height]), width, -depth, style.ceiling, index))
+    world.add(Rectangle(np.array([x0, y0, 0.0]), width, depth, style.floor, index))
+    world.add(Rectangle(np.array([x0, y1, room.height]), width, -depth, style.ceiling, index))
     for wall in walls:
         _build_wall(world, wall, style.wall)
     _build_lamps(world, index, room)
@@ -155,7 +155,7 @@ def _build_lamps(world: World, index: int, room: Room) -> None:
             cx, cy = x0 + (i + 0.5) * (x1 - x0) / nx, y0 + (j + 0.5) * (y1 - y0) / ny
             origin = np.array([cx - length / 2, cy + width / 2, room.height - 0.06])
             edge_u, edge_v = np.array([length, 0, 0]), np.array([0, -width, 0])
-            lamp = Surface(origin, edge_u, edge_v, Material("metal", 1.8, emission=2.0), index)
+            lamp = Rectangle(origin, edge_u, edge_v, Material("metal", 1.8, emission=2.0), index)
             world.add_lamp(lamp, 0.38 * room.height)
 
 
@@ -189,19 +189,19 @@ def _line(world: World, a: Wall, b: Wall, place: FloatArray, door: Doorway) -> N
     near, far = a.point(s - half), a.point(s + half)
     along, up = far - near, UP * door.height
     world.add(
-        Surface(near, outward, up, frame, a.room)
+        Rectangle(near, outward, up, frame, a.room)
         if np.cross(outward, up) @ along > 0
-        else Surface(near + outward, -outward, up, frame, a.room)
+        else Rectangle(near + outward, -outward, up, frame, a.room)
     )
     world.add(
-        Surface(far, outward, up, frame, a.room)
+        Rectangle(far, outward, up, frame, a.room)
         if np.cross(outward, up) @ along < 0
-        else Surface(far + outward, -outward, up, frame, a.room)
+        else Rectangle(far + outward, -outward, up, frame, a.room)
     )
-    floor = Surface(near, along, outward, frame, a.room)
-    world.add(floor if floor.normal[2] > 0 else Surface(near + outward, along, -outward, frame, a.room))
-    lintel = Surface(near + up, outward, along, frame, a.room)
-    world.add(lintel if lintel.normal[2] < 0 else Surface(near + up, along, outward, frame, a.room))
+    floor = Rectangle(near, along, outward, frame, a.room)
+    world.add(floor if floor.normal[2] > 0 else Rectangle(near + outward, along, -outward, frame, a.room))
+    lintel = Rectangle(near + up, outward, along, frame, a.room)
+    world.add(lintel if lintel.normal[2] < 0 else Rectangle(near + up, along, outward, frame, a.room))
     for wall in (a, b):
         t = float((place - wall.start) @ wall.along)
         _frame(world, wall, (t - half, t + half), door.height)

@@ -14,7 +14,7 @@ import numpy as np
 
 from slam_core.geometry import FloatArray
 from slam_simulation.building import Room, Wall
-from slam_simulation.world import Material, Surface, World, box
+from slam_simulation.world import Material, Rectangle, World, box
 
 Generator = np.random.Generator
 SIDE = "side"
@@ -68,7 +68,7 @@ class Spot:
 
     def box(
         self, place: tuple[float, float, float], size: tuple[float, ...], faces: dict[str, Material], turn: float = 0.0
-    ) -> list[Surface]:
+    ) -> list[Rectangle]:
         """A box of ``size`` (x, y, z) m that stands at ``place`` of this frame, turned by ``turn`` rad."""
         return box(self.at(*place), np.array(size), faces, self.room, self.yaw + turn)
 

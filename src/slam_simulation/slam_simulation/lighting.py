@@ -24,7 +24,7 @@ OPEN_DISTANCE = 0.8
 
 
 def bake(
-    surfaces: list[world.Surface], lamps: list[world.Lamp]
+    surfaces: list[world.Rectangle], lamps: list[world.Lamp]
 ) -> tuple[Float32Array, npt.NDArray[np.int64], FloatArray]:
     """Irradiance of all surfaces, where each one's grid lies in it, and the lamps as points.
 
@@ -57,13 +57,13 @@ def bake(
     return light, np.column_stack([offsets, columns, rows]), np.array(centres, dtype=np.float64).reshape(-1, 5)
 
 
-def _grid(surface: world.Surface) -> tuple[int, int]:
+def _grid(surface: world.Rectangle) -> tuple[int, int]:
     """Columns and rows of a surface's light map."""
     columns, rows = (int(np.clip(np.ceil(side / NODE_SPACING) + 1, 2, MAX_NODES)) for side in surface.size)
     return columns, rows
 
 
-def _centre(surface: world.Surface) -> FloatArray:
+def _centre(surface: world.Rectangle) -> FloatArray:
     return np.asarray(surface.origin + 0.5 * (surface.edge_u + surface.edge_v))
 
 
@@ -78,7 +78,7 @@ def _lamp_points(lamps: list[world.Lamp]) -> FloatArray:
     return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
 
-def _blockers(surfaces: list[world.Surface]) -> FloatArray:
+def _blockers(surfaces: list[world.Rectangle]) -> FloatArray:
     """Rectangles as (n, 12): normal, plane offset, edge_u / |edge_u|^2, its offset, edge_v / |edge_v|^2, its offset."""
     out = np.empty((len(surfaces), 12))
     for row, s in zip(out, surfaces, strict=True):

@@ -3,7 +3,7 @@
 
 Landmarks on a plane, a rig that drives a loop, range, bearing and odometry.
 
-    run = simulate_planar(PlanarConfig(), np.random.default_rng(1))
+    run = simulate_planar(PlanarWorldConfig(), np.random.default_rng(1))
     run.poses, run.odometry, run.observations[k].ids
 
 A pose is (x, y, heading), Eq. 5.1. Odometry is the motion in the frame of the pose before; bearing is from the rig's
@@ -22,7 +22,7 @@ from slam_core.geometry import FloatArray
 
 
 @dataclass(frozen=True)
-class PlanarConfig(Config):
+class PlanarWorldConfig(Config):
     """The thesis's experiment: 50 samples, range noise 5 cm, bearing noise 0.01 to 0.1 rad."""
 
     samples: int = parameter(50, "poses along the loop", minimum=2)
@@ -55,14 +55,14 @@ class PlanarRun:
     (samples - 1, 3), the k-th from pose k to k + 1 in the frame of pose k; observations: one per pose.
     """
 
-    config: PlanarConfig
+    config: PlanarWorldConfig
     poses: FloatArray
     landmarks: FloatArray
     odometry: FloatArray
     observations: tuple[PlanarObservation, ...]
 
 
-def simulate_planar(config: PlanarConfig, rng: np.random.Generator) -> PlanarRun:
+def simulate_planar(config: PlanarWorldConfig, rng: np.random.Generator) -> PlanarRun:
     """One drive round a circle, counter-clockwise, among random landmarks."""
     angle = np.linspace(0.0, 2.0 * np.pi * config.laps, config.samples)
     poses = np.column_stack([config.radius * np.sin(angle), -config.radius * np.cos(angle), angle])
@@ -86,7 +86,7 @@ def relative_motion(start: FloatArray, end: FloatArray) -> FloatArray:
 
 
 def _observe(
-    pose: FloatArray, landmarks: FloatArray, config: PlanarConfig, rng: np.random.Generator
+    pose: FloatArray, landmarks: FloatArray, config: PlanarWorldConfig, rng: np.random.Generator
 ) -> PlanarObservation:
     d = landmarks - pose[:2]
     distance, bearing = np.hypot(d[:, 0], d[:, 1]), wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - pose[2])

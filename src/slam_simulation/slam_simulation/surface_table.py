@@ -14,7 +14,7 @@ from slam_simulation.atlas import TextureAtlas, TextureTable
 from slam_simulation.lighting import bake
 from slam_simulation.materials import PATTERNS
 from slam_simulation.pictures import PICTURES, draw_picture
-from slam_simulation.world import Surface, World
+from slam_simulation.world import Rectangle, World
 
 OVERLAY = "blotches"
 OVERLAY_GAIN = 0.35
@@ -68,7 +68,7 @@ def compile_world(world: World) -> SurfaceTable:
     )
 
 
-def _appearance(seed: int, i: int, surface: Surface, atlas: TextureAtlas) -> tuple[list[float], tuple[int, int]]:
+def _appearance(seed: int, i: int, surface: Rectangle, atlas: TextureAtlas) -> tuple[list[float], tuple[int, int]]:
     """Row of ``look`` and the texture numbers of one surface."""
     material, (width, height) = surface.material, surface.size
     rng = np.random.default_rng([seed, i])

@@ -31,7 +31,7 @@ class Material:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class Rectangle:
     """One rectangle: ``origin`` (3,) m, ``edge_u``, ``edge_v`` (3,) m, orthogonal.
 
     ``room`` for the light it receives.
@@ -63,11 +63,13 @@ class Surface:
 class Lamp:
     """A rectangle that gives light to its room: a surface and its ``power`` (radiance times area, relative)."""
 
-    surface: Surface
+    surface: Rectangle
     power: float
 
 
-def box(centre: FloatArray, size: FloatArray, faces: dict[str, Material], room: int, yaw: float = 0.0) -> list[Surface]:
+def box(
+    centre: FloatArray, size: FloatArray, faces: dict[str, Material], room: int, yaw: float = 0.0
+) -> list[Rectangle]:
     """Surfaces of a box standing at ``centre`` (of its bottom), ``size`` (x, y, z) m, turned by ``yaw`` rad.
 
     ``faces`` maps front (+x), back, left (+y), right, top to materials; "side" is the default of all, and the bottom is
@@ -84,7 +86,7 @@ def box(centre: FloatArray, size: FloatArray, faces: dict[str, Material], room: 
         "bottom": ([-x, y, 0], [2 * x, 0, 0], [0, -2 * y, 0]),
     }
     return [
-        Surface(R @ np.array(o) + centre, R @ np.array(u), R @ np.array(v), faces.get(name, faces["side"]), room)
+        Rectangle(R @ np.array(o) + centre, R @ np.array(u), R @ np.array(v), faces.get(name, faces["side"]), room)
         for name, (o, u, v) in corners.items()
     ]
 
@@ -94,14 +96,14 @@ class World:
     """Surfaces and lamps, and the seed of their textures."""
 
     seed: int
-    surfaces: list[Surface] = field(default_factory=list)
+    surfaces: list[Rectangle] = field(default_factory=list)
     lamps: list[Lamp] = field(default_factory=list)
 
-    def add(self, *surfaces: Surface) -> None:
+    def add(self, *surfaces: Rectangle) -> None:
         """Add surfaces."""
         self.surfaces.extend(surfaces)
 
-    def add_lamp(self, surface: Surface, power: float) -> None:
+    def add_lamp(self, surface: Rectangle, power: float) -> None:
         """Add a surface that shines."""
         lit = replace(surface, material=replace(surface.material, emission=max(surface.material.emission, 1.0)))
         self.surfaces.append(lit)

@@ -17,7 +17,7 @@ from slam_bringup.experiments.page import write_page
 from slam_bringup.experiments.planar import filter_run, graph_of
 from slam_bringup.experiments.registration import register_motions
 from slam_bringup.experiments.survey import cost_of_a_step
-from slam_simulation.planar import PlanarConfig, simulate_planar
+from slam_simulation.planar import PlanarWorldConfig, simulate_planar
 
 
 def test_every_experiment_says_what_it_needs():
@@ -83,7 +83,7 @@ def test_an_unmet_mark_is_said(planar_run, tmp_path):
 
 
 def test_the_smoothers_problem_holds_every_associated_measurement():
-    run = simulate_planar(PlanarConfig(samples=20), np.random.default_rng(3))
+    run = simulate_planar(PlanarWorldConfig(samples=20), np.random.default_rng(3))
     _, _, slots = filter_run(run, known=True)
     graph = graph_of(run, slots)
     assert len(graph.measured) == sum(len(o.ids) for o in run.observations)

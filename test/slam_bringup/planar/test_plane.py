@@ -15,9 +15,9 @@ from slam_bringup.planar.log import PlanarLog, RobotLog
 from slam_bringup.planar.mapping import accuracy, dead_reckoning, map_log
 from slam_bringup.planar.output import landmark_error
 from slam_bringup.planar.readers import read_log
-from slam_simulation.planar import PlanarConfig, PlanarRun, simulate_planar
+from slam_simulation.planar import PlanarRun, PlanarWorldConfig, simulate_planar
 
-WORLD = PlanarConfig(samples=150, laps=2.2)
+WORLD = PlanarWorldConfig(samples=150, laps=2.2)
 
 
 def robot_log(run: PlanarRun, name: str = "robot") -> RobotLog:

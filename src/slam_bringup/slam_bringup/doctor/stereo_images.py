@@ -24,8 +24,8 @@ _DARK, _BRIGHT, _FLICKER, _EXPOSED_APART, _FROZEN = 6.0, 249.0, 0.12, 0.4, 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
-    """Matches of some pairs: rectified pixels (n, 2) left and right, the pair of each, keypoints found in all."""
+class PixelMatches:
+    """PixelMatches of some pairs: rectified pixels (n, 2) left and right, the pair of each, keypoints found in all."""
 
     left: FloatArray
     right: FloatArray
@@ -49,7 +49,7 @@ def check_stereo_images(evidence: Evidence) -> Iterator[Finding]:
         yield from _geometry(matches)
 
 
-def match_pairs(evidence: Evidence) -> Matches | None:
+def match_pairs(evidence: Evidence) -> PixelMatches | None:
     """SIFT matches of some rectified pairs; None without a usable calibration."""
     left, right = (evidence.rectified_info(role) for role in ("left", "right"))
     if left is None or right is None:
@@ -63,7 +63,7 @@ def match_pairs(evidence: Evidence) -> Matches | None:
     found = [_match(pair.left, pair.right) for pair in images]
     which = np.repeat(np.arange(len(found)), [len(a) for a, _, _ in found])
     a, b = (np.concatenate([f[i] for f in found]) if found else np.empty((0, 2)) for i in (0, 1))
-    return Matches(a, b, which, sum(n for _, _, n in found))
+    return PixelMatches(a, b, which, sum(n for _, _, n in found))
 
 
 def _match(left: AnyArray, right: AnyArray) -> tuple[FloatArray, FloatArray, int]:
@@ -78,7 +78,7 @@ def _match(left: AnyArray, right: AnyArray) -> tuple[FloatArray, FloatArray, int
     return a, b, len(kl)
 
 
-def _geometry(matches: Matches) -> Iterator[Finding]:
+def _geometry(matches: PixelMatches) -> Iterator[Finding]:
     if matches.keypoints < _FEWEST_KEYPOINTS:
         return
     if len(matches.left) < max(_SEEN_BY_BOTH * matches.keypoints, 1):

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ekf_slam_node.association import associate_jcbb, associate_mahalanobis, associate_nearest
 from ekf_slam_node.candidates import Candidates
-from ekf_slam_node.config import AssociationConfig
+from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.models import Frame, frame_from_features, rig_points
 from slam_bringup.experiments.chain import Kept
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Table
@@ -40,7 +40,7 @@ _SIGMA_MOTION = np.repeat([3.0, 4.0], 3)
 def associate(folder: Path, before: list[Path], method: str, every: int, frames: int) -> Kept:
     """Precision and recall of one method on a scenario's feature-level simulation, every n-th frame."""
     algorithm, overrides = METHODS[method]
-    config = replace(AssociationConfig(), method=algorithm, **overrides)
+    config = replace(FeatureAssociationConfig(), method=algorithm, **overrides)
     simulator = FeatureSimulator(Scenario.load("workshop_handheld"))
     views = [simulator.frame(k * every) for k in range(frames)]
     dt = every / simulator.scenario.rate
@@ -57,7 +57,7 @@ def associate(folder: Path, before: list[Path], method: str, every: int, frames:
 
 def _pairs(
     first: FeatureFrame, second: FeatureFrame, step: FloatArray, dt: float, T_rig_optical: FloatArray,
-    config: AssociationConfig,
+    config: FeatureAssociationConfig,
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:  # fmt: skip
     """Candidates of the first frame and features of the second that the method pairs."""
     before, now = _frame(first), _frame(second)

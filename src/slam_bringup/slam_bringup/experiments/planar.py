@@ -17,8 +17,7 @@ from slam_bringup.experiments.findings import Comparison, Experiment, Findings, 
 from slam_bringup.experiments.job import RENDERING, Job, JobResult
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray
-from slam_simulation.planar import PlanarConfig as WorldConfig
-from slam_simulation.planar import PlanarRun, simulate_planar
+from slam_simulation.planar import PlanarRun, PlanarWorldConfig, simulate_planar
 
 MODULE = "slam_bringup.experiments.planar"
 _BEARINGS = (0.01, 0.03, 0.1)
@@ -34,7 +33,7 @@ def monte_carlo(folder: Path, before: list[Path], sigma_bearing: float, known: b
     rows = []
     arrays: dict[str, FloatArray] = {}
     for seed in range(runs):
-        run = simulate_planar(WorldConfig(sigma_bearing=sigma_bearing), np.random.default_rng(seed))
+        run = simulate_planar(PlanarWorldConfig(sigma_bearing=sigma_bearing), np.random.default_rng(seed))
         ekf, poses, slots = filter_run(run, known)
         graph = graph_of(run, slots)
         smoothed = smooth(graph, run.poses[0], ekf.config)[0]

@@ -29,8 +29,7 @@ from slam_bringup.experiments.planar import filter_run, graph_of
 from slam_bringup.planar.log import PlanarLog, RobotLog
 from slam_bringup.planar.mapping import map_log, submaps_of
 from slam_core.geometry import FloatArray
-from slam_simulation.planar import PlanarConfig as WorldConfig
-from slam_simulation.planar import PlanarRun, simulate_planar
+from slam_simulation.planar import PlanarRun, PlanarWorldConfig, simulate_planar
 
 MODULE = "slam_bringup.experiments.survey"
 TECHNIQUES = {
@@ -43,11 +42,11 @@ _LAST_STEPS = 20
 _BATCHES = 3
 
 
-def world(size: int) -> WorldConfig:
+def world(size: int) -> PlanarWorldConfig:
     """A drive once round among ``size`` landmarks of the same density, a step about as long whatever the size."""
     scale = float(np.sqrt(size / 40.0))
     return replace(
-        WorldConfig(), landmarks=size, size=10.0 * scale, radius=3.0 * scale, samples=max(50, round(60 * scale)),
+        PlanarWorldConfig(), landmarks=size, size=10.0 * scale, radius=3.0 * scale, samples=max(50, round(60 * scale)),
         sigma_turn=0.005,
     )  # fmt: skip
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_bringup.viewer.command_post import position_radius, radius_text, unseen, ways_out
 from slam_bringup.viewer.page import AgentRow, ViewerPage
-from slam_bringup.viewer.pictures import Picture
+from slam_bringup.viewer.pictures import CaptionedImage
 from slam_bringup.viewer.run_folder import RunFolder
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
@@ -29,7 +29,7 @@ class FinishedView:
     """
 
     def __init__(
-        self, page: ViewerPage, run: RunFolder, picture_at: Callable[[str, int], Picture | None] | None = None
+        self, page: ViewerPage, run: RunFolder, picture_at: Callable[[str, int], CaptionedImage | None] | None = None
     ) -> None:
         self.page, self.run, self._picture_at = page, run, picture_at
         self._show_map()

@@ -25,7 +25,7 @@ _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 80)
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class CaptionedImage:
     """An RGB image (h, w, 3) uint8 and what it shows."""
 
     image: ByteArray
@@ -54,14 +54,14 @@ class BagPictures:
                 if count[reading.agent] % every.get(reading.agent, 1) == 0:
                     self._keep(run, opened.sensors[reading.agent], reading)
 
-    def at(self, agent: str, stamp_ns: int) -> Picture | None:
+    def at(self, agent: str, stamp_ns: int) -> CaptionedImage | None:
         """The agent's newest picture at a stamp, or None before its first."""
         k = bisect.bisect_right(self._stamps[agent], stamp_ns) - 1
         if k < 0:
             return None
         image = cv2.imdecode(self._jpegs[agent][k], cv2.IMREAD_COLOR)
         assert image is not None, "written by ourselves"
-        return Picture(
+        return CaptionedImage(
             np.ascontiguousarray(image[..., ::-1], dtype=np.uint8),
             f"{agent or 'rig'}: landmarks, green in one submap, yellow in many",
         )

@@ -20,20 +20,20 @@ from ndt_registration.visibility import range_image
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 
 
-class Scan(NamedTuple):
+class ScanPoints(NamedTuple):
     """Finite points (n, 3) m of a scan, and whether they came as (n, 2)."""
 
     points: FloatArray
     planar: bool
 
     @staticmethod
-    def of(points: npt.ArrayLike) -> Scan:
+    def of(points: npt.ArrayLike) -> ScanPoints:
         """The scan of an array (..., 3) or (..., 2), NaN where invalid."""
-        return Scan(finite_points(points), is_planar(points))
+        return ScanPoints(finite_points(points), is_planar(points))
 
 
 @dataclass(frozen=True, eq=False)
-class Keyframe:
+class ScanKeyframe:
     """A scan, thinned, with its pose T_odom_sensor (4, 4) and covariance (6, 6)."""
 
     T: FloatArray
@@ -42,15 +42,15 @@ class Keyframe:
     rims: FloatArray
 
 
-class LocalMap:
+class KeyframeWindow:
     """A sliding window of keyframes, as a registration target in the frame of the newest."""
 
     def __init__(self, keyframes: int) -> None:
-        self._keyframes: deque[Keyframe] = deque(maxlen=keyframes)
+        self._keyframes: deque[ScanKeyframe] = deque(maxlen=keyframes)
         self._target: Target | None = None
 
     @property
-    def newest(self) -> Keyframe:
+    def newest(self) -> ScanKeyframe:
         """The keyframe whose frame the target is in."""
         return self._keyframes[-1]
 
@@ -64,11 +64,11 @@ class LocalMap:
         self._keyframes.clear()
         self._target = None
 
-    def add(self, T: FloatArray, covariance: FloatArray, scan: Scan, config: RegistrationConfig) -> None:
+    def add(self, T: FloatArray, covariance: FloatArray, scan: ScanPoints, config: RegistrationConfig) -> None:
         """Append a keyframe and rebuild the target."""
         check_cloud(scan.points, "target", config)
         cloud = prepare(scan.points, config.target_points, planar=scan.planar, centre=np.zeros(3))
-        self._keyframes.append(Keyframe(T, covariance, cloud.points, cloud.rims))
+        self._keyframes.append(ScanKeyframe(T, covariance, cloud.points, cloud.rims))
         self._target = self._build(cloud, config)
 
     def _build(self, scan: Cloud, config: RegistrationConfig) -> Target:

@@ -5,19 +5,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from ekf_slam_node.steadiness import Steadiness
+from ekf_slam_node.landmark_noise import LandmarkNoise
 
 LANDMARKS, SIGHTINGS = 200, 40
 ALL = np.arange(LANDMARKS)
 CLAIMED = np.full((LANDMARKS, 2), 0.04)
 
 
-def watched(rng: np.random.Generator, sigma: np.ndarray, sightings: int = SIGHTINGS) -> Steadiness:
+def watched(rng: np.random.Generator, sigma: np.ndarray, sightings: int = SIGHTINGS) -> LandmarkNoise:
     """Residuals of standard deviation ``sigma`` (n,) px where 0.2 px are claimed."""
-    steadiness = Steadiness.unknown(LANDMARKS)
+    noise = LandmarkNoise.unknown(LANDMARKS)
     for _ in range(sightings):
-        steadiness.record(ALL, sigma[:, None] * rng.standard_normal((LANDMARKS, 2)), CLAIMED)
-    return steadiness
+        noise.record(ALL, sigma[:, None] * rng.standard_normal((LANDMARKS, 2)), CLAIMED)
+    return noise
 
 
 def test_landmarks_that_are_alike_are_told_apart_by_nothing(rng: np.random.Generator) -> None:
@@ -44,15 +44,15 @@ def test_little_is_said_of_few_sightings(rng: np.random.Generator) -> None:
 
 
 def test_one_outlier_is_no_verdict(rng: np.random.Generator) -> None:
-    steadiness = watched(rng, np.where(ALL % 4 == 0, 0.4, 0.15))
-    before = steadiness.factors(ALL)[1]
-    steadiness.record(np.array([1]), np.array([[500.0, 500.0]]), CLAIMED[:1])
-    assert steadiness.factors(ALL)[1] < before + 0.6
+    noise = watched(rng, np.where(ALL % 4 == 0, 0.4, 0.15))
+    before = noise.factors(ALL)[1]
+    noise.record(np.array([1]), np.array([[500.0, 500.0]]), CLAIMED[:1])
+    assert noise.factors(ALL)[1] < before + 0.6
 
 
 def test_removed_slots_are_filled_by_the_last(rng: np.random.Generator) -> None:
-    steadiness = watched(rng, np.linspace(0.1, 0.5, LANDMARKS))
-    last = steadiness.sums[-1]
-    steadiness.remove(7)
-    assert len(steadiness.counts) == len(steadiness.sums) == LANDMARKS - 1
-    assert steadiness.sums[7] == last
+    noise = watched(rng, np.linspace(0.1, 0.5, LANDMARKS))
+    last = noise.sums[-1]
+    noise.remove(7)
+    assert len(noise.counts) == len(noise.sums) == LANDMARKS - 1
+    assert noise.sums[7] == last

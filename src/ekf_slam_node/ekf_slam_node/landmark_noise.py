@@ -25,7 +25,7 @@ _OUTLIER = 9.0
 """Larger squares, in claimed variances, count as this one."""
 
 
-class Steadiness:
+class LandmarkNoise:
     """Squared residuals of landmarks: how many, and their sum in claimed variances, mean of u and v."""
 
     def __init__(self, counts: FloatArray, sums: FloatArray) -> None:
@@ -33,14 +33,14 @@ class Steadiness:
         self.sums = sums
 
     @classmethod
-    def unknown(cls, landmarks: int) -> Steadiness:
+    def unknown(cls, landmarks: int) -> LandmarkNoise:
         """Of landmarks never measured."""
         return cls(np.zeros(landmarks), np.zeros(landmarks))
 
-    def extended(self, landmarks: int) -> Steadiness:
+    def extended(self, landmarks: int) -> LandmarkNoise:
         """With so many new landmarks at the end."""
         new = np.zeros(landmarks)
-        return Steadiness(np.concatenate([self.counts, new]), np.concatenate([self.sums, new]))
+        return LandmarkNoise(np.concatenate([self.counts, new]), np.concatenate([self.sums, new]))
 
     def remove(self, slot: int) -> None:
         """Drop a landmark; the last one takes its slot."""

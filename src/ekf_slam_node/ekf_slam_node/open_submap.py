@@ -12,7 +12,7 @@ from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.covariance import IndexArray
 from ekf_slam_node.ekf import Ekf, UpdateReport
 from ekf_slam_node.landmarks import LandmarkBook, Pending, spread_choice
-from ekf_slam_node.linking import Link
+from ekf_slam_node.linking import FrameLink
 from ekf_slam_node.models import Frame, observe, rig_points
 from slam_core.camera import MIN_DEPTH
 from slam_core.geometry import FloatArray
@@ -37,7 +37,7 @@ class Sight:
         return self.select(np.arange(0, len(self), 2))
 
 
-class LocalMap:
+class OpenSubmap:
     """Landmarks around the start of one submap.
 
     Parameters
@@ -74,7 +74,7 @@ class LocalMap:
         )  # fmt: skip
 
     # ---------------------------------------------------------------------------------------------- one frame, in order
-    def confirm(self, frame: Frame, link: Link, wanted: int, new_ids: IndexArray) -> Sight:
+    def confirm(self, frame: Frame, link: FrameLink, wanted: int, new_ids: IndexArray) -> Sight:
         """Make landmarks of the pending features that the frame confirms, until ``wanted`` are in sight.
 
         The rig must still be at the previous frame: a new landmark's place comes from that frame's measurement.
@@ -113,22 +113,22 @@ class LocalMap:
         """
         seen = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
         z, claimed = frame.z[sight.columns], frame.variance[sight.columns]
-        variance = claimed * self._unsteadiness(sight)
+        variance = claimed * self._noise_factors(sight)
         S = self.ekf.innovation_blocks(seen, sight.slots, variance, common)
         innovation = self.ekf.innovation(z, seen, sight.slots)
         distance = squared_distances(innovation, S)
         good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > MIN_DEPTH))
         report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good], common)
         after = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
-        self.book.steadiness.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
+        self.book.noise.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
         return report, sight.select(good)
 
-    def _unsteadiness(self, sight: Sight) -> FloatArray:
+    def _noise_factors(self, sight: Sight) -> FloatArray:
         """Factors (k, 3) on the variances of u, v and inverse depth: a landmark's own share of the pixel noise."""
-        own = self.book.steadiness.factors(sight.slots)
+        own = self.book.noise.factors(sight.slots)
         return np.column_stack([own, own, np.ones(len(own))])
 
-    def remember(self, frame: Frame, sight: Sight, link: Link, landmarks_before: int) -> None:
+    def remember(self, frame: Frame, sight: Sight, link: FrameLink, landmarks_before: int) -> None:
         """Keep the features of a frame that measured nothing as the next frame's pending ones, with any names."""
         named = np.flatnonzero(link.rows >= landmarks_before)
         which = link.rows[named] - landmarks_before
