@@ -7,24 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from stereo_frontend import opencv_detectors
 from stereo_frontend.features import DETECTORS, FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import spread_over_grid
 from stereo_frontend.opencv_detectors import from_bits
 
 
-def available(name: str) -> bool:
-    try:
-        FeatureExtractor(FeatureConfig(detector=name))
-    except ValueError:
-        return False
-    return True
-
-
 @pytest.mark.parametrize("name", DETECTORS)
 def test_every_detector_gives_unit_descriptors_in_a_fixed_order(name, stereo_pair):
-    if not available(name):
-        pytest.skip(f"this OpenCV has no {name}")
     image = stereo_pair().left
     first, second = (FeatureExtractor(FeatureConfig(detector=name, target=200))(image) for _ in range(2))
     assert 100 <= len(first) <= 200
@@ -78,10 +67,3 @@ def test_colour_and_16_bit_images_are_refused():
     for image in (np.zeros((10, 10, 3), np.uint8), np.zeros((10, 10), np.uint16)):
         with pytest.raises(ValueError, match="uint8 grey"):
             FeatureExtractor()(image)
-
-
-def test_a_detector_that_opencv_lacks_is_named(monkeypatch):
-    monkeypatch.delattr(cv2, "ORB_create", raising=False)
-    monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
-    with pytest.raises(ValueError, match=r"has no ORB.*contrib"):
-        opencv_detectors.OpenCvDetector("orb")

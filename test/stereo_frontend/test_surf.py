@@ -209,3 +209,17 @@ def test_flat_and_tiny_images_have_no_keypoints(picture, upright):
 def test_images_beyond_the_integral_image_are_refused():
     with pytest.raises(ValueError, match="at most"):
         SurfDetector()(np.broadcast_to(np.uint8(0), (4000, 4000)), 1.0, keep_all)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_surf_64_adds_up_what_surf_128_splits_by_sign(image, upright):
+    long, short = (
+        SurfDetector(SurfConfig(upright=upright, extended=extended))(image, 0.3, keep_all).descriptors
+        for extended in (True, False)
+    )
+    assert short.shape == (len(long), 64)
+    assert len(long) > 5
+    terms = long.reshape(len(long), 16, 8).astype(float)
+    expected = (terms[..., [0, 1, 4, 5]] + terms[..., [2, 3, 6, 7]]).reshape(-1, 64)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(short, expected, atol=1e-6)

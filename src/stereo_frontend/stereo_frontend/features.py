@@ -4,8 +4,8 @@
 Every detector runs the same way: it returns all keypoints above a threshold; a grid keeps the strongest of each cell,
 so that features cover the image (thesis section 3.2); the threshold follows the number found from frame to frame
 (thesis ch. 9), so that a second pass over the image is the exception. Detectors: ``surf``
-(:mod:`stereo_frontend.surf`), and ``sift``, ``rootsift``, ``orb``, ``akaze`` from OpenCV
-(:mod:`stereo_frontend.opencv_detectors`).
+(:mod:`stereo_frontend.surf`), ``censure`` (:mod:`stereo_frontend.censure`), and ``sift``, ``rootsift``, ``orb`` from
+OpenCV (:mod:`stereo_frontend.opencv_detectors`).
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import numpy.typing as npt
 
 from slam_core.config import Config, group, parameter
 from slam_core.types import ByteArray, Float32Array
+from stereo_frontend.censure import CensureDetector
 from stereo_frontend.keypoints import Detector, Keypoints, spread_over_grid
 from stereo_frontend.opencv_detectors import OpenCvDetector
-from stereo_frontend.star_detector import StarDetector
 from stereo_frontend.surf import SurfConfig, SurfDetector
 
-DETECTORS = ("surf", "sift", "rootsift", "orb", "akaze", "star")
+DETECTORS = ("surf", "sift", "rootsift", "orb", "censure")
 _THRESHOLD_RANGE = (0.02, 20.0)
 _FIRST_THRESHOLD = 0.3
 """Of the customary one: the first image rather gives too many candidates than too few."""
@@ -51,16 +51,10 @@ class FeatureConfig(Config):
 
 
 def make_detector(config: FeatureConfig) -> Detector:
-    """The configured detector.
-
-    Raises
-    ------
-    ValueError
-        If the installed OpenCV lacks it.
-    """
+    """The configured detector."""
     if config.detector == "surf":
         return SurfDetector(config.surf)
-    return StarDetector() if config.detector == "star" else OpenCvDetector(config.detector)
+    return CensureDetector(config.surf) if config.detector == "censure" else OpenCvDetector(config.detector)
 
 
 class FeatureExtractor:

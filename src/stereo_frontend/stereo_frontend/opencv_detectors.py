@@ -18,26 +18,19 @@ from stereo_frontend.keypoints import Keypoints, Selector
 
 SIFT_CONTRAST = 0.04
 """Contrast threshold of Lowe 2004 as OpenCV scales it."""
-AKAZE_THRESHOLD = 0.001
 FAST_THRESHOLD = 20.0
 _MOST_KEYPOINTS = 20000
 
 
 class OpenCvDetector:
-    """One of OpenCV's detectors with descriptors: ``sift``, ``rootsift``, ``orb`` or ``akaze``.
+    """One of OpenCV's detectors with descriptors: ``sift``, ``rootsift`` or ``orb``.
 
     ``rootsift`` is the square root of the L1-normalised SIFT vector (Arandjelovic and Zisserman 2012).
-
-    Raises
-    ------
-    ValueError
-        If the installed OpenCV lacks the detector.
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
         self._make, self._normalise = _KINDS[name]
-        self._make(1.0)
 
     def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
         """Keypoints above ``threshold`` times the customary one, thinned out by ``select``."""
@@ -49,24 +42,6 @@ class OpenCvDetector:
         size = np.array([k.size for k in found], np.float32)
         kept = _without_repeats(uv, select(uv, size, response))
         return Keypoints(uv[kept], size[kept], response[kept], self._normalise(raw[kept]))
-
-
-def create_from_opencv(name: str, *arguments: Any, **options: Any) -> Any:
-    """``cv2.<name>_create`` from wherever the installed OpenCV keeps it (main module or contrib's ``xfeatures2d``).
-
-    Raises
-    ------
-    ValueError
-        If it is in neither.
-    """
-    for module in (cv2, getattr(cv2, "xfeatures2d", None)):
-        create = getattr(module, f"{name}_create", None)
-        if create is not None:
-            return create(*arguments, **options)
-    raise ValueError(
-        f"the installed OpenCV {cv2.__version__} has no {name}: install opencv-contrib-python-headless "
-        "or choose the detector surf or sift"
-    )
 
 
 def unit_norm(vectors: AnyArray) -> Float32Array:
@@ -95,21 +70,16 @@ def _without_repeats(uv: Float32Array, kept: AnyArray) -> AnyArray:
 
 
 def _sift(threshold: float) -> Any:
-    return create_from_opencv("SIFT", 0, 3, SIFT_CONTRAST * threshold)
+    return cv2.SIFT.create(0, 3, SIFT_CONTRAST * threshold)
 
 
 def _orb(threshold: float) -> Any:
     fast = int(np.clip(round(FAST_THRESHOLD * threshold), 2, 120))
-    return create_from_opencv("ORB", nfeatures=_MOST_KEYPOINTS, fastThreshold=fast)
-
-
-def _akaze(threshold: float) -> Any:
-    return create_from_opencv("AKAZE", threshold=AKAZE_THRESHOLD * threshold)
+    return cv2.ORB.create(nfeatures=_MOST_KEYPOINTS, fastThreshold=fast)
 
 
 _KINDS: dict[str, tuple[Callable[[float], Any], Callable[[AnyArray], Float32Array]]] = {
     "sift": (_sift, unit_norm),
     "rootsift": (_sift, root_normalised),
     "orb": (_orb, from_bits),
-    "akaze": (_akaze, from_bits),
 }

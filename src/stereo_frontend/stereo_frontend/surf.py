@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SURF-128 (Bay, Ess, Tuytelaars, Van Gool.
+"""SURF (Bay, Ess, Tuytelaars, Van Gool.
 
 Speeded-Up Robust Features, CVIU 2008), the thesis's choice of feature (ch. 3).
 
-Extended descriptor. Oriented by default: on rigs that stay level the upright one matches a sixth more, but where the
-camera rolls by 15 degrees and more it fails. On EuRoC's key frames, half of whose motions roll, mapping lost 8 of 50
-frames upright, 2 oriented, 2 with SIFT. The image is doubled by default, as the paper proposes for accuracy: keypoints
-half the size, and half the error of their place.
+Extended descriptor (SURF-128) by default, SURF-64 on request. Oriented by default: on rigs that stay level the upright
+one matches a sixth more, but where the camera rolls by 15 degrees and more it fails. On EuRoC's key frames, half of
+whose motions roll, mapping lost 8 of 50 frames upright, 2 oriented, 2 with SIFT. The image is doubled by default, as
+the paper proposes for accuracy: keypoints half the size, and half the error of their place.
 
 Patents: SURF was covered by US 8,165,401 and EP 1 850 270 (Bay et al., filed 2006-2007). Whoever ships a product should
 have their status checked; SIFT, whose patent US 6,711,293 ended in March 2020, is one configuration value away
@@ -21,14 +21,24 @@ import cv2
 import numpy as np
 
 from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray
 from slam_core.types import ByteArray, Float32Array
 from stereo_frontend.keypoints import Keypoints, Selector
-from stereo_frontend.surf_descriptor import DIMENSION, describe_oriented, describe_upright, region_weights
+from stereo_frontend.surf_descriptor import (
+    DIMENSION,
+    describe_oriented,
+    describe_upright,
+    merged_signs,
+    region_weights,
+)
 from stereo_frontend.surf_detector import MAX_PIXELS, find_keypoints, fitting_octaves, halved, integral_image
 
 _MOST_KEYPOINTS = 20000
 _DIAMETER = 9.0 / 1.2
 """Size of a keypoint (px) per unit of its scale: that of the filter that found it."""
+
+
+_WEIGHTS = region_weights()
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,7 @@ class SurfConfig(Config):
     )
     doubled: bool = parameter(True, "search the image enlarged twice: keypoints down to half the size")
     upright: bool = parameter(False, "describe along the image axes (U-SURF) instead of the keypoint's orientation")
+    extended: bool = parameter(True, "descriptors of 128 numbers (SURF-128) instead of 64: better told apart, slower")
 
 
 class SurfDetector:
@@ -48,7 +59,6 @@ class SurfDetector:
 
     def __init__(self, config: SurfConfig | None = None) -> None:
         self.config = config or SurfConfig()
-        self._weights = region_weights()
         self._found = np.empty((_MOST_KEYPOINTS, 4), np.float32)
 
     def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
@@ -64,9 +74,8 @@ class SurfDetector:
         image = np.ascontiguousarray(image)
         found = self._find_all(image, threshold * self.config.threshold)
         found = found[select(found[:, :2], _DIAMETER * found[:, 2], found[:, 3])]
-        descriptors = np.empty((len(found), DIMENSION), np.float32)
-        describe = describe_upright if self.config.upright else describe_oriented
-        describe(integral_image(image), found[:, :3].astype(np.float64), self._weights, descriptors)
+        places = found[:, :3].astype(np.float64)
+        descriptors = describe(image, places, upright=self.config.upright, extended=self.config.extended)
         return Keypoints(found[:, :2].copy(), _DIAMETER * found[:, 2], found[:, 3].copy(), descriptors)
 
     def _find_all(self, image: ByteArray, threshold: float) -> Float32Array:
@@ -82,3 +91,11 @@ class SurfDetector:
         found[:, :2] = (found[:, :2] + 0.5) * pixel - 0.5
         found[:, 2] *= pixel
         return found
+
+
+def describe(image: ByteArray, places: FloatArray, *, upright: bool, extended: bool) -> Float32Array:
+    """Descriptors, (n, 128) or (n, 64) where not ``extended``, of places (n, 3): u, v and scale, px."""
+    descriptors = np.empty((len(places), DIMENSION), np.float32)
+    kernel = describe_upright if upright else describe_oriented
+    kernel(integral_image(image), places, _WEIGHTS, descriptors)
+    return descriptors if extended else merged_signs(descriptors)

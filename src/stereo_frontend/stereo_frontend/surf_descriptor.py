@@ -67,6 +67,14 @@ def region_weights() -> Float32Array:
     return np.asarray(overlap * np.exp(-0.5 * (position / WEIGHT_SIGMA) ** 2), np.float32)
 
 
+def merged_signs(descriptors: Float32Array) -> Float32Array:
+    """SURF-64 (n, 64) of SURF-128 (n, 128): the sums of dx, |dx|, dy and |dy|, no longer split by the other's sign."""
+    split = descriptors.reshape(-1, 2, 2)
+    merged = split.sum(axis=1).reshape(len(descriptors), DIMENSION // 2)
+    norm = np.sqrt(np.einsum("nd,nd->n", merged, merged))
+    return np.asarray(merged / np.maximum(norm, np.float32(1e-12))[:, None], np.float32)
+
+
 @njit(cache=True, nogil=True)
 def describe_upright(integral, keypoints, weights, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (n, 128) for keypoints (n, 3) of u, v, scale with wavelets along the axes of the image."""

@@ -219,7 +219,7 @@ def _find_in_row(integral, layers, place, y, threshold, marks, cube, found):  # 
             for j in range(3):
                 for i in range(3):
                     cube[1, j, i], cube[2 - 2 * place, j, i] = own[rows[j], x - 1 + i], other[rows[j], x - 1 + i]
-            if _vertex(cube, offset):
+            if vertex(cube, offset):
                 found[count, 0] = x + offset[0]
                 found[count, 1] = y + offset[1]
                 found[count, 2] = 1.2 / 9.0 * (size + offset[2] * _STEP)
@@ -254,7 +254,7 @@ def _fill_outer(integral, x, y, size, value, out):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True)
-def _vertex(c, offset):  # type: ignore[no-untyped-def]
+def vertex(c, offset):  # type: ignore[no-untyped-def]
     """Vertex of the parabola through a neighbourhood (scale, v, u) relative to its centre; False if it lies outside."""
     centre = np.float64(c[1, 1, 1])
     gx = 0.5 * (c[1, 1, 2] - c[1, 1, 0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,36 +13,27 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from slam_bringup.experiments import plots
-from slam_bringup.experiments.chain import Kept
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
-from slam_bringup.experiments.job import RENDERING, Job, JobResult
+from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_bringup.experiments.true_frames import TrueFrame, simulated_frames, spread, transfer
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray, DepthImage
 from stereo_frontend.depth_lookup import DepthLookupConfig, sample_depth
 from stereo_frontend.features import DETECTORS, FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
+from stereo_frontend.surf import SurfConfig
 from stereo_frontend.tof_features import TofFeatureConfig, normalised_picture
 
 MODULE = "slam_bringup.experiments.features"
 _PACKAGES = (*RENDERING, "stereo_frontend", "tof_driver", "slam_bringup.experiments.true_frames")
 _SIZES = ((320, 240), (640, 480), (1024, 768))
 _THESIS_MS = {"sift": "about 300 (?)", "surf": "180 (?)"}
+_DETECTORS = {name: FeatureConfig(detector=name) for name in DETECTORS} | {
+    "surf-64": FeatureConfig(surf=SurfConfig(extended=False))
+}
 _KINDS = ("amplitude", "range", "intensity")
 _SAME_PX = 2.0
 """Two keypoints this near show the same point."""
-
-
-def available_detectors() -> dict[str, str]:
-    """Name of every detector, and why it cannot be used here, or ""."""
-    names = {}
-    for name in DETECTORS:
-        try:
-            FeatureExtractor(FeatureConfig(detector=name))
-            names[name] = ""
-        except ValueError as error:
-            names[name] = str(error)
-    return names
 
 
 def compare_detectors(folder: Path, before: list[Path], frames: int, repeats: int) -> Kept:
@@ -49,22 +41,19 @@ def compare_detectors(folder: Path, before: list[Path], frames: int, repeats: in
     cv2.setNumThreads(1)
     views = list(simulated_frames("small_room", frames, 3))
     values: dict[str, dict[str, object]] = {}
-    for name, why in available_detectors().items():
-        if why:
-            values[name] = {"missing": why}
-            continue
-        extractor = FeatureExtractor(FeatureConfig(detector=name, target=600))
+    for name, config in _DETECTORS.items():
+        extractor = FeatureExtractor(replace(config, target=600))
         found = [extractor(view.images.left) for view in views]
-        values[name] = {"times": _times(name, views[0].images.left, repeats), **_found_again(views, found)}
+        values[name] = {"times": _times(config, views[0].images.left, repeats), **_found_again(views, found)}
     return values, {"picture": views[0].images.left}
 
 
-def _times(name: str, picture: ByteArray, repeats: int) -> list[tuple[float, int]]:
+def _times(config: FeatureConfig, picture: ByteArray, repeats: int) -> list[tuple[float, int]]:
     """Median milliseconds of one thread and number of features for each picture size, 500 asked for."""
     rows = []
     for size in _SIZES:
         scaled = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-        extractor = FeatureExtractor(FeatureConfig(detector=name, target=500))
+        extractor = FeatureExtractor(replace(config, target=500))
         count, elapsed = 0, []
         for _ in range(repeats + 3):  # the first ones compile, and settle the threshold
             began = time.thread_time()
@@ -164,15 +153,13 @@ def _detectors() -> Experiment:
 
     def report(results: Mapping[str, JobResult]) -> Findings:
         values = results["table"].values
-        usable = {name: v for name, v in values.items() if "missing" not in v}
-        times = {name: v["times"] for name, v in usable.items()}
+        times = {name: v["times"] for name, v in values.items()}
         ratio = times["surf"][1][0] / times["sift"][1][0]
         rows = [
             [name, *(f"{ms:.1f} ms, {count}" for ms, count in v["times"]), f"{v['repeatability']:.2f}",
              f"{v['right']:.0f}", f"{v['precision']:.3f}", f"{v['spread_px']:.2f}"]
-            for name, v in usable.items()
+            for name, v in values.items()
         ]  # fmt: skip
-        rows += [[name, v["missing"], *[""] * 6] for name, v in values.items() if "missing" in v]
         header = ("detector", *(f"{w} x {h}" for w, h in _SIZES), "repeatability", "right matches", "precision",
                   "spread px")  # fmt: skip
         return Findings(
