@@ -43,7 +43,7 @@ SMALL_STEP = relative_motion(np.array([0.05, 0.02, 0.0, 0.0, 0.01, 0.05]), 1.0)
 LARGE_STEP = relative_motion(np.array([0.5, -0.3, 0.1, 0.05, 0.1, 0.6]), 1.0)
 
 
-@pytest.mark.parametrize("method", ["nearest", "mahalanobis", "jcbb"])
+@pytest.mark.parametrize("method", ["nearest", "mahalanobis", "jcbb", "ccda"])
 def test_small_step_is_associated_rightly(world: PointWorld, rng: np.random.Generator, method: str) -> None:
     candidates, first, now, second = two_views(world, SMALL_STEP, rng)
     prior = motion_prior(np.zeros(6), np.zeros((6, 6)), np.repeat([6.0, 6.0], 3), 0.1)

@@ -50,7 +50,7 @@ def test_one_filter_over_rough_rounds_is_honest_only_in_the_invariant_error() ->
     assert standard > 2.0
 
 
-@pytest.mark.parametrize("method", ["mahalanobis", "jcbb"])
+@pytest.mark.parametrize("method", ["mahalanobis", "jcbb", "ccda"])
 def test_unknown_association_closes_the_loop(rng: np.random.Generator, method: str) -> None:
     config = PlanarConfig(method=method)
     truth, motions, _, seen, measured = drive(rng, config)

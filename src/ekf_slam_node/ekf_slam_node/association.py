@@ -13,14 +13,18 @@ import numpy.typing as npt
 from numba import njit
 
 from ekf_slam_node.candidates import Candidates, innovation_covariance, predict
+from ekf_slam_node.ccda import ccda, distance_variances, equal_distances
 from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.jcbb import JointPrediction, jcbb
-from ekf_slam_node.models import Frame, rig_points
+from ekf_slam_node.models import Frame, Observation, rig_points
 from ekf_slam_node.pair_kernels import first_of_both
 from slam_core.geometry import FloatArray, transform_points
+from slam_core.least_squares import chi_square_bound
 
 IndexArray = npt.NDArray[np.int64]
 Similarity = npt.NDArray[np.floating]
+_JOINT_CONFIDENCE = 0.999
+"""Of the tests that take pairs together."""
 
 
 @njit(cache=True, nogil=True)
@@ -138,22 +142,50 @@ def associate_jcbb(
     They fix the motion; the others follow by their gates around it (:class:`ekf_slam_node.linking.Linker`).
     """
     seen = predict(candidates, T_previous_now, T_rig_optical, frame)
-    S = innovation_covariance(seen, candidates, motion_covariance)
-    compatible = np.zeros(similarity.shape, dtype=bool)
-    pairs = _gated_pairs(
-        frame.z, frame.variance, seen.z, S, seen.in_image(frame.camera), similarity, config.descriptor_threshold,
-        config.gate, 0.0,
-    )  # fmt: skip
-    compatible[pairs[:2]] = True
-    choices = compatible.sum(axis=0)
-    columns = np.argsort(np.where(choices > 0, choices, np.iinfo(np.int64).max), kind="stable")
-    columns = columns[: min(config.joint_features, int((choices > 0).sum()))]
-    rows = np.flatnonzero(compatible[:, columns].any(axis=1))
+    pairs = _clearest_pairs(candidates, frame, similarity, seen, motion_covariance, config)
+    rows, columns = np.unique(pairs[0]), np.unique(pairs[1])
     J = seen.J_pose[rows].reshape(-1, 6)
     joint = J @ motion_covariance @ J.T
     own = innovation_covariance(seen, candidates, None)[rows]
     for k in range(len(rows)):
         joint[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own[k]
     noise = frame.variance[columns][:, :, None] * np.eye(3)
-    found = jcbb(frame.z[columns], noise, JointPrediction(seen.z[rows], joint), confidence=0.999)
+    found = jcbb(frame.z[columns], noise, JointPrediction(seen.z[rows], joint), confidence=_JOINT_CONFIDENCE)
     return rows[found[found >= 0]], columns[found >= 0]
+
+
+def associate_ccda(
+    candidates: Candidates, frame: Frame, similarity: Similarity, T_previous_now: FloatArray,
+    motion_covariance: FloatArray, T_rig_optical: FloatArray, config: FeatureAssociationConfig,
+) -> tuple[IndexArray, IndexArray]:  # fmt: skip
+    """The most pairs whose points are two by two equally far apart (thesis 9.4.1), of the same features as JCBB's.
+
+    The motion only says which pairs are possible at all; with a covariance without bounds their descriptors do.
+    """
+    seen = predict(candidates, T_previous_now, T_rig_optical, frame)
+    rows, columns, costs = _clearest_pairs(candidates, frame, similarity, seen, motion_covariance, config)
+    before, now = candidates.points[rows], rig_points(frame.select(columns), T_rig_optical)
+    fits = equal_distances(
+        (before, distance_variances(before, candidates.covariances[rows])),
+        (now[0], distance_variances(*now)),
+        chi_square_bound(_JOINT_CONFIDENCE, 1),
+    )
+    found = ccda(rows, columns, costs, fits, len(frame))
+    paired = np.flatnonzero(found >= 0)
+    return found[paired], paired
+
+
+def _clearest_pairs(
+    candidates: Candidates, frame: Frame, similarity: Similarity, seen: Observation, motion_covariance: FloatArray,
+    config: FeatureAssociationConfig,
+) -> tuple[IndexArray, IndexArray, FloatArray]:  # fmt: skip
+    """Rows, columns and costs of the gated pairs of the ``joint_features`` features with the fewest candidates."""
+    S = innovation_covariance(seen, candidates, motion_covariance)
+    rows, columns, costs = _gated_pairs(
+        frame.z, frame.variance, seen.z, S, seen.in_image(frame.camera), similarity, config.descriptor_threshold,
+        config.gate, 0.0,
+    )  # fmt: skip
+    choices = np.bincount(columns, minlength=len(frame))
+    clearest = np.argsort(np.where(choices > 0, choices, np.iinfo(np.int64).max), kind="stable")
+    kept = np.isin(columns, clearest[: config.joint_features])
+    return rows[kept], columns[kept], costs[kept]

@@ -97,7 +97,7 @@ class FeatureAssociationConfig(Config):
     """How features find their landmarks (thesis chapter 4)."""
 
     method: str = parameter(
-        "mahalanobis", "how a feature chooses among its candidates", choices=("nearest", "mahalanobis", "jcbb")
+        "mahalanobis", "how a feature chooses among its candidates", choices=("nearest", "mahalanobis", "jcbb", "ccda")
     )
     gate: float = parameter(16.27, "chi-square gate of one feature, 3 degrees of freedom (99.9 %)", minimum=1.0)
     descriptor_threshold: float = parameter(0.75, "least cosine of the descriptors", minimum=-1.0, maximum=1.0)

@@ -13,6 +13,7 @@ import numpy as np
 from ekf_slam_node.association import (
     IndexArray,
     Similarity,
+    associate_ccda,
     associate_jcbb,
     associate_mahalanobis,
     associate_nearest,
@@ -24,6 +25,7 @@ from ekf_slam_node.models import Frame
 from ekf_slam_node.motion_guess import MotionGuess, guess_motion, refine_motion
 from slam_core.geometry import FloatArray
 
+_METHODS = {"mahalanobis": associate_mahalanobis, "jcbb": associate_jcbb, "ccda": associate_ccda}
 _CONVINCING = 0.5
 """Share of the features, or of the candidates where these are fewer, that a right prediction links."""
 
@@ -121,17 +123,22 @@ class Linker:
         config = self._config
         if config.method == "nearest":
             return associate_nearest(candidates, frame, prior.T, self._T_rig_optical, config.nearest_associate)
-        associate = associate_jcbb if config.method == "jcbb" else associate_mahalanobis
-        return associate(candidates, frame, similarity, prior.T, prior.covariance, self._T_rig_optical, config)
+        return _METHODS[config.method](
+            candidates, frame, similarity, prior.T, prior.covariance, self._T_rig_optical, config
+        )
 
     def _settle(
         self, candidates: Candidates, frame: Frame, similarity: Similarity, guess: MotionGuess, least: int
     ) -> FrameLink | None:
         """Associate once more around the motion found, where the gates are as small as they can be."""
-        noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))
-        rows, columns = associate_mahalanobis(
-            candidates, noisier, similarity, guess.T, guess.covariance, self._T_rig_optical, self._config
-        )
+        if self._config.method == "nearest":
+            near = self._config.nearest_associate
+            rows, columns = associate_nearest(candidates, frame, guess.T, self._T_rig_optical, near)
+        else:
+            noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))
+            rows, columns = associate_mahalanobis(
+                candidates, noisier, similarity, guess.T, guess.covariance, self._T_rig_optical, self._config
+            )
         final = refine_motion(
             candidates.select(rows), frame.select(columns), self._T_rig_optical, guess.T, self._config.gate
         )

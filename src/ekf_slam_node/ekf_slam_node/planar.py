@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
+from ekf_slam_node.ccda import ccda, distance_variances, equal_distances
 from ekf_slam_node.covariance import Covariance, whiten
 from ekf_slam_node.ekf import UpdateReport
 from ekf_slam_node.jcbb import UNPAIRED, IndexArray, JointPrediction, jcbb
@@ -30,7 +31,9 @@ class PlanarConfig(Config):
     sigma_range: float = parameter(0.05, "noise of a range", unit="m", minimum=1e-6)
     sigma_bearing: float = parameter(0.02, "noise of a bearing", unit="rad", minimum=1e-6)
     error: str = parameter("invariant", "error state", choices=("invariant", "standard"))
-    method: str = parameter("jcbb", "association where it is not known", choices=("nearest", "mahalanobis", "jcbb"))
+    method: str = parameter(
+        "jcbb", "association where it is not known", choices=("nearest", "mahalanobis", "jcbb", "ccda")
+    )
     confidence: float = parameter(0.99, "of the compatibility tests", minimum=0.5, maximum=0.999999)
     nearest_associate: float = parameter(0.5, "g_A of Algorithm 1", unit="m", minimum=0.0)
     new_confidence: float = parameter(
@@ -199,7 +202,25 @@ class PlanarEkf:
         if self.config.method == "jcbb":
             return jcbb(measured, noise, JointPrediction(z, S), angles=(1,), confidence=self.config.confidence)
         distance, nis = self._distances(measured)
-        return _one_to_one(np.where(nis < chi2.ppf(self.config.confidence, 2), distance, np.inf))
+        possible = nis < chi2.ppf(self.config.confidence, 2)
+        if self.config.method == "ccda":
+            return self._combined(measured, possible, distance)
+        return _one_to_one(np.where(possible, distance, np.inf))
+
+    def _combined(self, measured: FloatArray, possible: npt.NDArray[np.bool_], costs: FloatArray) -> IndexArray:
+        """Most pairs, each possible by itself (k, m), whose distances from each other agree (thesis 9.4.1)."""
+        columns, rows = np.nonzero(possible)
+        placed = [place(np.zeros(POSE_DIM), z) for z in measured]
+        points = np.array([point for point, _, _ in placed])
+        own = np.array([J @ self._noise @ J.T for _, _, J in placed])
+        index = POSE_DIM + 2 * rows[:, None] + np.arange(2)
+        joint = self.covariance.columns(index.ravel())[index.ravel()].reshape(len(rows), 2, len(rows), 2)
+        fits = equal_distances(
+            (self.landmarks[rows], distance_variances(self.landmarks[rows], joint)),
+            (points[columns], distance_variances(points[columns], own[columns])),
+            float(chi2.ppf(self.config.confidence, 1)),
+        )
+        return ccda(rows, columns, costs[columns, rows], fits, len(measured))
 
     def _nearest(self, measured: FloatArray) -> IndexArray:
         points = np.array([place(self.pose, z)[0] for z in measured])

@@ -4,51 +4,74 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ekf_slam_node.association import associate_jcbb, associate_mahalanobis, associate_nearest
-from ekf_slam_node.candidates import Candidates
+from ekf_slam_node.association import associate_ccda, associate_jcbb, associate_mahalanobis, associate_nearest
+from ekf_slam_node.candidates import Candidates, MotionPrior
 from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.models import Frame, frame_from_features, rig_points
-from slam_bringup.experiments.chain import Kept
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Table
-from slam_bringup.experiments.job import RENDERING, Job, JobResult
+from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_core.geometry import FloatArray, invert_transform
 from slam_simulation import Scenario
 from slam_simulation.feature_level import FeatureFrame, FeatureSimulator
 
 MODULE = "slam_bringup.experiments.association"
-_NO_DESCRIPTORS: dict[str, Any] = {"descriptor_threshold": -1.0, "descriptor_weight": 0.0}
-METHODS: dict[str, tuple[str, dict[str, Any]]] = {
-    "Algorithm 1: nearest": ("nearest", _NO_DESCRIPTORS),
-    "Algorithm 1 + descriptors": ("nearest", {}),
-    "Algorithm 2: Mahalanobis": ("mahalanobis", _NO_DESCRIPTORS),
-    "Algorithm 2 + descriptors": ("mahalanobis", {}),
-    "JCBB, of 20 features": ("jcbb", _NO_DESCRIPTORS),
-    "JCBB, of 20 features + descriptors": ("jcbb", {}),
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A method, with or without descriptors, and with the motion predicted or not at all."""
+
+    method: str
+    descriptors: bool = True
+    predicted: bool = True
+
+    def config(self) -> FeatureAssociationConfig:
+        """What the filter would be told."""
+        plain: dict[str, Any] = {} if self.descriptors else {"descriptor_threshold": -1.0, "descriptor_weight": 0.0}
+        return replace(FeatureAssociationConfig(), method=self.method, **plain)
+
+
+METHODS = {
+    "Algorithm 1: nearest": Variant("nearest", descriptors=False),
+    "Algorithm 1 + descriptors": Variant("nearest"),
+    "Algorithm 2: Mahalanobis": Variant("mahalanobis", descriptors=False),
+    "Algorithm 2 + descriptors": Variant("mahalanobis"),
+    "JCBB, of 20 features": Variant("jcbb", descriptors=False),
+    "JCBB, of 20 features + descriptors": Variant("jcbb"),
+    "CCDA, of 20 features": Variant("ccda", descriptors=False),
+    "CCDA, of 20 features + descriptors": Variant("ccda"),
+    "Algorithm 2 + descriptors, motion unknown": Variant("mahalanobis", predicted=False),
+    "CCDA, of 20 features + descriptors, motion unknown": Variant("ccda", predicted=False),
 }
+_JOINT = {"mahalanobis": associate_mahalanobis, "jcbb": associate_jcbb, "ccda": associate_ccda}
 _RATES = (10, 5, 2)
 _SIGMA_MOTION = np.repeat([3.0, 4.0], 3)
 """Accelerations of the constant-velocity model, m/s2 and rad/s2."""
+_UNKNOWN = MotionPrior(np.eye(4), np.diag(np.repeat([10.0, 3.0], 3) ** 2))
 
 
 def associate(folder: Path, before: list[Path], method: str, every: int, frames: int) -> Kept:
     """Precision and recall of one method on a scenario's feature-level simulation, every n-th frame."""
-    algorithm, overrides = METHODS[method]
-    config = replace(FeatureAssociationConfig(), method=algorithm, **overrides)
+    variant = METHODS[method]
     simulator = FeatureSimulator(Scenario.load("workshop_handheld"))
     views = [simulator.frame(k * every) for k in range(frames)]
     dt = every / simulator.scenario.rate
     right = paired = common = 0
     for k in range(2, frames):
         first, second = views[k - 1], views[k]
-        step = invert_transform(views[k - 2].T_world_rig) @ first.T_world_rig  # constant velocity
-        rows, columns = _pairs(first, second, step, dt, simulator.T_rig_left, config)
+        if variant.predicted:  # constant velocity
+            step = invert_transform(views[k - 2].T_world_rig) @ first.T_world_rig
+            prior = MotionPrior(step, np.diag((0.5 * dt**2 * _SIGMA_MOTION) ** 2))
+        else:
+            prior = _UNKNOWN
+        rows, columns = _pairs(first, second, prior, simulator.T_rig_left, variant.config())
         common += len(np.intersect1d(first.ids, second.ids))
         paired += len(rows)
         right += int((first.ids[rows] == second.ids[columns]).sum())
@@ -56,7 +79,7 @@ def associate(folder: Path, before: list[Path], method: str, every: int, frames:
 
 
 def _pairs(
-    first: FeatureFrame, second: FeatureFrame, step: FloatArray, dt: float, T_rig_optical: FloatArray,
+    first: FeatureFrame, second: FeatureFrame, prior: MotionPrior, T_rig_optical: FloatArray,
     config: FeatureAssociationConfig,
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:  # fmt: skip
     """Candidates of the first frame and features of the second that the method pairs."""
@@ -64,12 +87,11 @@ def _pairs(
     candidates = Candidates(*rig_points(before, T_rig_optical), before.descriptors)
     similarity = np.asarray(candidates.descriptors @ now.descriptors.T, dtype=np.float64)
     if config.method == "nearest":
-        rows, columns = associate_nearest(candidates, now, step, T_rig_optical, config.nearest_associate)
+        rows, columns = associate_nearest(candidates, now, prior.T, T_rig_optical, config.nearest_associate)
         alike = similarity[rows, columns] >= config.descriptor_threshold
         return rows[alike], columns[alike]
-    covariance = np.diag((0.5 * dt**2 * _SIGMA_MOTION) ** 2)
-    method = associate_jcbb if config.method == "jcbb" else associate_mahalanobis
-    return method(candidates, now, similarity, step, covariance, T_rig_optical, config)
+    associate = _JOINT[config.method]
+    return associate(candidates, now, similarity, prior.T, prior.covariance, T_rig_optical, config)
 
 
 def _frame(view: FeatureFrame) -> Frame:

@@ -26,7 +26,7 @@ from slam_core.least_squares import LevenbergMarquardtConfig, chi_square_bound
 from slam_core.rigid_alignment import umeyama
 
 METHODS = ("ekf", "sam", "submaps")
-ASSOCIATIONS = ("known", "nearest", "mahalanobis", "jcbb")
+ASSOCIATIONS = ("known", "nearest", "mahalanobis", "jcbb", "ccda")
 _INLIER_PROBABILITY = 0.999999
 """Share of true sightings that lie within their gate; others are left out where the association is known."""
 _NARROWING_GATES = (2500.0, 400.0, 100.0, 36.0, 36.0, 36.0)
