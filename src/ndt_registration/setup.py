@@ -20,6 +20,7 @@ setup(
         "numba",
         "numpy",
         "scipy",
+        "PyYAML",
     ],
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",

@@ -86,8 +86,42 @@ def test_unknown_kind_and_fields_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="unknown kind"):
         read_cloud(tmp_path / "a.obj")
     (tmp_path / "a.pcd").write_bytes(FILES["a.pcd"].replace(b"intensity x y z", b"intensity r s t"))
-    with pytest.raises(ValueError, match="no fields x, y and z"):
+    with pytest.raises(ValueError, match="no fields x and y"):
         read_cloud(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize("name", ["a.pcd", "b.pcd", "c.pcd", "a.ply", "b.ply"])
+def test_files_without_z_are_in_the_plane(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(FILES[name].replace(b"x y z", b"x y w").replace(b"float z", b"float w"))
+    np.testing.assert_array_equal(read_cloud(tmp_path / name), POINTS[:, :2])
+
+
+@pytest.mark.parametrize(
+    ("text", "points"),
+    [("x,y\n1,2\n3.5,-4\n", [[1, 2], [3.5, -4]]), ("# scan\n1 2 3\n\n4 5 nan\n", [[1, 2, 3], [4, 5, np.nan]])],
+)
+def test_lines_of_numbers(tmp_path: Path, text: str, points: list[list[float]]) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.csv"), points)
+
+
+@pytest.mark.parametrize("text", ["1 2\n3 4 5\n", "x y\n", "1\n2\n", "1 2\n3 four\n"])
+def test_other_lines_are_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(ValueError, match=r"a\.txt"):
+        read_cloud(tmp_path / "a.txt")
+
+
+SCAN = "{angle_min: 0.0, angle_increment: 1.5707963267948966, range_min: 0.1, range_max: 9.0, ranges: [2.0, .inf, 3.0]}"
+
+
+def test_a_laser_scan_as_ros_prints_it(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(f"{SCAN}\n---\n")
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.yaml"), [[2, 0], [np.nan, np.nan], [-3, 0]], atol=1e-6)
+    for text, reason in ((SCAN.replace("ranges", "rays"), "ranges"), ("[1, 2]", "no message"), ("{: ", "YAML")):
+        (tmp_path / "a.yaml").write_text(text)
+        with pytest.raises(ValueError, match=reason):
+            read_cloud(tmp_path / "a.yaml")
 
 
 def test_back_references_of_lzf() -> None:

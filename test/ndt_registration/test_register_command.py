@@ -95,8 +95,65 @@ def test_a_bad_guess_is_a_clear_error(clouds: tuple[str, str], guess: str, messa
 
 def test_bad_files_are_clear_errors(clouds: tuple[str, str], tmp_path: Path) -> None:
     empty = write_pcd(tmp_path / "empty.pcd", np.full((5, 3), np.nan))
-    text = tmp_path / "cloud.txt"
+    text = tmp_path / "cloud.obj"
     text.write_text("1 2 3")
-    for bad, message in ((empty, "no finite points"), (text, "cloud.txt"), (tmp_path / "none.pcd", "none.pcd")):
+    for bad, message in ((empty, "no finite points"), (text, "cloud.obj"), (tmp_path / "none.pcd", "none.pcd")):
         with pytest.raises((ValueError, OSError), match=message):
             CliRunner().invoke(command, [str(bad), clouds[1]], catch_exceptions=False)
+
+
+def walls(x: float, y: float, yaw: float, rng: np.random.Generator) -> FloatArray:
+    """Ranges (400,) of a laser scanner to the walls of an L-shaped room."""
+    corners = np.array([[-2.0, -1.5], [4.0, -1.5], [4.0, 1.0], [1.5, 1.0], [1.5, 3.0], [-2.0, 3.0]])
+    angle = yaw + np.linspace(-np.pi, np.pi, 400, endpoint=False)
+    ray = np.column_stack([np.cos(angle), np.sin(angle)])
+    nearest = np.full(400, np.inf)
+    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        along, offset = b - a, a - [x, y]
+        det = ray[:, 0] * -along[1] + ray[:, 1] * along[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = (offset[0] * -along[1] + offset[1] * along[0]) / det
+            share = (ray[:, 0] * offset[1] - ray[:, 1] * offset[0]) / det
+        hit = (reach > 0) & (share >= 0) & (share <= 1)
+        nearest[hit] = np.minimum(nearest[hit], reach[hit])
+    return np.asarray(nearest + 0.005 * rng.standard_normal(400))
+
+
+def write_scan(path: Path, ranges: FloatArray) -> str:
+    limits = f"angle_min: {-np.pi}\nangle_increment: {2 * np.pi / 400}\nrange_min: 0.05\nrange_max: 20.0\n"
+    path.write_text(f"{limits}ranges: [{', '.join(f'{r:.4f}' for r in ranges)}]\n")
+    return str(path)
+
+
+@pytest.mark.parametrize("method", ["ndt", "icp", "icp_plane"])
+def test_laser_scans_are_aligned_in_the_plane(tmp_path: Path, rng: np.random.Generator, method: str) -> None:
+    source = write_scan(tmp_path / "source.yaml", walls(0.2, 0.1, 0.1, rng))
+    target = write_scan(tmp_path / "target.yaml", walls(0.0, 0.0, 0.0, rng))
+    outcome = CliRunner().invoke(
+        command, [source, target, "--method", method, "-o", str(tmp_path / "out")], catch_exceptions=False
+    )
+    result = json.loads(outcome.stdout)
+    assert result["converged"], result["reason"]
+    error = boxminus(np.array(result["T_target_source"]), np.eye(4)) - [0.2, 0.1, 0.0, 0.0, 0.0, 0.1]
+    assert np.abs(error).max() < 0.02
+    np.testing.assert_allclose(error[2:5], 0.0, atol=1e-9)
+    assert (tmp_path / "out" / "registration.png").stat().st_size > 10_000
+
+
+def test_flat_clouds_with_a_height_are_in_the_plane_too(tmp_path: Path, rng: np.random.Generator) -> None:
+    files = []
+    for name, place in (("source", (0.2, 0.1, 0.1)), ("target", (0.0, 0.0, 0.0))):
+        ranges, angle = walls(*place, rng), np.linspace(-np.pi, np.pi, 400, endpoint=False)
+        points = np.column_stack([ranges * np.cos(angle), ranges * np.sin(angle), np.full(400, 0.3)])
+        files.append(str(write_pcd(tmp_path / f"{name}.pcd", points)))
+    result = json.loads(CliRunner().invoke(command, files, catch_exceptions=False).stdout)
+    assert np.abs(boxminus(np.array(result["T_target_source"]), np.eye(4))[[2, 3, 4]]).max() < 1e-9
+    assert np.array(result["T_target_source"])[0, 3] == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_scan_is_not_aligned_to_a_cloud_in_space(
+    clouds: tuple[str, str], tmp_path: Path, rng: np.random.Generator
+) -> None:
+    scan = write_scan(tmp_path / "scan.yaml", walls(0.0, 0.0, 0.0, rng))
+    with pytest.raises(ValueError, match="plane and the other in space"):
+        CliRunner().invoke(command, [scan, clouds[1]], catch_exceptions=False)

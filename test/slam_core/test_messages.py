@@ -218,6 +218,30 @@ def test_cloud_contradictions_are_named(rng: np.random.Generator) -> None:
         m.points_from_message(m.cloud_message(TYPES, header(), np.zeros(2, dtype=[("x", "f4"), ("y", "f4")])))
 
 
+def laser_scan(**changes: Any) -> Any:
+    fields = {"angle_min": -1.0, "angle_max": 1.0, "angle_increment": 0.5, "range_min": 0.2, "range_max": 8.0,
+              "ranges": np.array([1.0, 0.1, np.nan, np.inf, 4.0], np.float32), **changes}  # fmt: skip
+    times = {"time_increment": 0.0, "scan_time": 0.1, "intensities": np.zeros(0, np.float32)}
+    return over_the_wire(TYPES.LaserScan(header=header(), **times, **fields))
+
+
+def test_a_laser_scan_has_points_where_it_measured() -> None:
+    points = m.points_from_scan(laser_scan())
+    np.testing.assert_array_equal(np.isfinite(points[:, 0]), [True, False, False, False, True])
+    np.testing.assert_allclose(points[0], [np.cos(-1.0), np.sin(-1.0)], atol=1e-6)
+    np.testing.assert_allclose(points[4], [4 * np.cos(1.0), 4 * np.sin(1.0)], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [({"ranges": np.zeros(0, np.float32)}, "no ranges"), ({"angle_increment": 0.0}, "angle_increment 0"),
+     ({"angle_min": np.nan}, "angle_min nan"), ({"range_max": 0.1}, "from 0.2")],
+)  # fmt: skip
+def test_a_laser_scan_without_points_is_named(changes: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        m.points_from_scan(laser_scan(**changes))
+
+
 def make_features(rng: np.random.Generator, n: int) -> Features:
     def floats(*shape: int) -> np.ndarray:
         return rng.normal(size=shape).astype(np.float32)

@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds from files: PCD (ascii, binary, binary_compressed), PLY and legacy VTK (ascii and binary)."""
+"""Point clouds from files: PCD (ascii, binary, binary_compressed), PLY, legacy VTK (ascii and binary) and text.
+
+Files without z hold clouds in the plane. A laser scan is the YAML of a sensor_msgs/LaserScan, as ``ros2 topic echo
+--once --full-length`` prints it.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import yaml
 
 from ndt_registration.lzf import lzf_decompress
 from slam_core.geometry import FloatArray
+from slam_core.messages import points_from_scan
 
 PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16":
@@ -19,7 +26,7 @@ VTK_TYPES = {"float": ">f4", "double": ">f8"}
 
 
 def read_cloud(path: Path) -> FloatArray:
-    """Points (n, 3) m of a ``.pcd``, ``.ply`` or ``.vtk`` file, NaN points included.
+    """Points (n, 3) m, in the plane (n, 2), of a file of one of ``READERS``, NaN points included.
 
     Raises
     ------
@@ -28,10 +35,9 @@ def read_cloud(path: Path) -> FloatArray:
     OSError
         If it cannot be read.
     """
-    readers = {".pcd": read_pcd, ".ply": read_ply, ".vtk": read_vtk}
-    reader = readers.get(path.suffix.lower())
+    reader = READERS.get(path.suffix.lower())
     if reader is None:
-        raise ValueError(f"{path}: unknown kind of cloud '{path.suffix}', known: {', '.join(readers)}")
+        raise ValueError(f"{path}: unknown kind of cloud '{path.suffix}', known: {', '.join(READERS)}")
     content = path.read_bytes()
     if not content.strip():
         raise ValueError(f"{path}: the file is empty")
@@ -46,17 +52,17 @@ def read_pcd(content: bytes) -> FloatArray:
     header, body = _pcd_header(content)
     names = header["FIELDS"]
     count = int(header["POINTS"][0]) if "POINTS" in header else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
-    _require_xyz(names)
+    axes = _axes(names)
     counts = [int(c) for c in header.get("COUNT", ["1"] * len(names))]
     kinds = [f"<{_pcd_kind(t)}{s}" for t, s in zip(header["TYPE"], header["SIZE"], strict=True)]
     encoding = header["DATA"][0]
     if encoding == "ascii":
         first = np.concatenate([[0], np.cumsum(counts)])
-        return _ascii_columns(body, count, int(first[-1]), [int(first[names.index(axis)]) for axis in "xyz"])
+        return _ascii_columns(body, count, int(first[-1]), [int(first[names.index(axis)]) for axis in axes])
     layout = np.dtype([(f"{n}{i}", k, (c,)) for i, (n, k, c) in enumerate(zip(names, kinds, counts, strict=True))])
     if encoding == "binary":
         records = np.frombuffer(_exactly(body, count * layout.itemsize), dtype=layout)
-        return np.column_stack([records[f"{a}{names.index(a)}"][:, 0] for a in "xyz"]).astype(np.float64)
+        return np.column_stack([records[f"{a}{names.index(a)}"][:, 0] for a in axes]).astype(np.float64)
     if encoding == "binary_compressed":
         return _pcd_compressed(body, count, names, layout)
     raise ValueError(f"unknown DATA '{encoding}'")
@@ -87,7 +93,7 @@ def _pcd_compressed(body: bytes, count: int, names: list[str], layout: np.dtype[
         raise ValueError(f"{size} bytes of points announced, {count * layout.itemsize} needed")
     data = lzf_decompress(np.frombuffer(_exactly(body[8:], packed), np.uint8), size)
     columns = []
-    for axis in "xyz":
+    for axis in _axes(names):
         field = layout.fields[f"{axis}{names.index(axis)}"] if layout.fields else None
         assert field is not None
         start = field[1] * count
@@ -103,13 +109,13 @@ def read_ply(content: bytes) -> FloatArray:
     body = content[content.index(b"\n", end) + 1 :]
     encoding, count, properties = _ply_vertices(content[:end].decode("ascii", errors="replace").splitlines())
     names = [name for name, _ in properties]
-    _require_xyz(names)
+    axes = _axes(names)
     if encoding == "ascii":
-        return _ascii_columns(body, count, len(names), [names.index(axis) for axis in "xyz"])
+        return _ascii_columns(body, count, len(names), [names.index(axis) for axis in axes])
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
     layout = np.dtype([(name, order + kind) for name, kind in properties])
     records = np.frombuffer(_exactly(body, count * layout.itemsize), dtype=layout)
-    return np.column_stack([records[axis] for axis in "xyz"]).astype(np.float64)
+    return np.column_stack([records[axis] for axis in axes]).astype(np.float64)
 
 
 def _ply_vertices(lines: list[str]) -> tuple[str, int, list[tuple[str, str]]]:
@@ -146,6 +152,39 @@ def read_vtk(content: bytes) -> FloatArray:
     return _ascii_columns(body, count, 3, [0, 1, 2])
 
 
+def read_text(content: bytes) -> FloatArray:
+    """Points of lines of two or three numbers, apart by commas or blanks, after a line of names or none."""
+    lines = content.decode("utf-8").replace(",", " ").splitlines()
+    rows = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if rows and not _is_number(rows[0][0]):
+        rows = rows[1:]
+    if not rows or {len(row) for row in rows} not in ({2}, {3}):
+        raise ValueError("its lines must all have two numbers, x and y, or all three")
+    return np.array(rows, dtype=np.float64)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def read_laser_scan(content: bytes) -> FloatArray:
+    """Points (n, 2) of a sensor_msgs/LaserScan as YAML; a second document, as echo ends with, is left aside."""
+    try:
+        values = next(yaml.safe_load_all(content))
+    except yaml.YAMLError as error:
+        raise ValueError(f"it is no YAML: {error}") from error
+    if not isinstance(values, dict):
+        raise ValueError("it holds no message")
+    names = ("ranges", "angle_min", "angle_increment", "range_min", "range_max")
+    if missing := [name for name in names if name not in values]:
+        raise ValueError(f"a LaserScan has {', '.join(missing)}")
+    return points_from_scan(SimpleNamespace(**{name: values[name] for name in names})).astype(np.float64)
+
+
 def _ascii_columns(body: bytes, rows: int, width: int, columns: list[int]) -> FloatArray:
     words = body.split(maxsplit=rows * width)[: rows * width]
     if len(words) < rows * width:
@@ -154,12 +193,21 @@ def _ascii_columns(body: bytes, rows: int, width: int, columns: list[int]) -> Fl
     return table[:, columns]
 
 
-def _require_xyz(names: list[str]) -> None:
-    if not {"x", "y", "z"} <= set(names):
-        raise ValueError(f"no fields x, y and z among {', '.join(names)}")
+def _axes(names: list[str]) -> str:
+    """The coordinates that a file has."""
+    if not {"x", "y"} <= set(names):
+        raise ValueError(f"no fields x and y among {', '.join(names)}")
+    return "xyz" if "z" in names else "xy"
 
 
 def _exactly(body: bytes, size: int) -> bytes:
     if len(body) < size:
         raise ValueError(f"{size} bytes of points announced, {len(body)} found")
     return body[:size]
+
+
+READERS = {
+    ".pcd": read_pcd, ".ply": read_ply, ".vtk": read_vtk, ".csv": read_text, ".txt": read_text, ".xyz": read_text,
+    ".yaml": read_laser_scan,
+}  # fmt: skip
+"""What reads the content of a file, by its suffix."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ``ndt_odometry`` node.
 
-Point clouds of one sensor, and an IMU where there is one, in, the rig's odometry and motions out.
+Point clouds or laser scans of one sensor, and an IMU where there is one, in, the rig's odometry and motions out.
 """
 
 # rclpy is annotated in part only.
@@ -10,10 +10,10 @@ Point clouds of one sensor, and an IMU where there is one, in, the rig's odometr
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
+from ndt_registration.cloud import finite_points
 from ndt_registration.odometry import OdometryConfig, OdometryResult, OdometryStatus
 from ndt_registration.stage import Scan, ScanOdometryStage
 from slam_core.base_node import SlamNode
@@ -27,12 +27,13 @@ from slam_core.messages import (
     odometry_message,
     path_message,
     points_from_message,
+    points_from_scan,
     points_message,
     stamp_ns,
 )
 from slam_core.messages.base import Message
 from slam_core.ros import run_node
-from slam_core.types import PoseEstimate, RelativeMotion
+from slam_core.types import AnyArray, PoseEstimate, RelativeMotion
 
 
 @dataclass(frozen=True)
@@ -50,17 +51,37 @@ class NdtNode(SlamNode[NdtNodeConfig]):
     def __init__(self) -> None:
         super().__init__("ndt_odometry", NdtNodeConfig)
         self.stage = ScanOdometryStage(self.config, self.frames, self.config.base_frame)
+        self.source = ""
         self.path = deque[PoseEstimate](maxlen=self.config.path_length)
         self.advertise("ndt/odometry", "Odometry")
         self.advertise("ndt/motion", "PoseWithCovarianceStamped")
         self.advertise("ndt/path", "Path")
         self.advertise("ndt/points_aligned", "PointCloud2")
         self.listen("tof/points", "PointCloud2", self.on_points)
+        self.listen("scan", "LaserScan", self.on_laser_scan, required=False)
         self.listen("imu", "Imu", self.on_imu, required=False)
 
     def on_points(self, cloud: Message) -> None:
-        """One scan."""
-        self.stage.add_scan(Scan(stamp_ns(cloud), points_from_message(cloud), cloud.header.frame_id))
+        """A scan in space."""
+        self._add("tof/points", cloud, points_from_message)
+
+    def on_laser_scan(self, message: Message) -> None:
+        """A scan in the plane of a laser scanner, on a rig that stays level."""
+        self._add("scan", message, points_from_scan)
+        self.do_without("tof/points")
+
+    def _add(self, source: str, message: Message, points_of: Callable[[Message], AnyArray]) -> None:
+        """Take a scan of the sensor that was heard first.
+
+        Raises
+        ------
+        ValueError
+            For those of another one, whose map would be another one too.
+        """
+        if self.source not in ("", source):
+            raise ValueError(f"scans of {self.source} are registered already: remap the topic that is not wanted")
+        self.stage.add_scan(Scan(stamp_ns(message), points_of(message), message.header.frame_id))
+        self.source = source
         self._publish_ready()
 
     def on_imu(self, message: Message) -> None:
@@ -71,6 +92,7 @@ class NdtNode(SlamNode[NdtNodeConfig]):
     def on_reset(self) -> None:
         """Forget everything: the next scan is the origin."""
         self.stage.reset()
+        self.source = ""
         self.path.clear()
 
     def oldest_waiting_ns(self) -> int | None:
@@ -92,7 +114,7 @@ class NdtNode(SlamNode[NdtNodeConfig]):
         for estimate in self.stage.ready():
             self._publish(estimate.pose, estimate.motion)
             if self.has_listeners("ndt/points_aligned"):
-                points = np.asarray(estimate.scan.points).reshape(-1, 3)
+                points = finite_points(estimate.scan.points)
                 self._publish_aligned(points, estimate.T_odom_sensor, estimate.pose.stamp_ns)
             self._report(estimate.result)
 

@@ -108,6 +108,10 @@ class ListeningNode(GuardedNode):
             entry.message_class, entry.topic, lambda m: self._receive(entry, m), profile, event_callbacks=events
         )
 
+    def do_without(self, topic: str) -> None:
+        """Another input has taken the place of a required one: its silence is no fault."""
+        self._inputs[topic].required = False
+
     def _unconnected(self) -> list[str]:
         """Required topics that no publisher has been matched with."""
         inputs = self._inputs.values()

@@ -53,13 +53,14 @@ def command(
     source: Path, target: Path, method: str, initial_guess: str | None, config_file: Path | None, output: Path | None,
     as_json: bool, overwrite: bool,
 ) -> None:  # fmt: skip
-    """Align SOURCE to TARGET (pcd, ply, vtk).
+    """Align SOURCE to TARGET (pcd, ply, vtk; lines of numbers in csv, txt, xyz; a LaserScan's yaml).
 
+    Clouds without z, or of one height only, are aligned in the plane: x, y and yaw.
     Prints a table on a terminal and one JSON object elsewhere. Ends with exit code 1 if the clouds were not registered.
     """
     values = yaml.safe_load(config_file.read_text(encoding="utf-8")) or {} if config_file else {}
     config = from_mapping(RegistrationConfig, {**values, "method": method})
-    source_points, target_points = (_read(path) for path in (source, target))
+    source_points, target_points = _both_alike(_read(source), _read(target))
     guess = parse_guess(initial_guess) if initial_guess else None
     folder = _output_folder(output, source, target, overwrite)
     result = register(source_points, target_points, guess, config)
@@ -87,10 +88,19 @@ def _output_folder(output: Path | None, source: Path, target: Path, overwrite: b
 
 
 def _read(path: Path) -> FloatArray:
-    points = finite_points(read_cloud(path))
+    """Finite points (n, 3) of a file, (n, 2) where it has no z or but one."""
+    points = read_cloud(path)
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         raise ValueError(f"{path}: no finite points")
-    return points
+    is_flat = points.shape[1] == 3 and np.ptp(points[:, 2]) == 0.0
+    return points[:, :2] if is_flat else points
+
+
+def _both_alike(source: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+    if source.shape[1] != target.shape[1]:
+        raise ValueError("one cloud is in the plane and the other in space: give both with z, or both without")
+    return source, target
 
 
 def next_step(source: FloatArray, target: FloatArray, config: RegistrationConfig, *, guessed: bool) -> str:
@@ -168,6 +178,7 @@ def draw_before_after(path: Path, source: FloatArray, target: FloatArray, result
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    source, target = finite_points(source), finite_points(target)
     figure = Figure(figsize=(14, 7))
     FigureCanvasAgg(figure)
     axes = sorted(np.argsort(np.ptp(target, axis=0))[-2:])

@@ -15,6 +15,7 @@ from slam_core.messages.clouds import (
     cloud_message,
     landmark_cloud,
     points_from_message,
+    points_from_scan,
     points_message,
 )
 from slam_core.messages.depth import DEPTH_TOPICS, DepthMessages, depth_from_messages, depth_messages
@@ -87,6 +88,7 @@ __all__ = [
     "path_message",
     "picture_from_message",
     "points_from_message",
+    "points_from_scan",
     "points_message",
     "pose_from_message",
     "pose_message",

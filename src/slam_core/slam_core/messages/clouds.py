@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds: sensor_msgs/PointCloud2 from and to structured arrays."""
+"""Point clouds: sensor_msgs/PointCloud2 from and to structured arrays; sensor_msgs/LaserScan to points."""
 
 from __future__ import annotations
 
@@ -84,6 +84,30 @@ def points_from_message(message: Message) -> Float32Array:
     points = np.stack([cloud[name].ravel().astype(np.float32) for name in "xyz"], axis=-1)
     points[np.abs(points).max(axis=1, initial=0.0) > FARTHEST_M] = np.nan
     return points
+
+
+def points_from_scan(message: Message) -> Float32Array:
+    """Points x, y (n, 2) float32 of a laser scan in its own frame; NaN where no range was measured.
+
+    Raises
+    ------
+    ValueError
+        If the scan has no ranges, or its angles or limits are no numbers.
+    """
+    first, step = float(message.angle_min), float(message.angle_increment)
+    nearest, farthest = float(message.range_min), float(message.range_max)
+    ranges = np.asarray(message.ranges, dtype=np.float32)
+    if not (np.isfinite([first, step, nearest]).all() and step != 0.0 and farthest > nearest):
+        raise ValueError(
+            f"a laser scan of angle_min {first}, angle_increment {step} and ranges from {nearest} to {farthest} has no "
+            "points"
+        )
+    if ranges.ndim != 1 or len(ranges) == 0:
+        raise ValueError("the laser scan has no ranges")
+    measured = (ranges >= nearest) & (ranges <= min(farthest, FARTHEST_M))
+    angles = first + step * np.arange(len(ranges))
+    points = np.column_stack([np.cos(angles), np.sin(angles)]) * np.where(measured, ranges, np.nan)[:, None]
+    return np.asarray(points, np.float32)
 
 
 def landmark_cloud(
