@@ -2,29 +2,30 @@
 """Sections 6.3 to 6.6: what a step of each technique costs as the map grows, on the same planar worlds.
 
 One EKF updates the covariance of all landmarks at every step. Batch smoothing solves for everything whenever it is
-asked. iSAM2 (GTSAM, where it is installed) relinearises what changed. Joined submaps filter in maps of bounded size and
-join each when it is full. The survey's other techniques are not built: SEIF and its kin trade consistency for time
-by dropping links; conditionally independent submaps keep the cost of joining, which is the smaller part here; FastSLAM
-forgets the correlations that close large loops.
+asked. The sparse information filter drops links between the pose and landmarks. iSAM2 (GTSAM, where it is installed)
+relinearises what changed. Conditionally independent submaps share what is in view where they meet. Joined submaps
+filter in maps of bounded size and join each when it is full.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import time
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ekf_slam_node.planar import PlanarConfig, PlanarEkf
+from ekf_slam_node.planar_independent import IndependentSubmaps
 from ekf_slam_node.planar_sam import smooth
+from ekf_slam_node.planar_seif import PlanarSeif
 from sjsam_node.linear_slam.text_joining import join_text_maps
-from slam_bringup.experiments import plots
-from slam_bringup.experiments.chain import Kept
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
-from slam_bringup.experiments.job import RENDERING, Job, JobResult
+from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_bringup.experiments.planar import filter_run, graph_of
 from slam_bringup.planar.log import PlanarLog, RobotLog
 from slam_bringup.planar.mapping import map_log, submaps_of
@@ -34,6 +35,8 @@ from slam_simulation.planar import PlanarRun, PlanarWorldConfig, simulate_planar
 MODULE = "slam_bringup.experiments.survey"
 TECHNIQUES = {
     "one EKF": "one_filter",
+    "SEIF": "seif",
+    "conditionally independent submaps": "independent",
     "batch SAM": "batch",
     "iSAM2 (GTSAM)": "isam2",
     "joined submaps (ours)": "submaps",
@@ -56,9 +59,7 @@ def cost_of_a_step(folder: Path, before: list[Path], technique: str, size: int) 
     run = simulate_planar(world(size), np.random.default_rng(size))
     if technique == "isam2" and importlib.util.find_spec("gtsam") is None:
         return {"missing": "gtsam is not installed"}, {}
-    seconds, poses, numbers = {"one_filter": _one_filter, "batch": _batch, "isam2": _isam2, "submaps": _submaps}[
-        technique
-    ](run)
+    seconds, poses, numbers = _RUNNERS[technique](run)
     error = float(np.sqrt(np.mean(np.sum((poses - run.poses)[:, :2] ** 2, axis=1))))
     return {"seconds": seconds, "rmse_m": error, "numbers": numbers}, {}
 
@@ -75,6 +76,29 @@ def _one_filter(run: PlanarRun) -> tuple[float, FloatArray, int]:
         elapsed.append(time.process_time() - began)
         poses.append(ekf.pose.copy())
     return float(np.mean(elapsed[-_LAST_STEPS:])), np.array(poses), ekf.covariance.dense().size
+
+
+def _seif(run: PlanarRun) -> tuple[float, FloatArray, int]:
+    config, _ = _noise(run)
+    return _stepped(run, PlanarSeif(config, run.poses[0], 1e-9 * np.eye(3)))
+
+
+def _independent(run: PlanarRun) -> tuple[float, FloatArray, int]:
+    config, _ = _noise(run)
+    return _stepped(run, IndependentSubmaps(config, run.poses[0], 1e-9 * np.eye(3)))
+
+
+def _stepped(run: PlanarRun, technique: PlanarSeif | IndependentSubmaps) -> tuple[float, FloatArray, int]:
+    """Mean time of the last steps, in which the loop is closed; poses as they were when they were the newest."""
+    Q, poses, elapsed = _noise(run)[1], [], []
+    for k, seen in enumerate(run.observations):
+        began = time.process_time()
+        if k:
+            technique.predict(run.odometry[k - 1], Q)
+        technique.process(np.column_stack([seen.ranges, seen.bearings]), seen.ids)
+        elapsed.append(time.process_time() - began)
+        poses.append(technique.pose.copy())
+    return float(np.mean(elapsed[-_LAST_STEPS:])), np.array(poses), technique.numbers
 
 
 def _batch(run: PlanarRun) -> tuple[float, FloatArray, int]:
@@ -140,10 +164,76 @@ def _isam2(run: PlanarRun) -> tuple[float, FloatArray, int]:
     return float(np.mean(elapsed[-_LAST_STEPS:])), array, int(isam.getFactorsUnsafe().size())
 
 
+_RUNNERS = {
+    "one_filter": _one_filter, "seif": _seif, "independent": _independent, "batch": _batch, "isam2": _isam2,
+    "submaps": _submaps,
+}  # fmt: skip
+
+
 def _noise(run: PlanarRun) -> tuple[PlanarConfig, FloatArray]:
     c = run.config
     Q = np.diag(np.array([c.sigma_step, c.sigma_step, c.sigma_turn]) ** 2)
     return PlanarConfig(sigma_range=c.sigma_range, sigma_bearing=c.sigma_bearing), Q
+
+
+_NOT_BUILT = (
+    "Not built: exactly sparse information filters, which avoid SEIF's overconfidence by forgetting measurements at"
+    " each relocation; compressed filters, whose full update is one EKF's; Atlas, which never makes one map of all;"
+    " Tectonic SAM, whose submaps stay graphs that are solved anew where ours are Gaussians; FastSLAM, whose particles"
+    " forget the correlations that close large loops."
+)
+
+
+@dataclass(frozen=True)
+class _Growth:
+    """Milliseconds, thousands of numbers and RMSE m by size, and the exponents fitted to the last three sizes."""
+
+    ms: list[float]
+    thousands: list[float]
+    rmse: list[float]
+    time_exponent: float
+    memory_exponent: float
+
+
+def _growth(found: list[dict[str, Any]], sizes: list[int]) -> _Growth | None:
+    """How a technique's cost grows; None where it could not be run."""
+    if any("missing" in values for values in found):
+        return None
+    ms = [1e3 * values["seconds"] for values in found]
+    thousands = [values["numbers"] / 1e3 for values in found]
+    exponents = [float(np.polyfit(np.log(sizes[-3:]), np.log(cost[-3:]), 1)[0]) for cost in (ms, thousands)]
+    return _Growth(ms, thousands, [values["rmse_m"] for values in found], *exponents)
+
+
+_STEP = (
+    "Processor time of a step, ms: mean of the last twenty, in which the loop closes; joined submaps: mean of all,"
+    " joining included; batch SAM: one solution"
+)
+
+
+def _table(
+    title: str, growth: Mapping[str, _Growth], sizes: list[int], values: Callable[[_Growth], list[float]],
+    exponent: Callable[[_Growth], float] | None = None,
+) -> Table:  # fmt: skip
+    """One quantity of all techniques by size, with the exponent of its growth."""
+    header = ["technique", *(f"{size} landmarks" for size in sizes), *(["exponent"] if exponent else [])]
+    rows = []
+    for name, g in growth.items():
+        rows.append([name, *(f"{value:.3g}" for value in values(g)), *([f"{exponent(g):.2f}"] if exponent else [])])
+    return Table(title, header, rows)
+
+
+def _growth_figure(growth: Mapping[str, _Growth], sizes: list[int]) -> Figure:
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for name, g in growth.items():
+        left.loglog(sizes, g.ms, "o-", markersize=3, label=f"{name}, n^{g.time_exponent:.1f}")
+        right.loglog(sizes, g.thousands, "o-", markersize=3, label=f"{name}, n^{g.memory_exponent:.1f}")
+    left.set(xlabel="landmarks", ylabel="processor time of a step [ms]")
+    right.set(xlabel="landmarks", ylabel="numbers stored [thousands]")
+    for axes in (left, right):
+        axes.legend(fontsize=7)
+    return figure
 
 
 def _experiment() -> Experiment:
@@ -157,27 +247,28 @@ def _experiment() -> Experiment:
 
     def report(results: Mapping[str, JobResult]) -> Findings:
         sizes = sorted({int(key.split("|")[1]) for key in results})
-        figure, axes = plots.new_figure(7, 4)
-        rows, exponents = [], {}
-        for name in TECHNIQUES:
-            found = [results[f"{name}|{size}"].values for size in sizes]
-            if "missing" in found[0]:
-                rows.append([name, found[0]["missing"], *[""] * len(sizes)])
-                continue
-            ms = np.array([1e3 * v["seconds"] for v in found])
-            exponents[name] = float(np.polyfit(np.log(sizes[-3:]), np.log(ms[-3:]), 1)[0])
-            axes.loglog(sizes, ms, "o-", label=f"{name}, n^{exponents[name]:.1f}")
-            cells = [f"{t:.2f}, {v['rmse_m']:.2f}" for t, v in zip(ms, found, strict=True)]
-            rows.append([name, *cells, f"{exponents[name]:.2f}"])
-        axes.set(xlabel="landmarks", ylabel="processor time of a step [ms]")
-        axes.legend(fontsize=8)
-        ours, ekf = exponents["joined submaps (ours)"], exponents["one EKF"]
-        header = ("technique", *(f"{size} landmarks: ms, RMSE m" for size in sizes), "exponent of time")
+        growth = {name: _growth([results[f"{name}|{size}"].values for size in sizes], sizes) for name in TECHNIQUES}
+        usable = {name: g for name, g in growth.items() if g is not None}
+        ours, ekf = usable["joined submaps (ours)"], usable["one EKF"]
+        tables = [
+            _table(_STEP, usable, sizes, lambda g: g.ms, lambda g: g.time_exponent),
+            _table("Numbers stored, thousands", usable, sizes, lambda g: g.thousands, lambda g: g.memory_exponent),
+            _table("RMSE of the path, m: of filters each pose when it was the newest", usable, sizes, lambda g: g.rmse),
+        ]
+        missing = [f"{name}: {results[f'{name}|{sizes[0]}'].values['missing']}" for name in TECHNIQUES
+                   if name not in usable]  # fmt: skip
         return Findings(
-            [Comparison("growth of a step's time with the map: one EKF, joined submaps", "quadratic; close to constant",
-                        f"n^{ekf:.1f}, n^{ours:.1f}", "submaps grow more slowly", ours < ekf)],
-            [Table("A step at the end of a drive, and the error of the whole path", header, rows)],
-            [Picture(figure, "", "Processor time of a step against the size of the map.")],
+            [
+                Comparison("growth of a step's time: one EKF, joined submaps", "O(n^2); O(1) to O(n)",
+                           f"n^{ekf.time_exponent:.1f}, n^{ours.time_exponent:.1f}", "submaps grow more slowly",
+                           ours.time_exponent < ekf.time_exponent),
+                Comparison("growth of memory: one EKF, joined submaps", "O(n^2); O(n)",
+                           f"n^{ekf.memory_exponent:.1f}, n^{ours.memory_exponent:.1f}", "submaps grow more slowly",
+                           ours.memory_exponent < ekf.memory_exponent),
+            ],
+            tables,
+            [Picture(_growth_figure(usable, sizes), "", "Time of a step and numbers stored, by size of the map.")],
+            " ".join([_NOT_BUILT, *missing]),
         )  # fmt: skip
 
     return Experiment("survey", "6.3-6.6", "What a step costs as the map grows", jobs, report)
