@@ -48,7 +48,9 @@ def test_planar_scans_are_registered(plane: bool, limit: float) -> None:
     rng, config = np.random.default_rng(2), IcpConfig()
     truth = make_transform(rotation_from_euler(0.08), np.array([0.12, -0.07, 0.0]))
     source = transform_points(invert_transform(truth), corner(rng))
-    outcome = icp_align(source, IcpTarget(corner(rng), config), np.eye(4), 2.0, config, plane=plane, planar=True)
+    outcome = icp_align(
+        source, IcpTarget(corner(rng), config), np.eye(4), 2.0, config, coarse_points=10_000, plane=plane, planar=True
+    )
     error = boxminus(outcome.T, truth)
     assert outcome.converged
     assert np.linalg.norm(error[:2]) < limit
@@ -66,7 +68,9 @@ def test_points_beyond_the_rejection_limit_pull_at_nothing(plane: bool) -> None:
     errors = []
     for limit in (0.1, 5.0):
         config = IcpConfig(max_distance=limit, final_spacings=limit / SPACING, trimmed=1.0)
-        outcome = icp_align(source, IcpTarget(target, config), np.eye(4), 2.0, config, plane=plane, planar=True)
+        outcome = icp_align(
+            source, IcpTarget(target, config), np.eye(4), 2.0, config, coarse_points=10_000, plane=plane, planar=True
+        )
         errors.append(float(np.linalg.norm(outcome.T[:2, 3])))
     assert errors[0] < 0.01
     assert errors[1] > 3.0 * errors[0]

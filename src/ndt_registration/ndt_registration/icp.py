@@ -73,14 +73,20 @@ class IcpTarget:
 
 
 def icp_align(
-    source: FloatArray, target: IcpTarget, T: FloatArray, scale: float, config: IcpConfig, *, plane: bool, planar: bool
-) -> IcpOutcome:
-    """Move ``source`` (n, 3) onto ``target`` from the pose ``T``; ``planar`` allows x, y and yaw only."""
+    source: FloatArray, target: IcpTarget, T: FloatArray, scale: float, config: IcpConfig, *, coarse_points: int,
+    plane: bool, planar: bool,
+) -> IcpOutcome:  # fmt: skip
+    """Move ``source`` (n, 3), in random order, onto ``target`` from the pose ``T``.
+
+    All its points are used with the last rejection limit, ``coarse_points`` of them before. ``planar`` allows x, y and
+    yaw only.
+    """
     limit = config.max_distance or config.relative_max_distance * scale
     last = min(config.final_spacings * target.spacing, limit)
     iterations, converged = 0, False
     while True:
-        T, used, converged = _stage(source, target, T, limit, scale, config, plane, planar)
+        points = source if limit <= last else source[:coarse_points]
+        T, used, converged = _stage(points, target, T, limit, scale, config, plane, planar)
         iterations += used
         if limit <= last:
             return IcpOutcome(T, iterations, converged)

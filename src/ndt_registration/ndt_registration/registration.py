@@ -61,7 +61,9 @@ class RegistrationConfig(Config):
     method: str = parameter("ndt", "registration method", choices=("ndt", "icp", "icp_plane"))
     target_points: int = parameter(20000, "most points of the target that are used", minimum=10)
     source_points: int = parameter(8000, "most points of the source that are used", minimum=10)
-    coarse_points: int = parameter(2000, "most points of the source on all but the finest level", minimum=10)
+    coarse_points: int = parameter(
+        2000, "most points of the source on all but the finest level, and with all but ICP's last limit", minimum=10
+    )
     min_points: int = parameter(50, "fewest finite points of a cloud", minimum=10)
     max_iterations: int = parameter(50, "most iterations per level", minimum=1)
     tolerance: float = parameter(1e-4, "length of the last step, over the scale", minimum=0.0)
@@ -253,7 +255,10 @@ def _aligned(
     if config.method == "ndt":
         return _descend(source, target, T, start, scale, config)
     plane = config.method == "icp_plane"
-    outcome = icp_align(source.points, target.icp(config.icp), T, scale, config.icp, plane=plane, planar=source.planar)
+    outcome = icp_align(
+        source.points, target.icp(config.icp), T, scale, config.icp, coarse_points=config.coarse_points, plane=plane,
+        planar=source.planar,
+    )  # fmt: skip
     R, t = np.ascontiguousarray(outcome.T[:3, :3]), outcome.T[:3, 3].copy()
     layers = target.pyramid.layers(source, 0, len(source), config.rim_share)
     there = ndt_align(layers, R, t, planar_constraint(source.planar), scale, 0, 0.0)
