@@ -151,16 +151,19 @@ def test_maps_that_do_not_hang_together_are_refused(rng: np.random.Generator) ->
         join_text_maps([maps[0], maps[3]], 2)
 
 
-@pytest.mark.parametrize("rows", ["joint", "block"])
-def test_the_command_writes_summary_poses_and_features(rows: str, rng: np.random.Generator, tmp_path: Path) -> None:
+@pytest.mark.parametrize("options", [(), ("--rows", "block"), ("--robust", "cauchy")])
+def test_the_command_writes_summary_poses_and_features(
+    options: tuple[str, ...], rng: np.random.Generator, tmp_path: Path
+) -> None:
     maps, _ = walk(2, 8, rng, 0.01)
     source, out = tmp_path / "in", tmp_path / "out"
     source.mkdir()
     write(maps, source)
-    result = CliRunner().invoke(command, [str(source), "-o", str(out), "--rows", rows], catch_exceptions=False)
+    result = CliRunner().invoke(command, [str(source), "-o", str(out), *options], catch_exceptions=False)
     assert result.exit_code == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["submaps"] == 8
+    assert summary["rows"] == ("block" if "block" in options else "joint")
     assert summary["features"] == len((out / "features.txt").read_text().splitlines())
     assert len((out / "poses.txt").read_text().splitlines()) == 9
     assert summary["chi2"] > 0.0

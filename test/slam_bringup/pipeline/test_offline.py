@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import _ahead, run_bag
@@ -78,3 +79,30 @@ def test_a_run_that_is_told_to_stop_keeps_what_it_has():
     assert len(result.landmarks.positions) > 50
     assert len(result.dense) == 0  # it would keep whoever wants the end waiting
     assert not result.dropped
+
+
+THESIS = {
+    "feature_extractor": {"features": {"detector": "censure", "surf": {"extended": False}}},
+    "ekf_slam": {"association": {"method": "ccda"}, "submap": {"start": "conditional", "max_distance": 0.3}},
+    "sjsam": {"smoothing": {"estimator": {"rows": "block", "iterations": 1}}},
+}
+OTHERS = {
+    "feature_extractor": {"features": {"detector": "rootsift"}},
+    "ekf_slam": {"association": {"method": "jcbb"}, "submap": {"max_distance": 0.3}},
+    "sjsam": {"smoothing": {"estimator": {"robust": {"loss": "cauchy"}}}},
+}
+
+
+@pytest.mark.parametrize(("values", "numbers"), [(THESIS, 64), (OTHERS, 128)])
+def test_every_choice_of_method_maps(tmp_path, values, numbers):
+    file = tmp_path / "config.yaml"
+    file.write_text(yaml.safe_dump({node: {"ros__parameters": group} for node, group in values.items()}))
+    asked = iter(range(1000))
+    config = choose(load_system_config(file), "stereo", "sjsam", "none")
+    result, mapping = run_bag(DEMO, config, stopped=lambda: next(asked) >= 36)
+    records = mapping.global_map.graph.records
+    assert len(records) >= 2
+    assert {record.submap.descriptors.shape[1] for record in records} == {numbers}
+    evaluation = result.agents[0].evaluation()
+    assert evaluation is not None
+    assert evaluation.ate.rmse < 0.02

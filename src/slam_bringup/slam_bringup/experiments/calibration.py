@@ -11,9 +11,8 @@ from matplotlib.figure import Figure
 from scipy.stats import norm
 
 from slam_bringup.experiments import plots
-from slam_bringup.experiments.chain import Kept
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
-from slam_bringup.experiments.job import Job, JobResult
+from slam_bringup.experiments.job import Job, JobResult, Kept
 from slam_calibration.board import Chessboard
 from slam_calibration.bundle import LensState
 from slam_calibration.rig import calibrate

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs that render a scenario and map the bag with the whole chain, and what they keep of a run."""
+"""Jobs that map a scenario's bag with the whole chain, and what they keep of a run."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -10,21 +11,15 @@ import numpy as np
 import numpy.typing as npt
 
 from sjsam_node.graph.map_graph import MapGraph
-from slam_bringup.experiments.job import EVERYTHING, RENDERING, Job
+from slam_bringup.experiments.job import EVERYTHING, Job, Kept
+from slam_bringup.experiments.rendering import rendered
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.pipeline.results import AgentResult, RunResult, summarise
 from slam_core.evaluation import associate
 from slam_core.geometry import FloatArray, transform_points
 
-Kept = tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]
 MODULE = "slam_bringup.experiments.chain"
-
-
-def rendered(scenario: str, every: int = 1, frames: int | None = None) -> Job:
-    """The bag of a scenario: every n-th frame, of the first ``frames`` where that is given."""
-    arguments = {"scenario": scenario, "every": every, "frames": frames}
-    return Job(f"{MODULE}:render", arguments, (*RENDERING, "slam_bringup.commands.simulate", "slam_bringup.bags"))
 
 
 def mapped(
@@ -36,22 +31,12 @@ def mapped(
     return Job(f"{MODULE}:map_bag", arguments, EVERYTHING, (rendered(scenario, every, frames),))
 
 
-def render(folder: Path, before: list[Path], scenario: str, every: int, frames: int | None) -> Kept:
-    """Render a scenario to ``folder / bag``."""
-    from slam_bringup.commands.simulate import BagOptions, write_bag
-    from slam_simulation import Scenario
-
-    plan = Scenario.load(scenario)
-    if frames is not None:
-        plan = plan.shortened(frames * every)
-    write_bag(plan, folder / "bag", BagOptions(images="jpeg", compact=True, every=every), threads=1)
-    return {"scenario": scenario, "frames": plan.frames // every}, {}
-
-
 def map_bag(folder: Path, before: list[Path], mode: str, mapper: str, odometry: str) -> Kept:
     """Map the bag that the job before has rendered."""
     config = choose(load_system_config(None), mode, mapper, odometry)
+    began = time.process_time()
     result, mapping = run_bag(before[0] / "bag", config, mapper=mapper, odometry=odometry)
+    processor_s = time.process_time() - began
     graph = mapping.global_map.graph
     arrays: dict[str, npt.NDArray[Any]] = {
         "landmarks": result.landmarks.positions,
@@ -62,7 +47,7 @@ def map_bag(folder: Path, before: list[Path], mode: str, mapper: str, odometry: 
     }
     for k, agent in enumerate(result.agents):
         arrays |= _agent_arrays(agent, f"{k} ")
-    return {"summary": summarise(result), "agents": _agent_values(result)}, arrays
+    return {"summary": summarise(result), "agents": _agent_values(result), "processor_s": processor_s}, arrays
 
 
 def _agent_values(result: RunResult) -> list[dict[str, Any]]:

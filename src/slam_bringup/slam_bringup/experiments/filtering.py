@@ -44,10 +44,10 @@ def end_comparison(result: JobResult, thesis: str, mark_m: float) -> Comparison:
 
 
 def speed_comparison(result: JobResult, thesis: str) -> Comparison:
-    """Seconds of everything beside the seconds that the sensors recorded."""
-    summary = result.values["summary"]
-    ours = f"{summary['wall_s']:.0f} s of {summary['sensor_s']:.0f} s recorded"
-    return Comparison("time, features included", thesis, ours, "faster than real time", summary["real_time_factor"] > 1)
+    """Processor seconds of everything, dense model included, beside the seconds that the sensors recorded."""
+    took, recorded = result.values["processor_s"], result.values["summary"]["sensor_s"]
+    ours = f"{took:.0f} s of one core for {recorded:.0f} s recorded"
+    return Comparison("time, features included", thesis, ours, "faster than real time on one core", took < recorded)
 
 
 def bounds_comparison(scenario: str, result: JobResult) -> Comparison:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A piece of work of an experiment, whose result is kept and used again until something that it depends on changes.
 
-    bag = Job("slam_bringup.experiments.chain:render", {"scenario": "sweep"}, RENDERING)
+    bag = Job("slam_bringup.experiments.rendering:render", {"scenario": "sweep"}, RENDERING)
     run = Job("slam_bringup.experiments.chain:map_bag", {"mode": "stereo"}, EVERYTHING, after=(bag,))
     result = execute(run, cache)  # after execute(bag, cache)
 
@@ -36,6 +36,8 @@ EVERYTHING = (
     "slam_core", "slam_simulation", "slam_calibration", "stereo_frontend", "tof_driver", "ndt_registration",
     "ekf_slam_node", "sjsam_node", "slam_bringup.pipeline", "slam_bringup.bags",
 )  # fmt: skip
+Kept = tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]
+"""What a job's function returns: values as JSON knows them, and arrays by name."""
 _VALUES, _ARRAYS = "result.json", "arrays.npz"
 
 

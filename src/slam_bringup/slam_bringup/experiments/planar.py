@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from ekf_slam_node.planar import PlanarConfig, PlanarEkf, wrap
 from ekf_slam_node.planar_sam import PlanarGraph, PlanarMap, cost, smooth
 from slam_bringup.experiments import plots
-from slam_bringup.experiments.chain import Kept
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
-from slam_bringup.experiments.job import RENDERING, Job, JobResult
+from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray
 from slam_simulation.planar import PlanarRun, PlanarWorldConfig, simulate_planar

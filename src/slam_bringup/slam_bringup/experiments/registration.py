@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from ndt_registration.pyramid import GridConfig
 from ndt_registration.registration import RegistrationConfig, register
 from slam_bringup.experiments import plots
-from slam_bringup.experiments.chain import Kept, mapped
+from slam_bringup.experiments.chain import mapped
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
-from slam_bringup.experiments.job import RENDERING, Job, JobResult
+from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_bringup.experiments.tof_scans import SCANS, THESIS_MOTIONS, TofRoom, rig_motion, rig_pose, thinned
 from slam_core.geometry import boxminus
 
