@@ -25,13 +25,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Localization:
-    """Pose at the end of a submap in the map frame, None while unknown.
+    """Poses at the end and at the start of a submap in the map frame, None while unknown.
 
     Matched: landmarks of the map that were recognised.
     """
 
     pose: PoseEstimate | None
     matched: int
+    start: PoseEstimate | None = None
 
 
 class Localizer:
@@ -51,7 +52,7 @@ class Localizer:
             self._pose = None
         start, matched = self._fix(submap)
         self._pose = None if start is None else _moved(start, submap)
-        return Localization(self._pose, matched)
+        return Localization(self._pose, matched, start)
 
     def _fix(self, submap: Submap) -> tuple[PoseEstimate | None, int]:
         """Pose of the submap's start from the stored submap that matches best; the prediction where none does."""

@@ -97,8 +97,8 @@ class MapView:
             parts.setdefault(agent, []).append(PoseEstimate(p.stamp_ns, T, p.covariance))
         return {agent: _unique_stamps(part) for agent, part in sorted(parts.items())}
 
-    def trajectory(self) -> dict[str, list[PoseEstimate]]:
-        """Poses of every agent, in the order of their stamps, with covariances.
+    def trajectory(self, since: int = 0) -> dict[str, list[PoseEstimate]]:
+        """Poses of every agent in records from number ``since`` on, in the order of their stamps, with covariances.
 
         A component that nothing ties to the map yet is given in its own frame, laid where its agent was last seen, and
         its covariances are widened by ``unlinked_sigma``: a receiver sees that these poses mean nothing in the map
@@ -107,7 +107,7 @@ class MapView:
         out: dict[str, list[PoseEstimate]] = {}
         for component in np.unique(self.graph.component_of).tolist():
             marginals, widening = self.smoother.marginals(component), self._widening(component)
-            for i in marginals.records:
+            for i in (i for i in marginals.records if i >= since):
                 record = self.graph.records[i]
                 poses, covariances = _with_covariances(self.graph, marginals, i, *self._gain(i))
                 own = record.submap.path

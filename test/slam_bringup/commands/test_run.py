@@ -12,7 +12,10 @@ import pytest
 from click.testing import CliRunner
 
 from ekf_slam_node.slam import EkfSlam
+from sjsam_node.global_map import GlobalMap
+from slam_bringup.bags.bag import BagReader, BagWriter
 from slam_bringup.cli import slam
+from slam_core.geometry import boxminus
 from slam_core.trajectory import read_covariance_csv, read_trajectory
 
 DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
@@ -57,6 +60,58 @@ def test_every_pose_has_a_covariance_that_is_one(outputs):
     assert len(stamps) == 52
     assert np.isfinite(covariances).all()
     assert np.linalg.eigvalsh(covariances).min() > 0.0
+
+
+def world_from_map(folder: Path) -> np.ndarray:
+    """T_world_map of a run, by the truth of its first pose."""
+    estimate, truth = (read_trajectory(folder / name) for name in ("trajectory.tum", "ground_truth.tum"))
+    assert estimate.stamps_ns[0] == truth.stamps_ns[0]
+    return truth.poses[0] @ np.linalg.inv(estimate.poses[0])
+
+
+@pytest.fixture(scope="module", params=[[], ["--localize-only"]], ids=["go on", "localize only"])
+def again(request, outputs, tmp_path_factory) -> tuple[Path, Path, bool]:
+    """The demo from half way on, in the map of the whole."""
+    later = tmp_path_factory.mktemp("later") / "bag"
+    with BagReader(DEMO) as reader, BagWriter(later) as bag:
+        middle = reader.start_ns + round(0.5e9 * reader.duration_s)
+        for topic, stamp, data in reader.raw():
+            if stamp >= middle or "static" in topic:
+                bag.write_raw(topic, reader.topics[topic].type_name, data, max(stamp, middle))
+    folder = tmp_path_factory.mktemp("again") / "out"
+    result = run(str(later), "-o", str(folder), "--map", str(outputs[0]), *request.param)
+    assert result.exit_code == 0, result.output
+    return folder, outputs[0], not request.param
+
+
+@pytest.mark.slow
+def test_a_run_in_an_old_map_is_in_its_frame(again):
+    folder, old, _ = again
+    estimate, truth = (read_trajectory(folder / name) for name in ("trajectory.tum", "ground_truth.tum"))
+    assert len(estimate) >= 20
+    assert np.linalg.norm(estimate.poses[0][:3, 3]) > 1.0, "it begins where the old run was half way"
+    poses = dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True))
+    T_map_world = np.linalg.inv(world_from_map(old))
+    pairs = zip(estimate.stamps_ns.tolist(), estimate.poses, strict=True)
+    errors = [boxminus(T_map_world @ poses[s], T) for s, T in pairs]
+    assert np.linalg.norm(np.array(errors)[:, :3], axis=1).max() < 0.05
+    _, covariances = read_covariance_csv(folder / "trajectory_covariance.csv")
+    nees = [e @ np.linalg.solve(P, e) for e, P in zip(errors, covariances, strict=True)]
+    assert 0.2 < np.mean(nees) / 6 < 4.0
+
+
+@pytest.mark.slow
+def test_the_old_map_is_read_and_never_changed(again, outputs):
+    folder, old, goes_on = again
+    assert (old / "map" / "manifest.json").read_bytes() == (outputs[1] / "map" / "manifest.json").read_bytes()
+    sessions = {r.submap.session for r in GlobalMap.load(folder / "map").graph.records}
+    assert sessions == ({0, 1} if goes_on else {0})
+
+
+def test_localizing_needs_a_map(tmp_path):
+    assert "--map" in str(run(str(DEMO), "-o", str(tmp_path / "out"), "--localize-only").exception)
+    assert "not a map" in str(run(str(DEMO), "-o", str(tmp_path / "out"), "--map", str(tmp_path)).exception)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_mode_without_its_sensor_says_which_one_would_do(tmp_path, data_dir):

@@ -18,8 +18,10 @@ from slam_bringup.commands.mapping_options import (
     progress_bar,
     require_map,
 )
+from slam_bringup.commands.paths import UserPath
 from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.map_growth import map_growth
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.interrupt import INTERRUPTED, STOPPED, Interrupt
 from slam_bringup.report.output import write_results
@@ -33,27 +35,37 @@ FAILED = 1
 
 @click.command()
 @mapping_options
+@click.option(
+    "--map",
+    "old_map",
+    type=UserPath(exists=True, file_okay=False),
+    help="go on in the map of a finished run: its folder OUT, or OUT/map",
+)
+@click.option("--localize-only", is_flag=True, help="with --map: only find the way in that map, which stays as it is")
 def command(
     bag: Path, output: Path, mode: str | None, mapper: str, odometry: str, imu: str | None, config: Path | None,
-    topics: tuple[str, ...], base_frame: str, overwrite: bool,
+    topics: tuple[str, ...], base_frame: str, overwrite: bool, old_map: Path | None, localize_only: bool,
 ) -> None:  # fmt: skip
     """Map BAG without ROS: same classes as the nodes, no drops, the same bytes every time.
 
     BAG is a folder or file of ROS 2 (mcap, db3) or a .bag of ROS 1. Ctrl-C ends it early and writes what is mapped; an
     error on the way does too, is named, and makes the exit code 1.
+
+    With --map all results are in the frame of that map; OUT gets a map of its own, the old one is only read.
     """
     names = BagNames(parse_topics(topics), base_frame)
     with SensorBag(bag, names) as opened:
         readings = sum(opened.count(agent, role) for agent in opened.agents for role in ("left", "depth", "imu"))
         mode = mode_for(opened, mode)
     system = choose(load_system_config(config), mode, mapper, odometry, imu)
+    growth = map_growth(system.sjsam, old_map, localize_only=localize_only)
     if mode != "tof":
         require_stereo(bag, names)
     with OutputFolder(output, "run", bag, overwrite=overwrite) as results:
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"mapping {bag.name}", total=2 * readings)
-            result, mapping = run_bag(
-                bag, system, mapper=mapper, odometry=odometry, names=names,
+            result, growth = run_bag(
+                bag, system, mapper=mapper, odometry=odometry, names=names, growth=growth,
                 on_reading=lambda: progress.advance(task), stopped=lambda: interrupt.asked,
             )  # fmt: skip
         require_map(result)
@@ -61,7 +73,7 @@ def command(
             result = replace(result, events=(STOPPED, *result.events))
         with results.staged() as folder, Console(stderr=True).status(f"writing {output}"):
             write_result_bag(folder / "result.mcap", result)
-            summary = write_results(folder, result, mapping.global_map.save)
+            summary = write_results(folder, result, growth.save)
     Console().print(summary_table(summary, output))
     if result.failure:
         click.echo(f"slam: {result.failure}; {output} holds what was mapped until then", err=True)

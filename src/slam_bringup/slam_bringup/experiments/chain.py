@@ -35,9 +35,9 @@ def map_bag(folder: Path, before: list[Path], mode: str, mapper: str, odometry: 
     """Map the bag that the job before has rendered."""
     config = choose(load_system_config(None), mode, mapper, odometry)
     began = time.process_time()
-    result, mapping = run_bag(before[0] / "bag", config, mapper=mapper, odometry=odometry)
+    result, growth = run_bag(before[0] / "bag", config, mapper=mapper, odometry=odometry)
     processor_s = time.process_time() - began
-    graph = mapping.global_map.graph
+    graph = growth.global_map.graph
     arrays: dict[str, npt.NDArray[Any]] = {
         "landmarks": result.landmarks.positions,
         "landmark_covariances": result.landmarks.covariances,

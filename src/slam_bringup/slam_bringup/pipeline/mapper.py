@@ -13,9 +13,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from ekf_slam_node.stage import FilterStage, FrameResult
 from ndt_registration.stage import ScanEstimate
-from sjsam_node.global_map import GlobalMap, JoinReport
 from slam_bringup.bags.readings import AgentSensors
 from slam_bringup.pipeline.configuration import SystemConfig, filter_config
+from slam_bringup.pipeline.map_growth import MapGrowth
 from slam_bringup.pipeline.run_record import AgentRecord, RunRecord, StateChanges
 from slam_bringup.pipeline.sensor_pipeline import AgentItem
 from slam_bringup.pipeline.stage_times import StageTimes
@@ -24,28 +24,31 @@ from slam_core.types import Features, ImuSample, PoseEstimate, Submap
 
 
 class Mapper:
-    """Takes the inputs of all filters in order; ``global_map`` grows with every submap that one of them finishes.
+    """Takes the inputs of all filters in order, and hands every submap that one of them finishes to the map.
 
     Parameters
     ----------
     sensors
         What each agent carries, by name.
+    growth
+        What becomes of the submaps.
     """
 
-    def __init__(self, config: SystemConfig, sensors: Mapping[str, AgentSensors], times: StageTimes) -> None:
+    def __init__(
+        self, config: SystemConfig, sensors: Mapping[str, AgentSensors], times: StageTimes, growth: MapGrowth
+    ) -> None:
         self._times = times
+        self.growth = growth
         self._compact = config.ekf_slam.submap.compact
         self._filters = {
-            agent: FilterStage(filter_config(config.ekf_slam, s), s.frames, s.base_frame)
+            agent: FilterStage(filter_config(config.ekf_slam, s), s.frames, s.base_frame, growth.session(agent))
             for agent, s in sensors.items()
         }
         self._frames: dict[str, list[FrameResult]] = {agent: [] for agent in sensors}
         self._scans: dict[str, list[PoseEstimate]] = {agent: [] for agent in sensors}
-        self.reports: list[JoinReport] = []
-        """One per submap joined, complete after :meth:`finish`."""
-        self.global_map = GlobalMap(config.sjsam)
         self._joiner = ThreadPoolExecutor(1, thread_name_prefix="joining")
-        self._joins: list[Future[JoinReport]] = []
+        self._joins: list[Future[None]] = []
+        self._submaps = 0
         self._events: list[str] = []
 
     def process(self, item: AgentItem) -> None:
@@ -72,10 +75,10 @@ class Mapper:
         for join in self._joins:
             error = join.exception()
             if error is None:
-                self.reports.append(join.result())
+                self._submaps += 1
             else:
                 self._events.append(f"a submap could not be joined: {error!r}")
-        self.global_map = self.global_map.centrally()
+        self._events += self.growth.finish()
 
     def stop(self) -> None:
         """End the thread that joins, at the latest after the submap it is at."""
@@ -90,22 +93,23 @@ class Mapper:
         """What the run leaves behind, after :meth:`finish`."""
         return RunRecord(
             agents={agent: _agent_record(frames, self._scans[agent]) for agent, frames in self._frames.items()},
-            global_map=self.global_map,
-            submaps=len(self.reports),
-            loop_closures=sum(len(report.closures) for report in self.reports),
+            global_map=self.growth.global_map,
+            trajectories=self.growth.trajectories(),
+            submaps=self._submaps,
+            loop_closures=self.growth.closures,
             wall_s=wall_s,
             dropped=dropped,
             stage_ms=self._times.ms,
             rejections=self.rejections(),
             events=tuple(self._events),
             failure=failure,
-            solver=next((r.solver for r in reversed(self.reports) if r.solver), ""),
+            solver=self.growth.solver,
         )
 
     def rejections(self) -> dict[str, int]:
         """What all filters and the map rejected, by reason."""
         total: Counter[str] = Counter()
-        for counters in (*(stage.counters for stage in self._filters.values()), self.global_map.counters):
+        for counters in (*(stage.counters for stage in self._filters.values()), self.growth.global_map.counters):
             total.update(counters.counts)
         return dict(sorted(total.items()))
 
@@ -117,9 +121,9 @@ class Mapper:
     def _join(self, submaps: Iterable[Submap]) -> None:
         self._joins += [self._joiner.submit(self._add, submap) for submap in submaps]
 
-    def _add(self, submap: Submap) -> JoinReport:
+    def _add(self, submap: Submap) -> None:
         with self._times.measure("sjsam"):
-            return self.global_map.add(rounded(submap) if self._compact else submap)
+            self.growth.add(rounded(submap) if self._compact else submap)
 
 
 def _agent_record(frames: list[FrameResult], scans: list[PoseEstimate]) -> AgentRecord:

@@ -24,6 +24,7 @@ from slam_bringup.bags.readings import ImuReading, Reading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.map_growth import MapGrowth, map_growth
 from slam_bringup.pipeline.mapper import Mapper
 from slam_bringup.pipeline.results import RunResult
 from slam_bringup.pipeline.run_record import run_result, told
@@ -43,10 +44,11 @@ def run_bag(
     mapper: str = "sjsam",
     odometry: str = "none",
     names: BagNames | None = None,
+    growth: MapGrowth | None = None,
     on_reading: Callable[[], None] = lambda: None,
     stopped: Callable[[], bool] = lambda: False,
-) -> tuple[RunResult, Mapper]:
-    """Map a bag, offline and as fast as it goes.
+) -> tuple[RunResult, MapGrowth]:
+    """The result of mapping a bag, offline and as fast as it goes, and the map.
 
     Parameters
     ----------
@@ -58,6 +60,8 @@ def run_bag(
         Named in the result; ``odometry`` other than "none" runs scan odometry as well.
     names
         Topics and frames of the bag that are not named like the nodes' own.
+    growth
+        What becomes of the submaps; by default they are joined into a new map.
     on_reading
         Called after every reading of the bag, and again when the dense model has seen it, for a progress bar.
     stopped
@@ -75,7 +79,7 @@ def run_bag(
     start = time.perf_counter()
     with SensorBag(path, names) as bag:
         pipelines = {a: SensorPipeline(config, bag.sensors[a], odometry != "none", times) for a in bag.agents}
-        mapping = Mapper(config, bag.sensors, times)
+        mapping = Mapper(config, bag.sensors, times, growth or map_growth(config.sjsam))
         failure = ""
         try:
             try:
@@ -95,7 +99,7 @@ def run_bag(
             result = run_result(
                 bag, config, record, mapper=mapper, odometry=odometry, dense=not stopped(), on_reading=on_reading
             )
-    return result, mapping
+    return result, mapping.growth
 
 
 def _measured(

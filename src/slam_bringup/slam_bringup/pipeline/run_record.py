@@ -53,10 +53,11 @@ class AgentRecord:
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """All agents' records and the map that they were joined into. ``events`` belong to no agent."""
+    """All agents' records, the map, and their ``trajectories`` in it by agent. ``events`` belong to no agent."""
 
     agents: Mapping[str, AgentRecord]
     global_map: GlobalMap
+    trajectories: Mapping[str, Sequence[PoseEstimate]]
     submaps: int
     loop_closures: int
     wall_s: float
@@ -87,9 +88,9 @@ def run_result(
 
     ``on_reading`` is called after every reading that the dense model has seen, for a progress bar.
     """
-    trajectories = record.global_map.trajectory()
     agents = tuple(
-        _agent_result(bag, agent, trajectories.get(agent, []), of_agent) for agent, of_agent in record.agents.items()
+        _agent_result(bag, agent, record.trajectories.get(agent, []), of_agent)
+        for agent, of_agent in record.agents.items()
     )
     surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
     try:

@@ -71,6 +71,7 @@ def collect(
         record = RunRecord(
             agents={agent: recording.of_agent(agent) for agent in opened.agents},
             global_map=global_map,
+            trajectories=global_map.trajectory(),
             submaps=recording.submaps,
             loop_closures=int(run.diagnostics.get("/sjsam", {}).get("closures", "0")),
             wall_s=run.wall_s,
