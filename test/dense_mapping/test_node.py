@@ -16,6 +16,8 @@ from slam_core.camera import Camera  # noqa: E402
 from slam_core.geometry import OPTICAL_FROM_RIG, make_transform  # noqa: E402
 from slam_core.messages import (  # noqa: E402
     depth_messages,
+    header_message,
+    image_message,
     occupancy_from_message,
     odometry_message,
     path_message,
@@ -113,3 +115,25 @@ def test_a_new_session_keeps_what_is_in_the_model(node):
     node.on_new_session()
     assert len(node.mapper.model.keyframes) == 5
     assert node.mapper.waiting == 0
+
+
+def test_key_frames_take_the_colour_of_their_time_whether_it_comes_before_or_after(node):
+    poses = [estimate((k + 1) * 10**8, 0.15 * k) for k in range(5)]
+
+    def send_colour(pose: PoseEstimate) -> None:
+        red = np.full((60, 80, 3), (200, 10, 10 * round(pose.stamp_ns / 1e8)), np.uint8)
+        header = header_message(TYPES, pose.stamp_ns + 10**7, "tof_optical_frame")
+        node._on_colour("", image_message(TYPES, header, red, "rgb8"))
+
+    for k, pose in enumerate(poses):
+        node._on_odometry("", odometry_message(TYPES, "odom", "base_link", pose))
+        if k % 2:
+            send_colour(pose)
+        messages = depth_messages(TYPES, wall_image(pose.stamp_ns, 3.0 - float(pose.T[0, 3])))
+        node._on_depth("", messages.depth, messages.noise, messages.camera_info)
+        if k in (0, 2):
+            send_colour(pose)
+    node._on_path("", path_message(TYPES, poses[-1].stamp_ns, "map", poses))
+    pictures = [k.keyframe.picture for k in node.mapper.model.keyframes]
+    assert [tuple(p[30, 40]) if p.size else () for p in pictures[:4]] == [(200, 10, 10 * (k + 1)) for k in range(4)]
+    assert pictures[4].size == 0, "the last one's was never sent"

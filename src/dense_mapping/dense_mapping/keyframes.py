@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -101,7 +101,7 @@ def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray 
     while depth.size > config.max_pixels:
         # Every other pixel, not a mean: a mean over an edge would be a point in the air.
         depth, sigma = depth[::2, ::2], sigma[::2, ::2]
-        picture = None if picture is None else np.asarray(cv2.blur(picture, (2, 2))[::2, ::2], dtype=np.uint8)
+        picture = None if picture is None else _halved(picture)
         camera = Camera(depth.shape[1], depth.shape[0], camera.fx / 2, camera.fy / 2, camera.cx / 2, camera.cy / 2)
     return Keyframe(
         image.stamp_ns,
@@ -110,6 +110,27 @@ def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray 
         np.where(depth > 0.0, np.clip(np.rint(sigma / _SIGMA_UNIT), 1, 255), 0).astype(np.uint8),
         _NO_PICTURE if picture is None else np.ascontiguousarray(picture),
     )
+
+
+def with_picture(keyframe: Keyframe, picture: ByteArray) -> Keyframe:
+    """The key frame with a picture (h, w, 3) uint8 of its camera, in the pixels of its image before that was halved.
+
+    Raises
+    ------
+    ValueError
+        For a picture that halving does not bring to the key frame's size.
+    """
+    height, width = keyframe.camera.height, keyframe.camera.width
+    halved = picture
+    while halved.shape[0] > height:
+        halved = _halved(halved)
+    if halved.shape != (height, width, 3):
+        raise ValueError(f"a colour image of {picture.shape} is not that of a depth image of {(height, width)}")
+    return replace(keyframe, picture=np.ascontiguousarray(halved))
+
+
+def _halved(picture: ByteArray) -> ByteArray:
+    return np.asarray(cv2.blur(picture, (2, 2))[::2, ::2], dtype=np.uint8)
 
 
 def grey_levels(amplitude: Float32Array) -> ByteArray:

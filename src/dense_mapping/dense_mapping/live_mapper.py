@@ -10,15 +10,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dense_mapping.colours import RecentColours
 from dense_mapping.dense_model import DenseConfig, DenseModel
-from dense_mapping.keyframes import Keyframe, KeyframeSelector
+from dense_mapping.keyframes import Keyframe, KeyframeSelector, with_picture
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
-from slam_core.types import PoseEstimate
+from slam_core.types import ByteArray, PoseEstimate
 
 _WAITING = 400
 """Key frames kept for each camera until their pose is known."""
@@ -55,6 +56,7 @@ class LiveMapper:
         self._paths: dict[str, Trajectory] = {}
         self._mounts: dict[str, tuple[str, FloatArray]] = {}
         self._waiting: deque[_Waiting] = deque()
+        self._colours: dict[str, RecentColours] = {}
 
     def begin_session(self) -> None:
         """The clock has begun anew: drop what waits for a pose of the old time; the model stays."""
@@ -82,11 +84,26 @@ class LiveMapper:
         if not selector.wants(T_odom_base @ T_base_camera):
             return False
         self._mounts[camera] = (agent, T_base_camera)
-        self._waiting.append(_Waiting(camera, T_base_camera, make()))
+        self._waiting.append(self._coloured(_Waiting(camera, T_base_camera, make())))
         if len(self._waiting) > _WAITING:
             self._waiting.popleft()
             self.dropped += 1
         return True
+
+    def has_colours(self, agent: str) -> bool:
+        """Whether any colour picture of the agent has come."""
+        return any(camera.startswith(f"{agent}/") for camera in self._colours)
+
+    def add_colour(self, agent: str, sensor: str, stamp_ns: int, picture: ByteArray) -> None:
+        """Take a colour picture (h, w, 3) uint8 in the pixels of the camera's images, before or after the image."""
+        camera = f"{agent}/{sensor}"
+        self._colours.setdefault(camera, RecentColours()).add(stamp_ns, picture)
+        self._waiting = deque(self._coloured(item) if item.camera == camera else item for item in self._waiting)
+
+    def _coloured(self, item: _Waiting) -> _Waiting:
+        colours = self._colours.get(item.camera)
+        picture = None if colours is None else colours.near(item.keyframe.stamp_ns)
+        return item if picture is None else replace(item, keyframe=with_picture(item.keyframe, picture))
 
     def set_path(self, agent: str, poses: Sequence[tuple[int, FloatArray]]) -> int:
         """Take an agent's trajectory in the map, (stamp, T_map_base); returns how many key frames came in or moved."""

@@ -27,6 +27,7 @@ from slam_core.health import State
 from slam_core.messages import (
     camera_info_from_message,
     cloud_message,
+    colour_from_message,
     depth_from_messages,
     grey_from_message,
     header_message,
@@ -98,6 +99,7 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
             topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
             topics = {below(topic): kind for topic, kind in topics.items()}
             self.listen_together(topics, partial(self._on_depth, agent), required=False)
+            self.listen(below("tof/color/image"), "Image", partial(self._on_colour, agent), required=False)
         if self.config.use_stereo:
             for side in SIDES:
                 topic = below(f"stereo/{side}/camera_info")
@@ -117,6 +119,9 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
 
         self.mapper.add_image(agent, "tof", T_base_camera, make)
 
+    def _on_colour(self, agent: str, message: Message) -> None:
+        self.mapper.add_colour(agent, "tof", stamp_ns(message), colour_from_message(message))
+
     def _on_info(self, agent: str, side: str, message: Message) -> None:
         self._pairs[agent].set_info(side, camera_info_from_message(message))
 
@@ -128,7 +133,9 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
 
             def make() -> Keyframe:
                 depth = stereo_depth(images, self.config.stereo)  # noqa: B023 - called before the next turn
-                return make_keyframe(depth, self.config.keyframe, images.left)  # noqa: B023
+                # Where another camera gives colours, grey beside them would be blotches.
+                picture = np.empty((0, 0, 3), np.uint8) if self.mapper.has_colours(agent) else images.left  # noqa: B023
+                return make_keyframe(depth, self.config.keyframe, picture)
 
             self.mapper.add_image(agent, "stereo", T_base_camera, make)
 

@@ -23,6 +23,8 @@ from slam_core.types import ByteArray, Float32Array
 
 _CHUNK = 6
 """Blocks along the edge of a cube that marching cubes runs over at once."""
+_UNSEEN = 150
+"""Grey of a surface that no picture shows."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,8 @@ def _chunk_surface(
         x, y, z = ((volume.coordinates[row] - corner) * BLOCK).tolist()
         place = np.s_[x : x + BLOCK, y : y + BLOCK, z : z + BLOCK]
         distance[place], sigma[place] = mean.reshape((BLOCK,) * 3), uncertain.reshape((BLOCK,) * 3)
-        colours[place] = volume.colours[row, :, :3].reshape(BLOCK, BLOCK, BLOCK, 3)
+        known = volume.colours[row, :, 3:] > 0
+        colours[place] = np.where(known, volume.colours[row, :, :3], _UNSEEN).reshape(BLOCK, BLOCK, BLOCK, 3)
     edge = _CHUNK * BLOCK + 1
     distance = distance[:edge, :edge, :edge]
     if not (distance < 0.0).any() or not (distance > 0.0).any():

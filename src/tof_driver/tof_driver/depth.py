@@ -105,6 +105,11 @@ class DepthProcessor:
             self._rectified_picture(normalise(intensity)),
         )
 
+    def colour(self, picture: ByteArray) -> ByteArray:
+        """A picture (h, w, 3) uint8 in the pixels of the raw image, rectified; ValueError for another size."""
+        self._check_shape("color image", picture[..., 0])
+        return picture if self._rectification is None else self._rectification.colour(picture)
+
     def _metres(self, image: AnyArray) -> Float32Array:
         self._check_shape("image", image)
         if image.dtype == np.uint16:

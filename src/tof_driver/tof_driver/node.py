@@ -3,6 +3,7 @@
 
     tof/range/image_raw (or tof/depth/image_raw), tof/{amplitude,intensity}/image_raw, tof/camera_info
         -> tof/depth/image, tof/noise/image, tof/points, tof/{amplitude,intensity}/image
+    tof/color/image_raw, in the pixels of the depth image -> tof/color/image
 
 One ``tof/camera_info`` serves raw and rectified images, as everywhere in ROS: K and D are those of the raw image, P of
 the rectified one. It comes from the camera's own driver; with the parameter ``info`` it comes from a YAML file and this
@@ -30,8 +31,10 @@ from slam_core.messages import (
     camera_info_from_message,
     camera_info_message,
     cloud_message,
+    colour_from_message,
     depth_messages,
     header_message,
+    image_message,
     picture_from_message,
     stamp_ns,
 )
@@ -49,10 +52,13 @@ class TofDriverConfig(DepthConfig):
 
     pictures: str = parameter(
         "auto",
-        "images beside range; auto: amplitude and intensity with measurement range, none with depth",
-        choices=("auto", "both", "amplitude", "intensity", "none"),
+        "images beside range (color: as amplitude); auto: amplitude and intensity with measurement range, else none",
+        choices=("auto", "both", "amplitude", "intensity", "color", "none"),
     )
     info: str = parameter("", "camera_info YAML file; empty: from the topic tof/camera_info")
+
+
+_COLOUR = "tof/color/image"
 
 
 class TofDriverNode(SlamNode[TofDriverConfig]):
@@ -80,11 +86,16 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
             chosen = "both" if self.config.measurement == "range" else "none"
         return {"both": ("amplitude", "intensity"), "none": ()}.get(chosen, (chosen,))
 
+    def _roles(self) -> tuple[str, ...]:
+        """What the pictures are taken for."""
+        return tuple("amplitude" if name == "color" else name for name in self._pictures)
+
     def _advertise_outputs(self) -> tuple[str, ...]:
         """Offer the topics that this camera has; a camera info that comes from a topic is there already."""
-        unused = {f"tof/{name}/image" for name in ("amplitude", "intensity") if name not in self._pictures}
+        unused = {f"tof/{name}/image" for name in ("amplitude", "intensity") if name not in self._roles()}
         if not self.config.info:
             unused.add("tof/camera_info")
+        self.advertise(_COLOUR, "Image")
         used = tuple(topic for topic in DEPTH_TOPICS if topic not in unused)
         for topic in used:
             self.advertise(topic, DEPTH_TOPICS[topic])
@@ -95,6 +106,8 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
             self.listen("tof/camera_info", "CameraInfo", self._on_info)
         names = (self.config.measurement, *self._pictures)
         self.listen_together({f"tof/{name}/image_raw": "Image" for name in names}, self._on_images)
+        if "color" not in self._pictures:
+            self.listen(f"{_COLOUR}_raw", "Image", self._on_colour, required=False)
 
     # -- inputs --------------------------------------------------------------------------------------------------------
 
@@ -103,11 +116,19 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
         self._publish_ready()
 
     def _on_images(self, *messages: Message) -> None:
-        pictures = dict(zip(self._pictures, map(picture_from_message, messages[1:]), strict=True))
+        pictures = dict(zip(self._roles(), map(picture_from_message, messages[1:]), strict=True))
         header = messages[0].header
         image = picture_from_message(messages[0])
         self.stage.add(RawDepth(stamp_ns(messages[0]), image, **pictures, frame_id=header.frame_id))
         self._publish_ready()
+        if "color" in self._pictures:
+            self._on_colour(messages[1])
+
+    def _on_colour(self, message: Message) -> None:
+        picture = self.stage.colour(colour_from_message(message)) if self.has_listeners(_COLOUR) else None
+        if picture is not None:
+            header = header_message(self.types, stamp_ns(message), message.header.frame_id)
+            self.publish(_COLOUR, image_message(self.types, header, picture, "rgb8"))
 
     def _publish_ready(self) -> None:
         for depth in self.stage.ready():

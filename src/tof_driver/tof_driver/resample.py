@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from slam_core.camera import Camera
-from slam_core.types import Float32Array
+from slam_core.types import ByteArray, Float32Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,10 @@ class RectificationMap:
     def image(self, image: Float32Array) -> Float32Array:
         """Bilinear resampling of a picture (amplitude, intensity); zero outside the distorted image."""
         return np.asarray(cv2.remap(image, self.u, self.v, cv2.INTER_LINEAR), dtype=np.float32)
+
+    def colour(self, image: ByteArray) -> ByteArray:
+        """The same of a colour picture (height, width, 3) uint8."""
+        return np.asarray(cv2.remap(image, self.u, self.v, cv2.INTER_LINEAR), dtype=np.uint8)
 
     def depth(
         self, depth: Float32Array, sigma: Float32Array, slope: float, noise_multiple: float

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slam_core.camera import CameraInfo
-from slam_core.types import AnyArray, Counters, DepthImage
+from slam_core.types import AnyArray, ByteArray, Counters, DepthImage
 from tof_driver.depth import DepthConfig, DepthProcessor
 
 WAITING = 100
@@ -79,6 +79,16 @@ class DepthStage:
             share = float(np.isfinite(depth.depth).mean())
             self.complaint = f"{100.0 * share:.1f} % of the pixels have depth" if share < FEW_PIXELS else ""
             yield replace(depth, frame_id=raw.frame_id)
+
+    def colour(self, picture: ByteArray) -> ByteArray | None:
+        """A picture (h, w, 3) uint8 in the pixels of the raw depth image, rectified as that is; None: no calibration.
+
+        Raises
+        ------
+        ValueError
+            For a picture of another size.
+        """
+        return None if self._processor is None else self._processor.colour(picture)
 
     def reset(self) -> None:
         """Forget what waits; the calibration stays."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from slam_bringup.datasets.picture_registration import ColourCamera, register_picture
+from slam_bringup.datasets.picture_registration import ColourCamera, register_pictures
 from slam_core.camera import Camera
 
 DEPTH_CAMERA = Camera(320, 240, 290.0, 290.0, 160.0, 120.0)
@@ -32,7 +32,9 @@ def test_registered_picture_is_what_the_depth_camera_would_see(rng):
     own, other = picture_of_wall(rng, 2.0)
     depth = np.full((240, 320), 2.0)
     depth[100:110, 50:200] = 0.0
-    registered = register_picture(other.astype(np.uint8), depth, DEPTH_CAMERA, COLOUR).astype(float)
+    grey, colour = other.astype(np.uint8), np.repeat(other.astype(np.uint8)[..., None], 3, axis=2)
+    registered, coloured = (p.astype(float) for p in register_pictures((grey, colour), depth, DEPTH_CAMERA, COLOUR))
+    np.testing.assert_array_equal(coloured[..., 1], registered)
     inside = np.s_[20:220, 30:290]
     assert np.abs(registered[inside] - own[inside]).mean() < 1.5
     assert np.abs(other[inside] - own[inside]).mean() > 10.0
@@ -40,4 +42,5 @@ def test_registered_picture_is_what_the_depth_camera_would_see(rng):
 
 def test_a_frame_without_any_depth_keeps_its_picture(rng):
     grey = rng.integers(0, 255, (240, 320), dtype=np.uint8)
-    np.testing.assert_array_equal(register_picture(grey, np.zeros((240, 320)), DEPTH_CAMERA, COLOUR), grey)
+    (as_it_was,) = register_pictures((grey,), np.zeros((240, 320)), DEPTH_CAMERA, COLOUR)
+    np.testing.assert_array_equal(as_it_was, grey)

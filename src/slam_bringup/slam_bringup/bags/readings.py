@@ -9,10 +9,16 @@ from dataclasses import dataclass, field
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
-from slam_core.messages import grey_from_message, imu_from_message, picture_from_message, stamp_ns
+from slam_core.messages import (
+    colour_from_message,
+    grey_from_message,
+    imu_from_message,
+    picture_from_message,
+    stamp_ns,
+)
 from slam_core.messages.base import Message
 from slam_core.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
-from slam_core.types import ImuSample
+from slam_core.types import ByteArray, ImuSample
 from stereo_frontend.sources import RawPair
 from tof_driver.stage import RawDepth
 
@@ -58,7 +64,16 @@ class ImuReading:
         return self.sample.stamp_ns
 
 
-Reading = StereoReading | DepthReading | ImuReading
+@dataclass(frozen=True, eq=False)
+class ColourReading:
+    """A colour picture (h, w, 3) uint8, red first, in the pixels of the raw depth image."""
+
+    agent: str
+    stamp_ns: int
+    image: ByteArray
+
+
+Reading = StereoReading | DepthReading | ImuReading | ColourReading
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +130,8 @@ class AgentPairing:
         self._ready = []
         if role == "imu":
             self._on_imu(message)
+        elif role == "color":
+            self._hand_on(ColourReading(self._sensors.agent, stamp_ns(message), colour_from_message(message)))
         elif role in ("left", "right"):
             self._stereo.add(role, stamp_ns(message), message)
         else:

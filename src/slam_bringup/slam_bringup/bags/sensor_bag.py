@@ -9,7 +9,9 @@ Topics are those of the nodes, or given by role, see :mod:`slam_bringup.bags.sen
 
 - ``stereo/{left,right}/image_raw`` (or ``image_rect``; also ``.../compressed``) with ``camera_info``;
 - ``tof/range/image_raw`` (along the ray) or ``tof/depth/image_raw`` (along z, any depth camera) with
-  ``tof/camera_info`` and, where there are any, ``tof/{amplitude,intensity}/image_raw``;
+  ``tof/camera_info`` and, where there are any, ``tof/{amplitude,intensity}/image_raw``, and ``tof/color/image_raw``
+  in the pixels of the depth image: colours of the dense model, and the picture that features come from where there is
+  no other;
 - ``imu`` and ``ground_truth/pose``.
 
 Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts. A
@@ -27,7 +29,15 @@ from typing import Self
 import numpy as np
 
 from slam_bringup.bags.bag import BagReader
-from slam_bringup.bags.readings import AgentPairing, AgentSensors, DepthReading, ImuReading, Reading, StereoReading
+from slam_bringup.bags.readings import (
+    AgentPairing,
+    AgentSensors,
+    ColourReading,
+    DepthReading,
+    ImuReading,
+    Reading,
+    StereoReading,
+)
 from slam_bringup.bags.sensor_topics import BagNames, find_agents, is_rectified, join, topics_of
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
@@ -78,25 +88,30 @@ class SensorBag:
     def __exit__(self, *_: object) -> None:
         self.reader.__exit__()
 
-    def readings(self) -> Generator[Reading, None, None]:
+    def readings(self, *, colours: bool = False) -> Generator[Reading, None, None]:
         """Every reading in the order of the bag; of those with one stamp IMU and depth come before the stereo pair.
 
-        What helps a frame thus comes before it, as at the node, which waits for it.
+        What helps a frame thus comes before it, as at the node, which waits for it. ``colours``: the colour pictures
+        too, which only the dense model needs.
         """
-        for _, together in groupby(self._in_order_of_arrival(), key=lambda reading: reading.stamp_ns):
+        for _, together in groupby(self._in_order_of_arrival(colours), key=lambda reading: reading.stamp_ns):
             yield from sorted(together, key=_rank)
 
-    def _in_order_of_arrival(self) -> Iterator[Reading]:
+    def _in_order_of_arrival(self, colours: bool) -> Iterator[Reading]:
         """A pair comes when its last image does."""
         self.left_out.clear()
         pairing = {agent: AgentPairing(sensors, self.left_out) for agent, sensors in self.sensors.items()}
-        route = {t: (agent, role) for agent, s in self.sensors.items() for role, t in s.topics.items()}
-        wanted = [topic for topic, (_, role) in route.items() if role in _READ]
+        read = (*_READ, *("color",) * colours)
+        route: dict[str, list[tuple[str, str]]] = {}
+        for agent, sensors in self.sensors.items():
+            for role in (role for role in read if role in sensors.topics):
+                route.setdefault(sensors.topics[role], []).append((agent, role))
         types = {name: info.type_name for name, info in self.reader.topics.items()}
-        for topic, _, data in self.reader.raw(wanted):
-            agent, role = route[topic]
+        for topic, _, data in self.reader.raw(route):
             try:
-                yield from pairing[agent].add(role, self.reader.decode(types[topic], data))
+                message = self.reader.decode(types[topic], data)
+                for agent, role in route[topic]:
+                    yield from pairing[agent].add(role, message)
             except ValueError as error:
                 self._count_unusable(topic, error)
         for p in pairing.values():
@@ -147,6 +162,8 @@ class SensorBag:
         measurement = "range" if "range" in topics else "depth"
         if "range" in topics:
             topics["depth"] = topics.pop("range")
+        if "color" in topics and not {"amplitude", "intensity"} & topics.keys():
+            topics["amplitude"] = topics["color"]
         left, left_frame = self._camera_info(topics, "left", "left_info")
         right, _ = self._camera_info(topics, "right", "right_info")
         tof, tof_frame = self._camera_info(topics, "depth", "tof_info")
@@ -192,4 +209,4 @@ class SensorBag:
 
 
 def _rank(reading: Reading) -> int:
-    return (ImuReading, DepthReading, StereoReading).index(type(reading))
+    return (ImuReading, ColourReading, DepthReading, StereoReading).index(type(reading))

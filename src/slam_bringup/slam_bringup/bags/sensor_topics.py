@@ -18,6 +18,7 @@ _CANDIDATES = {
     "depth": ("tof/depth/image_raw",),
     "amplitude": ("tof/amplitude/image_raw",),
     "intensity": ("tof/intensity/image_raw",),
+    "color": ("tof/color/image_raw", "tof/color/image_raw/compressed"),
     "imu": ("imu",),
     "ground_truth": ("ground_truth/pose",),
 }

@@ -71,7 +71,7 @@ class SensorWriter:
         """A raw image of a depth camera.
 
         ``measurement`` "range" (along the ray) or "depth" (along z), uint16 mm or float32 m; further pictures by name
-        (``amplitude``, ``intensity``) where there are any.
+        (``amplitude``, ``intensity``, and ``color``, red first) where there are any.
         """
         self.picture(f"tof/{measurement}/image_raw", stamp_ns, TOF_FRAME, image)
         for name, picture in pictures.items():
@@ -91,7 +91,8 @@ class SensorWriter:
 
     def picture(self, topic: str, stamp_ns: int, frame: str, image: AnyArray) -> None:
         """One image on a topic below the agent's namespace."""
-        message = image_message(self._types, header_message(self._types, stamp_ns, self._frame(frame)), image)
+        header = header_message(self._types, stamp_ns, self._frame(frame))
+        message = image_message(self._types, header, image, "rgb8" if image.ndim == 3 else "")
         self._bag.write(f"{self._prefix}/{topic}", message, stamp_ns)
 
     def info(self, topic: str, stamp_ns: int, frame: str, info: CameraInfo) -> None:

@@ -48,6 +48,14 @@ def read_grey(path: Path) -> ByteArray:
     return _checked(path, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
+def read_colour(path: Path) -> ByteArray:
+    """A colour image uint8 (height, width, 3), red first, of a file; ValueError if it is none."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ValueError(f"{path}: expected a picture, found nothing readable")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
 def read_depth(path: Path) -> AnyArray:
     """A depth image uint16 (height, width), values as in the file; ValueError if it is none."""
     return _checked(path, cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.uint16)

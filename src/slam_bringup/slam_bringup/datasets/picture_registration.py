@@ -27,19 +27,23 @@ class ColourCamera:
     position: tuple[float, float, float]
 
 
-def register_picture(grey: ByteArray, depth_m: AnyArray, depth_camera: Camera, colour: ColourCamera) -> ByteArray:
-    """The picture as the depth camera would have taken it, uint8 (height, width) of the depth image.
+def register_pictures(
+    pictures: tuple[ByteArray, ...], depth_m: AnyArray, depth_camera: Camera, colour: ColourCamera
+) -> tuple[ByteArray, ...]:
+    """The pictures of a colour camera as the depth camera would have taken them, in the pixels of the depth image.
 
-    Pixels without depth take that of their nearest neighbour with depth, so that the picture has no holes; a picture
-    with no depth at all is returned as it is. ``depth_m`` is along z, m; zero or not finite where there is none.
+    Pixels without depth take that of their nearest neighbour with depth, so that the picture has no holes; pictures
+    with no depth at all are returned as they are. ``depth_m`` is along z, m; zero or not finite where there is none.
     """
     known = np.isfinite(depth_m) & (depth_m > 0.0)
     if not known.any():
-        return grey
+        return pictures
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     z = np.asarray(depth_m, dtype=np.float64)[tuple(nearest)]
     u, v = _pixels_in_picture(z, depth_camera, colour)
-    return np.asarray(cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+    return tuple(
+        np.asarray(cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)) for picture in pictures
+    )
 
 
 def _pixels_in_picture(z: FloatArray, camera: Camera, colour: ColourCamera) -> tuple[AnyArray, AnyArray]:

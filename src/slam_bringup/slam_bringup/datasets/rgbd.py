@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""RGB-D sequences as a depth camera with a grey picture: 7-Scenes, TUM RGB-D, and plain folders.
+"""RGB-D sequences as a depth camera with a grey and a colour picture: 7-Scenes, TUM RGB-D, and plain folders.
 
 - 7-Scenes (Shotton et al. 2013): ``frame-000000.color.png``, ``.depth.png`` (mm; 0 and 65535 are invalid),
   ``.pose.txt`` (camera to world); 30 Hz; ``camera-intrinsics.txt`` if there is one.
@@ -9,8 +9,8 @@
 - numbered, as deep-video-mvs (Duzceker et al. 2021) has it: ``images/<n>.png``, ``depth/<n>.png`` (mm, registered),
   ``K.txt``, ``poses.txt`` with a 4x4 camera-to-world matrix per line; no stamps, taken as 10 Hz.
 
-The depth is along z, so it goes to ``tof/depth/image_raw`` as it is; the grey picture, registered to it, becomes the
-amplitude.
+The depth is along z, so it goes to ``tof/depth/image_raw`` as it is; the picture, registered to it, becomes the
+amplitude in grey, which features come from, and ``tof/color/image_raw``.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pathlib import Path
 import numpy as np
 
 from slam_bringup.bags.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
-from slam_bringup.datasets.files import START_NS, StampedPair, existing, read_depth, read_grey
-from slam_bringup.datasets.picture_registration import ColourCamera, register_picture
+from slam_bringup.datasets.files import START_NS, StampedPair, existing, read_colour, read_depth, read_grey
+from slam_bringup.datasets.picture_registration import ColourCamera, register_pictures
 from slam_core.camera import Camera, CameraInfo
 from slam_core.camera_info import read_camera_info
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, invert_transform, make_transform, transform_from_pose7
@@ -87,11 +87,11 @@ class RgbdDataset:
         for number, pair in enumerate(pairs):
             depth = _clean(read_depth(pair.second), self._layout.units_per_metre)
             info = info or self._info(depth.shape)
-            grey = read_grey(pair.first)
+            grey, colour = read_grey(pair.first), read_colour(pair.first)
             if self._layout.colour is not None:
                 metres = depth * (1.0 / self._layout.units_per_metre if depth.dtype == np.uint16 else 1.0)
-                grey = register_picture(grey, metres, info.camera, self._layout.colour)
-            writer.depth(pair.stamp_ns, depth, info, measurement="depth", amplitude=grey)
+                grey, colour = register_pictures((grey, colour), metres, info.camera, self._layout.colour)
+            writer.depth(pair.stamp_ns, depth, info, measurement="depth", amplitude=grey, color=colour)
             yield number
         for stamp, T_world_camera in self._poses:
             writer.ground_truth(stamp, _level(T_world_camera))

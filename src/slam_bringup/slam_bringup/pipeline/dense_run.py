@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
+from dense_mapping.colours import RecentColours
 from dense_mapping.dense_model import DenseConfig, DenseModel
 from dense_mapping.keyframes import grey_levels
 from dense_mapping.stereo_depth import stereo_depth
-from slam_bringup.bags.readings import AgentSensors, DepthReading, ImuReading, Reading, StereoReading
+from slam_bringup.bags.readings import AgentSensors, ColourReading, DepthReading, ImuReading, Reading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
@@ -19,6 +20,8 @@ from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray, DepthImage
 from stereo_frontend.stage import StereoStage
 from tof_driver.stage import DepthStage
+
+_NO_PICTURE: ByteArray = np.empty((0, 0, 3), dtype=np.uint8)
 
 
 def dense_model(
@@ -35,12 +38,13 @@ def dense_model(
         if len(trajectory)
     }
     last_ns = max((int(t.stamps_ns[-1]) for t in trajectories.values() if len(t)), default=0)
-    for reading in bag.readings():
+    for reading in bag.readings(colours=True):
         if isinstance(reading, StereoReading | DepthReading) and reading.stamp_ns > last_ns:
             break
         if reading.agent in cameras:
             cameras[reading.agent].add(reading, model)
-        on_reading()
+        if not isinstance(reading, ColourReading):
+            on_reading()
     for camera in cameras.values():
         camera.finish(model)
     return model
@@ -55,6 +59,9 @@ class AgentDepth:
         self._depth: DepthStage | None = None
         self._stereo: StereoStage | None = None
         self._forces: list[tuple[int, FloatArray]] = []
+        self._has_colours = config.dense_mapper.use_tof and "color" in sensors.topics
+        self._colours = RecentColours()
+        self._uncoloured: list[tuple[str, FloatArray, DepthImage]] = []
         if self._config.use_tof and sensors.is_mounted("tof"):
             self._depth = depth_stage(config, sensors)
             self._T_base_tof = sensors.transform("base", "tof")
@@ -68,7 +75,11 @@ class AgentDepth:
             for camera, T in self._wanted(model, "tof", reading.stamp_ns, self._T_base_tof):
                 self._depth.add(reading.raw)
                 for image in self._depth.ready():
-                    model.add(camera, T, image, self._picture(image))
+                    self._add_depth(model, camera, T, image)
+        elif isinstance(reading, ColourReading) and self._depth is not None:
+            if (picture := self._depth.colour(reading.image)) is not None:
+                self._colours.add(reading.stamp_ns, picture)
+            self._put_coloured(model, reading.stamp_ns)
         elif isinstance(reading, ImuReading):
             R_base_imu = self._sensors.frames.lookup(self._sensors.base_frame, reading.sample.frame_id)[:3, :3]
             self._forces.append((reading.sample.stamp_ns, R_base_imu @ reading.sample.linear_acceleration))
@@ -76,10 +87,25 @@ class AgentDepth:
             for camera, T in self._wanted(model, "stereo", reading.stamp_ns, self._T_base_left):
                 self._stereo.add(reading.pair)
                 for images in self._stereo.ready():
-                    model.add(camera, T, stereo_depth(images, self._config.stereo), images.left)
+                    model.add(camera, T, stereo_depth(images, self._config.stereo), self._grey(images.left))
+
+    def _add_depth(self, model: DenseModel, camera: str, T: FloatArray, image: DepthImage) -> None:
+        """Put a depth image into the model, or keep it until its colours have come."""
+        if self._has_colours:
+            self._uncoloured.append((camera, T, image))
+        else:
+            model.add(camera, T, image, self._picture(image))
+
+    def _put_coloured(self, model: DenseModel, until_ns: int | None = None) -> None:
+        """Put those depth images into the model whose colours have come if they ever do: a later picture is here."""
+        while self._uncoloured and (until_ns is None or self._uncoloured[0][2].stamp_ns <= until_ns):
+            camera, T, image = self._uncoloured.pop(0)
+            picture = self._colours.near(image.stamp_ns)
+            model.add(camera, T, image, _NO_PICTURE if picture is None else picture)
 
     def finish(self, model: DenseModel) -> None:
-        """Give the model what the accelerometer read along the trajectory, all at once: poses are dear one by one."""
+        """Give the model what waits, and what the accelerometer read along the trajectory: poses cost one by one."""
+        self._put_coloured(model)
         stamps = self._trajectory.stamps_ns
         inside = [(stamp, force) for stamp, force in self._forces if stamps[0] <= stamp <= stamps[-1]]
         if inside:
@@ -103,10 +129,14 @@ class AgentDepth:
             return None
         return np.asarray(self._trajectory.interpolate(np.array([stamp_ns]))[0])
 
+    def _grey(self, left: ByteArray) -> ByteArray:
+        """The left image, or nothing where another camera gives colours: grey beside them would be blotches."""
+        return _NO_PICTURE if self._has_colours else left
+
     def _picture(self, image: DepthImage) -> ByteArray | None:
         """A ToF amplitude is no picture where stereo gives one: two kinds of grey on one wall are blotches."""
         if self._stereo is None and image.amplitude is not None:
             return grey_levels(image.amplitude)
         if self._stereo is None and image.intensity is not None:
             return np.asarray(np.rint(255.0 * image.intensity), dtype=np.uint8)
-        return np.empty((0, 0, 3), dtype=np.uint8)
+        return _NO_PICTURE

@@ -145,6 +145,8 @@ def _bag_parameters(config: SystemConfig, sensor: AgentSensors, map_path: str) -
     """What the topics of a bag ask of the nodes."""
     pictures = [name for name in ("amplitude", "intensity") if name in sensor.topics]
     chosen = {0: "none", 2: "both"}.get(len(pictures)) or pictures[0]
+    if chosen == "amplitude" and sensor.topics.get("color") == sensor.topics["amplitude"]:
+        chosen = "color"
     chooses = config.feature_extractor.mode == "tof" and config.feature_extractor.tof.images == "auto"
     compressed = sensor.topics.get("left", "").endswith("/compressed")
     return {
@@ -160,7 +162,7 @@ def _topics(sensor: AgentSensors, mode: str, odometry: bool) -> dict[str, str]:
     if mode != "tof":
         roles += ["left", "right", "left_info", "right_info"]
     if mode != "stereo" or odometry:
-        roles += ["depth", "amplitude", "intensity", "tof_info"]
+        roles += ["depth", "amplitude", "intensity", "color", "tof_info"]
     return {sensor.topics[role]: _heard(sensor, role) for role in roles if role in sensor.topics}
 
 

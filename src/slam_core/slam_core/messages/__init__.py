@@ -22,6 +22,7 @@ from slam_core.messages.depth import DEPTH_TOPICS, DepthMessages, depth_from_mes
 from slam_core.messages.features import FEATURE_TOPICS, FeatureMessages, features_from_messages, features_messages
 from slam_core.messages.grids import occupancy_from_message, occupancy_message
 from slam_core.messages.images import (
+    colour_from_message,
     compressed_image_message,
     grey_from_message,
     image_from_message,
@@ -62,6 +63,7 @@ __all__ = [
     "camera_info_message",
     "cloud_from_message",
     "cloud_message",
+    "colour_from_message",
     "compressed_image_message",
     "depth_from_messages",
     "depth_messages",

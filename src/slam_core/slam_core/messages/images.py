@@ -27,6 +27,13 @@ _TO_GREY = {
     "bayer_rggb8": cv2.COLOR_BayerBG2GRAY, "bayer_bggr8": cv2.COLOR_BayerRG2GRAY,
     "bayer_gbrg8": cv2.COLOR_BayerGR2GRAY, "bayer_grbg8": cv2.COLOR_BayerGB2GRAY,
 }  # fmt: skip
+_TO_RGB = {
+    "bgr8": cv2.COLOR_BGR2RGB, "8UC3": cv2.COLOR_BGR2RGB, "bgra8": cv2.COLOR_BGRA2RGB,
+    "yuv422": cv2.COLOR_YUV2RGB_UYVY, "uyvy": cv2.COLOR_YUV2RGB_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2, "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+    "bayer_rggb8": cv2.COLOR_BayerBG2RGB, "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB, "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
+}  # fmt: skip
 _DEFAULT_ENCODING = {"|u1": "mono8", "|i1": "8SC1", "<u2": "16UC1", "<f4": "32FC1", "<f8": "64FC1"}
 _COMPRESSED_DEPTH_HEADER = struct.Struct("<iff")
 
@@ -97,6 +104,25 @@ def picture_from_message(message: Message) -> AnyArray:
     """An image beside a depth image, (height, width): amplitude or intensity as it is, colours as grey."""
     image = image_from_message(message)
     return image if image.ndim == 2 else grey_from_message(message)
+
+
+def colour_from_message(message: Message) -> ByteArray:
+    """A colour image, uint8 (height, width, 3), red first; a grey one has three equal channels.
+
+    Raises
+    ------
+    ValueError
+        For images of other than 8 bits.
+    """
+    image = image_from_message(message)
+    encoding = getattr(message, "encoding", "mono8" if image.ndim == 2 else "bgr8")
+    if image.dtype != np.uint8:
+        raise ValueError(f"a colour image with 8 bits is needed, got {image.dtype}")
+    if encoding in ("rgb8", "rgba8"):
+        return np.ascontiguousarray(image[..., :3])
+    if encoding in _TO_RGB:
+        return np.asarray(cv2.cvtColor(image, _TO_RGB[encoding]))
+    return np.repeat(image[..., None], 3, axis=2)
 
 
 def metres_from_message(message: Message) -> Float32Array:

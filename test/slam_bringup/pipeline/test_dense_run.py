@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The dense model of a bag takes the colours of the colour camera, at the depth image that they belong to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from slam_bringup.bags.bag import BagReader, BagWriter
+from slam_bringup.bags.readings import ColourReading, DepthReading
+from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.bags.sensor_topics import BagNames
+from slam_bringup.bags.sensor_writer import SensorWriter
+from slam_bringup.datasets.rgbd import RgbdDataset
+from slam_bringup.pipeline.configuration import load_system_config
+from slam_bringup.pipeline.dense_run import dense_model
+from slam_core.types import PoseEstimate
+
+ORANGE = (240, 130, 20)
+
+
+def wall_of_colour(root: Path) -> Path:
+    """Six frames of an orange wall 2 m ahead, 0.25 m aside each; the upper half of the picture is dark."""
+    picture = np.empty((96, 128, 3), np.uint8)
+    picture[:], picture[:48] = ORANGE, (10, 10, 10)
+    for i in range(6):
+        for name, image in (("color", picture[..., ::-1]), ("depth", np.full((96, 128), 2000, np.uint16))):
+            (root / name).mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(root / name / f"{i}.png"), image)
+    rows = [[0.25 * i, 0, 0, 0, 0, 0, 1] for i in range(6)]
+    np.savetxt(root / "pose.txt", np.array(rows, dtype=float))
+    (root / "K.txt").write_text("120 0 63.5\n0 120 47.5\n0 0 1\n")
+    return root
+
+
+def bag_of(root: Path, path: Path) -> Path:
+    with BagWriter(path) as bag:
+        list(RgbdDataset(root, root / "K.txt").write(SensorWriter(bag)))
+    return path
+
+
+def surface_colours(bag: SensorBag) -> tuple[np.ndarray, np.ndarray]:
+    """Heights and colours of the model on the true poses."""
+    truth = bag.ground_truth("")
+    poses = [PoseEstimate(int(s), T, np.eye(6)) for s, T in zip(truth.stamps_ns, truth.poses, strict=True)]
+    model = dense_model(bag, load_system_config(None), {"": type(truth).from_estimates(poses)})
+    surface = model.surface()
+    assert len(surface) > 500
+    return surface.points[:, 2], surface.colours.astype(int)
+
+
+def test_a_converted_data_set_keeps_its_colours_and_the_surface_has_them(tmp_path):
+    with SensorBag(bag_of(wall_of_colour(tmp_path / "set"), tmp_path / "bag")) as bag:
+        pictures = [r for r in bag.readings(colours=True) if isinstance(r, ColourReading)]
+        assert len(pictures) == 6
+        assert tuple(pictures[0].image[90, 5]) == ORANGE
+        assert not any(isinstance(r, ColourReading) for r in bag.readings())
+        height, colours = surface_colours(bag)
+    assert np.abs(colours[height < -0.1] - ORANGE).max() <= 2
+    assert colours[height > 0.1].max() <= 12
+
+
+def test_a_colour_image_alone_is_also_the_picture_that_features_come_from(tmp_path):
+    source = bag_of(wall_of_colour(tmp_path / "set"), tmp_path / "whole")
+    with BagReader(source) as reader, BagWriter(tmp_path / "bag") as bag:
+        for topic, stamp, data in reader.raw():
+            if "amplitude" not in topic:
+                bag.write_raw(topic.replace("tof/color", "camera/rgb"), reader.topics[topic].type_name, data, stamp)
+    with SensorBag(tmp_path / "bag", BagNames({"color": "/camera/rgb/image_raw"})) as bag:
+        depth = next(r for r in bag.readings() if isinstance(r, DepthReading))
+        assert depth.raw.amplitude is not None
+        assert depth.raw.amplitude.shape == (96, 128)
+        assert depth.raw.amplitude[90, 5] == cv2.cvtColor(np.uint8([[ORANGE]]), cv2.COLOR_RGB2GRAY)[0, 0]
+        _, colours = surface_colours(bag)
+    assert np.abs(colours - ORANGE).max(axis=1).min() <= 2
