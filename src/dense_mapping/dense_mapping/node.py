@@ -19,7 +19,7 @@ from dense_mapping.keyframes import Keyframe, make_keyframe
 from dense_mapping.live_mapper import LiveMapper
 from dense_mapping.plan_io import write_plan
 from dense_mapping.stereo_depth import stereo_depth
-from dense_mapping.surface import Surface
+from dense_mapping.surface_cloud import cloud_of
 from dense_mapping.surface_io import write_mesh
 from slam_core.base_node import SlamNode
 from slam_core.config import parameter
@@ -39,7 +39,6 @@ from slam_core.messages import (
 from slam_core.messages.base import Message
 from slam_core.ros import run_node
 from slam_core.stamp_guard import StampPolicy
-from slam_core.types import AnyArray
 from stereo_frontend.calibrated_pairs import SIDES
 from stereo_frontend.sources import RawPair
 from stereo_frontend.stage import StereoStage
@@ -184,21 +183,6 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         except (ValueError, OSError) as error:
             response.success, response.message = False, str(error)
         return response
-
-
-CLOUD_DTYPE = np.dtype([(name, "<f4") for name in ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "sigma")])
-"""Fields of ``map/dense_cloud``; ``rgb`` as PCL and RViz pack it."""
-
-
-def cloud_of(surface: Surface) -> AnyArray:
-    """Structured array (n,) of :data:`CLOUD_DTYPE`."""
-    cloud = np.empty(len(surface), dtype=CLOUD_DTYPE)
-    for axis, name in enumerate("xyz"):
-        cloud[name], cloud[f"normal_{name}"] = surface.points[:, axis], surface.normals[:, axis]
-    red, green, blue = surface.colours.astype(np.uint32).T
-    cloud["rgb"] = ((red << 16) | (green << 8) | blue).astype("<u4").view("<f4")
-    cloud["sigma"] = surface.sigma
-    return cloud
 
 
 def _storey_topic(number: int) -> str:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
@@ -39,6 +41,14 @@ class FrameTree:
             if passed[-1] in passed[:-1]:
                 raise ValueError(f"the frames {' -> '.join(passed)} form a cycle")
         return passed[-1]
+
+    def below(self, base: str) -> dict[str, FloatArray]:
+        """T_base_frame (4, 4) of every other frame that hangs together with ``base``, sorted by name."""
+        found = {}
+        for frame in self.frames if base in self else ():
+            with suppress(ValueError):
+                found[frame] = self.lookup(base, frame)
+        return {frame: T for frame, T in found.items() if frame != base}
 
     def lookup(self, target: str, source: str) -> FloatArray:
         """T_target_source (4, 4).

@@ -10,6 +10,7 @@ Topics are discovered while it runs. The bag is complete only when the node has 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-from slam_bringup.bags.bag import BagWriter
+from slam_bringup.bags.bag import LATCHED_TOPICS, BagWriter
 from slam_bringup.bags.bag_types import typestore
 from slam_bringup.bags.pacing import header_stamp_ns
+from slam_bringup.bags.recording_clock import RecordingClock, has_header, topic_name
 from slam_bringup.bags.tf_recording import transform_topic, transforms_of
 from slam_core.config import Config, parameter
 from slam_core.ros import declare_config, has_tf2_msgs, message_class, run_node, sensor_qos
@@ -27,6 +29,8 @@ from slam_core.ros import declare_config, has_tf2_msgs, message_class, run_node,
 _DEPTH = 1000
 _DISCOVERY_PERIOD_S = 0.2
 _HIDDEN = ("/parameter_events", "/rosout", "/progress")
+_OTHER_CLOCK = ("diagnostic_msgs/msg/DiagnosticArray",)
+"""Types whose stamps are those of the machine, whatever the time of the sensors is."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,7 @@ class RecorderNode(Node):
             self._writer = self._open()
         except OSError as error:
             raise ValueError(f"cannot write {self.config.bag}: {error}") from error
+        self._clock = RecordingClock()
         self._known: set[str] = set()
         self._count = 0
         self.create_timer(_DISCOVERY_PERIOD_S, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -62,6 +67,8 @@ class RecorderNode(Node):
 
     def on_close(self) -> None:
         """Complete the bag."""
+        for waiting, stamp in self._clock.rest(self.get_clock().now().nanoseconds):
+            waiting(stamp)
         self._writer.__exit__(None, None, None)
         print(f"recorded {self._count} messages to {self._writer.path}", flush=True)
 
@@ -87,24 +94,24 @@ class RecorderNode(Node):
         self.get_logger().info(f"recording {topic}")
 
     def _callback(self, topic: str, type_name: str) -> Any:
-        stamped = self._has_header(type_name)
+        is_frame = has_header(type_name) and type_name not in _OTHER_CLOCK and topic_name(topic) not in LATCHED_TOPICS
         carried = None if has_tf2_msgs() else transform_topic(topic)
 
-        def on_message(data: bytes) -> None:
-            use_header = stamped and self.config.header_stamps
-            stamp = header_stamp_ns(data) if use_header else self.get_clock().now().nanoseconds
+        def write(data: bytes, stamp: int) -> None:
             self._writer.write_raw(topic, type_name, data, stamp)
-            self._count += 1
             if carried is not None:
                 message = typestore().deserialize_cdr(data, type_name)
                 self._writer.write(carried, transforms_of(message), stamp)
 
-        return on_message
+        def on_message(data: bytes) -> None:
+            self._count += 1
+            if not self.config.header_stamps:
+                write(data, self.get_clock().now().nanoseconds)
+                return
+            for waiting, stamp in self._clock.stamped(partial(write, data), header_stamp_ns(data) if is_frame else 0):
+                waiting(stamp)
 
-    @staticmethod
-    def _has_header(type_name: str) -> bool:
-        fields = typestore().fielddefs[type_name][1]
-        return bool(fields) and fields[0][0] == "header"
+        return on_message
 
 
 def main(args: list[str] | None = None) -> None:

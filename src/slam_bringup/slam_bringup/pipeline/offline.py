@@ -93,7 +93,10 @@ def run_bag(
         finally:
             mapping.stop()
         record = mapping.record(time.perf_counter() - start, dict(bag.left_out), failure)
-        record = record.with_front_ends({agent: pipeline.front_end() for agent, pipeline in pipelines.items()})
+        record = record.with_front_ends(
+            {agent: pipeline.front_end() for agent, pipeline in pipelines.items()},
+            {agent: pipeline.log.frames for agent, pipeline in pipelines.items()},
+        )
         with times.measure("dense model"):
             # Who wants the end now does not want to wait for the dense model.
             result = run_result(

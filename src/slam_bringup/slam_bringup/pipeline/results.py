@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
+from sjsam_node.global_map import GlobalMap
+from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_core.evaluation import Evaluation, evaluate
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
@@ -33,6 +35,12 @@ class AgentResult:
     feature_counts: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     front_end: FrontendReport = field(default_factory=FrontendReport)
     """What the images told."""
+    frames: tuple[LoggedFrame, ...] = ()
+    """Some of its pictures, with the features found in them."""
+    base_frame: str = "base_link"
+    """Frame of the rig."""
+    mounts: Mapping[str, FloatArray] = field(default_factory=dict)
+    """T_base_frame (4, 4) of the frames of its sensors."""
 
     def evaluation(self, trajectory: Trajectory | None = None) -> Evaluation | None:
         """A trajectory (by default the smoothed one) against ground truth, or None where the two do not meet."""
@@ -82,6 +90,7 @@ class RunResult:
     sensor_s: float
     wall_s: float
     stage_ms: Mapping[str, list[float]]
+    global_map: GlobalMap = field(default_factory=GlobalMap)
     events: tuple[str, ...] = ()
     solver: str = ""
     failure: str = ""

@@ -15,7 +15,9 @@ from sjsam_node.global_map import GlobalMap
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.dense_run import dense_model
+from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_bringup.pipeline.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
+from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
 from stereo_frontend.frontend import FrontendReport
@@ -41,7 +43,7 @@ class StateChanges:
 class AgentRecord:
     """What was said of one agent, frame by frame.
 
-    ``events`` are changes of its filter's state, ``front_end`` what its images told.
+    ``events`` are changes of its filter's state, ``front_end`` what its images told, ``frames`` some of its pictures.
     """
 
     filtered: Sequence[PoseEstimate] = field(default_factory=list)
@@ -49,6 +51,7 @@ class AgentRecord:
     feature_counts: Sequence[int] = field(default_factory=list)
     events: Sequence[str] = field(default_factory=list)
     front_end: FrontendReport = field(default_factory=FrontendReport)
+    frames: Sequence[LoggedFrame] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +71,15 @@ class RunRecord:
     solver: str = ""
     failure: str = ""
 
-    def with_front_ends(self, reports: Mapping[str, FrontendReport]) -> RunRecord:
-        """The same with what the agents' front ends report, by agent."""
-        agents = {agent: replace(record, front_end=reports[agent]) for agent, record in self.agents.items()}
-        return replace(self, agents=agents)
+    def with_front_ends(
+        self, reports: Mapping[str, FrontendReport], frames: Mapping[str, Sequence[LoggedFrame]] | None = None
+    ) -> RunRecord:
+        """The same with what the agents' front ends report, and some of their pictures, by agent."""
+        pictures = frames or {}
+        return replace(self, agents={
+            agent: replace(record, front_end=reports[agent], frames=pictures.get(agent, ()))
+            for agent, record in self.agents.items()
+        })  # fmt: skip
 
 
 def run_result(
@@ -108,6 +116,7 @@ def run_result(
         mapper=mapper,
         odometry=odometry,
         agents=agents,
+        global_map=record.global_map,
         landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings),
         dense=surface,
         floor_plans=plans,
@@ -141,7 +150,16 @@ def _agent_result(bag: SensorBag, agent: str, poses: Sequence[PoseEstimate], rec
         truth=bag.ground_truth(agent) or EMPTY_TRAJECTORY,
         feature_counts=np.array(record.feature_counts, dtype=np.int64),
         front_end=record.front_end,
+        frames=tuple(record.frames),
+        base_frame=bag.sensors[agent].base_frame,
+        mounts=_mounts(bag, agent),
     )
+
+
+def _mounts(bag: SensorBag, agent: str) -> dict[str, FloatArray]:
+    """T_base_frame of the agent's own frames; those of others hang together with it only through the map."""
+    sensors = bag.sensors[agent]
+    return sensors.frames.below(sensors.base_frame)
 
 
 def _events(agents: Mapping[str, AgentRecord]) -> list[str]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from ndt_registration.stage import Scan, ScanEstimate, ScanOdometryStage
 from slam_bringup.bags.readings import AgentSensors, DepthReading, ImuReading, Reading, StereoReading
 from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.frame_log import FrameLog
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.types import Features, ImuSample
 from stereo_frontend.frontend import FrontendReport
@@ -44,6 +45,8 @@ class SensorPipeline:
         self._times = times
         self._uses_stereo = mode != "tof"
         self._uses_depth = mode != "stereo" or odometry
+        self.log = FrameLog()
+        """Pictures with their features, for people to look at."""
         self._require(mode, sensors)
         self._stereo = stereo_stage(sensors)
         self._depth = depth_stage(config, sensors)
@@ -74,7 +77,9 @@ class SensorPipeline:
         if not isinstance(item.value, ExtractedFrame):
             return item
         with self._times.measure("features"):
-            return self._item(self._features.measure(item.value))
+            features = self._features.measure(item.value)
+        self.log.add(item.value, features)
+        return self._item(features)
 
     def front_end(self) -> FrontendReport:
         """What the front end found out about the images."""

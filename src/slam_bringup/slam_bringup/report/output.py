@@ -3,7 +3,7 @@
 
 ``summary.json``, ``trajectory.tum`` (map frame, rig poses), ``trajectory_covariance.csv``, ``landmarks.ply``,
 ``map.ply`` (dense points), ``mesh.ply`` and ``mesh.glb``, ``floor_plan.yaml`` and ``.pgm`` (Nav2), ``map/`` (loadable
-map), ``map.png``, ``report.html`` and ``result.mcap``. With several agents each has its
+map), ``map.png``, ``report.html``, ``result.mcap`` and ``foxglove_layout.json``. With several agents each has its
 own ``trajectory_<agent>.tum``; ``trajectory.tum`` is then the first one's.
 """
 
@@ -22,6 +22,7 @@ from dense_mapping.plan_io import write_plan
 from dense_mapping.surface_io import write_glb, write_mesh, write_points
 from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult, summarise
 from slam_bringup.report.figures import map_figure, save_png
+from slam_bringup.report.foxglove import write_layout
 from slam_bringup.report.report import write_report
 from slam_core.files import atomic_text
 from slam_core.point_cloud import write_ply
@@ -43,6 +44,8 @@ def write_results(out: Path, result: RunResult, save_map: Callable[[Path], objec
     write_mesh(out / "mesh.ply", result.dense)
     write_glb(out / "mesh.glb", result.dense)
     _write_plans(out, result.floor_plans)
+    if (out / "result.mcap").is_file():
+        write_layout(out / "foxglove_layout.json", out / "result.mcap")
     if save_map is not None:
         save_map(out / "map")
     summary = summarise(result)
