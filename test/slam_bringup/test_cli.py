@@ -4,14 +4,22 @@
 from __future__ import annotations
 
 import importlib
+import logging
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import click
 import pytest
 from click.testing import CliRunner
 
 from slam_bringup.cli import COMMANDS, VERSION, slam
+from slam_bringup.commands.console import progress_bar, show
 
+COMMAND = [sys.executable, "-m", "slam_bringup.cli"]
 SOURCES = Path(__file__).resolve().parents[2] / "src"
 
 
@@ -19,6 +27,47 @@ def test_the_version_is_that_of_the_packages() -> None:
     assert VERSION in CliRunner().invoke(slam, ["--version"]).output
     for package in SOURCES.glob("*/package.xml"):
         assert re.search(r"<version>(.*)</version>", package.read_text())[1] == VERSION, package
+
+
+def test_the_shell_completes_commands_and_options() -> None:
+    """As a shell asks, once ``eval "$(_SLAM_COMPLETE=bash_source slam)"`` has been said."""
+
+    def asked(words: str) -> list[str]:
+        place = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" ")), "_SLAM_COMPLETE": "bash_complete"}
+        done = subprocess.run(COMMAND, env=os.environ | place, capture_output=True, text=True, check=False)
+        return [line.partition(",")[2] for line in done.stdout.splitlines()]
+
+    assert asked("slam re") == ["record", "register"]
+    assert "--localize-only" in asked("slam run --l")
+    source = subprocess.run(
+        COMMAND, env=os.environ | {"_SLAM_COMPLETE": "bash_source"}, capture_output=True, text=True, check=False
+    )
+    assert "complete" in source.stdout
+
+
+@click.command()
+def talkative() -> None:
+    logging.getLogger("slam_bringup.x").debug("everything")
+    logging.getLogger("slam_bringup.x").info("more")
+    logging.getLogger("numba.core").error("noise")
+    with progress_bar() as bar:
+        bar.add_task("bar", total=2)
+    show("table")
+    logging.getLogger("slam_bringup.x").error("error")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [([], [], "table error"), (["-q"], [], "error"), ([], ["-q"], "error"), ([], ["-v"], "more table error"),
+     (["-vv"], [], "everything more table error")],
+)  # fmt: skip
+def test_how_much_is_said_is_chosen_before_or_behind_the_command(before, after, said, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "slam_bringup.commands.talkative", SimpleNamespace(command=talkative))
+    monkeypatch.setitem(COMMANDS, "talkative", "says something")
+    result = CliRunner().invoke(slam, [*before, "talkative", *after], catch_exceptions=False)
+    words = [w for w in result.output.split() if w in ("everything", "more", "noise", "table", "error")]
+    assert sorted(words) == sorted(said.split())
+    assert not [h for h in logging.getLogger().handlers if type(h) is logging.StreamHandler], "it ends with the command"
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -10,14 +10,13 @@ import sys
 import click
 
 import slam_core.process_life  # noqa: F401  # its clock starts with the program
+from slam_bringup.commands.console import log_to_terminal, with_verbosity
+from slam_bringup.version import VERSION
 
 # The stages of a run have threads of their own: BLAS threads beside them only wait for each other, spinning. NumPy and
 # SciPy read this when they are loaded, here and in the nodes that are started from here. One number of threads also
 # means one order of summation, hence the same bytes.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-VERSION = "0.2.0"
-"""That of the packages, see package.xml."""
 
 COMMANDS = {
     "run": "offline pipeline: a bag to a map and a trajectory",
@@ -47,8 +46,7 @@ class _LazyGroup(click.Group):
         if cmd_name not in COMMANDS:
             return None
         module = importlib.import_module(f"slam_bringup.commands.{cmd_name}")
-        command: click.Command = module.command
-        return command
+        return with_verbosity(module.command)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -57,8 +55,13 @@ class _LazyGroup(click.Group):
 
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(VERSION, prog_name="slam")
-def slam() -> None:
+@click.pass_context
+def slam(context: click.Context) -> None:
     """Map indoor areas with a stereo camera and a time-of-flight camera."""
+    log_to_terminal(context)
+
+
+with_verbosity(slam)
 
 
 def main() -> None:

@@ -42,6 +42,23 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path, storage: str) -> No
         assert file.read_bytes() == (second / file.name).read_bytes()
 
 
+def test_bags_are_compressed_as_mcap_has_it_unless_told_otherwise(tmp_path: Path) -> None:
+    sizes = {}
+    for compression in ("zstd", "none"):
+        with BagWriter(tmp_path / compression, compression=compression) as bag:
+            for i in range(30):
+                image = np.full((200, 300), i, np.uint8)
+                bag.write("/image", image_message(TYPES, header_message(TYPES, 10 + i, "camera"), image), 10 + i)
+        file = next((tmp_path / compression).glob("*.mcap"))
+        sizes[compression] = file.stat().st_size
+        assert (b"zstd" in file.read_bytes()) == (compression == "zstd")
+        with BagReader(tmp_path / compression) as bag:
+            assert [int(m.message.data[-1]) for m in bag.messages()] == list(range(30))
+    assert sizes["zstd"] < 0.1 * sizes["none"]
+    with pytest.raises(ValueError, match="zstd or none"):
+        BagWriter(tmp_path / "x", compression="lz4")
+
+
 def fail_while_writing(path: Path) -> None:
     with BagWriter(path) as bag:
         bag.write("/tf_static", TYPES.TFMessage(transforms=[]), 1)

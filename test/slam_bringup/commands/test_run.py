@@ -42,6 +42,16 @@ def test_the_same_bag_gives_the_same_bytes(outputs):
 
 
 @pytest.mark.slow
+def test_the_log_says_what_was_done_and_the_summary_which_sensors_were_used(outputs):
+    log = (outputs[0] / "logs" / "slam.log").read_text()
+    assert log.startswith("slam 0.")
+    assert "submap 0 of the rig: joined" in log
+    assert "ATE" in log, "the table that the run ends with"
+    sensors = json.loads((outputs[0] / "summary.json").read_text())["sensors"]
+    assert sensors == {"": ["stereo camera", "ToF camera for the dense model alone"]}
+
+
+@pytest.mark.slow
 def test_the_demo_is_mapped_to_centimetres(outputs):
     summary = json.loads((outputs[0] / "summary.json").read_text())
     assert summary["frames"] == 52

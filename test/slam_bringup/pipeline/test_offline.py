@@ -9,8 +9,13 @@ from pathlib import Path
 import pytest
 import yaml
 
+from slam_bringup.bags.readings import AgentSensors
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import _ahead, run_bag
+from slam_bringup.pipeline.run_record import StateChanges
+from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
+from slam_bringup.pipeline.stage_times import StageTimes
+from slam_core.frame_tree import FrameTree
 
 DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
 
@@ -68,6 +73,27 @@ def test_whoever_stops_early_stops_every_stage():
         time.sleep(0.01)
     assert source.closed
     assert threading.active_count() == before
+
+
+def test_changes_of_state_are_told_with_the_time_since_the_start():
+    changes = StateChanges()
+    changes.add(0, "OK", "")  # of a node that has not seen a frame
+    for k, state in enumerate(["OK", "OK", "LOST", "LOST", "OK", "OK", "OK", "OK"]):
+        changes.add(1403715273 * 10**9 + k * 10**8, state, "too few features" if state == "LOST" else "")
+    assert changes.events == ["0.2 s: LOST, too few features", "0.4 s: OK"]
+    assert changes.lost_share == 0.25
+
+
+@pytest.mark.parametrize(
+    ("mode", "odometry", "hint"),
+    [("stereo", "ndt", "leave --odometry out"), ("fuse", "ndt", "--mode stereo without --odometry"),
+     ("fuse", "none", "try --mode stereo")],
+)  # fmt: skip
+def test_who_lacks_a_tof_camera_is_told_what_would_do(mode, odometry, hint):
+    sensors = AgentSensors("", None, None, None, "depth", FrameTree(), topics={"left": "/l", "right": "/r"})
+    config = choose(load_system_config(None), mode, "sjsam", odometry)
+    with pytest.raises(ValueError, match=hint):
+        SensorPipeline(config, sensors, odometry != "none", StageTimes())
 
 
 def test_a_run_that_is_told_to_stop_keeps_what_it_has():

@@ -27,7 +27,7 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, ReaderError, StoragePlugin, Writer
 
 from slam_bringup.bags.bag_owner import OWNER, require_free
 from slam_bringup.bags.bag_salvage import is_whole_mcap, salvage_mcap
@@ -39,6 +39,8 @@ from slam_core.output_folder import free_name
 
 LATCHED_TOPICS = ("tf_static", "static_transforms", "robot_description")
 """Last parts of topics that are transient-local wherever they stand."""
+
+COMPRESSIONS = ("zstd", "none")
 
 _FOREVER = QosTime(2147483647, 4294967295)
 _STORAGE_SUFFIXES = (".mcap", ".db3")
@@ -92,6 +94,8 @@ class BagWriter:
         "mcap" or "sqlite3".
     overwrite
         Whether a bag of ours that is there is replaced; anything else never is.
+    compression
+        "zstd", which every reader of mcap knows, or "none"; sqlite3 is never compressed.
 
     Raises
     ------
@@ -99,9 +103,12 @@ class BagWriter:
         If there is something at ``path`` that must not be replaced.
     """
 
-    def __init__(self, path: Path, storage: str = "mcap", *, overwrite: bool = True) -> None:
+    def __init__(self, path: Path, storage: str = "mcap", *, overwrite: bool = True, compression: str = "zstd") -> None:
         if storage not in ("mcap", "sqlite3"):
             raise ValueError(f"bag storage must be mcap or sqlite3, got '{storage}'")
+        if compression not in COMPRESSIONS:
+            raise ValueError(f"bag compression must be {' or '.join(COMPRESSIONS)}, got '{compression}'")
+        self._is_compressed = compression == "zstd" and storage == "mcap"
         self.path = Path(path)
         self._single_file = self.path.suffix == ".mcap"
         if self._single_file and storage != "mcap":
@@ -117,6 +124,8 @@ class BagWriter:
         name = self.path.stem if self._single_file else self.path.name
         self._writer = Writer(self._workshop / name, version=9, storage_plugin=self._storage)
         self._writer.set_custom_data(*OWNER)
+        if self._is_compressed:
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._writer.open()
         return self
 

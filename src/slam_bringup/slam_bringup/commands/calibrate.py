@@ -10,9 +10,8 @@ from pathlib import Path
 import click
 import numpy as np
 import yaml
-from rich.console import Console
-from rich.progress import Progress
 
+from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.commands.refine import refine, write_refined
 from slam_bringup.report.figures import save_png
@@ -113,7 +112,7 @@ def _lenses(model: str, cameras: int) -> list[str]:
 
 
 def _find(board: Board, files: list[list[Path]]) -> BoardViews:
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    with progress_bar() as bar:
         task = bar.add_task("finding the board", total=sum(len(view) for view in files))
         return find_views(board, files, lambda: bar.advance(task))
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import click
-from rich.progress import track
 
-from slam_bringup.bags.bag import BagWriter
+from slam_bringup.bags.bag import COMPRESSIONS, BagWriter
 from slam_bringup.bags.bag_owner import require_free
 from slam_bringup.bags.sensor_writer import SensorWriter
+from slam_bringup.commands.console import is_quiet, progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.datasets.euroc import EurocDataset
 from slam_bringup.datasets.files import Dataset
@@ -25,11 +25,13 @@ DATASETS: dict[str, Callable[[Path, Path | None, Path | None], Dataset]] = {
 }
 
 
-def convert(dataset: Dataset, target: Path, storage: str = "mcap", *, overwrite: bool = False) -> int:
+def convert(
+    dataset: Dataset, target: Path, storage: str = "mcap", *, overwrite: bool = False, compression: str = "zstd"
+) -> int:
     """Write a data set to a bag; returns the number of frames."""
-    with BagWriter(target, storage, overwrite=overwrite) as bag:
+    with BagWriter(target, storage, overwrite=overwrite, compression=compression) as bag, progress_bar() as progress:
         frames = dataset.write(SensorWriter(bag))
-        for _ in track(frames, description=f"writing {target.name}", total=len(dataset), transient=True):
+        for _ in progress.track(frames, description=f"writing {target.name}", total=len(dataset)):
             pass
     return len(dataset)
 
@@ -41,10 +43,11 @@ def convert(dataset: Dataset, target: Path, storage: str = "mcap", *, overwrite:
 @click.option("--calibration", type=UserPath(), help="calibration, where the source has none")
 @click.option("--ground-truth", type=UserPath(), help="poses, where the source has none")
 @click.option("--storage", type=click.Choice(["mcap", "sqlite3"]), default="mcap", show_default=True)
+@click.option("--compression", type=click.Choice(COMPRESSIONS), default="zstd", show_default=True, help="of mcap")
 @overwrite_option("a bag that slam wrote")
 def command(
     kind: str, source: Path, output: Path, calibration: Path | None, ground_truth: Path | None, storage: str,
-    overwrite: bool,
+    compression: str, overwrite: bool,
 ) -> None:  # fmt: skip
     """Convert a public data set to a bag, and say what of it is left out.
 
@@ -53,7 +56,9 @@ def command(
     """
     require_free(output, overwrite=overwrite)
     dataset = DATASETS[kind](source, calibration, ground_truth)
-    frames = convert(dataset, output, storage, overwrite=overwrite)
+    frames = convert(dataset, output, storage, overwrite=overwrite, compression=compression)
+    if is_quiet():
+        return
     click.echo(f"{output}: {frames} frames")
     for reason, count in dataset.left_out.items():
         if count:

@@ -11,7 +11,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from slam_bringup.commands.mapping_options import progress_bar
+from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.experiments.catalogue import EXPERIMENTS, chosen
 from slam_bringup.experiments.findings import as_json

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.progress import Progress
 
 from sjsam_node.linear_slam.text_joining import ROWS, TextJoiningConfig, TextJoiningResult, join_text_maps
 from sjsam_node.linear_slam.text_maps import TextMap, find_maps, read_maps, write_values
 from sjsam_node.smoothing.robust import LOSSES
+from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.config import from_mapping
 from slam_core.files import atomic_text
@@ -42,7 +42,7 @@ def command(
     began = time.perf_counter()
     maps, dimension = read_maps(find_maps(folder))
     with results:
-        with Progress(transient=True) as bar:
+        with progress_bar() as bar:
             task = bar.add_task("joining", total=len(maps))
             result = join_text_maps(
                 maps, dimension, config, lambda done, total: bar.update(task, completed=done, total=total)

@@ -8,8 +8,6 @@ from functools import reduce
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import ROLES
@@ -63,13 +61,12 @@ def require_map(result: RunResult) -> None:
     losses = "; ".join((*(f"{count} x {reason}" for reason, count in result.dropped.items()), *result.events))
     if result.frames == 0:
         raise ValueError(f"not one frame of {result.bag} could be used: {losses or 'it has none'}")
-    raise ValueError(
-        f"nothing of {result.bag} was mapped in {result.frames} frames: {losses or 'too short'}. Are left and right "
-        "swapped, do the camera infos belong to these cameras?"
+    question = (
+        "Is the depth in metres where it is floating point, and in millimetres where it is 16 bit?"
+        if result.mode == "tof"
+        else "Are left and right swapped, do the camera infos belong to these cameras?"
     )
-
-
-def progress_bar() -> Progress:
-    """On standard error, so that standard output holds the result alone."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=Console(stderr=True))
+    raise ValueError(
+        f"nothing of {result.bag} was mapped in {result.frames} frames: {losses or 'too short'}. {question} "
+        "slam doctor looks at the recording"
+    )

@@ -8,14 +8,13 @@ import sys
 from pathlib import Path
 
 import click
-from rich.console import Console
 
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, parse_topics
+from slam_bringup.commands.console import LOG_NAME, Transcript, progress_bar, show
 from slam_bringup.commands.mapping_options import (
     mapping_options,
     mode_for,
-    progress_bar,
     require_map,
 )
 from slam_bringup.doctor.examination import require_stereo
@@ -26,7 +25,8 @@ from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.recorded_run import collect
 from slam_bringup.report.output import write_results
 from slam_bringup.report.summary_table import summary_table
-from slam_core.output_folder import OutputFolder
+from slam_bringup.version import VERSION
+from slam_core.output_folder import LOGS, OutputFolder
 
 _PAGE_PORT = 8080
 """Port of the page, where it is free."""
@@ -51,7 +51,8 @@ def command(
     if mode != "tof":
         require_stereo(bag, names)
     port = _page(view)
-    with OutputFolder(output, "nodes", bag, overwrite=overwrite) as results, results.staged() as folder:
+    transcript, results = Transcript(VERSION), OutputFolder(output, "nodes", bag, overwrite=overwrite)
+    with transcript, results, results.staged() as folder:
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"nodes mapping {bag.name}", total=frames)
             run = run_nodes(
@@ -62,7 +63,8 @@ def command(
         result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)
         require_map(result)
         summary = write_results(folder, result)
-    Console().print(summary_table(summary, output))
+        transcript.write(folder / LOGS / LOG_NAME, summary_table(summary, output))
+    show(summary_table(summary, output))
     if run.stopped:
         sys.exit(INTERRUPTED)
 

@@ -12,10 +12,10 @@ from rich.console import Console
 
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, parse_topics
+from slam_bringup.commands.console import LOG_NAME, Transcript, is_quiet, progress_bar, show
 from slam_bringup.commands.mapping_options import (
     mapping_options,
     mode_for,
-    progress_bar,
     require_map,
 )
 from slam_bringup.commands.paths import UserPath
@@ -27,7 +27,8 @@ from slam_bringup.processes.interrupt import INTERRUPTED, STOPPED, Interrupt
 from slam_bringup.report.output import write_results
 from slam_bringup.report.result_bag import write_result_bag
 from slam_bringup.report.summary_table import summary_table
-from slam_core.output_folder import OutputFolder
+from slam_bringup.version import VERSION
+from slam_core.output_folder import LOGS, OutputFolder
 
 FAILED = 1
 """Exit code of a run that an error has ended; its results are written."""
@@ -61,7 +62,7 @@ def command(
     growth = map_growth(system.sjsam, old_map, localize_only=localize_only)
     if mode != "tof":
         require_stereo(bag, names)
-    with OutputFolder(output, "run", bag, overwrite=overwrite) as results:
+    with OutputFolder(output, "run", bag, overwrite=overwrite) as results, Transcript(VERSION) as transcript:
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"mapping {bag.name}", total=2 * readings)
             result, growth = run_bag(
@@ -71,10 +72,11 @@ def command(
         require_map(result)
         if interrupt.asked:
             result = replace(result, events=(STOPPED, *result.events))
-        with results.staged() as folder, Console(stderr=True).status(f"writing {output}"):
+        with results.staged() as folder, Console(stderr=True, quiet=is_quiet()).status(f"writing {output}"):
             write_result_bag(folder / "result.mcap", result)
             summary = write_results(folder, result, growth.save)
-    Console().print(summary_table(summary, output))
+            transcript.write(folder / LOGS / LOG_NAME, summary_table(summary, output))
+    show(summary_table(summary, output))
     if result.failure:
         click.echo(f"slam: {result.failure}; {output} holds what was mapped until then", err=True)
         sys.exit(FAILED)

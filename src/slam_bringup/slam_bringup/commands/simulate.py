@@ -15,7 +15,6 @@ from pathlib import Path
 import click
 import cv2
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from slam_bringup.bags.bag import BagWriter
 from slam_bringup.bags.bag_owner import require_free
@@ -28,6 +27,7 @@ from slam_bringup.bags.sensor_writer import (
     WORLD_FRAME,
     SensorWriter,
 )
+from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.camera import CameraInfo
 from slam_core.geometry import FloatArray
@@ -96,14 +96,7 @@ def command(
     if frames is not None:
         plan = plan.shortened(frames)
     options = BagOptions(images, compact, truth, rectified, storage, every, overwrite)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns) as progress:
+    with progress_bar() as progress:
         task = progress.add_task(f"rendering {plan.name}", total=-(-plan.frames // every) * len(plan.agents))
         write_bag(plan, output, options, threads, lambda: progress.advance(task))
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -12,6 +13,8 @@ from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.localization import Localizer
 from slam_core.geometry import compose_covariance
 from slam_core.types import PoseEstimate, Submap
+
+_LOG = logging.getLogger(__name__)
 
 
 class MapGrowth(Protocol):
@@ -82,6 +85,10 @@ class Joining:
     def add(self, submap: Submap) -> None:
         """Join one submap."""
         report = self.global_map.add(submap)
+        _LOG.info(
+            "submap %d of %s: %s, %d landmarks known, %d new, closures %s", submap.index, submap.agent or "the rig",
+            report.reason or "joined", report.matched, report.new_landmarks, list(report.closures),
+        )  # fmt: skip
         self.closures += len(report.closures)
         self.solver = report.solver or self.solver
 
@@ -130,6 +137,8 @@ class Locating:
         """Locate one submap and all poses inside it."""
         localizer = self._localizers.setdefault(submap.agent, Localizer(self.global_map))
         found = localizer.process(submap)
+        known = "not recognised" if found.start is None else f"{found.matched} landmarks recognised"
+        _LOG.info("submap %d of %s: %s", submap.index, submap.agent or "the rig", known)
         self._taken += 1
         self.closures += found.matched > 0
         if found.start is None:

@@ -131,4 +131,5 @@ def _agent_record(frames: list[FrameResult], scans: list[PoseEstimate]) -> Agent
     changes = StateChanges()
     for e in estimates:
         changes.add(e.stamp_ns, e.state.value, e.reason)
-    return AgentRecord([e.pose for e in estimates], scans, [frame.features for frame in frames], changes.events)
+    counts = [frame.features for frame in frames]
+    return AgentRecord([e.pose for e in estimates], scans, counts, changes.events, changes.lost_share)

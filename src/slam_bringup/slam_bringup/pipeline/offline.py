@@ -10,6 +10,7 @@ does not depend on that.
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
@@ -32,6 +33,7 @@ from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.types import ImuSample
 
+_LOG = logging.getLogger(__name__)
 T = TypeVar("T")
 _AHEAD = 8
 """Images, or what became of them, that a stage may be ahead of the next."""
@@ -74,6 +76,7 @@ def run_bag(
 
     An error after the first frames ends the run early: the result holds what was mapped, and names it as ``failure``.
     """
+    _LOG.info("%s: mode %s, mapper %s, odometry %s", path, config.feature_extractor.mode, mapper, odometry)
     cv2.setNumThreads(1)  # every stage has a thread; OpenCV's own would only wait beside them, spinning
     times = StageTimes()
     start = time.perf_counter()
@@ -97,6 +100,7 @@ def run_bag(
             {agent: pipeline.front_end() for agent, pipeline in pipelines.items()},
             {agent: pipeline.log.frames for agent, pipeline in pipelines.items()},
         )
+        _LOG.info("mapped %d submaps in %.1f s; the dense model is next", record.submaps, record.wall_s)
         with times.measure("dense model"):
             # Who wants the end now does not want to wait for the dense model.
             result = run_result(

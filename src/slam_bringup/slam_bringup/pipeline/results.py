@@ -35,6 +35,10 @@ class AgentResult:
     feature_counts: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     front_end: FrontendReport = field(default_factory=FrontendReport)
     """What the images told."""
+    lost_share: float = 0.0
+    """Share of its frames at which it was lost."""
+    sensors: tuple[str, ...] = ()
+    """What its map is made of, in words."""
     frames: tuple[LoggedFrame, ...] = ()
     """Some of its pictures, with the features found in them."""
     base_frame: str = "base_link"
@@ -105,6 +109,8 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "mapper": result.mapper,
         "odometry": result.odometry,
         "frames": result.frames,
+        "sensors": {agent.name: list(agent.sensors) for agent in result.agents},
+        "lost_share": {agent.name: agent.lost_share for agent in result.agents},
         "dropped": int(sum(result.dropped.values())),
         "dropped_by_reason": dict(result.dropped),
         "rejections": dict(result.rejections),

@@ -26,16 +26,36 @@ _LOG = logging.getLogger(__name__)
 
 
 class StateChanges:
-    """The changes of a filter's state as lines of text."""
+    """The changes of a filter's state as lines of text, with the time since its first frame.
+
+    Attributes
+    ----------
+    events
+        The lines.
+    lost_share
+        Share of the states heard that were LOST.
+    """
 
     def __init__(self) -> None:
         self.events: list[str] = []
         self._state = "OK"
+        self._first_ns = 0
+        self._heard = self._lost = 0
+
+    @property
+    def lost_share(self) -> float:
+        """Share of the states heard that were LOST, 0 to 1."""
+        return self._lost / max(self._heard, 1)
 
     def add(self, stamp_ns: int, state: str, reason: str) -> None:
-        """Take the state after the frame of a stamp."""
+        """Take the state after the frame of a stamp; 0: before the first frame."""
+        if not stamp_ns:
+            return
+        self._first_ns = self._first_ns or stamp_ns
+        self._heard += 1
+        self._lost += state == "LOST"
         if state != self._state:
-            self.events.append(f"{stamp_ns / 1e9:.3f} s, {state}{f': {reason}' if reason else ''}")
+            self.events.append(f"{(stamp_ns - self._first_ns) / 1e9:.1f} s: {state}{f', {reason}' if reason else ''}")
         self._state = state
 
 
@@ -43,13 +63,15 @@ class StateChanges:
 class AgentRecord:
     """What was said of one agent, frame by frame.
 
-    ``events`` are changes of its filter's state, ``front_end`` what its images told, ``frames`` some of its pictures.
+    ``events`` are changes of its filter's state, ``lost_share`` how much of the time it was lost, ``front_end`` what
+    its images told, ``frames`` some of its pictures.
     """
 
     filtered: Sequence[PoseEstimate] = field(default_factory=list)
     scans: Sequence[PoseEstimate] = field(default_factory=list)
     feature_counts: Sequence[int] = field(default_factory=list)
     events: Sequence[str] = field(default_factory=list)
+    lost_share: float = 0.0
     front_end: FrontendReport = field(default_factory=FrontendReport)
     frames: Sequence[LoggedFrame] = ()
 
@@ -97,7 +119,7 @@ def run_result(
     ``on_reading`` is called after every reading that the dense model has seen, for a progress bar.
     """
     agents = tuple(
-        _agent_result(bag, agent, record.trajectories.get(agent, []), of_agent)
+        _agent_result(bag, config, agent, odometry, record.trajectories.get(agent, []), of_agent)
         for agent, of_agent in record.agents.items()
     )
     surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
@@ -110,6 +132,9 @@ def run_result(
         failure = failure or told(error, "no dense model was made")
     landmarks = record.global_map.landmarks()
     stamps = [agent.filtered.stamps_ns for agent in agents if len(agent.filtered)]
+    events = (*(failure,) * bool(failure), *bag.warnings, *record.events, *_events(record.agents))
+    for event in events:
+        _LOG.info("%s", event)
     return RunResult(
         bag=bag.reader.path.name,
         mode=config.feature_extractor.mode,
@@ -128,7 +153,7 @@ def run_result(
         sensor_s=max((s[-1] - s[0]) / 1e9 for s in stamps) if stamps else 0.0,
         wall_s=record.wall_s,
         stage_ms=record.stage_ms,
-        events=(*(failure,) * bool(failure), *bag.warnings, *record.events, *_events(record.agents)),
+        events=events,
         solver=record.solver,
         failure=failure,
     )
@@ -141,7 +166,9 @@ def told(error: Exception, consequence: str) -> str:
     return f"{consequence}: {kind}{error}"
 
 
-def _agent_result(bag: SensorBag, agent: str, poses: Sequence[PoseEstimate], record: AgentRecord) -> AgentResult:
+def _agent_result(
+    bag: SensorBag, config: SystemConfig, agent: str, odometry: str, poses: Sequence[PoseEstimate], record: AgentRecord
+) -> AgentResult:
     return AgentResult(
         name=agent,
         trajectory=Trajectory.from_estimates(poses),
@@ -150,10 +177,24 @@ def _agent_result(bag: SensorBag, agent: str, poses: Sequence[PoseEstimate], rec
         truth=bag.ground_truth(agent) or EMPTY_TRAJECTORY,
         feature_counts=np.array(record.feature_counts, dtype=np.int64),
         front_end=record.front_end,
+        lost_share=record.lost_share,
+        sensors=_sensors(bag, config, agent, odometry),
         frames=tuple(record.frames),
         base_frame=bag.sensors[agent].base_frame,
         mounts=_mounts(bag, agent),
     )
+
+
+def _sensors(bag: SensorBag, config: SystemConfig, agent: str, odometry: str) -> tuple[str, ...]:
+    """The sensors that the agent's map is made of, in words."""
+    mode, dense, topics = config.feature_extractor.mode, config.dense_mapper, bag.sensors[agent].topics
+    depth = "ToF camera" if bag.sensors[agent].measurement == "range" else "depth camera"
+    used = ["stereo camera"] * (mode != "tof") + [depth] * (mode != "stereo" or odometry != "none")
+    used += ["IMU"] * (config.ekf_slam.motion.imu != "off" and bag.count(agent, "imu") > 0)
+    for name, wanted, role in (("stereo camera", dense.use_stereo, "right"), (depth, dense.use_tof, "depth")):
+        if wanted and role in topics and name not in used:
+            used.append(f"{name} for the dense model alone")
+    return tuple(used)
 
 
 def _mounts(bag: SensorBag, agent: str) -> dict[str, FloatArray]:

@@ -47,7 +47,7 @@ class SensorPipeline:
         self._uses_depth = mode != "stereo" or odometry
         self.log = FrameLog()
         """Pictures with their features, for people to look at."""
-        self._require(mode, sensors)
+        self._require(mode, sensors, odometry)
         self._stereo = stereo_stage(sensors)
         self._depth = depth_stage(config, sensors)
         self._features = FeatureStage(config.feature_extractor, sensors.frames)
@@ -116,12 +116,15 @@ class SensorPipeline:
     def _item(self, value: ExtractedFrame | Features | ScanEstimate | ImuSample) -> AgentItem:
         return AgentItem(self._agent, value)
 
-    def _require(self, mode: str, sensors: AgentSensors) -> None:
+    def _require(self, mode: str, sensors: AgentSensors, odometry: bool) -> None:
         who = f"agent '{sensors.agent}'" if sensors.agent else "the bag"
         if self._uses_stereo and not {"left", "right"} <= sensors.topics.keys():
             raise ValueError(f"mode '{mode}' needs stereo images, and {who} has none: try --mode tof")
         if self._uses_depth and "depth" not in sensors.topics:
-            raise ValueError(f"mode '{mode}' or scan odometry needs ToF images, and {who} has none: try --mode stereo")
+            if mode == "stereo":
+                raise ValueError(f"scan odometry needs ToF images, and {who} has none: leave --odometry out")
+            hint = "--mode stereo without --odometry" if odometry else "--mode stereo"
+            raise ValueError(f"mode '{mode}' needs ToF images, and {who} has none: try {hint}")
 
 
 def stereo_stage(sensors: AgentSensors) -> StereoStage:

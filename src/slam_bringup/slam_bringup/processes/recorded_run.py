@@ -54,6 +54,7 @@ class Recording:
             scans=self._odometry[_topic(agent, "ndt/odometry")],
             feature_counts=self._feature_counts[_topic(agent, "features")],
             events=self._states[_topic(agent, "ekf_slam")].events,
+            lost_share=self._states[_topic(agent, "ekf_slam")].lost_share,
         )
 
     def _add_latency(self, node: str, values: dict[str, str]) -> None:

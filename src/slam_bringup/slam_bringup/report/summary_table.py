@@ -16,6 +16,9 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
     table = Table(title=f"{summary['bag']} ({summary['mode']}, {summary['mapper']})", show_header=False)
     table.add_column(style="bold")
     table.add_column()
+    for name, sensors in summary["sensors"].items():
+        if sensors:
+            table.add_row(f"sensors {name}".strip(), ", ".join(sensors))
     table.add_row("frames", f"{summary['frames']}, {_lost(summary)}")
     for reason, count in summary["dropped_by_reason"].items():
         table.add_row("dropped", f"{count} x {reason}")
@@ -43,9 +46,14 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
 
 
 def _lost(summary: dict[str, Any]) -> str:
-    """The share of what came that was not used."""
+    """The share of what came that was not used, and of the frames at which an agent was lost."""
     dropped = summary["dropped"]
-    return f"lost {dropped / max(dropped + summary['frames'], 1):.0%} of the messages" if dropped else "none dropped"
+    unused = f"{dropped / max(dropped + summary['frames'], 1):.0%} of the messages not used" if dropped else ""
+    lost = [
+        f"{name} lost {share:.0%} of the frames".strip()
+        for name, share in summary["lost_share"].items() if share > 0.0
+    ]  # fmt: skip
+    return ", ".join(filter(None, [unused, *lost])) or "none dropped"
 
 
 def _accuracy(part: dict[str, Any]) -> str:
