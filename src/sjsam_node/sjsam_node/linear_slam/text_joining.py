@@ -48,15 +48,19 @@ class TextJoiningConfig(Config):
 class TextJoiningResult:
     """The joined map in the frame of the first map's reference pose, and how it came about.
 
-    dropped: poses and features of single maps that a robust loss left out; chi2 is then that of the others.
+    dropped: poses and features of single maps that a robust loss left out; chi2 is then that of the others. Covariances
+    (P, 3 | 6, 3 | 6) of the poses and (F, 2 | 3, 2 | 3) of the features, in the frame of the map: position, then turn
+    about its axes. The first pose has none: it is the frame.
     """
 
     chi2: float
     start_chi2: float
     pose_ids: IntArray
     poses: FloatArray
+    pose_covariances: FloatArray
     feature_ids: IntArray
     features: FloatArray
+    feature_covariances: FloatArray
     solver: str
     iterations: int
     converged: bool
@@ -78,9 +82,11 @@ def join_text_maps(
     index = TextIndex.of(maps, dimension)
     joiner = TextJoiner(index, config)
     best, optimum = joiner.best(progress)
+    of_poses, of_features = joiner.covariances(best)
     return TextJoiningResult(
-        optimum.cost, joiner.start_cost, index.pose_ids, _pose_values(best), index.feature_ids, best.landmarks,
-        joiner.solver, optimum.iterations, optimum.converged, joiner.start, joiner.dropped,
+        optimum.cost, joiner.start_cost, index.pose_ids, _pose_values(best), of_poses, index.feature_ids,
+        best.landmarks, of_features, joiner.solver, optimum.iterations, optimum.converged, joiner.start,
+        joiner.dropped,
     )  # fmt: skip
 
 
@@ -166,6 +172,18 @@ class TextJoiner:
             if agree:
                 break
         return (state, result) if self.config.robust.loss == "none" else self._robust(state)
+
+    def covariances(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Marginal covariances of every pose and every feature at the optimum."""
+        fixed = np.array([0])
+        problem = JoiningProblem(flatten(self.maps), state, fixed, self.model, self.config.solver)
+        marginals = problem.marginals(state)
+        size, d = state.model_dimensions
+        poses = np.zeros((len(state.translations), size, size))
+        for k in range(1, len(poses)):
+            poses[k] = marginals.covariance([k])
+        features = np.arange(len(state.landmarks))
+        return poses, marginals.landmark_blocks(features) if len(features) else np.empty((0, d, d))
 
     def _robust(self, state: State) -> tuple[State, LeastSquaresResult]:
         """Without the closing rows that the others contradict."""

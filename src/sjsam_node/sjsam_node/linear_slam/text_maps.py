@@ -5,7 +5,8 @@ A file ``localmap_<k>.txt`` holds: ``Ref``, the id of the pose whose frame the m
 N x N information matrix. The values of one id stand together: a pose is x y phi in 2D and x y z yaw pitch roll in 3D
 (so that the rotation to the reference frame is ``Rz(yaw) Ry(pitch) Rx(roll)``), a feature x y or x y z. Ids of
 features are positive; poses count down from 0 in sets with features and up in pose graphs, so that a pose and a
-feature may share a number. Where poses count down, ``Ref`` is written without its sign.
+feature may share a number. Where poses count down, ``Ref`` is written without its sign. An id may stand twice in one
+map, where a pose came in by two ways: the two are one unknown, and their joint information says what it is.
 """
 
 from __future__ import annotations
@@ -53,7 +54,9 @@ def find_maps(folder: Path) -> list[Path]:
 
 
 def read_maps(paths: Iterable[Path]) -> tuple[list[TextMap], int]:
-    """All maps and their dimension, 2 or 3; the dimension is 3 where any id has six values.
+    """All maps and their dimension, 2 or 3: 3 where an id of most maps has six values, as every 3D pose has.
+
+    In single maps of a 2D set six values are a pose that stands there twice.
 
     Raises
     ------
@@ -61,7 +64,7 @@ def read_maps(paths: Iterable[Path]) -> tuple[list[TextMap], int]:
         With the file's name, for one that is not of this format.
     """
     raw = [(path, *_read(path)) for path in paths]
-    dimension = 3 if any(np.any(sizes == 6) for _, _, _, sizes, _, _ in raw) else 2
+    dimension = 3 if 2 * sum(bool(np.any(sizes == 6)) for _, _, _, sizes, _, _ in raw) > len(raw) else 2
     maps = [_interpret(dimension, *item) for item in raw]
     if any(np.any(m.pose_ids < 0) for m in maps):
         maps = [replace(m, reference=-abs(m.reference)) for m in maps]
@@ -97,9 +100,6 @@ def _check_ids(path: Path, reference: float, ids: FloatArray) -> None:
     for value in (reference, *ids.tolist()):
         if value != int(value):
             raise ValueError(f"{path}: id {value} is not a whole number")
-    unique, count = np.unique(ids, return_counts=True)
-    if count.max() > 1:
-        raise ValueError(f"{path}: the values of id {int(unique[count.argmax()])} do not stand together")
 
 
 def _interpret(
@@ -112,6 +112,7 @@ def _interpret(
     information: FloatArray,
 ) -> TextMap:
     pose_size = 3 if dimension == 2 else 6
+    ids, sizes = _split(ids, sizes, dimension)
     is_pose = sizes == pose_size
     if not np.all(is_pose | (sizes == dimension)):
         wrong = sizes[~is_pose & (sizes != dimension)][0]
@@ -126,10 +127,52 @@ def _interpret(
     information = 0.5 * (information + information.T)[np.ix_(order, order)]
     if np.linalg.eigvalsh(information)[0] <= 0.0:
         raise ValueError(f"{path}: the information matrix is not positive definite")
-    return TextMap(
+    read = TextMap(
         reference, ids[0, is_pose], values[of_pose].reshape(-1, pose_size),
         ids[0, ~is_pose], values[~of_pose].reshape(-1, dimension), information,
     )  # fmt: skip
+    repeated = any(len(np.unique(own)) < len(own) for own in (read.pose_ids, read.feature_ids))
+    return _each_once(read, dimension) if repeated else read
+
+
+def _split(ids: IntArray, sizes: IntArray, dimension: int) -> tuple[IntArray, IntArray]:
+    """Ids and sizes where values that stand together are those of the same id several times over."""
+    pose_size = 3 if dimension == 2 else 6
+    of_one = [
+        next((size for size in (pose_size, dimension) if total % size == 0), total) if total > pose_size else total
+        for total in sizes.tolist()
+    ]  # fmt: skip
+    times = sizes // np.array(of_one)
+    whole = np.repeat(np.array(of_one), times)
+    return np.stack([np.repeat(ids[0], times), whole]), whole
+
+
+def _each_once(m: TextMap, dimension: int) -> TextMap:
+    """The map with each id once: the mean and information of what the copies say together (least squares)."""
+    pose_size = m.poses.shape[1]
+    pose_ids, first_pose, pose_of = np.unique(m.pose_ids, return_index=True, return_inverse=True)
+    feature_ids, first_feature, feature_of = np.unique(m.feature_ids, return_index=True, return_inverse=True)
+    columns = np.concatenate([
+        (pose_of.reshape(-1, 1) * pose_size + np.arange(pose_size)).ravel(),
+        len(pose_ids) * pose_size + (feature_of.reshape(-1, 1) * dimension + np.arange(dimension)).ravel(),
+    ])  # fmt: skip
+    start = np.concatenate([m.poses[first_pose].ravel(), m.features[first_feature].ravel()])
+    apart = np.concatenate([m.poses.ravel(), m.features.ravel()]) - start[columns]
+    of_pose = np.tile(np.arange(pose_size) >= dimension, len(m.poses))
+    is_angle = np.concatenate([of_pose, np.zeros(m.features.size, dtype=bool)])
+    apart[is_angle] = (apart[is_angle] + np.pi) % (2.0 * np.pi) - np.pi
+    J = np.zeros((len(columns), len(start)))
+    J[np.arange(len(columns)), columns] = 1.0
+    information = J.T @ m.information @ J
+    mean = start + np.linalg.solve(information, J.T @ (m.information @ apart))
+    poses = mean[: len(pose_ids) * pose_size].reshape(-1, pose_size)
+    features = mean[poses.size :].reshape(-1, dimension)
+    return TextMap(m.reference, pose_ids, poses, feature_ids, features, 0.5 * (information + information.T))
+
+
+def write_covariances(path: Path, ids: Iterable[int], covariances: FloatArray) -> None:
+    """Covariances (n, k, k) of joined poses or features, a line ``id`` and the k x k numbers, row by row, each."""
+    write_values(path, ids, covariances.reshape(len(covariances), covariances.shape[1] ** 2))
 
 
 def write_values(path: Path, ids: Iterable[int], values: FloatArray) -> None:

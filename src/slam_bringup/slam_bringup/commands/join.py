@@ -12,10 +12,11 @@ from typing import Any
 import click
 
 from sjsam_node.linear_slam.text_joining import ROWS, TextJoiningConfig, TextJoiningResult, join_text_maps
-from sjsam_node.linear_slam.text_maps import TextMap, find_maps, read_maps, write_values
+from sjsam_node.linear_slam.text_maps import TextMap, find_maps, read_maps, write_covariances, write_values
 from sjsam_node.smoothing.robust import LOSSES
 from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_bringup.report.joined_map import draw_joined
 from slam_core.config import from_mapping
 from slam_core.files import atomic_text
 from slam_core.output_folder import OutputFolder
@@ -35,9 +36,16 @@ from slam_core.output_folder import OutputFolder
 def command(
     folder: Path, output: Path, rows: str, robust: str | None, config_file: Path | None, overwrite: bool
 ) -> None:
-    """Join the submaps localmap_<k>.txt in DIR; writes summary.json, poses.txt and features.txt to OUT."""
+    """Join the submaps localmap_<k>.txt in DIR.
+
+    OUT gets summary.json, poses.txt, features.txt, their covariances (poses_covariance.txt, features_covariance.txt:
+    the id, then the matrix row by row, in the frame of the first pose) and map.png.
+    """
     values = {**_yaml(config_file), "rows": rows}
-    config = from_mapping(TextJoiningConfig, values if robust is None else {**values, "robust.loss": robust})
+    try:
+        config = from_mapping(TextJoiningConfig, values if robust is None else {**values, "robust.loss": robust})
+    except ValueError as error:
+        raise ValueError(f"{config_file}: {error}" if config_file else str(error)) from error
     results = OutputFolder(output, "join", folder, overwrite=overwrite)
     began = time.perf_counter()
     maps, dimension = read_maps(find_maps(folder))
@@ -60,7 +68,10 @@ def _yaml(path: Path | None) -> dict[str, Any]:
         return {}
     import yaml
 
-    values = yaml.safe_load(path.read_text()) or {}
+    try:
+        values = yaml.safe_load(path.read_text()) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: not YAML: {error}") from error
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected a mapping of parameters, got {type(values).__name__}")
     return values
@@ -88,5 +99,8 @@ def _degrees_of_freedom(result: TextJoiningResult, maps: Sequence[TextMap]) -> i
 
 def _write(output: Path, result: TextJoiningResult, summary: dict[str, Any]) -> None:
     write_values(output / "poses.txt", result.pose_ids.tolist(), result.poses)
+    write_covariances(output / "poses_covariance.txt", result.pose_ids.tolist(), result.pose_covariances)
     write_values(output / "features.txt", result.feature_ids.tolist(), result.features)
+    write_covariances(output / "features_covariance.txt", result.feature_ids.tolist(), result.feature_covariances)
+    draw_joined(output / "map.png", result)
     atomic_text(output / "summary.json", json.dumps(summary, indent=2) + "\n")
