@@ -19,7 +19,8 @@ def write(path: Path, storage: str = "mcap", count: int = 30, *, overwrite: bool
         transform = transform_message(TYPES, 1, "base_link", "camera", np.eye(4))
         bag.write("/tf_static", TYPES.TFMessage(transforms=[transform]), 1)
         for i in range(count):
-            image = np.full((200, 300), i, np.uint8)
+            image = np.random.default_rng(i).integers(0, 256, (200, 300), np.uint8)  # nothing to compress
+            image[0, 0] = i
             bag.write("/image", image_message(TYPES, header_message(TYPES, 10 + i, "camera"), image), 10 + i)
     return path
 
