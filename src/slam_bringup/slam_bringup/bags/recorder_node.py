@@ -56,7 +56,7 @@ class RecorderNode(Node):
             self._writer = self._open()
         except OSError as error:
             raise ValueError(f"cannot write {self.config.bag}: {error}") from error
-        self._clock = RecordingClock()
+        self._stamps = RecordingClock()
         self._known: set[str] = set()
         self._count = 0
         self.create_timer(_DISCOVERY_PERIOD_S, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -67,7 +67,7 @@ class RecorderNode(Node):
 
     def on_close(self) -> None:
         """Complete the bag."""
-        for waiting, stamp in self._clock.rest(self.get_clock().now().nanoseconds):
+        for waiting, stamp in self._stamps.rest(self.get_clock().now().nanoseconds):
             waiting(stamp)
         self._writer.__exit__(None, None, None)
         print(f"recorded {self._count} messages to {self._writer.path}", flush=True)
@@ -108,7 +108,7 @@ class RecorderNode(Node):
             if not self.config.header_stamps:
                 write(data, self.get_clock().now().nanoseconds)
                 return
-            for waiting, stamp in self._clock.stamped(partial(write, data), header_stamp_ns(data) if is_frame else 0):
+            for waiting, stamp in self._stamps.stamped(partial(write, data), header_stamp_ns(data) if is_frame else 0):
                 waiting(stamp)
 
         return on_message
