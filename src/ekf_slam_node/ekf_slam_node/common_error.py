@@ -16,6 +16,7 @@ On simulated images of exact cameras neighbours share nothing, and the error is 
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from ekf_slam_node.models import Frame
 from slam_core.geometry import FloatArray
@@ -58,13 +59,11 @@ class CommonError:
             return
         spread = 1.4826 * np.median(np.abs(residuals), axis=0)
         r = np.clip(residuals, -_OUTLIER * spread, _OUTLIER * spread)
-        distance = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
-        first, second = np.nonzero(np.triu(distance < _NEIGHBOURS * width, 1))
-        products = 0.5 * np.sum(r[first] * r[second], axis=1)
-        self._sum = _FORGETTING * self._sum + float(products.sum())
+        total, pairs = _shared_by_neighbours(pixels, r, _NEIGHBOURS * width)
+        self._sum = _FORGETTING * self._sum + total
         # One frame's pairs share features and the frame's own error: each frame's sum counts as one draw.
-        self._square_sum = _FORGETTING**2 * self._square_sum + float(products.sum()) ** 2
-        self._weight = _FORGETTING * self._weight + len(products)
+        self._square_sum = _FORGETTING**2 * self._square_sum + total**2
+        self._weight = _FORGETTING * self._weight + pairs
 
     def sigma(self, frame: Frame) -> FloatArray:
         """Standard deviations (6,) of the pose-like error of a frame: translation m, rotation rad.
@@ -74,3 +73,16 @@ class CommonError:
         angle = self._factor * self.shared_px / frame.camera.fx
         distance = float(1.0 / np.median(frame.z[:, 2])) if len(frame) else 0.0
         return np.repeat([angle * distance, angle], 3)
+
+
+@njit(cache=True, nogil=True)
+def _shared_by_neighbours(pixels, residuals, reach):  # type: ignore[no-untyped-def]
+    """Sum, over all pairs of pixels (n, 2) nearer than ``reach``, of the residuals' mean product; number of pairs."""
+    total, pairs = 0.0, 0
+    for i in range(len(pixels)):
+        for j in range(i + 1, len(pixels)):
+            du, dv = pixels[j, 0] - pixels[i, 0], pixels[j, 1] - pixels[i, 1]
+            if du * du + dv * dv < reach * reach:
+                total += 0.5 * (residuals[i, 0] * residuals[j, 0] + residuals[i, 1] * residuals[j, 1])
+                pairs += 1
+    return total, pairs

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from slam_bringup.pipeline.results import AgentResult, RunResult
+from slam_bringup.report.canvas import blank
 from slam_core.geometry import FloatArray
 
 _AXES = ("x", "y", "z")
@@ -21,7 +22,8 @@ def side_view(result: RunResult) -> Figure | None:
         return None
     path = np.concatenate(paths)
     along = int(np.argmax(np.ptp(path[:, :2], axis=0)))
-    figure, axes = _plot(10.0, 3.2)
+    figure, ((axes,),) = blank(10.0, 3.2)
+    axes.grid(color="0.92")
     points = result.landmarks.positions
     if len(points):
         low, high = np.percentile(points, [2, 98], axis=0)
@@ -42,8 +44,7 @@ def sigma_figure(agent: AgentResult) -> Figure | None:
     if covariances is None or len(agent.trajectory) < 2:
         return None
     sigma = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
-    figure = Figure(figsize=(10, 2.8), layout="constrained")
-    position, rotation = figure.subplots(1, 2, sharex=True)
+    figure, ((position, rotation),) = blank(10, 2.8, 1, 2)
     for k, name in enumerate(_AXES):
         position.plot(_seconds(agent), 1e3 * sigma[:, k], linewidth=1.0, label=name)
         rotation.plot(_seconds(agent), np.degrees(sigma[:, 3 + k]), linewidth=1.0, label=f"about {name}")
@@ -58,8 +59,7 @@ def motion_figure(agent: AgentResult) -> Figure | None:
         return None
     poses, time = agent.trajectory.poses, _seconds(agent)
     angles = np.unwrap(Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX"), axis=0)
-    figure = Figure(figsize=(10, 2.8), layout="constrained")
-    attitude, speed = figure.subplots(1, 2, sharex=True)
+    figure, ((attitude, speed),) = blank(10, 2.8, 1, 2)
     for k, name in enumerate(("yaw", "pitch", "roll")):
         attitude.plot(time, np.degrees(angles[:, k]), linewidth=1.0, label=name)
     velocity = np.linalg.norm(np.gradient(poses[:, :3, 3], time, axis=0), axis=1)
@@ -80,13 +80,6 @@ def _turn_rate(poses: FloatArray, time: FloatArray) -> FloatArray:
 def _seconds(agent: AgentResult) -> FloatArray:
     stamps = agent.trajectory.stamps_ns
     return np.asarray((stamps - stamps[0]) / 1e9, dtype=np.float64)
-
-
-def _plot(width: float, height: float) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    axes = figure.add_subplot()
-    axes.grid(color="0.92")
-    return figure, axes
 
 
 def _finish(axes: Axes, ylabel: str) -> None:

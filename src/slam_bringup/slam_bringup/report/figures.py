@@ -10,11 +10,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
-from scipy.stats import chi2
 
 from dense_mapping.floor_plan import FREE, OCCUPIED, FloorPlan
 from dense_mapping.navigation import frontiers
 from slam_bringup.pipeline.results import AgentResult, RunResult
+from slam_bringup.report.canvas import blank
+from slam_core.chi_square import chi_square_quantile
 from slam_core.evaluation import align, associate
 from slam_core.files import atomic_path
 from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
@@ -34,8 +35,7 @@ def save_png(path: Path, figure: Figure, dpi: int = 130) -> None:
 
 def map_figure(result: RunResult) -> Figure:
     """The map from above: dense points, landmarks with 99.5 % ellipses, trajectories, ground truth (Fig. 9.2)."""
-    figure = Figure(figsize=(10, 8), layout="constrained")
-    axes = figure.add_subplot()
+    figure, ((axes,),) = blank(10, 8)
     _draw_dense(axes, result)
     _draw_landmarks(axes, result)
     for agent, colour in zip(result.agents, COLOURS * len(result.agents), strict=False):
@@ -70,7 +70,7 @@ def _draw_landmarks(axes: Axes, result: RunResult) -> None:
     if len(landmarks.positions) == 0:
         return
     values, vectors = np.linalg.eigh(landmarks.covariances[:, :2, :2])
-    axis_lengths = 2.0 * np.sqrt(np.maximum(values, 0.0) * chi2.ppf(ELLIPSE_CONFIDENCE, 2))
+    axis_lengths = 2.0 * np.sqrt(np.maximum(values, 0.0) * chi_square_quantile(ELLIPSE_CONFIDENCE, 2))
     # An ellipse as large as a room says only that the landmark is far away.
     shown = axis_lengths[:, 1] < 2.0
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
@@ -120,8 +120,7 @@ def _limit_to_content(axes: Axes, result: RunResult) -> None:
 
 def floor_plan_figure(result: RunResult, plan: FloorPlan) -> Figure:
     """A storey from above with the trajectories, and where nobody has looked yet (frontiers)."""
-    figure = Figure(figsize=(10, 8), layout="constrained")
-    axes = figure.add_subplot()
+    figure, ((axes,),) = blank(10, 8)
     rows, columns = plan.cells.shape
     shades = np.select([plan.cells == FREE, plan.cells == OCCUPIED], [255, 30], 200).astype(np.uint8)
     extent = (0.0, columns * plan.resolution, 0.0, rows * plan.resolution)
@@ -173,9 +172,8 @@ def error_figure(agent: AgentResult) -> Figure | None:
     error[:, 3:] = np.degrees(error[:, 3:])
     sigma = np.sqrt(np.diagonal(matched.covariances, axis1=1, axis2=2)).copy()
     sigma[:, 3:] = np.degrees(sigma[:, 3:])
-    bound = float(np.sqrt(chi2.ppf(ELLIPSE_CONFIDENCE, 1)))
-    figure = Figure(figsize=(10, 5), layout="constrained")
-    grid = figure.subplots(2, 3, sharex=True)
+    bound = float(np.sqrt(chi_square_quantile(ELLIPSE_CONFIDENCE, 1)))
+    figure, grid = blank(10, 5, 2, 3)
     for i, (axes, name) in enumerate(
         zip(grid.ravel(), ("x m", "y m", "z m", "rx deg", "ry deg", "rz deg"), strict=True)
     ):
@@ -190,8 +188,7 @@ def error_figure(agent: AgentResult) -> Figure | None:
 
 def timing_figure(result: RunResult) -> Figure:
     """Milliseconds of every stage over the run (thesis Fig. 9.20, time per sample)."""
-    figure = Figure(figsize=(10, 3.2), layout="constrained")
-    axes = figure.add_subplot()
+    figure, ((axes,),) = blank(10, 3.2)
     for name, times in result.stage_ms.items():
         if times:
             axes.plot(np.linspace(0, 1, len(times)), times, linewidth=0.9, label=f"{name} ({np.median(times):.1f} ms)")
@@ -206,8 +203,7 @@ def timing_figure(result: RunResult) -> Figure:
 
 def features_figure(agent: AgentResult) -> Figure:
     """Number of features with depth in each frame."""
-    figure = Figure(figsize=(10, 2.4), layout="constrained")
-    axes = figure.add_subplot()
+    figure, ((axes,),) = blank(10, 2.4)
     axes.plot(agent.feature_counts, color=COLOURS[1], linewidth=1.0)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("frame")

@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
-from scipy.stats import chi2
 
 from sjsam_node.linear_slam.text_joining import TextJoiningResult
 from slam_bringup.report.figures import COLOURS, ELLIPSE_CONFIDENCE, save_png
@@ -45,7 +44,7 @@ def _draw(axes: Axes, result: TextJoiningResult, a: int, b: int) -> None:
 
 def _ellipses(axes: Axes, centres: np.ndarray, covariances: np.ndarray, colour: str) -> None:
     values, vectors = np.linalg.eigh(covariances)
-    lengths = 2.0 * np.sqrt(np.maximum(values, 0.0) * chi2.ppf(ELLIPSE_CONFIDENCE, 2))
+    lengths = 2.0 * np.sqrt(np.maximum(values, 0.0) * chi_square_quantile(ELLIPSE_CONFIDENCE, 2))
     angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     axes.add_collection(EllipseCollection(
         lengths[:, 1], lengths[:, 0], angles, units="xy", offsets=centres, offset_transform=axes.transData,

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.navigation import Frontier, Way, frontiers, way
+from slam_core.chi_square import chi_square_quantile
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate
 
@@ -65,7 +65,8 @@ def ways_out(
 
 def position_radius(pose: PoseEstimate) -> float:
     """Radius (m) of the circle on the floor that holds the agent with 99.5 %, by the largest axis of its ellipse."""
-    return float(np.sqrt(chi2.ppf(_CONFIDENCE, 2) * max(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1], 0.0)))
+    largest = max(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1], 0.0)
+    return float(np.sqrt(chi_square_quantile(_CONFIDENCE, 2) * largest))
 
 
 def radius_text(radius: float) -> str:

@@ -17,11 +17,11 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 import viser
-from scipy.stats import chi2
 
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from slam_bringup.viewer.picture_of_plan import plan_picture
+from slam_core.chi_square import chi_square_quantile
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, quaternion_from_rotation
 from slam_core.types import ByteArray, Float32Array
 
@@ -277,7 +277,7 @@ class ViewerPage:
         self, name: str, positions: FloatArray, covariances: FloatArray, colour: tuple[int, int, int]
     ) -> None:
         values, vectors = np.linalg.eigh(covariances)
-        radii = np.sqrt(np.maximum(values, 0.0) * chi2.ppf(_ELLIPSOID_CONFIDENCE, 3))
+        radii = np.sqrt(np.maximum(values, 0.0) * chi_square_quantile(_ELLIPSOID_CONFIDENCE, 3))
         shown = np.flatnonzero(radii[:, 2] < _LARGEST_ELLIPSOID_M)[:_MOST_ELLIPSOIDS]
         vectors = vectors * np.where(np.linalg.det(vectors) < 0, -1.0, 1.0)[:, None, None]
         ball = trimesh.creation.icosphere(subdivisions=1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
+from slam_core.chi_square import chi_square_quantile
 from slam_core.geometry import FloatArray, make_transform
 from slam_core.messages.base import Message, MessageTypes
 from slam_core.messages.poses import pose_message
@@ -58,7 +58,7 @@ def _ellipsoids(covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rotations (n, 3, 3) whose columns are the axes, and full lengths (n, 3) m of the axes."""
     eigenvalues, axes = np.linalg.eigh(np.asarray(covariances).reshape(-1, 3, 3))
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
-    factor = chdtri(3, 1.0 - PROBABILITY)
+    factor = chi_square_quantile(PROBABILITY, 3)
     return axes, 2.0 * np.sqrt(factor * np.maximum(eigenvalues, 0.0))
 
 

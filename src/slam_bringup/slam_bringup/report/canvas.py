@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blank figures with margins of fixed width: a layout that looks for them draws every figure twice."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+_LEFT, _RIGHT, _BOTTOM, _TOP = 0.75, 0.15, 0.5, 0.35
+"""Room (inches) for labels and titles around the axes."""
+_BETWEEN = (0.65, 0.3)
+"""Room (inches) between columns and between rows of axes."""
+
+
+def blank(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, npt.NDArray[np.object_]]:
+    """A figure (inches) and its axes (rows, columns), which share their x axis."""
+    figure = Figure(figsize=(width, height))
+    across = (width - _LEFT - _RIGHT - (columns - 1) * _BETWEEN[0]) / columns
+    along = (height - _BOTTOM - _TOP - (rows - 1) * _BETWEEN[1]) / rows
+    axes = figure.subplots(
+        rows, columns, sharex=True, squeeze=False,
+        gridspec_kw={
+            "left": _LEFT / width, "right": 1.0 - _RIGHT / width, "bottom": _BOTTOM / height,
+            "top": 1.0 - _TOP / height, "wspace": _BETWEEN[0] / across, "hspace": _BETWEEN[1] / along,
+        },
+    )  # fmt: skip
+    return figure, axes
