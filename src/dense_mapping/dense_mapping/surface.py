@@ -21,6 +21,8 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import ByteArray, Float32Array
 
+_FACES_AT_ONCE = 50_000
+"""Triangles whose normals are computed at once, for the sake of memory."""
 _CHUNK = 6
 """Blocks along the edge of a cube that marching cubes runs over at once."""
 _UNSEEN = 150
@@ -169,8 +171,13 @@ def _without_islands(faces: npt.NDArray[np.int32], count: int, least: int) -> np
 
 def _normals(points: Float32Array, faces: npt.NDArray[np.int32]) -> Float32Array:
     """Unit normals of the vertices, from the triangles around each, by area."""
-    a, b, c = (points[faces[:, k]].astype(np.float64) for k in range(3))
-    across = np.cross(b - a, c - a)
-    total = np.stack([np.bincount(faces.ravel(), np.repeat(across[:, k], 3), len(points)) for k in range(3)], axis=1)
+    total = np.zeros((3, len(points)))
+    for first in range(0, len(faces), _FACES_AT_ONCE):
+        some = faces[first : first + _FACES_AT_ONCE]
+        a, b, c = (points[some[:, k]].astype(np.float64) for k in range(3))
+        across = np.cross(b - a, c - a)
+        for k in range(3):
+            np.add.at(total[k], some.ravel(), np.repeat(across[:, k], 3))
+    total = total.T
     length: FloatArray = np.linalg.norm(total, axis=1, keepdims=True)
     return (total / np.maximum(length, 1e-12)).astype(np.float32)

@@ -9,7 +9,6 @@ The sums are linear: an image whose pose has changed is taken away where it was 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +19,6 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray, Float32Array
 
-Scalar = TypeVar("Scalar", bound=np.generic)
 VOXELS = BLOCK**3
 _KEY_RANGE = 1 << 20
 """Block coordinates lie within plus and minus half of this."""
@@ -131,27 +129,18 @@ class TsdfVolume:
         room = self.config.max_blocks - len(self)
         self.refused_blocks += max(0, len(new) - room)
         new = new[: max(0, room)]
-        self._grow(len(self) + len(new))
+        self._make_room()
         for i in new:
             self._coordinates[len(self)] = cells[i]
             self._rows[int(_keys(cells[i : i + 1])[0])] = len(self)
 
-    def _grow(self, wanted: int) -> None:
-        """Room for so many blocks; doubled, so that adding one costs the same however many there are."""
-        capacity = len(self._voxels)
-        if wanted <= capacity:
-            return
-        size = max(wanted, 2 * capacity, 1024)
-        self._coordinates = _extended(self._coordinates, size)
-        self._voxels = _extended(self._voxels, size)
-        self._colours = _extended(self._colours, size)
-
-
-def _extended(rows: npt.NDArray[Scalar], size: int) -> npt.NDArray[Scalar]:
-    """The rows, and zeros after them up to ``size``: of zeros that nothing is written to no memory is taken."""
-    out = np.zeros((size, *rows.shape[1:]), dtype=rows.dtype)
-    out[: len(rows)] = rows
-    return out
+    def _make_room(self) -> None:
+        """Room for all blocks that there may be: the system gives memory to those alone that are written to."""
+        if not len(self._voxels):
+            most = self.config.max_blocks
+            self._coordinates = np.zeros((most, 3), dtype=np.int64)
+            self._voxels = np.zeros((most, VOXELS, 4), dtype=np.float32)
+            self._colours = np.zeros((most, VOXELS, 4), dtype=np.uint8)
 
 
 def _keys(cells: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

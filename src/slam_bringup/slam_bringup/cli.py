@@ -12,6 +12,7 @@ import click
 import slam_core.process_life  # noqa: F401  # its clock starts with the program
 from slam_bringup.commands.console import log_to_terminal, with_verbosity
 from slam_bringup.version import VERSION
+from slam_core.memory import share_one_heap
 
 # The stages of a run have threads of their own: BLAS threads beside them only wait for each other, spinning. NumPy and
 # SciPy read this when they are loaded, here and in the nodes that are started from here. One number of threads also
@@ -59,6 +60,7 @@ class _LazyGroup(click.Group):
 def slam(context: click.Context) -> None:
     """Map indoor areas with a stereo camera and a time-of-flight camera."""
     log_to_terminal(context)
+    share_one_heap()
 
 
 with_verbosity(slam)

@@ -30,6 +30,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from slam_core.config import Config, ParameterInfo, from_mapping, iterate_parameters
 from slam_core.guarded_node import GuardedNode
+from slam_core.memory import share_one_heap
 from slam_core.messages import MessageTypes
 from slam_core.messages.base import Message
 from slam_core.process_life import end_with_parent, on_request_to_end
@@ -196,6 +197,7 @@ def run_node(node_type: Callable[[], RunnableNode], args: list[str] | None = Non
     A signal only asks for the end: rclpy's own handlers would shut the context down under a callback that still
     publishes. The message in hand is finished first.
     """
+    share_one_heap()
     use_fast_dds_profile()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()

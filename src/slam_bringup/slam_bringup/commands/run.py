@@ -24,8 +24,6 @@ from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.map_growth import map_growth
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.interrupt import INTERRUPTED, STOPPED, Interrupt
-from slam_bringup.report.output import write_results
-from slam_bringup.report.result_bag import write_result_bag
 from slam_bringup.report.summary_table import summary_table
 from slam_bringup.version import VERSION
 from slam_core.output_folder import LOGS, OutputFolder
@@ -72,6 +70,10 @@ def command(
         require_map(result)
         if interrupt.asked:
             result = replace(result, events=(STOPPED, *result.events))
+        # What draws and writes is loaded when there is something to write: mapping needs the memory.
+        from slam_bringup.report.output import write_results
+        from slam_bringup.report.result_bag import write_result_bag
+
         with results.staged() as folder, Console(stderr=True, quiet=is_quiet()).status(f"writing {output}"):
             write_result_bag(folder / "result.mcap", result)
             summary = write_results(folder, result, growth.save)

@@ -44,8 +44,7 @@ class Mapper:
             agent: FilterStage(filter_config(config.ekf_slam, s), s.frames, s.base_frame, growth.session(agent))
             for agent, s in sensors.items()
         }
-        self._frames: dict[str, list[FrameResult]] = {agent: [] for agent in sensors}
-        self._scans: dict[str, list[PoseEstimate]] = {agent: [] for agent in sensors}
+        self._diaries = {agent: _Diary() for agent in sensors}
         self._joiner = ThreadPoolExecutor(1, thread_name_prefix="joining")
         self._joins: list[Future[None]] = []
         self._submaps = 0
@@ -57,7 +56,7 @@ class Mapper:
         if isinstance(value, ImuSample):
             stage.add_imu(value)
         elif isinstance(value, ScanEstimate):
-            self._scans[item.agent].append(value.pose)
+            self._diaries[item.agent].scans.append(value.pose)
             stage.add_motion(value.pose.stamp_ns, value.motion)
         elif isinstance(value, Features):
             stage.add_features(value)
@@ -87,12 +86,12 @@ class Mapper:
     @property
     def has_frames(self) -> bool:
         """Whether any filter has seen a frame."""
-        return any(self._frames.values())
+        return any(diary.poses for diary in self._diaries.values())
 
     def record(self, wall_s: float, dropped: Mapping[str, int], failure: str) -> RunRecord:
         """What the run leaves behind, after :meth:`finish`."""
         return RunRecord(
-            agents={agent: _agent_record(frames, self._scans[agent]) for agent, frames in self._frames.items()},
+            agents={agent: diary.record() for agent, diary in self._diaries.items()},
             global_map=self.growth.global_map,
             trajectories=self.growth.trajectories(),
             submaps=self._submaps,
@@ -115,7 +114,7 @@ class Mapper:
 
     def _take_results(self, agent: str) -> None:
         for frame in self._times.each("ekf", self._filters[agent].ready()):
-            self._frames[agent].append(frame)
+            self._diaries[agent].add(frame)
             self._join(frame.estimate.submaps)
 
     def _join(self, submaps: Iterable[Submap]) -> None:
@@ -126,10 +125,20 @@ class Mapper:
             self.growth.add(rounded(submap) if self._compact else submap)
 
 
-def _agent_record(frames: list[FrameResult], scans: list[PoseEstimate]) -> AgentRecord:
-    estimates = [frame.estimate for frame in frames]
-    changes = StateChanges()
-    for e in estimates:
-        changes.add(e.stamp_ns, e.state.value, e.reason)
-    counts = [frame.features for frame in frames]
-    return AgentRecord([e.pose for e in estimates], scans, counts, changes.events, changes.lost_share)
+class _Diary:
+    """What is kept of each of an agent's frames: a result's views of the open submap would fill the memory."""
+
+    def __init__(self) -> None:
+        self.poses: list[PoseEstimate] = []
+        self.scans: list[PoseEstimate] = []
+        self._features: list[int] = []
+        self._changes = StateChanges()
+
+    def add(self, frame: FrameResult) -> None:
+        estimate = frame.estimate
+        self.poses.append(estimate.pose)
+        self._features.append(frame.features)
+        self._changes.add(estimate.stamp_ns, estimate.state.value, estimate.reason)
+
+    def record(self) -> AgentRecord:
+        return AgentRecord(self.poses, self.scans, self._features, self._changes.events, self._changes.lost_share)

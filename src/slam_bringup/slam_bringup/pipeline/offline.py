@@ -31,6 +31,7 @@ from slam_bringup.pipeline.results import RunResult
 from slam_bringup.pipeline.run_record import run_result, told
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
+from slam_core.memory import give_back
 from slam_core.types import ImuSample
 
 _LOG = logging.getLogger(__name__)
@@ -101,6 +102,7 @@ def run_bag(
             {agent: pipeline.log.frames for agent, pipeline in pipelines.items()},
         )
         _LOG.info("mapped %d submaps in %.1f s; the dense model is next", record.submaps, record.wall_s)
+        give_back()
         with times.measure("dense model"):
             # Who wants the end now does not want to wait for the dense model.
             result = run_result(

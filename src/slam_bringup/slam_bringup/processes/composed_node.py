@@ -30,6 +30,7 @@ from slam_bringup.pipeline.configuration import MODES, ODOMETRIES, choose, load_
 from slam_bringup.processes.node_graph import live_nodes
 from slam_bringup.processes.processes import NodeCommand
 from slam_core.exchange import Exchange
+from slam_core.memory import share_one_heap
 from slam_core.process_life import end_with_parent, on_request_to_end
 from slam_core.ros import spin, use_fast_dds_profile
 
@@ -54,6 +55,7 @@ def run_composed(commands: Sequence[NodeCommand], ros_arguments: Sequence[str] =
     ValueError
         If a node refuses its parameters.
     """
+    share_one_heap()
     use_fast_dds_profile()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from sjsam_node.linear_slam.text_joining import TextJoiningResult
 from slam_bringup.report.figures import COLOURS, ELLIPSE_CONFIDENCE, save_png
+from slam_core.chi_square import chi_square_quantile
 
 _FEATURES = "#b36b00"
 

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The heap of a process: shared by its threads, and given back."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+SCRIPT = """
+import resource, threading
+import numpy as np
+from slam_core.memory import give_back, share_one_heap
+
+def resident_mib():
+    return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize() / 2**20
+
+share_one_heap()
+kept = []
+def fill():  # every third stays, so that the others are holes in the heap
+    kept.extend([np.ones(100_000) for _ in range(120)][::3])
+threads = [threading.Thread(target=fill) for _ in range(3)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+before = resident_mib()
+give_back()
+print(before - resident_mib())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the C library of Linux")
+def test_what_threads_have_freed_goes_back_to_the_system() -> None:
+    given_back = float(subprocess.check_output([sys.executable, "-c", SCRIPT], text=True))
+    assert given_back > 100.0
