@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slam_bringup.bags.bag_types import BagTypes, typestore
-from slam_bringup.bags.pacing import FlowControl, ReplayClock, header_stamp_ns
+from slam_bringup.bags.pacing import Audience, FlowControl, ReplayClock, header_stamp_ns
 from slam_core.messages import header_message, image_message
 
 STAMP = 1_403_715_273_262_142_976
@@ -77,3 +77,18 @@ def test_rate_zero_never_delays_and_a_rate_scales_time() -> None:
     assert 4.0 < clock.delay_s(10 * 10**9) <= 5.0
     with pytest.raises(ValueError, match="-1"):
         ReplayClock(-1.0)
+
+
+def test_an_audience_is_missing_until_every_topic_has_its_subscribers() -> None:
+    audience = Audience(("/left=2", "/tof/info=1", "/imu=0", "/not_played=1"))
+    matched = {"/left": 1, "/tof/info": 1, "/imu": 0}
+    audience.forget_all_but(matched)
+    assert audience.missing(matched.__getitem__) == ["/left"]
+    matched["/left"] = 3
+    assert audience.missing(matched.__getitem__) == []
+
+
+@pytest.mark.parametrize("pair", ["/left", "/left=many", "=2", "/left=-1"])
+def test_an_audience_of_another_form_is_refused(pair: str) -> None:
+    with pytest.raises(ValueError, match="topic>=<number"):
+        Audience((pair,))

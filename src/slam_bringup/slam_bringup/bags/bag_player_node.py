@@ -21,7 +21,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from slam_bringup.bags.bag import BagReader, RawMessage
-from slam_bringup.bags.pacing import FlowControl, ReplayClock, header_stamp_ns
+from slam_bringup.bags.pacing import Audience, FlowControl, ReplayClock, header_stamp_ns
 from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.config import Config, parameter
 from slam_core.messages import (
@@ -53,6 +53,9 @@ class PlayerConfig(Config):
     patience: float = parameter(120.0, "longest wait for a paced node that reports nothing", unit="s", minimum=1.0)
     wait_for_subscribers: float = parameter(3.0, "longest wait for subscribers at the start", unit="s", minimum=0.0)
     wait_for_start: bool = parameter(False, "begin when the service ~/start is called, not when subscribers are there")
+    subscribers: tuple[str, ...] = parameter(
+        (), "'<topic>=<number>' as published: do not begin before it has so many subscribers, or patience runs out"
+    )
 
 
 class BagPlayerNode(Node):
@@ -65,6 +68,7 @@ class BagPlayerNode(Node):
             raise ValueError("parameter 'bag' must name the bag to play")
         self._types = RosTypes()
         self._flow = FlowControl(self.config.pace, self.config.window, self.config.patience)
+        self._audience = Audience(self.config.subscribers)
         self._names = dict(pair.split("=", 1) for pair in self.config.rename)
         self._stop = threading.Event()
         self._start = threading.Event()
@@ -104,6 +108,7 @@ class BagPlayerNode(Node):
                 self._start.wait()
             else:
                 self._wait_for_subscribers()
+            self._wait_for_audience()
             self._static_output.wait_for_all_acked(Duration(seconds=5))
             self._play_once()
             while self.config.loop and not self._stop.is_set():
@@ -184,6 +189,18 @@ class BagPlayerNode(Node):
                 counts, stable_since = now, time.monotonic()
             if any(counts) and time.monotonic() - stable_since > _SETTLE_S:
                 break
+
+    def _wait_for_audience(self) -> None:
+        """Until this end knows of everybody who is to hear: discovery takes both ends their own time."""
+        outputs = {self._names.get(topic, topic): publisher for topic, publisher in self._outputs.items()}
+        self._audience.forget_all_but(outputs)
+        deadline = time.monotonic() + self.config.patience
+        while missing := self._audience.missing(lambda topic: outputs[topic].get_subscription_count()):
+            if self._stop.wait(0.02):
+                return
+            if time.monotonic() > deadline:
+                self.get_logger().warning(f"going on without all subscribers of {', '.join(missing)}")
+                return
 
 
 def main(args: list[str] | None = None) -> None:

@@ -103,6 +103,31 @@ def _forget_up_to(stamps: deque[int], stamp_ns: int) -> None:
         stamps.popleft()
 
 
+class Audience:
+    """How many subscribers each topic must have before its first message is sent, which none of them is to miss.
+
+    Parameters
+    ----------
+    pairs
+        "topic=number" texts; ValueError for another form.
+    """
+
+    def __init__(self, pairs: Iterable[str]) -> None:
+        split = [pair.rpartition("=") for pair in pairs]
+        if bad := ["".join(parts) for parts in split if not parts[0] or not parts[2].isdecimal()]:
+            raise ValueError(f"subscribers must be '<topic>=<number>', got {bad[0]!r}")
+        self._expected = {topic: int(number) for topic, _, number in split}
+
+    def forget_all_but(self, topics: Iterable[str]) -> None:
+        """Expect nobody on topics that are not played."""
+        played = set(topics)
+        self._expected = {topic: number for topic, number in self._expected.items() if topic in played}
+
+    def missing(self, matched: Callable[[str], int]) -> list[str]:
+        """Topics that fewer subscribers are matched with than expected, sorted."""
+        return sorted(topic for topic, number in self._expected.items() if matched(topic) < number)
+
+
 class ReplayClock:
     """When a message of a bag is due: ``rate`` times as fast as it was recorded; rate 0 is as fast as possible."""
 
