@@ -55,6 +55,16 @@ def test_a_pose_is_corrected_by_the_end_only_as_far_as_the_two_share_errors(rng:
         assert np.allclose(remaining, submap.path[k].covariance - expected @ shared.T)
 
 
+def test_a_pose_less_sure_than_the_end_is_moved_no_farther_than_the_end(rng: np.random.Generator) -> None:
+    """A rig that came back to landmarks of the start is surer of the end than it was on the way."""
+    A = rng.normal(size=(6, 6))
+    submap = replace(walk(6, 1e-6 * np.eye(6), A @ A.T + np.eye(6)), covariance=0.01 * (A @ A.T + np.eye(6)))
+    for k in (2, 4):
+        gain, remaining = _smoothing(submap, submap.path[k])
+        assert np.allclose(gain, np.eye(6))
+        assert np.allclose(remaining, submap.path[k].covariance - submap.covariance)
+
+
 def test_the_ends_of_a_submap_are_the_skeleton_itself() -> None:
     submap = walk(4, np.eye(6), 0.1 * np.eye(6))
     for pose, gain in ((submap.path[0], np.zeros((6, 6))), (submap.path[-1], np.eye(6))):

@@ -212,6 +212,9 @@ def _smoothing(submap: Submap, pose: PoseEstimate) -> tuple[FloatArray, FloatArr
 
     A pose errs by what it hands on to the end, and by the noise of its own frame's measurement, which the end does not
     share. The first pose after the start shows the size of the latter: its covariance is that of two frames.
+
+    Where the filter was less sure on the way than it is at the end (it has come back to landmarks of the start), most
+    of what a pose erred by was made good before the end, which shares no more than the whole of its own error.
     """
     end_covariance = submap.covariance[:6, :6]
     if pose.stamp_ns == submap.end_stamp_ns:
@@ -221,8 +224,18 @@ def _smoothing(submap: Submap, pose: PoseEstimate) -> tuple[FloatArray, FloatArr
     handed_on = _positive(pose.covariance - 0.5 * submap.path[1].covariance)
     A = np.eye(6)  # the lever arm of what is left of the way
     A[:3, 3:] = -skew(submap.end_pose[:3, 3] - pose.T[:3, 3])
-    gain = np.asarray(np.linalg.solve(end_covariance, A @ handed_on).T, dtype=np.float64)
+    shared = _capped(A @ handed_on @ A.T, end_covariance)
+    gain = np.linalg.solve(A, np.linalg.solve(end_covariance, shared).T)
     return gain, _positive(pose.covariance - gain @ end_covariance @ gain.T)
+
+
+def _capped(covariance: FloatArray, largest: FloatArray) -> FloatArray:
+    """The covariance, in no direction larger than another one, which is positive definite."""
+    root = np.linalg.cholesky(largest)
+    relative = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
+    values, vectors = np.linalg.eigh(0.5 * (relative + relative.T))
+    half = root @ vectors
+    return np.asarray((half * np.minimum(values, 1.0)) @ half.T)
 
 
 def _positive(covariance: FloatArray) -> FloatArray:
