@@ -22,7 +22,7 @@ from slam_bringup.experiments.true_frames import simulated_frames
 from slam_core.types import StereoImages
 from stereo_frontend.disparity import refine_disparity
 from stereo_frontend.features import FeatureExtractor
-from stereo_frontend.frontend import Frontend, FrontendConfig
+from stereo_frontend.frontend import RIGHT_SURPLUS, Frontend, FrontendConfig
 from stereo_frontend.matching import disparity_bounds, has_candidate, match_stereo
 
 T = TypeVar("T")
@@ -50,7 +50,7 @@ class Watch:
 
 def measure(title: str, pairs: Iterable[StereoImages], config: FrontendConfig) -> None:
     watch, frontend = Watch(), Frontend(config)
-    more = replace(config.features, target=int(config.right_surplus * config.features.target))
+    more = replace(config.features, target=int(RIGHT_SURPLUS * config.features.target))
     left, right = FeatureExtractor(config.features), FeatureExtractor(more)
     features = 0
     pairs = list(pairs)

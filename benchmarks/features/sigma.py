@@ -94,7 +94,6 @@ def fusion_against_both(frames: list[TrueFrame]) -> None:
     print(
         "\nCommon field of view: rms depth error of the same features, mm, and error of mapping into the ToF image, px"
     )
-    config = FrontendConfig(mode="stereo")
     stereo, fused = depth_of_left(frames, "stereo"), depth_of_left(frames, "fuse")
     rows, mapping = [], []
     for f, s, g in zip(frames, stereo, fused, strict=True):
@@ -102,7 +101,7 @@ def fusion_against_both(frames: list[TrueFrame]) -> None:
         both = [(i, j) for i, j in _same(s, g) if g.source[j] == FeatureSource.FUSED]
         i, j = (np.array(x) for x in zip(*both, strict=True))
         camera = f.images.stereo.camera
-        tof = map_depth(s.uv[i], s.depth[i].astype(np.float64), camera, f.depth, f.T_left_tof, config.fusion)
+        tof = map_depth(s.uv[i], s.depth[i].astype(np.float64), camera, f.depth, f.T_left_tof)
         truth = true_depth(f.truth, s.uv[i])
         rows.append(np.column_stack([s.depth[i] - truth, tof.depth - truth, g.depth[j] - truth]))
         place = np.linalg.inv(f.T_left_tof) @ np.vstack([camera.unproject(s.uv[i], truth).T, np.ones(len(i))])

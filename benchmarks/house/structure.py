@@ -29,7 +29,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkouts", nargs="*", type=Path, default=[ROOT], help="folders with a src/ below them")
     checkouts = parser.parse_args().checkouts
-    columns = [measure(read_trees(path)) for path in checkouts]
+    columns = [measure(read_trees(path)) | parameter_counts(path) for path in checkouts]
     print("| figure | " + " | ".join(path.resolve().name for path in checkouts) + " |")
     print("|---" * (len(checkouts) + 1) + "|")
     for name in columns[0]:
@@ -60,7 +60,7 @@ def measure(trees: Trees) -> dict[str, str]:
         "modules": str(len(trees)),
         "lines": str(sum(lines.values())),
         "public names": str(sum(len(list(public_names(tree))) for _, tree in trees.values())),
-        "declared parameters": str(sum(count_parameters(tree) for _, tree in trees.values())),
+        "parameters of all configurations": str(sum(count_parameters(tree) for _, tree in trees.values())),
         "named and inline float constants": str(sum(count_constants(tree) for _, tree in trees.values())),
         "class names that stand twice": f"{len(twice)} ({', '.join(twice)})" if twice else "0",
         "import circles of modules": str(len(circles(module_imports(trees)))),
@@ -69,6 +69,14 @@ def measure(trees: Trees) -> dict[str, str]:
         "functions over 40 lines": str(sum(length > 40 for length in lengths)),
         "longest file, lines": f"{lines[longest]} ({longest.name})",
     }
+
+
+def parameter_counts(checkout: Path) -> dict[str, str]:
+    """How many ROS parameters the nodes declare; ``parameters.py`` lists them."""
+    from parameters import declared_parameters  # beside this file: there when it runs as a script
+
+    declared = declared_parameters(checkout)
+    return {"declared ROS parameters": f"{len(declared)}, {len({(p.config, p.field) for p in declared})} distinct"}
 
 
 def public_names(tree: ast.Module) -> Iterator[str]:

@@ -33,7 +33,7 @@ def corner(rng: np.random.Generator) -> FloatArray:
 def test_normals_of_a_planar_cloud_lie_in_the_plane(lift: float) -> None:
     rng = np.random.default_rng(1)
     points = corner(rng) + lift * rng.normal(size=(450, 3)) * [0.0, 0.0, 1.0]
-    normals = IcpTarget(points, IcpConfig()).normals
+    normals = IcpTarget(points).normals
     np.testing.assert_array_equal(normals[:, 2], 0.0)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
     assert np.median(np.abs(normals[20:130, 1])) > 0.99  # of the wall along x
@@ -49,7 +49,7 @@ def test_planar_scans_are_registered(plane: bool, limit: float) -> None:
     truth = make_transform(rotation_from_euler(0.08), np.array([0.12, -0.07, 0.0]))
     source = transform_points(invert_transform(truth), corner(rng))
     outcome = icp_align(
-        source, IcpTarget(corner(rng), config), np.eye(4), 2.0, config, coarse_points=10_000, plane=plane, planar=True
+        source, IcpTarget(corner(rng)), np.eye(4), 2.0, config, coarse_points=10_000, plane=plane, planar=True
     )
     error = boxminus(outcome.T, truth)
     assert outcome.converged
@@ -69,7 +69,7 @@ def test_points_beyond_the_rejection_limit_pull_at_nothing(plane: bool) -> None:
     for limit in (0.1, 5.0):
         config = IcpConfig(max_distance=limit, final_spacings=limit / SPACING, trimmed=1.0)
         outcome = icp_align(
-            source, IcpTarget(target, config), np.eye(4), 2.0, config, coarse_points=10_000, plane=plane, planar=True
+            source, IcpTarget(target), np.eye(4), 2.0, config, coarse_points=10_000, plane=plane, planar=True
         )
         errors.append(float(np.linalg.norm(outcome.T[:2, 3])))
     assert errors[0] < 0.01

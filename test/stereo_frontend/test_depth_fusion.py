@@ -9,7 +9,7 @@ import pytest
 from slam_core.camera import Camera
 from slam_core.geometry import invert_transform, make_transform, so3_exp, transform_points
 from slam_core.types import DepthImage
-from stereo_frontend.depth_fusion import FusionConfig, MappedDepth, fuse_depth, map_depth
+from stereo_frontend.depth_fusion import MappedDepth, fuse_depth, map_depth
 
 LEFT = Camera(640, 480, 283.0, 283.0, 320.0, 240.0)
 TOF = Camera(204, 204, 280.0, 280.0, 101.5, 101.5)
@@ -35,7 +35,7 @@ def left_points(rng, n=300):
 @pytest.mark.parametrize("offset", [0.0, 0.5, -0.6, np.nan])
 def test_parallax_is_solved_whatever_the_first_guess(rng, offset):
     uv, truth = left_points(rng)
-    mapped = map_depth(uv, truth + offset, LEFT, tof_image_of_the_plane(), T_LEFT_TOF, FusionConfig())
+    mapped = map_depth(uv, truth + offset, LEFT, tof_image_of_the_plane(), T_LEFT_TOF)
     assert np.isfinite(mapped.depth).mean() > 0.95
     ok = np.isfinite(mapped.depth)
     np.testing.assert_allclose(mapped.depth[ok], truth[ok], atol=0.002)
@@ -46,20 +46,20 @@ def test_parallax_is_solved_whatever_the_first_guess(rng, offset):
 
 def test_pixels_outside_the_tof_image_have_no_depth(rng):
     uv = np.array([[5.0, 5.0], [630.0, 470.0]])
-    mapped = map_depth(uv, np.array([1.5, 1.5]), LEFT, tof_image_of_the_plane(), T_LEFT_TOF, FusionConfig())
+    mapped = map_depth(uv, np.array([1.5, 1.5]), LEFT, tof_image_of_the_plane(), T_LEFT_TOF)
     assert np.isnan(mapped.depth).all()
 
 
 def test_an_empty_depth_image_gives_nothing(rng):
     uv, truth = left_points(rng, 5)
     empty = DepthImage(0, np.full((204, 204), np.nan, np.float32), np.full((204, 204), np.nan, np.float32), TOF)
-    assert np.isnan(map_depth(uv, truth, LEFT, empty, T_LEFT_TOF, FusionConfig()).depth).all()
+    assert np.isnan(map_depth(uv, truth, LEFT, empty, T_LEFT_TOF).depth).all()
 
 
 def test_age_grows_the_sigma(rng):
     uv, truth = left_points(rng)
     sigma = [
-        np.nanmedian(map_depth(uv, truth, LEFT, tof_image_of_the_plane(), T_LEFT_TOF, FusionConfig(), age).sigma)
+        np.nanmedian(map_depth(uv, truth, LEFT, tof_image_of_the_plane(), T_LEFT_TOF, age).sigma)
         for age in (0.0, 0.02, 0.05)
     ]
     assert sigma[0] < sigma[1] < sigma[2]

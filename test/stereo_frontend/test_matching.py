@@ -8,6 +8,7 @@ import pytest
 
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.matching import (
+    MAX_SIZE_RATIO,
     MatchingConfig,
     disparity_bounds,
     has_candidate,
@@ -74,7 +75,7 @@ def twin(left, right, config, bounds):
     disparity = left.uv[:, None, 0] - right.uv[None, :, 0]
     allowed = (np.abs(left.uv[:, None, 1] - right.uv[None, :, 1]) <= config.epipolar_band) & (disparity >= bounds[0])
     allowed &= (disparity <= bounds[1]) & (
-        np.abs(np.log(left.size[:, None] / right.size[None])) <= np.log(config.max_size_ratio)
+        np.abs(np.log(left.size[:, None] / right.size[None])) <= np.log(MAX_SIZE_RATIO)
     )
     similarity = np.where(allowed, left.descriptors @ right.descriptors.T, -2.0)
     best = similarity.argmax(axis=1)

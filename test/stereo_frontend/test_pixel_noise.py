@@ -6,13 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
+from stereo_frontend.pixel_noise import ROW_FLOOR, ROW_SLOPE, PixelNoise, PixelNoiseConfig
 
 
 def learn(noise, rng, true_factor, frames=60, offset=0.0):
     size = rng.uniform(12, 60, 200).astype(np.float32)
     for _ in range(frames):
-        clean = np.hypot(noise.config.row_floor, noise.config.row_slope * size)
+        clean = np.hypot(ROW_FLOOR, ROW_SLOPE * size)
         errors = true_factor * clean * rng.normal(size=(2, 200))
         noise.learn(errors[0] - errors[1] + offset, size)
     return noise

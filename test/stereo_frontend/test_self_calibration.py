@@ -66,7 +66,7 @@ class Walk:
 
 
 def learnt(turn: np.ndarray, seed: int, frames: int = 25, **options) -> StereoSelfCalibration:
-    calibration = StereoSelfCalibration(from_mapping(SelfCalibrationConfig, {"row_floor": 0.01, **options}))
+    calibration = StereoSelfCalibration(SelfCalibrationConfig(row_floor=0.01, **options))
     for k, view in enumerate(Walk(turn, seed).views(frames)):
         if k == 0:
             calibration.acquire(view)

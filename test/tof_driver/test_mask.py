@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tof_driver.mask import MaskConfig, Reason, judge_pixels, reject_flying_pixels
+from tof_driver.mask import (
+    MAXIMUM_INCIDENCE_DEG,
+    MINIMUM_NEIGHBOURS,
+    NOISE_MULTIPLE,
+    MaskConfig,
+    Reason,
+    judge_pixels,
+    reject_flying_pixels,
+)
 
 CONFIG = MaskConfig()
 
@@ -55,11 +63,11 @@ def flying_twin(
             if 0 <= n < height and 0 <= m < width and read[n, m]:
                 steps = np.hypot(n - v, m - u)
                 limit = steps * slope * min(distance[v, u], distance[n, m])
-                limit += CONFIG.noise_multiple * (sigma[v, u] + sigma[n, m]) / np.sqrt(2.0)
+                limit += NOISE_MULTIPLE * (sigma[v, u] + sigma[n, m]) / np.sqrt(2.0)
                 if abs(distance[v, u] - distance[n, m]) > limit:
                     flying[v, u] = True
                 same += 1
-        flying[v, u] |= same < CONFIG.minimum_neighbours
+        flying[v, u] |= same < MINIMUM_NEIGHBOURS
     return flying
 
 
@@ -70,9 +78,9 @@ def test_kernel_against_its_twin(rng: np.random.Generator) -> None:
     reason = rng.choice([0, 0, 0, 0, 0, 1, 3, 4], distance.shape).astype(np.uint8)
     read = (reason != Reason.NO_READING) & (reason != Reason.SATURATED)
     distance[~read] = rng.choice([0.0, np.nan, 9.0], int((~read).sum()))
-    expected = flying_twin(distance, sigma, read, np.tan(np.radians(CONFIG.maximum_incidence_deg)) / 280.0)
+    expected = flying_twin(distance, sigma, read, np.tan(np.radians(MAXIMUM_INCIDENCE_DEG)) / 280.0)
     before = reason.copy()
-    reject_flying_pixels(CONFIG, distance, sigma, reason, 1.0 / 280.0)
+    reject_flying_pixels(distance, sigma, reason, 1.0 / 280.0)
     np.testing.assert_array_equal(reason == Reason.FLYING, expected & (before == Reason.VALID))
     np.testing.assert_array_equal(reason[before != Reason.VALID], before[before != Reason.VALID])
     assert 50 < expected.sum() < 0.9 * expected.size
@@ -83,11 +91,11 @@ def test_a_mixed_pixel_goes_and_a_slanted_wall_stays() -> None:
     edge = np.where(np.arange(9) < 4, 1.5, 3.0) * np.ones((7, 1))
     edge[:, 4] = 2.2
     reason = np.zeros(edge.shape, dtype=np.uint8)
-    reject_flying_pixels(CONFIG, edge.astype(np.float32), sigma, reason, 1.0 / 280.0)
+    reject_flying_pixels(edge.astype(np.float32), sigma, reason, 1.0 / 280.0)
     np.testing.assert_array_equal(reason[3] == Reason.FLYING, [0, 0, 0, 1, 1, 1, 0, 0, 0])
     slanted = 2.0 + 2.0 * np.tan(np.radians(70.0)) / 280.0 * np.arange(9) * np.ones((7, 1))
     reason[:] = 0
-    reject_flying_pixels(CONFIG, slanted.astype(np.float32), sigma, reason, 1.0 / 280.0)
+    reject_flying_pixels(slanted.astype(np.float32), sigma, reason, 1.0 / 280.0)
     assert not reason.any()
 
 
@@ -95,6 +103,6 @@ def test_a_dark_neighbour_still_shows_the_edge() -> None:
     distance = np.where(np.arange(9) < 4, 1.5, 3.0) * np.ones((7, 1), dtype=np.float32)
     reason = np.zeros(distance.shape, dtype=np.uint8)
     reason[:, 4:] = Reason.TOO_DARK
-    reject_flying_pixels(CONFIG, distance.astype(np.float32), np.full_like(distance, 0.003), reason, 1.0 / 280.0)
+    reject_flying_pixels(distance.astype(np.float32), np.full_like(distance, 0.003), reason, 1.0 / 280.0)
     assert (reason[:, 3] == Reason.FLYING).all()
     assert (reason[1:-1, :3] == Reason.VALID).all()

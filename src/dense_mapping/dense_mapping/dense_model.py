@@ -26,6 +26,13 @@ from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.types import ByteArray, DepthImage
 
+_MOVE_DISTANCE = 0.01
+"""A key frame is moved when its pose changes by more."""
+_MOVE_ANGLE_DEG = 0.3
+"""Or turns by more, deg."""
+_MOVES_AT_ONCE = 40
+"""Key frames moved in one step."""
+
 PoseLookup = Callable[[str, int], FloatArray | None]
 """T_map_camera of a camera at a stamp, or None where it is not known (any more)."""
 
@@ -39,9 +46,6 @@ class DenseConfig(Config):
     max_keyframes: int = parameter(
         1500, "key frames kept to be moved; the oldest beyond that stay where they are", minimum=1
     )
-    move_distance: float = parameter(0.01, "a key frame is moved when its pose changes by more", unit="m", minimum=0.0)
-    move_angle_deg: float = parameter(0.3, "or turns by more", unit="deg", minimum=0.0)
-    moves_at_once: int = parameter(40, "key frames moved in one step", minimum=1)
     keyframe: KeyframeConfig = group(KeyframeConfig)
     stereo: StereoDepthConfig = group(StereoDepthConfig)
     tsdf: TsdfConfig = group(TsdfConfig)
@@ -94,7 +98,7 @@ class DenseModel:
     def move(self, lookup: PoseLookup, most: int | None = None) -> int:
         """Move key frames whose pose has changed, ``most`` at once (default ``moves_at_once``); returns how many."""
         changes = sorted(self._changes(lookup), key=lambda change: -change[0])
-        chosen = changes[: self.config.moves_at_once if most is None else most]
+        chosen = changes[: _MOVES_AT_ONCE if most is None else most]
         for _, placed, T in chosen:
             k = placed.keyframe
             self.volume.remove(placed.T_map_camera, k.camera, k.depth, k.sigma)
@@ -122,7 +126,7 @@ class DenseModel:
 
     def _changes(self, lookup: PoseLookup) -> Iterator[tuple[float, PlacedKeyframe, FloatArray]]:
         """How far key frames are from where they belong, in units of what is tolerated."""
-        tolerance = np.array([self.config.move_distance, np.radians(self.config.move_angle_deg)]) + 1e-9
+        tolerance = np.array([_MOVE_DISTANCE, np.radians(_MOVE_ANGLE_DEG)]) + 1e-9
         for placed in self._placed:
             T = lookup(placed.camera, placed.keyframe.stamp_ns)
             if T is None:

@@ -21,6 +21,17 @@ from slam_core.camera import MIN_DEPTH
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, make_transform, transform_points
 
+_CLEAR_BELOW = 0.6
+"""Only rays lower than this above the floor make a cell free: a ray over a table does not."""
+_MIN_RAYS = 2
+"""Rays through a cell that make it free."""
+_RAY_STEP = 4
+"""Every so many pixels a ray is drawn, px."""
+_STOREY_HEIGHT = 2.0
+"""Least height from one floor to the next."""
+_MAX_CELLS = 25_000_000
+"""A plan with more cells is not made."""
+
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """Values of nav_msgs/OccupancyGrid."""
 
@@ -34,20 +45,11 @@ class FloorPlanConfig(Config):
     resolution: float = parameter(0.05, "edge of a cell", unit="m", minimum=0.01, maximum=1.0)
     lowest: float = parameter(0.15, "surface lower than this above the floor is no obstacle", unit="m", minimum=0.0)
     highest: float = parameter(1.9, "surface higher than this above the floor is no obstacle", unit="m", minimum=0.1)
-    clear_below: float = parameter(
-        0.6,
-        "only rays lower than this above the floor make a cell free: a ray over a table does not",
-        unit="m",
-        minimum=0.05,
-    )
-    min_points: int = parameter(3, "points of the model that make a cell occupied", minimum=1)
-    min_rays: int = parameter(2, "rays through a cell that make it free", minimum=1)
-    ray_step: int = parameter(4, "every so many pixels a ray is drawn", unit="px", minimum=1)
-    storey_height: float = parameter(2.0, "least height from one floor to the next", unit="m", minimum=0.5)
+    min_points: int = 3
+    """Points of the model that make a cell occupied."""
     camera_height: float = parameter(
         1.3, "height of the cameras above the floor where no floor was seen", unit="m", minimum=0.0
     )
-    max_cells: int = parameter(25_000_000, "a plan with more cells is not made", minimum=1000)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,13 +112,13 @@ def floor_plans(
     normals = surface.normals.astype(np.float64) @ T_level_map[:3, :3].T
     poses = [T_level_map @ k.T_map_camera for k in keyframes]
     cameras = np.stack([T[:3, 3] for T in poses])
-    floors = floor_heights(points, normals, cameras, config.storey_height, config.camera_height)
+    floors = floor_heights(points, normals, cameras, _STOREY_HEIGHT, config.camera_height)
     storeys = storey_of(cameras, floors)
     plans = []
     for i, floor in enumerate(floors):
         own = np.flatnonzero(storeys == i).tolist()
         band = (points[:, 2] > floor + config.lowest) & (points[:, 2] < floor + config.highest)
-        rays = [_rays(keyframes[k], poses[k], config.ray_step) for k in own]
+        rays = [_rays(keyframes[k], poses[k], _RAY_STEP) for k in own]
         if own:
             plans.append(_plan(points[band], rays, float(floor), config, T_level_map))
     return tuple(plans)
@@ -142,16 +144,16 @@ def _plan(
     corners = np.concatenate([obstacles[:, :2], everything[:, :2], everything[:, 3:5]])
     low = np.floor(corners.min(axis=0) / config.resolution) - 2.0
     shape = (np.ceil(corners.max(axis=0) / config.resolution) - low + 2.0).astype(np.int64)[::-1]
-    if shape.prod() > config.max_cells:
+    if shape.prod() > _MAX_CELLS:
         raise ValueError(
             f"a floor plan of {shape[1]} x {shape[0]} cells of {config.resolution} m is more than max_cells "
-            f"({config.max_cells}): raise resolution"
+            f"({_MAX_CELLS}): raise resolution"
         )
     corner = low * config.resolution
     through = np.zeros(tuple(shape), dtype=np.int32)
-    band = np.array([floor - 0.5 * config.lowest, floor + config.clear_below])
+    band = np.array([floor - 0.5 * config.lowest, floor + _CLEAR_BELOW])
     _trace(everything, corner, config.resolution, band, through)
-    cells = np.where(through >= config.min_rays, FREE, UNKNOWN).astype(np.int8)
+    cells = np.where(through >= _MIN_RAYS, FREE, UNKNOWN).astype(np.int8)
     cells[_occupied(obstacles, corner, config, through.shape)] = OCCUPIED
     for ray in rays:
         if len(ray):

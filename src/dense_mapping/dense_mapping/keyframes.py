@@ -14,6 +14,9 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.types import ByteArray, DepthImage, Float32Array
 
+_MAX_PIXELS = 320 * 240
+"""Larger depth images are halved until they have no more pixels, px."""
+
 _DEPTH_UNIT = 0.00025
 _SIGMA_UNIT = 0.0005
 _NO_PICTURE: ByteArray = np.empty((0, 0, 3), dtype=np.uint8)
@@ -29,9 +32,6 @@ class KeyframeConfig(Config):
     max_depth: float = parameter(5.0, "depth beyond which a pixel is left out", unit="m", minimum=0.5, maximum=16.0)
     max_sigma: float = parameter(
         0.12, "standard deviation of depth beyond which a pixel is left out", unit="m", minimum=1e-3, maximum=0.12
-    )
-    max_pixels: int = parameter(
-        320 * 240, "larger depth images are halved until they have no more pixels", unit="px", minimum=1000
     )
 
 
@@ -98,7 +98,7 @@ def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray 
     with np.errstate(invalid="ignore"):
         good = (depth >= config.min_depth) & (depth <= config.max_depth) & (sigma <= config.max_sigma)
     depth, sigma = np.where(good, depth, 0.0).astype(np.float32), np.where(good, sigma, 0.0).astype(np.float32)
-    while depth.size > config.max_pixels:
+    while depth.size > _MAX_PIXELS:
         # Every other pixel, not a mean: a mean over an edge would be a point in the air.
         depth, sigma = depth[::2, ::2], sigma[::2, ::2]
         picture = None if picture is None else _halved(picture)

@@ -22,6 +22,29 @@ import numpy.typing as npt
 from slam_core.config import Config, parameter
 from slam_core.types import AnyArray, ByteArray, DepthImage, Float32Array, StereoImages
 
+_BLOCK_SIZE = 7
+"""Window that is compared, odd, px."""
+_UNIQUENESS_PERCENT = 5
+"""How much better the best disparity must be than the second best, %."""
+_MAX_LEFT_RIGHT = 1.0
+"""Largest difference between the disparities left to right and right to left, px."""
+_SPECKLE_SIZE = 200
+"""Islands of disparity up to this size are dropped, px."""
+_EDGE_RADIUS = 2
+"""Pixels so near a jump of disparity are dropped: the matcher widens near objects, px."""
+_JUMP = 3.0
+"""Difference of disparities within :data:`_EDGE_RADIUS` that is a jump, px."""
+_WINDOW = 15
+"""Window of the sub-pixel step and of sigma, odd, px."""
+_IMAGE_NOISE = 2.0
+"""Standard deviation of a grey value."""
+_SIGMA_SCALE = 2.0
+"""Factor on the standard deviation from residual and gradient: neighbours share their errors."""
+_SIGMA_FLOOR = 0.12
+"""Standard deviation of a perfect window's disparity, px."""
+_MAX_SIGMA = 1.0
+"""Disparities with a larger sigma are dropped, px."""
+
 Mask = npt.NDArray[np.bool_]
 
 _SUBPIXELS = 16.0
@@ -40,27 +63,6 @@ class StereoDepthConfig(Config):
     max_pixels: int = parameter(
         240000, "larger images are halved for matching until they have no more pixels", unit="px", minimum=1000
     )
-    block_size: int = parameter(7, "window that is compared, odd", unit="px", minimum=3, maximum=21)
-    uniqueness_percent: int = parameter(
-        5, "how much better the best disparity must be than the second best", unit="%", minimum=0, maximum=100
-    )
-    max_left_right: float = parameter(
-        1.0, "largest difference between the disparities left to right and right to left", unit="px", minimum=0.1
-    )
-    speckle_size: int = parameter(200, "islands of disparity up to this size are dropped", unit="px", minimum=0)
-    edge_radius: int = parameter(
-        2, "pixels so near a jump of disparity are dropped: the matcher widens near objects", unit="px", minimum=0
-    )
-    jump: float = parameter(
-        3.0, "difference of disparities within ``edge_radius`` that is a jump", unit="px", minimum=0.1
-    )
-    window: int = parameter(15, "window of the sub-pixel step and of sigma, odd", unit="px", minimum=3, maximum=31)
-    image_noise: float = parameter(2.0, "standard deviation of a grey value", minimum=0.1)
-    sigma_scale: float = parameter(
-        2.0, "factor on the standard deviation from residual and gradient: neighbours share their errors", minimum=0.1
-    )
-    sigma_floor: float = parameter(0.12, "standard deviation of a perfect window's disparity", unit="px", minimum=0.001)
-    max_sigma: float = parameter(1.0, "disparities with a larger sigma are dropped", unit="px", minimum=0.01)
 
 
 def stereo_depth(images: StereoImages, config: StereoDepthConfig) -> DepthImage:
@@ -76,8 +78,8 @@ def stereo_depth(images: StereoImages, config: StereoDepthConfig) -> DepthImage:
 def _disparity(images: StereoImages, config: StereoDepthConfig) -> tuple[Float32Array, Float32Array]:
     """Disparity and its standard deviation (height, width) px, NaN where either is not trusted."""
     disparity = _checked_disparity(images, config)
-    refined, sigma = _refined(images.left, images.right, disparity, config)
-    dropped = ~(sigma < config.max_sigma) | ~(np.abs(refined - disparity) < 1.0) | ~(refined > 0.5)
+    refined, sigma = _refined(images.left, images.right, disparity)
+    dropped = ~(sigma < _MAX_SIGMA) | ~(np.abs(refined - disparity) < 1.0) | ~(refined > 0.5)
     refined[dropped] = np.nan
     sigma[dropped] = np.nan
     return refined, sigma
@@ -90,11 +92,11 @@ def _checked_disparity(images: StereoImages, config: StereoDepthConfig) -> Float
     scale = left.shape[1] / width
     largest = scale * images.stereo.camera.fx * images.stereo.baseline / config.min_depth
     steps = 16 * max(1, int(np.ceil(min(largest, left.shape[1] / 3.0) / 16.0)))
-    disparity = _match(left, right, steps, config)
+    disparity = _match(left, right, steps)
     mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (right, left)]
-    back = _match(mirrored[0], mirrored[1], steps, config)[:, ::-1]
-    disparity[_disagrees(disparity, back, config.max_left_right)] = np.nan
-    disparity[_near_jump(disparity, config)] = np.nan
+    back = _match(mirrored[0], mirrored[1], steps)[:, ::-1]
+    disparity[_disagrees(disparity, back, _MAX_LEFT_RIGHT)] = np.nan
+    disparity[_near_jump(disparity)] = np.nan
     # Linear: nearest neighbours would make steps of every slanted wall. What has an unknown neighbour gets unknown.
     return np.asarray(cv2.resize(disparity / np.float32(scale), (width, height), interpolation=cv2.INTER_LINEAR))
 
@@ -106,13 +108,13 @@ def _halved(image: ByteArray, max_pixels: int) -> ByteArray:
     return image
 
 
-def _match(image: ByteArray, other: ByteArray, steps: int, config: StereoDepthConfig) -> Float32Array:
-    area = config.block_size**2
+def _match(image: ByteArray, other: ByteArray, steps: int) -> Float32Array:
+    area = _BLOCK_SIZE**2
     # Columns left of the first disparity cannot be matched: widened images keep the left edge of the picture.
     padded = [cv2.copyMakeBorder(i, 0, 0, steps, 0, cv2.BORDER_REPLICATE) for i in (image, other)]
     matcher = cv2.StereoSGBM.create(
-        minDisparity=0, numDisparities=steps, blockSize=config.block_size, P1=8 * area, P2=64 * area, preFilterCap=31,
-        uniquenessRatio=config.uniqueness_percent, speckleWindowSize=config.speckle_size, speckleRange=1,
+        minDisparity=0, numDisparities=steps, blockSize=_BLOCK_SIZE, P1=8 * area, P2=64 * area, preFilterCap=31,
+        uniquenessRatio=_UNIQUENESS_PERCENT, speckleWindowSize=_SPECKLE_SIZE, speckleRange=1,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
     disparity = matcher.compute(*padded)[:, steps:].astype(np.float32) / np.float32(_SUBPIXELS)
@@ -129,39 +131,37 @@ def _disagrees(left: Float32Array, right: Float32Array, most: float) -> Mask:
     return _mask(~(inside & (np.abs(left - back) <= most)))
 
 
-def _near_jump(disparity: Float32Array, config: StereoDepthConfig) -> Mask:
+def _near_jump(disparity: Float32Array) -> Mask:
     """Within ``edge_radius`` of a jump; a slope as steep as a floor is none."""
-    if config.edge_radius == 0:
+    if _EDGE_RADIUS == 0:
         return np.zeros(disparity.shape, dtype=bool)
     known = np.isfinite(disparity)
-    window = np.ones((2 * config.edge_radius + 1,) * 2, np.uint8)
+    window = np.ones((2 * _EDGE_RADIUS + 1,) * 2, np.uint8)
     lowest = cv2.erode(np.where(known, disparity, _FAR_PX).astype(np.float32), window)
     highest = cv2.dilate(np.where(known, disparity, -_FAR_PX).astype(np.float32), window)
-    return _mask((highest - lowest > config.jump) & (highest > 0.0) & (lowest < _FAR_PX))
+    return _mask((highest - lowest > _JUMP) & (highest > 0.0) & (lowest < _FAR_PX))
 
 
 def _mask(values: AnyArray) -> Mask:
     return np.asarray(values, dtype=np.bool_)
 
 
-def _refined(
-    left: ByteArray, right: ByteArray, disparity: Float32Array, config: StereoDepthConfig
-) -> tuple[Float32Array, Float32Array]:
+def _refined(left: ByteArray, right: ByteArray, disparity: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Disparity after one Gauss-Newton step, and its standard deviation, from a window around each pixel."""
     known = np.isfinite(disparity)
     warped = _warped(right, np.where(known, disparity, np.float32(0.0)))
     image = left.astype(np.float32)
     gradient = 0.5 * (_along_row(image) + _along_row(warped))
     residual = warped - image
-    sums = _WindowSums(known, config.window)
+    sums = _WindowSums(known, _WINDOW)
     offset, slope = sums(residual) / sums.count, sums(gradient) / sums.count
-    noise = np.float32(config.image_noise**2)
+    noise = np.float32(_IMAGE_NOISE**2)
     energy = np.maximum(sums(gradient**2) - sums.count * (slope**2 + 0.25 * noise), 1e-3)
     product = sums(gradient * residual) - sums.count * slope * offset
     variance = np.maximum(sums(residual**2) / sums.count - offset**2, 2.0 * noise)
     # warped(u) = R(u - d): a larger d moves the right image to the right, so dr/dd = -g.
     refined = np.where(known, disparity + np.clip(product / energy, -2.0, 2.0), np.nan).astype(np.float32)
-    sigma = np.hypot(config.sigma_scale * np.sqrt(variance / energy), config.sigma_floor)
+    sigma = np.hypot(_SIGMA_SCALE * np.sqrt(variance / energy), _SIGMA_FLOOR)
     return refined, np.where(known, sigma, np.nan).astype(np.float32)
 
 

@@ -21,8 +21,15 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import ByteArray, Float32Array
 
+_SIGMA_FLOOR = 0.002
+"""Standard deviation that no number of images improves: calibration, grid."""
+_CORRELATION = 0.15
+"""Share of the variance that the key frames of one place have in common."""
+_MIN_TRIANGLES = 60
+"""Connected pieces with fewer triangles are left out."""
 _FACES_AT_ONCE = 50_000
 """Triangles whose normals are computed at once, for the sake of memory."""
+
 _CHUNK = 6
 """Blocks along the edge of a cube that marching cubes runs over at once."""
 _UNSEEN = 150
@@ -33,15 +40,9 @@ _UNSEEN = 150
 class SurfaceConfig(Config):
     """Which voxels shape the surface, and what its standard deviation is made of."""
 
-    min_images: int = parameter(2, "a voxel counts from so many key frames on", minimum=1)
+    min_images: int = 2
+    """A voxel counts from so many key frames on."""
     max_sigma: float = parameter(0.06, "voxels whose distance is less certain are left out", unit="m", minimum=1e-3)
-    sigma_floor: float = parameter(
-        0.002, "standard deviation that no number of images improves: calibration, grid", unit="m", minimum=0.0
-    )
-    correlation: float = parameter(
-        0.15, "share of the variance that the key frames of one place have in common", minimum=0.0, maximum=1.0
-    )
-    min_triangles: int = parameter(60, "connected pieces with fewer triangles are left out", minimum=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ def extract_surface(volume: TsdfVolume, config: SurfaceConfig) -> Surface:
     points, colours, sigma = (np.concatenate([piece[k] for piece in pieces]) for k in (0, 2, 3))
     faces = np.concatenate([piece[1] + offset for piece, offset in zip(pieces, offsets, strict=False)])
     points, faces, kept = _welded(points, faces, volume.config.voxel_size)
-    faces = _without_islands(faces, len(points), config.min_triangles)
+    faces = _without_islands(faces, len(points), _MIN_TRIANGLES)
     used, faces = _renumbered(faces, len(points))
     points = points[used]
     return Surface(points, _normals(points, faces), colours[kept][used], sigma[kept][used], faces)
@@ -95,7 +96,7 @@ def voxel_statistics(voxels: Float32Array, config: SurfaceConfig) -> tuple[Float
     w, count = weight[seen].astype(np.float64), number[seen].astype(np.float64)
     seen_mean = weighted[seen] / w
     spread = np.maximum(squared[seen] - weighted[seen] * seen_mean, 0.0) / np.maximum(count - 1.0, 1.0)
-    variance = np.maximum(spread, 1.0) * (1.0 + (count - 1.0) * config.correlation) / w + config.sigma_floor**2
+    variance = np.maximum(spread, 1.0) * (1.0 + (count - 1.0) * _CORRELATION) / w + _SIGMA_FLOOR**2
     seen_sigma = np.sqrt(variance)
     known = seen_sigma <= config.max_sigma
     mean, sigma = (np.full(seen.shape, np.nan, dtype=np.float32) for _ in range(2))

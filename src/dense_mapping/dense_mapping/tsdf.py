@@ -19,6 +19,8 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray, Float32Array
 
+_TRUNCATION_VOXELS = 3.0
+"""Distances are kept up to so many voxels."""
 VOXELS = BLOCK**3
 _KEY_RANGE = 1 << 20
 """Block coordinates lie within plus and minus half of this."""
@@ -29,7 +31,6 @@ class TsdfConfig(Config):
     """The grid of the dense model."""
 
     voxel_size: float = parameter(0.03, "edge of a voxel", unit="m", minimum=0.005, maximum=0.5)
-    truncation_voxels: float = parameter(3.0, "distances are kept up to so many voxels", minimum=2.0, maximum=10.0)
     max_blocks: int = parameter(60000, "blocks of 8 x 8 x 8 voxels (10 kB each) beyond which none is added", minimum=1)
 
 
@@ -51,7 +52,7 @@ class TsdfVolume:
 
     def __init__(self, config: TsdfConfig) -> None:
         self.config = config
-        self.truncation = config.truncation_voxels * config.voxel_size
+        self.truncation = _TRUNCATION_VOXELS * config.voxel_size
         self.block_size = BLOCK * config.voxel_size
         self.refused_blocks = 0
         self._rows: dict[int, int] = {}

@@ -21,6 +21,9 @@ from slam_core.geometry import (
 )  # fmt: skip
 from slam_core.types import ImuSample, RelativeMotion
 
+_AID_STAMP_TOLERANCE = 0.005
+"""Largest difference of the stamps of a motion aid and of the frames it joins."""
+
 ALL = slice(0, 6)
 ROTATION = slice(3, 6)
 
@@ -107,7 +110,7 @@ class MotionAids:
 
     def _motions_cover(self, start_stamp_ns: int, end_stamp_ns: int) -> bool:
         first, last = self._motions[0], self._motions[-1]
-        tolerance = self._config.aid_stamp_tolerance * 1e9
+        tolerance = _AID_STAMP_TOLERANCE * 1e9
         reach = last.end_stamp_ns + max(tolerance, last.end_stamp_ns - last.start_stamp_ns)
         return first.start_stamp_ns <= start_stamp_ns + tolerance and end_stamp_ns <= reach
 
@@ -138,7 +141,7 @@ class MotionAids:
         return Aid(make_transform(rotation, np.zeros(3)), variance * dt**2, ROTATION)
 
     def _is_same_time(self, a: int, b: int) -> bool:
-        return abs(a - b) <= self._config.aid_stamp_tolerance * 1e9
+        return abs(a - b) <= _AID_STAMP_TOLERANCE * 1e9
 
 
 def aid_error(aid: Aid, T_previous_now: FloatArray, rotation_map_previous: FloatArray) -> tuple[FloatArray, FloatArray]:

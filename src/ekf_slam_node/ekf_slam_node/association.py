@@ -21,6 +21,9 @@ from ekf_slam_node.pair_kernels import first_of_both
 from slam_core.geometry import FloatArray, transform_points
 from slam_core.least_squares import chi_square_bound
 
+_JOINT_FEATURES = 20
+"""Features that the search for joint compatibility takes in."""
+
 IndexArray = npt.NDArray[np.int64]
 Similarity = npt.NDArray[np.floating]
 _JOINT_CONFIDENCE = 0.999
@@ -179,7 +182,7 @@ def _clearest_pairs(
     candidates: Candidates, frame: Frame, similarity: Similarity, seen: Observation, motion_covariance: FloatArray,
     config: FeatureAssociationConfig,
 ) -> tuple[IndexArray, IndexArray, FloatArray]:  # fmt: skip
-    """Rows, columns and costs of the gated pairs of the ``joint_features`` features with the fewest candidates."""
+    """Rows, columns and costs of the gated pairs of the features with the fewest candidates."""
     S = innovation_covariance(seen, candidates, motion_covariance)
     rows, columns, costs = _gated_pairs(
         frame.z, frame.variance, seen.z, S, seen.in_image(frame.camera), similarity, config.descriptor_threshold,
@@ -187,5 +190,5 @@ def _clearest_pairs(
     )  # fmt: skip
     choices = np.bincount(columns, minlength=len(frame))
     clearest = np.argsort(np.where(choices > 0, choices, np.iinfo(np.int64).max), kind="stable")
-    kept = np.isin(columns, clearest[: config.joint_features])
+    kept = np.isin(columns, clearest[:_JOINT_FEATURES])
     return rows[kept], columns[kept], costs[kept]

@@ -11,6 +11,9 @@ from ekf_slam_node.calibration import CalibrationErrorConfig
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray
 
+NEAREST_ASSOCIATE = 0.15
+"""Gate g_A of Algorithm 1."""
+
 
 @dataclass(frozen=True)
 class MotionConfig(Config):
@@ -30,7 +33,6 @@ class MotionConfig(Config):
         "auto", "whether an IMU is used: where there is one, never, or always (a run without one is refused)",
         choices=("auto", "off", "on"),
     )  # fmt: skip
-    coast_time: float = parameter(0.5, "a lost rig is assumed to stop after this time", unit="s", minimum=0.0)
     sigma_gyro: float = parameter(
         0.02, "noise of the mean turn rate of an IMU between two frames", unit="rad/s", minimum=1e-6
     )
@@ -39,10 +41,6 @@ class MotionConfig(Config):
     )
     sigma_gyro_bias_walk: float = parameter(
         1e-4, "change of that error within a second, growing with the root of the time", unit="rad/s", minimum=0.0
-    )
-    aid_gate: float = parameter(22.46, "chi-square gate of a motion aid, 6 degrees of freedom (99.9 %)", minimum=1.0)
-    aid_stamp_tolerance: float = parameter(
-        0.005, "largest difference of the stamps of a motion aid and of the frames it joins", unit="s", minimum=0.0
     )
 
     @property
@@ -60,27 +58,6 @@ class MotionConfig(Config):
 class MeasurementConfig(Config):
     """Which features are good enough to be measurements."""
 
-    max_relative_depth_sigma: float = parameter(
-        0.3,
-        "features of a larger sigma of depth / depth are not used; a limit that cuts through many favours those"
-        " whose noise makes them look near and biases the motion",
-        minimum=0.001,
-        maximum=0.5,
-    )
-    min_sigma_px: float = parameter(0.05, "floor of the pixel noise", unit="px", minimum=1e-3)
-    min_sigma_depth: float = parameter(1e-4, "floor of the depth noise", unit="m", minimum=1e-6)
-    noise_memory: float = parameter(
-        0.9,
-        "share of the past in the running estimate of how much larger the noise is than claimed",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    noise_tolerance: float = parameter(
-        2.0, "variances of one frame are enlarged only if its errors exceed them by more than this factor", minimum=1.0
-    )
-    max_noise_factor: float = parameter(
-        25.0, "largest factor on the claimed variances; 1 trusts every claim", minimum=1.0, maximum=1e4
-    )
     common_error: float = parameter(
         2.5,
         "error of the camera's pose, new in every frame, in multiples of what the residuals of neighbouring features"
@@ -106,27 +83,7 @@ class FeatureAssociationConfig(Config):
         "weight of 1 - cosine beside the normalised distance of Eq. 4.8; 0 is Algorithm 2 as published",
         minimum=0.0,
     )
-    nearest_associate: float = parameter(0.15, "gate g_A of Algorithm 1", unit="m", minimum=0.0)
-    joint_features: int = parameter(20, "features that the search for joint compatibility takes in", minimum=4)
     min_inliers: int = parameter(8, "associations below which the rig is lost", minimum=3)
-    min_inlier_ratio: float = parameter(
-        0.2, "inliers among the descriptor matches below which a motion guess is not trusted", minimum=0.0, maximum=1.0
-    )
-    guess_min_inliers: int = parameter(12, "associations a motion guess from descriptors alone needs", minimum=4)
-    guess_ratio: float = parameter(
-        0.85, "a match of a motion guess needs a second best whose descriptor distance is larger by 1 / this",
-        minimum=0.1, maximum=1.0,
-    )  # fmt: skip
-    guess_descriptor_threshold: float = parameter(
-        0.6, "least cosine of the descriptors in the second attempt at a motion guess", minimum=-1.0, maximum=1.0
-    )
-    hypotheses: int = parameter(200, "samples drawn for the motion guess", minimum=10)
-    max_gate_px: float = parameter(
-        80.0,
-        "prediction uncertainty (one sigma in the image) above which the prediction is not tried",
-        unit="px",
-        minimum=1.0,
-    )
     seed: int = parameter(0, "seed of the random samples", minimum=0)
 
 
@@ -137,13 +94,10 @@ class LandmarkConfig(Config):
     target_in_view: int = parameter(80, "new landmarks are added until so many are observed", minimum=6)
     min_sightings: int = parameter(3, "s_min of section 4.4", minimum=1)
     probation_frames: int = parameter(6, "N of section 4.4: frames a landmark has to reach min_sightings", minimum=1)
-    min_hit_ratio: float = parameter(
-        0.15,
-        "a landmark seen in a smaller share of the frames in which it should be seen is removed",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    min_expected: int = parameter(12, "frames in which it should be seen before that share is judged", minimum=1)
+    min_hit_ratio: float = 0.15
+    """A landmark seen in a smaller share of the frames in which it should be seen is removed."""
+    min_expected: int = 12
+    """Frames in which it should be seen before that share is judged."""
 
 
 @dataclass(frozen=True)
@@ -157,15 +111,6 @@ class SubmapConfig(Config):
     max_distance: float = parameter(1.0, "a submap ends this far from its start", unit="m", minimum=0.05)
     max_landmarks: int = parameter(400, "a submap ends at this number of landmarks", minimum=10)
     max_frames: int = parameter(300, "a submap ends after this number of frames", minimum=2)
-    min_frames: int = parameter(5, "a submap has at least so many frames", minimum=2)
-    min_shared: int = parameter(15, "landmarks seen in the last frame, below which the end is put off", minimum=3)
-    lost_frames: int = parameter(2, "frames without association after which a new submap may start", minimum=1)
-    restart_sigma_velocity: float = parameter(
-        1.0, "uncertainty of the speed at an independent start", unit="m/s", minimum=0.0
-    )
-    restart_sigma_turn_rate: float = parameter(
-        1.0, "uncertainty of the turn rate at an independent start", unit="rad/s", minimum=0.0
-    )
     compact: bool = parameter(
         False, "send submaps rounded, in a quarter of the bytes: 32-bit factor of the covariance, 8-bit descriptors"
     )

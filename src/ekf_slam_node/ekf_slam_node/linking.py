@@ -20,10 +20,23 @@ from ekf_slam_node.association import (
     match_descriptors,
 )  # fmt: skip
 from ekf_slam_node.candidates import Candidates, MotionPrior
-from ekf_slam_node.config import FeatureAssociationConfig
+from ekf_slam_node.config import NEAREST_ASSOCIATE, FeatureAssociationConfig
 from ekf_slam_node.models import Frame
 from ekf_slam_node.motion_guess import MotionGuess, guess_motion, refine_motion
 from slam_core.geometry import FloatArray
+
+_MIN_INLIER_RATIO = 0.2
+"""Inliers among the descriptor matches below which a motion guess is not trusted."""
+_GUESS_MIN_INLIERS = 12
+"""Associations a motion guess from descriptors alone needs."""
+_GUESS_RATIO = 0.85
+"""A match of a motion guess needs a second best whose descriptor distance is larger by 1 / this."""
+_GUESS_DESCRIPTOR_THRESHOLD = 0.6
+"""Least cosine of the descriptors in the second attempt at a motion guess."""
+_HYPOTHESES = 200
+"""Samples drawn for the motion guess."""
+_MAX_GATE_PX = 80.0
+"""Prediction uncertainty (one sigma in the image) above which the prediction is not tried, px."""
 
 _METHODS = {"mahalanobis": associate_mahalanobis, "jcbb": associate_jcbb, "ccda": associate_ccda}
 _CONVINCING = 0.5
@@ -77,7 +90,7 @@ class Linker:
         self, candidates: Candidates, frame: Frame, similarity: Similarity, prior: MotionPrior, rng: np.random.Generator
     ) -> FrameLink | None:
         config = self._config
-        if _image_spread(prior, frame) > config.max_gate_px:
+        if _image_spread(prior, frame) > _MAX_GATE_PX:
             return None
         rows, columns = self._associate(candidates, frame, similarity, prior)
         guess = guess_motion(
@@ -85,7 +98,7 @@ class Linker:
             frame.select(columns),
             self._T_rig_optical,
             rng,
-            config.hypotheses,
+            _HYPOTHESES,
             config.gate,
             prior.T,
         )
@@ -98,21 +111,21 @@ class Linker:
     ) -> FrameLink | None:
         """First with the descriptors that agree well, then with all that agree at all."""
         config = self._config
-        strict = match_descriptors(similarity, config.descriptor_threshold, config.guess_ratio)
-        loose = match_descriptors(similarity, config.guess_descriptor_threshold, 1.0)
+        strict = match_descriptors(similarity, config.descriptor_threshold, _GUESS_RATIO)
+        loose = match_descriptors(similarity, _GUESS_DESCRIPTOR_THRESHOLD, 1.0)
         for rows, columns in (strict, loose):
             guess = guess_motion(
                 candidates.select(rows),
                 frame.select(columns),
                 self._T_rig_optical,
                 rng,
-                2 * config.hypotheses,
+                2 * _HYPOTHESES,
                 config.gate,
             )
-            enough = max(config.min_inliers, config.min_inlier_ratio * len(rows))
+            enough = max(config.min_inliers, _MIN_INLIER_RATIO * len(rows))
             if guess is None or guess.inliers.sum() < enough:
                 continue
-            link = self._settle(candidates, frame, similarity, guess, config.guess_min_inliers)
+            link = self._settle(candidates, frame, similarity, guess, _GUESS_MIN_INLIERS)
             if link is not None:
                 return link
         return None
@@ -122,7 +135,7 @@ class Linker:
     ) -> tuple[IndexArray, IndexArray]:
         config = self._config
         if config.method == "nearest":
-            return associate_nearest(candidates, frame, prior.T, self._T_rig_optical, config.nearest_associate)
+            return associate_nearest(candidates, frame, prior.T, self._T_rig_optical, NEAREST_ASSOCIATE)
         return _METHODS[config.method](
             candidates, frame, similarity, prior.T, prior.covariance, self._T_rig_optical, config
         )
@@ -132,7 +145,7 @@ class Linker:
     ) -> FrameLink | None:
         """Associate once more around the motion found, where the gates are as small as they can be."""
         if self._config.method == "nearest":
-            near = self._config.nearest_associate
+            near = NEAREST_ASSOCIATE
             rows, columns = associate_nearest(candidates, frame, guess.T, self._T_rig_optical, near)
         else:
             noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))

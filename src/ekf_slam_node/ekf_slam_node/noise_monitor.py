@@ -10,9 +10,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ekf_slam_node.config import MeasurementConfig
 from ekf_slam_node.models import Frame
 from slam_core.geometry import FloatArray
+
+_NOISE_MEMORY = 0.9
+"""Share of the past in the running estimate of how much larger the noise is than claimed."""
+_NOISE_TOLERANCE = 2.0
+"""Variances of one frame are enlarged only if its errors exceed them by more than this factor."""
+_MAX_NOISE_FACTOR = 25.0
+"""Largest factor on the claimed variances; 1 trusts every claim."""
 
 _CHANCE = 0.15
 """Logarithm of a factor that true claims may reach by chance."""
@@ -21,8 +27,7 @@ _CHANCE = 0.15
 class NoiseMonitor:
     """Running factors (3,) on the variances of u, v and inverse depth, never below one."""
 
-    def __init__(self, config: MeasurementConfig) -> None:
-        self._config = config
+    def __init__(self) -> None:
         self._log_factor = np.zeros(3)
 
     @property
@@ -39,10 +44,9 @@ class NoiseMonitor:
 
         The frame itself, if far off, corrected.
         """
-        limit = np.log(self._config.max_noise_factor)
+        limit = np.log(_MAX_NOISE_FACTOR)
         applied = np.log(self.factor)
-        own = np.minimum(np.where(ratio > self._config.noise_tolerance, ratio, 1.0), np.exp(limit - applied))
+        own = np.minimum(np.where(ratio > _NOISE_TOLERANCE, ratio, 1.0), np.exp(limit - applied))
         seen = applied + np.log(ratio)
-        memory = self._config.noise_memory
-        self._log_factor = np.clip(memory * self._log_factor + (1.0 - memory) * seen, -_CHANCE, limit)
+        self._log_factor = np.clip(_NOISE_MEMORY * self._log_factor + (1.0 - _NOISE_MEMORY) * seen, -_CHANCE, limit)
         return frame.with_larger_noise(own)

@@ -28,6 +28,9 @@ from ekf_slam_node.submap_chain import SubmapChain
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
 from slam_core.types import Counters, Features, ImuSample, PoseEstimate, RelativeMotion, Submap
 
+_AID_GATE = 22.46
+"""Chi-square gate of a motion aid, 6 degrees of freedom (99.9 %)."""
+
 _STANDING_VELOCITY = np.repeat([0.02, np.radians(0.5)], 3)
 """Standard deviations (m/s, rad/s) of the velocities of a rig that stands."""
 
@@ -69,13 +72,13 @@ class EkfSlam:
 
     def _forget(self) -> None:
         self._aids = MotionAids(self.config.motion)
-        self._noise = NoiseMonitor(self.config.measurement)
+        self._noise = NoiseMonitor()
         self._common = CommonError(self.config.measurement.common_error)
         self._chain = SubmapChain(self.config, self._T_rig_optical, self.session)
         self._next_id = 0
         self._newest_stamp_ns = 0
         self._standing = StandingDetector(self.config.motion.standing_frames, self.config.association.gate)
-        self._missed = MissedFrames(self._linker, self._T_rig_optical, self.config)
+        self._missed = MissedFrames(self._linker, self._T_rig_optical, self.config.motion)
 
     # --------------------------------------------------------------------------------------------------------- input
     def process(self, features: Features, motion: RelativeMotion | None = None) -> EkfResult:
@@ -89,9 +92,9 @@ class EkfSlam:
         if problem:
             return self._chain.result(self._newest_stamp_ns, TrackingState.DEGRADED, problem)
         self._newest_stamp_ns = features.stamp_ns
-        usable = usable_features(features, self.config.measurement)
+        usable = usable_features(features)
         self.counters.add("features_unusable", int(len(features) - usable.sum()))
-        frame = self._noise.corrected(frame_of_strongest(features, usable, self.config.measurement))
+        frame = self._noise.corrected(frame_of_strongest(features, usable, self.config.measurement.max_features))
         if not self._chain.is_open:
             return self._begin(frame)
         try:
@@ -182,7 +185,7 @@ class EkfSlam:
         step = ekf.time_update(linked.dt, sigma, link.T)
         ekf.apply_time_update(step)
         if aid is not None:
-            if contradicts(aid, link.T, linked.motion_covariance, self.config.motion.aid_gate):
+            if contradicts(aid, link.T, linked.motion_covariance, _AID_GATE):
                 self.counters.add("aids_rejected")
             else:
                 self._use_aid(step, aid, link.T)
@@ -221,8 +224,7 @@ class EkfSlam:
         """Measure the step just predicted, unless the aid contradicts the prediction."""
         rotation = step.T[:3, :3] @ T_previous_now[:3, :3].T
         error, covariance = aid_error(aid, T_previous_now, rotation)
-        gate = self.config.motion.aid_gate
-        applied = self._chain.local.ekf.update_increment(step, error, covariance, aid.rows, gate).applied
+        applied = self._chain.local.ekf.update_increment(step, error, covariance, aid.rows, _AID_GATE).applied
         self.counters.add("aids_used" if applied else "aids_rejected")
 
     def _arrive(self, frame: Frame, standing: bool = False) -> None:

@@ -14,6 +14,11 @@ from slam_core.geometry import FloatArray
 from slam_core.linear_algebra import blas
 from slam_core.types import PoseEstimate, Submap
 
+_MIN_FRAMES = 5
+"""A submap has at least so many frames."""
+_MIN_SHARED = 15
+"""Landmarks seen in the last frame, below which the end is put off."""
+
 _LEAST_EIGENVALUE = 1e-12
 """Share of the largest eigenvalue that rounding may reach."""
 
@@ -56,8 +61,8 @@ class SubmapBuilder:
             len(ekf.landmarks) / config.max_landmarks,
             (len(self._path) - self._standing) / config.max_frames,
         )
-        limit = 1.0 if shared >= config.min_shared else 2.0
-        return len(self._path) >= config.min_frames and size > limit
+        limit = 1.0 if shared >= _MIN_SHARED else 2.0
+        return len(self._path) >= _MIN_FRAMES and size > limit
 
     @property
     def is_empty(self) -> bool:

@@ -20,6 +20,13 @@ from ekf_slam_node.submap_builder import SubmapBuilder, conditional_start
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate, Submap
 
+_COAST_TIME = 0.5
+"""A lost rig is assumed to stop after this time."""
+_RESTART_SIGMA_VELOCITY = 1.0
+"""Uncertainty of the speed at an independent start, m/s."""
+_RESTART_SIGMA_TURN_RATE = 1.0
+"""Uncertainty of the turn rate at an independent start, rad/s."""
+
 
 class SubmapChain:
     """Holds the filter of the open submap, the submap's path, and ``T_odom_submap``.
@@ -80,9 +87,8 @@ class SubmapChain:
         self._odometry.advance(self.pose(frame.stamp_ns))
         if self._config.submap.start == "independent":
             pending = inheriting(frame, self._T_rig_optical, seen, measured, local.book)
-            config = self._config.submap
             # The velocity is a starting point with a variance so wide that it carries no information over.
-            wide = np.repeat([config.restart_sigma_velocity, config.restart_sigma_turn_rate], 3) ** 2
+            wide = np.repeat([_RESTART_SIGMA_VELOCITY, _RESTART_SIGMA_TURN_RATE], 3) ** 2
             return self._open(self._empty_map(frame, local.ekf.velocity, wide, pending), frame, follows=True)
         ekf = conditional_start(local.ekf, measured.slots, self._config.error == "invariant")
         pending = pending_of(frame, self._T_rig_optical).without(measured.columns)
@@ -137,7 +143,7 @@ class SubmapChain:
         dt = seconds_between(self.stamp_ns, stamp_ns)
         if dt <= 0.0:
             return self._odometry.pose(stamp_ns, ekf.T, ekf.pose_covariance())
-        T = ekf.T @ relative_motion(ekf.velocity, min(dt, motion.coast_time))
+        T = ekf.T @ relative_motion(ekf.velocity, min(dt, _COAST_TIME))
         return self._odometry.pose(stamp_ns, T, ekf.time_update(dt, motion.sigma).head[:6, :6])
 
     def last_sound_pose(self, stamp_ns: int) -> PoseEstimate:

@@ -7,23 +7,15 @@ costs hardly more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ndt_registration.search import SEPARATION, Candidate, pose_distance
-from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus
 
-
-@dataclass(frozen=True)
-class AmbiguityConfig(Config):
-    """When the answer of a search is called ambiguous; a given initial guess is never doubted in this way."""
-
-    margin: float = parameter(0.03, "cost by which the answer must beat every rival", minimum=0.0)
-    gate: float = parameter(
-        22.5, "squared Mahalanobis distance within which a pose is no rival: the covariance covers it", minimum=0.0
-    )
+_MARGIN = 0.03
+"""Cost by which the answer must beat every rival."""
+_GATE = 22.5
+"""Squared Mahalanobis distance within which a pose is no rival: the covariance covers it."""
 
 
 def reason_of_doubt(
@@ -31,7 +23,6 @@ def reason_of_doubt(
     others: list[Candidate],
     covariance: FloatArray,
     scale: float,
-    config: AmbiguityConfig,
 ) -> str:
     """Why the best of a search's poses cannot be trusted, empty if it can.
 
@@ -43,18 +34,16 @@ def reason_of_doubt(
         Shape (6, 6), of the answer; poses that it covers, such as those along a corridor, are no rivals.
     scale
         Scale of the target, m.
-    config
-        Settings.
     """
     for other in others:
-        if other.cost < best.cost + config.margin and _differs(best, other, covariance, scale, config):
+        if other.cost < best.cost + _MARGIN and _differs(best, other, covariance, scale):
             return f"ambiguous: a pose {_difference(best.T, other.T)} away explains the scan about equally well"
     return ""
 
 
-def _differs(best: Candidate, other: Candidate, covariance: FloatArray, scale: float, config: AmbiguityConfig) -> bool:
+def _differs(best: Candidate, other: Candidate, covariance: FloatArray, scale: float) -> bool:
     d = boxminus(other.T, best.T)
-    return bool(pose_distance(other.T, best.T, scale) > SEPARATION and d @ np.linalg.solve(covariance, d) > config.gate)
+    return bool(pose_distance(other.T, best.T, scale) > SEPARATION and d @ np.linalg.solve(covariance, d) > _GATE)
 
 
 def _difference(T: FloatArray, other: FloatArray) -> str:

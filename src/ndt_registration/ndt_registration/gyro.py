@@ -11,6 +11,9 @@ import numpy as np
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, so3_exp
 
+_MAX_GAP = 0.05
+"""Gap between samples above which they are not used."""
+
 
 @dataclass(frozen=True)
 class GyroConfig(Config):
@@ -21,7 +24,6 @@ class GyroConfig(Config):
         0.01, "error of its angular velocity, constant over a scan", unit="rad/s", minimum=0.0
     )
     noise: float = parameter(0.001, "white noise of its angular velocity", unit="rad/s/sqrt(Hz)", minimum=1e-6)
-    max_gap: float = parameter(0.05, "gap between samples above which they are not used", unit="s", minimum=0.001)
 
 
 class Gyro:
@@ -52,7 +54,7 @@ class Gyro:
         while R is not None and now < end_ns:
             stamp, rate = self._samples[0]
             until = min(self._samples[1][0] if len(self._samples) > 1 else end_ns, end_ns)
-            if 1e-9 * (until - stamp) > self._config.max_gap or stamp > now:
+            if 1e-9 * (until - stamp) > _MAX_GAP or stamp > now:
                 return None
             R = R @ so3_exp(rate * 1e-9 * (until - now))
             now = until

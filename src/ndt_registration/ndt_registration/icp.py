@@ -17,21 +17,27 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxplus, make_transform, transform_points
 from slam_core.rigid_alignment import umeyama
 
+_RELATIVE_MAX_DISTANCE = 0.2
+"""First rejection limit over the scale."""
+_SHRINKAGE = 0.6
+"""Factor of the limit from stage to stage."""
+_ITERATIONS = 20
+"""Most iterations per stage."""
+_TOLERANCE = 1e-4
+"""Length of the last step, over the scale."""
+_NEIGHBOURS = 12
+"""Neighbours from which a normal is computed."""
+
 
 @dataclass(frozen=True)
 class IcpConfig(Config):
     """Iterative closest points."""
 
     max_distance: float = parameter(0.0, "first rejection limit, 0: from the cloud's scale", unit="m", minimum=0.0)
-    relative_max_distance: float = parameter(0.2, "first rejection limit over the scale", minimum=0.001)
-    final_spacings: float = parameter(3.0, "last rejection limit over the median spacing of the target", minimum=0.5)
-    shrinkage: float = parameter(0.6, "factor of the limit from stage to stage", minimum=0.1, maximum=0.95)
-    trimmed: float = parameter(
-        0.9, "share of the pairs within the limit that is used, nearest first", minimum=0.1, maximum=1.0
-    )
-    iterations: int = parameter(20, "most iterations per stage", minimum=1)
-    tolerance: float = parameter(1e-4, "length of the last step, over the scale", minimum=0.0)
-    neighbours: int = parameter(12, "neighbours from which a normal is computed", minimum=3)
+    final_spacings: float = 3.0
+    """Last rejection limit over the median spacing of the target."""
+    trimmed: float = 0.9
+    """Share of the pairs within the limit that is used, nearest first."""
 
 
 _FLAT = 1e-9
@@ -49,11 +55,11 @@ class IcpOutcome(NamedTuple):
 class IcpTarget:
     """kd-tree, spacing and normals of a cloud (n, 3), each place once: a tree cannot part points that coincide."""
 
-    def __init__(self, points: FloatArray, config: IcpConfig) -> None:
+    def __init__(self, points: FloatArray) -> None:
         points = points[np.sort(np.unique(points, axis=0, return_index=True)[1])]
         self.points = points
         self.tree = cKDTree(points)
-        distances, self._neighbours = self.tree.query(points, k=min(config.neighbours, len(points)))
+        distances, self._neighbours = self.tree.query(points, k=min(_NEIGHBOURS, len(points)))
         self.spacing = float(np.median(distances[:, 1]))
         self._normals: FloatArray | None = None
 
@@ -81,7 +87,7 @@ def icp_align(
     All its points are used with the last rejection limit, ``coarse_points`` of them before. ``planar`` allows x, y and
     yaw only.
     """
-    limit = config.max_distance or config.relative_max_distance * scale
+    limit = config.max_distance or _RELATIVE_MAX_DISTANCE * scale
     last = min(config.final_spacings * target.spacing, limit)
     iterations, converged = 0, False
     while True:
@@ -90,7 +96,7 @@ def icp_align(
         iterations += used
         if limit <= last:
             return IcpOutcome(T, iterations, converged)
-        limit = max(limit * config.shrinkage, last)
+        limit = max(limit * _SHRINKAGE, last)
 
 
 def _stage(
@@ -104,7 +110,7 @@ def _stage(
     planar: bool,
 ) -> tuple[FloatArray, int, bool]:
     """Iterations with one rejection limit: pose, number, whether it settled."""
-    for iteration in range(1, config.iterations + 1):
+    for iteration in range(1, _ITERATIONS + 1):
         moved = transform_points(T, source)
         distance, nearest = target.tree.query(moved, distance_upper_bound=limit)
         pairs = np.flatnonzero(np.isfinite(distance))
@@ -120,9 +126,9 @@ def _stage(
             T_new = _point_step(points, target.points[matches], planar) @ T
         change = np.linalg.norm(T_new[:3, 3] - T[:3, 3]) + scale * np.linalg.norm(T_new[:3, :3] - T[:3, :3])
         T = T_new
-        if change < config.tolerance * scale:
+        if change < _TOLERANCE * scale:
             return T, iteration, True
-    return T, config.iterations, False
+    return T, _ITERATIONS, False
 
 
 def _point_step(points: FloatArray, matches: FloatArray, planar: bool) -> FloatArray:

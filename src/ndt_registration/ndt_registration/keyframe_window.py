@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare
 from ndt_registration.pyramid import Pyramid
-from ndt_registration.registration import RegistrationConfig, Target, check_cloud
+from ndt_registration.registration import IMAGE_SIZE, RegistrationConfig, Target, check_cloud
 from ndt_registration.visibility import range_image
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 
@@ -77,5 +77,5 @@ class KeyframeWindow:
         older_rims = [transform_points(T_newest_odom @ k.T, k.rims) for k in list(self._keyframes)[:-1]]
         points, rims = np.concatenate([scan.points, *older]), np.concatenate([scan.rims, *older_rims])
         cloud = Cloud(np.ascontiguousarray(points), np.ascontiguousarray(rims), scan.scale, scan.planar)
-        image = range_image(scan.points, config.image_size)
+        image = range_image(scan.points, IMAGE_SIZE)
         return Target(cloud, Pyramid.build(cloud, config.grid), image, np.zeros(3))

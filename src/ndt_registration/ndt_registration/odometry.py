@@ -26,6 +26,19 @@ from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, boxminus, compose_jacobians, invert_transform
 from slam_core.types import RelativeMotion
 
+_KEYFRAME_OVERLAP = 0.75
+"""Overlap over the best since the last keyframe, below which a scan becomes one."""
+_KEYFRAME_ANGLE_DEG = 12.0
+"""Rotation likewise, deg."""
+_MAX_CORRECTION = 0.5
+"""Largest deviation from the guess."""
+_MAX_CORRECTION_DEG = 20.0
+"""Likewise, deg."""
+_MAX_GAP = 1.0
+"""Gap between scans above which the velocity is not used."""
+_SEARCH_AFTER = 1
+"""Failures after which the pose is searched globally, if no other source knows the motion."""
+
 ODOMETRY_REGISTRATION = RegistrationConfig(
     source_points=4000,
     target_points=8000,
@@ -45,20 +58,11 @@ class OdometryConfig(Config):
     """ScanPoints odometry."""
 
     keyframes: int = parameter(10, "keyframes in the local map", minimum=1)
-    keyframe_overlap: float = parameter(
-        0.75, "overlap over the best since the last keyframe, below which a scan becomes one", minimum=0.0, maximum=1.0
-    )
     keyframe_distance: float = parameter(
         0.3, "distance from the last keyframe above which a scan becomes one", unit="m", minimum=0.0
     )
-    keyframe_angle_deg: float = parameter(12.0, "rotation likewise", unit="deg", minimum=0.0)
-    max_correction: float = parameter(0.5, "largest deviation from the guess", unit="m", minimum=0.0)
-    max_correction_deg: float = parameter(20.0, "likewise", unit="deg", minimum=0.0)
-    max_gap: float = parameter(1.0, "gap between scans above which the velocity is not used", unit="s", minimum=0.0)
-    search_after: int = parameter(
-        1, "failures after which the pose is searched globally, if no other source knows the motion", minimum=0
-    )
-    restart_after: int = parameter(5, "failures after which the map starts anew", minimum=1)
+    restart_after: int = 5
+    """Failures after which the map starts anew."""
     motion: MotionFilterConfig = group(MotionFilterConfig)
     gyro: GyroConfig = group(GyroConfig)
     registration: RegistrationConfig = field(default_factory=lambda: ODOMETRY_REGISTRATION)
@@ -120,7 +124,7 @@ class ScanOdometry:
         if stamp_ns <= self._stamp_ns:
             raise ValueError(f"scans must be in order of time, got stamp {stamp_ns} ns after {self._stamp_ns} ns")
         self._predict(stamp_ns, prior)
-        result = self._register(scan, lost=prior is None and self._failures >= self._config.search_after)
+        result = self._register(scan, lost=prior is None and self._failures >= _SEARCH_AFTER)
         return self._track(scan, result) if result.converged else self._fail(scan, result)
 
     def add_angular_velocity(self, stamp_ns: int, rate: FloatArray) -> None:
@@ -142,7 +146,7 @@ class ScanOdometry:
         if prior is not None:
             self._filter.move(prior.T, prior.covariance, seconds)
             return
-        if seconds > self._config.max_gap:
+        if seconds > _MAX_GAP:
             self._filter.forget_velocity()
         self._filter.predict(seconds)
         turn = self._gyro.turn(self._last_stamp_ns, stamp_ns)
@@ -168,7 +172,7 @@ class ScanOdometry:
         """The result, as a failure where it would move the pose too far; where it may slide it does not count."""
         correction = self._filter.correction(*self._in_odometry(result))
         distance, angle = np.linalg.norm(correction[:3]), np.rad2deg(np.linalg.norm(correction[3:]))
-        if result.converged and (distance > self._config.max_correction or angle > self._config.max_correction_deg):
+        if result.converged and (distance > _MAX_CORRECTION or angle > _MAX_CORRECTION_DEG):
             reason = f"implausible: {distance:.2f} m and {angle:.1f} deg from the guess"
             return replace(result, converged=False, reason=reason)
         return result
@@ -208,9 +212,9 @@ class ScanOdometry:
         c = self._config
         moved = boxminus(result.T_target_source, np.eye(4))
         return bool(
-            result.overlap < c.keyframe_overlap * self._best_overlap
+            result.overlap < _KEYFRAME_OVERLAP * self._best_overlap
             or np.linalg.norm(moved[:3]) > c.keyframe_distance
-            or np.rad2deg(np.linalg.norm(moved[3:])) > c.keyframe_angle_deg
+            or np.rad2deg(np.linalg.norm(moved[3:])) > _KEYFRAME_ANGLE_DEG
         )
 
     def _fail(self, scan: ScanPoints, result: RegistrationResult) -> OdometryResult:

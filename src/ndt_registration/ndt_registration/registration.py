@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from ndt_registration.ambiguity import AmbiguityConfig, reason_of_doubt
+from ndt_registration.ambiguity import reason_of_doubt
 from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare, viewpoint
 from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
 from ndt_registration.matching import block_gradients, fit_to_grid
@@ -42,6 +42,19 @@ from slam_core.geometry import (
     skew,
 )
 
+_COARSE_POINTS = 2000
+"""Most points of the source on all but the finest level, and with all but ICP's last limit."""
+_MAX_ITERATIONS = 50
+"""Most iterations per level."""
+_TOLERANCE = 1e-4
+"""Length of the last step, over the scale."""
+IMAGE_SIZE = 64
+"""Edge of the range image that holds free space, px."""
+_MIN_OVERLAP = 0.15
+"""Least share of source points on the target's surfaces."""
+_MAX_CONFLICT = 0.3
+"""Largest visibility cost of a success."""
+
 _LEAST_EXTENT, _LARGEST_EXTENT = 1e-6, 1e15
 """Extent of a cloud, m, between which sums and squares of its coordinates mean something."""
 _PLANAR_VOXEL_SIZE = 0.18
@@ -61,23 +74,15 @@ class RegistrationConfig(Config):
     method: str = parameter("ndt", "registration method", choices=("ndt", "icp", "icp_plane"))
     target_points: int = parameter(20000, "most points of the target that are used", minimum=10)
     source_points: int = parameter(8000, "most points of the source that are used", minimum=10)
-    coarse_points: int = parameter(
-        2000, "most points of the source on all but the finest level, and with all but ICP's last limit", minimum=10
-    )
-    min_points: int = parameter(50, "fewest finite points of a cloud", minimum=10)
-    max_iterations: int = parameter(50, "most iterations per level", minimum=1)
-    tolerance: float = parameter(1e-4, "length of the last step, over the scale", minimum=0.0)
-    start_level: int = parameter(2, "coarsest level used from a given initial guess", minimum=0, maximum=7)
-    image_size: int = parameter(64, "edge of the range image that holds free space", unit="px", minimum=8)
-    min_overlap: float = parameter(
-        0.15, "least share of source points on the target's surfaces", minimum=0.0, maximum=1.0
-    )
-    max_conflict: float = parameter(0.3, "largest visibility cost of a success", minimum=0.0)
-    rim_share: float = parameter(0.1, "weight of all rims over that of all surfaces", minimum=0.0)
+    min_points: int = 50
+    """Fewest finite points of a cloud."""
+    start_level: int = 2
+    """Coarsest level used from a given initial guess."""
+    rim_share: float = 0.1
+    """Weight of all rims over that of all surfaces."""
     icp: IcpConfig = group(IcpConfig)
     grid: GridConfig = group(GridConfig)
     search: SearchConfig = group(SearchConfig)
-    ambiguity: AmbiguityConfig = group(AmbiguityConfig)
     uncertainty: UncertaintyConfig = group(UncertaintyConfig)
 
 
@@ -115,10 +120,10 @@ class Target:
     centre: FloatArray
     _icp: list[IcpTarget] = field(default_factory=list)
 
-    def icp(self, config: IcpConfig) -> IcpTarget:
+    def icp(self) -> IcpTarget:
         """The cloud with kd-tree and normals, made when first asked for."""
         if not self._icp:
-            self._icp.append(IcpTarget(self.cloud.points, config))
+            self._icp.append(IcpTarget(self.cloud.points))
         return self._icp[0]
 
     @staticmethod
@@ -135,7 +140,7 @@ class Target:
         check_cloud(finite, "target", config)
         centre = viewpoint(finite)
         cloud = prepare(finite, config.target_points, planar=is_planar(points), centre=centre)
-        return Target(cloud, Pyramid.build(cloud, config.grid), range_image(cloud.points, config.image_size), centre)
+        return Target(cloud, Pyramid.build(cloud, config.grid), range_image(cloud.points, IMAGE_SIZE), centre)
 
 
 def register(
@@ -175,7 +180,7 @@ def register(
         check_cloud(points, "source", config)
         prepared = target if isinstance(target, Target) else Target.build(target, config)
     except DegenerateCloudError as error:
-        return _failure(str(error), config)
+        return _failure(str(error))
     cloud = prepare(points, config.source_points, planar=prepared.cloud.planar, centre=prepared.centre)
     guess = None if initial_guess is None else _shifted(np.asarray(initial_guess, dtype=np.float64), -prepared.centre)
     return _register(cloud, prepared, guess, config)
@@ -211,7 +216,7 @@ def _register(
     source: Cloud, target: Target, guess: FloatArray | None, config: RegistrationConfig
 ) -> RegistrationResult:
     scale = max(target.cloud.scale, 1e-6)
-    views = Views(source, range_image(source.points, config.image_size), target.cloud, target.image)
+    views = Views(source, range_image(source.points, IMAGE_SIZE), target.cloud, target.image)
     candidates: list[Candidate] = []
     if guess is not None:
         T, start = guess, config.start_level
@@ -221,25 +226,25 @@ def _register(
     else:
         T, start = np.eye(4), config.grid.levels - 1
     optimum, iterations = _aligned(source, target, T, start, scale, config)
-    conflict = judge(views, optimum, config.search).conflict
+    conflict = judge(views, optimum).conflict
     result = _result(source, target, optimum, iterations, conflict, config)
     if candidates and result.converged:
-        return _doubted(result, candidates[0], candidates[1:], target, config)
+        return _doubted(result, candidates[0], candidates[1:], target)
     return result
 
 
 def _doubted(
-    result: RegistrationResult, best: Candidate, others: list[Candidate], target: Target, config: RegistrationConfig
+    result: RegistrationResult, best: Candidate, others: list[Candidate], target: Target
 ) -> RegistrationResult:
     """The result of a search, as a failure where it is not the only answer."""
     scale = max(target.cloud.scale, 1e-6)
     centred = _shifted_covariance(result.covariance, -best.T[:3, :3] @ target.centre)
-    reason = reason_of_doubt(best, others, centred, scale, config.ambiguity)
+    reason = reason_of_doubt(best, others, centred, scale)
     if not reason and result.degenerate:
         return replace(result, converged=False, reason=f"without a guess {result.reason}")
     if not reason:
         return result
-    covariance = _shifted_covariance(unknown(scale, config.uncertainty), best.T[:3, :3] @ target.centre)
+    covariance = _shifted_covariance(unknown(scale), best.T[:3, :3] @ target.centre)
     return replace(result, covariance=covariance, converged=False, reason=reason)
 
 
@@ -256,7 +261,7 @@ def _aligned(
         return _descend(source, target, T, start, scale, config)
     plane = config.method == "icp_plane"
     outcome = icp_align(
-        source.points, target.icp(config.icp), T, scale, config.icp, coarse_points=config.coarse_points, plane=plane,
+        source.points, target.icp(), T, scale, config.icp, coarse_points=_COARSE_POINTS, plane=plane,
         planar=source.planar,
     )  # fmt: skip
     R, t = np.ascontiguousarray(outcome.T[:3, :3]), outcome.T[:3, 3].copy()
@@ -274,10 +279,10 @@ def _descend(
     fixed = planar_constraint(source.planar)
     R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
     for level in range(min(start, len(grids) - 1), -1, -1):
-        count = len(source) if level == 0 else config.coarse_points
+        count = len(source) if level == 0 else _COARSE_POINTS
         layers = target.pyramid.layers(source, level, count, config.rim_share)
-        tolerance = config.tolerance * scale * (1.0 if level == 0 else _COARSE_TOLERANCE)
-        optimum = ndt_align(layers, R, t, fixed, scale, config.max_iterations, tolerance)
+        tolerance = _TOLERANCE * scale * (1.0 if level == 0 else _COARSE_TOLERANCE)
+        optimum = ndt_align(layers, R, t, fixed, scale, _MAX_ITERATIONS, tolerance)
         R, t = optimum.rotation, optimum.translation
         iterations += optimum.iterations
     return optimum, iterations
@@ -300,16 +305,16 @@ def _result(
         Curvature(optimum.hessian, optimum.majorant, fit.spurious_hessian, fit.spurious_majorant),
         gradient_scatter(gradients, len(source) / len(target.cloud)),
         Extent(fit.centre, max(fit.radius, _LEAST_RADIUS * scale)),
-        ScoreLoss(target.pyramid.layers(source, 0, config.coarse_points, config.rim_share), _pose(optimum)).loss,
+        ScoreLoss(target.pyramid.layers(source, 0, _COARSE_POINTS, config.rim_share), _pose(optimum)).loss,
         scale,
         planar_constraint(source.planar) > 0.0,
         config.uncertainty,
     )
-    reason = _reason_of_failure(optimum, fit.overlap, cost, config)
+    reason = _reason_of_failure(optimum, fit.overlap, cost)
     if reason and not 1.0 / _UNITS_APART < source.scale / scale < _UNITS_APART:
         reason = f"the source is {source.scale / scale:.2g} times as large as the target: is one of them in mm?"
     names = direction_names(uncertainty.free)
-    covariance = uncertainty.covariance if not reason else unknown(scale, config.uncertainty)
+    covariance = uncertainty.covariance if not reason else unknown(scale)
     return RegistrationResult(
         T_target_source=_shifted(_pose(optimum), target.centre),
         covariance=_shifted_covariance(covariance, optimum.rotation @ target.centre),
@@ -329,21 +334,19 @@ _LEAST_RADIUS = 0.05
 """Spread of the matched points, over the scale, below which rotations would be measured against nothing."""
 
 
-def _reason_of_failure(optimum: NdtOptimum, overlap: float, cost: float, config: RegistrationConfig) -> str:
-    if overlap < config.min_overlap:
-        needed = 100 * config.min_overlap
+def _reason_of_failure(optimum: NdtOptimum, overlap: float, cost: float) -> str:
+    if overlap < _MIN_OVERLAP:
+        needed = 100 * _MIN_OVERLAP
         return f"only {100 * overlap:.0f} % of the source lie on the target, at least {needed:.0f} % are needed"
-    if cost > config.max_conflict:
-        return (
-            f"the source lies in space that the target saw as free (cost {cost:.2f}, at most {config.max_conflict:.2f})"
-        )
+    if cost > _MAX_CONFLICT:
+        return f"the source lies in space that the target saw as free (cost {cost:.2f}, at most {_MAX_CONFLICT:.2f})"
     if not optimum.converged:
         return "the steps did not become small within the allowed iterations"
     return ""
 
 
-def _failure(reason: str, config: RegistrationConfig) -> RegistrationResult:
-    return RegistrationResult(np.eye(4), unknown(1.0, config.uncertainty), False, 0, 0.0, 0.0, 0.0, reason)
+def _failure(reason: str) -> RegistrationResult:
+    return RegistrationResult(np.eye(4), unknown(1.0), False, 0, 0.0, 0.0, 0.0, reason)
 
 
 def _shifted(T: FloatArray, centre: FloatArray) -> FloatArray:

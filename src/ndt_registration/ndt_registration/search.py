@@ -24,29 +24,39 @@ from ndt_registration.visibility import Prices, RangeImage, visibility_cost
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform
 
+_ROTATIONS = 4
+"""Rotations that are combined with every translation."""
+_TOLERANCE = 0.03
+"""Deviation along the ray that costs nothing in the lattice, over the scale."""
+_LATTICE_POINTS = 40
+"""Points judged at each pose of the lattice."""
+_SHORTLIST = 200
+"""Poses of the lattice that are looked at with more points."""
+_STARTS = 16
+"""Poses of the lattice that are refined."""
+_JUDGE_POINTS = 500
+"""Points used to judge refined poses."""
+_JUDGE_TOLERANCE = 0.02
+"""Deviation along the ray that costs nothing there, over the scale."""
+_SCORE_GAIN = 0.3
+"""What a full score takes off the cost of a pose."""
+
 
 @dataclass(frozen=True)
 class SearchConfig(Config):
     """Reach and resolution of the global search; lengths are relative to the cloud's scale (its median range)."""
 
     enabled: bool = parameter(True, "search globally where no initial guess is given")
-    max_rotation_deg: float = parameter(37.0, "largest rotation looked for", unit="deg", minimum=0.0, maximum=180.0)
-    rotation_step_deg: float = parameter(7.0, "spacing of the rotations", unit="deg", minimum=1.0)
-    rotations: int = parameter(4, "rotations that are combined with every translation", minimum=1)
-    max_translation: float = parameter(0.6, "largest translation looked for, over the scale", minimum=0.0)
-    translation_step: float = parameter(0.07, "spacing of the translations, over the scale", minimum=0.01)
-    tolerance: float = parameter(
-        0.03, "deviation along the ray that costs nothing in the lattice, over the scale", minimum=0.001
-    )
-    lattice_points: int = parameter(40, "points judged at each pose of the lattice", minimum=8)
-    shortlist: int = parameter(200, "poses of the lattice that are looked at with more points", minimum=1)
-    starts: int = parameter(16, "poses of the lattice that are refined", minimum=1)
-    judge_points: int = parameter(500, "points used to judge refined poses", minimum=16)
-    judge_tolerance: float = parameter(
-        0.02, "deviation along the ray that costs nothing there, over the scale", minimum=0.001
-    )
-    score_gain: float = parameter(0.3, "what a full score takes off the cost of a pose", minimum=0.0)
-    candidates: int = parameter(4, "distinct refined poses that are handed on", minimum=1)
+    max_rotation_deg: float = 37.0
+    """Largest rotation looked for, deg."""
+    rotation_step_deg: float = 7.0
+    """Spacing of the rotations, deg."""
+    max_translation: float = 0.6
+    """Largest translation looked for, over the scale."""
+    translation_step: float = 0.07
+    """Spacing of the translations, over the scale."""
+    candidates: int = 4
+    """Distinct refined poses that are handed on."""
 
 
 PRICES = Prices(unseen=0.15, hidden=0.5, free=2.0)
@@ -114,7 +124,7 @@ def search(views: Views, pyramid: Pyramid, rim_share: float, config: SearchConfi
         for T in poses:
             R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
             optimum = ndt_align(layers, R, t, fixed, views.scale, step.iterations, 1e-3 * views.scale)
-            refined.append(judge(views, optimum, config))
+            refined.append(judge(views, optimum))
         candidates = distinct(sorted(refined, key=lambda candidate: candidate.cost), views.scale, step.keep)
         poses = [candidate.T for candidate in candidates]
     return candidates
@@ -146,19 +156,19 @@ def pose_distance(T: FloatArray, other: FloatArray, scale: float) -> float:
     return float(2.0 * np.arcsin(min(chord, 1.0)) + np.linalg.norm(T[:3, 3] - other[:3, 3]) / scale)
 
 
-def judge(views: Views, optimum: NdtOptimum, config: SearchConfig) -> Candidate:
+def judge(views: Views, optimum: NdtOptimum) -> Candidate:
     """An optimum with its cost; each scan's points are held against what the other has seen."""
     T, score = make_transform(optimum.rotation, optimum.translation), optimum.score
-    tolerance = config.judge_tolerance * views.scale
+    tolerance = _JUDGE_TOLERANCE * views.scale
     conflict = 0.0
     for points, image, pose in (
-        (views.source.sample(config.judge_points), views.target_image, T),
-        (views.target.sample(config.judge_points), views.source_image, invert_transform(T)),
+        (views.source.sample(_JUDGE_POINTS), views.target_image, T),
+        (views.target.sample(_JUDGE_POINTS), views.source_image, invert_transform(T)),
     ):
         turned = np.ascontiguousarray(points @ pose[:3, :3].T)
         conflict += 0.5 * visibility_cost(turned, pose[:3, 3].copy(), image, tolerance, PRICES)
     curvature = optimum.majorant / max(optimum.points, 1)
-    return Candidate(T, conflict - config.score_gain * score, conflict, score, curvature)
+    return Candidate(T, conflict - _SCORE_GAIN * score, conflict, score, curvature)
 
 
 def _starts(views: Views, config: SearchConfig) -> list[FloatArray]:
@@ -169,15 +179,15 @@ def _starts(views: Views, config: SearchConfig) -> list[FloatArray]:
         rotations = rotation_lattice(largest, step, (2,))
     else:
         a, b = (facing_normals(cloud.points, _PATCH * scale) for cloud in (source, target))
-        rotations = best_rotations(a, b, largest, step, config.rotations)
+        rotations = best_rotations(a, b, largest, step, _ROTATIONS)
     axes = (0, 1) if source.planar else (0, 1, 2)
     translations = scale * ball_lattice(config.max_translation, config.translation_step, axes)
     field = near_field(target.sample(_FIELD_POINTS), _FIELD_EDGE * scale, _FIELD_REACH * scale)
-    seen = (views.target_image, config.tolerance * scale, PRICES, field, config.score_gain)
-    costs = lattice_costs(source.sample(config.lattice_points), rotations, translations, *seen).ravel()
-    shortlist = np.argsort(costs, kind="stable")[: config.shortlist]
+    seen = (views.target_image, _TOLERANCE * scale, PRICES, field, _SCORE_GAIN)
+    costs = lattice_costs(source.sample(_LATTICE_POINTS), rotations, translations, *seen).ravel()
+    shortlist = np.argsort(costs, kind="stable")[:_SHORTLIST]
     turns, shifts = np.divmod(shortlist, len(translations))
-    points = source.sample(config.judge_points)
+    points = source.sample(_JUDGE_POINTS)
     again = np.empty(len(shortlist))
     for turn in np.unique(turns):
         of_turn = turns == turn
@@ -188,7 +198,7 @@ def _starts(views: Views, config: SearchConfig) -> list[FloatArray]:
         gaps = np.linalg.norm(translations[shifts[same]] - translations[shifts[k]], axis=1)
         if (gaps > _START_SEPARATION * scale).all():
             chosen.append(int(k))
-        if len(chosen) == config.starts:
+        if len(chosen) == _STARTS:
             break
     return [np.eye(4), *(make_transform(rotations[turns[k]], translations[shifts[k]]) for k in chosen)]
 

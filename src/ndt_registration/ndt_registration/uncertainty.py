@@ -13,29 +13,25 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from slam_core.config import Config, parameter
+from slam_core.config import Config
 from slam_core.geometry import FloatArray, skew
+
+_PROBE = 0.03
+"""How far the pose is moved to see whether it is determined, over the scale."""
+_FREE_SIGMA = 1.0
+"""Largest standard deviation given to a free direction, over the scale."""
+_SIGMA_FLOOR = 1e-5
+"""Least standard deviation of any direction, over the scale."""
 
 
 @dataclass(frozen=True)
 class UncertaintyConfig(Config):
     """Covariance and degeneracy of a registration."""
 
-    probe: float = parameter(
-        0.03, "how far the pose is moved to see whether it is determined, over the scale", minimum=0.001
-    )
-    least_loss: float = parameter(
-        0.015, "share of its fit that a determined pose loses by that", minimum=0.0, maximum=1.0
-    )
-    loss_noise: float = parameter(
-        1.0,
-        "loss that chance makes up for: a free direction is known to the probe times this over its loss",
-        minimum=0.0,
-    )
-    free_sigma: float = parameter(
-        1.0, "largest standard deviation given to a free direction, over the scale", minimum=0.0
-    )
-    sigma_floor: float = parameter(1e-5, "least standard deviation of any direction, over the scale", minimum=0.0)
+    least_loss: float = 0.015
+    """Share of its fit that a determined pose loses by that."""
+    loss_noise: float = 1.0
+    """Loss that chance makes up for: a free direction is known to the probe times this over its loss."""
 
 
 class Uncertainty(NamedTuple):
@@ -112,15 +108,15 @@ def sandwich(
     free, sigma = np.zeros(6, dtype=bool), np.zeros(6)
     for k in np.flatnonzero(~constrained):
         v = vectors[:, k]
-        step = config.probe * scale * (to_pose @ v)
+        step = _PROBE * scale * (to_pose @ v)
         least = config.least_loss * (_SPURIOUS_FACTOR if v @ H @ v < v @ spurious @ v else 1.0)
         lost = min(loss(step), loss(-step))
         free[k] = v @ M @ v <= v @ spurious @ v or lost < least
-        sigma[k] = scale * min(config.free_sigma, config.probe * config.loss_noise / max(lost, 1e-9))
+        sigma[k] = scale * min(_FREE_SIGMA, _PROBE * config.loss_noise / max(lost, 1e-9))
         if not free[k] and lost > _WELL_DETERMINED * config.least_loss:
             break
     known = vectors[:, ~free & ~constrained]
-    covariance = (config.sigma_floor * scale) ** 2 * np.eye(6)
+    covariance = (_SIGMA_FLOOR * scale) ** 2 * np.eye(6)
     if known.shape[1]:
         inverse = _inverse(known.T @ (H - F) @ known, known.T @ M @ known)
         covariance += known @ inverse @ (known.T @ C @ known) @ inverse @ known.T
@@ -165,10 +161,10 @@ _SPURIOUS_FACTOR = 2.0
 """So many times the loss is asked for where the curvature is no more than what errors of the normals make."""
 
 
-def unknown(scale: float, config: UncertaintyConfig) -> FloatArray:
+def unknown(scale: float) -> FloatArray:
     """Covariance (6, 6) of a pose of which nothing is known: every direction free."""
-    sigma = config.free_sigma * max(scale, 1.0)
-    return np.diag(np.r_[np.full(3, sigma), np.full(3, config.free_sigma)] ** 2)
+    sigma = _FREE_SIGMA * max(scale, 1.0)
+    return np.diag(np.r_[np.full(3, sigma), np.full(3, _FREE_SIGMA)] ** 2)
 
 
 def direction_names(free: FloatArray) -> tuple[str, ...]:

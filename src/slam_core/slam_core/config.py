@@ -20,6 +20,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from slam_core.fixed_parameters import is_fixed
+
 C = TypeVar("C", bound="Config")
 
 
@@ -114,13 +116,33 @@ def iterate_parameters(config: Config, prefix: str = "") -> Iterator[tuple[str, 
 
 
 def from_mapping(config_type: type[C], values: Mapping[str, Any]) -> C:
-    """A configuration with some values replaced; keys may be nested mappings or dotted names.
+    """The default configuration with some values replaced; keys may be nested mappings or dotted names.
 
     Raises
     ------
     ValueError
-        For an unknown name (with the nearest known one), a wrong type or a value out of range.
+        For an unknown name (with the nearest known one), one that is fixed now, a wrong type or a value out of range.
     """
+    return changed(config_type(), values)
+
+
+def changed(config: C, values: Mapping[str, Any]) -> C:
+    """A configuration with some values replaced, as :func:`from_mapping`; what is not named stays as it is."""
+    known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    replaced: dict[str, Any] = {}
+    for name, value in _nested(values).items():
+        if not (name in known and _can_be_set(config, name)):
+            raise ValueError(_unknown(config, name))
+        if isinstance(known[name], Config):
+            if not isinstance(value, Mapping):
+                raise ValueError(f"parameter group '{name}' of {type(config).__name__} needs a mapping, got {value!r}")
+            value = changed(known[name], value)
+        replaced[name] = value
+    return dataclasses.replace(config, **replaced)
+
+
+def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted names as mappings of their groups."""
     nested: dict[str, Any] = {}
     for key, value in values.items():
         head, _, rest = key.partition(".")
@@ -130,15 +152,19 @@ def from_mapping(config_type: type[C], values: Mapping[str, Any]) -> C:
             nested.setdefault(head, {}).update(value)
         else:
             nested[head] = value
-    types = typing.get_type_hints(config_type)
-    known = {f.name for f in dataclasses.fields(config_type)}
-    for name, value in nested.items():
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(sorted(known))}"
-            raise ValueError(f"unknown parameter '{name}' of {config_type.__name__}{hint}")
-        if isinstance(types[name], type) and issubclass(types[name], Config):
-            if not isinstance(value, Mapping):
-                raise ValueError(f"parameter group '{name}' of {config_type.__name__} needs a mapping, got {value!r}")
-            nested[name] = from_mapping(types[name], value)
-    return config_type(**nested)
+    return nested
+
+
+def _can_be_set(config: Config, name: str) -> bool:
+    """Whether a field is a parameter or a group of such."""
+    info = {f.name: f.metadata for f in dataclasses.fields(config)}[name]
+    return "parameter" in info or isinstance(getattr(config, name), Config)
+
+
+def _unknown(config: Config, name: str) -> str:
+    kind, known = type(config), [f.name for f in dataclasses.fields(config) if _can_be_set(config, f.name)]
+    if is_fixed(kind, name):
+        return f"parameter '{name}' of {kind.__name__} is fixed now and cannot be set: leave it out"
+    near = difflib.get_close_matches(name, known, 1)
+    hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(sorted(known))}"
+    return f"unknown parameter '{name}' of {kind.__name__}{hint}"

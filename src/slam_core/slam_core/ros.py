@@ -28,7 +28,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from slam_core.config import Config, ParameterInfo, from_mapping, iterate_parameters
+from slam_core.config import Config, ParameterInfo, changed, from_mapping, iterate_parameters
 from slam_core.guarded_node import GuardedNode
 from slam_core.memory import share_one_heap
 from slam_core.messages import MessageTypes
@@ -89,8 +89,7 @@ def declare_config(
 
 def changed_config(config: C, parameters: Iterable[Parameter]) -> C:
     """The configuration with some parameters changed at run time; ValueError says why one cannot be so."""
-    changes = {p.name: _plain(p.value) for p in parameters}
-    return from_mapping(type(config), {name: value for name, value, _ in iterate_parameters(config)} | changes)
+    return changed(config, {p.name: _plain(p.value) for p in parameters})
 
 
 def _declare(node: Node, name: str, value: Any, descriptor: Message) -> None:

@@ -14,10 +14,17 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.camera import Camera
-from slam_core.config import Config, group, parameter
+from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform
 from slam_core.types import DepthImage
-from stereo_frontend.depth_lookup import DepthLookupConfig, DepthSamples, sample_depth
+from stereo_frontend.depth_lookup import DepthSamples, sample_depth
+
+_MOTION_SPEED = 0.3
+"""Speed of the rig assumed when the stamps differ: depth sigma grows by speed times age, m/s."""
+_MOTION_RATE = 0.3
+"""Turn rate assumed when the stamps differ: pixel sigma grows by rate times age times f, rad/s."""
+_MAPPING_SIGMA = 0.1
+"""Standard deviation of the mapping into the ToF image, px."""
 
 _ITERATIONS = 8
 
@@ -28,22 +35,6 @@ class FusionConfig(Config):
 
     gate: float = parameter(9.0, "chi-square gate (1 DoF) on the disagreement of stereo and ToF depth", minimum=0.1)
     max_age: float = parameter(0.06, "greatest time between the stereo pair and the depth image", unit="s", minimum=0.0)
-    motion_speed: float = parameter(
-        0.3,
-        "speed of the rig assumed when the stamps differ: depth sigma grows by speed times age",
-        unit="m/s",
-        minimum=0.0,
-    )
-    motion_rate: float = parameter(
-        0.3,
-        "turn rate assumed when the stamps differ: pixel sigma grows by rate times age times f",
-        unit="rad/s",
-        minimum=0.0,
-    )
-    mapping_sigma: float = parameter(
-        0.1, "standard deviation of the mapping into the ToF image", unit="px", minimum=0.0
-    )
-    lookup: DepthLookupConfig = group(DepthLookupConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +56,6 @@ def map_depth(
     camera: Camera,
     image: DepthImage,
     T_left_tof: FloatArray,
-    config: FusionConfig,
     age: float = 0.0,
 ) -> MappedDepth:
     """ToF depth of left pixels.
@@ -78,8 +68,6 @@ def map_depth(
         First guess (n,) m, from stereo; NaN takes the median of the depth image.
     camera, image, T_left_tof
         Left camera, depth image and the pose (4, 4) of the ToF optical frame in the left one.
-    config
-        Lookup and the assumed motion.
     age
         Difference of the stamps, s; its sign does not matter.
     """
@@ -89,12 +77,12 @@ def map_depth(
     depth = np.where(np.isfinite(initial_depth), initial_depth, _median_depth(image))
     for _ in range(_ITERATIONS):
         pixels = image.camera.project(rays_tof * depth[:, None] + origin)
-        samples = sample_depth(image, pixels, config.lookup)
+        samples = sample_depth(image, pixels)
         update = (samples.depth - origin[2]) / rays_tof[:, 2]
         moved = np.abs(update - depth)
         depth = np.where(np.isfinite(update), update, depth)
     settled = moved <= np.maximum(samples.sigma, 1e-3)
-    sigma = _mapped_sigma(samples, image.camera, config, age) / np.abs(rays_tof[:, 2])
+    sigma = _mapped_sigma(samples, image.camera, age) / np.abs(rays_tof[:, 2])
     blank = np.where(settled & (depth > 0.0), 0.0, np.nan)
     return MappedDepth(update + blank, sigma + blank, pixels)
 
@@ -110,10 +98,10 @@ def fuse_depth(
     return np.where(agrees, depth, stereo_depth), np.where(agrees, np.sqrt(R), stereo_sigma), agrees
 
 
-def _mapped_sigma(samples: DepthSamples, camera: Camera, config: FusionConfig, age: float) -> FloatArray:
-    pixel = np.hypot(config.mapping_sigma, config.motion_rate * age * camera.fx)
+def _mapped_sigma(samples: DepthSamples, camera: Camera, age: float) -> FloatArray:
+    pixel = np.hypot(_MAPPING_SIGMA, _MOTION_RATE * age * camera.fx)
     across = np.linalg.norm(samples.gradient, axis=1) * pixel
-    return np.asarray(np.sqrt(samples.sigma**2 + across**2 + (config.motion_speed * age) ** 2))
+    return np.asarray(np.sqrt(samples.sigma**2 + across**2 + (_MOTION_SPEED * age) ** 2))
 
 
 def _median_depth(image: DepthImage) -> float:

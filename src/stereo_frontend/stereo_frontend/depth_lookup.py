@@ -13,24 +13,21 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import DepthImage
+
+_MAX_MISFIT = 4.0
+"""Greatest deviation of a pixel from the local plane, in its sigma."""
+_MIN_STEP = 0.005
+"""Deviations below this share of the depth are never an edge."""
+_MAX_SLOPE = 0.06
+"""Greatest change of depth per pixel, as a share of depth."""
 
 _DU, _DV = (g.ravel() for g in np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]))
 _FREEDOM = 6
 """Nine pixels less the three numbers of the plane."""
 _MEDIAN_CHI_SQUARE, _HIGH_CHI_SQUARE = 0.891, 2.099
 """Median and 95 % bound of chi-square over its freedom of six."""
-
-
-@dataclass(frozen=True)
-class DepthLookupConfig(Config):
-    """When a neighbourhood counts as one surface."""
-
-    max_misfit: float = parameter(4.0, "greatest deviation of a pixel from the local plane, in its sigma", minimum=1.0)
-    min_step: float = parameter(0.005, "deviations below this share of the depth are never an edge", minimum=0.0)
-    max_slope: float = parameter(0.06, "greatest change of depth per pixel, as a share of depth", minimum=0.001)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +39,7 @@ class DepthSamples:
     gradient: FloatArray
 
 
-def sample_depth(image: DepthImage, uv: npt.ArrayLike, config: DepthLookupConfig) -> DepthSamples:
+def sample_depth(image: DepthImage, uv: npt.ArrayLike) -> DepthSamples:
     """Depth of positions (n, 2) px; positions outside the image or beside missing pixels are NaN."""
     uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
     centre, inside = _nearest_inner_pixels(uv, image.depth.shape)
@@ -52,7 +49,7 @@ def sample_depth(image: DepthImage, uv: npt.ArrayLike, config: DepthLookupConfig
     sigma = image.sigma[v, u].astype(np.float64)
     usable = inside & np.all(np.isfinite(depth) & (depth > 0.0) & np.isfinite(sigma), axis=1)
     depth[~usable], sigma[~usable] = 1.0, 1.0
-    return _fit_plane(depth, sigma, uv - centre, usable, config)
+    return _fit_plane(depth, sigma, uv - centre, usable)
 
 
 def _nearest_inner_pixels(uv: FloatArray, shape: tuple[int, ...]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
@@ -68,7 +65,6 @@ def _fit_plane(
     sigma: FloatArray,
     offset: FloatArray,
     usable: npt.NDArray[np.bool_],
-    config: DepthLookupConfig,
 ) -> DepthSamples:
     inverse = 1.0 / depth
     mean, slope_u, slope_v = inverse.mean(axis=1), inverse @ _DU / 6.0, inverse @ _DV / 6.0
@@ -78,8 +74,8 @@ def _fit_plane(
         z = 1.0 / value
         step = np.abs(inverse - fitted) * z[:, None] ** 2
         gradient = -np.column_stack([slope_u, slope_v]) * z[:, None] ** 2
-    limit = np.maximum(config.max_misfit * sigma, config.min_step * z[:, None])
-    smooth = np.all(step <= limit, axis=1) & np.all(np.abs(gradient) <= config.max_slope * z[:, None], axis=1)
+    limit = np.maximum(_MAX_MISFIT * sigma, _MIN_STEP * z[:, None])
+    smooth = np.all(step <= limit, axis=1) & np.all(np.abs(gradient) <= _MAX_SLOPE * z[:, None], axis=1)
     ok = usable & smooth & (value > 0.0) & (depth.min(axis=1) * 0.9 <= z) & (z <= depth.max(axis=1) * 1.1)
     pixel_variance = (sigma**2).mean(axis=1)
     misfit = (step**2).sum(axis=1) / _FREEDOM

@@ -25,6 +25,19 @@ from slam_core.config import Config, parameter
 from slam_core.types import ByteArray, Float32Array
 from stereo_frontend.patch_alignment import align_patches
 
+_INNER_RADIUS = 5
+"""Half width of the smaller patch that must agree, px."""
+_MAX_SHIFT = 3.0
+"""Most correction of the keypoints' disparity, px."""
+_MIN_CORRELATION = 0.8
+"""Least normalised cross-correlation of the aligned patches."""
+_MAX_DISAGREEMENT = 2.0
+"""Most difference of the three alignments, in their standard deviations."""
+_SLOPE_SIGMA = 0.15
+"""Standard deviation of the change of disparity per pixel; 0.1 is a floor seen from 10 baselines above."""
+_SIGMA_SCALE = 1.15
+"""Factor on the standard deviation from residual and curvature."""
+
 _DISAGREEMENT_WEIGHT = 0.3
 """Share of a disagreement that enters the standard deviation."""
 
@@ -34,32 +47,10 @@ class DisparityConfig(Config):
     """The patch alignment and its noise model."""
 
     radius: int = parameter(7, "half width of the patch", unit="px", minimum=2, maximum=15)
-    inner_radius: int = parameter(
-        5, "half width of the smaller patch that must agree", unit="px", minimum=2, maximum=15
-    )
-    max_shift: float = parameter(
-        3.0, "most correction of the keypoints' disparity", unit="px", minimum=0.1, maximum=20.0
-    )
-    min_correlation: float = parameter(
-        0.8, "least normalised cross-correlation of the aligned patches", minimum=0.0, maximum=1.0
-    )
-    max_disagreement: float = parameter(
-        2.0, "most difference of the three alignments, in their standard deviations", minimum=0.1
-    )
-    row_sigma: float = parameter(
-        0.3, "standard deviation of the rectification error across the rows", unit="px", minimum=0.001
-    )
-    slope_sigma: float = parameter(
-        0.15,
-        "standard deviation of the change of disparity per pixel; 0.1 is a floor seen from 10 baselines above",
-        minimum=0.001,
-    )
-    sigma_scale: float = parameter(
-        1.15,
-        "factor on the standard deviation from residual and curvature",
-        minimum=0.1,
-    )
-    sigma_floor: float = parameter(0.02, "standard deviation of a perfect patch", unit="px", minimum=0.001)
+    row_sigma: float = 0.3
+    """Standard deviation of the rectification error across the rows, px."""
+    sigma_floor: float = 0.02
+    """Standard deviation of a perfect patch, px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +101,11 @@ def refine_disparity(
     partner = uv_left - np.column_stack([found.disparity, -found.row_shift])
     back = _align(right, left, partner, uv_left[:, 0], -row_offset, config.radius, config)
     there_and_back = found.disparity + back.disparity
-    agrees = np.abs(there_and_back) <= config.max_disagreement * found.sigma
+    agrees = np.abs(there_and_back) <= _MAX_DISAGREEMENT * found.sigma
     u_inner = np.where(agrees, partner[:, 0], np.float32(np.nan))
-    inner = _align(left, right, uv_left, u_inner, row_offset, config.inner_radius, config)
+    inner = _align(left, right, uv_left, u_inner, row_offset, _INNER_RADIUS, config)
     inner_outer = found.disparity - inner.disparity
-    agrees &= np.abs(inner_outer) <= config.max_disagreement * inner.sigma
+    agrees &= np.abs(inner_outer) <= _MAX_DISAGREEMENT * inner.sigma
     disagreement = _DISAGREEMENT_WEIGHT * np.hypot(there_and_back, inner_outer)
     disparity = np.where(agrees, found.disparity, np.float32(np.nan))
     sigma = np.hypot(found.sigma, disagreement)
@@ -131,11 +122,11 @@ def _align(
     config: DisparityConfig,
 ) -> RefinedDisparity:
     """One pass over all patches of ``template``, (n, 2) px; NaN positions stay NaN."""
-    slope = 1.0 / config.slope_sigma**2
+    slope = 1.0 / _SLOPE_SIGMA**2
     information = np.array([0.0, 1.0 / config.row_sigma**2, slope, slope])
     out = np.full((len(uv), 5), np.nan, np.float32)
-    align_patches(template, image, uv, u_start, row_offset, radius, config.max_shift, information, out)
-    out[~(out[:, 2] >= config.min_correlation)] = np.nan
+    align_patches(template, image, uv, u_start, row_offset, radius, _MAX_SHIFT, information, out)
+    out[~(out[:, 2] >= _MIN_CORRELATION)] = np.nan
     disparity, variance, correlation, row_shift, row_variance = out.T
-    sigma = np.sqrt(config.sigma_scale**2 * variance + config.sigma_floor**2).astype(np.float32)
+    sigma = np.sqrt(_SIGMA_SCALE**2 * variance + config.sigma_floor**2).astype(np.float32)
     return RefinedDisparity(disparity, sigma, correlation, row_shift, np.sqrt(row_variance))

@@ -23,6 +23,15 @@ from stereo_frontend.keypoints import Detector, Keypoints, spread_over_grid
 from stereo_frontend.opencv_detectors import OpenCvDetector
 from stereo_frontend.surf import SurfConfig, SurfDetector
 
+_GRID_COLUMNS = 10
+"""Columns of the coverage grid."""
+_GRID_ROWS = 8
+"""Rows of the coverage grid."""
+_SURPLUS = 1.5
+"""Candidates wanted per feature kept: the grid chooses among them."""
+_ADAPTATION = 0.7
+"""How fast the threshold follows the number of candidates; 0 keeps it fixed."""
+
 DETECTORS = ("surf", "sift", "rootsift", "orb", "censure")
 _THRESHOLD_RANGE = (0.02, 20.0)
 _FIRST_THRESHOLD = 0.3
@@ -39,14 +48,6 @@ class FeatureConfig(Config):
 
     detector: str = parameter("surf", "keypoint detector and descriptor", choices=DETECTORS)
     target: int = parameter(600, "number of features wanted per image", minimum=10, maximum=20000)
-    grid_columns: int = parameter(10, "columns of the coverage grid", minimum=1, maximum=200)
-    grid_rows: int = parameter(8, "rows of the coverage grid", minimum=1, maximum=200)
-    surplus: float = parameter(
-        1.5, "candidates wanted per feature kept: the grid chooses among them", minimum=1.0, maximum=10.0
-    )
-    adaptation: float = parameter(
-        0.7, "how fast the threshold follows the number of candidates; 0 keeps it fixed", minimum=0.0, maximum=1.0
-    )
     surf: SurfConfig = group(SurfConfig)
 
 
@@ -84,7 +85,7 @@ class FeatureExtractor:
             keypoints, candidates = self._one_pass(image, wanted)
             enough = candidates >= self.config.target or self.threshold <= _THRESHOLD_RANGE[0]
             self._adapt(candidates)
-            if enough or self.config.adaptation == 0.0:
+            if enough or _ADAPTATION == 0.0:
                 break
         return keypoints
 
@@ -100,7 +101,7 @@ class FeatureExtractor:
             candidates = len(uv)
             c = self.config
             kept = spread_over_grid(
-                uv, response, (image.shape[0], image.shape[1]), (c.grid_rows, c.grid_columns), c.target
+                uv, response, (image.shape[0], image.shape[1]), (_GRID_ROWS, _GRID_COLUMNS), c.target
             )
             return kept if wanted is None else kept[wanted(uv[kept], size[kept])]
 
@@ -112,5 +113,5 @@ class FeatureExtractor:
 
         Their number falls as 1/threshold.
         """
-        ratio = np.clip(candidates / (self.config.surplus * self.config.target), 0.25, 4.0)
-        self.threshold = float(np.clip(self.threshold * ratio**self.config.adaptation, *_THRESHOLD_RANGE))
+        ratio = np.clip(candidates / (_SURPLUS * self.config.target), 0.25, 4.0)
+        self.threshold = float(np.clip(self.threshold * ratio**_ADAPTATION, *_THRESHOLD_RANGE))

@@ -37,6 +37,13 @@ from stereo_frontend.self_calibration import SelfCalibrationConfig, StereoSelfCa
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
 from stereo_frontend.two_view_consistency import StereoView
 
+_MAX_RELATIVE_SIGMA = 0.35
+"""Features whose depth sigma exceeds this share of their depth are dropped."""
+RIGHT_SURPLUS = 1.6
+"""Features wanted in the right image per feature of the left, so that few partners are missing."""
+_NEIGHBOURS = 16
+"""A match must share its disparity with one of so many neighbours; 0 switches it off."""
+
 MODES = ("stereo", "tof", "replace", "fuse")
 _FEW_TRUSTED = 0.1
 """Share of keypoints with a trusted disparity below which the sign of the disparities is questioned."""
@@ -49,12 +56,6 @@ class FrontendConfig(Config):
     """Everything between rectified images and features."""
 
     mode: str = parameter("stereo", "where depth comes from", choices=MODES)
-    max_relative_sigma: float = parameter(
-        0.35, "features whose depth sigma exceeds this share of their depth are dropped", minimum=0.001, maximum=1.0
-    )
-    right_surplus: float = parameter(
-        1.6, "features wanted in the right image per feature of the left, so that few partners are missing", minimum=1.0
-    )
     features: FeatureConfig = group(FeatureConfig)
     matching: MatchingConfig = group(MatchingConfig)
     disparity: DisparityConfig = group(DisparityConfig)
@@ -92,7 +93,7 @@ class Frontend:
         self.config = config or FrontendConfig()
         self.counters = Counters()
         self._left = FeatureExtractor(self.config.features)
-        self._right = FeatureExtractor(_more(self.config.features, self.config.right_surplus))
+        self._right = FeatureExtractor(_more(self.config.features, RIGHT_SURPLUS))
         self._noise = PixelNoise(self.config.noise)
         self.self_calibration = StereoSelfCalibration(self.config.self_calibration)
         self._wide = self.self_calibration.widened(self.config.matching)
@@ -150,7 +151,7 @@ class Frontend:
         if self.config.mode == "tof":
             if depth is None:
                 raise ValueError("mode 'tof' needs a depth image, got none")
-            return self._tof(depth, self.config.max_relative_sigma)
+            return self._tof(depth, _MAX_RELATIVE_SIGMA)
         if images is None or keypoints is None:
             raise ValueError(f"mode '{self.config.mode}' needs a stereo pair, got none")
         left, right = keypoints
@@ -159,7 +160,7 @@ class Frontend:
             estimate = self._with_tof(images, left, estimate, depth, T_left_tof)
         return make_features(
             images.stamp_ns, left, estimate, self._noise.sigma(left.size), images.stereo.camera,
-            "stereo_left_optical_frame", self.config.max_relative_sigma,
+            "stereo_left_optical_frame", _MAX_RELATIVE_SIGMA,
         )  # fmt: skip
 
     def reset(self) -> None:
@@ -191,7 +192,7 @@ class Frontend:
         correction, correction_sigma = calibration.columns(partner)
         disparity = refined.disparity + correction
         disparity[~(disparity >= bounds[0])] = np.nan
-        disparity[~has_consistent_neighbour(uv, disparity, self.config.matching.neighbours)] = np.nan
+        disparity[~has_consistent_neighbour(uv, disparity, _NEIGHBOURS)] = np.nan
         sigma = np.sqrt(refined.sigma**2 + self._noise.rectification_sigma**2 + correction_sigma**2)
         estimate = DepthEstimate.unknown(len(left))
         estimate.depth[matches.left] = stereo.depth_from_disparity(disparity)
@@ -282,7 +283,7 @@ class Frontend:
         if age > self.config.fusion.max_age:
             self.counters.add("tof_too_old")
             return None
-        return map_depth(left.uv, stereo.depth, images.stereo.camera, depth, T, self.config.fusion, age)
+        return map_depth(left.uv, stereo.depth, images.stereo.camera, depth, T, age)
 
     def _reject_swapped(self, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> None:
         share, matches = swapped_share(left, right, self.config.matching, bounds)

@@ -19,6 +19,9 @@ from slam_core.geometry import FloatArray
 from slam_core.types import Float32Array
 from stereo_frontend.keypoints import Keypoints
 
+MAX_SIZE_RATIO = 1.5
+"""Most ratio of the two keypoints' sizes."""
+
 IndexArray = npt.NDArray[np.intp]
 
 
@@ -37,10 +40,6 @@ class MatchingConfig(Config):
         "most ratio of the best to the second-best descriptor distance in the band; 1 switches it off",
         minimum=0.1,
         maximum=1.0,
-    )
-    max_size_ratio: float = parameter(1.5, "most ratio of the two keypoints' sizes", minimum=1.0, maximum=10.0)
-    neighbours: int = parameter(
-        16, "a match must share its disparity with one of so many neighbours; 0 switches it off", minimum=0
     )
     min_depth: float = parameter(0.3, "nearest depth looked for", unit="m", minimum=0.01)
     max_depth: float = parameter(200.0, "farthest depth looked for", unit="m", minimum=0.1)
@@ -137,7 +136,7 @@ def _any_in_band(uv_right, log_size_right, uv, log_size, limits):  # type: ignor
 
 def _limits(config: MatchingConfig, bounds: tuple[float, float]) -> FloatArray:
     """Row difference, least and greatest disparity (px), logarithm of the ratio of sizes."""
-    return np.array([config.epipolar_band, bounds[0], bounds[1], np.log(config.max_size_ratio)])
+    return np.array([config.epipolar_band, bounds[0], bounds[1], np.log(MAX_SIZE_RATIO)])
 
 
 def swapped_share(

@@ -26,7 +26,7 @@ from stereo_frontend.calibrated_pairs import SIDES
 from stereo_frontend.frontend import FrontendConfig
 from stereo_frontend.sources import RawPair
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
-from stereo_frontend.tof_features import normalised_picture
+from stereo_frontend.tof_features import CLIP, GAMMA, normalised_picture
 
 FEW_FEATURES = 20
 """Fewer features than this are reported as DEGRADED."""
@@ -127,11 +127,11 @@ class FeatureNode(SlamNode[FrontendConfig]):
         if frame.images is not None:
             return frame.images.left
         assert frame.depth is not None
-        depth, tof = frame.depth, self.config.tof
+        depth = frame.depth
         grey = next((picture for picture in (depth.amplitude, depth.intensity) if picture is not None), None)
         if grey is None:
-            return normalised_picture(depth.depth, tof.clip, 1.0)
-        return normalised_picture(grey, tof.clip, tof.gamma)
+            return normalised_picture(depth.depth, CLIP, 1.0)
+        return normalised_picture(grey, CLIP, GAMMA)
 
     def _report(self, number: int) -> None:
         self.health.take(self.stage.counters | self.pairs.counters)

@@ -18,6 +18,17 @@ import numpy as np
 from slam_core.config import Config, parameter
 from slam_core.types import Float32Array
 
+ROW_FLOOR = 0.06
+"""Standard deviation of the row of the smallest keypoints in one clean image, px."""
+ROW_SLOPE = 0.003
+"""Growth of that with the keypoint's diameter."""
+_MEMORY = 0.9
+"""Weight of the past in the running factor; 1 keeps it constant."""
+_MIN_MATCHES = 30
+"""Matches needed in a frame to learn from it."""
+_MIN_FACTOR = 0.7
+"""Least factor."""
+
 _MAD_TO_SIGMA = 1.4826
 
 
@@ -34,16 +45,8 @@ class PixelNoiseConfig(Config):
     slope: float = parameter(
         0.015, "growth of the standard deviation with the keypoint's diameter", minimum=0.0, maximum=1.0
     )
-    row_floor: float = parameter(
-        0.06, "standard deviation of the row of the smallest keypoints in one clean image", unit="px", minimum=0.001
-    )
-    row_slope: float = parameter(0.003, "growth of that with the keypoint's diameter", minimum=0.0, maximum=1.0)
-    memory: float = parameter(
-        0.9, "weight of the past in the running factor; 1 keeps it constant", minimum=0.0, maximum=1.0
-    )
-    min_matches: int = parameter(30, "matches needed in a frame to learn from it", minimum=5)
-    min_factor: float = parameter(0.7, "least factor", minimum=0.01)
-    max_factor: float = parameter(3.0, "greatest factor", minimum=0.1)
+    max_factor: float = 3.0
+    """Greatest factor."""
 
 
 class PixelNoise:
@@ -67,20 +70,20 @@ class PixelNoise:
         Their median is an error of rectification, not of the detector, and is removed.
         """
         c = self.config
-        if len(row_difference) < c.min_matches:
+        if len(row_difference) < _MIN_MATCHES:
             return
-        clean = np.sqrt(2.0) * np.hypot(c.row_floor, c.row_slope * size)
+        clean = np.sqrt(2.0) * np.hypot(ROW_FLOOR, ROW_SLOPE * size)
         normalised = (row_difference - np.median(row_difference)) / clean
-        measured = float(np.clip(_MAD_TO_SIGMA * np.median(np.abs(normalised)), c.min_factor, c.max_factor))
-        self.factor = c.memory * self.factor + (1.0 - c.memory) * measured
+        measured = float(np.clip(_MAD_TO_SIGMA * np.median(np.abs(normalised)), _MIN_FACTOR, c.max_factor))
+        self.factor = _MEMORY * self.factor + (1.0 - _MEMORY) * measured
 
     def learn_rectification(self, row_shift: Float32Array, row_sigma: Float32Array) -> None:
         """Take in the row shifts (n,) px of aligned patches and their standard deviations (n,) px."""
-        if len(row_shift) < self.config.min_matches:
+        if len(row_shift) < _MIN_MATCHES:
             return
         spread = _MAD_TO_SIGMA * np.median(np.abs(row_shift - np.median(row_shift)))
         excess = np.sqrt(max(0.0, float(spread**2 - np.median(row_sigma) ** 2)))
-        memory = self.config.memory
+        memory = _MEMORY
         self.rectification_sigma = memory * self.rectification_sigma + (1.0 - memory) * excess
 
     def reset(self) -> None:

@@ -34,6 +34,23 @@ from stereo_frontend.two_view_consistency import (
     row_equations,
 )
 
+_MIN_CHI_SQUARE = 36.0
+"""Evidence against a perfect calibration from which disparities are corrected."""
+_MIN_ROW_ERROR = 0.25
+"""Row differences, root mean square over the image, from which rows are corrected, px."""
+_MIN_MOMENTS = 4
+"""Pairs of moments needed before disparities are corrected."""
+_MIN_PARALLAX = 8.0
+"""Median motion of keypoints between two moments that are compared, px."""
+_MEMORY = 400
+"""Pairs of moments remembered."""
+_ROW_REACH = 2.0
+"""Row difference looked for beyond the epipolar band while the rows are not known, px."""
+_MIN_SIMILARITY = 0.85
+"""Least scalar product of two moments' descriptors."""
+_MAX_RATIO = 0.8
+"""Most ratio of the best to the second-best distance."""
+
 _GROUP = 4
 """Consecutive pieces of evidence that are not independent: they share keypoints."""
 _FEW = 30
@@ -49,25 +66,8 @@ class SelfCalibrationConfig(Config):
     """When to learn and when to believe it."""
 
     mode: str = parameter("auto", "correct where the evidence asks for it, or never", choices=("auto", "off"))
-    min_chi_square: float = parameter(
-        36.0, "evidence against a perfect calibration from which disparities are corrected", minimum=1.0
-    )
-    min_row_error: float = parameter(
-        0.25, "row differences, root mean square over the image, from which rows are corrected", unit="px", minimum=0.0
-    )
-    min_moments: int = parameter(4, "pairs of moments needed before disparities are corrected", minimum=2)
-    min_parallax: float = parameter(
-        8.0, "median motion of keypoints between two moments that are compared", unit="px", minimum=0.5
-    )
-    memory: int = parameter(400, "pairs of moments remembered", minimum=10)
-    row_floor: float = parameter(0.1, "standard deviation of a perfect match's row difference", unit="px", minimum=0.01)
-    row_reach: float = parameter(
-        2.0, "row difference looked for beyond the epipolar band while the rows are not known", unit="px", minimum=0.0
-    )
-    min_similarity: float = parameter(
-        0.85, "least scalar product of two moments' descriptors", minimum=0.0, maximum=1.0
-    )
-    max_ratio: float = parameter(0.8, "most ratio of the best to the second-best distance", minimum=0.1, maximum=1.0)
+    row_floor: float = 0.1
+    """Standard deviation of a perfect match's row difference, px."""
 
 
 class StereoSelfCalibration:
@@ -82,13 +82,13 @@ class StereoSelfCalibration:
         self.error: RectificationError | None = None
         self.corrects_rows = self.corrects = False
         self._reference: StereoView | None = None
-        self._evidence: deque[NormalEquations] = deque(maxlen=self.config.memory)
+        self._evidence: deque[NormalEquations] = deque(maxlen=_MEMORY)
         self._moments = 0
 
     # ---- what is known
     def widened(self, matching: MatchingConfig) -> MatchingConfig:
         """The matching for images whose rows are not known yet, and for keypoints that are found before that."""
-        reach = 0.0 if self.config.mode == "off" else self.config.row_reach
+        reach = 0.0 if self.config.mode == "off" else _ROW_REACH
         return replace(matching, epipolar_band=matching.epipolar_band + reach)
 
     def knows(self, camera: Camera) -> bool:
@@ -145,9 +145,9 @@ class StereoSelfCalibration:
         if self._reference is None:
             self._take(view, row_equations(view, self.error, self.config.row_floor))
             return
-        rows, columns = match_views(self._reference, view, self.config.min_similarity, self.config.max_ratio)
+        rows, columns = match_views(self._reference, view, _MIN_SIMILARITY, _MAX_RATIO)
         first, second = self._reference.select(rows), view.select(columns)
-        stays = len(rows) >= _FEW and np.median(np.linalg.norm(first.uv - second.uv, axis=1)) < self.config.min_parallax
+        stays = len(rows) >= _FEW and np.median(np.linalg.norm(first.uv - second.uv, axis=1)) < _MIN_PARALLAX
         if stays:
             return
         evidence = row_equations(view, self.error, self.config.row_floor)
@@ -166,16 +166,14 @@ class StereoSelfCalibration:
         self.error = error
         slack = _HYSTERESIS if self.corrects_rows else 1.0
         rows = error.row_rms()
-        self.corrects_rows = rows > slack * self.config.min_row_error and rows > slack * self._doubt(
-            error.row_sigma_rms()
-        )
+        self.corrects_rows = rows > slack * _MIN_ROW_ERROR and rows > slack * self._doubt(error.row_sigma_rms())
         slack = _HYSTERESIS if self.corrects else 1.0
-        enough = self._moments >= self.config.min_moments
+        enough = self._moments >= _MIN_MOMENTS
         self.corrects = enough and error.column_rms() > slack * self._doubt(error.column_sigma_rms())
 
     def _doubt(self, sigma: float) -> float:
         """What an error of standard deviation ``sigma`` must exceed to be believed."""
-        return float(np.sqrt(self.config.min_chi_square)) * sigma
+        return float(np.sqrt(_MIN_CHI_SQUARE)) * sigma
 
 
 def _estimate(evidence: list[NormalEquations], camera: Camera) -> RectificationError:

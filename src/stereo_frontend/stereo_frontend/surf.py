@@ -33,6 +33,11 @@ from stereo_frontend.surf_descriptor import (
 )
 from stereo_frontend.surf_detector import MAX_PIXELS, find_keypoints, fitting_octaves, halved, integral_image
 
+_OCTAVES = 3
+"""Octaves of four filter sizes."""
+_CUSTOMARY_THRESHOLD = 26.0
+"""Determinant of the Hessian of a customary keypoint, grey values 0 to 255."""
+
 _MOST_KEYPOINTS = 20000
 _DIAMETER = 9.0 / 1.2
 """Size of a keypoint (px) per unit of its scale: that of the filter that found it."""
@@ -45,10 +50,6 @@ _WEIGHTS = region_weights()
 class SurfConfig(Config):
     """Parameters of SURF, named as in the paper."""
 
-    octaves: int = parameter(3, "octaves of four filter sizes", minimum=1, maximum=6)
-    threshold: float = parameter(
-        26.0, "determinant of the Hessian of a customary keypoint, grey values 0 to 255", minimum=0.01
-    )
     doubled: bool = parameter(True, "search the image enlarged twice: keypoints down to half the size")
     upright: bool = parameter(False, "describe along the image axes (U-SURF) instead of the keypoint's orientation")
     extended: bool = parameter(True, "descriptors of 128 numbers (SURF-128) instead of 64: better told apart, slower")
@@ -72,7 +73,7 @@ class SurfDetector:
         if image.size > MAX_PIXELS:
             raise ValueError(f"SURF takes images of at most {MAX_PIXELS} px, got {image.shape[1]} x {image.shape[0]}")
         image = np.ascontiguousarray(image)
-        found = self._find_all(image, threshold * self.config.threshold)
+        found = self._find_all(image, threshold * _CUSTOMARY_THRESHOLD)
         found = found[select(found[:, :2], _DIAMETER * found[:, 2], found[:, 3])]
         places = found[:, :3].astype(np.float64)
         descriptors = describe(image, places, upright=self.config.upright, extended=self.config.extended)
@@ -85,7 +86,7 @@ class SurfDetector:
             first, second, pixel = large, image, 0.5
         else:
             first, second, pixel = image, halved(image), 1.0
-        octaves = fitting_octaves(first.shape[0], first.shape[1], self.config.octaves)
+        octaves = fitting_octaves(first.shape[0], first.shape[1], _OCTAVES)
         number = find_keypoints(first, second, octaves, np.float32(threshold), self._found)
         found = self._found[:number].copy()
         found[:, :2] = (found[:, :2] + 0.5) * pixel - 0.5

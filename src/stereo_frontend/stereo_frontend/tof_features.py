@@ -13,13 +13,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_core.config import Config, group, parameter
+from slam_core.config import Config, parameter
 from slam_core.types import ByteArray, DepthImage, Features, FeatureSource, Float32Array
 from stereo_frontend.assembly import DepthEstimate, make_features
-from stereo_frontend.depth_lookup import DepthLookupConfig, sample_depth
+from stereo_frontend.depth_lookup import sample_depth
 from stereo_frontend.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
+
+CLIP = 0.005
+"""Share of pixels beyond the black and the white point each."""
+GAMMA = 0.5
+"""Exponent after normalisation: lifts what is far and dark."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +37,6 @@ class TofFeatureConfig(Config):
         "both: amplitude and range",
         choices=("auto", "amplitude", "intensity", "range", "both"),
     )
-    clip: float = parameter(
-        0.005, "share of pixels beyond the black and the white point each", minimum=0.0, maximum=0.2
-    )
-    gamma: float = parameter(0.5, "exponent after normalisation: lifts what is far and dark", minimum=0.1, maximum=2.0)
-    lookup: DepthLookupConfig = group(DepthLookupConfig)
 
 
 class TofFeatures:
@@ -52,7 +52,7 @@ class TofFeatures:
     def __call__(self, image: DepthImage, max_relative_sigma: float = 1.0) -> Features:
         """Features of ``image`` in the ToF optical frame; those without a single surface below them are left out."""
         keypoints = _joined([self._extractors[name](picture) for name, picture in self._pictures(image).items()])
-        samples = sample_depth(image, keypoints.uv, self.config.lookup)
+        samples = sample_depth(image, keypoints.uv)
         sigma_uv = self._noise.sigma(keypoints.size)
         source = np.full(len(keypoints), FeatureSource.TOF, np.uint8)
         estimate = DepthEstimate(samples.depth, samples.sigma, source)
@@ -91,7 +91,7 @@ class TofFeatures:
         """The 8-bit picture of that name in which features are searched."""
         values = _values(image, name)
         assert values is not None
-        return normalised_picture(values, self.config.clip, 1.0 if name == "range" else self.config.gamma)
+        return normalised_picture(values, CLIP, 1.0 if name == "range" else GAMMA)
 
 
 def _values(image: DepthImage, name: str) -> Float32Array | None:

@@ -16,7 +16,14 @@ import numpy as np
 from slam_core.camera import Camera
 from slam_core.config import Config, group, parameter
 from slam_core.types import AnyArray, ByteArray, Counters, DepthImage, Float32Array
-from tof_driver.mask import MaskConfig, Reason, judge_pixels, reject_flying_pixels
+from tof_driver.mask import (
+    MAXIMUM_INCIDENCE_DEG,
+    NOISE_MULTIPLE,
+    MaskConfig,
+    Reason,
+    judge_pixels,
+    reject_flying_pixels,
+)
 from tof_driver.noise import NoiseConfig, range_sigma
 from tof_driver.resample import RectificationMap
 
@@ -143,7 +150,7 @@ class DepthProcessor:
         else:
             sigma = range_sigma(noise, distance, amplitude)
         if mask.flying_pixels:
-            reject_flying_pixels(mask, distance, sigma, reason, self._pixel_angle)
+            reject_flying_pixels(distance, sigma, reason, self._pixel_angle)
         return reason, sigma
 
     def _along_z(
@@ -160,9 +167,8 @@ class DepthProcessor:
     ) -> tuple[Float32Array, Float32Array]:
         if self._rectification is None:
             return depth, sigma
-        mask = self.config.mask
-        slope = self._pixel_angle * np.tan(np.radians(mask.maximum_incidence_deg))
-        return self._rectification.depth(depth, sigma, slope, mask.noise_multiple)
+        slope = self._pixel_angle * np.tan(np.radians(MAXIMUM_INCIDENCE_DEG))
+        return self._rectification.depth(depth, sigma, slope, NOISE_MULTIPLE)
 
     def _rectified_picture(self, image: Float32Array | None) -> Float32Array | None:
         return image if image is None or self._rectification is None else self._rectification.image(image)

@@ -16,6 +16,13 @@ from numba import njit
 from slam_core.config import Config, parameter
 from slam_core.types import ByteArray, Float32Array
 
+MAXIMUM_INCIDENCE_DEG = 75.0
+"""Steepest surface, angle between ray and normal, deg."""
+NOISE_MULTIPLE = 3.5
+"""Difference of neighbours explained by noise, sigma."""
+MINIMUM_NEIGHBOURS = 3
+"""Of the eight neighbours, how many must lie on the same surface."""
+
 
 class Reason(IntEnum):
     """Why a pixel has no depth; ``VALID`` where it has one."""
@@ -50,13 +57,6 @@ class MaskConfig(Config):
         maximum=1.0,
     )
     flying_pixels: bool = parameter(True, "reject pixels between foreground and background")
-    maximum_incidence_deg: float = parameter(
-        75.0, "steepest surface, angle between ray and normal", unit="deg", minimum=10.0, maximum=89.5
-    )
-    noise_multiple: float = parameter(3.5, "difference of neighbours explained by noise", unit="sigma", minimum=1.0)
-    minimum_neighbours: int = parameter(
-        3, "of the eight neighbours, how many must lie on the same surface", minimum=0, maximum=8
-    )
 
 
 def judge_pixels(config: MaskConfig, distance: Float32Array, amplitude: Float32Array | None) -> ByteArray:
@@ -84,9 +84,7 @@ def judge_pixels(config: MaskConfig, distance: Float32Array, amplitude: Float32A
     return reason
 
 
-def reject_flying_pixels(
-    config: MaskConfig, distance: Float32Array, sigma: Float32Array, reason: ByteArray, pixel_angle: float
-) -> None:
+def reject_flying_pixels(distance: Float32Array, sigma: Float32Array, reason: ByteArray, pixel_angle: float) -> None:
     """Mark flying pixels in ``reason`` (in place).
 
     Neighbours are on one surface where their ranges differ by no more than noise and the steepest believable surface
@@ -96,8 +94,6 @@ def reject_flying_pixels(
 
     Parameters
     ----------
-    config
-        Steepest surface, noise multiple and number of neighbours.
     distance, sigma, reason
         Range and its standard deviation (m) and reasons so far, shape (height, width).
     pixel_angle
@@ -107,9 +103,9 @@ def reject_flying_pixels(
     # A frame of NaN spares the kernel all tests for borders and missing neighbours: no comparison with NaN holds.
     surrounded = np.pad(np.where(read, distance, np.float32(np.nan)), 1, constant_values=np.nan)
     # Half of the noise of a difference: sqrt(a^2 + b^2) is taken as (a + b) / sqrt(2).
-    noise = np.pad(sigma * np.float32(config.noise_multiple / np.sqrt(2.0)), 1)
-    slope = np.float32(pixel_angle * np.tan(np.radians(config.maximum_incidence_deg)))
-    flying = _flying(surrounded, noise, slope, config.minimum_neighbours)
+    noise = np.pad(sigma * np.float32(NOISE_MULTIPLE / np.sqrt(2.0)), 1)
+    slope = np.float32(pixel_angle * np.tan(np.radians(MAXIMUM_INCIDENCE_DEG)))
+    flying = _flying(surrounded, noise, slope, MINIMUM_NEIGHBOURS)
     reason[flying & (reason == Reason.VALID)] = Reason.FLYING
 
 

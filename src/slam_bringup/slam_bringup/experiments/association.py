@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ekf_slam_node.association import associate_ccda, associate_jcbb, associate_mahalanobis, associate_nearest
 from ekf_slam_node.candidates import Candidates, MotionPrior
-from ekf_slam_node.config import FeatureAssociationConfig
+from ekf_slam_node.config import NEAREST_ASSOCIATE, FeatureAssociationConfig
 from ekf_slam_node.models import Frame, frame_from_features, rig_points
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Table
 from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
@@ -87,7 +87,7 @@ def _pairs(
     candidates = Candidates(*rig_points(before, T_rig_optical), before.descriptors)
     similarity = np.asarray(candidates.descriptors @ now.descriptors.T, dtype=np.float64)
     if config.method == "nearest":
-        rows, columns = associate_nearest(candidates, now, prior.T, T_rig_optical, config.nearest_associate)
+        rows, columns = associate_nearest(candidates, now, prior.T, T_rig_optical, NEAREST_ASSOCIATE)
         alike = similarity[rows, columns] >= config.descriptor_threshold
         return rows[alike], columns[alike]
     associate = _JOINT[config.method]

@@ -18,11 +18,11 @@ from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_bringup.experiments.true_frames import TrueFrame, simulated_frames, spread, transfer
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray, DepthImage
-from stereo_frontend.depth_lookup import DepthLookupConfig, sample_depth
+from stereo_frontend.depth_lookup import sample_depth
 from stereo_frontend.features import DETECTORS, FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.surf import SurfConfig
-from stereo_frontend.tof_features import TofFeatureConfig, normalised_picture
+from stereo_frontend.tof_features import CLIP, GAMMA, normalised_picture
 
 MODULE = "slam_bringup.experiments.features"
 _PACKAGES = (*RENDERING, "stereo_frontend", "tof_driver", "slam_bringup.experiments.true_frames")
@@ -101,12 +101,11 @@ def compare_tof_pictures(folder: Path, before: list[Path], frames: int) -> Kept:
 
 def tof_picture(image: DepthImage, kind: str) -> ByteArray:
     """One of the laser camera's pictures as features are looked for in it, uint8."""
-    config = TofFeatureConfig()
     if kind == "range":
-        return normalised_picture(image.depth, config.clip, 1.0)
+        return normalised_picture(image.depth, CLIP, 1.0)
     values = image.amplitude if kind == "amplitude" else image.intensity
     assert values is not None
-    return normalised_picture(values, config.clip, config.gamma)
+    return normalised_picture(values, CLIP, GAMMA)
 
 
 def _tof_found_again(views: Sequence[TrueFrame], kind: str) -> dict[str, float]:
@@ -129,7 +128,7 @@ def _tof_found_again(views: Sequence[TrueFrame], kind: str) -> dict[str, float]:
 def _with_depth(extractor: FeatureExtractor, image: DepthImage, kind: str) -> tuple[Keypoints, FloatArray]:
     """Keypoints that have a depth below them: the others cannot be used."""
     keypoints = extractor(tof_picture(image, kind))
-    depth = sample_depth(image, keypoints.uv, DepthLookupConfig()).depth
+    depth = sample_depth(image, keypoints.uv).depth
     known = np.isfinite(depth)
     return keypoints.select(known), depth[known].astype(np.float64)
 
