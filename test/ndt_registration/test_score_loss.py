@@ -10,8 +10,8 @@ import numpy as np
 
 from ndt_registration.cloud import prepare
 from ndt_registration.registration import RegistrationConfig, Target
-from ndt_registration.score_loss import ScoreLoss
-from slam_core.geometry import FloatArray
+from ndt_registration.score_loss import ScoreLoss, point_fits
+from slam_core.geometry import FloatArray, make_transform, rotation_from_euler, transform_points
 
 STEP = 0.1
 
@@ -36,6 +36,18 @@ def test_a_furnished_room_holds_everywhere(room: Any, start: FloatArray, at: Cal
     rng, truth = np.random.default_rng(4), at(0.0, 0.1)
     lost = losses(room.scan(start @ truth, rng), room.scan(start, rng), truth)
     assert (lost > 4.0 * RegistrationConfig().uncertainty.least_loss).all()
+
+
+def test_points_fit_where_their_pose_brings_them(room: Any, start: FloatArray) -> None:
+    rng, config = np.random.default_rng(4), RegistrationConfig()
+    scan = room.scan(start, rng)
+    T = make_transform(rotation_from_euler(0.03, -0.02, 0.04), np.array([0.02, -0.03, 0.01]))
+    cloud = prepare(scan, 2000, planar=False, centre=np.zeros(3))
+    layer = Target.build(scan, config).pyramid.layers(cloud, 0, 2000, config.rim_share)[0]
+    moved = layer._replace(points=transform_points(T, layer.points))
+    expected = point_fits(moved, np.eye(3), np.zeros(3))
+    assert (expected > 0.1).sum() > 200
+    np.testing.assert_allclose(point_fits(layer, np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()), expected, atol=1e-9)
 
 
 def test_nothing_is_lost_where_nothing_moves(room: Any, start: FloatArray) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ndt_registration.near_field import FULL, lattice_costs, near_field
-from ndt_registration.orientation import best_rotations, direction_density, facing_normals
+from ndt_registration.orientation import _bin_directions, best_rotations, direction_density, facing_normals
 from ndt_registration.search import PRICES
-from ndt_registration.visibility import range_image, visibility_cost
+from ndt_registration.visibility import direction_bin, range_image, visibility_cost
 from slam_core.geometry import FloatArray, so3_exp, so3_log
 
 
@@ -27,6 +27,12 @@ def test_direction_density_is_the_mean_of_bells(rng: np.random.Generator) -> Non
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     expected = np.exp((normals[:5] @ normals.T - 1.0) / 0.1**2).mean(axis=1)
     np.testing.assert_allclose(direction_density(normals[:5], normals, 0.1), expected, atol=4e-4)
+
+
+def test_every_bin_of_the_direction_image_holds_its_own_direction() -> None:
+    directions = _bin_directions()
+    size = round(np.sqrt(len(directions)))
+    assert [direction_bin(*direction, size) for direction in directions] == list(range(size * size))
 
 
 @pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.5), (0.2, -0.3, 0.1)])

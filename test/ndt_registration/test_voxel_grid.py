@@ -106,6 +106,17 @@ def test_cells_of_a_plane_take_the_wider_normal_and_keep_their_mean(rng: np.rand
     assert changed.counts.mean() > 2.0 * own.counts.mean()
 
 
+def test_adopted_planes_inform_across_by_what_slack_leaves_of_their_thickness(rng: np.random.Generator) -> None:
+    own, changed = adopted(flat_patch(rng, 20000, (0.0, 0.8), 0.02))
+    taken = np.abs(changed.normal - own.normal).max(axis=1) > 0
+    assert taken.sum() > 40
+    thickness = np.maximum(changed.variance[taken, 0], 1e-6)
+    expected = 1.0 / thickness - 10.0 / np.maximum(changed.variance[taken, 2], thickness)
+    assert (expected > 0).all()
+    across = np.einsum("ni,nj->nij", changed.normal[taken], changed.normal[taken])[:, *np.triu_indices(3)]
+    np.testing.assert_allclose(changed.information[taken], expected[:, None] * across, rtol=1e-6, atol=1e-6)
+
+
 def test_cells_at_a_step_keep_their_own_normal(rng: np.random.Generator) -> None:
     """A picture 8 mm before its wall hardly thickens a wide cell, but tilts it by more than the cell beside allows."""
     step = 0.39
