@@ -34,9 +34,10 @@ def test_the_demo_keeps_its_bounds():
 
 
 @pytest.mark.slow
-def test_a_rendered_scenario_keeps_its_bounds(tmp_path):
-    write_bag(Scenario.load("sweep"), tmp_path / "bag", BagOptions(images="jpeg", compact=True))
-    assert violations("sweep", summary_of(tmp_path / "bag", expected()["sweep"]["mode"])) == []
+@pytest.mark.parametrize("name", ["sweep", "fireman_5hz"])
+def test_a_rendered_scenario_keeps_its_bounds(tmp_path, name):
+    write_bag(Scenario.load(name), tmp_path / "bag", BagOptions(images="jpeg", compact=True))
+    assert violations(name, summary_of(tmp_path / "bag", expected()[name]["mode"])) == []
 
 
 def test_what_lies_outside_is_said():

@@ -11,8 +11,10 @@ import pytest
 from click.testing import CliRunner
 
 from slam_bringup.cli import slam
+from slam_bringup.experiments.answers import answers
 from slam_bringup.experiments.association import METHODS, associate
 from slam_bringup.experiments.catalogue import EXPERIMENTS, chosen
+from slam_bringup.experiments.findings import Comparison, Findings, as_json
 from slam_bringup.experiments.page import write_page
 from slam_bringup.experiments.planar import filter_run, graph_of
 from slam_bringup.experiments.registration import register_motions
@@ -67,6 +69,29 @@ def test_the_markdown_page_holds_every_comparison(planar_run):
     assert "slam experiment planar" in page
 
 
+ENTRIES = {
+    "one_filter": {"comparisons": [{"quantity": "time per frame at the end", "ours": "40 ms, with submaps 7 ms"},
+                                   {"quantity": "ANEES, one filter and joined submaps", "ours": "1.9, 1.1"}]},
+    "survey": {"comparisons": [{"quantity": "growth of a step's time: one EKF, joined submaps", "ours": "n^2, n^0.4"}]},
+    "figure_eight": {"comparisons": [{"quantity": "end error", "ours": "2.0 mm"}]},
+    "five_rooms": {"comparisons": [{"quantity": "loop", "ours": "9 closures, end error 1.7 mm"}]},
+    "sweep": {"tables": [{"header": ["run", "ATE mm"], "rows": [["sweep", "2.0"]]}], "comparisons": []},
+    "fireman": {"tables": [{"header": ["run", "ATE mm"], "rows": [["fireman_5hz", "9.0"], ["fireman_10hz", "3.0"]]}],
+                "comparisons": [{"quantity": "5hz, looking round", "ours": "lost 0 times"}]},
+}  # fmt: skip
+
+
+def test_questions_are_answered_by_figures_of_what_was_run():
+    found = {answer["question"]: answer["answer"] for answer in answers(ENTRIES)}
+    assert len(found) == 2  # the others' experiments were not run
+    techniques, motion = found.values()
+    for figure in ("40 ms, with submaps 7 ms", "1.9, 1.1", "n^2, n^0.4", "2.0 mm", "9 closures"):
+        assert figure in techniques
+    assert "ATE 2.0 mm in a slow sweep" in motion
+    assert "3.0 mm" in motion
+    assert "1.5 times" in motion
+
+
 def test_a_folder_of_others_is_refused(tmp_path):
     (tmp_path / "experiments.html").write_text("mine")
     result = CliRunner().invoke(slam, ["experiment", "planar", "-o", str(tmp_path), "--quick"])
@@ -80,6 +105,13 @@ def test_an_unmet_mark_is_said(planar_run, tmp_path):
     write_page(out / "failed.html", [failed])
     assert "not met" in (out / "failed.html").read_text()
     assert "0 of 1 marks are met" in (out / "failed.html").read_text()
+
+
+def test_marks_that_numpy_judged_are_written(tmp_path):
+    comparison = Comparison("length", "1", "2", "<= 3", np.array(2.0) <= 3.0)
+    for quick, met in ((False, True), (True, None)):
+        written = json.loads(json.dumps(as_json(EXPERIMENTS["planar"], Findings([comparison]), tmp_path, quick=quick)))
+        assert written["comparisons"][0]["met"] is met
 
 
 def test_the_smoothers_problem_holds_every_associated_measurement():

@@ -6,6 +6,7 @@ from __future__ import annotations
 from slam_bringup.experiments import (
     association,
     calibration,
+    dense,
     features,
     filtering,
     fusion,
@@ -18,7 +19,7 @@ from slam_bringup.experiments.findings import Experiment
 
 EXPERIMENTS: dict[str, Experiment] = {
     experiment.name: experiment
-    for module in (planar, survey, calibration, features, association, filtering, joining, registration, fusion)
+    for module in (planar, survey, calibration, features, association, filtering, dense, joining, registration, fusion)
     for experiment in module.EXPERIMENTS
 }
 

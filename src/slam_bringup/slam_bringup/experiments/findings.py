@@ -71,7 +71,10 @@ def as_json(experiment: Experiment, findings: Findings, folder: Path, *, quick: 
         file = f"{experiment.name}_{k + 1}.png"
         save_png(folder / file, picture.figure, dpi=110)
         pictures.append({"file": file, "number": picture.number, "caption": picture.caption})
-    comparisons = [asdict(c) | ({"met": None} if quick else {}) for c in findings.comparisons]
+    comparisons = [
+        asdict(c) | {"met": None if quick or c.met is None else bool(c.met)}  # NumPy's bool is none of JSON's
+        for c in findings.comparisons
+    ]
     return {
         "name": experiment.name,
         "sections": experiment.sections,

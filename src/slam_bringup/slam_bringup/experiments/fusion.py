@@ -4,32 +4,69 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
 
 from slam_bringup.experiments import plots
 from slam_bringup.experiments.chain import mapped
-from slam_bringup.experiments.filtering import ACCURACY_HEADER, accuracy_row, frames
+from slam_bringup.experiments.features import tof_picture
+from slam_bringup.experiments.filtering import ACCURACY_HEADER, accuracy_row, bounds_comparison, frames
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
-from slam_bringup.experiments.job import Job, JobResult
+from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
+from slam_bringup.experiments.true_frames import simulated_frames, true_depth
+from slam_core.geometry import invert_transform, transform_points
+from stereo_frontend.features import FeatureConfig, FeatureExtractor
 
+MODULE = "slam_bringup.experiments.fusion"
 _MODES = ("stereo", "tof", "replace", "fuse")
+_PIXELS = "pixels"
+
+
+def map_pixels(folder: Path, before: list[Path]) -> Kept:
+    """Features of a left picture of the small room, and where the laser camera sees what they show."""
+    frame = next(simulated_frames("small_room", 1))
+    assert frame.depth is not None
+    uv = FeatureExtractor(FeatureConfig(target=150))(frame.images.left).uv.astype(np.float64)
+    points = frame.images.stereo.camera.unproject(uv, true_depth(frame.truth, uv))
+    pixels = frame.depth.camera.project(transform_points(invert_transform(frame.T_left_tof), points))
+    seen = np.all((pixels >= 0) & (pixels < frame.depth.depth.shape[::-1]), axis=1)
+    pictures = {"left": frame.images.left, "tof": tof_picture(frame.depth, "amplitude")}
+    return {}, pictures | {"left pixels": uv[seen], "tof pixels": pixels[seen]}
+
+
+def _mapped_pixels(arrays: Mapping[str, np.ndarray]) -> Figure:
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    for axes, name in zip(figure.subplots(1, 2), ("left", "tof"), strict=True):
+        axes.imshow(arrays[name], cmap="gray")
+        pixels = arrays[f"{name} pixels"]
+        axes.scatter(*pixels.T, s=18, c=np.arange(len(pixels)), cmap="hsv", edgecolors="white", linewidths=0.4)
+        axes.set_axis_off()
+    return figure
 
 
 def _modes() -> Experiment:
     def jobs(quick: bool) -> Mapping[str, Job]:
         runs = {mode: mapped("small_room", mode, frames=frames(quick)) for mode in _MODES}
-        return runs | {"fuse + ndt": mapped("small_room", "fuse", odometry="ndt", frames=frames(quick))}
+        runs |= {"fuse + ndt": mapped("small_room", "fuse", odometry="ndt", frames=frames(quick))}
+        return runs | {_PIXELS: Job(f"{MODULE}:map_pixels", {}, (*RENDERING, "stereo_frontend", "tof_driver"))}
 
     def report(results: Mapping[str, JobResult]) -> Findings:
+        mapping = results[_PIXELS].arrays
+        results = {name: result for name, result in results.items() if name != _PIXELS}
         ate = {name: 1e3 * r.values["agents"][0]["joined_ate_m"] for name, r in results.items()}
         best = min(_MODES, key=lambda mode: ate[mode])
         comparisons = [
             Comparison(f"ATE, {mode}", "missing from our copy", f"{ate[mode]:.1f} mm") for mode in _MODES
-        ] + [Comparison("best of the four", "missing from our copy", best, "fuse", best == "fuse")]  # fmt: skip
+        ] + [Comparison("best of the four", "missing from our copy", best, "fuse", best == "fuse"),
+             bounds_comparison("small_room", results["fuse"])]  # fmt: skip
         return Findings(
             comparisons,
             [Table("The four modes, and with scan odometry", ACCURACY_HEADER,
                    [accuracy_row(name, result) for name, result in results.items()])],
-            [Picture(plots.map_view(results[mode].arrays), "", f"Mode {mode}.") for mode in _MODES],
+            [Picture(_mapped_pixels(mapping), "11.1", "Pixels of the left picture in the laser camera's."),
+             *(Picture(plots.map_view(results[mode].arrays), "", f"Mode {mode}.") for mode in _MODES)],
             f"Weighted by their variances, both cameras give {ate['fuse']:.1f} mm; the stereo camera alone "
             f"{ate['stereo']:.1f} mm, the laser camera alone {ate['tof']:.1f} mm.",
         )  # fmt: skip
@@ -57,6 +94,7 @@ def _firemen() -> Experiment:
                 Comparison(f"{len(agents)} firemen in one map, largest ATE", "only imagined", f"{1e3 * worst:.1f} mm",
                            "<= 60 mm, as of one agent", worst <= 0.06)
             )  # fmt: skip
+            comparisons.append(bounds_comparison(name, results[name]))
         return Findings(
             comparisons,
             [Table("Every fireman in the joint map", ("run", "way m", "ATE mm", "end mm", "ANEES"), rows)],

@@ -41,6 +41,7 @@ def _one_filter() -> Experiment:
                            "submaps more consistent", abs(np.log(anees[1])) <= abs(np.log(anees[0]))),
                 Comparison("time per frame at the end", "10 min in all", f"{last[0]:.0f} ms, with submaps "
                            f"{last[1]:.0f} ms", "submaps cheaper", bool(last[1] < last[0])),
+                bounds_comparison("two_rooms", joined),
             ],
             tables=[Table("Accuracy", ACCURACY_HEADER, [accuracy_row("one filter", one),
                                                        accuracy_row("submaps, joined", joined)])],

@@ -11,6 +11,7 @@ from typing import Any
 
 import jinja2
 
+from slam_bringup.experiments.answers import answers
 from slam_core.files import atomic_text
 
 _PREAMBLE = """\
@@ -30,7 +31,7 @@ def write_page(path: Path, findings: Sequence[Mapping[str, Any]]) -> None:
     marks = [c["met"] for entry in findings for c in entry["comparisons"] if c["met"] is not None]
     html = template.render(
         experiments=[_with_pictures(entry, path.parent) for entry in findings],
-        questions=_questions({entry["name"]: entry for entry in findings}),
+        questions=answers({entry["name"]: entry for entry in findings}),
         met=sum(marks),
         marks=len(marks),
         quick=any(entry["quick"] for entry in findings),
@@ -40,7 +41,9 @@ def write_page(path: Path, findings: Sequence[Mapping[str, Any]]) -> None:
 
 def write_markdown(path: Path, findings: Sequence[Mapping[str, Any]]) -> None:
     """The comparisons and tables as a page of the documentation."""
-    lines = [_PREAMBLE]
+    lines = [_PREAMBLE, *_summary(findings)]
+    for found in answers({entry["name"]: entry for entry in findings}):
+        lines += [f"**{found['question']}** {found['answer']}", ""]
     for entry in findings:
         lines += [f"## {entry['title']} ({entry['sections']})", "", f"`slam experiment {entry['name']} -o OUT`", ""]
         lines += [entry["answer"], ""] if entry["answer"] else []
@@ -50,6 +53,15 @@ def write_markdown(path: Path, findings: Sequence[Mapping[str, Any]]) -> None:
         for table in entry["tables"]:
             lines += [f"{table['title']}:", "", *_markdown_table(table["header"], table["rows"])]
     atomic_text(path, "\n".join(lines).rstrip() + "\n")
+
+
+def _summary(findings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How many marks are met, and those that are not by name."""
+    marks = [(entry, c) for entry in findings for c in entry["comparisons"] if c["met"] is not None]
+    missed = [f"{entry['name']}: {c['quantity']} ({c['ours']}, mark {c['mark']})" for entry, c in marks if not c["met"]]
+    if not marks:
+        return []
+    return [f"{len(marks) - len(missed)} of {len(marks)} marks are met. Not met: {'; '.join(missed) or 'none'}.", ""]
 
 
 def _markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -63,23 +75,3 @@ def _with_pictures(entry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         data = base64.b64encode((folder / picture["file"]).read_bytes()).decode()
         pictures.append({**picture, "data": f"data:image/png;base64,{data}"})
     return {**entry, "pictures": pictures}
-
-
-def _questions(entries: Mapping[str, Mapping[str, Any]]) -> list[dict[str, str]]:
-    """The thesis's five questions (1.5) and what the experiments that were run say."""
-    asked = (
-        ("Which technique makes large and good maps?", ("one_filter", "figure_eight", "five_rooms")),
-        ("What does the laser camera add?", ("modes",)),
-        ("Does a systematic motion give a better map than a random one?", ("sweep", "fireman")),
-        ("Is a robot's map better than one made by hand?", ("workshop_rig", "workshop_handheld")),
-        ("ICP or NDT?", ("registration", "scan_trajectory")),
-    )
-    answers = []
-    for question, names in asked:
-        rows = [
-            f"{entries[name]['title']}: {c['quantity']} {c['ours']}"
-            for name in names if name in entries for c in entries[name]["comparisons"][-3:]
-        ]  # fmt: skip
-        if rows:
-            answers.append({"question": question, "answer": "; ".join(rows) + "."})
-    return answers
