@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from feature_world import T_RIG_OPTICAL, loop, room
 
-from ekf_slam_node.association import associate_jcbb, associate_mahalanobis, associate_nearest
+from ekf_slam_node.association import associate_ccda, associate_jcbb, associate_mahalanobis, associate_nearest
 from ekf_slam_node.candidates import Candidates
 from ekf_slam_node.config import EkfSlamConfig, FeatureAssociationConfig, LandmarkConfig, SubmapConfig
 from ekf_slam_node.ekf import Ekf
@@ -90,7 +90,7 @@ def test_every_algorithm_pairs_what_is_the_same(rng):
     similarity = np.asarray(candidates.descriptors @ now.descriptors.T, dtype=np.float64)
     config, covariance = FeatureAssociationConfig(), 1e-4 * np.eye(6)
     common = len(np.intersect1d(first, second))
-    for associate, share in ((associate_mahalanobis, 0.95), (associate_jcbb, 0.2)):
+    for associate, share in ((associate_mahalanobis, 0.95), (associate_jcbb, 0.2), (associate_ccda, 0.2)):
         rows, columns = associate(candidates, now, similarity, np.eye(4), covariance, T_RIG_OPTICAL, config)
         assert (first[rows] == second[columns]).mean() > 0.99
         assert len(rows) >= share * common

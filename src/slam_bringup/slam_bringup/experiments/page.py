@@ -18,8 +18,8 @@ _PREAMBLE = """\
 # Experiments
 
 The thesis's experiments on simulated rooms of its sizes, with ground truth, beside the thesis's own figures. Made by
-`slam experiment all -o OUT`, which writes this page as `OUT/experiments.md`; do not edit. Times are of two cores of a
-shared machine.
+`slam experiment all -o OUT`, which writes this page as `OUT/experiments.md` with its figures in `OUT/experiments.html`;
+do not edit. Times of frames and submaps are wall times with other work beside them, all others processor times.
 """
 
 
