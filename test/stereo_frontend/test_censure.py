@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from stereo_frontend.censure import INNER, OUTER, CensureDetector, responses
 from stereo_frontend.surf import SurfConfig
@@ -49,6 +50,20 @@ def test_a_blob_is_found_at_its_place(radius, contrast):
     best = found.response.argmax()
     np.testing.assert_allclose(found.uv[best], at, atol=0.15)
     assert found.descriptors.shape[1] == 128
+
+
+def test_keypoints_are_extrema_among_all_their_neighbours(rng):
+    smooth = gaussian_filter(rng.standard_normal((120, 160)), 2.5)
+    image = np.round(128.0 + 300.0 * smooth).clip(0, 255).astype(np.uint8)
+    response = responses(image)
+    highest, lowest = maximum_filter(response, 3), minimum_filter(response, 3)
+    is_extremum = ((response == highest) & (response > 8.0)) | ((response == lowest) & (response < -8.0))
+    is_extremum[[0, -1]] = False
+    found = CensureDetector()(image, 1.0, keep_all)
+    assert 20 < len(found) <= is_extremum.sum()
+    near = maximum_filter(is_extremum.any(axis=0), 3)
+    u, v = np.round(found.uv).astype(int).T
+    assert near[v, u].all()
 
 
 def test_larger_blobs_have_larger_keypoints():
