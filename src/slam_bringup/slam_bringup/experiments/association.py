@@ -100,7 +100,7 @@ def _frame(view: FeatureFrame) -> Frame:
 
 def _experiment() -> Experiment:
     def jobs(quick: bool) -> Mapping[str, Job]:
-        frames = 15 if quick else 60
+        frames = 8 if quick else 60
         packages = (*RENDERING, "ekf_slam_node")
         return {
             f"{method}, {rate} Hz": Job(

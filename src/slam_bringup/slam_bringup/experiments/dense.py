@@ -15,7 +15,6 @@ from slam_bringup.experiments.chain import mapped
 from slam_bringup.experiments.filtering import frames
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
 from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept, load
-from slam_core.evaluation import align
 from slam_core.geometry import transform_points
 from slam_simulation import Scenario
 from slam_simulation.surface_distance import distance_to_surfaces
@@ -28,10 +27,10 @@ _MARK_M = 0.02
 
 
 def to_true_surfaces(folder: Path, before: list[Path]) -> Kept:
-    """Distances of the model's points near the way from the nearest true surface, the way laid on the true one."""
+    """Distances of the model's points near the way from the nearest true surface, the first pose at the true one."""
     run = load(before[0]).arrays
     poses, truth = run["0 joined poses"], run["0 joined truth"]
-    T_truth_map = align(poses, truth, "se3")[0] @ np.linalg.inv(poses[0])
+    T_truth_map = truth[0] @ np.linalg.inv(poses[0])
     points = transform_points(T_truth_map, run["dense_points"].astype(np.float64))
     points = points[:: max(1, len(points) // _MOST_POINTS)]
     way = truth[:: max(1, len(truth) // 50), :3, 3]
@@ -42,7 +41,7 @@ def to_true_surfaces(folder: Path, before: list[Path]) -> Kept:
 def _experiment() -> Experiment:
     def jobs(quick: bool) -> Mapping[str, Job]:
         run = mapped(_SCENARIO, frames=frames(quick))
-        return {"model": Job(f"{MODULE}:to_true_surfaces", {}, (*RENDERING, "slam_core.evaluation"), (run,))}
+        return {"model": Job(f"{MODULE}:to_true_surfaces", {}, RENDERING, (run,))}
 
     def report(results: Mapping[str, JobResult]) -> Findings:
         arrays = results["model"].arrays

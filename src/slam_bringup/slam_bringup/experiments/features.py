@@ -147,7 +147,7 @@ def _place_in_next(first: TrueFrame, second: TrueFrame, keypoints: Keypoints, de
 
 def _detectors() -> Experiment:
     def jobs(quick: bool) -> Mapping[str, Job]:
-        arguments = {"frames": 3 if quick else 12, "repeats": 3 if quick else 11}
+        arguments = {"frames": 2 if quick else 12, "repeats": 1 if quick else 11}
         return {"table": Job(f"{MODULE}:compare_detectors", arguments, _PACKAGES)}
 
     def report(results: Mapping[str, JobResult]) -> Findings:
@@ -187,7 +187,7 @@ def _keypoint_figure(picture: ByteArray) -> Figure:
 
 def _tof_features() -> Experiment:
     def jobs(quick: bool) -> Mapping[str, Job]:
-        return {"table": Job(f"{MODULE}:compare_tof_pictures", {"frames": 4 if quick else 20}, _PACKAGES)}
+        return {"table": Job(f"{MODULE}:compare_tof_pictures", {"frames": 3 if quick else 20}, _PACKAGES)}
 
     def report(results: Mapping[str, JobResult]) -> Findings:
         values, arrays = results["table"].values, results["table"].arrays

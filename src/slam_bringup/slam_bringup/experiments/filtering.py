@@ -13,7 +13,7 @@ from slam_bringup.experiments.expected import violations
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
 from slam_bringup.experiments.job import Job, JobResult
 
-_QUICK_FRAMES = 40
+_QUICK_FRAMES = 20
 ACCURACY_HEADER = (
     "run", "frames", "landmarks", "submaps", "ATE mm", "end mm", "end deg", "ANEES", "filter alone: ATE mm",
     "processor s / s",
