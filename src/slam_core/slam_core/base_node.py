@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
@@ -172,8 +172,11 @@ class SlamNode(TransformNode, Generic[C]):
         """The clock of the inputs has jumped back: begin anew with the next message; what is mapped must survive."""
         self.on_reset()
 
-    def on_finish(self) -> str:
-        """The input has ended: publish what is still open. Override where there is any; returns a line for the log."""
+    def on_finish(self) -> str | Awaitable[str]:
+        """The input has ended: publish what is still open. Override where there is any; returns a line for the log.
+
+        A node that has to wait for it returns something to await, and goes on with all else meanwhile.
+        """
         return "nothing open"
 
     def on_close(self) -> None:
@@ -304,11 +307,11 @@ class SlamNode(TransformNode, Generic[C]):
         response.success, response.message = True, "paused" if self._paused else "running"
         return response
 
-    def _on_finish_service(self, _: Any, response: Any) -> Any:
-        while self.work():  # what has come so far belongs to the input
-            pass
+    async def _on_finish_service(self, _: Any, response: Any) -> Any:
+        self.finish_work()  # what has come so far belongs to the input
         try:
-            response.success, response.message = True, self.on_finish()
+            line = self.on_finish()
+            response.success, response.message = True, line if isinstance(line, str) else await line
         except ValueError as error:
             response.success, response.message = False, str(error)
         return response

@@ -10,10 +10,12 @@ goes on, ``cleanup`` resets it.
 
 from __future__ import annotations
 
+import inspect
 import traceback
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from slam_core.health import Health
@@ -63,16 +65,21 @@ class GuardedNode(LifecycleNode):
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any], *rest: Any, **options: Any
     ) -> Any:
-        """As rclpy's, guarded: a request that fails is answered with the reason."""
+        """As rclpy's, guarded: a request that fails is answered with the reason.
 
-        def answer(request: Any, response: Any) -> Any:
+        Where ``callback`` returns something to await, the node does everything else until it is there.
+        """
+
+        async def answer(request: Any, response: Any) -> Any:
             self.calls += 1
             try:
-                return callback(request, response)
+                answered = callback(request, response)
+                return await answered if inspect.isawaitable(answered) else answered
             except Exception as error:
                 self._on_fault(f"service {srv_name}")
                 return _failed(srv_type.Response(), f"{type(error).__name__}: {error}")
 
+        options.setdefault("callback_group", ReentrantCallbackGroup())
         return super().create_service(srv_type, srv_name, answer, *rest, **options)
 
     @property

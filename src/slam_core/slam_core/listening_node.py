@@ -18,7 +18,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from slam_core.exchange import Exchange
 from slam_core.guarded_node import GuardedNode
 from slam_core.input_config import InputConfig
-from slam_core.job_queue import JobQueue
+from slam_core.job_queue import JobQueue, QueuedCall
 from slam_core.messages.base import Message
 from slam_core.ros import declare_config, incompatibility, sensor_qos
 from slam_core.stamp_gaps import StampGaps
@@ -78,6 +78,16 @@ class ListeningNode(GuardedNode):
     def work(self) -> bool:
         """Do the next job that waits; False if there is none."""
         return self._jobs.run_one()
+
+    def finish_work(self) -> None:
+        """Do all jobs that wait."""
+        while self.work():
+            pass
+
+    def do_later(self, source: str, run: Callable[[], None]) -> None:
+        """Have something done in the node's own thread, in its turn; may be called from any thread."""
+        self._jobs.add(QueuedCall(source, self._guarded(source, run)))
+        self._wake.trigger()
 
     def _connect(self, entry: Input) -> None:
         """Listen to a node of this process where one publishes the topic, else to the network."""
