@@ -23,10 +23,11 @@ import numpy as np
 import problems  # noqa: F401 - sets the import path
 from recorded_submaps import Recording, load
 
-from sjsam_node.global_map import GlobalMap, JoinReport
+from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
 from slam_core.evaluation import evaluate
 from slam_core.trajectory import Trajectory
 
+CONFIG = GlobalMapConfig()
 HEADINGS = (
     "run", "submaps", "landmarks", "add mean ms", "read mean", "mean ms", "95 %", "max", "20-40", "last 20",
     "MB/submap", "finish s", "all % of sensor", "of features", "closures", "parts", "chi2 / redundancy", "ATE mm",
@@ -39,8 +40,11 @@ def main() -> None:
     parser.add_argument("recordings", nargs="+", type=Path)
     parser.add_argument("--unread", action="store_true")
     parser.add_argument("--every", action="store_true")
+    parser.add_argument("--ties", type=int)
     parser.add_argument("--most", type=int, default=10**6, help="submaps of each recording, at most")
     arguments = parser.parse_args()
+    global CONFIG
+    CONFIG = GlobalMapConfig(ties=arguments.ties) if arguments.ties else GlobalMapConfig()
     if len(arguments.recordings) == 1:
         measure(arguments.recordings[0], not arguments.unread, arguments.every, arguments.most)
         return
@@ -56,7 +60,7 @@ def main() -> None:
 def measure(path: Path, is_read: bool, every: bool, most: int) -> None:
     recording, submaps = load(path)
     warm_up(path)
-    global_map = GlobalMap()
+    global_map = GlobalMap(CONFIG)
     adding, reading, memory = [], [], []
     reports: list[JoinReport] = []
     for submap in islice(submaps, most):
@@ -136,7 +140,7 @@ def publish(global_map: GlobalMap, agent: str) -> None:
 
 def warm_up(path: Path) -> None:
     """Load the compiled kernels."""
-    global_map = GlobalMap()
+    global_map = GlobalMap(CONFIG)
     for submap in islice(load(path)[1], 3):
         global_map.add(submap)
         publish(global_map, submap.agent)
@@ -144,8 +148,9 @@ def warm_up(path: Path) -> None:
 
 
 def resident_mb() -> float:
+    """Memory of this process without what it maps from files, which the system takes back when it needs it."""
     for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-        if line.startswith("VmRSS"):
+        if line.startswith("RssAnon"):
             return int(line.split()[1]) / 1024.0
     return 0.0
 

@@ -56,7 +56,7 @@ def test_a_map_that_is_saved_again_is_never_absent(
 ) -> None:
     """Killed at the worst moment, before the manifest is renamed, the old map is still there."""
     joined.save(tmp_path / "map")
-    joined.marks.add(joined.graph, np.zeros(3))
+    joined.marks.add(joined.graph.poses, np.zeros(3))
 
     def killed(*_: object) -> None:
         raise KeyboardInterrupt

@@ -19,6 +19,7 @@ from typing import overload
 import numpy as np
 
 from sjsam_node import storage
+from sjsam_node.agents import Agents, in_order
 from sjsam_node.graph.links import Link, Status
 from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.graph.offload import Offload
@@ -30,10 +31,13 @@ from sjsam_node.marks import Marks
 from sjsam_node.smoothing.smoother import Smoother, SmootherConfig
 from sjsam_node.storage import StoredMap
 from slam_core.config import Config, group, parameter
-from slam_core.geometry import FloatArray, compose_covariance, invert_transform, is_rigid_transform
+from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
 from slam_core.types import Counters, PoseEstimate, Submap
 
 ALREADY_JOINED = "already joined"
+
+_PASSES = 2
+"""How often settling looks for closures, and lets go what the map contradicts: one finding lets another follow."""
 
 FARTHEST_M = 1e6
 """Landmarks beyond are none of a building."""
@@ -56,11 +60,11 @@ class GlobalMapConfig(Config):
     joined_at_once: int = parameter(
         12, "closures found when the map settles that are joined, and refused, together", minimum=1
     )
-    ties: int = parameter(24, "landmarks by which two submaps are tied together, at most", minimum=3)
+    ties: int = parameter(8, "landmarks by which two submaps are tied together, at most", minimum=3)
     redundant_share: float = parameter(
         0.6, "share of a submap's landmarks that closures match from which on it shows nothing new", minimum=0.0
     )
-    redundant_ties: int = parameter(8, "landmarks that tie such a submap to each other one, at most", minimum=3)
+    redundant_matches: int = parameter(24, "least number of these landmarks", minimum=3)
     smoothing: SmootherConfig = group(SmootherConfig)
     closure: ClosureConfig = group(ClosureConfig)
     consistency: ConsistencyConfig = group(ConsistencyConfig)
@@ -96,6 +100,7 @@ class GlobalMap:
     """Joins submaps of one or several agents, each as it comes."""
 
     graph: MapGraph
+    agents: Agents
     smoother: Smoother
     detector: LoopDetector
     consistency: Consistency
@@ -112,12 +117,13 @@ class GlobalMap:
         self._take(MapGraph())
         self.marks = Marks()
         self._offload = Offload()
-        self._lookup: dict[tuple[str, int, int], int] = {}
         self._has_moved = False
+        self._is_settled = True
 
     def _take(self, graph: MapGraph) -> None:
         """Work on a graph."""
         self.graph = graph
+        self.agents = Agents(graph, self.config.closure.window)
         self.smoother = Smoother(graph, self.config.smoothing)
         self.detector = LoopDetector(self.smoother, self.config.closure)
         self.consistency = Consistency(self.smoother, self.config.consistency, self.config.closure)
@@ -130,14 +136,15 @@ class GlobalMap:
             self.counters.add(f"refused: {reason}")
             return JoinReport(False, reason)
         new = self._place(submap)
-        chain = self._chain(new)
+        self._is_settled = False
+        chain = self.agents.chain(new)
         for link in self.detector.sequential(chain, new):
             self.graph.add_link(link)
         matched = self._matched(new)
         self.smoother.condense(new, chain)
         found = self.detector.closures(chain, new)
         if self._has_moved:
-            found += self.detector.missed(self._chain, self.config.compared_at_once)
+            found += self.detector.missed(self.agents.chain, self.config.compared_at_once)
         self._judge_redundancy(new, found)
         result, verdict = self.consistency.update(found, new)
         self._account(verdict, len(found))
@@ -157,8 +164,9 @@ class GlobalMap:
         """A submap of a place that the map knows well adds few unknowns, and nothing is compared with it later."""
         known = [k.pairs[:, 1] for k in found if k.second == new and k.status is Status.CONSISTENT]
         count = len(np.unique(np.concatenate(known))) if known else 0
-        if count > max(self.config.redundant_share * len(self.graph.records[new].observations), self.config.ties):
-            self.graph.mark_redundant(new, self.config.redundant_ties)
+        share = self.config.redundant_share * len(self.graph.records[new].observations)
+        if count > max(share, self.config.redundant_matches):
+            self.graph.redundant[new] = True
 
     def _account(self, verdict: Verdict, found: int) -> None:
         """Count what became of closures, and compare anew what they let go."""
@@ -185,6 +193,7 @@ class GlobalMap:
                 descriptors=self._offload.put(submap.descriptors),
             )
             self.graph.records[old] = replace(self.graph.records[old], submap=small)
+            self.detector.index.move(old, small.descriptors)
 
     @property
     def components(self) -> int:
@@ -208,7 +217,7 @@ class GlobalMap:
         known = self.graph.records[0].submap.descriptors.shape[1] if self.graph.records else None
         if known is not None and submap.descriptors.shape[1] != known and len(submap.landmarks):
             return f"descriptors of {submap.descriptors.shape[1]} columns in a map of {known}"
-        held = self._lookup.get((submap.agent, submap.session, submap.index))
+        held = self.agents.record(submap.agent, submap.session, submap.index)
         if held is None:
             return ""
         same = self.graph.records[held].submap.start_stamp_ns == submap.start_stamp_ns
@@ -216,31 +225,18 @@ class GlobalMap:
 
     def _place(self, submap: Submap) -> int:
         """Add a record at the end of its predecessor, or as a component of its own where the agent was last seen."""
-        previous = self._lookup.get((submap.agent, submap.session, submap.index - 1))
+        previous = self.agents.record(submap.agent, submap.session, submap.index - 1)
         follows = submap.follows_previous and previous is not None
         start = self.graph.records[previous].end if follows and previous is not None else None
         self.graph.append(submap, start, self.last_pose(submap.agent), self.config.ties)
         new = len(self.graph.records) - 1
-        self._lookup[self.graph.records[new].key] = new
+        self.agents.add(new)
         return new
 
     def last_pose(self, agent: str) -> FloatArray:
         """Where an agent was last; the origin for one not seen before."""
-        newest = next((r for r in reversed(self.graph.records) if r.submap.agent == agent), None)
+        newest = self.agents.newest(agent)
         return np.eye(4) if newest is None else self.graph.poses[newest.end]
-
-    def _chain(self, new: int) -> list[int]:
-        """The last records before ``new`` along its agent's odometry, newest first, as many as it may be linked to."""
-        chain: list[int] = []
-        agent, session, index = self.graph.records[new].key
-        while (
-            len(chain) < self.config.closure.window
-            and (previous := self._lookup.get((agent, session, index - 1))) is not None
-            and (self.graph.records[previous].end == self.graph.records[self._lookup[agent, session, index]].start)
-        ):
-            chain.append(previous)
-            index -= 1
-        return chain
 
     def _matched(self, new: int) -> int:
         """Landmarks of a record that another record sees too."""
@@ -269,29 +265,51 @@ class GlobalMap:
         return self.view.landmarks()
 
     def settle(self) -> None:
-        """Do now what was put off: compare what has come near, let go what does not fit, and join in batch."""
-        if not self.graph.records:
+        """Do now what was put off: compare what has come near, let go what does not fit, and join in batch.
+
+        A map to which nothing was added since is settled already.
+        """
+        if self._is_settled:
             return
         newest = len(self.graph.records) - 1
-        missed = self.detector.missed(self._chain, self.config.compared_at_settling * len(self.graph.records))
-        for found in _grouped(missed, self.config.joined_at_once):
-            self._account(self.consistency.update(found, newest)[1], len(found))
-        self.smoother.settle()
-        self._account(self.consistency.settle(newest), 0)
-        self.smoother.settle()
-        self._has_moved = False
+        for _ in range(_PASSES):
+            missed = self.detector.missed(self.agents.chain, self.config.compared_at_settling * len(self.graph.records))
+            for found in _grouped(missed, self.config.joined_at_once):
+                self._account(self.consistency.update(found, newest)[1], len(found))
+            if not missed:
+                break
+        for _ in range(_PASSES):
+            self.smoother.settle()
+            verdict = self.consistency.settle(newest)
+            self._account(verdict, 0)
+            if not verdict.removed and not verdict.dropped:
+                break
+        else:
+            self.smoother.settle()
+        self._account(self.consistency.relieve(), 0)
+        self._has_moved, self._is_settled = False, True
+
+    @property
+    def doubt(self) -> str:
+        """What settling found if submaps contradict each other (see ``Consistency.relieve``); empty if they do not."""
+        strained = np.nonzero(self.graph.doubt > 1.0)[0]
+        if not len(strained):
+            return ""
+        tied = {i for k in self.graph.links if not k.is_closure for i in k.ends}
+        alone = sum(i not in tied for i in strained.tolist())
+        return (f"submaps contradict each other {self.graph.doubt.max():.0f} times more than they claim: "
+                f"{alone} of {len(self.graph.records)} are chained as the filter made them")  # fmt: skip
 
     def centrally(self) -> GlobalMap:
-        """The map that does not depend on who came first: all submaps joined anew, agent after agent, and settled.
+        """The settled map that does not depend on who came first: all submaps joined in the order of their stamps.
 
-        The map itself where they came in that order; otherwise it costs as much as they did when they came.
+        The map itself where they came in that order; otherwise they are joined anew.
         """
-        records, central = self.graph.records, self
-        order = sorted(range(len(records)), key=lambda i: records[i].key)
-        if order != list(range(len(records))):
+        submaps, central = [r.submap for r in self.graph.records], self
+        if (ordered := in_order(submaps)) != submaps:
             central = GlobalMap(self.config)
-            for record in (records[i] for i in order):
-                central.add(record.submap)
+            for submap in ordered:
+                central.add(submap)
             central.counters = self.counters
             central.marks = self._marks_in(central)
         central.settle()
@@ -301,25 +319,17 @@ class GlobalMap:
         """The marks of this map, on the nodes of another one of the same submaps."""
         node = {}
         for record in self.graph.records:
-            twin = other.graph.records[other._lookup[record.key]]
+            twin = other.graph.records[other.agents.record(*record.key) or 0]
             node[record.start], node[record.end] = twin.start, twin.end
         return Marks([replace(mark, node=node[mark.node]) for mark in self.marks.marks])
 
     def map_to_odom(self, agent: str) -> FloatArray:
         """T_map_odom of an agent: what its newest joined pose adds to its own odometry (chained submap end poses)."""
-        own = [r for r in self.graph.records if r.submap.agent == agent]
-        if not own:
-            return np.eye(4)
-        return np.asarray(self.graph.poses[own[-1].end] @ invert_transform(self.odometry_pose(agent).T))
+        return np.asarray(self.last_pose(agent) @ invert_transform(self.odometry_pose(agent).T))
 
     def odometry_pose(self, agent: str) -> PoseEstimate:
-        """End pose of an agent's newest submap in its own odometry frame: the chain of end poses of its session."""
-        own = [r.submap for r in self.graph.records if r.submap.agent == agent]
-        T, P = np.eye(4), np.zeros((6, 6))
-        for submap in sorted((s for s in own if s.session == own[-1].session), key=lambda s: s.index):
-            P = compose_covariance(T, P, submap.end_pose, submap.covariance[:6, :6])
-            T = T @ submap.end_pose
-        return PoseEstimate(own[-1].end_stamp_ns if own else 0, T, P)
+        """End pose of an agent's newest submap in its own odometry frame."""
+        return self.agents.odometry(agent)
 
     def start_pose(self, record: int) -> PoseEstimate:
         """Start pose of a record in the map frame, with covariance."""
@@ -328,10 +338,9 @@ class GlobalMap:
 
     def end_pose(self, agent: str) -> PoseEstimate | None:
         """Where an agent's newest submap ends in the map frame; None for one not heard of."""
-        own = [i for i, r in enumerate(self.graph.records) if r.submap.agent == agent]
-        if not own:
+        r = self.agents.newest(agent)
+        if r is None:
             return None
-        r = self.graph.records[own[-1]]
         return PoseEstimate(r.submap.end_stamp_ns, self.graph.poses[r.end], self.view.node(r.end))
 
     def save(self, path: Path | str) -> None:
@@ -352,11 +361,12 @@ class GlobalMap:
         stored = storage.read(Path(path))
         loaded, graph = cls(config), stored.graph
         loaded._take(graph)
+        loaded._is_settled = not graph.records
         loaded.marks = stored.marks
         loaded.consistency.refused = stored.refused
         loaded.detector.pending, loaded.detector.near.compared = stored.pending, stored.compared
         for i, record in enumerate(graph.records):
-            loaded._lookup[record.key] = i
+            loaded.agents.add(i)
             if not graph.redundant[i]:
                 loaded.detector.index.add(i, record.submap.descriptors)
             loaded._put_away(i)

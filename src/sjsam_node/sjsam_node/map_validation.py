@@ -79,11 +79,13 @@ def check_arrays(manifest: dict[str, Any], arrays: Arrays) -> None:
     _require_shape(arrays, "poses", (nodes, 4, 4))
     _require_shape(arrays, "points", (sum(landmarks), 3))
     _require_shape(arrays, "component_of", (nodes,))
-    for name in ("ties", "redundant"):
+    for name in ("ties", "redundant", "doubt"):
         _require_shape(arrays, name, (len(records),))
     for name, value in arrays.items():
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             raise ValueError(f"{name} holds numbers that are not finite")
+    if (arrays["doubt"] < 1.0).any():
+        raise ValueError("doubt holds variance factors below one")
     _require_rigid("poses", arrays["poses"])
     _require_index("component_of", arrays["component_of"], nodes)
     _require_index("a mark's node", np.array([mark[1] for mark in manifest["marks"]], dtype=np.int64), nodes)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sjsam_node.graph.map_graph import MapGraph
 from slam_core.geometry import FloatArray
 
 
@@ -29,26 +28,24 @@ class Marks:
 
     marks: list[Mark] = field(default_factory=list)
 
-    def add(self, graph: MapGraph, point: FloatArray, name: str = "") -> Mark:
-        """Mark a point (3,) of the map frame, m.
+    def add(self, poses: FloatArray, point: FloatArray, name: str = "") -> Mark:
+        """Mark a point (3,) of the map frame, m, where the map's nodes are at ``poses`` (n, 4, 4).
 
         Raises
         ------
         ValueError
             If the map is empty or the point is not finite.
         """
-        if not len(graph.poses):
+        if not len(poses):
             raise ValueError("nothing can be marked in an empty map")
         if point.shape != (3,) or not np.all(np.isfinite(point)):
             raise ValueError(f"a mark needs three finite coordinates in m, got {point}")
-        node = int(np.argmin(np.linalg.norm(graph.poses[:, :3, 3] - point, axis=1)))
-        T = graph.poses[node]
+        node = int(np.argmin(np.linalg.norm(poses[:, :3, 3] - point, axis=1)))
+        T = poses[node]
         mark = Mark(name or f"mark {len(self.marks) + 1}", node, T[:3, :3].T @ (point - T[:3, 3]))
         self.marks.append(mark)
         return mark
 
-    def positions(self, graph: MapGraph) -> FloatArray:
-        """Marks in the map frame as it is now, (n, 3) m."""
-        return np.array(
-            [graph.poses[m.node][:3, :3] @ m.point + graph.poses[m.node][:3, 3] for m in self.marks]
-        ).reshape(-1, 3)
+    def positions(self, poses: FloatArray) -> FloatArray:
+        """Marks in the map frame, (n, 3) m, where the map's nodes are at ``poses`` (n, 4, 4)."""
+        return np.array([poses[m.node, :3, :3] @ m.point + poses[m.node, :3, 3] for m in self.marks]).reshape(-1, 3)

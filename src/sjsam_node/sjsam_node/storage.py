@@ -27,7 +27,7 @@ from sjsam_node.marks import Mark, Marks
 from slam_core.files import atomic_path
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
-FORMAT, VERSION = "indoor-slam-map", 5
+FORMAT, VERSION = "indoor-slam-map", 6
 _MANIFEST = "manifest.json"
 Arrays = dict[str, AnyArray]
 
@@ -179,7 +179,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
 def _graph_arrays(graph: MapGraph) -> Arrays:
     return {
         "poses": graph.poses, "points": graph.points, "component_of": graph.component_of, "ties": graph.ties,
-        "redundant": graph.redundant,
+        "redundant": graph.redundant, "doubt": graph.doubt,
     }  # fmt: skip
 
 
@@ -243,6 +243,6 @@ def _graph(records: list[list[Any]], arrays: Arrays) -> MapGraph:
         graph.append(submap, start if start < len(graph.poses) else None, np.eye(4))
     graph.component_of = arrays["component_of"]
     graph.poses, graph.points = arrays["poses"], arrays["points"]
-    graph.ties, graph.redundant = arrays["ties"], arrays["redundant"]
+    graph.ties, graph.redundant, graph.doubt = arrays["ties"], arrays["redundant"], arrays["doubt"]
     graph.replace_links(_links("links", arrays))
     return graph

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from judging import ate, errors, join
-from submap_world import Agent, Sensor, World, path_through, room
+from submap_world import Agent, Sensor, World, circle, path_through, ring_world, room
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.graph.links import Link, Prior, Status
@@ -15,6 +18,7 @@ from sjsam_node.loop_closure.consistency import Verdict
 from sjsam_node.loop_closure.point_sets import at_start
 from sjsam_node.smoothing.smoother import UpdateResult
 from slam_core.geometry import boxminus, invert_transform
+from slam_core.types import Submap
 
 BACK_AND_FORTH = [
     (-1.0, -1.0), (1.0, -1.0), (1.0, 0.0), (13.0, 0.0), (13.0, -1.0), (15.0, -1.0), (15.0, 1.0), (13.0, 0.5),
@@ -117,7 +121,47 @@ def test_closures_found_when_the_map_settles_are_judged_in_groups_consistent_one
         return joined.smoother.update(newest), Verdict()
 
     missed = [link.with_status(Status.INCONSISTENT), *[link.with_status(Status.CONSISTENT)] * 3]
-    monkeypatch.setattr(joined.detector, "missed", lambda *_: missed)
+    monkeypatch.setattr(joined.detector, "missed", lambda *_: [missed.pop(0) for _ in range(len(missed))])
     monkeypatch.setattr(joined.consistency, "update", update)
     joined.settle()
     assert offered == [[Status.CONSISTENT] * 2, [Status.CONSISTENT], [Status.INCONSISTENT]]
+
+
+def few_landmarks(seed: int, sure: float) -> tuple[Agent, list[Submap]]:
+    """Two rounds among 20 landmarks, a submap sees about six; variances are ``sure`` times too small."""
+    rng = np.random.default_rng(seed)
+    world = ring_world(3.0, rng, 20.0 / (6.0 * np.pi) + 1e-9)
+    agent = Agent(world, circle(3.0, 2.0), rng, "a", Sensor(half_fov=1.5))
+    return agent, [replace(s, covariance=s.covariance / sure) for s in agent.submaps()]
+
+
+def chain_ate(agent: Agent, submaps: list[Submap]) -> float:
+    """Error of the ends of the submaps as the filter chains them, m."""
+    T, e = agent.path[0], []
+    for k, submap in enumerate(submaps):
+        T = T @ submap.end_pose
+        e.append(np.linalg.norm(T[:3, 3] - agent.true_start(k + 1)[:3, 3]))
+    return float(np.sqrt(np.mean(np.square(e))))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_joining_submaps_that_contradict_each_other_is_not_worse_than_their_chain(seed: int, tmp_path: Path) -> None:
+    agent, submaps = few_landmarks(seed, 100.0)
+    joined, reports = join(submaps)
+    assert reports[-1].is_strained
+    joined.save(tmp_path / "map")
+    e, nees = errors(joined, agent)
+    assert ate(e) < 1.05 * chain_ate(agent, submaps)
+    assert nees.mean() / 6.0 < 2.0, "and says so"
+    assert f"{len(submaps)} of {len(submaps)} are chained" in joined.doubt
+    loaded = GlobalMap.load(tmp_path / "map")
+    assert loaded.doubt == joined.doubt
+    assert np.allclose(errors(loaded, agent)[1], nees, rtol=1e-6)
+
+
+def test_honest_submaps_with_few_landmarks_are_joined_and_kept() -> None:
+    agent, submaps = few_landmarks(1, 1.0)
+    joined, _ = join(submaps)
+    joined.settle()
+    assert not joined.doubt
+    assert ate(errors(joined, agent)[0]) < 0.5 * chain_ate(agent, submaps)

@@ -10,6 +10,7 @@ import pytest
 from judging import join
 from submap_world import Agent, circle, ring_world
 
+from sjsam_node.agents import in_order
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.graph.links import Prior, Status
 from sjsam_node.loop_closure.association import match
@@ -47,15 +48,15 @@ def test_pairs_are_compared_once_and_again_when_they_have_moved(agent: Agent) ->
     missed = {(k.first, k.second) for k in graph.links if k.is_closure}
     graph.links = [k for k in graph.links if not k.is_closure]
     near.compared = Compared()
-    due = near.due(graph, joined._chain)
+    due = near.due(graph, joined.agents.chain)
     assert len(missed & set(due)) > 10
     assert not any((k.first, k.second) in due for k in graph.links)
     for first, second in due:
         near.note(graph, second, first)
-    assert near.due(graph, joined._chain) == []
+    assert near.due(graph, joined.agents.chain) == []
     first, second = due[0]
     graph.poses[graph.records[second].start] = boxplus(graph.poses[graph.records[second].start], STEP)
-    assert (first, second) in near.due(graph, joined._chain)
+    assert (first, second) in near.due(graph, joined.agents.chain)
 
 
 def test_compared_pairs_are_kept_like_a_dictionary_of_them(rng: np.random.Generator) -> None:
@@ -131,8 +132,8 @@ def test_the_central_map_does_not_depend_on_who_comes_first(
     two_agents: list[tuple[list[Submap], list[Submap]]],
 ) -> None:
     for a, b in two_agents:
-        one, other = join(a + b)[0], join([*b[:3], *a[::-1], *b[3:]])[0]
-        mark = other.marks.add(other.graph, np.array([1.0, 2.0, 0.5]))
+        one, other = join(in_order(a + b))[0], join([*b[:3], *a[::-1], *b[3:]])[0]
+        mark = other.marks.add(other.graph.poses, np.array([1.0, 2.0, 0.5]))
         assert one.centrally() is one
         central = other.centrally()
         assert same_landmarks(one) == same_landmarks(central)

@@ -9,7 +9,11 @@ from judging import ate, errors, join
 from submap_world import Agent, circle, ring_world
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
+from sjsam_node.smoothing.estimator import EstimatorConfig
+from sjsam_node.smoothing.regions import RegionConfig
+from sjsam_node.smoothing.smoother import SmootherConfig
 from slam_core.geometry import boxminus
+from slam_core.types import Submap
 
 
 @pytest.fixture(scope="module")
@@ -20,10 +24,15 @@ def agent() -> Agent:
 
 
 @pytest.fixture(scope="module")
-def laps(agent: Agent) -> tuple[GlobalMap, list[int]]:
+def submaps(agent: Agent) -> list[Submap]:
+    return agent.submaps()
+
+
+@pytest.fixture(scope="module")
+def laps(submaps: list[Submap]) -> tuple[GlobalMap, list[int]]:
     """The map, and how many unknowns each of its updates had."""
-    joined, unknowns = GlobalMap(GlobalMapConfig(redundant_share=0.3, ties=12)), []
-    for submap in agent.submaps():
+    joined, unknowns = GlobalMap(GlobalMapConfig(redundant_share=0.3, redundant_matches=12, ties=12)), []
+    for submap in submaps:
         joined.add(submap)
         unknowns.append(joined.smoother.assembled(0).problem.layout.pattern.n)
     return joined, unknowns
@@ -51,6 +60,19 @@ def test_parked_submaps_stay_where_they_are_and_claim_no_more_than_they_know(
     for i in parked:
         gap = boxminus(before[joined.graph.records[i].key], joined.graph.poses[joined.graph.records[i].start])
         assert np.linalg.norm(gap[:3]) < 0.05
+
+
+def test_a_condensed_map_is_within_one_sigma_of_the_uncondensed_one(submaps: list[Submap]) -> None:
+    """With few ties and parked submaps; before anything is settled."""
+    condensed, _ = join(submaps, GlobalMap(GlobalMapConfig(redundant_share=0.3, redundant_matches=12)))
+    whole = SmootherConfig(region=RegionConfig(open=10_000), estimator=EstimatorConfig(live_tolerance=1e-9))
+    every, _ = join(submaps, GlobalMap(GlobalMapConfig(redundant_share=2.0, ties=1000, smoothing=whole)))
+    assert len(condensed.smoother.parked)
+    gaps = [boxminus(p.T, q.T) for p, q in zip(condensed.trajectory("a")[1:], every.trajectory("a")[1:], strict=True)]
+    known = [p.covariance for p in condensed.trajectory("a")[1:]]
+    distance = [gap @ np.linalg.solve(P, gap) / 6.0 for gap, P in zip(gaps, known, strict=True)]
+    assert np.mean(distance) < 0.5
+    assert np.percentile(distance, 95.0) < 1.0
 
 
 def test_a_node_that_is_not_parked_has_no_reference(agent: Agent) -> None:

@@ -81,6 +81,8 @@ class MapGraph:
     point_covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
     ties: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     redundant: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    doubt: FloatArray = field(default_factory=lambda: np.empty(0))
+    """Variance factor that the matches of each record had when they were let go for contradicting each other, or 1."""
     is_complete: bool = False
     _pairs: dict[Link, IntArray] = field(default_factory=dict)
     _rank: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -114,11 +116,6 @@ class MapGraph:
             )  # fmt: skip
         return self._variable_of
 
-    def mark_redundant(self, record: int, ties: int) -> None:
-        """A record shows nothing that others do not: so many landmarks, at most, tie it to each of them."""
-        self.ties[record], self.redundant[record] = ties, True
-        self._variable_of = None
-
     def use_all_ties(self, use: bool) -> None:
         """Let all landmarks that submaps share tie them together, or a selection of them."""
         if use != self.is_complete:
@@ -146,7 +143,7 @@ class MapGraph:
         middle = np.median(submap.landmarks, axis=0) if len(submap.landmarks) else np.zeros(3)
         self._middles, self.starts = np.concatenate([self._middles, middle[None]]), np.append(self.starts, start)
         self.ties, self._rank = np.append(self.ties, ties), np.append(self._rank, spread_order(submap.landmarks))
-        self.redundant = np.append(self.redundant, False)
+        self.redundant, self.doubt = np.append(self.redundant, False), np.append(self.doubt, 1.0)
         self.use_all_ties(False)
         self._variable_of = None
         self.records.append(record)

@@ -29,6 +29,9 @@ from slam_core.geometry import FloatArray, boxminus
 from slam_core.least_squares import chi_square_bound
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
+_RELIEF = 0.5
+"""Share of the strain that may be left for closures to have been its cause."""
+
 
 @dataclass(frozen=True)
 class ConsistencyConfig(Config):
@@ -118,6 +121,59 @@ class Consistency:
         offered, result = list(self.smoother.graph.links), self.smoother.result(self.smoother.graph.component(newest))
         self._evaluate(newest, result, self.config.settling_rounds)
         return self._verdict([], offered)
+
+    def relieve(self) -> Verdict:
+        """Treat parts whose submaps contradict each other by more than ``max_variance_factor`` when all is settled.
+
+        They are settled with few of the landmarks that they share, and keep the variance factor that all of them had.
+        If they contradict each other still, closures are let go, the worst ones first, if that helps. If it does not,
+        the matches between neighbours are: the filter's own chain of submaps stays.
+        """
+        graph, offered = self.smoother.graph, list(self.smoother.graph.links)
+        components = np.unique(graph.component_of).tolist()
+        strained = [graph.records_of(c)[0] for c in components if self._strain(c) > self.config.max_variance_factor]
+        for record in strained:
+            self._doubt(record)
+        if strained:
+            self.smoother.settle()
+        for record in strained:
+            self._let_go(record)
+        return self._verdict([], offered)
+
+    def _strain(self, component: int) -> float:
+        return self.smoother.result(component).strain
+
+    def _doubt(self, record: int) -> None:
+        """Keep how much the component of a record is strained."""
+        graph = self.smoother.graph
+        records, strain = graph.records_of(graph.component(record)), self._strain(graph.component(record))
+        graph.doubt[records] = np.maximum(graph.doubt[records], strain)
+
+    def _let_go(self, record: int) -> None:
+        """Let go what strains the component of a record."""
+        graph = self.smoother.graph
+        for _ in range(self.config.settling_rounds):
+            strain = self._strain(graph.component(record))
+            if strain <= self.config.max_variance_factor:
+                return
+            own = [k for k in graph.links if graph.component(k.first) == graph.component(record)]
+            suspects = self._worst_closures([k for k in own if k.is_closure], self._nis(graph.component(record)))
+            checkpoint = self.smoother.checkpoint()
+            if suspects and self.smoother.update(record, removed=suspects).strain <= _RELIEF * strain:
+                continue
+            self.smoother.restore(checkpoint)
+            self._doubt(record)
+            if neighbours := [k for k in own if not k.is_closure]:
+                self.smoother.update(record, removed=neighbours)
+            return
+
+    def _worst_closures(self, closures: list[Link], nis: FloatArray) -> list[Link]:
+        """Of closures the one that its landmarks contradict most, and those of the same two stretches of way."""
+        if not closures:
+            return []
+        worst = max(closures, key=lambda k: self._median_nis(k, nis))
+        near = np.abs(np.array([k.ends for k in closures]) - worst.ends).max(axis=1) <= self.drift.window
+        return [k for k, is_near in zip(closures, near, strict=True) if is_near]
 
     def _wait(self, links: Iterable[Link]) -> None:
         known = {k.ends for k in self.refused}

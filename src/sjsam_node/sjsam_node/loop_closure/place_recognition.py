@@ -98,6 +98,11 @@ class PlaceIndex:
             self._post(waiting, self._tree.words(held))
         self._waiting.clear()
 
+    def move(self, place: int, descriptors: Descriptors) -> None:
+        """Go on with the same descriptors of a place in another memory, or on disk."""
+        if place in self._descriptors:
+            self._descriptors[place] = descriptors
+
     def _post(self, place: int, words: IntArray) -> None:
         missing = max(place + 1 - len(self._sizes), 0)
         self._sizes = np.concatenate([self._sizes, np.ones(missing, dtype=np.int64)])

@@ -202,12 +202,22 @@ class Marginals:
         return variable_scalars(self.layout, self.dimensions, poses, landmarks)
 
     def landmark_blocks(self, landmarks: IntArray) -> FloatArray:
-        """Covariance (n, 3, 3) of each of some landmarks."""
-        d = self.dimensions[1]
-        scalars = self.scalars([], landmarks).reshape(-1, d)
+        """Covariance (n, d, d) of each of some landmarks."""
+        return self._blocks(self.scalars([], landmarks).reshape(-1, self.dimensions[1]))
+
+    def pose_blocks(self, poses: IntArray) -> FloatArray:
+        """Covariance (n, k, k) of each of some poses."""
+        return self._blocks(self.scalars(poses, []).reshape(-1, self.dimensions[0]))
+
+    def _blocks(self, scalars: IntArray) -> FloatArray:
+        """Covariance of each row (n, k) of unknowns; zero for what is fixed."""
+        free, size = scalars[:, 0] >= 0, scalars.shape[1]
+        out = np.zeros((len(scalars), size, size))
         if isinstance(self.entries, InversePanels):
-            return self.entries.blocks(scalars)
-        return np.array([self.entries.block(s) for s in scalars]).reshape(-1, d, d)
+            out[free] = self.entries.blocks(scalars[free])
+        else:
+            out[free] = np.array([self.entries.block(s) for s in scalars[free]]).reshape(-1, size, size)
+        return out
 
     def covariance(self, poses: Sequence[int] | IntArray, landmarks: Sequence[int] | IntArray = ()) -> FloatArray:
         """Joint covariance of any poses and landmarks.

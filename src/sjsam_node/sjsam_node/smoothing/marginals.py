@@ -66,6 +66,16 @@ class ComponentMarginals:
         J = scipy.linalg.block_diag(*jacobians)
         return np.asarray(J @ self._of_nodes(references) @ J.T + own)
 
+    def _starts(self, record: IntArray) -> FloatArray:
+        """Covariance (n, 6, 6) of the start of each of some records, before the variance factor."""
+        records, back = np.unique(record, return_inverse=True)
+        out, is_held = np.empty((len(records), 6, 6)), np.isin(records, self._assembled.records)
+        held = self._graph.starts[records[is_held]]
+        out[is_held] = self._marginals.pose_blocks(np.searchsorted(self._assembled.nodes, held))
+        for k in np.nonzero(~is_held)[0].tolist():
+            out[k] = self._hung([int(self._graph.starts[records[k]])])
+        return np.asarray(out[back])
+
     def landmarks(self, observations: IntArray) -> FloatArray:
         """Covariance (n, 3, 3) in the map frame of the landmarks of some observations."""
         graph, held = self._graph, self._assembled.landmarks
@@ -76,8 +86,7 @@ class ComponentMarginals:
         out[is_held] = self._marginals.landmark_blocks(at[is_held])
         others = observations[~is_held]
         record = graph.record_of[others]
-        starts = {int(i): self.ends(int(i))[:6, :6] / self.factor for i in np.unique(record)}
-        pose = np.array([starts[int(i)] for i in record]).reshape(-1, 6, 6)
+        pose = self._starts(record)
         T = graph.poses[graph.starts[record]]
         J = np.concatenate(
             [np.broadcast_to(np.eye(3), (len(others), 3, 3)), -skew(graph.points[others] - T[:, :3, 3])], axis=2

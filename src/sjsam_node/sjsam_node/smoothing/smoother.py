@@ -42,21 +42,30 @@ class SmootherConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class UpdateResult:
-    """chi2 of the component and its redundancy, iterations, whether it converged, and the solver."""
+    """chi2 of the component and its redundancy, iterations, whether it converged, and the solver.
+
+    doubt: variance factor of what was let go because it contradicted itself.
+    """
 
     cost: float
     redundancy: int
     iterations: int
     converged: bool
     solver: str
+    doubt: float = 1.0
+
+    @property
+    def strain(self) -> float:
+        """chi2 per degree of freedom."""
+        return self.cost / self.redundancy if self.redundancy > 0 else 0.0
 
     @property
     def variance_factor(self) -> float:
-        """chi2 per degree of freedom: how much larger the errors of the submaps are than they claim; never below one.
+        """How much larger the errors of the submaps are than they claim; never below one.
 
         Submaps that agree better than they should are not made surer.
         """
-        return max(1.0, self.cost / self.redundancy) if self.redundancy > 0 else 1.0
+        return max(self.doubt, self.strain)
 
 
 @dataclass(eq=False)
@@ -141,10 +150,11 @@ class Smoother:
         self.parked = self.parked.with_one(graph, record, reference, covariances)
 
     def settle(self) -> None:
-        """Bring all to its optimum, with every submap on its own and all shared landmarks, where that is affordable."""
-        self.graph.use_all_ties(True)
-        if self._work() > self.config.settled_work:
-            self.graph.use_all_ties(False)
+        """Bring all to its optimum, with every submap on its own and all shared landmarks, where that is affordable.
+
+        And where they do not contradict each other: then fewer say more.
+        """
+        self._choose_ties()
         self.parked = Parked()
         self.regions.open(self.regions.closed, len(self.graph.records))
         for component in np.unique(self.graph.component_of).tolist():
@@ -152,16 +162,14 @@ class Smoother:
 
     def resume(self) -> None:
         """Keep nothing but the graph and its estimate, which is at its optimum: after loading as after saving."""
-        self.graph.use_all_ties(True)
-        if self._work() > self.config.settled_work:
-            self.graph.use_all_ties(False)
+        self._choose_ties()
         self._solved.clear()
         self.parked = Parked()
         self.regions = Regions(self.estimator.local_maps, self.config.region)
         for component in np.unique(self.graph.component_of).tolist():
             assembled = self.estimator.assemble(self.graph, component)
             cost = assembled.problem.cost(assembled.state)
-            self._solved[component] = _Solved(assembled, _result_of(assembled, cost, 0, True))
+            self._solved[component] = _Solved(assembled, self._result_of(component, assembled, cost, 0, True))
 
     def checkpoint(self) -> Checkpoint:
         """Everything that an update changes, to come back to."""
@@ -173,6 +181,11 @@ class Smoother:
         self._solved = dict(checkpoint.solved)
         self.regions.closed = list(checkpoint.regions)
         self.parked = checkpoint.parked
+
+    def _choose_ties(self) -> None:
+        self.graph.use_all_ties(True)
+        if self._work() > self.config.settled_work or (self.graph.doubt > 1.0).any():
+            self.graph.use_all_ties(False)
 
     def _work(self) -> float:
         """Entries of the information matrices that the selected landmarks make."""
@@ -189,9 +202,15 @@ class Smoother:
             if not bent:
                 break
             self.regions.open(bent, len(self.graph.records))
-        result = _result_of(assembled, found.cost, found.iterations, found.converged)
+        result = self._result_of(component, assembled, found.cost, found.iterations, found.converged)
         self._solved[component] = _Solved(assembled, result)
         return result
+
+    def _result_of(
+        self, component: int, assembled: Assembled, cost: float, iterations: int, converged: bool
+    ) -> UpdateResult:
+        doubt = float(self.graph.doubt[self.graph.records_of(component)].max())
+        return UpdateResult(cost, assembled.redundancy, iterations, converged, assembled.problem.backend, doubt)
 
     def _parked_in(self, component: int) -> Parked:
         """Parked records of a component; those whose reference is in another one by now are taken back."""
@@ -266,7 +285,3 @@ class Smoother:
             T = submap.end_pose @ T
             node = graph.records[before].start
         return node, T, covariance
-
-
-def _result_of(assembled: Assembled, cost: float, iterations: int, converged: bool) -> UpdateResult:
-    return UpdateResult(cost, assembled.redundancy, iterations, converged, assembled.problem.backend)

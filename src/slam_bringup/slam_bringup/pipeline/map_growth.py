@@ -96,12 +96,15 @@ class Joining:
         """Settle the map; a new one ends up the same whoever came first."""
         if not self._known:
             self.global_map = self.global_map.centrally()
-            return []
         self.global_map.settle()
+        return [*self._apart(), *filter(None, [self.global_map.doubt])]
+
+    def _apart(self) -> list[str]:
+        """Tell of new submaps that hang on nothing of the map that was there before."""
         graph = self.global_map.graph
         new = graph.records[self._known :]
         tied = sum(graph.component_of[r.start] == graph.component(0) for r in new)
-        if tied == len(new):
+        if not self._known or tied == len(new):
             return []
         return [f"{len(new) - tied} of {len(new)} submaps are not tied to the old map: no place of it was recognised"]
 

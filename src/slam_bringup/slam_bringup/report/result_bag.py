@@ -124,7 +124,7 @@ def _lasting_messages(result: RunResult, stamp: int) -> Iterator[_Stamped]:
     yield stamp, "/map/graph", graph_message(_TYPES, header, result.global_map)
     marks = result.global_map.marks
     if marks.marks:
-        yield stamp, "/map/marks", marks_message(_TYPES, header, marks.positions(result.global_map.graph))
+        yield stamp, "/map/marks", marks_message(_TYPES, header, marks.positions(result.global_map.graph.poses))
     for number, plan in enumerate(result.floor_plans):
         topic = f"/map/occupancy_{number}" if number else "/map/occupancy"
         yield stamp, topic, occupancy_message(_TYPES, header, plan.cells, plan.resolution, plan.T_map_plan)

@@ -51,7 +51,7 @@ class FinishedView:
             page.show_plan(plan, number)
         page.show_landmarks(landmarks.positions[landmarks.linked], landmarks.covariances[landmarks.linked])
         marks = run.global_map.marks
-        page.show_marks([m.name for m in marks.marks], marks.positions(run.global_map.graph))
+        page.show_marks([m.name for m in marks.marks], marks.positions(run.global_map.graph.poses))
         borders = unseen(run.plans)
         page.show_frontiers(np.array([f.point for f in borders]).reshape(-1, 3), [f.length for f in borders])
         ways = [t.poses[:, :3, 3] for t in run.trajectories.values() if len(t)]
