@@ -212,7 +212,9 @@ def _map_before(probe: Probe, folder: Path) -> tuple[GlobalMap, int]:
         for topic, message in zip(SUBMAP_TOPICS, submap_messages(probe.types, submap), strict=True):
             probe.send(topic, message)
     probe.wait(
-        lambda: _counts(probe).get("/sjsam", {}).get("submaps", 0) == len(submaps), "submaps are not joined", 300.0
+        lambda: _counts(probe).get("/sjsam", {}).get("submaps joined", 0) == len(submaps),
+        "submaps are not joined",
+        300.0,
     )
     _saved(probe, folder)
     return _saved(probe, folder), len(submaps)

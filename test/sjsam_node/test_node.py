@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,10 +21,12 @@ pytestmark = pytest.mark.ros
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from sjsam_node.global_map import GlobalMap, JoinReport  # noqa: E402
 from sjsam_node.node import SjsamNode  # noqa: E402
 from slam_core.geometry import boxminus  # noqa: E402
 from slam_core.messages import SUBMAP_TOPICS, path_from_message, submap_messages  # noqa: E402
 from slam_core.ros import RosTypes, sensor_qos  # noqa: E402
+from slam_core.types import Submap  # noqa: E402
 
 
 class Bench:
@@ -35,6 +39,7 @@ class Bench:
         for member in (node, self.neighbour):
             self.executor.add_node(member)
         self.received: dict[str, list[Any]] = {}
+        self.submap_publishers: list[Any] = []
 
     def listen(self, topic: str, kind: str) -> None:
         self.received[topic] = []
@@ -52,10 +57,24 @@ class Bench:
             self.node.work()
         return condition()
 
+    def ask(self, name: str) -> Any:
+        return self.neighbour.create_client(Trigger, f"/sjsam/{name}").call_async(Trigger.Request())
+
     def call(self, name: str) -> Any:
-        future = self.neighbour.create_client(Trigger, f"/sjsam/{name}").call_async(Trigger.Request())
-        self.executor.spin_until_future_complete(future, timeout_sec=20.0)
+        future = self.ask(name)
+        assert self.spin_until(future.done, 20.0), f"{name} does not answer"
         return future.result()
+
+    def send(self, submaps: list[Submap]) -> None:
+        if not self.submap_publishers:
+            self.submap_publishers = [self.publisher(topic, kind) for topic, kind in SUBMAP_TOPICS.items()]
+        for submap in submaps:
+            for publisher, message in zip(self.submap_publishers, submap_messages(self.types, submap), strict=True):
+                publisher.publish(message)
+
+    @property
+    def counters(self) -> Counter[str]:
+        return self.node.health.counters
 
 
 @pytest.fixture
@@ -79,10 +98,7 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
         ("map/landmarks", "PointCloud2"), ("map/graph", "MarkerArray"), ("map/marks", "MarkerArray"),
     ):  # fmt: skip
         bench.listen(topic, kind)
-    publishers = [bench.publisher(topic, kind) for topic, kind in SUBMAP_TOPICS.items()]
-    for submap in submaps:
-        for publisher, message in zip(publishers, submap_messages(bench.types, submap), strict=True):
-            publisher.publish(message)
+    bench.send(submaps)
     assert bench.spin_until(lambda: len(bench.node.global_map.graph.records) == len(submaps))
     wanted = len(submaps) * agent.steps + 1
     assert bench.spin_until(lambda: any(len(m.poses) == wanted for m in bench.received["map/path"]))
@@ -113,3 +129,74 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
 def test_services_answer_on_an_empty_map(bench: Bench) -> None:
     assert not bench.call("load_map").success
     assert not bench.call("mark_here").success
+
+
+class SlowJoiner:
+    """``GlobalMap.add`` that joins nothing more until it may go on."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, before: int) -> None:
+        self.may_go_on, self.is_held = threading.Event(), threading.Event()
+        add, left = GlobalMap.add, iter(range(before))
+
+        def slow_add(joined: GlobalMap, submap: Submap) -> JoinReport:
+            if next(left, None) is None:
+                self.is_held.set()
+                assert self.may_go_on.wait(60.0)
+            return add(joined, submap)
+
+        monkeypatch.setattr(GlobalMap, "add", slow_add)
+
+
+@pytest.fixture
+def submaps(rng: np.random.Generator) -> list[Submap]:
+    return Agent(ring_world(3.0, rng, 12.0), circle(3.0, 0.4), rng, "").submaps()
+
+
+def test_everything_is_answered_while_a_submap_is_being_joined(
+    bench: Bench, submaps: list[Submap], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    slow = SlowJoiner(monkeypatch, before=2)
+    bench.listen("map_to_odom", "TransformStamped")
+    bench.listen("map/marks", "MarkerArray")
+    bench.send(submaps)
+    assert bench.spin_until(lambda: bench.counters["submaps received"] == len(submaps) and slow.is_held.is_set())
+    heard = len(bench.received["map_to_odom"])
+    assert bench.spin_until(lambda: len(bench.received["map_to_odom"]) > heard + 3)
+    assert bench.call("mark_here").message == "mark 1"
+    assert bench.spin_until(lambda: len(bench.received["map/marks"]) > 0)
+    saved, finished = bench.ask("save_map"), bench.ask("finish")
+    assert not bench.spin_until(lambda: saved.done() or finished.done(), 0.5)
+    counters = bench.counters
+    assert (counters["submaps joined"], counters["submaps waiting"]) == (2, len(submaps) - 2)
+    slow.may_go_on.set()
+    assert bench.spin_until(lambda: saved.done() and finished.done())
+    assert f"{len(submaps)} submaps joined" in finished.result().message
+    assert len(GlobalMap.load(tmp_path / "map").graph.records) == 3, "the map is saved as soon as it can be"
+    counters = bench.counters
+    assert (counters["submaps joined"], counters["submaps waiting"]) == (len(submaps), 0)
+
+
+def test_reset_leaves_out_what_waits_and_what_is_being_joined(
+    bench: Bench, submaps: list[Submap], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = SlowJoiner(monkeypatch, before=2)
+    bench.send(submaps[:-1])
+    assert bench.spin_until(lambda: bench.counters["submaps received"] == len(submaps) - 1 and slow.is_held.is_set())
+    assert bench.call("reset").success
+    bench.send(submaps[-1:])
+    assert bench.spin_until(lambda: bench.counters["submaps received"] == len(submaps))
+    slow.may_go_on.set()
+    assert bench.call("finish").success
+    assert [r.submap.index for r in bench.node.global_map.graph.records] == [submaps[-1].index]
+    assert bench.counters["submaps joined"] == 3
+
+
+def test_what_waits_when_the_node_is_told_to_end_is_in_the_copy(
+    bench: Bench, submaps: list[Submap], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    slow = SlowJoiner(monkeypatch, before=1)
+    bench.send(submaps)
+    assert bench.spin_until(lambda: bench.counters["submaps received"] == len(submaps) and slow.is_held.is_set())
+    slow.may_go_on.set()
+    bench.node.on_close()
+    assert len(GlobalMap.load(tmp_path / "map.autosave.ended").graph.records) == len(submaps)

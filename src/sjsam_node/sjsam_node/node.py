@@ -7,19 +7,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 import numpy as np
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
 from sjsam_node.autosave import Autosave
-from sjsam_node.global_map import ALREADY_JOINED, GlobalMap, GlobalMapConfig, JoinReport
-from sjsam_node.localization import Localizer
+from sjsam_node.global_map import ALREADY_JOINED, GlobalMap, GlobalMapConfig
+from sjsam_node.live_map import Joined, LiveMap
+from sjsam_node.localization import Localization
 from sjsam_node.map_messages import (
     cloud_message,
     ellipsoids_message,
@@ -27,9 +30,11 @@ from sjsam_node.map_messages import (
     landmarks_message,
     marks_message,
 )  # fmt: skip
+from sjsam_node.map_writer import result_of
 from sjsam_node.pose_tracker import PoseTracker
 from slam_core.base_node import SlamNode
 from slam_core.config import parameter
+from slam_core.geometry import FloatArray
 from slam_core.health import State
 from slam_core.messages import (
     SUBMAP_TOPICS,
@@ -47,6 +52,7 @@ from slam_core.ros import run_node
 from slam_core.stamp_guard import StampPolicy
 from slam_core.types import PoseEstimate, Submap
 
+T = TypeVar("T")
 _MAP_PERIOD_S = 1.0
 _TRANSFORM_PERIOD_S = 0.05
 _LONGEST_SILENCE_S = 1.0
@@ -76,21 +82,21 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     """Publishes each agent's pose, ``map_to_odom`` and the map.
 
     ``pose`` comes with every odometry message, ``map_to_odom`` twenty times a second, and the map, which costs the more
-    the larger it is, once a second at most. None of them changes the map.
+    the larger it is, once a second at most. Submaps are joined on another thread (:mod:`sjsam_node.live_map`), so that
+    all else goes on meanwhile, from the last estimate.
     """
 
     CHANGEABLE = ("map_path", "ply_path", "transform_tolerance_s")
 
     def __init__(self) -> None:
         super().__init__("sjsam", SjsamNodeConfig)
-        self.global_map = GlobalMap(self.config)
-        self.localizers: dict[str, Localizer] = {}
-        self.autosave = self._make_autosave()
+        self.map = LiveMap(self.config, self._make_autosave())
         self._stamp_ns = 0
-        self._map_is_news = self._copy_is_old = False
+        self._drawn = self.map.poses
+        self._picture: Future[Any] = self.map.finish()
         self._advertise_outputs()
+        self._start_trackers()
         self._go_on_from_last_time()
-        self.trackers = {agent: self._make_tracker(agent) for agent in self.config.agents}
         self._heard_at_s: dict[str, float] = {}
         for agent in self.config.agents:
             self._listen_to(agent)
@@ -114,6 +120,11 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         """File of the exported landmarks."""
         return Path(self.config.ply_path).expanduser()
 
+    @property
+    def global_map(self) -> GlobalMap:
+        """The map, which another thread changes."""
+        return self.map.global_map
+
     def _make_autosave(self) -> Autosave:
         path = self.config.autosave_path or f"{self.map_path}.autosave"
         return Autosave(Path(path).expanduser(), 0.0 if self.config.localize_only else self.config.autosave_period_s)
@@ -121,21 +132,26 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def _go_on_from_last_time(self) -> None:
         """The map of a node that was killed, or the one to localise in."""
         if self.config.localize_only:
-            self.get_logger().info(self.load_map())
-        elif (copy := self.autosave.found()) is not None:
+            self._show_loaded(*self.map.load(self.map_path, self._seen).result())
+            self.get_logger().info(self._size("read from"))
+        elif (copy := self.map.killed()) is not None:
             try:
-                self._replace_map(copy)
+                self._show_loaded(*self.map.load(copy, self._seen).result())
             except ValueError as error:
                 self.get_logger().error(f"the autosaved map cannot be used, a new one begins: {error}")
-                self.autosave.put_away()
+                self.map.reset(forget=True)
                 return
             count = len(self.global_map.graph.records)
             self.get_logger().warning(
                 f"a node was killed: going on from {count} submaps in {copy} (~/reset forgets them)"
             )
 
-    def _make_tracker(self, agent: str) -> PoseTracker:
-        return PoseTracker(None if self.config.localize_only else self.global_map.last_pose(agent))
+    def _start_trackers(self, last: Mapping[str, FloatArray] = MappingProxyType({})) -> None:
+        """Follow every agent from where it was ``last``, else from the origin; one to be located from nowhere yet."""
+        self.trackers = {
+            agent: PoseTracker(None if self.config.localize_only else last.get(agent, np.eye(4)))
+            for agent in self.config.agents
+        }
 
     def _advertise_outputs(self) -> None:
         for name in ("map/landmarks", "map/cloud"):
@@ -153,10 +169,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self.listen_together(topics, partial(self.on_submap, agent), latched=True, stamps=StampPolicy.ANY)
         self.listen(_below(agent, "odom"), "Odometry", on_odometry, required=False, stamps=StampPolicy.ANY)
 
-    def _serve(self, name: str, action: Callable[[], str]) -> None:
-        def answer(_: Any, response: Any) -> Any:
+    def _serve(self, name: str, action: Callable[[], Awaitable[str]]) -> None:
+        async def answer(_: Any, response: Any) -> Any:
             try:
-                response.success, response.message = True, action()
+                response.success, response.message = True, await action()
             except (ValueError, OSError) as error:
                 response.success, response.message = False, str(error)
             self.get_logger().info(f"{name}: {response.message}")
@@ -167,23 +183,48 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     # -- inputs --------------------------------------------------------------------------------------------------------
 
     def on_submap(self, agent: str, *messages: Message) -> None:
-        """One finished submap."""
+        """One finished submap: it is joined, or located, when those before it are."""
         submap = submap_from_messages(SubmapMessages(*messages))
         self._stamp_ns = max(self._stamp_ns, submap.end_stamp_ns)
-        if self.config.localize_only:
-            self._localize(agent, submap)
-            return
-        report = self.global_map.add(submap)
-        if report.reason == ALREADY_JOINED:  # sent again to a node that was started again
+        self.health.count("submaps received")
+        done: Future[Any] = self.map.locate(agent, submap) if self.config.localize_only else self.map.add(submap)
+        self._show_waiting()
+        take = partial(self._take, agent, submap, done)
+        done.add_done_callback(
+            lambda _: self.do_later("submap", partial(self._process, "submap", 0, take, announce=False))
+        )
+
+    def _take(self, agent: str, submap: Submap, done: Future[Any]) -> None:
+        """Go on from what has become of a submap; nothing has where the node was reset meanwhile."""
+        self._show_waiting()
+        found = done.result()
+        if isinstance(found, Joined):
+            self._take_joined(agent, submap, found)
+        elif isinstance(found, Localization):
+            self._take_located(agent, found)
+
+    def _take_joined(self, agent: str, submap: Submap, joined: Joined) -> None:
+        if joined.report.reason == ALREADY_JOINED:  # sent again to a node that was started again
             self.health.count("submaps sent again")
             return
-        if not report.accepted:
-            raise ValueError(f"submap {submap.frame_id}: {report.reason}")
-        self._count(report)
-        pose = self.global_map.end_pose(submap.agent)
-        if pose is not None:
-            self._follow(agent, pose, submap)
-        self._map_is_news = self._copy_is_old = True
+        if joined.end is None:
+            raise ValueError(f"submap {submap.frame_id}: {joined.report.reason}")
+        self.health.processed(joined.duration_s, is_frame=False)
+        self._count(joined)
+        self._follow(agent, joined.end, joined.in_odom)
+
+    def _take_located(self, agent: str, found: Localization) -> None:
+        self.health.count("localized" if found.matched else "not recognised")
+        if found.pose is None:
+            self.health.set(State.LOST, "the place is not recognised in the map")
+            return
+        self.health.set(State.OK if found.matched else State.DEGRADED, "" if found.matched else "by odometry alone")
+        self._follow(agent, found.pose)
+
+    def _show_waiting(self) -> None:
+        waiting, counters = self.map.waiting, self.health.counters
+        counters["submaps waiting"] = waiting
+        counters["submaps waiting at most"] = max(waiting, counters["submaps waiting at most"])
 
     def on_odometry(self, agent: str, message: Message) -> None:
         """Where the agent is in the map at a pose of its odometry."""
@@ -195,47 +236,34 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         """Mark a find at a point of the map frame."""
         if message.header.frame_id not in ("", self.config.map_frame):
             raise ValueError(f"clicked_point must be in frame {self.config.map_frame}, got {message.header.frame_id}")
-        self.global_map.marks.add(self.global_map.graph, np.array([message.point.x, message.point.y, message.point.z]))
-        self._publish_marks()
-        self._copy_is_old = True
+        self._mark(np.array([message.point.x, message.point.y, message.point.z]))
 
     def on_initial_pose(self, message: Message) -> None:
         """Where the agents are believed to be in the loaded map."""
         estimate = estimate_from_message(message)
         for agent in self.config.agents:
-            self._localizer(agent).set_pose(estimate)
+            self.map.set_pose(agent, estimate)
 
     def on_reset(self) -> None:
         """Forget the map; in a loaded map only where the agents are."""
-        self.localizers.clear()
-        if not self.config.localize_only:
-            self.global_map.reset()
-            self.autosave.put_away()
-            self._copy_is_old = False
-            self._publish_map()
-        self.trackers = {agent: self._make_tracker(agent) for agent in self.config.agents}
+        self.map.reset(forget=not self.config.localize_only)
+        self._start_trackers()
+        self._publish_map()
+
+    async def on_finish(self) -> str:
+        """Wait until all submaps that have come are joined."""
+        await self._done(self.map.finish())
+        self.finish_work()
+        return f"{len(self.global_map.graph.records)} submaps joined"
 
     def on_close(self) -> None:
-        """Write what has been mapped since the last copy, and put the copy away: nobody needs to go on from it."""
-        if self.autosave.is_on and self._copy_is_old:
-            self.autosave.wait()
-            self.autosave.save(self.global_map.stored(), time.monotonic())
-        self.autosave.put_away()
-        self.autosave.close()
+        """Join what waits: no submap that has come is lost."""
+        self.finish_work()
+        if self.map.waiting:
+            self.get_logger().info(f"joining {self.map.waiting} submaps before the end")
+        self.map.close()
 
-    def _localizer(self, agent: str) -> Localizer:
-        return self.localizers.setdefault(agent, Localizer(self.global_map))
-
-    def _localize(self, agent: str, submap: Submap) -> None:
-        found = self._localizer(agent).process(submap)
-        self.health.count("localized" if found.matched else "not recognised")
-        if found.pose is None:
-            self.health.set(State.LOST, "the place is not recognised in the map")
-            return
-        self.health.set(State.OK if found.matched else State.DEGRADED, "" if found.matched else "by odometry alone")
-        self._follow(agent, found.pose, submap)
-
-    def _follow(self, agent: str, end: PoseEstimate, submap: Submap) -> None:
+    def _follow(self, agent: str, end: PoseEstimate, in_odom: PoseEstimate | None = None) -> None:
         """The end of a submap is known in the map: carry the agent's odometry on from there."""
         tracker = self.trackers[agent]
         if tracker.newest_ns is None:  # no odometry is heard: the ends of submaps are all that is known
@@ -243,15 +271,14 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self.publish(_below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, end))
         if tracker.has_heard(end.stamp_ns):
             tracker.add_submap(end)
-        elif not self.config.localize_only:
-            tracker.add_submap(end, self.global_map.odometry_pose(submap.agent))
+        elif in_odom is not None:
+            tracker.add_submap(end, in_odom)
 
-    def _count(self, report: JoinReport) -> None:
-        self.health.count("submaps")
+    def _count(self, joined: Joined) -> None:
+        report = joined.report
+        self.health.count("submaps joined")
         self.health.count("closures", len(report.closures))
-        self.health.counters["components"] = report.components
-        for name, count in self.global_map.counters.counts.items():
-            self.health.counters[name] = count
+        self.health.take(joined.counts | {"components": report.components})
         reasons = [f"{report.components} separate parts"] if report.components > 1 else []
         if report.is_strained:
             reasons.append(f"submaps contradict each other {report.variance_factor:.0f} times more than they claim")
@@ -259,73 +286,86 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     # -- services ------------------------------------------------------------------------------------------------------
 
-    def save_map(self) -> str:
-        """Write the map to ``map_path``; an empty one never over another."""
-        if not self.global_map.graph.records and self.map_path.exists():
-            raise ValueError(f"the map is empty: {self.map_path} is left as it is")
-        self.global_map.save(self.map_path)
+    async def save_map(self) -> str:
+        """Write the map, with the submaps joined so far, to ``map_path``; an empty one never over another."""
+        waiting = self.map.waiting
+        await self._done(self.map.save(self.map_path))
         self._publish_map()
-        return f"{len(self.global_map.graph.records)} submaps written to {self.map_path}"
+        return self._size("written to") + (f", {waiting} more wait to be joined" if waiting else "")
 
-    def load_map(self) -> str:
+    async def load_map(self) -> str:
         """Replace the map by the one in ``map_path``; where that cannot be used the map stays as it is."""
-        self._replace_map(self.map_path)
-        self.trackers = {agent: self._make_tracker(agent) for agent in self.config.agents}
-        return f"{len(self.global_map.graph.records)} submaps read from {self.map_path}"
+        self._show_loaded(*await self._done(self.map.load(self.map_path, self._seen)))
+        return self._size("read from")
 
-    def _replace_map(self, path: Path) -> None:
-        loaded = GlobalMap.load(path, self.config)
+    def _seen(self, loaded: GlobalMap) -> tuple[dict[str, Message], dict[str, FloatArray]]:
+        """What a loaded map looks like and where its agents were last, which becomes the node's."""
         self._stamp_ns = max((r.submap.end_stamp_ns for r in loaded.graph.records), default=self._stamp_ns)
-        outputs = self._map_messages(loaded)  # whatever is wrong with it shows before anything changes
-        self.global_map = loaded
-        self.localizers.clear()
-        self._copy_is_old = True
+        return self._map_messages(loaded), {agent: loaded.last_pose(agent) for agent in self.config.agents}
+
+    def _show_loaded(self, outputs: dict[str, Message], last: dict[str, FloatArray]) -> None:
+        self._start_trackers(last)
         self._publish_all(outputs)
+        self._drawn = self.map.poses
 
-    def export_ply(self) -> str:
+    async def export_ply(self) -> str:
         """Write the landmarks to ``ply_path``; a file that is no PLY is not replaced."""
-        if self.ply_path.exists() and not is_ply(self.ply_path):
-            raise ValueError(f"{self.ply_path} is there and no PLY file: it is left as it is, choose another ply_path")
-        positions = self.global_map.landmarks().positions
-        write_ply(self.ply_path, positions.astype(np.float32))
-        return f"{len(positions)} landmarks written to {self.ply_path}"
+        path = self.ply_path
+        if path.exists() and not is_ply(path):
+            raise ValueError(f"{path} is there and no PLY file: it is left as it is, choose another ply_path")
+        landmarks = await self._done(self.map.read(GlobalMap.landmarks))
+        write_ply(path, landmarks.positions.astype(np.float32))
+        return f"{len(landmarks.positions)} landmarks written to {path}"
 
-    def mark_here(self) -> str:
+    async def mark_here(self) -> str:
         """Mark where the agent that was heard last is."""
-        records = self.global_map.graph.records
-        if not records:
-            raise ValueError("nothing can be marked in an empty map")
-        mark = self.global_map.marks.add(self.global_map.graph, self.global_map.graph.poses[records[-1].end][:3, 3])
-        self._publish_marks()
-        self._copy_is_old = True
+        return self._mark(self.map.poses[-1:, :3, 3].sum(axis=0))
+
+    def _mark(self, point: FloatArray) -> str:
+        mark = self.map.mark(point)
+        header = header_message(self.types, self._stamp_ns, self.config.map_frame)
+        self.publish("map/marks", marks_message(self.types, header, self.global_map.marks.positions(self.map.poses)))
         return mark.name
+
+    def _size(self, done: str) -> str:
+        return f"{len(self.global_map.graph.records)} submaps {done} {self.map_path}"
+
+    async def _done(self, future: Future[T]) -> T:
+        """What another thread returns; until then the node does all else."""
+        future.add_done_callback(lambda _: self._wake.trigger())
+        return await result_of(future)
 
     # -- outputs -------------------------------------------------------------------------------------------------------
 
     def _publish_news(self) -> None:
-        if self._map_is_news:
+        if self._drawn is not self.map.poses and self._picture.done():
             self._publish_map()
-        if self._copy_is_old and self.autosave.is_due(time.monotonic()):
-            self._copy_is_old = False
-            self.autosave.save(self.global_map.stored(), time.monotonic())
+        copy = self.map.save_copy()
+        if copy is not None:  # what went wrong with the one before shows
+            copy.add_done_callback(lambda done: self.do_later("autosave", done.result))
 
     def _publish_map(self) -> None:
-        self._map_is_news = False
-        self._publish_all(self._map_messages(self.global_map))
+        """Have the map drawn and then published."""
+        self._picture = self.map.read(self._draw)
+        self._picture.add_done_callback(lambda done: self.do_later("map", lambda: self._publish_all(done.result())))
+
+    def _draw(self, global_map: GlobalMap) -> dict[str, Message]:
+        self._drawn = self.map.poses
+        return self._map_messages(global_map)
 
     def _publish_all(self, messages: dict[str, Message]) -> None:
         for topic, message in messages.items():
             self.publish(topic, message)
 
     def _map_messages(self, global_map: GlobalMap) -> dict[str, Message]:
-        """What a map looks like, by topic."""
+        """What a map looks like, by topic; on the thread that may read it."""
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
         landmarks, paths = global_map.landmarks(), global_map.path()
         messages = {
             "map/landmarks": landmarks_message(self.types, header, landmarks),
             "map/cloud": cloud_message(self.types, header, landmarks),
             "map/graph": graph_message(self.types, header, global_map),
-            "map/marks": marks_message(self.types, header, global_map.marks.positions(global_map.graph)),
+            "map/marks": marks_message(self.types, header, global_map.marks.positions(global_map.graph.poses)),
         }
         if self.has_listeners("map/ellipsoids"):
             messages["map/ellipsoids"] = ellipsoids_message(self.types, header, landmarks)
@@ -333,11 +373,6 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             poses = paths.get(agent, [])
             messages[_below(agent, "map/path")] = path_message(self.types, self._stamp_ns, self.config.map_frame, poses)
         return messages
-
-    def _publish_marks(self) -> None:
-        header = header_message(self.types, self._stamp_ns, self.config.map_frame)
-        marks = self.global_map.marks.positions(self.global_map.graph)
-        self.publish("map/marks", marks_message(self.types, header, marks))
 
     def _publish_transforms(self) -> None:
         """``map_to_odom`` of every agent that has odometry, stamped a little ahead of the present time."""

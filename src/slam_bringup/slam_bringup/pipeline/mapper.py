@@ -13,10 +13,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from ekf_slam_node.stage import FilterStage, FrameResult
 from ndt_registration.stage import ScanEstimate
+from sjsam_node.agents import in_order
 from slam_bringup.bags.readings import AgentSensors
 from slam_bringup.pipeline.configuration import SystemConfig, filter_config
 from slam_bringup.pipeline.map_growth import MapGrowth
-from slam_bringup.pipeline.run_record import AgentRecord, RunRecord, StateChanges
+from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges
 from slam_bringup.pipeline.sensor_pipeline import AgentItem
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.messages import rounded
@@ -47,7 +48,7 @@ class Mapper:
         self._diaries = {agent: _Diary() for agent in sensors}
         self._joiner = ThreadPoolExecutor(1, thread_name_prefix="joining")
         self._joins: list[Future[None]] = []
-        self._submaps = 0
+        self._submaps = self._tried = self._most_waiting = 0
         self._events: list[str] = []
 
     def process(self, item: AgentItem) -> None:
@@ -67,10 +68,12 @@ class Mapper:
 
         A submap whose joining failed is left out of the map; the events say so.
         """
+        last: list[Submap] = []
         for agent, stage in self._filters.items():
             stage.give_up()
             self._take_results(agent)
-            self._join(stage.finish())
+            last += stage.finish()
+        self._join(in_order(last))
         for join in self._joins:
             error = join.exception()
             if error is None:
@@ -103,7 +106,12 @@ class Mapper:
             events=tuple(self._events),
             failure=failure,
             solver=self.growth.solver,
+            backlog=self._backlog(),
         )
+
+    def _backlog(self) -> dict[str, int]:
+        counts = len(self._joins), self._submaps, len(self._joins) - self._tried, self._most_waiting
+        return dict(zip(BACKLOG, counts, strict=True))
 
     def rejections(self) -> dict[str, int]:
         """What all filters and the map rejected, by reason."""
@@ -119,10 +127,14 @@ class Mapper:
 
     def _join(self, submaps: Iterable[Submap]) -> None:
         self._joins += [self._joiner.submit(self._add, submap) for submap in submaps]
+        self._most_waiting = max(self._most_waiting, len(self._joins) - self._tried)
 
     def _add(self, submap: Submap) -> None:
-        with self._times.measure("sjsam"):
-            self.growth.add(rounded(submap) if self._compact else submap)
+        try:
+            with self._times.measure("sjsam"):
+                self.growth.add(rounded(submap) if self._compact else submap)
+        finally:
+            self._tried += 1
 
 
 class _Diary:

@@ -76,6 +76,7 @@ class RunResult:
     """Everything a run found out.
 
     stage_ms: the time of every call of a stage, in order. failure: what ended the run early, "" if nothing did.
+    backlog: submaps received, joined, waiting at the end, and waiting at most.
     """
 
     bag: str
@@ -98,6 +99,7 @@ class RunResult:
     events: tuple[str, ...] = ()
     solver: str = ""
     failure: str = ""
+    backlog: Mapping[str, int] = field(default_factory=dict)
 
 
 def summarise(result: RunResult) -> dict[str, Any]:
@@ -119,6 +121,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "dense_triangles": len(result.dense.faces),
         "free_floor_m2": [plan.free_m2 for plan in result.floor_plans],
         "submaps": result.submaps,
+        "submap_backlog": dict(result.backlog),
         "loop_closures": result.loop_closures,
         "path_length_m": sum(agent.trajectory.length_m for agent in result.agents),
         "sensor_s": result.sensor_s,

@@ -59,6 +59,10 @@ class StateChanges:
         self._state = state
 
 
+BACKLOG = ("received", "joined", "waiting", "waiting_at_most")
+"""Numbers of submaps that ``summary.json`` gives."""
+
+
 @dataclass(frozen=True, eq=False)
 class AgentRecord:
     """What was said of one agent, frame by frame.
@@ -92,6 +96,7 @@ class RunRecord:
     events: tuple[str, ...] = ()
     solver: str = ""
     failure: str = ""
+    backlog: Mapping[str, int] = field(default_factory=dict)
 
     def with_front_ends(
         self, reports: Mapping[str, FrontendReport], frames: Mapping[str, Sequence[LoggedFrame]] | None = None
@@ -156,6 +161,7 @@ def run_result(
         events=events,
         solver=record.solver,
         failure=failure,
+        backlog=record.backlog,
     )
 
 

@@ -244,7 +244,7 @@ class _Choreography:
 
     def _all_joined(self) -> bool:
         values = self._supervisor.diagnostics.get(_SJSAM, {})
-        joined = sum(int(values.get(key, "0")) for key in ("submaps", "rejected"))
+        joined = sum(int(values.get(key, "0")) for key in ("submaps joined", "rejected"))
         return joined >= int(self._supervisor.submaps)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 
 from sjsam_node.global_map import GlobalMap
@@ -12,7 +13,7 @@ from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.results import RunResult
-from slam_bringup.pipeline.run_record import AgentRecord, RunRecord, StateChanges, run_result
+from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges, run_result
 from slam_bringup.processes.interrupt import STOPPED
 from slam_bringup.processes.online_run import OnlineRun, unclean_ends
 from slam_core.messages import estimate_from_message
@@ -78,6 +79,7 @@ def collect(
             wall_s=run.wall_s,
             dropped=_losses(run.diagnostics),
             stage_ms=recording.stage_ms,
+            backlog=_backlog(run.diagnostics.get("/sjsam", {})),
             events=tuple([STOPPED] * run.stopped + unclean_ends(run)),
         )
         record = record.with_front_ends({agent: _front_end(agent, run.diagnostics) for agent in opened.agents})
@@ -99,6 +101,12 @@ def _number(text: str) -> float | str:
         return float(text)
     except ValueError:
         return text
+
+
+def _backlog(values: Mapping[str, str]) -> dict[str, int]:
+    """Submaps received, joined and waiting, as ``sjsam`` counts them."""
+    found = {key.removeprefix("submaps ").replace(" ", "_"): key for key in values if key.startswith("submaps ")}
+    return {name: int(values[found[name]]) for name in BACKLOG if name in found}
 
 
 def _losses(diagnostics: dict[str, dict[str, str]]) -> dict[str, int]:

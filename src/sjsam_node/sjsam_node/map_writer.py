@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The thread that alone writes the map: submaps one after the other, and between two of them what else is asked for.
+
+Whoever hands something over goes on at once. So a node answers and publishes from the last estimate, however long
+joining takes and however many submaps wait.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import types
+from collections.abc import Callable, Generator
+from concurrent.futures import Future
+from queue import PriorityQueue
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+_REQUEST, _SUBMAP, _LATER, _END = range(4)
+"""What is done first of all that waits."""
+
+
+class MapWriter:
+    """Does what it is given, on one thread; the future of each task holds what it returns or raises."""
+
+    def __init__(self) -> None:
+        self._tasks = PriorityQueue[tuple[int, int, Callable[[], None]]]()
+        self._number = itertools.count()
+        self._submaps: list[Future[Any]] = []
+        self._is_open = True
+        self._thread = threading.Thread(target=self._run, name="joining", daemon=True)
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Number of submaps that are not joined yet, the one at hand included."""
+        self._submaps = [future for future in self._submaps if not future.done()]
+        return len(self._submaps)
+
+    def join(self, task: Callable[[], T]) -> Future[T]:
+        """Join a submap when all before it are joined."""
+        future = self._put(_SUBMAP, task)
+        self._submaps.append(future)
+        return future
+
+    def ask(self, task: Callable[[], T]) -> Future[T]:
+        """Do something as soon as the submap at hand is joined, however many wait."""
+        return self._put(_REQUEST, task)
+
+    def when_idle(self) -> Future[None]:
+        """A future that is done when nothing waits any more."""
+        return self._put(_LATER, lambda: None)
+
+    def close(self) -> None:
+        """Do all that waits and end the thread."""
+        self._put(_END, self._stop)
+        self._thread.join()
+
+    def _put(self, priority: int, task: Callable[[], T]) -> Future[T]:
+        future: Future[T] = Future()
+
+        def run() -> None:
+            try:
+                result = task()
+            except Exception as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+
+        self._tasks.put((priority, next(self._number), run))
+        return future
+
+    def _stop(self) -> None:
+        self._is_open = False
+
+    def _run(self) -> None:
+        while self._is_open:
+            self._tasks.get()[2]()
+
+
+@types.coroutine
+def result_of(future: Future[T]) -> Generator[None, None, T]:
+    """Await what another thread does in a callback of rclpy, whose executor goes on with all else."""
+    while not future.done():
+        yield
+    return future.result()
