@@ -16,13 +16,13 @@ from memory import PeakMemory
 from pycolmap import cost_functions
 from scipy.spatial.transform import Rotation
 
-from sjsam_node.smoothing.problem import LocalMap, State
+from sjsam_node.smoothing.problem import JoiningState, LocalMap
 from slam_core.geometry import make_transform, so3_exp
 
 THREADS = 1
 
 
-def solve(maps: list[LocalMap], state: State, repeat: int) -> dict[str, Any]:
+def solve(maps: list[LocalMap], state: JoiningState, repeat: int) -> dict[str, Any]:
     """Levenberg-Marquardt with the sparse Schur complement."""
     memory, times = PeakMemory(), []
     for _ in range(repeat):
@@ -35,11 +35,11 @@ def solve(maps: list[LocalMap], state: State, repeat: int) -> dict[str, Any]:
         pyceres.solve(options, problem, summary)
         times.append(time.perf_counter() - began)
     R = Rotation.from_quat(q).as_matrix().transpose(0, 2, 1)
-    optimum = State(np.ascontiguousarray(R), -np.einsum("nij,nj->ni", R, t), points)
+    optimum = JoiningState(np.ascontiguousarray(R), -np.einsum("nij,nj->ni", R, t), points)
     return {"batch": times, "memory": memory.grown(), "state": optimum}
 
 
-def _problem(maps: list[LocalMap], state: State) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
+def _problem(maps: list[LocalMap], state: JoiningState) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
     """Poses enter as the map's frame seen from them: quaternions (x y z w) and translations."""
     R = state.rotations.transpose(0, 2, 1)
     q, t = Rotation.from_matrix(R).as_quat(), -np.einsum("nij,nj->ni", R, state.translations)

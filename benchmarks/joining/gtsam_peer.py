@@ -10,13 +10,13 @@ import gtsam
 import numpy as np
 from memory import PeakMemory
 
-from sjsam_node.smoothing.problem import LocalMap, State
+from sjsam_node.smoothing.problem import JoiningState, LocalMap
 from slam_core.geometry import make_transform, so3_exp
 
 X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
 
 
-def solve(maps: list[LocalMap], state: State, repeat: int) -> dict[str, Any]:
+def solve(maps: list[LocalMap], state: JoiningState, repeat: int) -> dict[str, Any]:
     """Batch Levenberg-Marquardt with its default parameters, and the joint covariance of eight poses."""
     graph, values = graph_of(maps, state)
     memory, times, covariances, solution = PeakMemory(), [], [], values
@@ -33,7 +33,7 @@ def solve(maps: list[LocalMap], state: State, repeat: int) -> dict[str, Any]:
     return {"batch": times, "covariances": covariances, "memory": grown, "state": _state_of(solution, state)}
 
 
-def isam2(maps: list[LocalMap], state: State, repeat: int) -> dict[str, Any]:
+def isam2(maps: list[LocalMap], state: JoiningState, repeat: int) -> dict[str, Any]:
     """One submap after the other with the estimate after each, default parameters; once, whatever ``repeat``."""
     del repeat
     memory, began = PeakMemory(), time.perf_counter()
@@ -58,7 +58,7 @@ def isam2(maps: list[LocalMap], state: State, repeat: int) -> dict[str, Any]:
     return {"batch": [seconds], "memory": memory.grown(), "state": _state_of(estimate, state)}
 
 
-def graph_of(maps: list[LocalMap], state: State) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def graph_of(maps: list[LocalMap], state: JoiningState) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """The same block rows as GTSAM's own factors. Its poses move in the body frame, rotation first."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(gtsam.PriorFactorPose3(X(0), _pose(state, 0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
@@ -95,11 +95,11 @@ def _sighting(pose: int, landmark: int, point: np.ndarray, information: np.ndarr
     return gtsam.BearingRangeFactor3D(X(pose), L(landmark), bearing, distance, noise)
 
 
-def _pose(state: State, i: int) -> gtsam.Pose3:
+def _pose(state: JoiningState, i: int) -> gtsam.Pose3:
     return gtsam.Pose3(make_transform(state.rotations[i], state.translations[i]))
 
 
-def _state_of(values: gtsam.Values, like: State) -> State:
+def _state_of(values: gtsam.Values, like: JoiningState) -> JoiningState:
     poses = np.array([values.atPose3(X(i)).matrix() for i in range(len(like.translations))])
     points = [values.atPoint3(L(i)) for i in range(len(like.landmarks))]
-    return State(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), np.array(points))
+    return JoiningState(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), np.array(points))

@@ -39,7 +39,7 @@ from problems import KnownProblem, flattened, joining_problem, local_maps, ring
 
 from sjsam_node.smoothing.block_problem import BlockProblem
 from sjsam_node.smoothing.joining import JoiningProblem
-from sjsam_node.smoothing.problem import LocalMap, State
+from sjsam_node.smoothing.problem import JoiningState, LocalMap
 from slam_core.geometry import so3_exp
 from slam_core.least_squares import LevenbergMarquardtConfig
 
@@ -55,10 +55,10 @@ def timed(action: Callable[[], Any]) -> tuple[float, Any]:
     return time.perf_counter() - began, result
 
 
-def solve_ours(maps: list[LocalMap], state: State, rows: str, repeat: int) -> dict[str, Any]:
+def solve_ours(maps: list[LocalMap], state: JoiningState, rows: str, repeat: int) -> dict[str, Any]:
     flat = flattened(maps, rows)
 
-    def run() -> tuple[JoiningProblem | BlockProblem, State]:
+    def run() -> tuple[JoiningProblem | BlockProblem, JoiningState]:
         problem = joining_problem(flat, state)
         return problem, problem.optimize(state, STOP)[0]
 
@@ -100,7 +100,7 @@ def child(solver: str, path: Path, repeat: int) -> dict[str, Any]:
     return result
 
 
-def in_turn(maps: list[LocalMap], state: State) -> dict[str, Any]:
+def in_turn(maps: list[LocalMap], state: JoiningState) -> dict[str, Any]:
     """One submap after the other; poses and landmarks are numbered by first sight, so that a prefix is a problem."""
     compiles = joining_problem(flattened(maps[:3], "block"), state)
     compiles.optimize(state, LevenbergMarquardtConfig(max_iterations=3))
@@ -114,11 +114,11 @@ def in_turn(maps: list[LocalMap], state: State) -> dict[str, Any]:
         seen = max(seen, int(m.landmarks.max()) + 1)
         due += 1.0 / (1.0 + np.sqrt(k) / 3.0)
         if due >= 1.0 or k == len(maps) - 1:
-            known, due = State(R[: k + 2], t[: k + 2], points[:seen]), 0.0
+            known, due = JoiningState(R[: k + 2], t[: k + 2], points[:seen]), 0.0
             known = joining_problem(flat.first(k + 1), known).optimize(known, STOP)[0]
             R[: k + 2], t[: k + 2], points[:seen] = known.rotations, known.translations, known.landmarks
     seconds = time.perf_counter() - began
-    return {"batch": [seconds], "memory": memory.grown(), "state": State(R, t, points)}
+    return {"batch": [seconds], "memory": memory.grown(), "state": JoiningState(R, t, points)}
 
 
 def as_node(problem: KnownProblem) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from submap_world import Agent, circle, ring_world  # noqa: E402
 from sjsam_node.smoothing import kernels  # noqa: E402
 from sjsam_node.smoothing.block_problem import BlockProblem, FlatRows, flatten_rows  # noqa: E402
 from sjsam_node.smoothing.joining import JoiningProblem  # noqa: E402
-from sjsam_node.smoothing.problem import FlatMaps, LocalMap, State, block_rows, flatten  # noqa: E402
+from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten  # noqa: E402
 from slam_core.geometry import so3_log  # noqa: E402
 from slam_core.types import Submap  # noqa: E402
 
@@ -56,7 +56,7 @@ def chained(problem: KnownProblem) -> np.ndarray:
     return np.array(poses)
 
 
-def local_maps(problem: KnownProblem, rows: str, shared_only: bool) -> tuple[list[LocalMap], State]:
+def local_maps(problem: KnownProblem, rows: str, shared_only: bool) -> tuple[list[LocalMap], JoiningState]:
     """The problem for our solver, started from chained odometry; landmarks numbered by first sight."""
     counts = np.bincount(np.concatenate(problem.world_index))
     used: dict[int, int] = {}
@@ -75,7 +75,9 @@ def local_maps(problem: KnownProblem, rows: str, shared_only: bool) -> tuple[lis
         ids = np.array([used[int(world[i])] for i in kept], dtype=np.int64)
         local = LocalMap(k, np.array([k + 1]), ids, mean, 0.5 * (information + information.T))
         maps.append(block_rows(local, 6, 3) if rows == "block" else local)
-    state = State(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), np.array(points))
+    state = JoiningState(
+        np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), np.array(points)
+    )
     return maps, state
 
 
@@ -84,7 +86,9 @@ def flattened(maps: list[LocalMap], rows: str) -> FlatMaps | FlatRows:
     return flatten_rows(maps, 6, 3) if rows == "block" else flatten(maps)
 
 
-def joining_problem(flat: FlatMaps | FlatRows, state: State, backend: str = "auto") -> JoiningProblem | BlockProblem:
+def joining_problem(
+    flat: FlatMaps | FlatRows, state: JoiningState, backend: str = "auto"
+) -> JoiningProblem | BlockProblem:
     if isinstance(flat, FlatRows):
         return BlockProblem(flat, state, np.array([0]), kernels.TANGENT, backend)
     return JoiningProblem(flat, state, np.array([0]), kernels.TANGENT, backend)

@@ -37,7 +37,7 @@ class Autosave:
 
     @property
     def is_on(self) -> bool:
-        """Whether copies are written at all."""
+        """True if copies are written at all."""
         return self._period_s > 0.0
 
     def found(self) -> Path | None:
@@ -45,7 +45,7 @@ class Autosave:
         return self.path if self.is_on and storage.is_map(self.path) else None
 
     def is_due(self, now_s: float) -> bool:
-        """Whether to hand over the map now; what went wrong with the copy before is raised here."""
+        """True if the map is to be handed over now; raises what went wrong with the copy before."""
         if self._job is not None and self._job.done():
             job, self._job = self._job, None
             self._due_s = max(self._due_s, self._began_s + _SHARE * job.result())

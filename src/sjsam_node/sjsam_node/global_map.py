@@ -72,7 +72,7 @@ class GlobalMapConfig(Config):
 
 @dataclass(frozen=True, eq=False)
 class JoinReport:
-    """What became of one submap.
+    """Report on one submap.
 
     accepted with reason otherwise; matched: its landmarks already in the map; new_landmarks; closures: links accepted
     now, as (agent, index) of the older submap; dropped: matches let go; components: parts of the map that hang
@@ -234,7 +234,7 @@ class GlobalMap:
         return new
 
     def last_pose(self, agent: str) -> FloatArray:
-        """Where an agent was last; the origin for one not seen before."""
+        """Last pose of an agent, (4, 4); the origin for one not seen before."""
         newest = self.agents.newest(agent)
         return np.eye(4) if newest is None else self.graph.poses[newest.end]
 
@@ -291,7 +291,7 @@ class GlobalMap:
 
     @property
     def doubt(self) -> str:
-        """What settling found if submaps contradict each other (see ``Consistency.relieve``); empty if they do not."""
+        """Warning if submaps contradict each other (see ``Consistency.relieve``); empty if they do not."""
         strained = np.nonzero(self.graph.doubt > 1.0)[0]
         if not len(strained):
             return ""
@@ -337,7 +337,7 @@ class GlobalMap:
         return PoseEstimate(r.submap.start_stamp_ns, self.graph.poses[r.start], self.view.node(r.start))
 
     def end_pose(self, agent: str) -> PoseEstimate | None:
-        """Where an agent's newest submap ends in the map frame; None for one not heard of."""
+        """End of an agent's newest submap in the map frame; None for an agent not heard of."""
         r = self.agents.newest(agent)
         if r is None:
             return None

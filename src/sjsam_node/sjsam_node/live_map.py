@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """What a submap has brought: a report, where it ends in the map and in its agent's odometry, and all counts so far.
+    """Result of joining a submap: report, end in the map and in its agent's odometry, all counts so far.
 
     ``end`` is None for a refused submap; ``duration_s`` is what joining took.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where is an agent in a map that is not to change: an initial pose or a look at the surroundings, then tracking.
+"""Locates an agent in a map that is not to change: by an initial pose or a look at the surroundings, then tracking.
 
 A new submap is matched to the stored submaps around its predicted pose, or, without prediction, to those that look
 like it. Between matches its odometry carries the pose on, with growing covariance.
@@ -43,7 +43,7 @@ class Localizer:
         self._pose: PoseEstimate | None = None
 
     def set_pose(self, pose: PoseEstimate) -> None:
-        """Where the agent is believed to be (``initialpose``), map frame."""
+        """Take the pose at which the agent is believed to be (``initialpose``), map frame."""
         self._pose = pose
 
     def process(self, submap: Submap) -> Localization:

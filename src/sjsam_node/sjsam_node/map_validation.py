@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether what a stored map says can be true: types, sizes, references, finite numbers, rigid poses, covariances.
+"""Checks that what a stored map says can be true: types, sizes, references, finite numbers, rigid poses, covariances.
 
 A map is a file that somebody else may have touched. Everything is checked before anything is made of it; each check
 raises ``ValueError`` that names what is wrong.

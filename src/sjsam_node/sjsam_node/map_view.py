@@ -78,7 +78,7 @@ class MapView:
 
     @property
     def graph(self) -> MapGraph:
-        """What is pictured."""
+        """Graph that is pictured."""
         return self.smoother.graph
 
     def path(self) -> dict[str, list[PoseEstimate]]:
@@ -137,7 +137,7 @@ class MapView:
         return MapLandmarks(ids, graph.points[rows], covariances, _descriptors(graph, rows), counts, component == main)
 
     def _widening(self, component: int) -> FloatArray:
-        """What is added (6, 6) to the covariances of a component whose frame nothing ties to the map's."""
+        """Covariance (6, 6) that is added in a component whose frame nothing ties to the map's."""
         if component == self.graph.component(0):
             return np.asarray(_ORIGIN_SIGMA**2 * np.eye(6))
         return np.diag(np.square([*[self.unlinked_sigma] * 3, np.pi, np.pi, np.pi]))

@@ -227,7 +227,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         counters["submaps waiting at most"] = max(waiting, counters["submaps waiting at most"])
 
     def on_odometry(self, agent: str, message: Message) -> None:
-        """Where the agent is in the map at a pose of its odometry."""
+        """Publish the pose of an agent in the map at a pose of its odometry."""
         self._heard_at_s[agent] = time.monotonic()
         for pose in self.trackers[agent].add_odometry(estimate_from_message(message)):
             self.publish(_below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, pose))
@@ -239,7 +239,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._mark(np.array([message.point.x, message.point.y, message.point.z]))
 
     def on_initial_pose(self, message: Message) -> None:
-        """Where the agents are believed to be in the loaded map."""
+        """Take the pose at which the agents are believed to be in the loaded map."""
         estimate = estimate_from_message(message)
         for agent in self.config.agents:
             self.map.set_pose(agent, estimate)
@@ -299,7 +299,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         return self._size("read from")
 
     def _seen(self, loaded: GlobalMap) -> tuple[dict[str, Message], dict[str, FloatArray]]:
-        """What a loaded map looks like and where its agents were last, which becomes the node's."""
+        """Messages of a loaded map and the last poses of its agents."""
         self._stamp_ns = max((r.submap.end_stamp_ns for r in loaded.graph.records), default=self._stamp_ns)
         return self._map_messages(loaded), {agent: loaded.last_pose(agent) for agent in self.config.agents}
 
@@ -331,7 +331,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         return f"{len(self.global_map.graph.records)} submaps {done} {self.map_path}"
 
     async def _done(self, future: Future[T]) -> T:
-        """What another thread returns; until then the node does all else."""
+        """Result of another thread; until it is there the node does all else."""
         future.add_done_callback(lambda _: self._wake.trigger())
         return await result_of(future)
 
@@ -358,7 +358,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self.publish(topic, message)
 
     def _map_messages(self, global_map: GlobalMap) -> dict[str, Message]:
-        """What a map looks like, by topic; on the thread that may read it."""
+        """Messages that show a map, by topic; on the thread that may read it."""
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
         landmarks, paths = global_map.landmarks(), global_map.path()
         messages = {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where an agent is in the map at every pose of its odometry: the end of its newest joined submap, carried on.
+"""Pose of an agent in the map at every pose of its odometry: the end of its newest joined submap, propagated.
 
     T_map_rig = T_map_end * (T_odom_end^-1 * T_odom_rig)
 
@@ -74,7 +74,7 @@ class PoseTracker:
         return self.pose_of(pose)
 
     def has_heard(self, stamp_ns: int) -> bool:
-        """Whether the odometry pose of a stamp is known."""
+        """True if the odometry pose of a stamp is known."""
         return stamp_ns in self._odometry
 
     def add_submap(self, end: PoseEstimate, in_odom: PoseEstimate | None = None) -> None:

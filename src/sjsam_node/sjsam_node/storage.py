@@ -149,7 +149,7 @@ def _digest(manifest: dict[str, Any]) -> str:
 
 
 def is_map(folder: Path) -> bool:
-    """Whether a folder holds a map of any version, and nothing else."""
+    """True if a folder holds a map of any version, and nothing else."""
     try:
         content = json.loads((folder / _MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -9,7 +9,7 @@ import pytest
 from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.block_problem import BlockProblem, flatten_rows
 from sjsam_node.smoothing.joining import JoiningProblem
-from sjsam_node.smoothing.problem import LocalMap, State, block_rows, flatten
+from sjsam_node.smoothing.problem import JoiningState, LocalMap, block_rows, flatten
 from slam_core.geometry import boxminus, euler_from_rotation, make_transform, rotation_from_euler, so3_exp
 from slam_core.linear_algebra.sparse_cholesky import BACKENDS
 
@@ -18,7 +18,7 @@ MODELS = {"planar": kernels.PLANAR, "tangent": kernels.TANGENT, "euler": kernels
 
 def random_problem(
     model: int, rng: np.random.Generator, maps: int = 5, landmarks: int = 7
-) -> tuple[list[LocalMap], State]:
+) -> tuple[list[LocalMap], JoiningState]:
     """A chain of noisy local maps, each seeing some of the landmarks; the last one also holds an older pose."""
     d, a = (2, 1) if model == kernels.PLANAR else (3, 3)
     P = maps + 1
@@ -36,7 +36,7 @@ def random_problem(
         root = rng.normal(size=(len(mean),) * 2)
         mean = mean + 0.02 * rng.normal(size=len(mean))
         out.append(LocalMap(k, poses, seen, mean, 100.0 * (root @ root.T + 5.0 * np.eye(len(mean)))))
-    return out, State(np.ascontiguousarray(R), t, points)
+    return out, JoiningState(np.ascontiguousarray(R), t, points)
 
 
 def measured_pose(model: int, Ri: np.ndarray, ti: np.ndarray, Rj: np.ndarray, tj: np.ndarray) -> np.ndarray:
@@ -50,7 +50,7 @@ def measured_pose(model: int, Ri: np.ndarray, ti: np.ndarray, Rj: np.ndarray, tj
     return np.concatenate([Ri.T @ (tj - ti), angle])
 
 
-def residual(model: int, m: LocalMap, s: State) -> np.ndarray:
+def residual(model: int, m: LocalMap, s: JoiningState) -> np.ndarray:
     """NumPy twin of the kernels' residual."""
     R, t = s.rotations[m.reference], s.translations[m.reference]
     size = 3 if model == kernels.PLANAR else 6
@@ -70,11 +70,11 @@ def residual(model: int, m: LocalMap, s: State) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def cost(model: int, maps: list[LocalMap], s: State) -> float:
+def cost(model: int, maps: list[LocalMap], s: JoiningState) -> float:
     return float(sum(residual(model, m, s) @ m.information @ residual(model, m, s) for m in maps))
 
 
-def dense_normal_matrix(model: int, maps: list[LocalMap], problem: JoiningProblem, s: State) -> np.ndarray:
+def dense_normal_matrix(model: int, maps: list[LocalMap], problem: JoiningProblem, s: JoiningState) -> np.ndarray:
     """J^T information J by central differences."""
     n, step = problem.layout.pattern.n, 1e-6
     H = np.zeros((n, n))
@@ -95,7 +95,7 @@ def model(request: pytest.FixtureRequest) -> int:
     return MODELS[request.param]
 
 
-def perturbed(problem: JoiningProblem, s: State, rng: np.random.Generator, size: float = 0.1) -> State:
+def perturbed(problem: JoiningProblem, s: JoiningState, rng: np.random.Generator, size: float = 0.1) -> JoiningState:
     return problem.retract(s, size * rng.normal(size=problem.layout.pattern.n))
 
 
@@ -157,7 +157,7 @@ def test_block_rows_keep_each_marginal_and_drop_correlations(rng: np.random.Gene
 
 def test_a_problem_that_hangs_on_nothing_is_refused() -> None:
     loose = LocalMap(0, np.array([1]), np.empty(0, np.int64), np.zeros(6), np.eye(6))
-    s = State(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.zeros((0, 3)))
+    s = JoiningState(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.zeros((0, 3)))
     problem = JoiningProblem(flatten([loose]), s, np.empty(0, np.int64), kernels.TANGENT)
     with pytest.raises(ValueError, match="singular"):
         problem.marginals(s)
@@ -209,7 +209,7 @@ def test_an_attitude_measured_beyond_a_pitch_of_90_degrees_is_the_attitude_it_sa
 ) -> None:
     z = np.array([1.0, 2.0, 3.0, 0.4, pitch, -0.3])
     R = np.stack([np.eye(3), rotation_from_euler(*z[3:])])
-    s = State(R, np.stack([np.zeros(3), z[:3]]), np.empty((0, 3)))
+    s = JoiningState(R, np.stack([np.zeros(3), z[:3]]), np.empty((0, 3)))
     local = LocalMap(0, np.array([1]), np.empty(0, dtype=np.int64), z, np.diag(rng.uniform(1.0, 100.0, 6)))
     problem = JoiningProblem(flatten([local]), s, np.array([0]), kernels.EULER)
     assert problem.cost(s) < 1e-20

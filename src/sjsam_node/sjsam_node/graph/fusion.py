@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which observations are one landmark: pairs are fused one after the other, and no submap sees a landmark twice.
+"""Fuses observations to landmarks: pairs are fused one after the other, and no submap sees a landmark twice.
 
 The observations of a landmark form a ring, each naming the next one, so that fusing two landmarks costs what these two
 have been seen, however large the map is.
@@ -58,7 +58,7 @@ class Fusion:
         return Fusion(self.landmark_of.copy(), self.following.copy(), self.record_of)
 
     def is_shared(self) -> BoolArray:
-        """Whether each observation's landmark is seen by another submap too, (n,) bool."""
+        """Mask (n,) of observations whose landmark another submap sees too."""
         return np.asarray(self.following != np.arange(len(self.following)))
 
 

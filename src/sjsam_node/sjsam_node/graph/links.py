@@ -11,7 +11,7 @@ from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 
 class Status(Enum):
-    """What the map says of a link's relative pose: it agrees, it cannot tell, or it disagrees."""
+    """Verdict of the map on a link's relative pose: it agrees, it cannot tell, or it disagrees."""
 
     CONSISTENT = "consistent"
     UNINFORMATIVE = "uninformative"
@@ -57,7 +57,7 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known beforehand of ``T`` = T_first_second: covariance (6, 6); None if ``T`` is exact."""
+    """Knowledge beforehand of ``T`` = T_first_second: covariance (6, 6); None if ``T`` is exact."""
 
     T: FloatArray
     covariance: FloatArray | None

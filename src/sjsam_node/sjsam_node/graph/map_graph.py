@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has been joined so far: submaps, the poses between them, and which of their landmarks are the same.
+"""Graph of what has been joined so far: submaps, the poses between them, and which of their landmarks are the same.
 
 *Nodes* are the poses at which submaps start and end (the skeleton of chapter 7). An *observation* is one landmark of
 one submap, numbered through all submaps. *Links* say that observations of two submaps are the same thing; a landmark
@@ -270,9 +270,9 @@ class MapGraph:
         self._fusion, self.component_of = snapshot.fusion.copy(), snapshot.component_of.copy()
 
     def shared(self) -> BoolArray:
-        """Whether each observation's landmark is seen by more than one submap, (observations,) bool."""
+        """Mask (observations,) of those whose landmark more than one submap sees."""
         return self._fusion.is_shared()
 
     def tying(self) -> BoolArray:
-        """Whether each observation is of a variable that ties submaps together, (observations,) bool."""
+        """Mask (observations,) of those of a variable that ties submaps together."""
         return np.bincount(self.variable_of, minlength=len(self.points))[self.variable_of] > 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of the landmarks that submaps share tie them together in the estimate.
+"""Selects which of the landmarks that submaps share tie them together in the estimate.
 
 A few dozen well spread landmarks say nearly all that two submaps can say of each other's pose. The others are the same
 landmarks of the map all the same, but stay marginalised in their submaps (a Gaussian's rows are dropped, which is exact

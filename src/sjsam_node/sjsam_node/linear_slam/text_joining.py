@@ -17,7 +17,7 @@ from sjsam_node.linear_slam.text_maps import Progress, TextMap
 from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.block_problem import BlockProblem, FlatRows, flatten_rows
 from sjsam_node.smoothing.joining import JoiningProblem, map_residual
-from sjsam_node.smoothing.problem import FlatMaps, LocalMap, State, block_rows, flatten
+from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten
 from sjsam_node.smoothing.robust import RobustConfig, RobustJoining, closing_rows
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, euler_from_rotation, rotation_from_euler
@@ -29,7 +29,7 @@ ROWS = ("joint", "block")
 
 @dataclass(frozen=True)
 class TextJoiningConfig(Config):
-    """How text submaps are joined."""
+    """Parameters of joining text submaps."""
 
     rows: str = parameter("joint", "a submap as one Gaussian, or pose and landmarks each on their own", choices=ROWS)
     solver: str = parameter("auto", "sparse solver", choices=BACKENDS)
@@ -153,13 +153,13 @@ class TextJoiner:
         self.flat: FlatMaps | FlatRows = flat
         self.solver, self.start, self.start_cost, self.dropped = "", "", np.nan, 0
 
-    def chained(self) -> State:
-        """Where the maps, each from where it starts, say that everything is."""
+    def chained(self) -> JoiningState:
+        """Poses and features as the maps say, each from where it starts."""
         state = self._blank()
         self._place(state, 0, len(self.index.maps), set())
         return state
 
-    def best(self, progress: Progress | None) -> tuple[State, LeastSquaresResult]:
+    def best(self, progress: Progress | None) -> tuple[JoiningState, LeastSquaresResult]:
         """The lowest optimum, once two ways have led there or none is left; from there robustly, if so configured."""
         self.start, (state, result) = "chained", self.optimize(self.chained())
         self.start_cost = result.initial_cost
@@ -173,7 +173,7 @@ class TextJoiner:
                 break
         return (state, result) if self.config.robust.loss == "none" else self._robust(state)
 
-    def covariances(self, state: State) -> tuple[FloatArray, FloatArray]:
+    def covariances(self, state: JoiningState) -> tuple[FloatArray, FloatArray]:
         """Marginal covariances of every pose and every feature at the optimum."""
         fixed = np.array([0])
         problem = JoiningProblem(flatten(self.maps), state, fixed, self.model, self.config.solver)
@@ -185,7 +185,7 @@ class TextJoiner:
         features = np.arange(len(state.landmarks))
         return poses, marginals.landmark_blocks(features) if len(features) else np.empty((0, d, d))
 
-    def _robust(self, state: State) -> tuple[State, LeastSquaresResult]:
+    def _robust(self, state: JoiningState) -> tuple[JoiningState, LeastSquaresResult]:
         """Without the closing rows that the others contradict."""
         sizes = state.model_dimensions
         joining = RobustJoining(
@@ -196,24 +196,24 @@ class TextJoiner:
         self.maps, self.dropped = found.maps, found.count
         return self._optimize_maps(found.maps, found.state)
 
-    def optimize(self, state: State) -> tuple[State, LeastSquaresResult]:
+    def optimize(self, state: JoiningState) -> tuple[JoiningState, LeastSquaresResult]:
         """The optimum of all maps reached from ``state``."""
         problem = self._problem(len(self.maps), state)
         self.solver = problem.backend
         return problem.optimize(state, self.config.optimizer)
 
-    def _optimize_maps(self, maps: list[LocalMap], state: State) -> tuple[State, LeastSquaresResult]:
+    def _optimize_maps(self, maps: list[LocalMap], state: JoiningState) -> tuple[JoiningState, LeastSquaresResult]:
         """The same maps with other information matrices."""
         problem = JoiningProblem(flatten(maps), state, np.array([0]), self.model, self.config.solver)
         return problem.optimize(state, self.config.optimizer)
 
-    def _problem(self, count: int, state: State) -> JoiningProblem | BlockProblem:
+    def _problem(self, count: int, state: JoiningState) -> JoiningProblem | BlockProblem:
         fixed, maps = np.array([0]), self.flat.first(count)
         if isinstance(maps, FlatRows):
             return BlockProblem(maps, state, fixed, self.model, self.config.solver)
         return JoiningProblem(maps, state, fixed, self.model, self.config.solver)
 
-    def _incremental(self, growth: float, progress: Progress | None) -> State:
+    def _incremental(self, growth: float, progress: Progress | None) -> JoiningState:
         """Place and join a growing part of the maps, by the share ``growth``, so that each starts near its optimum."""
         state, known, done, total = self._blank(), set[tuple[bool, int]](), 0, len(self.index.maps)
         few = LevenbergMarquardtConfig(max_iterations=self.config.step_iterations, relative_tolerance=1e-4)
@@ -226,14 +226,14 @@ class TextJoiner:
                 progress(done, total)
         return state
 
-    def _blank(self) -> State:
+    def _blank(self) -> JoiningState:
         d = self.index.dimension
         poses = len(self.index.pose_ids)
-        return State(
+        return JoiningState(
             np.tile(np.eye(d), (poses, 1, 1)), np.zeros((poses, d)), np.zeros((len(self.index.feature_ids), d))
         )
 
-    def _place(self, state: State, first: int, last: int, known: set[tuple[bool, int]]) -> None:
+    def _place(self, state: JoiningState, first: int, last: int, known: set[tuple[bool, int]]) -> None:
         """Initialise (in place) what the maps ``first`` to ``last`` see for the first time, from where they start."""
         known.add((True, 0))
         for m in self.index.maps[first:last]:
@@ -268,7 +268,7 @@ def _local_values(m: LocalMap, dimension: int) -> tuple[FloatArray, FloatArray, 
     return rotations, poses[:, :dimension], m.mean[size * len(m.poses) :].reshape(-1, dimension)
 
 
-def _pose_values(state: State) -> FloatArray:
+def _pose_values(state: JoiningState) -> FloatArray:
     """Poses as the format writes them: x y phi, or x y z yaw pitch roll."""
     if state.translations.shape[1] == 2:
         angles = np.arctan2(state.rotations[:, 1, 0], state.rotations[:, 0, 0])[:, None]

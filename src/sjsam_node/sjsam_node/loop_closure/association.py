@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which landmarks of two submaps are the same (chapter 4, 7.5 and 9.4.1).
+"""Matches the landmarks of two submaps (chapter 4, 7.5 and 9.4.1).
 
 Three ways, weakest first: *nearest* neighbour within a Euclidean gate (Algorithm 1, as chapter 7 uses it),
 *mahalanobis* with each pair's innovation covariance (Algorithm 2), *joint*, which in addition asks that all pairs
@@ -162,7 +162,7 @@ def jointly_compatible(
 def _compatible(
     first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig
 ) -> tuple[Alignment, float]:
-    """What is left when the worst is dropped until all agree, and how much too sure of themselves the submaps are."""
+    """Pairs left when the worst are dropped until all agree, and how much too sure of themselves the submaps are."""
     scale = 1.0
     while True:
         solved = _solve(first, second, pairs, prior, config)
@@ -189,7 +189,7 @@ def _nis_one_by_one(
 
 
 def variance_factor(nis: FloatArray) -> float:
-    """How much too sure of themselves covariances are, from normalised squared errors of 3 degrees of freedom each.
+    """Factor by which covariances are too small, from normalised squared errors of 3 degrees of freedom each.
 
     The median tells, so that false matches do not: where it is what it should be, or below, the factor is one.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which loop closures the map holds: those that agree with the odometry, with each other, and with the joined map.
+"""Decides which loop closures the map holds: those that agree with the odometry, each other and the joined map.
 
 Two closures over the same stretches of way are compared pairwise by the odometry between them (pairwise consistency,
 Mangelson et al. 2018): of those that exclude each other the set that more landmarks speak for is held. What is held is
@@ -35,7 +35,7 @@ _RELIEF = 0.5
 
 @dataclass(frozen=True)
 class ConsistencyConfig(Config):
-    """What a joined map must look like for a closure to be held."""
+    """Conditions on a joined map for a closure to be held."""
 
     outlier_probability: float = parameter(
         0.99999, "share of true matches that a joined map keeps", minimum=0.9, maximum=0.99999999
@@ -221,7 +221,7 @@ class Consistency:
         return [link for link in self.smoother.graph.links if link.is_closure]
 
     def _are_against_odometry(self, links: Sequence[Link]) -> BoolArray:
-        """Whether each of some links contradicts the odometry between its records."""
+        """Mask of links that contradict the odometry between their records."""
         if not links:
             return np.empty(0, dtype=bool)
         ends = np.array([k.ends for k in links])
@@ -229,7 +229,7 @@ class Consistency:
         return self._are_off(T, np.array([k.T for k in links]), np.array([k.covariance for k in links]), way)
 
     def _excluded(self, one: Link, others: Sequence[Link]) -> BoolArray:
-        """Whether each of some links says something else than ``one`` of the same two stretches of way."""
+        """Mask of links that say something else than ``one`` of the same two stretches of way."""
         if not others:
             return np.empty(0, dtype=bool)
         out = np.zeros(len(others), dtype=bool)
@@ -243,7 +243,7 @@ class Consistency:
         return out
 
     def _are_off(self, T: FloatArray, T_claimed: FloatArray, covariance: FloatArray, way: FloatArray) -> BoolArray:
-        """Whether each claimed pose (n, 4, 4) is further from ``T`` than odometry drifts on a ``way`` (n,) m.
+        """Mask of claimed poses (n, 4, 4) further from ``T`` than odometry drifts on a ``way`` (n,) m.
 
         Not where ``T`` is NaN.
         """
@@ -276,7 +276,7 @@ class Consistency:
         return outweighed and self._excess((rise - known) / self.config.view_change, dof, newest) <= 0.0
 
     def _excess(self, rise: float, dof: int, newest: int) -> float:
-        """How far chi2 rose above what true matches explain.
+        """Rise of chi2 above what true matches explain.
 
         Submaps that are too sure of themselves make every closure look bad: the bound is in units of the map's own
         variance factor (Baarda 1968), never below one.
@@ -360,7 +360,7 @@ class Consistency:
         return replace(link, pairs=kept) if len(kept) >= 3 or not link.is_closure else None
 
     def _verdict(self, added: Sequence[Link], offered: Sequence[Link]) -> Verdict:
-        """What became of the links there were, of which ``added`` are new."""
+        """Verdict on the links there were, of which ``added`` are new."""
         held = {(k.ends, k.is_closure): k for k in self.smoother.graph.links}
         left = sum(len(k.pairs) for k in held.values())
         accepted = tuple(k for k in added if (k.ends, True) in held)
@@ -369,5 +369,5 @@ class Consistency:
 
 
 def _is_in(link: Link, links: Iterable[Link]) -> bool:
-    """Whether a link between the same two records is among others."""
+    """True if a link between the same two records is among others."""
     return any(k.ends == link.ends for k in links)

@@ -44,7 +44,7 @@ class LoopDetector:
 
     @property
     def graph(self) -> MapGraph:
-        """Where links are looked for."""
+        """Graph in which links are looked for."""
         return self.smoother.graph
 
     def sequential(self, chain: list[int], new: int) -> list[Link]:
@@ -131,7 +131,7 @@ class LoopDetector:
         )  # fmt: skip
 
     def _verified(self, pairs: list[tuple[int, int]], known: Novelty, *, by_looks: bool = True) -> list[Link]:
-        """What geometry and the map say of pairs of records, but for those of which nothing new can be learnt."""
+        """Links between pairs of records that geometry and the map support; none that tell nothing new."""
         out: list[Link] = []
         for old, new in pairs:
             if known.is_all_known(old, new):
@@ -174,7 +174,7 @@ class LoopDetector:
 
 
 def _same_loop(graph: MapGraph, a: Link, b: Link) -> bool:
-    """Whether two links between the same parts of the map move the second part alike, within what both claim."""
+    """True if two links between the same parts of the map move the second part alike, within what both claim."""
     if (graph.component(a.first), graph.component(a.second)) != (
         graph.component(b.first),
         graph.component(b.second),
@@ -196,7 +196,7 @@ def _same_loop(graph: MapGraph, a: Link, b: Link) -> bool:
 
 
 def _movement(graph: MapGraph, link: Link) -> FloatArray:
-    """How a link would move the part of the map that its second record is in."""
+    """Movement (4, 4) that a link asks of the part of the map that its second record is in."""
     T_first, T_second = (graph.poses[graph.records[i].start] for i in (link.first, link.second))
     return np.asarray(T_first @ link.T @ invert_transform(T_second))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which submaps the map says are near each other and have not been compared there yet.
+"""Finds submaps that are near each other in the map and have not been compared there yet.
 
 A new submap is compared with the old ones around it where the map then believes it to be. Later closures move it, and
 whole parts of the map that nothing tied together come to lie side by side: pairs that have become near, or have moved
@@ -64,7 +64,7 @@ class Compared:
         self.codes, self.seen = self.codes[kept], self.seen[kept]
 
     def where(self, pairs: IntArray) -> FloatArray:
-        """Where each of some pairs (k, 2) was seen, (k, 3); infinitely far where it was not compared."""
+        """Places (k, 3) at which pairs (k, 2) were seen; infinitely far for one that was not compared."""
         codes = _codes(pairs)
         at = np.searchsorted(self.codes, codes)
         known = np.append(self.codes, -1)[at] == codes

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether comparing two submaps can tell anything that the map does not know.
+"""Judges whether comparing two submaps can tell anything that the map does not know.
 
 Where many laps or agents went, a new submap lies beside many old ones that see the same landmarks. Once it is linked to
 one of them, those of its landmarks that the others see too are theirs already. Comparing it with these as well would
@@ -20,7 +20,7 @@ from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 @dataclass
 class Novelty:
-    """What the map and the links found so far, not in the map yet, say of the landmarks that submaps see.
+    """Landmarks that submaps see by the map and by the links found so far, not in the map yet.
 
     enough: landmarks in common that tie two submaps. threshold: least scalar product of descriptors, and reach (m):
     largest distance, of two landmarks that may be the same.
@@ -41,11 +41,11 @@ class Novelty:
         self._poses[link.second] = self._pose(link.first) @ link.T
 
     def is_known(self, record: int) -> bool:
-        """Whether a link of this record to older ones was noted."""
+        """True if a link of this record to older ones was noted."""
         return record in self._poses
 
     def is_all_known(self, first: int, second: int) -> bool:
-        """Whether two submaps are tied already, and no others of their landmarks may be the same."""
+        """True if two submaps are tied already, and no others of their landmarks may be the same."""
         one, other = self._seen(first), self._seen(second)
         old, new = ~np.isin(one, other), ~np.isin(other, one)
         if len(new) - int(np.count_nonzero(new)) < self.enough:

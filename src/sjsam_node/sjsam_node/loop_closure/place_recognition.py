@@ -140,7 +140,7 @@ class PlaceIndex:
 
 
 def _likeness(first: Descriptors, second: Descriptors) -> float:
-    """How well the descriptors of the second place find a counterpart in the first."""
+    """Likeness of two places: how well the second one's descriptors find a counterpart in the first."""
     if not len(first) or not len(second):
         return 0.0
     return float(np.clip((first @ second.T).max(axis=0) - 0.5, 0.0, None).sum())

@@ -31,7 +31,7 @@ from slam_core.rigid_alignment import ransac_rigid_transform
 
 @dataclass(frozen=True)
 class ClosureConfig(Config):
-    """What a link between submaps must show before it is believed."""
+    """Conditions on a link between submaps for it to be believed."""
 
     window: int = parameter(3, "submaps back along the agent's path that a new one is linked to directly", minimum=1)
     proximity: float = parameter(
@@ -149,7 +149,7 @@ class Verifier:
         return max(3, self.config.min_inliers // 2)
 
     def is_alike(self, first: PointSet, second: PointSet) -> bool:
-        """Whether descriptors alone leave a chance, before anything dearer is asked."""
+        """True if descriptors alone leave a chance; asked before anything dearer."""
         return len(self._distinct_pairs(first, second)) >= self._few_pairs
 
     def _distinct_pairs(self, first: PointSet, second: PointSet) -> IntArray:

@@ -17,7 +17,7 @@ import numpy as np
 from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.joining import solved_covariance, variable_scalars
 from sjsam_node.smoothing.layout import Layout, make_layout
-from sjsam_node.smoothing.problem import FlatMaps, LocalMap, State, flatten
+from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, flatten
 from sjsam_node.smoothing.sighting_kernels import KERNELS, counting_order, pair_positions, pose_pairs
 from slam_core.geometry import FloatArray
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
@@ -82,7 +82,7 @@ class BlockProblem:
     Unknowns are ordered poses first, then landmarks; parameters as there.
     """
 
-    def __init__(self, rows: FlatRows, state: State, fixed: IntArray, model: int, backend: str = "auto") -> None:
+    def __init__(self, rows: FlatRows, state: JoiningState, fixed: IntArray, model: int, backend: str = "auto") -> None:
         self.model, d = model, state.translations.shape[1]
         self._kernels = KERNELS[d]
         poses, landmarks = len(state.translations), len(state.landmarks)
@@ -115,13 +115,13 @@ class BlockProblem:
         """The solver that runs."""
         return self.factor.backend
 
-    def cost(self, state: State) -> float:
+    def cost(self, state: JoiningState) -> float:
         """chi2 of the rows."""
         arrays = state.rotations, state.translations, state.landmarks
         poses = kernels.joint_cost(self.model, self.odometry, *arrays)
         return float(poses + self._kernels.cost(self.sightings, *arrays))
 
-    def linearize(self, state: State) -> FloatArray:
+    def linearize(self, state: JoiningState) -> FloatArray:
         """Gradient over poses and landmarks; keeps the blocks that the Schur complement is made of."""
         self._values[:] = 0.0
         self._gradient[:] = 0.0
@@ -145,7 +145,7 @@ class BlockProblem:
         self._kernels.reduce(self.sightings, self._pair_ptr, self._pair, self._stride, self._v, self._F, values)
         return self.factor.factorize(values)
 
-    def gradient(self, state: State) -> FloatArray:
+    def gradient(self, state: JoiningState) -> FloatArray:
         """Gradient alone over poses and landmarks."""
         out = np.zeros_like(self._gradient)
         arrays = state.rotations, state.translations, state.landmarks
@@ -162,17 +162,17 @@ class BlockProblem:
         self._kernels.recover(self.sightings, offset, n, self._v, self._K, self._F, right, step)
         return step
 
-    def retract(self, state: State, step: FloatArray) -> State:
+    def retract(self, state: JoiningState, step: FloatArray) -> JoiningState:
         """The state moved by ``step``."""
         return state.retract(self.layout.pose_offset, self._landmark_offset, step)
 
     def optimize(
-        self, state: State, config: LevenbergMarquardtConfig | None = None
-    ) -> tuple[State, LeastSquaresResult]:
+        self, state: JoiningState, config: LevenbergMarquardtConfig | None = None
+    ) -> tuple[JoiningState, LeastSquaresResult]:
         """The optimum reached from ``state``."""
         return levenberg_marquardt(self, state, config)
 
-    def columns(self, state: State, poses: IntArray) -> FloatArray:
+    def columns(self, state: JoiningState, poses: IntArray) -> FloatArray:
         """Joint covariance of a few poses, linearised at ``state``.
 
         Raises
@@ -202,7 +202,7 @@ def _diagonal_blocks(A: FloatArray, first: int, d: int) -> FloatArray:
 
 
 def _coupled(odometry: FlatMaps, pose: IntArray, landmark: IntArray, poses: int, landmarks: int) -> FlatMaps:
-    """Which poses are coupled: the odometry's maps, then one without values for every two that share a landmark."""
+    """Coupled poses: the odometry's maps, then one without values for every two that share a landmark."""
     landmark_ptr, by_landmark = counting_order(landmark, landmarks)
     pose_ptr, by_pose = counting_order(pose, poses)
     first, second = pose_pairs(landmark_ptr, by_landmark, pose_ptr, by_pose, pose, landmark)

@@ -17,7 +17,7 @@ from sjsam_node.graph.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.joining import JoiningProblem, map_residual
 from sjsam_node.smoothing.parking import Parked
-from sjsam_node.smoothing.problem import LocalMap, State, block_rows, flatten
+from sjsam_node.smoothing.problem import JoiningState, LocalMap, block_rows, flatten
 from sjsam_node.smoothing.regions import Region
 from sjsam_node.smoothing.robust import RobustConfig, RobustJoining, closing_rows, predicted
 from slam_core.config import Config, group, parameter
@@ -29,7 +29,7 @@ from slam_core.linear_algebra.sparse_cholesky import BACKENDS, IntArray
 
 @dataclass(frozen=True)
 class EstimatorConfig(Config):
-    """How the joining problem is posed and solved."""
+    """Parameters of the joining problem and its solver."""
 
     rows: str = parameter(
         "joint", "noise of a submap: its joint covariance, or per landmark", choices=("joint", "block")
@@ -47,7 +47,7 @@ class EstimatorConfig(Config):
 
     @property
     def linearises(self) -> bool:
-        """Whether submaps may be joined to larger ones: at the optimum, and with all their rows."""
+        """True if submaps may be joined to larger ones: at the optimum, and with all their rows."""
         return self.robust.loss == "none" and self.iterations > 1
 
 
@@ -98,7 +98,7 @@ class Assembled:
     reduced: list[ReducedMap]
     maps: list[LocalMap]
     problem: JoiningProblem
-    state: State
+    state: JoiningState
     dropped: list[IntArray]
     parked: Parked = field(default_factory=Parked)
 
@@ -158,7 +158,7 @@ class Estimator:
             *(region.local_map(graph, nodes, landmarks) for region in regions),
         ]
         poses = graph.poses[nodes]
-        state = State(
+        state = JoiningState(
             np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), graph.points[landmarks]
         )
         anchor = np.searchsorted(nodes, [graph.oldest(component).start])
@@ -211,12 +211,12 @@ class Estimator:
         return replace(assembled, state=state), result
 
     def _robust(
-        self, assembled: Assembled, state: State, optimizer: LevenbergMarquardtConfig
-    ) -> tuple[State, LeastSquaresResult, Assembled]:
+        self, assembled: Assembled, state: JoiningState, optimizer: LevenbergMarquardtConfig
+    ) -> tuple[JoiningState, LeastSquaresResult, Assembled]:
         """Without the rows that the others contradict; the order of the variables stays."""
         problem, maps = assembled.problem, assembled.maps
 
-        def solve(weighted: list[LocalMap], start: State) -> State:
+        def solve(weighted: list[LocalMap], start: JoiningState) -> JoiningState:
             problem.maps = flatten(weighted)
             return problem.optimize(start, optimizer)[0]
 
@@ -255,7 +255,7 @@ def local_residual(graph: MapGraph, record: Record, reduced: ReducedMap) -> Floa
     """Residual ``h [-] z`` (m,) of a record at the graph's estimate."""
     poses = graph.poses[[record.start, record.end]]
     points = graph.points[graph.variable_of[record.observations[reduced.shared]]]
-    state = State(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), points)
+    state = JoiningState(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), points)
     local = LocalMap(0, np.array([1]), np.arange(len(points)), reduced.mean, reduced.information)
     return map_residual(kernels.TANGENT, local, state)
 

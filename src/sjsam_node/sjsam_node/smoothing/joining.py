@@ -18,7 +18,7 @@ import numpy as np
 
 from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.layout import Layout, make_layout
-from sjsam_node.smoothing.problem import FlatMaps, LocalMap, State
+from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap
 from slam_core.geometry import FloatArray
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
 from slam_core.linear_algebra.block_pattern import IntArray
@@ -53,7 +53,7 @@ class JoiningProblem:
     def __init__(
         self,
         maps: FlatMaps,
-        state: State,
+        state: JoiningState,
         fixed: IntArray,
         model: int,
         backend: str = "auto",
@@ -68,7 +68,7 @@ class JoiningProblem:
         self._sizes = state.model_dimensions
         pattern = self.layout.pattern
         self._values, self._gradient = np.zeros(int(pattern.value_ptr[-1])), np.zeros(pattern.n)
-        self._factorized: State | None = None
+        self._factorized: JoiningState | None = None
         self._damping = np.inf
 
     @property
@@ -76,11 +76,11 @@ class JoiningProblem:
         """The solver that runs."""
         return self.factor.backend
 
-    def cost(self, state: State) -> float:
+    def cost(self, state: JoiningState) -> float:
         """chi2: sum over the local maps of ``r^T information r + 2 pull^T r``, and the constant."""
         return self._constant + float(kernels.joint_cost(self.model, self.maps, *_arrays(state)))
 
-    def linearize(self, state: State) -> FloatArray:
+    def linearize(self, state: JoiningState) -> FloatArray:
         """Normal equations at ``state``."""
         self._values[:] = 0.0
         self._gradient[:] = 0.0
@@ -99,7 +99,7 @@ class JoiningProblem:
         self._damping = damping
         return self.factor.solve(-self._gradient)
 
-    def gradient(self, state: State) -> FloatArray:
+    def gradient(self, state: JoiningState) -> FloatArray:
         """Gradient alone at ``state``."""
         self._gradient[:] = 0.0
         kernels.joint_gradient(self.model, self.maps, *_arrays(state), self.layout.scatter, self._gradient)
@@ -109,13 +109,13 @@ class JoiningProblem:
         """Step for this gradient with the last factor."""
         return self.factor.solve(-gradient)
 
-    def retract(self, state: State, step: FloatArray) -> State:
+    def retract(self, state: JoiningState, step: FloatArray) -> JoiningState:
         """The state moved by ``step``."""
         return state.retract(self.layout.pose_offset, self.layout.landmark_offset, step)
 
     def optimize(
-        self, state: State, config: LevenbergMarquardtConfig | None = None, *, keep_factor: bool = False
-    ) -> tuple[State, LeastSquaresResult]:
+        self, state: JoiningState, config: LevenbergMarquardtConfig | None = None, *, keep_factor: bool = False
+    ) -> tuple[JoiningState, LeastSquaresResult]:
         """The optimum reached from ``state``.
 
         ``keep_factor``: its covariances are to be those of the last factor, which is linearised where the last step
@@ -126,7 +126,7 @@ class JoiningProblem:
             self._factorized = state
         return state, result
 
-    def columns(self, state: State, poses: IntArray) -> FloatArray:
+    def columns(self, state: JoiningState, poses: IntArray) -> FloatArray:
         """Joint covariance of a few poses, linearised at ``state``."""
         self._factorize_at(state)
         return solved_covariance(self.factor, self.scalars(poses, np.empty(0, dtype=np.int64)))
@@ -135,12 +135,12 @@ class JoiningProblem:
         """Scalar unknowns of poses and landmarks, in order; -1 for fixed ones."""
         return variable_scalars(self.layout, self._sizes, poses, landmarks)
 
-    def marginal_information(self, state: State, scalars: IntArray) -> FloatArray:
+    def marginal_information(self, state: JoiningState, scalars: IntArray) -> FloatArray:
         """Marginal information matrix of the variables to eliminate ``last``, at ``state``."""
         self._factorize_at(state)
         return self.factor.marginal_information(scalars)
 
-    def newton_step(self, state: State) -> tuple[FloatArray, float]:
+    def newton_step(self, state: JoiningState) -> tuple[FloatArray, float]:
         """The step from ``state`` to the optimum of the problem linearised there, and the cost promised for it.
 
         Raises
@@ -152,7 +152,7 @@ class JoiningProblem:
         step = self.factor.solve(-self._gradient)
         return step, self.cost(state) + float(self._gradient @ step)
 
-    def marginals(self, state: State) -> Marginals:
+    def marginals(self, state: JoiningState) -> Marginals:
         """Exact marginal covariances, linearised at ``state``.
 
         Raises
@@ -163,7 +163,7 @@ class JoiningProblem:
         self._factorize_at(state)
         return Marginals(self.layout, state.model_dimensions, self.factor, self.factor.inverse_entries())
 
-    def _factorize_at(self, state: State) -> None:
+    def _factorize_at(self, state: JoiningState) -> None:
         if self._factorized is state:
             return
         self.linearize(state)
@@ -172,7 +172,7 @@ class JoiningProblem:
         self._factorized = state
 
 
-def map_residual(model: int, m: LocalMap, state: State) -> FloatArray:
+def map_residual(model: int, m: LocalMap, state: JoiningState) -> FloatArray:
     """Error ``h [-] z`` (m,) of one local map at a state."""
     d = state.translations.shape[1]
     angles = 1 if d == 2 else 3
@@ -184,7 +184,7 @@ def map_residual(model: int, m: LocalMap, state: State) -> FloatArray:
     return residual
 
 
-def _arrays(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _arrays(state: JoiningState) -> tuple[FloatArray, FloatArray, FloatArray]:
     return state.rotations, state.translations, state.landmarks
 
 

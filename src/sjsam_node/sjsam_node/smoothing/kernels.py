@@ -301,7 +301,7 @@ def scatter_dense(f, H, g, scatter, values, gradient):
 
 @njit(cache=True, nogil=True)
 def retract(R, t, points, pose_offset, landmark_offset, step, R_out, t_out, points_out):
-    """State moved by ``step``; an offset of -1 stays."""
+    """JoiningState moved by ``step``; an offset of -1 stays."""
     d = t.shape[1]
     a = 1 if d == 2 else 3
     E = np.empty((d, d))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where each variable stands in the normal equations: the symbolic part of the joining problem.
+"""Layout of the variables in the normal equations: the symbolic part of the joining problem.
 
 Landmarks that are seen by exactly the same local maps have the same neighbours in the elimination graph. They form one
 *group*: ordering and symbolic factorisation then work on a few groups per local map instead of on every landmark. A
@@ -20,7 +20,7 @@ from slam_core.linear_algebra.sparse_cholesky import elimination_order
 
 
 class Scatter(NamedTuple):
-    """Where each local map's normal equations go, as ``kernels.joint_linearize`` reads it.
+    """Places of each local map's normal equations, as ``kernels.joint_linearize`` reads them.
 
     An *item* is a pose or landmark of a local map: it belongs to one of the map's local groups, at an offset, with a
     width. For every pair of local groups (first >= second): the position of its first entry among the stored values

@@ -72,7 +72,7 @@ class Parked:
 
 
 def is_tied(graph: MapGraph, record: int) -> bool:
-    """Whether a record is tied to submaps that are not redundant by enough landmarks of its own."""
+    """True if a record is tied to submaps that are not redundant by enough landmarks of its own."""
     variables = graph.variable_of[graph.records[record].observations]
     owner = graph.record_of[variables]
     return int(np.count_nonzero((owner != record) & ~graph.redundant[owner])) >= _ENOUGH

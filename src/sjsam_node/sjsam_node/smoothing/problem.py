@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is joined: local maps, each one Gaussian in the frame of its reference pose, and the state they share."""
+"""Input of joining: local maps, each one Gaussian in the frame of its reference pose, and the state they share."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _joined(parts: Sequence[Any], dtype: type) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class JoiningState:
     """Poses as rotations (P, d, d) and translations (P, d), landmarks (L, d), d = 2 or 3, all in the map frame."""
 
     rotations: FloatArray
@@ -101,9 +101,11 @@ class State:
         """Dimensions of a pose (3 or 6) and of a landmark (2 or 3)."""
         return (3, 2) if self.translations.shape[1] == 2 else (6, 3)
 
-    def retract(self, pose_offset: IntArray, landmark_offset: IntArray, step: FloatArray) -> State:
+    def retract(self, pose_offset: IntArray, landmark_offset: IntArray, step: FloatArray) -> JoiningState:
         """The state moved by ``step``, variables found at the given offsets (-1 stays)."""
-        out = State(np.empty_like(self.rotations), np.empty_like(self.translations), np.empty_like(self.landmarks))
+        out = JoiningState(
+            np.empty_like(self.rotations), np.empty_like(self.translations), np.empty_like(self.landmarks)
+        )
         kernels.retract(
             self.rotations, self.translations, self.landmarks, pose_offset, landmark_offset, step,
             out.rotations, out.translations, out.landmarks,

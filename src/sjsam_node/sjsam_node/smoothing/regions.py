@@ -20,7 +20,7 @@ import scipy.sparse.csgraph
 from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.joining import JoiningProblem
-from sjsam_node.smoothing.problem import LocalMap, State, flatten
+from sjsam_node.smoothing.problem import JoiningState, LocalMap, flatten
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
 from slam_core.linear_algebra.sparse_cholesky import IntArray
@@ -36,7 +36,7 @@ LocalMaps = Callable[[MapGraph, list[int], IntArray, IntArray], list[LocalMap]]
 
 @dataclass(frozen=True)
 class RegionConfig(Config):
-    """Which submaps of a large map are joined to larger ones until a closure needs them."""
+    """Parameters of condensing: which submaps are joined to larger ones until a closure needs them."""
 
     size: int = parameter(96, "submaps that are joined to a larger one, at most", minimum=2)
     open: int = parameter(64, "submaps of a component that take part in each update one by one, about", minimum=2)
@@ -100,7 +100,7 @@ class Region:
     redundancy: int
 
     def holds(self, graph: MapGraph, sightings: IntArray, uses: IntArray, anchor: int) -> bool:
-        """Whether the rest of the map knows no more of it than when it was joined, and what it knows is still apart.
+        """True if the rest of the map knows no more of it than when it was joined, and what it knows is still apart.
 
         ``sightings`` of every observation's landmark, ``uses`` of every node, the ``anchor`` of the component.
         """
@@ -209,7 +209,7 @@ class Regions:
 
 
 def _tied(graph: MapGraph, records: IntArray) -> IntArray:
-    """Which of some records hang together by nodes or enough landmarks: a label for each."""
+    """Label for each of some records: equal for those that hang together by nodes or enough landmarks."""
     observations = np.concatenate([graph.records[i].observations for i in records])
     rows, seen = np.searchsorted(records, graph.record_of[observations]), graph.variable_of[observations]
     B = scipy.sparse.csr_matrix((np.ones(len(rows)), (rows, seen)), (len(records), len(graph.points)))
@@ -225,12 +225,12 @@ def _tied(graph: MapGraph, records: IntArray) -> IntArray:
 
 
 def _sightings(graph: MapGraph) -> IntArray:
-    """How many observations the landmark of each observation has."""
+    """Number of observations of each observation's landmark."""
     return np.asarray(np.bincount(graph.variable_of, minlength=len(graph.points))[graph.variable_of])
 
 
 def _uses(graph: MapGraph) -> IntArray:
-    """How many submaps start or end at each node; at the end of a way it counts as one more, that may come."""
+    """Number of submaps that start or end at each node; one more at the end of a way, that may come."""
     ends = np.array([(r.start, r.end) for r in graph.records], dtype=np.int64).reshape(-1, 2)
     uses = np.bincount(ends.ravel(), minlength=len(graph.poses))
     open_end = np.ones(len(uses), dtype=bool)
@@ -252,7 +252,7 @@ def join(graph: MapGraph, records: IntArray, component: int, local_maps: LocalMa
     shared = landmarks[sightings[observations[first]] > 1]
     T_reference = invert_transform(graph.poses[reference])
     poses, points = T_reference @ graph.poses[nodes], transform_points(T_reference, graph.points)
-    state = State(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), points[shared])
+    state = JoiningState(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), points[shared])
     maps = local_maps(graph, records.tolist(), nodes, shared)
     at_separator, kept = np.searchsorted(nodes, separator), np.searchsorted(shared, landmarks[known])
     rows = 6 * len(separator) + 3 * len(kept)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sjsam_node.smoothing.problem import LocalMap, State
+from sjsam_node.smoothing.problem import JoiningState, LocalMap
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.least_squares import chi_square_bound
@@ -30,13 +30,13 @@ _STEPS = 8
 _SETTLING = 3
 """Rounds with the wanted bound."""
 
-Residual = Callable[[LocalMap, State], FloatArray]
-Solve = Callable[[list[LocalMap], State], State]
+Residual = Callable[[LocalMap, JoiningState], FloatArray]
+Solve = Callable[[list[LocalMap], JoiningState], JoiningState]
 
 
 @dataclass(frozen=True)
 class RobustConfig(Config):
-    """What becomes of closures that the rest of the map contradicts."""
+    """Treatment of closures that the rest of the map contradicts."""
 
     loss: str = parameter("none", "loss of rows that close something", choices=LOSSES)
     probability: float = parameter(
@@ -108,7 +108,7 @@ class RobustResult:
     landmarks these are.
     """
 
-    state: State
+    state: JoiningState
     maps: list[LocalMap]
     dropped: list[IntArray]
     count: int
@@ -126,7 +126,7 @@ class RobustJoining:
         self.maps, self.rows, self.config = maps, rows, config
         self._residual, self._solve = residual, solve
 
-    def run(self, state: State) -> RobustResult:
+    def run(self, state: JoiningState) -> RobustResult:
         """From the state that plain least squares found."""
         worst = max(self._worst(state), 1.0)
         schedule = worst ** (1.0 - np.arange(1, _STEPS + 1) / _STEPS)
@@ -140,7 +140,7 @@ class RobustJoining:
     def _bound(self, dof: int) -> float:
         return chi_square_bound(self.config.probability, dof)
 
-    def _worst(self, state: State) -> float:
+    def _worst(self, state: JoiningState) -> float:
         """Largest error of any closing row, in units of its bound."""
         worst = 0.0
         for m, rows in zip(self.maps, self.rows, strict=True):
@@ -149,7 +149,7 @@ class RobustJoining:
                 worst = max(worst, normalized_error(m.information, residual, r) / self._bound(len(r)))
         return worst
 
-    def _weighted(self, k: int, state: State, excess: float) -> LocalMap:
+    def _weighted(self, k: int, state: JoiningState, excess: float) -> LocalMap:
         """A map whose closing rows have the weights of the loss, its bound ``excess`` times as wide.
 
         First each row, then all of them together, which may agree among themselves and be wrong.
@@ -163,7 +163,7 @@ class RobustJoining:
                 information = widened(information, rows, w)
         return replace(self.maps[k], information=0.5 * (information + information.T))
 
-    def _decided(self, k: int, state: State) -> tuple[LocalMap, IntArray]:
+    def _decided(self, k: int, state: JoiningState) -> tuple[LocalMap, IntArray]:
         """A map without the rows that are beyond their bound, worst first, and these rows."""
         m, left, dropped = self.maps[k], list(self.rows[k]), [np.empty(0, dtype=np.int64)]
         information, residual = m.information, self._residual(m, state)

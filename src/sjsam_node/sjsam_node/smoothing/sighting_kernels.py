@@ -329,7 +329,7 @@ KERNELS = {2: make_kernels(2), 3: make_kernels(3)}
 
 @njit(cache=True, nogil=True)
 def counting_order(keys, count):
-    """Where each of the keys 0 ... count - 1 starts in the stable order that sorts ``keys``, and that order."""
+    """Start of each of the keys 0 ... count - 1 in the stable order that sorts ``keys``, and that order."""
     ptr = np.zeros(count + 1, np.int64)
     for key in keys:
         ptr[key + 1] += 1
@@ -365,7 +365,7 @@ def pose_pairs(landmark_ptr, by_landmark, pose_ptr, by_pose, pose, landmark):
 
 @njit(cache=True, nogil=True)
 def pair_positions(landmark_ptr, landmark, pose, pose_ptr, by_pose, block, column_ptr, rows, base):
-    """Where the block of each pair of sightings starts among the sparse values.
+    """Start of the block of each pair of sightings among the sparse values.
 
     Of every sighting and those behind it of the same landmark (sorted by elimination); -1 for fixed poses. ``block``
     (P,) is a pose's block, -1 for a fixed one.

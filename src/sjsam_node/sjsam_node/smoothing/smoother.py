@@ -30,7 +30,7 @@ from slam_core.geometry import FloatArray, compose_covariance
 
 @dataclass(frozen=True)
 class SmootherConfig(Config):
-    """How the estimate is kept."""
+    """Parameters of keeping the estimate."""
 
     settled_work: float = parameter(
         3e7, "entries of the submaps' information matrices up to which a map settles with all its landmarks",
@@ -61,7 +61,7 @@ class UpdateResult:
 
     @property
     def variance_factor(self) -> float:
-        """How much larger the errors of the submaps are than they claim; never below one.
+        """Factor by which the errors of the submaps are larger than they claim; never below one.
 
         Submaps that agree better than they should are not made surer.
         """
@@ -231,7 +231,7 @@ class Smoother:
     # -- reading -------------------------------------------------------------------------------------------------------
 
     def result(self, component: int) -> UpdateResult:
-        """What the last update of a component said."""
+        """Result of the last update of a component."""
         return self._solved[component].result
 
     def assembled(self, component: int) -> Assembled:
@@ -251,7 +251,7 @@ class Smoother:
         return solved.marginals
 
     def relative_pose(self, first: int, second: int) -> Prior | None:
-        """What the map knows of T_first_second (starts of two records, the second one the newer).
+        """Estimate of T_first_second (starts of two records, the second one the newer).
 
         None across components. What the last factor does not hold counts with its odometry alone, which is never too
         sure.
