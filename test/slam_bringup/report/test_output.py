@@ -76,6 +76,7 @@ def test_all_files_are_written_and_agree(result, tmp_path):
     html = (tmp_path / "report.html").read_text()
     assert "&lt;lost&gt;" in html
     assert html.count("data:image/png;base64") == 8
+    assert html.count("<iframe") == 1, "the model, to be turned"
 
 
 def test_the_same_result_gives_the_same_bytes(result, tmp_path):

@@ -12,6 +12,7 @@ import pytest
 import trimesh
 
 from browser import Browser, find_chromium
+from dense_mapping.decimation import at_most
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from slam_bringup.viewer.page import AgentRow, ViewerPage
@@ -108,13 +109,12 @@ def test_the_page_has_no_link_to_another_host():
 
 
 def test_a_large_mesh_is_made_coarser_not_torn():
-    from slam_bringup.viewer.page import _coarser
-
     fine = hill()
-    points, faces, colours = _coarser(fine, 0.3)
-    assert len(faces) < len(fine.faces) / 2
-    assert len(colours) == len(points)
-    area = trimesh.Trimesh(points, faces, process=False).area
+    coarse = at_most(fine, len(fine.faces) // 2)
+    assert len(fine.faces) / 8 < len(coarse.faces) <= len(fine.faces) / 2
+    assert len(coarse.colours) == len(coarse.normals) == len(coarse.points)
+    assert at_most(fine, 10**6) is fine
+    area = trimesh.Trimesh(coarse.points, coarse.faces, process=False).area
     assert abs(area / trimesh.Trimesh(fine.points, fine.faces, process=False).area - 1.0) < 0.2
 
 

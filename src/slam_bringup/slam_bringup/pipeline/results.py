@@ -100,6 +100,8 @@ class RunResult:
     solver: str = ""
     failure: str = ""
     backlog: Mapping[str, int] = field(default_factory=dict)
+    changed: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters that are not at their defaults."""
 
 
 def summarise(result: RunResult) -> dict[str, Any]:
@@ -131,6 +133,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         "solver": result.solver,
         "failure": result.failure,
+        "changed_parameters": dict(result.changed),
         "events": list(result.events),
         **_accuracy(first, first.trajectory),
     }

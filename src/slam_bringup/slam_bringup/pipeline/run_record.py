@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.dense_run import dense_model
 from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_bringup.pipeline.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
+from slam_core.config import iterate_parameters
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
@@ -162,6 +164,7 @@ def run_result(
         solver=record.solver,
         failure=failure,
         backlog=record.backlog,
+        changed=_changed(config),
     )
 
 
@@ -201,6 +204,12 @@ def _sensors(bag: SensorBag, config: SystemConfig, agent: str, odometry: str) ->
         if wanted and role in topics and name not in used:
             used.append(f"{name} for the dense model alone")
     return tuple(used)
+
+
+def _changed(config: SystemConfig) -> dict[str, Any]:
+    """Parameters that are not at their defaults, by node and name."""
+    defaults = {name: value for name, value, _ in iterate_parameters(SystemConfig())}
+    return {name: value for name, value, _ in iterate_parameters(config) if value != defaults[name]}
 
 
 def _mounts(bag: SensorBag, agent: str) -> dict[str, FloatArray]:

@@ -10,6 +10,8 @@ own ``trajectory_<agent>.tum``; ``trajectory.tum`` is then the first one's.
 from __future__ import annotations
 
 import json
+import shlex
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +26,7 @@ from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult, s
 from slam_bringup.report.figures import map_figure, save_png
 from slam_bringup.report.foxglove import write_layout
 from slam_bringup.report.report import write_report
+from slam_bringup.version import VERSION
 from slam_core.files import atomic_text
 from slam_core.point_cloud import write_ply
 from slam_core.process_life import STARTED_S
@@ -48,13 +51,19 @@ def write_results(out: Path, result: RunResult, save_map: Callable[[Path], objec
         write_layout(out / "foxglove_layout.json", out / "result.mcap")
     if save_map is not None:
         save_map(out / "map")
-    summary = summarise(result)
+    summary = summarise(result) | _made()
     save_png(out / "map.png", map_figure(result))
     map_png = (out / "map.png").read_bytes()  # drawn once: it is the dearest of the figures
     write_report(out / "report.html", result, summary | _in_all(result), map_png)
     summary |= _in_all(result)
     atomic_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
     return summary
+
+
+def _made() -> dict[str, str]:
+    """By what, how and when the results were made."""
+    command = shlex.join(["slam", *sys.argv[1:]])
+    return {"version": VERSION, "command": command, "date": time.strftime("%Y-%m-%d %H:%M:%S %z")}
 
 
 def _in_all(result: RunResult) -> dict[str, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,16 @@ import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 
-from slam_bringup.pipeline.results import RunResult
+from slam_bringup.pipeline.frame_log import LoggedFrame
+from slam_bringup.pipeline.results import AgentResult, RunResult
 from slam_bringup.report.agent_figures import motion_figure, side_view, sigma_figure
 from slam_bringup.report.figures import error_figure, features_figure, floor_plan_figure, timing_figure
+from slam_bringup.report.scene3d import scene_page
+from slam_bringup.report.structure_figures import sparsity_figure, submaps_figure
 from slam_core.evaluation import Evaluation
 from slam_core.files import atomic_text
 
+_PICTURES = 6
 _DISHONEST = 1.6
 """Factor between errors and claimed sigmas from which the report warns."""
 
@@ -39,6 +44,7 @@ def write_report(path: Path, result: RunResult, summary: dict[str, Any], map_png
             "sigmas": _embedded(sigma_figure(agent)),
             "motion": _embedded(motion_figure(agent)),
             "features": _embedded(features_figure(agent)) if len(agent.feature_counts) else None,
+            "pictures": [_picture(frame, agent) for frame in _spread(agent.frames, _PICTURES)],
         }
         for agent in result.agents
     ]
@@ -47,10 +53,26 @@ def write_report(path: Path, result: RunResult, summary: dict[str, Any], map_png
         agents=agents,
         map=_as_url(map_png),
         side=_embedded(side_view(result)),
+        scene=scene_page(result),
+        submaps=_embedded(submaps_figure(result.global_map.graph)),
+        sparsity=_embedded(sparsity_figure(result.global_map.graph)),
         timing=_embedded(timing_figure(result)),
         plans=[_embedded(floor_plan_figure(result, plan)) for plan in result.floor_plans],
     )
     atomic_text(path, html)
+
+
+def _spread(frames: Sequence[LoggedFrame], count: int) -> list[LoggedFrame]:
+    """So many of the frames, evenly spread."""
+    if not frames:
+        return []
+    return [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int)).tolist()]
+
+
+def _picture(frame: LoggedFrame, agent: AgentResult) -> dict[str, str]:
+    start = int(agent.filtered.stamps_ns[0]) if len(agent.filtered) else frame.stamp_ns
+    seconds = (frame.stamp_ns - start) / 1e9
+    return {"url": _as_url(frame.jpeg, "jpeg"), "caption": f"{seconds:.1f} s, {len(frame.features)} features"}
 
 
 def verdict(evaluation: Evaluation | None) -> str:
@@ -73,5 +95,5 @@ def _embedded(figure: Figure | None) -> str | None:
     return _as_url(buffer.getvalue())
 
 
-def _as_url(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+def _as_url(image: bytes, kind: str = "png") -> str:
+    return f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")

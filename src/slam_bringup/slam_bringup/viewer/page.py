@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import trimesh
 import viser
 
+from dense_mapping.decimation import at_most
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from slam_bringup.viewer.picture_of_plan import plan_picture
@@ -134,12 +134,8 @@ class ViewerPage:
         """The dense model as a mesh, without faces seen from behind, so that one looks into rooms from outside."""
         if not len(surface.faces):
             return
-        points, faces, colours = surface.points, surface.faces, surface.colours
-        size = 0.03
-        while len(faces) > _MOST_FACES:
-            size *= 1.5
-            points, faces, colours = _coarser(surface, size)
-        mesh = trimesh.Trimesh(points, faces, vertex_colors=_brightened(colours), process=False)
+        shown = at_most(surface, _MOST_FACES)
+        mesh = trimesh.Trimesh(shown.points, shown.faces, vertex_colors=_brightened(shown.colours), process=False)
         self.server.scene.add_mesh_trimesh("/mesh/model", mesh, cast_shadow=False, receive_shadow=False)
 
     def show_points(self, points: Float32Array, colours: ByteArray | None = None) -> None:
@@ -291,20 +287,6 @@ class ViewerPage:
 def _wxyz(rotation: FloatArray) -> FloatArray:
     """Quaternions (..., 4) in viser's order, w first."""
     return np.asarray(quaternion_from_rotation(rotation)[..., [3, 0, 1, 2]])
-
-
-def _coarser(surface: Surface, size: float) -> tuple[Float32Array, npt.NDArray[np.int32], ByteArray]:
-    """Points, faces and colours of a mesh with one vertex in each cell of ``size`` m (Rossignac and Borrel 1993)."""
-    _, first, cell, count = np.unique(
-        np.floor(surface.points / size).astype(np.int64), axis=0, return_index=True, return_inverse=True,
-        return_counts=True,
-    )  # fmt: skip
-    cell = cell.ravel()
-    mean = np.stack([np.bincount(cell, axis) for axis in surface.points.T], axis=1) / count[:, None]
-    faces = cell[surface.faces].astype(np.int32)
-    a, b, c = faces.T
-    faces = np.unique(faces[(a != b) & (b != c) & (c != a)], axis=0)
-    return mean.astype(np.float32), faces, surface.colours[first]
 
 
 def _chain(points: FloatArray) -> FloatArray:

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The dense model and the paths as a page that turns, drawn by the three.js that trimesh brings; it asks no network."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from trimesh.viewer.notebook import scene_to_html
+
+from dense_mapping.decimation import at_most
+from slam_bringup.pipeline.results import RunResult
+from slam_bringup.report.figures import COLOURS
+from slam_core.geometry import FloatArray, make_transform
+
+_MOST_FACES = 60_000
+"""As many as make some two megabytes."""
+_Y_UP: FloatArray = make_transform(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+"""The map's Z axis is up, that of three.js is Y."""
+
+
+def scene_page(result: RunResult) -> str | None:
+    """A complete HTML page, seen first from above and aside; None for a run without a dense model."""
+    if not len(result.dense.faces):
+        return None
+    surface = at_most(result.dense, _MOST_FACES)
+    colours = np.clip(40.0 + 0.9 * surface.colours.astype(np.float32), 0, 255).astype(np.uint8)
+    # Without normals the viewer shades each face, which shows the shape of what has no texture.
+    scene = trimesh.Scene(trimesh.Trimesh(surface.points, surface.faces, vertex_colors=colours, process=False))
+    for agent, colour in zip(result.agents, COLOURS * len(result.agents), strict=False):
+        if len(agent.trajectory) > 1:
+            scene.add_geometry(_path(agent.trajectory.poses[:, :3, 3], colour))
+    scene.apply_transform(_Y_UP)  # type: ignore[no-untyped-call]
+    low, high = np.percentile(surface.points @ _Y_UP[:3, :3].T, [2, 98], axis=0)
+    scene.camera_transform = _view(low, high)
+    page: str = scene_to_html(scene)
+    return page
+
+
+def _path(points: FloatArray, colour: str) -> trimesh.path.Path3D:
+    line = trimesh.load_path(np.stack([points[:-1], points[1:]], axis=1))
+    rgba = [int(colour[i : i + 2], 16) for i in (1, 3, 5)] + [255]
+    line.colors = np.tile(np.array(rgba, dtype=np.uint8), (len(line.entities), 1))
+    return line  # type: ignore[no-any-return]
+
+
+def _view(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Pose (4, 4) of a camera, looking along its -Z, from above and aside at a box, m; Y is up."""
+    middle = (low + high) / 2
+    distance = 0.75 * float(np.linalg.norm(high - low)) + 1.0
+    back = np.array([-0.25, 0.8, 0.55])
+    back /= np.linalg.norm(back)
+    right = np.cross([0.0, 1.0, 0.0], back)
+    right /= np.linalg.norm(right)
+    return make_transform(np.column_stack([right, np.cross(back, right), back]), middle + distance * back)
