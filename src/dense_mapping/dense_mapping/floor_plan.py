@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,8 @@ from slam_core.geometry import FloatArray, invert_transform, make_transform, tra
 
 _CLEAR_BELOW = 0.6
 """Only rays lower than this above the floor make a cell free: a ray over a table does not."""
+_MIN_COVER = 0.5
+"""Surface above a cell, as a share of its own area, that makes it occupied."""
 _MIN_RAYS = 2
 """Rays through a cell that make it free."""
 _RAY_STEP = 4
@@ -45,11 +48,16 @@ class FloorPlanConfig(Config):
     resolution: float = parameter(0.05, "edge of a cell", unit="m", minimum=0.01, maximum=1.0)
     lowest: float = parameter(0.15, "surface lower than this above the floor is no obstacle", unit="m", minimum=0.0)
     highest: float = parameter(1.9, "surface higher than this above the floor is no obstacle", unit="m", minimum=0.1)
-    min_points: int = 3
-    """Points of the model that make a cell occupied."""
     camera_height: float = parameter(
         1.3, "height of the cameras above the floor where no floor was seen", unit="m", minimum=0.0
     )
+
+
+class Obstacles(NamedTuple):
+    """Triangles of the model between floor and head: middles (n, 3) m and areas (n,) m2."""
+
+    middles: FloatArray
+    areas: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +117,7 @@ def floor_plans(
     image_ups = np.stack([-k.T_map_camera[:3, 1] for k in keyframes])
     T_level_map = level_transform(up_direction(surface, image_ups, gravity_up))
     points = transform_points(T_level_map, surface.points.astype(np.float64))
+    middles, areas = _triangles(points, surface.faces)
     normals = surface.normals.astype(np.float64) @ T_level_map[:3, :3].T
     poses = [T_level_map @ k.T_map_camera for k in keyframes]
     cameras = np.stack([T[:3, 3] for T in poses])
@@ -117,11 +126,18 @@ def floor_plans(
     plans = []
     for i, floor in enumerate(floors):
         own = np.flatnonzero(storeys == i).tolist()
-        band = (points[:, 2] > floor + config.lowest) & (points[:, 2] < floor + config.highest)
+        band = (middles[:, 2] > floor + config.lowest) & (middles[:, 2] < floor + config.highest)
         rays = [_rays(keyframes[k], poses[k], _RAY_STEP) for k in own]
         if own:
-            plans.append(_plan(points[band], rays, float(floor), config, T_level_map))
+            obstacles = Obstacles(middles[band], areas[band])
+            plans.append(_plan(obstacles, rays, float(floor), config, T_level_map))
     return tuple(plans)
+
+
+def _triangles(points: FloatArray, faces: npt.NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
+    """Middles (n, 3) and areas (n,) of triangles."""
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return (a + b + c) / 3.0, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
 def _rays(placed: PlacedKeyframe, T_level_camera: FloatArray, step: int) -> FloatArray:
@@ -138,10 +154,10 @@ def _rays(placed: PlacedKeyframe, T_level_camera: FloatArray, step: int) -> Floa
 
 
 def _plan(
-    obstacles: FloatArray, rays: list[FloatArray], floor: float, config: FloorPlanConfig, T_level_map: FloatArray
+    obstacles: Obstacles, rays: list[FloatArray], floor: float, config: FloorPlanConfig, T_level_map: FloatArray
 ) -> FloorPlan:
     everything = np.concatenate(rays)
-    corners = np.concatenate([obstacles[:, :2], everything[:, :2], everything[:, 3:5]])
+    corners = np.concatenate([obstacles.middles[:, :2], everything[:, :2], everything[:, 3:5]])
     low = np.floor(corners.min(axis=0) / config.resolution) - 2.0
     shape = (np.ceil(corners.max(axis=0) / config.resolution) - low + 2.0).astype(np.int64)[::-1]
     if shape.prod() > _MAX_CELLS:
@@ -164,12 +180,15 @@ def _plan(
 
 
 def _occupied(
-    obstacles: FloatArray, corner: FloatArray, config: FloorPlanConfig, shape: tuple[int, ...]
+    obstacles: Obstacles, corner: FloatArray, config: FloorPlanConfig, shape: tuple[int, ...]
 ) -> npt.NDArray[np.bool_]:
-    """Where the model has enough points; a cell without an occupied neighbour is taken for noise."""
-    columns, rows = np.floor((obstacles[:, :2] - corner) / config.resolution).astype(np.int64).T
-    count = np.bincount(rows * shape[1] + columns, minlength=shape[0] * shape[1]).reshape(shape)
-    occupied = count >= config.min_points
+    """Where the model has enough surface; a cell without an occupied neighbour is taken for noise.
+
+    Counting the model's points instead would draw a table top as a grid: they lie 3 cm apart, the cells 5.
+    """
+    columns, rows = np.floor((obstacles.middles[:, :2] - corner) / config.resolution).astype(np.int64).T
+    cover = np.bincount(rows * shape[1] + columns, obstacles.areas, shape[0] * shape[1]).reshape(shape)
+    occupied = cover >= _MIN_COVER * config.resolution**2
     padded = np.pad(occupied, 1).astype(np.int8)
     around = sum(padded[i : i + shape[0], j : j + shape[1]] for i in range(3) for j in range(3))
     return np.asarray(occupied & (around > 1))

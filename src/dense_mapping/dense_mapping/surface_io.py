@@ -9,6 +9,7 @@ import numpy as np
 import plyfile
 import trimesh
 
+from dense_mapping.gltf import matt_glb
 from dense_mapping.surface import Surface
 from slam_core.files import atomic_path
 
@@ -39,10 +40,8 @@ def write_glb(path: Path, surface: Surface) -> None:
     mesh = trimesh.Trimesh(
         surface.points @ turn.T, surface.faces, vertex_normals=normals, vertex_colors=surface.colours, process=False
     )
-    data = mesh.export(file_type="glb")
-    assert isinstance(data, bytes)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+        temporary.write_bytes(matt_glb(trimesh.Scene(mesh)))
 
 
 def read_mesh(path: Path) -> Surface:

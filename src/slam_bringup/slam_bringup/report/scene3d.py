@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import base64
+
 import numpy as np
 import trimesh
 from trimesh.viewer.notebook import scene_to_html
 
 from dense_mapping.decimation import at_most
+from dense_mapping.gltf import matt_glb
 from slam_bringup.pipeline.results import RunResult
 from slam_bringup.report.figures import COLOURS
 from slam_core.geometry import FloatArray, make_transform
@@ -23,7 +26,7 @@ def scene_page(result: RunResult) -> str | None:
     if not len(result.dense.faces):
         return None
     surface = at_most(result.dense, _MOST_FACES)
-    colours = np.clip(40.0 + 0.9 * surface.colours.astype(np.float32), 0, 255).astype(np.uint8)
+    colours = np.clip(60.0 + 0.8 * surface.colours.astype(np.float32), 0, 255).astype(np.uint8)
     # Without normals the viewer shades each face, which shows the shape of what has no texture.
     scene = trimesh.Scene(trimesh.Trimesh(surface.points, surface.faces, vertex_colors=colours, process=False))
     for agent, colour in zip(result.agents, COLOURS * len(result.agents), strict=False):
@@ -32,8 +35,17 @@ def scene_page(result: RunResult) -> str | None:
     scene.apply_transform(_Y_UP)  # type: ignore[no-untyped-call]
     low, high = np.percentile(surface.points @ _Y_UP[:3, :3].T, [2, 98], axis=0)
     scene.camera_transform = _view(low, high)
-    page: str = scene_to_html(scene)
-    return page
+    return _page(scene)
+
+
+def _page(scene: trimesh.Scene) -> str:
+    """The viewer's page of another scene with ours in its place: its own export has no material, which means metal."""
+    other = trimesh.Scene(trimesh.creation.box())
+    page: str = scene_to_html(other)
+    data = other.export(file_type="glb")  # type: ignore[no-untyped-call]
+    before, found, after = page.partition(base64.b64encode(data).decode("ascii"))
+    assert found, "the page holds the scene as base64"
+    return before + base64.b64encode(matt_glb(scene)).decode("ascii") + after
 
 
 def _path(points: FloatArray, colour: str) -> trimesh.path.Path3D:
