@@ -11,12 +11,15 @@ from trimesh.viewer.notebook import scene_to_html
 
 from dense_mapping.decimation import at_most
 from dense_mapping.gltf import matt_glb
+from dense_mapping.surface import Surface
 from slam_bringup.pipeline.results import RunResult
 from slam_bringup.report.figures import COLOURS
 from slam_core.geometry import FloatArray, make_transform
+from slam_core.types import ByteArray
 
 _MOST_FACES = 60_000
 """As many as make some two megabytes."""
+_LIGHT = np.array([0.4, -0.7, 1.0])
 _Y_UP: FloatArray = make_transform(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 """The map's Z axis is up, that of three.js is Y."""
 
@@ -26,9 +29,8 @@ def scene_page(result: RunResult) -> str | None:
     if not len(result.dense.faces):
         return None
     surface = at_most(result.dense, _MOST_FACES)
-    colours = np.clip(60.0 + 0.8 * surface.colours.astype(np.float32), 0, 255).astype(np.uint8)
-    # Without normals the viewer shades each face, which shows the shape of what has no texture.
-    scene = trimesh.Scene(trimesh.Trimesh(surface.points, surface.faces, vertex_colors=colours, process=False))
+    mesh = trimesh.Trimesh(surface.points, surface.faces, vertex_colors=_shaded(surface), process=False)
+    scene = trimesh.Scene(mesh)
     for agent, colour in zip(result.agents, COLOURS * len(result.agents), strict=False):
         if len(agent.trajectory) > 1:
             scene.add_geometry(_path(agent.trajectory.poses[:, :3, 3], colour))
@@ -45,7 +47,15 @@ def _page(scene: trimesh.Scene) -> str:
     data = other.export(file_type="glb")  # type: ignore[no-untyped-call]
     before, found, after = page.partition(base64.b64encode(data).decode("ascii"))
     assert found, "the page holds the scene as base64"
-    return before + base64.b64encode(matt_glb(scene)).decode("ascii") + after
+    return before + base64.b64encode(matt_glb(scene, lit=False)).decode("ascii") + after
+
+
+def _shaded(surface: Surface) -> ByteArray:
+    """Colours as if light came from above and aside, so that shape shows where there is no texture."""
+    light = _LIGHT / np.linalg.norm(_LIGHT)
+    brightness = 0.78 + 0.22 * (surface.normals @ light)
+    colours = (55.0 + 0.75 * surface.colours.astype(np.float32)) * brightness[:, None]
+    return np.asarray(np.clip(colours, 0, 235), dtype=np.uint8)
 
 
 def _path(points: FloatArray, colour: str) -> trimesh.path.Path3D:
