@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from dense_mapping.dense_model import DenseModel
-from dense_mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
+from dense_mapping.floor_plan import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    FloorPlan,
+    FloorPlanConfig,
+    Obstacles,
+    _occupied,
+    _triangles,
+)
 from dense_mapping.levelling import floor_heights, level_transform, up_direction
 from dense_mapping.navigation import frontiers, way
 from slam_core.camera import Camera
@@ -143,3 +152,17 @@ def test_a_plan_that_would_fill_the_memory_is_refused_with_what_to_do(both_rooms
     model.add("tof", far, DepthImage(100, last.depth, last.sigma, last.camera))
     with pytest.raises(ValueError, match="raise resolution"):
         model.floor_plans(model.surface())
+
+
+def test_a_table_top_is_drawn_whole_though_its_points_lie_as_wide_apart_as_cells():
+    """Points every 3 cm in cells of 5 cm: counted, they would draw a grid."""
+    u, v = np.meshgrid(np.arange(0.0, 1.2, 0.03), np.arange(0.0, 1.2, 0.03), indexing="ij")
+    points = np.stack([u, v, np.full_like(u, 0.7)], axis=-1).reshape(-1, 3)
+    k = np.arange(len(points)).reshape(u.shape)
+    corners = [part.ravel() for part in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:])]
+    faces = np.concatenate([np.stack([corners[i] for i in t], axis=1) for t in ((0, 1, 2), (0, 2, 3))])
+    middles, areas = _triangles(points, faces.astype(np.int32))
+    assert areas.sum() == pytest.approx(1.17**2)
+    occupied = _occupied(Obstacles(middles, areas), np.array([-0.1, -0.1]), FloorPlanConfig(), (30, 30))
+    assert occupied[3:24, 3:24].all()
+    assert not occupied[:, 27:].any()
