@@ -21,7 +21,10 @@ ESTIMATORS = (
     ("ekf_slam_node", "ekf_slam"),
     ("sjsam_node", "sjsam"),
 )
-TOOLS = (("slam_bringup", "bag_player"), ("slam_bringup", "recorder"), ("slam_bringup", "slam_composed"))
+TOOLS = (
+    ("dense_mapping", "dense_mapper"),
+    *(("slam_bringup", name) for name in ("bag_player", "recorder", "slam_composed", "viewer")),
+)
 
 
 @pytest.mark.parametrize(("package", "executable"), [*ESTIMATORS, *TOOLS])

@@ -6,19 +6,28 @@ python -m slam_bringup.parameter_reference > docs/parameters.md
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import fields
 from typing import Any
 
 from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.overrides import NODE_CONFIGS
 from slam_core.config import Config, ParameterInfo, iterate_parameters
 from slam_core.input_config import InputConfig
+
+_TOOLS = {
+    "viewer": ("slam_bringup.viewer.viewer_node", "ViewerConfig"),
+    "bag_player": ("slam_bringup.bags.bag_player_node", "PlayerConfig"),
+    "recorder": ("slam_bringup.bags.recorder_node", "RecorderConfig"),
+}
+"""Nodes that are no estimators."""
 
 _PREAMBLE = """\
 # Parameters
 
 Made from the configuration classes by `python -m slam_bringup.parameter_reference`; do not edit. Every node declares
 these as ROS parameters (`ros2 param describe` tells the same); `slam run --config FILE` and `slam nodes --config FILE`
-take them as YAML:
+take them as YAML. What begins with "node:" only the node has, and `slam run` passes over:
 
 ```yaml
 ekf_slam:
@@ -29,27 +38,38 @@ ekf_slam:
 
 
 def reference() -> str:
-    """The page as Markdown."""
-    system = SystemConfig()
-    sections = [_section(f.name, getattr(system, f.name)) for f in fields(system)]
-    sections.append(_section("Every node (`--ros-args -p input.policy:=all`)", InputConfig(), "input."))
+    """The page as Markdown; it needs ROS, whose nodes have parameters of their own."""
+    system = {f.name: getattr(SystemConfig(), f.name) for f in fields(SystemConfig)}
+    sections = [_node_section(name, system.get(name), *where) for name, where in (NODE_CONFIGS | _TOOLS).items()]
+    every = [_row(*entry) for entry in iterate_parameters(InputConfig(), "input.")]
+    sections.append(_section("Every node (`--ros-args -p input.policy:=all`)", every))
     return "\n".join([_PREAMBLE, *sections])
 
 
-def _section(name: str, config: Config, prefix: str = "") -> str:
-    rows = [_row(*entry) for entry in iterate_parameters(config, prefix)]
+def _node_section(name: str, algorithm: Config | None, module: str, kind: str) -> str:
+    """The parameters of the algorithm, which ``slam run`` takes as well, then those that only the node has."""
+    known = {} if algorithm is None else {n: (n, v, info) for n, v, info in iterate_parameters(algorithm)}
+    node: Config = getattr(importlib.import_module(module), kind)()
+    own = [entry for entry in iterate_parameters(node) if entry[0] not in known]
+    rows = [_row(*entry) for entry in known.values()] + [_row(*entry, "node: ") for entry in own]
+    return _section(name, rows)
+
+
+def _section(name: str, rows: list[str]) -> str:
     return "\n".join([f"## {name}\n", "| parameter | default | range | meaning |", "|---|---|---|---|", *rows, ""])
 
 
-def _row(name: str, value: Any, info: ParameterInfo) -> str:
+def _row(name: str, value: Any, info: ParameterInfo, kind: str = "") -> str:
     unit = f" {info.unit}" if info.unit else ""
-    description = info.description.replace("|", "\\|")
+    description = kind + info.description.replace("|", "\\|")
     return f"| `{name}` | {_shown(value)}{unit} | {_range(info)} | {description} |"
 
 
 def _shown(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, tuple):
+        return ", ".join(str(part) or '""' for part in value) or "none"
     return f"{value:g}" if isinstance(value, float) else str(value) or '""'
 
 

@@ -35,6 +35,7 @@ NODE_CONFIGS = {
     "ndt_odometry": ("ndt_registration.node", "NdtNodeConfig"),
     "ekf_slam": ("ekf_slam_node.node", "EkfNodeConfig"),
     "sjsam": ("sjsam_node.node", "SjsamNodeConfig"),
+    "dense_mapper": ("dense_mapping.node", "DenseNodeConfig"),
 }
 """Module and class of each node's own configuration; the modules need ROS."""
 
