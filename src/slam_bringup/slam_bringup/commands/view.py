@@ -18,7 +18,11 @@ from slam_bringup.processes.processes import become_node
 @click.command()
 @click.argument("out", type=UserPath(exists=True, file_okay=False), required=False)
 @click.option("--live", is_flag=True, help="what the running nodes publish, instead of a finished run")
-@click.option("--bag", type=UserPath(exists=True), help="the bag of the run, for the camera's pictures")
+@click.option(
+    "--bag",
+    type=UserPath(exists=True),
+    help="the bag of the run: pictures with the map's landmarks instead of features",
+)
 @click.option("--agent", "agents", multiple=True, help="with --live: namespace of an agent (may be repeated)")
 @click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="of the page; 0: any")
 @click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 lets other machines see the page")
@@ -43,11 +47,16 @@ def _show_finished(out: Path, bag: Path | None, port: int, host: str, browser: b
     # Here and not above: loading viser takes a second, and --help should not.
     from slam_bringup.viewer.finished import FinishedView
     from slam_bringup.viewer.page import ViewerPage
-    from slam_bringup.viewer.pictures import BagPictures
+    from slam_bringup.viewer.pictures import BagPictures, RecordedPictures
     from slam_bringup.viewer.run_folder import RunFolder
 
     run = RunFolder.read(out)
-    pictures = None if bag is None else BagPictures(run, bag)
+    recording = out / "result.mcap"
+    pictures: BagPictures | RecordedPictures | None = None
+    if bag is not None:
+        pictures = BagPictures(run, bag)
+    elif recording.is_file():
+        pictures = RecordedPictures(recording)
     page = ViewerPage(port, host, f"Indoor SLAM: {out.name}")
     FinishedView(page, run, None if pictures is None else pictures.at)
     click.echo(f"{out} at {page.url} (Ctrl-C ends)", err=True)

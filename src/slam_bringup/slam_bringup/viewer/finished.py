@@ -49,7 +49,8 @@ class FinishedView:
         page.show_points(run.surface.points, run.surface.colours)
         for number, plan in enumerate(run.plans):
             page.show_plan(plan, number)
-        page.show_landmarks(landmarks.positions[landmarks.linked], landmarks.covariances[landmarks.linked])
+        known = landmarks.linked
+        page.show_landmarks(landmarks.positions[known], landmarks.covariances[known], landmarks.sightings[known])
         marks = run.global_map.marks
         page.show_marks([m.name for m in marks.marks], marks.positions(run.global_map.graph.poses))
         borders = unseen(run.plans)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import trimesh
 import viser
 
@@ -170,10 +171,13 @@ class ViewerPage:
             f"{name}/name", " ".join(filter(None, (agent or "rig", note))), position=(0, 0, 0.3)
         )
 
-    def show_landmarks(self, positions: FloatArray, covariances: FloatArray) -> None:
-        """Landmarks (n, 3) m and their 99.5 % ellipsoids."""
+    def show_landmarks(
+        self, positions: FloatArray, covariances: FloatArray, sightings: npt.NDArray[np.int64] | None = None
+    ) -> None:
+        """Landmarks (n, 3) m and their 99.5 % ellipsoids; orange are new, green those seen in many submaps."""
+        tint = (230, 140, 0) if sightings is None else _age_colours(sightings)
         self.server.scene.add_point_cloud(
-            "/landmarks/points", positions.astype(np.float32), (230, 140, 0), point_size=0.018, point_shape="circle",
+            "/landmarks/points", positions.astype(np.float32), tint, point_size=0.018, point_shape="circle",
             precision="float32",
         )  # fmt: skip
         if len(positions):
@@ -287,6 +291,12 @@ class ViewerPage:
 def _wxyz(rotation: FloatArray) -> FloatArray:
     """Quaternions (..., 4) in viser's order, w first."""
     return np.asarray(quaternion_from_rotation(rotation)[..., [3, 0, 1, 2]])
+
+
+def _age_colours(sightings: npt.NDArray[np.int64]) -> ByteArray:
+    """Colours (n, 3) from orange, seen in one submap, to green, seen in eight or more."""
+    share = np.clip(np.log2(np.maximum(sightings, 1)) / 3.0, 0.0, 1.0)[:, None]
+    return np.asarray(np.rint((1.0 - share) * [230, 140, 0] + share * [20, 160, 60]), dtype=np.uint8)
 
 
 def _chain(points: FloatArray) -> FloatArray:

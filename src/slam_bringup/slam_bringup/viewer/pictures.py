@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's pictures of a bag beside a finished run, with the map's landmarks drawn where they should appear."""
+"""The camera's pictures beside a finished run: with features from its result, or with landmarks from its bag."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from slam_bringup.bags.bag import BagReader
 from slam_bringup.bags.readings import AgentSensors, DepthReading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.viewer.run_folder import RunFolder
@@ -19,6 +20,7 @@ from slam_core.camera import Camera
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray
 
+_FEATURE_PICTURES = "/features/image/compressed"
 _MOST = 300
 """Pictures kept for each agent."""
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 80)
@@ -32,16 +34,55 @@ class CaptionedImage:
     caption: str
 
 
-class BagPictures:
+class StampedPictures:
+    """JPEG files by agent and stamp, and what they show in words."""
+
+    SHOWS = ""
+
+    def __init__(self) -> None:
+        self._stamps: dict[str, list[int]] = defaultdict(list)
+        self._jpegs: dict[str, list[bytes]] = defaultdict(list)
+
+    def __bool__(self) -> bool:
+        return bool(self._stamps)
+
+    def at(self, agent: str, stamp_ns: int) -> CaptionedImage | None:
+        """The agent's newest picture at a stamp, or None before its first."""
+        k = bisect.bisect_right(self._stamps[agent], stamp_ns) - 1
+        if k < 0:
+            return None
+        image = cv2.imdecode(np.frombuffer(self._jpegs[agent][k], dtype=np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None, "written by ourselves"
+        picture = np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
+        return CaptionedImage(picture, f"{agent or 'rig'}: {self.SHOWS}")
+
+
+class RecordedPictures(StampedPictures):
+    """The pictures with their features that a run has put into its own ``result.mcap``."""
+
+    SHOWS = "features, red near, blue far; circle stereo, square ToF"
+
+    def __init__(self, result: Path) -> None:
+        super().__init__()
+        with BagReader(result) as bag:
+            topics = [topic for topic in bag.topics if topic.endswith(_FEATURE_PICTURES)]
+            for topic, stamp, message in bag.messages(topics):
+                agent = topic.removesuffix(_FEATURE_PICTURES).strip("/")
+                self._stamps[agent].append(stamp)
+                self._jpegs[agent].append(bytes(message.data))
+
+
+class BagPictures(StampedPictures):
     """Pictures by agent and stamp, drawn once when the bag is read.
 
     A landmark is a ring whose colour says in how many submaps it is: green in one, yellow in many. It is drawn where
     the map and the pose put it: rings that do not sit on corners of the picture show an error of either.
     """
 
+    SHOWS = "landmarks, green in one submap, yellow in many"
+
     def __init__(self, run: RunFolder, bag: Path) -> None:
-        self._stamps: dict[str, list[int]] = defaultdict(list)
-        self._jpegs: dict[str, list[ByteArray]] = defaultdict(list)
+        super().__init__()
         landmarks = run.global_map.landmarks()
         self._points, self._sightings = landmarks.positions[landmarks.linked], landmarks.sightings[landmarks.linked]
         with SensorBag(bag) as opened:
@@ -53,18 +94,6 @@ class BagPictures:
                 count[reading.agent] += 1
                 if count[reading.agent] % every.get(reading.agent, 1) == 0:
                     self._keep(run, opened.sensors[reading.agent], reading)
-
-    def at(self, agent: str, stamp_ns: int) -> CaptionedImage | None:
-        """The agent's newest picture at a stamp, or None before its first."""
-        k = bisect.bisect_right(self._stamps[agent], stamp_ns) - 1
-        if k < 0:
-            return None
-        image = cv2.imdecode(self._jpegs[agent][k], cv2.IMREAD_COLOR)
-        assert image is not None, "written by ourselves"
-        return CaptionedImage(
-            np.ascontiguousarray(image[..., ::-1], dtype=np.uint8),
-            f"{agent or 'rig'}: landmarks, green in one submap, yellow in many",
-        )
 
     @staticmethod
     def _is_main(bag: SensorBag, reading: StereoReading | DepthReading) -> bool:
@@ -83,7 +112,7 @@ class BagPictures:
         T_map_camera = trajectory.interpolate(np.array([stamp]))[0] @ sensors.transform("base", mount)
         picture = draw_landmarks(grey, camera, T_map_camera, self._points, self._sightings)
         self._stamps[reading.agent].append(stamp)
-        self._jpegs[reading.agent].append(np.asarray(cv2.imencode(".jpg", picture, _JPEG)[1], dtype=np.uint8))
+        self._jpegs[reading.agent].append(cv2.imencode(".jpg", picture, _JPEG)[1].tobytes())
 
 
 def draw_landmarks(

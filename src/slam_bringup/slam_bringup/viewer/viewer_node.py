@@ -83,6 +83,9 @@ class ViewerNode(SlamNode[ViewerConfig]):
             self._post = self.page.server.gui.add_markdown("")
             button = self.page.server.gui.add_button("Mark a place: then click into the scene")
             button.on_click(lambda _: self.page.on_click(self._on_click))
+            for agent in self.config.agents:
+                here = self.page.server.gui.add_button(f"Mark where {agent or 'the rig'} is")
+                here.on_click(partial(self._mark_agent, agent))
         self.create_timer(self.config.post_period_s, self._show_post, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f"the page is at {self.page.url}")
 
@@ -194,7 +197,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
             for j, b in enumerate("xyz"):
                 covariances[:, i, j] = cloud[f"cov_{min(a, b)}{max(a, b)}"]
         positions = np.stack([cloud[axis] for axis in "xyz"], axis=1).astype(np.float64)
-        self.page.show_landmarks(positions, covariances)
+        self.page.show_landmarks(positions, covariances, cloud["sightings"].astype(np.int64))
 
     def _on_graph(self, message: Message) -> None:
         for marker in message.markers:
@@ -258,7 +261,16 @@ class ViewerNode(SlamNode[ViewerConfig]):
         along = float(direction @ T[:3, 2])
         if abs(along) < 1e-6:
             return
-        x, y, z = (origin + direction * ((T[:3, 3] - origin) @ T[:3, 2]) / along).tolist()
+        self._publish_mark(origin + direction * ((T[:3, 3] - origin) @ T[:3, 2]) / along)
+
+    def _mark_agent(self, agent: str, _: object) -> None:
+        """Publish where an agent is, as a find of its own; nothing while that is not known."""
+        own = self._agents[agent]
+        if own.T_odom_base is not None:
+            self._publish_mark((own.T_map_odom @ own.T_odom_base)[:3, 3])
+
+    def _publish_mark(self, point: FloatArray) -> None:
+        x, y, z = point.tolist()
         header = header_message(self.types, self._now_ns(), self.config.map_frame)
         self.publish("clicked_point", self.types.PointStamped(header=header, point=self.types.Point(x=x, y=y, z=z)))
 
