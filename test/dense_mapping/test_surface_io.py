@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
@@ -26,6 +28,16 @@ def test_a_mesh_comes_back_as_it_was(tile, tmp_path):
     back = read_mesh(tmp_path / "mesh.ply")
     for name in ("points", "normals", "colours", "sigma", "faces"):
         np.testing.assert_array_equal(getattr(back, name), getattr(tile, name))
+
+
+def test_the_surface_of_a_glb_is_matt(tile, tmp_path):
+    """Without a material glTF means metal, which is black where a viewer has no surroundings to mirror."""
+    write_glb(tmp_path / "mesh.glb", tile)
+    data = (tmp_path / "mesh.glb").read_bytes()
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    (primitive,) = tree["meshes"][0]["primitives"]
+    assert tree["materials"][primitive["material"]]["pbrMetallicRoughness"]["metallicFactor"] == 0.0
+    assert "COLOR_0" in primitive["attributes"]
 
 
 def test_points_have_no_faces(tile, tmp_path):

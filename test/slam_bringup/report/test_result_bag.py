@@ -11,17 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from slam_bringup.bags.bag import BagReader
 from slam_bringup.bags.recording_clock import RecordingClock
-from slam_bringup.cli import slam
 from slam_bringup.report.foxglove import layout
 from slam_core.frame_tree import FrameTree
 from slam_core.messages import pose_from_message, stamp_ns, transform_from_message
 from slam_core.trajectory import read_trajectory
 
-DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
 SCENE = {
     f"{package}/msg/{name}"
     for package, names in {
@@ -29,13 +26,6 @@ SCENE = {
         "sensor_msgs": ("PointCloud2", "CompressedImage", "CameraInfo"), "visualization_msgs": ("MarkerArray",),
     }.items() for name in names
 }  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def out(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("result") / "out"
-    assert CliRunner().invoke(slam, ["run", str(DEMO), "-o", str(folder), "--mode", "fuse"]).exit_code == 0
-    return folder
 
 
 def messages(out: Path) -> list:
