@@ -25,6 +25,6 @@ def _set_material(tree: dict[str, Any], lit: bool) -> None:
     if not lit:
         tree["extensionsUsed"] = [_UNLIT]
     tree["materials"] = [_MATT if lit else _MATT | {"extensions": {_UNLIT: {}}}]
-    for mesh in tree["meshes"]:
+    for mesh in tree.get("meshes", ()):  # a run that saw nothing has none
         for primitive in mesh["primitives"]:
             primitive["material"] = 0
