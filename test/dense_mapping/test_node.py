@@ -34,7 +34,7 @@ TYPES = RosTypes()
 
 @pytest.fixture
 def node():
-    rclpy.init(args=["--ros-args", "-p", "surface.min_images:=1", "-p", "keyframe.distance:=0.1"])
+    rclpy.init(args=["--ros-args", "-p", "keyframe.distance:=0.1"])
     made = DenseMapperNode()
     sent: dict[str, list] = {}
     made.publish = lambda topic, message: sent.setdefault(topic, []).append(message)

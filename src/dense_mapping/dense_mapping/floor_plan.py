@@ -24,7 +24,7 @@ from slam_core.geometry import FloatArray, invert_transform, make_transform, tra
 
 _CLEAR_BELOW = 0.6
 """Only rays lower than this above the floor make a cell free: a ray over a table does not."""
-_MIN_COVER = 0.5
+_MIN_COVER = 0.3
 """Surface above a cell, as a share of its own area, that makes it occupied."""
 _MIN_RAYS = 2
 """Rays through a cell that make it free."""
