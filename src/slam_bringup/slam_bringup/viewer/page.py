@@ -175,7 +175,8 @@ class ViewerPage:
         self, positions: FloatArray, covariances: FloatArray, sightings: npt.NDArray[np.int64] | None = None
     ) -> None:
         """Landmarks (n, 3) m and their 99.5 % ellipsoids; orange are new, green those seen in many submaps."""
-        tint = (230, 140, 0) if sightings is None else _age_colours(sightings)
+        # viser takes no empty list of colours.
+        tint = (230, 140, 0) if sightings is None or not len(sightings) else _age_colours(sightings)
         self.server.scene.add_point_cloud(
             "/landmarks/points", positions.astype(np.float32), tint, point_size=0.018, point_shape="circle",
             precision="float32",
