@@ -17,8 +17,8 @@ from slam_bringup.report.figures import COLOURS
 from slam_core.geometry import FloatArray, make_transform
 from slam_core.types import ByteArray
 
-_MOST_FACES = 60_000
-"""As many as make some two megabytes."""
+_MOST_FACES = 120_000
+"""As many as make some four megabytes."""
 _LIGHT = np.array([0.4, -0.7, 1.0])
 _Y_UP: FloatArray = make_transform(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 """The map's Z axis is up, that of three.js is Y."""
