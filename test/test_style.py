@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -22,3 +24,25 @@ def test_the_tree_is_clean(command):
         [sys.executable, "-m", tool, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
+
+
+def summaries(path: Path) -> list[str]:
+    """Summary lines of all docstrings of a file, as ``file:line: text``."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
+            found.append(f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}: {text.splitlines()[0]}")
+    return found
+
+
+PACKAGES = {path.name for path in (ROOT / "src").iterdir() if path.is_dir()}
+IN_WORK = {"sjsam_node"}
+"""Packages whose summaries are being rewritten."""
+
+
+@pytest.mark.parametrize("package", sorted(PACKAGES - IN_WORK))
+def test_a_summary_says_what_is_returned_or_done_and_asks_no_question(package):
+    lines = [line for path in (ROOT / "src" / package).rglob("*.py") for line in summaries(path)]
+    assert lines
+    questions = [line for line in lines if re.search(r":\d+: (What|Whether|Which|Where|When|Who|Why|How)\b", line)]
+    assert not questions, "\n".join(questions)

@@ -80,7 +80,7 @@ class DenseModel:
         return tuple(self._placed)
 
     def wants(self, camera: str, T_map_camera: FloatArray) -> bool:
-        """Whether a frame of ``camera`` at this pose is a key frame; the caller then adds it."""
+        """True if a frame of ``camera`` at this pose is a key frame; the caller then adds it."""
         selector = self._selectors.setdefault(camera, KeyframeSelector(self.config.keyframe))
         return selector.wants(T_map_camera)
 
@@ -125,7 +125,7 @@ class DenseModel:
         self.volume.add(placed.T_map_camera, k.camera, k.depth, k.sigma, k.picture)
 
     def _changes(self, lookup: PoseLookup) -> Iterator[tuple[float, PlacedKeyframe, FloatArray]]:
-        """How far key frames are from where they belong, in units of what is tolerated."""
+        """Distances of key frames from where they belong, in units of what is tolerated."""
         tolerance = np.array([_MOVE_DISTANCE, np.radians(_MOVE_ANGLE_DEG)]) + 1e-9
         for placed in self._placed:
             T = lookup(placed.camera, placed.keyframe.stamp_ns)

@@ -78,7 +78,7 @@ class FloorPlan:
         return np.floor(local[:, [1, 0]] / self.resolution).astype(np.int64)
 
     def contains(self, cells: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """Whether each (row, column) (n, 2) lies on the plan."""
+        """True if each (row, column) (n, 2) lies on the plan."""
         return np.asarray(((cells >= 0) & (cells < self.cells.shape)).all(axis=1))
 
     def point_of(self, cells: npt.NDArray[np.int64], height: float = 0.0) -> FloatArray:
@@ -182,7 +182,7 @@ def _plan(
 def _occupied(
     obstacles: Obstacles, corner: FloatArray, config: FloorPlanConfig, shape: tuple[int, ...]
 ) -> npt.NDArray[np.bool_]:
-    """Where the model has enough surface; a cell without an occupied neighbour is taken for noise.
+    """Cells in which the model has enough surface; a cell without an occupied neighbour is taken for noise.
 
     Counting the model's points instead would draw a table top as a grid: they lie 3 cm apart, the cells 5.
     """

@@ -24,7 +24,7 @@ _NO_PICTURE: ByteArray = np.empty((0, 0, 3), dtype=np.uint8)
 
 @dataclass(frozen=True)
 class KeyframeConfig(Config):
-    """Which frames become key frames, and which of their pixels count."""
+    """Selection of key frames, and of their pixels that count."""
 
     distance: float = parameter(0.2, "a key frame every so much way", unit="m", minimum=0.01)
     angle_deg: float = parameter(10.0, "or every so much turn", unit="deg", minimum=1.0)
@@ -43,7 +43,7 @@ class KeyframeSelector:
         self._last: FloatArray | None = None
 
     def wants(self, T_map_camera: FloatArray) -> bool:
-        """Whether a frame at this pose is a key frame; the next ones are then compared with it."""
+        """True if a frame at this pose is a key frame; the next ones are then compared with it."""
         if self._last is not None:
             moved = boxminus(T_map_camera, self._last)
             near = np.linalg.norm(moved[:3]) < self._config.distance

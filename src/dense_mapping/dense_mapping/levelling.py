@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which way is up in the map, and at which heights its floors lie.
+"""Levelling of the map: its vertical, and the heights of its floors.
 
 The map's Z axis is that of the first rig pose, and a handheld rig starts at an angle. Up is first what gravity says,
 or, without an IMU, where the upper edges of the images pointed on the whole; then floors and ceilings say it exactly.

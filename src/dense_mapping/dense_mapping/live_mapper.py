@@ -71,7 +71,7 @@ class LiveMapper:
         return len(self._waiting)
 
     def add_odometry(self, agent: str, T_odom_base: FloatArray) -> None:
-        """Where an agent's odometry has it now: says which images are key frames."""
+        """Take an agent's pose by its odometry, by which key frames are chosen."""
         self._odometry[agent] = T_odom_base
 
     def add_image(self, agent: str, sensor: str, T_base_camera: FloatArray, make: Callable[[], Keyframe]) -> bool:
@@ -91,7 +91,7 @@ class LiveMapper:
         return True
 
     def has_colours(self, agent: str) -> bool:
-        """Whether any colour picture of the agent has come."""
+        """True if any colour picture of the agent has come."""
         return any(camera.startswith(f"{agent}/") for camera in self._colours)
 
     def add_colour(self, agent: str, sensor: str, stamp_ns: int, picture: ByteArray) -> None:

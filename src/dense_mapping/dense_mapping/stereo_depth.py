@@ -123,7 +123,7 @@ def _match(image: ByteArray, other: ByteArray, steps: int) -> Float32Array:
 
 
 def _disagrees(left: Float32Array, right: Float32Array, most: float) -> Mask:
-    """Where the partner of a left pixel does not point back to it; (height, width)."""
+    """Mask of left pixels whose partner does not point back to them; (height, width)."""
     rows, columns = np.indices(left.shape)
     partner = np.rint(columns - np.nan_to_num(left)).astype(np.int64)
     inside = partner >= 0

@@ -38,7 +38,7 @@ _UNSEEN = 150
 
 @dataclass(frozen=True)
 class SurfaceConfig(Config):
-    """Which voxels shape the surface, and what its standard deviation is made of."""
+    """Choice of the voxels that shape the surface."""
 
     min_images: int = 2
     """A voxel counts from so many key frames on."""

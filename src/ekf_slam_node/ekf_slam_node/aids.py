@@ -153,7 +153,7 @@ def aid_error(aid: Aid, T_previous_now: FloatArray, rotation_map_previous: Float
 
 
 def contradicts(aid: Aid, T_previous_now: FloatArray, covariance: FloatArray, gate: float) -> bool:
-    """Whether an aid lies beyond the gate of a motion found otherwise, with its covariance (6, 6).
+    """True if an aid lies beyond the gate of a motion found otherwise, with its covariance (6, 6).
 
     Scan registration that has slid along a wall is as wrong as it is sure of itself, and only vision can tell.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the calibration leaves unknown: errors that stay the same over a run and so never average out.
+"""Calibration errors: those that stay the same over a run and so never average out.
 
 A filter takes its noise as fresh in every frame. A wrong baseline (or range scale of a ToF camera) instead stretches
 all lengths alike, ``t -> (1 + s) t``, and a camera mounted a little turned turns the whole trajectory about the start,
@@ -38,7 +38,7 @@ class CalibrationErrorConfig(Config):
 
     @property
     def is_exact(self) -> bool:
-        """Whether nothing is in doubt."""
+        """True if nothing is in doubt."""
         return self.sigma_scale == 0.0 and self.sigma_mounting == 0.0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame may be associated with.
+"""Candidates that a frame may be associated with.
 
 Landmarks and features of the previous frame, as the previous rig pose has them around it.
 

@@ -48,7 +48,7 @@ def ccda(
 def equal_distances(
     first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray], gate: float
 ) -> npt.NDArray[np.bool_]:
-    """Whether pairs of points are two by two equally far apart, (n, n).
+    """True if pairs of points are two by two equally far apart, (n, n).
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ class MotionConfig(Config):
 
 @dataclass(frozen=True)
 class MeasurementConfig(Config):
-    """Which features are good enough to be measurements."""
+    """Selection and noise of the features that are measured."""
 
     common_error: float = parameter(
         2.5,
@@ -71,7 +71,7 @@ class MeasurementConfig(Config):
 
 @dataclass(frozen=True)
 class FeatureAssociationConfig(Config):
-    """How features find their landmarks (thesis chapter 4)."""
+    """Data association of features and landmarks (thesis chapter 4)."""
 
     method: str = parameter(
         "mahalanobis", "how a feature chooses among its candidates", choices=("nearest", "mahalanobis", "jcbb", "ccda")
@@ -89,7 +89,7 @@ class FeatureAssociationConfig(Config):
 
 @dataclass(frozen=True)
 class LandmarkConfig(Config):
-    """Which features become landmarks and which landmarks stay (section 4.4)."""
+    """Map management: new landmarks, and those that are removed (section 4.4)."""
 
     target_in_view: int = parameter(80, "new landmarks are added until so many are observed", minimum=6)
     min_sightings: int = parameter(3, "s_min of section 4.4", minimum=1)
@@ -102,7 +102,7 @@ class LandmarkConfig(Config):
 
 @dataclass(frozen=True)
 class SubmapConfig(Config):
-    """When a submap ends and how the next one starts (section 7.1)."""
+    """End of a submap and start of the next one (section 7.1)."""
 
     start: str = parameter(
         "independent", "what the next submap takes over: nothing but the last frame's own measurement, or Eq. 7.1",

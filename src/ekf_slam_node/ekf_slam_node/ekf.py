@@ -273,7 +273,7 @@ class Ekf:
 
     @property
     def is_finite(self) -> bool:
-        """Whether the mean and the rig's covariance with everything are finite numbers."""
+        """True if the mean and the rig's covariance with everything are finite numbers."""
         parts = (self.T, self.velocity, self.landmarks, self.covariance.head(CORE_DIM))
         return all(bool(np.isfinite(part).all()) for part in parts)
 

@@ -22,7 +22,7 @@ UNPAIRED = -1
 
 @dataclass(frozen=True, eq=False)
 class JointPrediction:
-    """What L landmarks will look like.
+    """Joint prediction of the measurements of L landmarks.
 
     ``z`` (L, d) and the joint covariance ``H P H'`` (L d, L d), correlations included.
     """

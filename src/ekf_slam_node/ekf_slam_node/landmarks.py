@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of landmarks beside their positions: identity, descriptor, and whether they can be relied on (4.4)."""
+"""Landmarks beside their positions: identity, descriptor, record of sightings (section 4.4)."""
 
 from __future__ import annotations
 

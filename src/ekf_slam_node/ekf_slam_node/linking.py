@@ -164,7 +164,7 @@ class Linker:
 
 
 def _is_usable(motion: MotionGuess) -> bool:
-    """Whether a motion is finite and determined in all directions."""
+    """True if a motion is finite and determined in all directions."""
     finite = np.isfinite(motion.T).all() and np.isfinite(motion.covariance).all()
     return bool(finite) and bool(np.linalg.eigvalsh(motion.covariance)[0] > 0.0)
 

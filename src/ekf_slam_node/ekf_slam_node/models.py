@@ -154,7 +154,7 @@ def rig_points(frame: Frame, T_rig_optical: FloatArray) -> tuple[FloatArray, Flo
 
 
 def observe(T_parent_rig: FloatArray, T_rig_optical: FloatArray, points: FloatArray, camera: Camera) -> Observation:
-    """What a rig at ``T_parent_rig`` sees of points (n, 3) in the parent frame."""
+    """Predicted measurements, by a rig at ``T_parent_rig``, of points (n, 3) in the parent frame."""
     T = T_parent_rig @ T_rig_optical
     optical = (points - T[:3, 3]) @ T[:3, :3]
     J_point = project_jacobian(optical, camera) @ T[:3, :3].T

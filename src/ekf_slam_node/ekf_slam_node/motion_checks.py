@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame's motion is compared with: the prediction, other sensors, and no motion at all."""
+"""Checks of a frame's motion: against the prediction, other sensors, and no motion at all."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _STANDING_SIGMA = np.repeat([0.002, np.radians(0.05)], 3)
 
 
 def is_surprising(link: FrameLink, expected: MotionPrior, gate: float) -> bool:
-    """Whether the motion found contradicts constant velocity, by the gate of one feature.
+    """True if the motion found contradicts constant velocity, by the gate of one feature.
 
     What a motion within this gate moves a feature by lies within the same gate of that feature: the normalised length
     of an error cannot grow when it is seen in three coordinates. With a wider gate here than there a motion would pass
@@ -30,7 +30,7 @@ def is_surprising(link: FrameLink, expected: MotionPrior, gate: float) -> bool:
 
 
 def is_still(linked: LinkedFrame, gate: float) -> bool:
-    """Whether the motion found is none, as far as a good look can tell."""
+    """True if the motion found is none, as far as a good look can tell."""
     # The landmarks' errors are correlated, so that a motion from them is known a little less well than it says.
     covariance = linked.motion_covariance + np.diag((0.25 * _STANDING_SIGMA) ** 2)
     error = boxminus(linked.link.T, np.eye(4))
@@ -60,7 +60,7 @@ def explaining_sigma(T_previous_now: FloatArray, velocity: FloatArray, sigma: Fl
 
 
 def aided(expected: MotionPrior, aid: Aid | None) -> MotionPrior:
-    """What to expect of the next frame where something else has measured the motion, or its rotation."""
+    """Motion prior of the next frame where another sensor has measured the motion, or its rotation."""
     if aid is None:
         return expected
     T, covariance = expected.T.copy(), expected.covariance.copy()

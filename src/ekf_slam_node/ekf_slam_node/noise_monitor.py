@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much larger the measurement noise is than the features claim.
+"""Running estimate of the measurement noise, where it is larger than the features claim.
 
 Keypoints wander when the viewpoint changes, calibrations are never exact, images blur: real errors exceed what a
 detector can know about itself. The errors of each frame's associated pairs tell by how much, for pixels and for depth,

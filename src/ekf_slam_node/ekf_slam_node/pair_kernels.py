@@ -129,7 +129,7 @@ def normal_equations(error, S, J, chosen, scale):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True)
 def first_of_both(rows, columns, row_count, column_count):  # type: ignore[no-untyped-def]
-    """Which pairs (n,) come when their row and their column have not been taken by a pair before."""
+    """Mask (n,) of the pairs whose row and column no pair before them has taken."""
     row_taken, column_taken = np.zeros(row_count, np.bool_), np.zeros(column_count, np.bool_)
     out = np.zeros(len(rows), np.bool_)
     for k in range(len(rows)):

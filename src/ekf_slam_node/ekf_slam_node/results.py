@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the filter reports for each frame."""
+"""Result of the filter for each frame."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ class EkfSlam:
         return result
 
     def _problem_with(self, features: Features) -> str:
-        """Why a frame cannot be used at all, or ""."""
+        """Reason for which a frame cannot be used at all, or ""."""
         if not self._chain.has_begun:
             return ""
         if features.stamp_ns <= self._newest_stamp_ns:

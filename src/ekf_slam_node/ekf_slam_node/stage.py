@@ -44,7 +44,7 @@ class FilterConfig(EkfSlamConfig):
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """What the filter says of one frame, and of how many features."""
+    """Estimate after one frame, and the number of its features."""
 
     estimate: EkfResult
     features: int
@@ -77,7 +77,7 @@ class FilterStage:
 
     @property
     def counters(self) -> Counters:
-        """What the filter accepted and rejected."""
+        """Counts of what the filter accepted and rejected."""
         return Counters() if self._slam is None else self._slam.counters
 
     @property

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the steps of Algorithm 3 hand on to each other within one frame."""
+"""Records that the steps of Algorithm 3 hand on within one frame."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class SubmapBuilder:
         self._path.append(PoseEstimate(stamp_ns, ekf.T.copy(), ekf.pose_covariance()))
 
     def is_complete(self, ekf: Ekf, config: SubmapConfig, shared: int) -> bool:
-        """Whether the rig is far enough from the start, or the submap large or old enough.
+        """True if the rig is far enough from the start, or the submap large or old enough.
 
         Landmarks ``shared`` with the next submap hold the two together: with too few of them the end is put off, up to
         twice the limits.
@@ -66,7 +66,7 @@ class SubmapBuilder:
 
     @property
     def is_empty(self) -> bool:
-        """Whether the submap has no pose beside its first."""
+        """True if the submap has no pose beside its first."""
         return len(self._path) < 2
 
     def last_sound_pose(self) -> PoseEstimate:

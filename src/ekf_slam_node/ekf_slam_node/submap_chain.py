@@ -53,12 +53,12 @@ class SubmapChain:
 
     @property
     def has_begun(self) -> bool:
-        """Whether there was a first frame."""
+        """True if there was a first frame."""
         return self._local is not None
 
     @property
     def is_open(self) -> bool:
-        """Whether frames can be added to a submap."""
+        """True if frames can be added to a submap."""
         return self.has_begun and not self._is_finished
 
     @property
@@ -115,7 +115,7 @@ class SubmapChain:
         self.stamp_ns = stamp_ns
 
     def is_complete(self, shared: int) -> bool:
-        """Whether the submap ends with this frame, in which the next one would share so many landmarks with it."""
+        """True if the submap ends with this frame, in which the next one would share so many landmarks with it."""
         return self._builder.is_complete(self.local.ekf, self._config.submap, shared)
 
     # -------------------------------------------------------------------------------------------------------- closing

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the answer of a global search is the only one: the other poses that the search refined are its witnesses.
+"""Ambiguity of a global search: another refined pose that explains the scan as well makes the answer doubtful.
 
 Where two scans share little, a wrong pose can look as good as the true one. An answer is doubted where another pose
 costs hardly more.
@@ -24,7 +24,7 @@ def reason_of_doubt(
     covariance: FloatArray,
     scale: float,
 ) -> str:
-    """Why the best of a search's poses cannot be trusted, empty if it can.
+    """Reason for which the best of a search's poses cannot be trusted, "" if it can.
 
     Parameters
     ----------

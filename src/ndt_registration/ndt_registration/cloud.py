@@ -74,7 +74,7 @@ def finite_points(points: npt.ArrayLike) -> FloatArray:
 
 
 def is_planar(points: npt.ArrayLike) -> bool:
-    """Whether a cloud is two-dimensional: shape (..., 2)."""
+    """True if a cloud is two-dimensional: shape (..., 2)."""
     return bool(np.shape(points)[-1:] == (2,))
 
 

@@ -70,7 +70,7 @@ def _nearest_behind(
 def _surface_goes_on(
     i: int, behind: int, size: int, step: float, d: FloatArray, r: FloatArray, bins: Int32Array, first: Int32Array
 ) -> bool:
-    """Whether a point of the surface of ``i`` lies farther towards ``behind`` than ``i`` does, or before it."""
+    """True if a point of the surface of ``i`` lies farther towards ``behind`` than ``i`` does, or before it."""
     row, column = bins[i] // size, bins[i] % size
     bx, by, bz = d[behind, 0] - d[i, 0], d[behind, 1] - d[i, 1], d[behind, 2] - d[i, 2]
     gap = bx * bx + by * by + bz * bz

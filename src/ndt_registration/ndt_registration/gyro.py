@@ -17,7 +17,7 @@ _MAX_GAP = 0.05
 
 @dataclass(frozen=True)
 class GyroConfig(Config):
-    """How an IMU helps scan odometry."""
+    """Gyroscope beside scan odometry."""
 
     enabled: bool = parameter(False, "predict the turn between scans from an IMU: for rigs that turn abruptly")
     bias_sigma: float = parameter(

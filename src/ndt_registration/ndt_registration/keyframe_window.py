@@ -56,7 +56,7 @@ class KeyframeWindow:
 
     @property
     def target(self) -> Target | None:
-        """What scans are registered to; None while there is no keyframe."""
+        """Target of the next scan; None while there is no keyframe."""
         return self._target
 
     def clear(self) -> None:

@@ -14,7 +14,7 @@ from slam_core.geometry import FloatArray
 
 
 class Fit(NamedTuple):
-    """How a cloud fits the target's surfaces.
+    """Fit of a cloud to the target's surfaces.
 
     Share of points on the surfaces, their root mean square distance (m), their centroid (3,) about the target's axes
     and their root mean square distance from it.

@@ -36,7 +36,7 @@ _LOST_SIGMA = 100.0
 
 @dataclass(frozen=True)
 class MotionFilterConfig(Config):
-    """How a sensor moves between scans."""
+    """Motion model of a sensor between scans."""
 
     acceleration_sigma: float = parameter(2.0, "acceleration between scans", unit="m/s2", minimum=1e-3)
     angular_acceleration_sigma: float = parameter(4.0, "likewise", unit="rad/s2", minimum=1e-3)
@@ -108,7 +108,7 @@ class MotionFilter:
         self.T = make_transform(self.T_before[:3, :3] @ R, self.T[:3, 3])
 
     def correction(self, T: FloatArray, covariance: FloatArray) -> FloatArray:
-        """How far (6,) a measured pose (4, 4) would move this one, each by its covariance."""
+        """Correction (6,) of this pose by a measured one (4, 4), each weighted by its covariance."""
         predicted = self.covariance
         return np.asarray(predicted @ np.linalg.solve(predicted + covariance, boxminus(T, self.T)))
 

@@ -138,7 +138,7 @@ class NdtNode(SlamNode[NdtNodeConfig]):
         self.health.set(State.DEGRADED if degraded else State.OK, result.reason)
 
     def _show(self, result: OdometryResult) -> None:
-        """What the newest registration says of itself, in ``/diagnostics``."""
+        """Show the newest registration in ``/diagnostics``."""
         registration = result.registration
         if registration is None:
             return

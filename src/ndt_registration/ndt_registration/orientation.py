@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which rotations turn the surfaces of one scan into those of another: the normals alone say it, wherever the scan is.
+"""Rotation search: the normals alone tell which rotations turn one scan's surfaces into those of another.
 
 Two scans of one place show much the same set of surface directions, and a rotation matches the sets however far the
 sensor has moved. So rotations are found first, apart from translations (compare Makadia et al. 2006 on extended

@@ -77,7 +77,7 @@ class Pyramid:
         return Pyramid(tuple(surface_grids), tuple(rim_grids))
 
     def layers(self, source: Cloud, level: int, count: int, rim_share: float) -> tuple[Layer, Layer]:
-        """What NDT needs on a level.
+        """Layers of NDT on a level.
 
         At most ``count`` source points and their rims, which together weigh ``rim_share``.
         """

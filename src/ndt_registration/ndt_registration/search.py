@@ -142,7 +142,7 @@ def distinct(candidates: list[Candidate], scale: float, count: int) -> list[Cand
 
 
 def is_same(candidate: Candidate, other: Candidate, scale: float) -> bool:
-    """Whether two poses are one answer: near each other, or apart only where the scan leaves the pose free."""
+    """True if two poses are one answer: near each other, or apart only where the scan leaves the pose free."""
     if pose_distance(candidate.T, other.T, scale) < SEPARATION:
         return True
     d = boxminus(other.T, candidate.T)
@@ -204,5 +204,5 @@ def _starts(views: Views, config: SearchConfig) -> list[FloatArray]:
 
 
 def planar_constraint(planar: bool) -> FloatArray:
-    """Which components of a pose error are held, shape (6,): z, roll and pitch in the plane, none in space."""
+    """Mask (6,) of the components of a pose error that are held: z, roll and pitch in the plane, none in space."""
     return np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0]) if planar else np.zeros(6)

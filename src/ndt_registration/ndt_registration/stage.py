@@ -30,7 +30,7 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class ScanEstimate:
-    """What one scan says: the rig's ``pose`` T_odom_base and its ``motion`` since the scan before, None if not known.
+    """Estimate from a scan: ``pose`` T_odom_base and ``motion`` since the scan before, None if not known.
 
     ``scan`` sat at ``T_odom_sensor``. ``result`` is the registration, in the sensor's own frame.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a registration determines the pose.
+"""Covariance of a registration: directions in which it determines the pose, and those it leaves free.
 
 Covariance from the scatter of the blocks' gradients, and directions left free.
 """
@@ -57,7 +57,7 @@ class Curvature(NamedTuple):
 
 
 class Extent(NamedTuple):
-    """Where the points are that were matched: centroid (3,) and root mean square distance from it, m."""
+    """Extent of the matched points: centroid (3,) and root mean square distance from it, m."""
 
     centre: FloatArray
     radius: float

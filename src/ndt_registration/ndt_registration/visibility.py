@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scan says about the space along its rays: surface, free space in front of it, nothing known behind or beside.
+"""Space along the rays of a scan: surface, free space in front of it, nothing known behind or beside.
 
 A scan that sees only part of a room fits its neighbour best, point for point, where the two overlap most, which is not
 where they belong. Free space decides: a point of one scan may lie outside the other's view or hidden behind its

@@ -61,7 +61,7 @@ class LensState:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """What is estimated: cameras, and per view ``T_first_board`` (4, 4)."""
+    """Estimated quantities: cameras, and per view ``T_first_board`` (4, 4)."""
 
     cameras: tuple[LensState, ...]
     board_poses: tuple[FloatArray, ...]

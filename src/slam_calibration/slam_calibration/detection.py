@@ -168,7 +168,7 @@ def _find_markers(image: ByteArray, dictionary: str, border_bits: int) -> tuple[
 
 
 def _predict(points: FloatArray, seen: npt.NDArray[np.int64], pixels: FloatArray, neighbours: int) -> FloatArray:
-    """Where each board point should appear, shape (n, 2); NaN where it cannot be told.
+    """Expected pixel of each board point, shape (n, 2); NaN where it cannot be told.
 
     By the homography of the seen points nearest to it: lens distortion bends the board as a whole, hardly its parts.
     """
@@ -209,7 +209,7 @@ def _refine(image: ByteArray, pixels: FloatArray, half_window: FloatArray) -> Fl
 
 
 def _are_saddles(image: ByteArray, pixels: FloatArray, radius: FloatArray) -> npt.NDArray[np.bool_]:
-    """Whether two opposite quarters round each corner are dark and the other two bright, whatever their orientation."""
+    """True if two opposite quarters round each corner are dark and the other two bright, whatever their orientation."""
     angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
     samples = pixels[:, None] + np.maximum(radius, 1.5)[:, None, None] * ring

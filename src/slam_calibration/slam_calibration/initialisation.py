@@ -19,7 +19,7 @@ MINIMUM_CORNERS = 6
 
 
 def is_posable(board_points: FloatArray, corners: Corners) -> bool:
-    """Whether a picture shows enough of the board for a pose: corners that are not few and not all on one line."""
+    """True if a picture shows enough of the board for a pose: corners that are not few and not all on one line."""
     if len(corners) < MINIMUM_CORNERS:
         return False
     points = board_points[corners.ids, :2]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which picture belongs to which camera and view, and what of the board each shows."""
+"""Pictures by camera and view, and the part of the board that each shows."""
 
 from __future__ import annotations
 

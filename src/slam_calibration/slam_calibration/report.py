@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a calibration looks like: tables as in the thesis (2.1-2.3), board poses, and reprojection residuals."""
+"""Report of a calibration: tables as in the thesis (2.1-2.3), board poses, and reprojection residuals."""
 
 from __future__ import annotations
 

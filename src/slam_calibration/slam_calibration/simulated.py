@@ -36,7 +36,7 @@ def simulate_views(
     poses: Sequence[FloatArray],
     noise_px: float,
 ) -> list[list[Corners]]:
-    """What the cameras see in each view: visible corners with noise of ``noise_px`` per axis.
+    """Simulated views of the cameras: visible corners with noise of ``noise_px`` per axis.
 
     ``poses``: T_first_board of each view, for a board whose origin is moved to its middle.
     """

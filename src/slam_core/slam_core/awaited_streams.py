@@ -50,7 +50,7 @@ class AwaitedStreams:
         self._frames.append(stamp_ns)
 
     def must_wait(self, stamp_ns: int) -> bool:
-        """Whether a stream that is not silent has yet to reach the stamp."""
+        """True if a stream that is not silent has yet to reach the stamp."""
         return bool(self._missing(stamp_ns) - set(self.silent))
 
     def give_up(self, stamp_ns: int) -> tuple[str, ...]:
@@ -68,7 +68,7 @@ class AwaitedStreams:
         return tuple(sorted(name for name, newest in self._newest.items() if self._is_silent(name, newest)))
 
     def complaint(self) -> str:
-        """Which streams are silent since when, or ""."""
+        """Names of the silent streams with their last stamps, or ""."""
         return "; ".join(f"no {name} {self._since(name)}" for name in self.silent)
 
     def _since(self, stream: str) -> str:

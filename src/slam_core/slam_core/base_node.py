@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every node shares: typed parameters, guarded inputs, diagnostics, watchdog, reset and pause, and a clean end.
+"""Base of every node: typed parameters, guarded inputs, diagnostics, watchdog, reset and pause, and a clean end.
 
     class NdtNode(SlamNode[NdtNodeConfig]):
         def __init__(self) -> None:
@@ -161,7 +161,7 @@ class SlamNode(TransformNode, Generic[C]):
             self._outputs[topic].publish(as_ros(message))
 
     def has_listeners(self, topic: str) -> bool:
-        """Whether anybody subscribes to an advertised topic: costly pictures are made only then."""
+        """True if anybody subscribes to an advertised topic: costly pictures are made only then."""
         inside = self._exchange is not None and self._exchange.has_listeners(self.resolve_topic_name(topic))
         return inside or bool(self._outputs[topic].get_subscription_count() > 0)
 
@@ -351,7 +351,7 @@ class SlamNode(TransformNode, Generic[C]):
         return self._ros_types.DiagnosticArray(header=header, status=[status])
 
     def _lateness(self) -> str:
-        """How many frames were left out since the last report because the node is too slow, or ""."""
+        """Complaint about frames left out since the last report because the node is too slow, or ""."""
         skipped = self._jobs.skipped.total()
         new, self._skipped = skipped - self._skipped, skipped
         return f"{new} frames left out: they come faster than they are processed" if new else ""

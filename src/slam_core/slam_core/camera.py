@@ -56,7 +56,7 @@ class Camera:
 
     @property
     def is_rectified(self) -> bool:
-        """Whether straight lines stay straight: no distortion left."""
+        """True if straight lines stay straight: no distortion left."""
         if self.distortion_model == "equidistant":
             return False  # a fisheye even with all coefficients zero: the radius is the angle, not its tangent
         return self.distortion_model == "none" or not np.any(self.distortion)
@@ -142,7 +142,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class CameraInfo:
-    """What a sensor_msgs/CameraInfo says of one camera, without ROS.
+    """Content of a sensor_msgs/CameraInfo, without ROS.
 
     camera: intrinsics K and distortion D of the *raw* image. R: (3, 3) rotation from the raw to the rectified optical
     frame. P: (3, 4) projection of the rectified image; ``P[0, 3] = -fx * baseline`` for the right camera of a pair,
@@ -179,7 +179,7 @@ class CameraInfo:
 
     @property
     def is_rectified(self) -> bool:
-        """Whether the raw image already is the rectified one: no distortion, no rotation, K equal to P."""
+        """True if the raw image already is the rectified one: no distortion, no rotation, K equal to P."""
         same = np.allclose(self.P[:, :3], self.camera.K, atol=1e-6) and np.allclose(self.R, np.eye(3), atol=1e-9)
         return bool(self.camera.is_rectified and same)
 

@@ -27,7 +27,7 @@ C = TypeVar("C", bound="Config")
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """What is known of one parameter beside its type and default."""
+    """Description, unit and range of a parameter."""
 
     description: str
     unit: str = ""
@@ -156,7 +156,7 @@ def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _can_be_set(config: Config, name: str) -> bool:
-    """Whether a field is a parameter or a group of such."""
+    """True if a field is a parameter or a group of such."""
     info = {f.name: f.metadata for f in dataclasses.fields(config)}[name]
     return "parameter" in info or isinstance(getattr(config, name), Config)
 

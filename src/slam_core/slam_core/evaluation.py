@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good is a trajectory, and does its covariance tell the truth: ATE, RPE, drift and NEES.
+"""Accuracy of a trajectory and honesty of its covariance: ATE, RPE, drift and NEES.
 
 ATE and RPE follow Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), as evo computes
 them; NEES and its chi-square bounds follow Bar-Shalom, Li and Kirubarajan (2001), section 5.4.

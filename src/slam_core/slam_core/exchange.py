@@ -19,7 +19,7 @@ from slam_core.types import AnyArray
 
 
 class Exchange:
-    """Who publishes and who listens in this process. Nodes are made front to back, listeners after publishers."""
+    """Publishers and listeners of this process. Nodes are made front to back, listeners after publishers."""
 
     current: ClassVar[Exchange | None] = None
     """The exchange of the node that is being made, see :meth:`node`; None outside a composed process."""
@@ -45,7 +45,7 @@ class Exchange:
         self._publishers.add(topic)
 
     def has_publisher(self, topic: str) -> bool:
-        """Whether a node of this process publishes the topic."""
+        """True if a node of this process publishes the topic."""
         return topic in self._publishers
 
     def listen(self, topic: str, callback: Callable[[Message], None]) -> None:
@@ -53,7 +53,7 @@ class Exchange:
         self._listeners[topic].append(callback)
 
     def has_listeners(self, topic: str) -> bool:
-        """Whether a node of this process listens."""
+        """True if a node of this process listens."""
         return bool(self._listeners.get(topic))
 
     def publish(self, topic: str, message: Message) -> None:
@@ -107,7 +107,7 @@ class SharedTypes(MessageTypes):
         self._ros_types = ros
 
     def load(self, package: str, name: str) -> Any:
-        """What makes a message of a type."""
+        """Factory of the messages of a type."""
         return lambda **fields: SharedMessage(self._ros_types, name, fields)
 
     def octets(self, array: AnyArray) -> Any:

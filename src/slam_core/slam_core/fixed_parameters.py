@@ -60,5 +60,5 @@ FIXED = {
 
 
 def is_fixed(config_type: type, name: str) -> bool:
-    """Whether ``name`` was a parameter or a group of a configuration, or of one that it extends."""
+    """True if ``name`` was a parameter or a group of a configuration, or of one that it extends."""
     return any(name in FIXED.get(base.__name__, "").split() for base in config_type.__mro__)

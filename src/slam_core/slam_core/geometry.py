@@ -257,7 +257,7 @@ def interpolate_transform(T0: FloatArray, T1: FloatArray, fraction: FloatArray) 
 
 
 def is_rigid_transform(T: FloatArray, tolerance: float = 1e-6) -> bool:
-    """Whether ``T`` is a finite (4, 4) matrix with a proper rotation and the last row 0 0 0 1."""
+    """True if ``T`` is a finite (4, 4) matrix with a proper rotation and the last row 0 0 0 1."""
     if T.shape != (4, 4) or not np.all(np.isfinite(T)):
         return False
     R = T[:3, :3]

@@ -84,7 +84,7 @@ class GuardedNode(LifecycleNode):
 
     @property
     def has_work(self) -> bool:
-        """Whether something waits that :meth:`work` would do."""
+        """True if something waits that :meth:`work` would do."""
         return False
 
     def work(self) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How every node subscribes, pairs and keeps up: the parameters ``input.*``."""
+"""Subscriptions of every node, their pairing and queues: the parameters ``input.*``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from slam_core.synchronizer import PAIRING_TOLERANCE_S
 
 @dataclass(frozen=True)
 class InputConfig(Config):
-    """How a node subscribes and pairs; parameters ``input.*`` of every node."""
+    """Subscriptions, pairing and queues of a node; parameters ``input.*`` of every node."""
 
     reliability: str = parameter(
         "match",

@@ -45,13 +45,13 @@ def whitening(covariance: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=4096)
 def chi_square_bound(probability: float, dof: int) -> float:
-    """What a chi-square variable of ``dof`` degrees of freedom stays below with this probability."""
+    """Bound that a chi-square variable of ``dof`` degrees of freedom stays below with this probability."""
     return float(2.0 * gammaincinv(0.5 * dof, probability))
 
 
 @dataclass(frozen=True)
 class LevenbergMarquardtConfig(Config):
-    """When to stop, and how to damp."""
+    """Stopping rules and damping."""
 
     max_iterations: int = parameter(100, "linearisations at most", minimum=1)
     relative_tolerance: float = parameter(1e-12, "stop when a step promises to lower the cost by less than this share",
@@ -63,7 +63,7 @@ class LevenbergMarquardtConfig(Config):
 
 
 class LeastSquaresProblem(Protocol[State]):
-    """What :func:`levenberg_marquardt` needs of a problem."""
+    """Interface of a problem to :func:`levenberg_marquardt`."""
 
     def cost(self, state: State) -> float:
         """Sum of squared whitened residuals at ``state``."""
@@ -146,7 +146,7 @@ def levenberg_marquardt(
 
 
 def _is_last(decrement: float, gained: float, cost: float, tolerance: float) -> bool:
-    """Whether nothing worth a step is left: the step just taken promised as little, or the next one would.
+    """True if nothing worth a step is left: the step just taken promised as little, or the next one would.
 
     Newton's steps promise about the square of what the one before did, as a share of the cost, and what the linear
     model got wrong about a step is what the next can gain.

@@ -49,7 +49,7 @@ class Input:
 
     @property
     def has_publisher(self) -> bool:
-        """Whether anybody publishes the topic; what comes from this process has no subscription."""
+        """True if anybody publishes the topic; what comes from this process has no subscription."""
         return self.subscription is None or bool(self.subscription.get_publisher_count())
 
 
@@ -72,7 +72,7 @@ class ListeningNode(GuardedNode):
 
     @property
     def has_work(self) -> bool:
-        """Whether a job waits."""
+        """True if a job waits."""
         return len(self._jobs) > 0
 
     def work(self) -> bool:
@@ -128,7 +128,7 @@ class ListeningNode(GuardedNode):
         return [entry.topic for entry in inputs if entry.required and not entry.has_publisher]
 
     def _silence(self) -> str:
-        """Which required topics have been silent for five seconds and why, or "" if none has."""
+        """Names of required topics that have been silent for five seconds, with the reason, or ""."""
         now, texts = time.monotonic(), []
         for entry in self._inputs.values():
             if entry.required and not self._paused and now - (entry.seen_at_s or self._started_at_s) > WATCHDOG_S:

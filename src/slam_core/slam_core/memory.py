@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a process asks the system for memory, with the C library of Linux (glibc); elsewhere nothing is changed.
+"""Settings of the C library's memory allocator (glibc); elsewhere nothing is changed.
 
 Every frame makes and frees images and matrices. By default each thread keeps a heap of its own for them, and what is
 larger than some size is asked for and given back every time. One heap for all threads takes less memory; not giving

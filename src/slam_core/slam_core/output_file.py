@@ -40,7 +40,7 @@ class OutputFile:
 
 
 def _writer_of(path: Path) -> dict[str, str]:
-    """Who wrote a file; empty if it was not this program."""
+    """Name of the command that wrote a file; empty if it was not this program."""
     try:
         writer = json.loads(path.read_text(encoding="utf-8"))[_KEY]
         return dict(writer) if writer["program"] == "slam" else {}

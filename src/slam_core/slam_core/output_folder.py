@@ -32,7 +32,7 @@ _STAGING = ".slam.{pid}.part"
 
 @dataclass(frozen=True)
 class Manifest:
-    """What is ours in a folder. ``files``: relative name to digests that mark it as unchanged; none: any content."""
+    """Files of ours in a folder. ``files``: relative name to digests that mark it as unchanged; none: any content."""
 
     command: str
     source: str
@@ -208,7 +208,7 @@ def _is_unchanged(folder: Path, name: str, digests: list[str]) -> bool:
 
 
 def _is_taken(folder: Path, name: str, *, is_ours: bool) -> bool:
-    """Whether a file of that name cannot be put there without touching what is not ours."""
+    """True if a file of that name cannot be put there without touching what is not ours."""
     file, parents = folder / name, [folder / p for p in PurePosixPath(name).parents if str(p) != "."]
     in_the_way = file.is_dir() or any(p.is_symlink() or p.is_file() for p in parents)
     return in_the_way or (os.path.lexists(file) and not is_ours)

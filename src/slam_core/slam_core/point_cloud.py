@@ -44,7 +44,7 @@ def write_ply(
 
 
 def is_ply(path: Path) -> bool:
-    """Whether a file begins as a PLY does."""
+    """True if a file begins as a PLY does."""
     if not path.is_file():
         return False
     with path.open("rb") as file:

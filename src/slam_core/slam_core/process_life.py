@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a process ends: with the one that started it, and by which signals it is asked to."""
+"""End of a process: with the one that started it, and by the signals that ask for it."""
 
 from __future__ import annotations
 

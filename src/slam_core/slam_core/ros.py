@@ -131,7 +131,7 @@ def sensor_qos(depth: int, latched: bool = False, *, best_effort: bool = False) 
 
 
 def incompatibility(offered: QoSProfile, wanted: QoSProfile) -> str:
-    """Why a publisher's offer does not serve a subscription, or ""."""
+    """Reason for which a publisher's offer does not serve a subscription, or ""."""
     reasons = []
     if (offered.reliability, wanted.reliability) == (ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE):
         reasons.append("offers best effort, reliable is asked for (input.reliability)")
@@ -141,7 +141,7 @@ def incompatibility(offered: QoSProfile, wanted: QoSProfile) -> str:
 
 
 def has_tf2_msgs() -> bool:
-    """Whether tf2_msgs can be imported: it is part of every ROS installation but has no wheel on PyPI."""
+    """True if tf2_msgs can be imported: it is part of every ROS installation but has no wheel on PyPI."""
     return importlib.util.find_spec("tf2_msgs") is not None
 
 
@@ -161,7 +161,7 @@ def use_fast_dds_profile() -> None:
 
 
 class RunnableNode(Protocol):
-    """What :func:`run_node` needs of a node beside rclpy's own."""
+    """Interface of a node to :func:`run_node`, beside rclpy's own."""
 
     def on_close(self) -> None:
         """Close what is open."""

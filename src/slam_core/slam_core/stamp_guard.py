@@ -37,7 +37,7 @@ _UNKNOWN_STEP_NS = 60_000_000_000
 
 
 class StampPolicy(Enum):
-    """What a topic's stamps mean. FRAMES run in order and begin sessions, FOLLOWS run in order, ANY are not judged."""
+    """Meaning of a topic's stamps. FRAMES run in order and begin sessions, FOLLOWS run in order, ANY are not judged."""
 
     FRAMES = "frames"
     FOLLOWS = "follows"
@@ -46,7 +46,7 @@ class StampPolicy(Enum):
 
 @dataclass(frozen=True)
 class Ruling(Generic[T]):
-    """What to do now: messages ``released`` as (stamp_ns, item) in order, stamps ``rejected`` and why.
+    """Decision about messages: those ``released`` as (stamp_ns, item) in order, stamps ``rejected`` and why.
 
     new_session: what was released is the first of a new session.
     """
@@ -77,17 +77,17 @@ class _Stream(Generic[T]):
         return max(LONGEST_STEP_NS, 3 * (self.last_ns - self.floor_ns))
 
     def goes_on(self, stamp_ns: int) -> bool:
-        """Whether a stamp is the stream's next."""
+        """True if a stamp is the stream's next."""
         return self.last_ns is not None and 0 <= stamp_ns - self.last_ns <= self.longest_step_ns
 
     def is_late(self, stamp_ns: int) -> bool:
-        """Whether a stamp is a little out of order, or behind nothing but the stream's last step."""
+        """True if a stamp is a little out of order, or behind nothing but the stream's last step."""
         if self.last_ns is None or stamp_ns >= self.last_ns:
             return False
         return self.last_ns - stamp_ns < LATE_NS or (self.floor_ns is not None and stamp_ns > self.floor_ns)
 
     def agrees_with_held(self, stamp_ns: int) -> bool:
-        """Whether a stamp is the next of those held."""
+        """True if a stamp is the next of those held."""
         if not self.held:
             return False
         step = stamp_ns - self.held[-1][0]
@@ -128,7 +128,7 @@ class StampGuard(Generic[T]):
         self._streams.clear()
 
     def _is_near(self, stamp_ns: int) -> bool:
-        """Whether a stamp belongs to the session's time; ahead of it may be a straggler of the session before."""
+        """True if a stamp belongs to the session's time; ahead of it may be a straggler of the session before."""
         known = [s.last_ns for s in self._streams.values() if s.last_ns is not None]
         ahead = NEAR_NS if self.session == 0 else LATE_NS
         return not known or any(-NEAR_NS <= stamp_ns - last <= ahead for last in known)
@@ -164,7 +164,7 @@ class StampGuard(Generic[T]):
         return Ruling(rejected=rejected, reason=_off(self._reference(stream), rejected[0]) if rejected else "")
 
     def _is_gap(self, stream: _Stream[T]) -> bool:
-        """Whether what is held lies ahead in the stream's own time, or in that of the session where it has none."""
+        """True if what is held lies ahead in the stream's own time, or in that of the session where it has none."""
         if stream.last_ns is not None:
             return stream.held[0][0] > stream.last_ns
         return any(

@@ -23,7 +23,7 @@ AnyArray = npt.NDArray[Any]
 
 
 class FeatureSource(IntEnum):
-    """Where a feature's depth came from; the values of the ``source`` field of the ``features`` topic."""
+    """Source of a feature's depth; the values of the ``source`` field of the ``features`` topic."""
 
     STEREO = 0
     TOF = 1

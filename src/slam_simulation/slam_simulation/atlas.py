@@ -20,7 +20,7 @@ from slam_core.types import ByteArray
 
 
 class TextureTable(NamedTuple):
-    """What the kernels read: ``texels`` flat uint8.
+    """Textures as the kernels read them: ``texels`` flat uint8.
 
     ``entries`` int64 (n, 4) = offset, log2 width, log2 height, clamp.
     """

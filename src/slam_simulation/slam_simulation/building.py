@@ -56,7 +56,7 @@ class Room:
             raise ValueError(f"room '{self.name}' is too small: x {self.x}, y {self.y}, height {self.height} m")
 
     def holds(self, x: float, y: float, margin: float = 0.0) -> bool:
-        """Whether a place lies in the room, or no farther than ``margin`` (m) beside it."""
+        """True if a place lies in the room, or no farther than ``margin`` (m) beside it."""
         inside_x = self.x[0] - margin <= x <= self.x[1] + margin
         return inside_x and self.y[0] - margin <= y <= self.y[1] + margin
 

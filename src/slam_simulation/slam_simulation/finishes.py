@@ -15,7 +15,7 @@ _DARKER, _DARKER_INFRARED, _GLOSS = 0.35, 0.2, 0.4
 
 @dataclass(frozen=True)
 class FinishConfig(Config):
-    """Which share of the surfaces is of an unfriendly finish."""
+    """Shares of the surfaces with an unfriendly finish."""
 
     dark: float = parameter(0.0, "share of surfaces that are dark, in the infrared even more", minimum=0.0, maximum=1.0)
     shiny: float = parameter(0.0, "share of surfaces with strong highlights", minimum=0.0, maximum=1.0)

@@ -55,7 +55,7 @@ def _window(world: World, wall: Wall, s: float, width: float, rng: Generator) ->
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """Where a thing stands: ``floor`` (3,) m, turned by ``yaw`` rad, in a room. Its x axis is its front."""
+    """Place of a thing: ``floor`` (3,) m, turned by ``yaw`` rad, in a room. Its x axis is its front."""
 
     room: int
     floor: FloatArray
@@ -233,7 +233,7 @@ def _fittings(world: World, wall: Wall, rng: Generator) -> None:
 
 
 def _free(wall: Wall, first: float, last: float, depth: float) -> bool:
-    """Whether an interval of a wall has no opening near it and leaves the corners to the neighbouring walls."""
+    """True if an interval of a wall has no opening near it and leaves the corners to the neighbouring walls."""
     corner = 0.1 if depth < 0.1 else 0.7
     if first < corner or last > wall.length - corner:
         return False

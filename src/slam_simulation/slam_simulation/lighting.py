@@ -98,7 +98,7 @@ def _hemisphere() -> FloatArray:
 def _blocked(
     x: float, y: float, z: float, dx: float, dy: float, dz: float, own: int, blockers: FloatArray
 ) -> bool:  # pragma: no cover - compiled
-    """Whether the segment from (x, y, z) by (dx, dy, dz) meets a rectangle other than ``own``."""
+    """True if the segment from (x, y, z) by (dx, dy, dz) meets a rectangle other than ``own``."""
     for q in range(blockers.shape[0]):
         if q == own:
             continue

@@ -20,7 +20,7 @@ SIZE = 512
 
 @dataclass(frozen=True)
 class Pattern:
-    """How a pattern is drawn and what it covers: ``extent`` m of one repetition, both ways."""
+    """Drawing of a pattern and its size: ``extent`` m of one repetition, both ways."""
 
     draw: Callable[[np.random.Generator], FloatArray]
     extent: float

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What does not stay where it is: people who walk through the view, and a chair that somebody moves.
+"""Moving things: people who walk through the view, and a chair that somebody moves.
 
 Moving things are the last surfaces of the world, drawn where they stand at first; :class:`MovingThings` takes them to
 where they are at a time. Light is baked once, so a thing keeps the light, and its soft shadow, of its first place.
@@ -28,7 +28,7 @@ _CHAIR_SHIFT = np.array([0.5, 0.3, 0.0])
 
 @dataclass(frozen=True)
 class MovingConfig(Config):
-    """How many things move."""
+    """Numbers of moving things."""
 
     people: int = parameter(0, "people who walk through the view", minimum=0, maximum=5)
     moved_chairs: int = parameter(0, "chairs that are moved halfway through", minimum=0, maximum=5)
@@ -44,7 +44,7 @@ def add_moving(world: World, config: MovingConfig, path: Path, rooms: tuple[Room
 
 
 class MovingThings:
-    """Where the moving things are at a time; they keep to the way of a rig."""
+    """Places of the moving things at a time; they keep to the way of a rig."""
 
     def __init__(self, config: MovingConfig, path: Path) -> None:
         self._config = config

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How hard a simulated recording is: ``ideal`` rendering, or ``real`` with what real rooms and sensors add.
+"""Profiles of a simulated recording: ``ideal`` rendering, or ``real`` with what real rooms and sensors add.
 
 Every effect is a small module of its own with a configuration here; all of them are off in ``ideal``, whose bytes they
 leave as they are.
@@ -20,7 +20,7 @@ PROFILES = ("ideal", "real")
 
 @dataclass(frozen=True)
 class RealismConfig(Config):
-    """What reality adds to the ideal rendering; the defaults add nothing."""
+    """Disturbances that reality adds to the ideal rendering; the defaults add nothing."""
 
     moving: MovingConfig = group(MovingConfig)
     finishes: FinishConfig = group(FinishConfig)

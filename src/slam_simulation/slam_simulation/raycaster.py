@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which surface does each pixel see? A tiled ray caster over rectangles.
+"""Tiled ray caster over rectangles: the surface that each pixel sees.
 
 All geometry is brought into the camera's frame once per view, where pixel rays are fixed. The image is cut into tiles
 of 16 x 16 pixels; each tile keeps only the rectangles that its pyramid of rays can meet, nearest first, and drops
@@ -92,7 +92,7 @@ def make_view(world: SurfaceTable, T_world_camera: FloatArray, bounds: FloatArra
 
 
 class Hits(NamedTuple):
-    """What :func:`trace` finds.
+    """Result of :func:`trace`.
 
     surface: int32 (h, w), row of the *view* or -1. depth: float32 (h, w), z in m, 0 where nothing is hit. candidates:
     int32 (tiles, m), each tile's rectangles nearest first; counts: int32 (tiles,).

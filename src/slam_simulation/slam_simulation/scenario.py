@@ -45,7 +45,7 @@ SCENARIO_FOLDERS = (FilePath("bags/scenarios"), FilePath(__file__).resolve().par
 
 @dataclass(frozen=True)
 class Agent:
-    """Who carries a rig: namespace, motion style, height of the camera and way points (or stations) of the path."""
+    """Carrier of a rig: namespace, motion style, height of the camera and way points (or stations) of the path."""
 
     name: str = ""
     motion: str = "rig"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What does a pixel see? Radiance of the traced image: filtered textures, baked light, highlights, smooth edges.
+"""Radiance of the traced image: filtered textures, baked light, highlights, smooth edges.
 
 Textures are averaged over the parallelogram that a pixel's ray derivatives span on the surface. Pixels at the border of
 surfaces are shared out among them by 4 x 4 rays, and each surface is shaded once.
@@ -153,7 +153,7 @@ def _radiance(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def is_edge(surface: npt.NDArray[np.int32], i: int, j: int) -> bool:  # pragma: no cover - compiled
-    """Whether one of the four neighbours of a pixel sees another surface."""
+    """True if one of the four neighbours of a pixel sees another surface."""
     q = surface[i, j]
     height, width = surface.shape
     return bool(
@@ -177,7 +177,7 @@ def split_pixel(
     near: FloatArray,
     parts: FloatArray,
 ) -> int:  # pragma: no cover - compiled
-    """Which surfaces share a pixel? EDGE_RAYS x EDGE_RAYS rays, gathered by surface.
+    """Surfaces that share a pixel, by EDGE_RAYS x EDGE_RAYS rays, gathered by surface.
 
     Fills a row of ``parts`` (EDGE_RAYS^2, 4) for each: row of the view, share of the pixel, mean x and mean y of its
     rays; returns their number.

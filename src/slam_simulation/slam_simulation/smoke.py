@@ -22,7 +22,7 @@ _BACKSCATTER_RANGE = 0.5
 
 @dataclass(frozen=True)
 class SmokeConfig(Config):
-    """How thick the smoke is."""
+    """Density of the smoke."""
 
     density: float = parameter(
         0.0, "extinction: 0.02 is haze, 0.3 a burning room", unit="1/m", minimum=0.0, maximum=5.0

@@ -120,7 +120,7 @@ class StereoSensor:
     def _light(
         self, k: int, world: SurfaceTable, T_world_rig: FloatArray, twist: FloatArray, pool: ThreadPoolExecutor | None
     ) -> Float32Array:
-        """What reaches the sensor of camera ``k``: radiance, smeared by motion, darkened and blurred by the lens."""
+        """Light on the sensor of camera ``k``: radiance, smeared by motion, darkened and blurred by the lens."""
         rays, T_world_camera = self.rays[k], T_world_rig @ self.T_rig_raw[k]
         view = make_view(world, T_world_camera, rays.bounds)
         hits = trace(view, rays, pool)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far points are from the surfaces of a world, and which of its surfaces a camera has seen: truth for models."""
+"""Distances of points from the surfaces of a world, and the surfaces that a camera has seen: truth for models."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def count_sightings(
     world: SurfaceTable, points: FloatArray, normals: FloatArray, camera: Camera, poses: FloatArray, max_depth: float,
     max_incidence_deg: float = 75.0,
 ) -> FloatArray:  # fmt: skip
-    """How many of the cameras at ``poses`` T_world_camera (m, 4, 4) see each point (n, 3): near, not hidden."""
+    """Number of the cameras at ``poses`` T_world_camera (m, 4, 4) that see each point (n, 3), near and not hidden."""
     rays = camera_rays(camera)
     seen = np.zeros(len(points))
     for T in poses:

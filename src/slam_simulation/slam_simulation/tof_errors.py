@@ -43,5 +43,5 @@ def with_indirect_light(phasor: FloatArray, ambiguity_range: float, config: TofE
 
 
 def wiggle(distance: FloatArray, ambiguity_range: float, config: TofErrorConfig) -> FloatArray:
-    """What is added to ranges (h, w) m."""
+    """Periodic error of ranges (h, w) m."""
     return np.asarray(config.wiggling * np.sin(_WIGGLES * 2.0 * np.pi * distance / ambiguity_range))

@@ -128,7 +128,7 @@ class TofSensor:
         return self._disturbed(direct, hits), np.asarray(self.config.ambient_scale * out[..., 2])
 
     def _disturbed(self, phasor: FloatArray, hits: Hits) -> FloatArray:
-        """What reaches the sensor of the light of the surfaces, smoke and other ways of light counted in."""
+        """Light of the surfaces on the sensor, smoke and indirect light included."""
         c, r = self.config, self._realism
         distance = hits.depth * np.sqrt(1.0 + (self.rays.rays[..., :2] ** 2).sum(axis=-1))
         phasor = echo_through(phasor, distance, c.ambiguity_range, c.amplitude_scale, r.smoke)

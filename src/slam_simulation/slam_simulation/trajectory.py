@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the rig moves: a smooth path through way points, and what a walking person adds to it.
+"""Motion of the rig: a smooth path through way points, and what a walking person adds to it.
 
 Position, heading and pitch are cubic splines of time with zero velocity at both ends (twice continuously
 differentiable). A motion style adds bob and sway at the step frequency and slow unrest, faded in and out so that a

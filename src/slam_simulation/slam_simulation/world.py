@@ -16,7 +16,7 @@ from slam_core.geometry import FloatArray, rotation_from_euler
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface looks.
+    """Appearance of a surface.
 
     ``name`` is a pattern (repeats every few decimetres) or a picture (fills the surface); ``brightness`` multiplies its
     reflectance. ``gloss`` is the strength of the mirror-like part, ``infrared`` the reflectance at the ToF camera's

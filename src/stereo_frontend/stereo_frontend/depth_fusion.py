@@ -31,7 +31,7 @@ _ITERATIONS = 8
 
 @dataclass(frozen=True)
 class FusionConfig(Config):
-    """How ToF depth meets stereo features."""
+    """Fusion of ToF depth and stereo features."""
 
     gate: float = parameter(9.0, "chi-square gate (1 DoF) on the disagreement of stereo and ToF depth", minimum=0.1)
     max_age: float = parameter(0.06, "greatest time between the stereo pair and the depth image", unit="s", minimum=0.0)

@@ -69,7 +69,7 @@ class RefinedDisparity:
 
     @property
     def valid(self) -> npt.NDArray[np.bool_]:
-        """Which alignments are trusted."""
+        """Mask of the alignments that are trusted."""
         return np.isfinite(self.disparity)
 
     def select(self, index: npt.NDArray[np.intp]) -> RefinedDisparity:

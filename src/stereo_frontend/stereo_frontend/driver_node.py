@@ -38,7 +38,7 @@ from stereo_frontend.stage import StereoStage
 
 @dataclass(frozen=True)
 class StereoDriverConfig(Config):
-    """Where the images come from and how they are calibrated."""
+    """Source of the images and their calibration."""
 
     source: str = parameter("topics", "origin of the raw pairs", choices=("topics", "camera", "video", "folder"))
     path: str = parameter("0", "camera number or device, video file, or folder of images; unused with source topics")

@@ -44,7 +44,7 @@ Wanted = Callable[[Float32Array, Float32Array], npt.NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class FeatureConfig(Config):
-    """Which features, how many and how they are spread."""
+    """Detector, number and spread of the features."""
 
     detector: str = parameter("surf", "keypoint detector and descriptor", choices=DETECTORS)
     target: int = parameter(600, "number of features wanted per image", minimum=10, maximum=20000)

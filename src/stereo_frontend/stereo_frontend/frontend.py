@@ -67,7 +67,7 @@ class FrontendConfig(Config):
 
 @dataclass(frozen=True)
 class FrontendReport:
-    """What the front end knows of its images.
+    """Findings of the front end about its images.
 
     rectification: figures of the stereo pair; advice: to the user, a sentence each; picture: what features are searched
     in: "stereo", "amplitude", "intensity", "range" or "" before the first image.
@@ -170,7 +170,7 @@ class Frontend:
         self.counters = Counters()
 
     def report(self) -> FrontendReport:
-        """What was found out about the images so far."""
+        """Findings about the images so far."""
         advice = (self.self_calibration.advice(), self._tof.advice())
         picture = "+".join(self._tof.used) if self.config.mode == "tof" else "stereo"
         return FrontendReport(self.self_calibration.figures(), tuple(text for text in advice if text), picture)
@@ -213,7 +213,7 @@ class Frontend:
         return match_stereo(left, aligned, self.config.matching, bounds)
 
     def _view(self, images: StereoImages, left: Keypoints, refined: RefinedDisparity) -> StereoView:
-        """What self-calibration learns from."""
+        """View that self-calibration learns from."""
         r = refined
         measured = (left.uv, r.disparity, r.sigma, r.row_shift, r.row_sigma, self._noise.sigma(left.size))
         return StereoView(images.stereo, left.descriptors, *(np.asarray(v, np.float64) for v in measured))

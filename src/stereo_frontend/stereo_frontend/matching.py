@@ -27,7 +27,7 @@ IndexArray = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class MatchingConfig(Config):
-    """What counts as a stereo match."""
+    """Limits of a stereo match."""
 
     min_similarity: float = parameter(
         0.7, "least scalar product of two descriptors (alpha of Eq. 3.1)", minimum=-1.0, maximum=1.0
@@ -152,7 +152,7 @@ def swapped_share(
 
 
 def has_consistent_neighbour(uv: Float32Array, disparity: FloatArray, neighbours: int) -> npt.NDArray[np.bool_]:
-    """Which positions (n, 2) px share their disparity (n,) px, within 20 % or 2 px, with one of their neighbours.
+    """Mask of positions (n, 2) px that share their disparity (n,) px, within 20 % or 2 px, with a neighbour.
 
     On brickwork and drawers a match can slip by whole repeats and still look perfect; then it stands alone in its
     depth. NaN disparities are no neighbours and have none.

@@ -83,7 +83,7 @@ class FeatureNode(SlamNode[FrontendConfig]):
         self.listen_together(topics, self._on_depth)
 
     def _tof_picture(self) -> str:
-        """Which image is needed beside depth, or ""; a node cannot know what there will be, so auto means amplitude."""
+        """Image that is needed beside depth, or ""; a node cannot know what there will be, so auto means amplitude."""
         if self.config.mode != "tof" or self.config.tof.images == "range":
             return ""
         return "intensity" if self.config.tof.images == "intensity" else "amplitude"

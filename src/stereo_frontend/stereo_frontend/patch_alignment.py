@@ -173,7 +173,7 @@ def _right_hand_side(template, patch, jacobian, energy, power, out):  # type: ig
 
 @njit(cache=True, nogil=True)
 def _correlation_factor(residual, radius):  # type: ignore[no-untyped-def]
-    """How much more variance correlated noise leaves than white noise, ``(1 + 2 rho_u) (1 + 2 rho_v)``.
+    """Factor of the variance that correlated noise leaves over that of white noise, ``(1 + 2 rho_u) (1 + 2 rho_v)``.
 
     Rectification interpolates, which makes neighbouring pixels share their noise: the residual's own correlation shows
     it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well keypoints and disparities are placed, from their size and from what a stereo pair shows anyway.
+"""Position noise of keypoints and disparities, from their size and from what a stereo pair shows anyway.
 
 Seen again from elsewhere, a keypoint lies off the surface point it was first found on by an error that grows with its
 size (measured on simulated rooms, frames 0.3 s apart). How good the images are shows in every rectified pair: the two

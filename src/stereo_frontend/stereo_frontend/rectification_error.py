@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a rectified stereo pair is still wrong by: a smooth field of small errors of the right image against the left.
+"""Error that is left in a rectified stereo pair: a smooth field of small errors of the right image against the left.
 
 A calibration errs in a few numbers of the right camera: where its axis points, its focal length, its lens. Each of
 them moves the pixels of the right image along the rows and across them *together* (linear terms of the pinhole and

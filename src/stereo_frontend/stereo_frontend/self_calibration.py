@@ -63,7 +63,7 @@ _PRIOR_GROUPS = 5.0
 
 @dataclass(frozen=True)
 class SelfCalibrationConfig(Config):
-    """When to learn and when to believe it."""
+    """Limits of learning and of what is believed."""
 
     mode: str = parameter("auto", "correct where the evidence asks for it, or never", choices=("auto", "off"))
     row_floor: float = 0.1
@@ -92,7 +92,7 @@ class StereoSelfCalibration:
         return replace(matching, epipolar_band=matching.epipolar_band + reach)
 
     def knows(self, camera: Camera) -> bool:
-        """Whether the rows of this camera's pair are known, or not asked for."""
+        """True if the rows of this camera's pair are known, or not asked for."""
         return self.config.mode == "off" or (self.error is not None and self.error.camera == camera)
 
     def rows(self, uv_right: Float32Array, disparity: AnyArray) -> Float32Array:
@@ -102,13 +102,13 @@ class StereoSelfCalibration:
         return self.error.rows(uv_right, disparity).astype(np.float32)
 
     def columns(self, uv_right: Float32Array) -> tuple[FloatArray, FloatArray]:
-        """What to add to disparities (n,) px and its standard deviation (n,) px; zeros while there is doubt."""
+        """Correction of disparities (n,) px with its standard deviation (n,) px; zeros while there is doubt."""
         if self.error is None or not self.corrects:
             return np.zeros(len(uv_right)), np.zeros(len(uv_right))
         return self.error.columns(uv_right), self.error.column_sigma(uv_right)
 
     def figures(self) -> dict[str, float | str]:
-        """What is known, for a summary; empty before the first pair."""
+        """Figures for a summary; empty before the first pair."""
         if self.error is None:
             return {}
         return {
@@ -119,7 +119,7 @@ class StereoSelfCalibration:
         }
 
     def advice(self) -> str:
-        """What a user should know and do about it, or ""."""
+        """Advice to the user, or ""."""
         if self.error is None or not (self.corrects_rows or self.corrects):
             return ""
         text = f"rectification off by {self.error.row_rms():.1f} px across the rows"
@@ -172,7 +172,7 @@ class StereoSelfCalibration:
         self.corrects = enough and error.column_rms() > slack * self._doubt(error.column_sigma_rms())
 
     def _doubt(self, sigma: float) -> float:
-        """What an error of standard deviation ``sigma`` must exceed to be believed."""
+        """Limit that an error of standard deviation ``sigma`` must exceed to be believed."""
         return float(np.sqrt(_MIN_CHI_SQUARE)) * sigma
 
 

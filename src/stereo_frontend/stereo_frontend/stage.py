@@ -43,7 +43,7 @@ class StereoStage:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was dropped, by name."""
+        """Counts of what was dropped, by name."""
         return {"pairs_without_camera_info": self._pairs.dropped}
 
     def set_info(self, side: str, info: CameraInfo) -> None:
@@ -100,16 +100,16 @@ class FeatureStage:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was accepted and rejected, by name."""
+        """Counts of what was accepted and rejected, by name."""
         return self._frontend.counters.counts
 
     def report(self) -> FrontendReport:
-        """What the front end found out about the images so far."""
+        """Findings of the front end about the images so far."""
         return self._frontend.report()
 
     @property
     def complaint(self) -> str:
-        """Why features lack depth that they should have, or ""."""
+        """Reason for which features lack depth that they should have, or ""."""
         return self._pairing.complaint
 
     @property
@@ -132,7 +132,7 @@ class FeatureStage:
             self._ready += self._pairing.add_depth(depth)
 
     def extracted(self) -> Iterator[ExtractedFrame]:
-        """What need not wait any more, with its keypoints, oldest first."""
+        """Yield the frames that need not wait any more, with their keypoints, oldest first."""
         while self._ready:
             images, depth = self._ready.popleft()
             yield ExtractedFrame(images, depth, self._frontend.extract(images))

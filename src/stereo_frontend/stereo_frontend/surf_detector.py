@@ -35,7 +35,7 @@ IntegralImage = npt.NDArray[np.int32]
 
 
 def fitting_octaves(height: int, width: int, octaves: int) -> int:
-    """How many of so many octaves have filters that fit an image (height, width) px."""
+    """Number of the given octaves whose filters fit an image (height, width) px."""
     return sum(2 * _BORDERS[1] + 1 < min(height, width) >> octave for octave in range(octaves))
 
 

@@ -29,7 +29,7 @@ GAMMA = 0.5
 
 @dataclass(frozen=True)
 class TofFeatureConfig(Config):
-    """Which images of the ToF camera give features."""
+    """Images of the ToF camera that give features."""
 
     images: str = parameter(
         "auto",
@@ -67,7 +67,7 @@ class TofFeatures:
         self.used = ()
 
     def advice(self) -> str:
-        """What a user should know and do about the images used, or ""."""
+        """Advice to the user about the images used, or ""."""
         if self.used != ("range",) or self.config.images == "range":
             return ""
         return (
@@ -99,7 +99,7 @@ def _values(image: DepthImage, name: str) -> Float32Array | None:
 
 
 def _shows_something(values: Float32Array | None) -> bool:
-    """Whether there is a picture that is not blank."""
+    """True if there is a picture that is not blank."""
     return values is not None and bool(np.nanmax(values, initial=-np.inf) > np.nanmin(values, initial=np.inf))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What two moments say of the error of a stereo pair: the same points, measured twice, must fit one rigid motion.
+"""Error of a stereo pair from two moments: the same points, measured twice, must fit one rigid motion.
 
 Every match of a keypoint from one frame to the next is measured as (u, v, disparity) twice. Disparities that a wrong
 calibration bends make the scene change its shape while the camera moves. The adjustment solves for the motion and the

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which range pixels can be believed, and the reason for each one that cannot.
+"""Mask of range pixels that can be believed, with the reason for each one that cannot.
 
 A pixel is judged alone first (no reading, too dark, saturated, out of range, wrapped round the ambiguity range), then
 among its neighbours: a pixel at a depth edge mixes the light of foreground and background and flies between them.
@@ -25,7 +25,7 @@ MINIMUM_NEIGHBOURS = 3
 
 
 class Reason(IntEnum):
-    """Why a pixel has no depth; ``VALID`` where it has one."""
+    """Reason for which a pixel has no depth; ``VALID`` where it has one."""
 
     VALID = 0
     NO_READING = 1

@@ -87,7 +87,7 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
         return {"both": ("amplitude", "intensity"), "none": ()}.get(chosen, (chosen,))
 
     def _roles(self) -> tuple[str, ...]:
-        """What the pictures are taken for."""
+        """Roles that the pictures are taken for."""
         return tuple("amplitude" if name == "color" else name for name in self._pictures)
 
     def _advertise_outputs(self) -> tuple[str, ...]:

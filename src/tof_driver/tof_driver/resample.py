@@ -20,7 +20,7 @@ from slam_core.types import ByteArray, Float32Array
 
 @dataclass(frozen=True, eq=False)
 class RectificationMap:
-    """Where each pixel of the ideal image lies in the distorted one: ``u``, ``v`` float32 (height, width) px."""
+    """Position of each pixel of the ideal image in the distorted one: ``u``, ``v`` float32 (height, width) px."""
 
     u: Float32Array
     v: Float32Array

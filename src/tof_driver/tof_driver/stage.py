@@ -44,7 +44,7 @@ class DepthStage:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was accepted and rejected, by name."""
+        """Counts of what was accepted and rejected, by name."""
         counts = {} if self._processor is None else dict(self._processor.counters.counts)
         return counts | ({"images_without_camera_info": self._dropped} if self._dropped else {})
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which bags this program wrote: their metadata say so, and only these may be replaced.
+"""Mark of the bags that this program wrote: only these may be replaced.
 
 A folder's are in ``metadata.yaml``; those of a single mcap file are the same text in its record "rosbag2" (MCAP
 specification: footer, summary section, metadata index, metadata).
@@ -39,7 +39,7 @@ def require_free(path: Path, *, overwrite: bool) -> None:
 
 
 def is_own_bag(path: Path) -> bool:
-    """Whether a folder or mcap file is a bag that this program wrote, and holds nothing else."""
+    """True if a folder or mcap file is a bag that this program wrote, and holds nothing else."""
     try:
         if path.is_file():
             return _is_own(yaml.safe_load(_mcap_metadata(path)))

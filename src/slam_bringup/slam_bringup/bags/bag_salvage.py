@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is left of an mcap file that a killed recorder did not close: its whole records, behind which an end is written.
+"""Salvage of an mcap file that a killed recorder did not close: its whole records, with an end behind them.
 
 Records are an opcode (1 byte), a length (8 bytes) and the content (MCAP specification, section Records).
 """
@@ -17,7 +17,7 @@ _BLOCK = 1 << 20
 
 
 def is_whole_mcap(path: Path) -> bool:
-    """Whether the file ends as an mcap file does."""
+    """True if the file ends as an mcap file does."""
     with path.open("rb") as file:
         file.seek(0, os.SEEK_END)
         if file.tell() < 2 * len(_MAGIC):

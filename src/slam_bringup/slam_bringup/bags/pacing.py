@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a player waits for those who process: the stamps on their way to each node, and the clock of a replay."""
+"""Pacing of a player by those who process: the stamps on their way to each node, and the clock of a replay."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def _forget_up_to(stamps: deque[int], stamp_ns: int) -> None:
 
 
 class Audience:
-    """How many subscribers each topic must have before its first message is sent, which none of them is to miss.
+    """Numbers of subscribers that each topic must have before its first message is sent.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class Audience:
 
 
 class ReplayClock:
-    """When a message of a bag is due: ``rate`` times as fast as it was recorded; rate 0 is as fast as possible."""
+    """Due times of a bag's messages: ``rate`` times as fast as it was recorded; rate 0 is as fast as possible."""
 
     def __init__(self, rate: float) -> None:
         if rate < 0.0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the messages of one agent become: readings of its sensors, paired by stamp and decoded."""
+"""Messages of one agent as readings of its sensors, paired by stamp and decoded."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ Reading = StereoReading | DepthReading | ImuReading | ColourReading
 
 @dataclass(frozen=True, eq=False)
 class AgentSensors:
-    """What one agent carries. Frames and infos are None where there is no such sensor.
+    """Sensors of one agent. Frames and infos are None where there is no such sensor.
 
     ``measurement``: "range" along the ray or "depth" along z. ``frames``: the static transforms between its frames.
     """
@@ -101,7 +101,7 @@ class AgentSensors:
         return self.frames.lookup(names[target], names[source])
 
     def is_mounted(self, camera: str) -> bool:
-        """Whether the bag has "left" or "tof" and knows where it sits on the rig."""
+        """True if the bag has "left" or "tof" and knows where it sits on the rig."""
         try:
             self.transform("base", camera)
         except ValueError:

@@ -40,7 +40,7 @@ class RecordingClock(Generic[T]):
 
 
 def has_header(type_name: str) -> bool:
-    """Whether messages of a type begin with a header."""
+    """True if messages of a type begin with a header."""
     fields = typestore().fielddefs[type_name][1]
     return bool(fields) and fields[0][0] == "header"
 

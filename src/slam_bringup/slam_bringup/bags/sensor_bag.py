@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag holds for the estimators: per agent, paired and decoded images, depth, IMU, extrinsics, ground truth.
+"""A bag's content for the estimators: per agent, paired and decoded images, depth, IMU, extrinsics, ground truth.
 
     with SensorBag(path) as bag:
         for reading in bag.readings():
@@ -126,7 +126,7 @@ class SensorBag:
 
     @property
     def warnings(self) -> list[str]:
-        """What a user should know of this bag, as far as it has been read."""
+        """Warnings about this bag, as far as it has been read."""
         return self._warnings + [self.reader.warning] * bool(self.reader.warning)
 
     def count(self, agent: str, role: str) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which topic of a bag is which sensor: the nodes' own names below each agent's namespace, or names that a user gives.
+"""Topics of a bag by sensor: the nodes' own names below each agent's namespace, or names that a user gives.
 
 A role is what a topic is for ("left", "depth", "imu", ...). The camera info of an image stands beside it, as
 image_transport has it (``<camera>/camera_info``), unless its role ("left_info") is given.
@@ -30,7 +30,7 @@ ROLES = (*_CANDIDATES, *_INFO_OF)
 
 @dataclass(frozen=True)
 class BagNames:
-    """What a bag names otherwise than the nodes do.
+    """Names of a bag that differ from those of the nodes.
 
     topics: by role. base_frame: the frame whose poses are wanted; "": ``base_link``, or where there is none the root
     above the camera in the tree of frames.
@@ -90,12 +90,12 @@ def topics_of(agent: str, known: Collection[str], given: Mapping[str, str]) -> d
 
 
 def is_rectified(image_topic: str) -> bool:
-    """Whether the images of a topic are rectified, by their name: ``image_rect``, ``image_rect_raw``, ..."""
+    """True if the images of a topic are rectified, by their name: ``image_rect``, ``image_rect_raw``, ..."""
     return "rect" in _without_transport(image_topic).rsplit("/", 1)[-1]
 
 
 def nodes_name(agent: str, role: str, topic: str, measurement: str) -> str:
-    """What the nodes call the topic of a role; ``measurement`` is what the depth camera measures.
+    """Name that the nodes give the topic of a role; ``measurement`` is what the depth camera measures.
 
     Raises
     ------

@@ -16,7 +16,7 @@ _CARRIERS = {"map_to_odom": "/tf", "static_transforms": "/tf_static", "odom": "/
 
 
 def transform_topic(topic: str) -> str | None:
-    """Where transforms carried by ``topic`` belong, /tf or /tf_static; None if it carries none."""
+    """Topic for the transforms carried by ``topic``, /tf or /tf_static; None if it carries none."""
     return _CARRIERS.get(topic.rsplit("/", 1)[-1])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much the commands say on the terminal (``-q``, ``-v``), and the log that a run leaves in its folder.
+"""Output of the commands on the terminal (``-q``, ``-v``), and the log that a run leaves in its folder.
 
 The packages log by Python's ``logging``. On the terminal stands what the chosen verbosity lets through; a
 :class:`Transcript` keeps everything, for ``OUT/logs/slam.log``.
@@ -57,7 +57,7 @@ def with_verbosity(command: click.Command) -> click.Command:
 
 
 def is_quiet() -> bool:
-    """Whether only errors are wanted."""
+    """True if only errors are wanted."""
     return _verbosity() < 0
 
 

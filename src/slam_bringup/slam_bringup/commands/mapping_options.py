@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``slam run`` and ``slam nodes`` have in common: arguments, options, and the progress bar."""
+"""Common parts of ``slam run`` and ``slam nodes``: arguments, options, and the progress bar."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def _both_alike(source: FloatArray, target: FloatArray) -> tuple[FloatArray, Flo
 
 
 def next_step(source: FloatArray, target: FloatArray, config: RegistrationConfig, *, guessed: bool) -> str:
-    """What to try where two clouds (n, 3) could not be registered."""
+    """Advice where two clouds (n, 3) could not be registered."""
     sizes = [float(np.ptp(cloud, axis=0).max()) for cloud in (source, target)]
     if max(sizes) > UNIT_RATIO * min(sizes):
         return f"The source spans {sizes[0]:.3g} m and the target {sizes[1]:.3g} m: are both in metres?"

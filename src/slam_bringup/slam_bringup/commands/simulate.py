@@ -44,7 +44,7 @@ IMAGE_FORMATS = ("raw", "png", "jpeg")
 
 @dataclass(frozen=True)
 class BagOptions:
-    """How a simulated bag is stored.
+    """Storage of a simulated bag.
 
     images: "raw" Image messages, or CompressedImage "png" (lossless) or "jpeg" (quality 90). compact: ToF images in
     16 bits (mm and counts, no intensity): their rounding is a tenth of the sensor's noise. truth: add the true depth of
@@ -132,7 +132,7 @@ class SimulationWriter(SensorWriter):
         self._simulator, self._options = simulator, options
 
     def mountings(self, stamp: int) -> None:
-        """Where the sensors sit on the rig."""
+        """Mountings of the sensors on the rig."""
         s, sensors = self._simulator, self._simulator.scenario.sensors
         T_rig_right = s.T_rig_left.copy()
         T_rig_right[1, 3] -= s.stereo.stereo.baseline

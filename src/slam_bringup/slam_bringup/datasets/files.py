@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the readers of all data sets share: images from files, and a source of readings."""
+"""Common parts of the data sets' readers: images from files, and a source of readings."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the checks look at: stamps of every message, calibration, frames, and some of the images of each agent.
+"""Evidence for the checks: stamps of every message, calibration, frames, and some of the images of each agent.
 
     messages of a bag -> streams (all stamps) -> sample (three bursts of consecutive images) -> decoded images
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Finding:
-    """What is wrong, and what to do.
+    """A fault, and its remedy.
 
     check: short name, the same for the same kind of fault. prevents_mapping: whether no map can come of it.
     """

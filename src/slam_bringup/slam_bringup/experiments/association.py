@@ -33,7 +33,7 @@ class Variant:
     predicted: bool = True
 
     def config(self) -> FeatureAssociationConfig:
-        """What the filter would be told."""
+        """Configuration that the filter would get."""
         plain: dict[str, Any] = {} if self.descriptors else {"descriptor_threshold": -1.0, "descriptor_weight": 0.0}
         return replace(FeatureAssociationConfig(), method=self.method, **plain)
 

@@ -33,7 +33,7 @@ def expected() -> dict[str, dict[str, Any]]:
 
 
 def violations(scenario: str, summary: Mapping[str, Any]) -> list[str]:
-    """What of a run's ``summary.json`` lies outside of the scenario's bounds, in words; empty if nothing does."""
+    """Values of a run's ``summary.json`` outside of the scenario's bounds, in words; empty if there are none."""
     bounds = expected()[scenario]
     agents = summary.get("agents") or {"": summary}
     lost = sum("LOST" in event for event in summary["events"])

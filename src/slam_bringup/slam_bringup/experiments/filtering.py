@@ -21,7 +21,7 @@ ACCURACY_HEADER = (
 
 
 def frames(quick: bool) -> int | None:
-    """How many frames of a scenario are used."""
+    """Number of a scenario's frames that are used."""
     return _QUICK_FRAMES if quick else None
 
 
@@ -52,7 +52,7 @@ def speed_comparison(result: JobResult, thesis: str) -> Comparison:
 
 
 def bounds_comparison(scenario: str, result: JobResult) -> Comparison:
-    """Whether the run keeps the bounds of ``bags/expected.yaml``."""
+    """True if the run keeps the bounds of ``bags/expected.yaml``."""
     outside = violations(scenario, result.values["summary"])
     return Comparison(
         f"bounds of bags/expected.yaml, {scenario}", "", "; ".join(outside) or "kept", "kept", not outside

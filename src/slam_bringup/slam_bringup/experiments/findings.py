@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an experiment has to show: comparisons with the thesis, tables, figures and an answer in words."""
+"""Findings of an experiment: comparisons with the thesis, tables, figures and an answer in words."""
 
 from __future__ import annotations
 

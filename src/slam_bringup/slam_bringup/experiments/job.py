@@ -63,18 +63,18 @@ class Job:
 
     @property
     def title(self) -> str:
-        """What a progress bar shows."""
+        """Title for the progress bar."""
         arguments = " ".join(str(v) for v in self.arguments.values() if v not in (None, ""))
         return f"{self.function.partition(':')[2].replace('_', ' ')} {arguments}".strip()
 
     def folder(self, cache: Path) -> Path:
-        """Where the result is kept."""
+        """Folder in which the result is kept."""
         return cache / f"{self.function.partition(':')[2]}-{self.digest}"
 
 
 @dataclass(frozen=True, eq=False)
 class JobResult:
-    """What a job found: ``values`` as JSON knows them, ``arrays`` by name, and the folder with any files it wrote."""
+    """Result of a job: ``values`` as JSON knows them, ``arrays`` by name, and the folder with any files it wrote."""
 
     folder: Path
     values: dict[str, Any]

@@ -107,7 +107,7 @@ def submaps(arrays: Arrays, kind: str) -> Figure:
 
 
 def measurement_matrix(arrays: Arrays) -> Figure:
-    """Which submap (rows) observes which landmark (columns), in the order of their first sighting (Fig. 9.23)."""
+    """Matrix of submaps (rows) that observe landmarks (columns), in the order of first sighting (Fig. 9.23)."""
     figure, axes = new_figure(8.0, 3.5)
     _, column = np.unique(arrays["landmark_of"], return_inverse=True)
     axes.plot(column, arrays["submap_of"], ",", color="black")

@@ -78,7 +78,7 @@ def register_on_one_grid(folder: Path, before: list[Path], edge: float, scans: i
 
 
 def _successes(result: JobResult) -> np.ndarray:
-    """Which registrations (motions, scans) are within 5 cm and 1 deg."""
+    """Mask (motions, scans) of registrations within 5 cm and 1 deg."""
     error = result.arrays["found"] - result.arrays["true"]
     return np.asarray(
         (np.linalg.norm(error[..., :3], axis=-1) < _GOOD_M) & (np.linalg.norm(error[..., 3:], axis=-1) < _GOOD_RAD)

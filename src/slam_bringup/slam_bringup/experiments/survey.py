@@ -196,7 +196,7 @@ class _Growth:
 
 
 def _growth(found: list[dict[str, Any]], sizes: list[int]) -> _Growth | None:
-    """How a technique's cost grows; None where it could not be run."""
+    """Growth of a technique's cost; None where it could not be run."""
     if any("missing" in values for values in found):
         return None
     ms = [1e3 * values["seconds"] for values in found]

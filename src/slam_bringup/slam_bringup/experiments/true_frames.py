@@ -60,7 +60,7 @@ def true_depth(truth: DepthTruth, uv: np.ndarray) -> FloatArray:
 
 
 def transfer(first: TrueFrame, second: TrueFrame, uv: np.ndarray) -> FloatArray:
-    """Where the surface points at ``uv`` (n, 2) px of the first left image appear in the second; NaN where hidden."""
+    """Pixels in the second left image of the surface points at ``uv`` (n, 2) px of the first; NaN where hidden."""
     camera = first.images.stereo.camera
     depth = true_depth(first.truth, uv)
     points = camera.unproject(np.asarray(uv, np.float64), depth)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of the submaps of a run: a new map, more of a finished one, or places in one that stays as it is."""
+"""Use of the submaps of a run: for a new map, more of a finished one, or places in one that stays as it is."""
 
 from __future__ import annotations
 

@@ -88,11 +88,11 @@ class Mapper:
 
     @property
     def has_frames(self) -> bool:
-        """Whether any filter has seen a frame."""
+        """True if any filter has seen a frame."""
         return any(diary.poses for diary in self._diaries.values())
 
     def record(self, wall_s: float, dropped: Mapping[str, int], failure: str) -> RunRecord:
-        """What the run leaves behind, after :meth:`finish`."""
+        """Record of the run, after :meth:`finish`."""
         return RunRecord(
             agents={agent: diary.record() for agent, diary in self._diaries.items()},
             global_map=self.growth.global_map,
@@ -114,7 +114,7 @@ class Mapper:
         return dict(zip(BACKLOG, counts, strict=True))
 
     def rejections(self) -> dict[str, int]:
-        """What all filters and the map rejected, by reason."""
+        """Counts of what all filters and the map rejected, by reason."""
         total: Counter[str] = Counter()
         for counters in (*(stage.counters for stage in self._filters.values()), self.growth.global_map.counters):
             total.update(counters.counts)
@@ -138,7 +138,7 @@ class Mapper:
 
 
 class _Diary:
-    """What is kept of each of an agent's frames: a result's views of the open submap would fill the memory."""
+    """Essence of an agent's frames: whole results, with their views of the open submap, would fill the memory."""
 
     def __init__(self) -> None:
         self.poses: list[PoseEstimate] = []

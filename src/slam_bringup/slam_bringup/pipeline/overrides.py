@@ -124,7 +124,7 @@ def parse_assignments(text: str) -> dict[str, dict[str, Any]]:
 
 
 def is_parameter_of(node: str, name: str) -> bool:
-    """Whether a node has a parameter; False as well where ROS, and with it the nodes, is not installed."""
+    """True if a node has a parameter; False as well where ROS, and with it the nodes, is not installed."""
     return name.startswith(_ROS_OWN) or name in _parameters_of(node)
 
 
@@ -163,7 +163,7 @@ def _flattened(values: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[st
 
 
 def _names(pattern: str, full_name: str) -> bool:
-    """Whether a rule is for a node: a bare name in any namespace; ``*`` one part of a name, ``**`` any number."""
+    """True if a rule is for a node: a bare name in any namespace; ``*`` one part of a name, ``**`` any number."""
     if not pattern.startswith("/"):
         pattern = f"/**/{pattern}"
     parts = {"/**/": "/(?:.*/)?", "/**": "(?:/.*)?", "**": ".*", "*": "[^/]*"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run ends with, the same for ``slam run`` and ``slam nodes``, and its summary."""
+"""Result of a run and its summary, the same for ``slam run`` and ``slam nodes``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run leaves behind, offline or through nodes, and the result that is made of it in one way."""
+"""Record of a run, offline or through nodes, and the result that is made of it in one way."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ BACKLOG = ("received", "joined", "waiting", "waiting_at_most")
 
 @dataclass(frozen=True, eq=False)
 class AgentRecord:
-    """What was said of one agent, frame by frame.
+    """Estimates of one agent, frame by frame.
 
     ``events`` are changes of its filter's state, ``lost_share`` how much of the time it was lost, ``front_end`` what
     its images told, ``frames`` some of its pictures.

@@ -24,7 +24,7 @@ from tof_driver.stage import DepthStage
 
 @dataclass(frozen=True, eq=False)
 class AgentItem:
-    """What comes out of the sensors of ``agent``; an extracted frame has yet to be measured."""
+    """Output of the sensors of ``agent``; an extracted frame has yet to be measured."""
 
     agent: str
     value: ExtractedFrame | Features | ScanEstimate | ImuSample
@@ -56,7 +56,7 @@ class SensorPipeline:
         )
 
     def add(self, reading: Reading) -> Iterator[AgentItem]:
-        """What a reading leads to; a stereo pair that waits for its ToF image comes out with a later reading."""
+        """Take a reading; yields what it leads to. A stereo pair that waits for its ToF image comes out later."""
         if isinstance(reading, ImuReading):
             yield from self._on_imu(reading.sample)
         elif isinstance(reading, StereoReading) and self._uses_stereo:
@@ -65,7 +65,7 @@ class SensorPipeline:
             yield from self._on_depth(reading)
 
     def finish(self) -> Iterator[AgentItem]:
-        """What still waits when the input has ended."""
+        """Yield what still waits when the input has ended."""
         if self._odometry is not None:
             self._odometry.finish()
         self._features.finish()
@@ -82,7 +82,7 @@ class SensorPipeline:
         return self._item(features)
 
     def front_end(self) -> FrontendReport:
-        """What the front end found out about the images."""
+        """Findings of the front end about the images."""
         return self._features.report()
 
     def _on_imu(self, sample: ImuSample) -> Iterator[AgentItem]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long every stage takes: for the report only, no estimator sees it."""
+"""Times of every stage: for the report only, no estimator sees them."""
 
 from __future__ import annotations
 

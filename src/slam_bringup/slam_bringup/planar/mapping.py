@@ -53,7 +53,7 @@ class RobotPath:
 
 @dataclass(frozen=True, eq=False)
 class PlanarResult:
-    """What became of a log: paths, landmarks (m, 2) with their ids, sightings left out, cost, and processor time."""
+    """Result of a log: paths, landmarks (m, 2) with their ids, sightings left out, cost, and processor time."""
 
     paths: tuple[RobotPath, ...]
     landmarks: FloatArray

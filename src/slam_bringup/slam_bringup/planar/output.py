@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``slam plane`` writes: summary, paths with covariances, landmarks and a picture."""
+"""Output of ``slam plane``: summary, paths with covariances, landmarks and a picture."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``slam.launch.py`` starts, from the texts of its arguments: for a live rig, or to play a bag.
+"""Processes of ``slam.launch.py``, from the texts of its arguments: for a live rig, or to play a bag.
 
     arguments, YAML -> configuration -> nodes with their parameters, names of topics, a player
 
@@ -113,7 +113,7 @@ def _for_rig(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
 
 
 def _remapped(topics: Mapping[str, str]) -> list[tuple[str, str]]:
-    """What the nodes call the topics of a rig, and what they are called."""
+    """Pairs of the nodes' names and the rig's names of its topics."""
     found = []
     for role, topic in topics.items():
         measurement = role if role in ("range", "depth") else "range"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which nodes a run needs, with which parameters, and who has to keep up with which topic."""
+"""Graph of the nodes that a run needs, with their parameters, and the topics that each has to keep up with."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port
 
 
 def _bag_parameters(config: SystemConfig, sensor: AgentSensors, map_path: str) -> dict[str, dict[str, Any]]:
-    """What the topics of a bag ask of the nodes."""
+    """Parameters of the nodes that follow from a bag's topics."""
     pictures = [name for name in ("amplitude", "intensity") if name in sensor.topics]
     chosen = {0: "none", 2: "both"}.get(len(pictures)) or pictures[0]
     if chosen == "amplitude" and sensor.topics.get("color") == sensor.topics["amplitude"]:

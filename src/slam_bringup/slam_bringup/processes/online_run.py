@@ -40,7 +40,7 @@ _SJSAM = "/sjsam"
 
 @dataclass(frozen=True, eq=False)
 class OnlineRun:
-    """What the nodes left behind.
+    """Messages and files that the nodes left behind.
 
     recording: the bag of their topics. map_folder: the map that ``sjsam`` saved. diagnostics: last values by full node
     name. exit_codes: by full node name. wall_s: from the first message played to the last submap joined. stopped:

@@ -152,7 +152,7 @@ class NodeProcess:
 
     @property
     def is_running(self) -> bool:
-        """Whether the process still runs."""
+        """True if the process still runs."""
         return self.process.poll() is None
 
     def interrupt(self) -> None:

@@ -49,7 +49,7 @@ class Recording:
                         self._states[status.name].add(stamp, values["state"], values["reason"])
 
     def of_agent(self, agent: str) -> AgentRecord:
-        """What was heard of one agent."""
+        """Record of one agent, as it was heard."""
         return AgentRecord(
             filtered=self._odometry[_topic(agent, "odom")],
             scans=self._odometry[_topic(agent, "ndt/odometry")],
@@ -89,7 +89,7 @@ def collect(
 
 
 def _front_end(agent: str, diagnostics: dict[str, dict[str, str]]) -> FrontendReport:
-    """What the last diagnostics of an agent's ``feature_extractor`` say of its images."""
+    """Findings about an agent's images in the last diagnostics of its ``feature_extractor``."""
     values = diagnostics.get(_topic(agent, "feature_extractor"), {})
     figures = {key.removeprefix(_FIGURES): text for key, text in values.items() if key.startswith(_FIGURES)}
     advice = tuple(text for text in values.get("advice", "").split("; ") if text)
@@ -110,7 +110,7 @@ def _backlog(values: Mapping[str, str]) -> dict[str, int]:
 
 
 def _losses(diagnostics: dict[str, dict[str, str]]) -> dict[str, int]:
-    """What was lost between and in the nodes: "node: reason" to a number, where it is not zero."""
+    """Losses between and in the nodes: "node: reason" to a number, where it is not zero."""
     counted = {
         f"{name.strip('/')}: {key}": int(values[key])
         for name, values in sorted(diagnostics.items())

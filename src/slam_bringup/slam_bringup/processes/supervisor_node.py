@@ -120,7 +120,7 @@ class Supervisor:
         return {info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)}
 
     def publishes(self, topic: str) -> bool:
-        """Whether anybody publishes a topic."""
+        """True if anybody publishes a topic."""
         return bool(self._node.get_publishers_info_by_topic(topic))
 
     def call(self, service: str, timeout_s: float = 60.0, has_effect: Callable[[], bool] = lambda: False) -> str:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run leaves behind: files, figures, page, table and result bag."""
+"""Output of a run: files, figures, page, table and result bag."""

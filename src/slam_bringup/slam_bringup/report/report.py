@@ -76,7 +76,7 @@ def _picture(frame: LoggedFrame, agent: AgentResult) -> dict[str, str]:
 
 
 def verdict(evaluation: Evaluation | None) -> str:
-    """What ANEES says of the claimed covariance, in words; "" without it."""
+    """Judgement of the claimed covariance by ANEES, in words; "" without it."""
     if evaluation is None or evaluation.anees is None:
         return ""
     factor = float(np.sqrt(evaluation.anees))

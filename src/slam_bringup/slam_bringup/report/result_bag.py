@@ -107,7 +107,7 @@ def _transforms(agent: AgentResult, prefix: str, odom: str) -> Iterator[_Stamped
 
 
 def _lasting_messages(result: RunResult, stamp: int) -> Iterator[_Stamped]:
-    """What holds all the time, all stamped with the first time of the bag."""
+    """Yield the messages that hold all the time, stamped with the first time of the bag."""
     yield stamp, "/tf_static", _static_transforms(result, stamp)
     for agent in result.agents:
         prefix = f"/{agent.name}" if agent.name else ""

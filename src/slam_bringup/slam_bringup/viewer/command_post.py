@@ -70,12 +70,12 @@ def position_radius(pose: PoseEstimate) -> float:
 
 
 def radius_text(radius: float) -> str:
-    """How well a position is known, in words."""
+    """Uncertainty of a position, in words."""
     if radius > _NOWHERE_M:
         return "position not tied to the map"
     return f"position ±{radius:.2f} m (99.5 %)"
 
 
 def unseen(plans: Sequence[FloorPlan], most: int = 30) -> list[Frontier]:
-    """Where nobody has looked yet, on all storeys, the longest borders first."""
+    """Borders of what nobody has seen yet, on all storeys, the longest first."""
     return sorted((f for plan in plans for f in frontiers(plan)), key=lambda f: -f.length)[:most]

@@ -59,7 +59,7 @@ class FinishedView:
         page.look_at(np.concatenate([*ways, run.surface.points[::50].astype(np.float64)]) if ways else np.empty((0, 3)))
 
     def show_until(self, stamp_ns: int) -> None:
-        """Where everybody was at a stamp, how they had come there, and how they would have come out."""
+        """Show everybody's place at a stamp, the way there, and the way out."""
         with self.page.server.atomic():
             lines = self.run.submap_lines(stamp_ns)
             self.page.show_submaps(lines[:, 0], lines[:, 1])

@@ -44,7 +44,7 @@ _HIDDEN_AT_FIRST = ("dense points", "landmarks", "ellipsoids", "submaps")
 
 @dataclass(frozen=True)
 class AgentRow:
-    """What the overview says of an agent: ``state`` OK, DEGRADED or LOST, or since when it is silent."""
+    """Row of an agent in the overview: ``state`` OK, DEGRADED or LOST, or since when it is silent."""
 
     name: str
     state: str
@@ -91,7 +91,7 @@ class ViewerPage:
 
     @property
     def url(self) -> str:
-        """Where a browser finds the page."""
+        """Address of the page for a browser."""
         return f"http://{'localhost' if self.host in ('127.0.0.1', '0.0.0.0') else self.host}:{self.port}"
 
     def stop(self) -> None:
@@ -162,7 +162,7 @@ class ViewerPage:
         self._lines(f"/{layer}/{agent or 'rig'}", _chain(poses[:, :3, 3]), colour, 0.03)
 
     def show_agent(self, agent: str, index: int, T_map_base: FloatArray, note: str = "") -> None:
-        """Where an agent is, with its axes and name."""
+        """Show an agent with its axes and name."""
         name, colour = f"/agents/{agent or 'rig'}", COLOURS[index % len(COLOURS)]
         wxyz, position = _wxyz(T_map_base[:3, :3]), T_map_base[:3, 3]
         self.server.scene.add_frame(name, axes_length=0.35, axes_radius=0.018, wxyz=wxyz, position=position)
@@ -197,7 +197,7 @@ class ViewerPage:
         self._lines("/closures/lines", lines, (255, 190, 0), 0.02)
 
     def show_frontiers(self, points: FloatArray, lengths: Sequence[float]) -> None:
-        """Where nobody has looked yet, (n, 3) m."""
+        """Show the borders of what nobody has seen yet, (n, 3) m."""
         self._remove("/frontiers")
         for k, (point, length) in enumerate(zip(points, lengths, strict=True)):
             above = point + np.array([0, 0, 0.15])

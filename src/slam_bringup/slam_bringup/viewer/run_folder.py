@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the viewer shows of a finished run: the files of its folder, read back."""
+"""A finished run for the viewer: the files of its folder, read back."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class ViewerConfig(Config):
 
 @dataclass
 class _Agent:
-    """What is known of one agent now."""
+    """State of one agent."""
 
     state: str = "no news yet"
     reason: str = ""

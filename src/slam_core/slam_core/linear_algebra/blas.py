@@ -22,7 +22,7 @@ _LOWER, _PLAIN, _TRANSPOSED, _RIGHT = c_char(b"L"), c_char(b"N"), c_char(b"T"), 
 
 
 def address_of(module: Any, name: str) -> int:
-    """Where a routine that a Cython module exports lies in memory."""
+    """Address of a routine that a Cython module exports."""
     capsule = module.__pyx_capi__[name]
     get_name, get_pointer = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
     get_name.restype, get_name.argtypes = ctypes.c_char_p, [ctypes.py_object]

@@ -16,7 +16,7 @@ IntArray = npt.NDArray[np.int64]
 
 
 def pointers(counts: npt.ArrayLike) -> IntArray:
-    """Where each of consecutive runs starts: 0 and the running sums of ``counts``, shape (n + 1,)."""
+    """Starts of consecutive runs: 0 and the running sums of ``counts``, shape (n + 1,)."""
     sums = np.cumsum(np.asarray(counts, dtype=np.int64))
     return np.concatenate([np.zeros(1, dtype=np.int64), sums])
 
@@ -52,7 +52,7 @@ class BlockPattern:
 
     @cached_property
     def row_offset(self) -> IntArray:
-        """Where every stored block starts among the rows of its panel, (len(rows),)."""
+        """First row of every stored block in its panel, (len(rows),)."""
         above = pointers(self.width[self.rows])
         return np.asarray(above[:-1] - np.repeat(above[self.column_ptr[:-1]], np.diff(self.column_ptr)))
 
@@ -64,7 +64,7 @@ class BlockPattern:
 
     @cached_property
     def value_ptr(self) -> IntArray:
-        """Where the values of every panel start, (N + 1,)."""
+        """Starts of the values of every panel, (N + 1,)."""
         return pointers(self.height * self.width)
 
     @cached_property

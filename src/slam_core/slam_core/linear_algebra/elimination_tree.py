@@ -163,7 +163,7 @@ def _postorder(parent, largest_first):
 
 @njit(cache=True, nogil=True)
 def _supernodes(parent, width, below):
-    """Where supernodes start, in postorder.
+    """Starts of the supernodes, in postorder.
 
     Columns of the same rows, then relaxed (Ashcraft and Grimes 1989): a supernode joins its parent behind it where that
     stores few zeros, since larger fronts are worth some.

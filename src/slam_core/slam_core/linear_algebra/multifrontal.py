@@ -54,7 +54,7 @@ class Multifrontal:
         return np.asarray(W.T @ W)
 
     def marginal_information(self, variables: IntArray) -> FloatArray:
-        """What eliminating all others leaves of ``variables`` (k,), which must be those that are eliminated last.
+        """Information of ``variables`` (k,) with all others eliminated; they must be those that are eliminated last.
 
         With their rows and columns of L it is ``L L^T``.
         """

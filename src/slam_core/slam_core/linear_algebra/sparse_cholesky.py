@@ -95,7 +95,7 @@ class _Backend(Protocol):
 
 
 class _Library(ABC):
-    """What the backends from libraries have in common: they know single unknowns only."""
+    """Common part of the backends from libraries: they know single unknowns only."""
 
     def __init__(self, pattern: BlockPattern) -> None:
         self._n = pattern.n
@@ -324,7 +324,7 @@ def takahashi(indptr, indices, data):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _continues(indptr, indices, column):  # type: ignore[no-untyped-def]
-    """Whether the column before ``column`` has the same pattern, itself added; in a factor its size and parent tell."""
+    """True if the column before ``column`` has the same pattern, itself added; in a factor its size and parent tell."""
     before = column - 1
     same_size = indptr[column] - indptr[before] == indptr[column + 1] - indptr[column] + 1
     return same_size and indices[indptr[before] + 1] == column

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How messages are made, whatever library they belong to, and their stamps and headers."""
+"""Construction of messages, whatever library they belong to, and their stamps and headers."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class MessageTypes(ABC):
 
     @abstractmethod
     def load(self, package: str, name: str) -> Any:
-        """What makes a message of one type: a callable that takes the fields by keyword."""
+        """Factory of messages of one type: a callable that takes the fields by keyword."""
 
     @abstractmethod
     def octets(self, array: AnyArray) -> Any:
