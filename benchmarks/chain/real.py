@@ -51,7 +51,7 @@ def main() -> None:
     for heading in ("run", "frames", "submaps", "closures", "times lost", "x real time"):
         table.add_column(heading, justify="right")
     for heading in ("joined", "filter alone", "scan odometry"):
-        table.add_column(f"{heading}: ATE m, drift %, ANEES, in doubt", justify="right")
+        table.add_column(f"{heading}: ATE m, drift %, ANEES, with truth's errors", justify="right")
     with tempfile.TemporaryDirectory() as scratch:
         folder = arguments.keep or Path(scratch)
         for name in track(arguments.names, description="mapping", console=Console(stderr=True)):

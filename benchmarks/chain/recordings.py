@@ -5,7 +5,7 @@
 
 NAME: mh01, v101, kitti1, kitti2, hololens, redkitchen (default: those whose data are there). A row is one run of
 ``slam run``'s pipeline: ATE (rigidly aligned) and end error mm, scale of the path, claimed position sigma over ATE,
-ANEES as it is and in doubt (with the errors that the ground truth itself has, ``doubt.py``), frames lost, processor
+ANEES as it is and with the errors that the ground truth itself has (``doubt.py``), frames lost, processor
 milliseconds per frame of all stages. "filter" is the same run without joining. Peers: frame to frame SIFT and PnP
 (``../ekf/ground_truth.py`` for stereo, here for depth) and GICP (small_gicp, where it is installed).
 """
@@ -85,7 +85,7 @@ class Row:
     scale_percent: float
     sigma_over_ate: float | None
     anees: float | None
-    anees_in_doubt: float | None
+    anees_with_truth_errors: float | None
     lost: int
     ms_per_frame: float | None
 
@@ -273,13 +273,14 @@ def _cells(row: Row) -> list[str]:
 
     return [
         row.recording, row.run, str(row.frames), text(row.ate_mm, 1), text(row.end_mm, 1), f"{row.scale_percent:+.2f}",
-        text(row.sigma_over_ate, 1), text(row.anees, 1), text(row.anees_in_doubt, 2), str(row.lost),
+        text(row.sigma_over_ate, 1), text(row.anees, 1), text(row.anees_with_truth_errors, 2), str(row.lost),
         text(row.ms_per_frame, 0),
     ]  # fmt: skip
 
 
 _HEADINGS = (
-    "recording", "run", "frames", "ATE mm", "end mm", "scale %", "sigma / ATE", "ANEES", "in doubt", "lost", "CPU ms",
+    "recording", "run", "frames", "ATE mm", "end mm", "scale %", "sigma / ATE", "ANEES",
+    "with truth's errors", "lost", "CPU ms",
 )  # fmt: skip
 
 

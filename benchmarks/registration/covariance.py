@@ -54,7 +54,7 @@ def one_place(scenario: str, runs: int) -> None:
 
 
 def many_places(runs: int, seed: int) -> None:
-    print(f"\n{ROOMS} random rooms   mean   median  below 99 % gate  said to be degenerate")
+    print(f"\n{ROOMS} random rooms   mean   median  below 99 % gate  reported degenerate")
     rooms, rng = [random_room(seed + k) for k in range(ROOMS)], np.random.default_rng(seed)
     for name in MOTIONS:
         errors, covariances, degenerate = [], [], 0

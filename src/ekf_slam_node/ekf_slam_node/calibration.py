@@ -38,7 +38,7 @@ class CalibrationErrorConfig(Config):
 
     @property
     def is_exact(self) -> bool:
-        """True if nothing is in doubt."""
+        """True if all errors are zero."""
         return self.sigma_scale == 0.0 and self.sigma_mounting == 0.0
 
 

@@ -25,7 +25,7 @@ class AwaitedStreams:
     expected
         Streams waited for from the first frame on; others once they were heard.
     patience
-        Frames that may be ahead of a stream before it counts as silent.
+        Frames that may wait for a stream before it counts as silent.
     """
 
     def __init__(self, expected: Iterable[str] = (), patience: int = PATIENCE) -> None:

@@ -28,7 +28,7 @@ class DepthPairing:
     max_age
         Greatest difference of the stamps, s; a pair without such a depth image gets None.
     patience
-        Pairs that may be ahead of the depth camera before it counts as silent.
+        Pairs that may wait for the depth camera before it counts as silent.
     """
 
     def __init__(self, max_age: float, patience: int = PATIENCE) -> None:

@@ -96,13 +96,13 @@ class StereoSelfCalibration:
         return self.config.mode == "off" or (self.error is not None and self.error.camera == camera)
 
     def rows(self, uv_right: Float32Array, disparity: AnyArray) -> Float32Array:
-        """Error (n,) px across the rows at pixels (n, 2) of the right image; zeros where it is small or in doubt."""
+        """Error (n,) px across the rows at pixels (n, 2) of the right image; zeros where not significant."""
         if self.error is None or not self.corrects_rows:
             return np.zeros(len(uv_right), np.float32)
         return self.error.rows(uv_right, disparity).astype(np.float32)
 
     def columns(self, uv_right: Float32Array) -> tuple[FloatArray, FloatArray]:
-        """Correction of disparities (n,) px with its standard deviation (n,) px; zeros while there is doubt."""
+        """Correction of disparities (n,) px with its standard deviation (n,) px; zeros while it is not significant."""
         if self.error is None or not self.corrects:
             return np.zeros(len(uv_right)), np.zeros(len(uv_right))
         return self.error.columns(uv_right), self.error.column_sigma(uv_right)
@@ -166,12 +166,12 @@ class StereoSelfCalibration:
         self.error = error
         slack = _HYSTERESIS if self.corrects_rows else 1.0
         rows = error.row_rms()
-        self.corrects_rows = rows > slack * _MIN_ROW_ERROR and rows > slack * self._doubt(error.row_sigma_rms())
+        self.corrects_rows = rows > slack * _MIN_ROW_ERROR and rows > slack * self._significant(error.row_sigma_rms())
         slack = _HYSTERESIS if self.corrects else 1.0
         enough = self._moments >= _MIN_MOMENTS
-        self.corrects = enough and error.column_rms() > slack * self._doubt(error.column_sigma_rms())
+        self.corrects = enough and error.column_rms() > slack * self._significant(error.column_sigma_rms())
 
-    def _doubt(self, sigma: float) -> float:
+    def _significant(self, sigma: float) -> float:
         """Limit that an error of standard deviation ``sigma`` must exceed to be believed."""
         return float(np.sqrt(_MIN_CHI_SQUARE)) * sigma
 

@@ -48,9 +48,9 @@ def with_verbosity(command: click.Command) -> click.Command:
     if any(option.name == "verbose" for option in command.params):
         return command
     command.params += [
-        click.Option(["-q", "--quiet"], is_flag=True, expose_value=False, callback=_quieter, help="errors alone"),
+        click.Option(["-q", "--quiet"], is_flag=True, expose_value=False, callback=_quieter, help="print errors only"),
         click.Option(
-            ["-v", "--verbose"], count=True, expose_value=False, callback=_louder, help="say more; -vv: everything"
+            ["-v", "--verbose"], count=True, expose_value=False, callback=_louder, help="print more; -vv: everything"
         ),
     ]
     return command

@@ -43,7 +43,9 @@ def convert(
 @click.option("--calibration", type=UserPath(), help="calibration, where the source has none")
 @click.option("--ground-truth", type=UserPath(), help="poses, where the source has none")
 @click.option("--storage", type=click.Choice(["mcap", "sqlite3"]), default="mcap", show_default=True)
-@click.option("--compression", type=click.Choice(COMPRESSIONS), default="zstd", show_default=True, help="of mcap")
+@click.option(
+    "--compression", type=click.Choice(COMPRESSIONS), default="zstd", show_default=True, help="compression of mcap bags"
+)
 @overwrite_option("a bag that slam wrote")
 def command(
     kind: str, source: Path, output: Path, calibration: Path | None, ground_truth: Path | None, storage: str,

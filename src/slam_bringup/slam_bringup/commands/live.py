@@ -17,9 +17,15 @@ from slam_bringup.processes.node_graph import live_nodes
 @click.argument("camera", required=False)
 @click.option("--topics", is_flag=True, help="the sensors publish topics; instead of CAMERA")
 @click.option("--left-info", type=click.Path(exists=True, dir_okay=False), help="camera_info YAML of its left half")
-@click.option("--right-info", type=click.Path(exists=True, dir_okay=False), help="the same of its right half")
+@click.option("--right-info", type=click.Path(exists=True, dir_okay=False), help="camera_info YAML of its right half")
 @click.option("--mode", type=click.Choice(MODES), default="stereo", show_default=True, help="where depth comes from")
-@click.option("--odometry", type=click.Choice(ODOMETRIES), default="none", show_default=True, help="of ToF scans")
+@click.option(
+    "--odometry",
+    type=click.Choice(ODOMETRIES),
+    default="none",
+    show_default=True,
+    help="scan odometry from the ToF camera",
+)
 @click.option("--agents", default="", help="names of the agents, comma-separated [one rig]")
 @click.option(
     "--config", type=click.Path(exists=True, dir_okay=False, path_type=Path),

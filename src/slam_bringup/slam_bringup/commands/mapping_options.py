@@ -25,7 +25,7 @@ _OPTIONS = (
     click.option(
         "--mapper", type=click.Choice(MAPPERS), default="sjsam", show_default=True, help="one filter, or submaps"
     ),
-    click.option("--odometry", type=click.Choice(ODOMETRIES), default="none", show_default=True, help="of ToF scans"),
+    click.option("--odometry", type=click.Choice(ODOMETRIES), default="none", show_default=True, help="scan odometry from the ToF camera"),
     click.option("--imu", type=click.Choice(("auto", "on", "off")), help="use of an IMU [auto: if there is one]"),
     click.option(
         "--config", type=UserPath(exists=True, dir_okay=False),

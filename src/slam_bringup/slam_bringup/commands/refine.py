@@ -39,7 +39,7 @@ def refine(bag: Path) -> tuple[tuple[CameraInfo, CameraInfo], dict[str, Any]]:
                 frontend.process(rectifier(pair.stamp_ns, pair.left, pair.right))
     calibration = frontend.self_calibration
     if calibration.error is None or not calibration.corrects:
-        raise ValueError(f"nothing to correct beyond doubt: {calibration.figures()}")
+        raise ValueError(f"the images show no significant error to correct: {calibration.figures()}")
     corrected, left_over = corrected_right(right, calibration.error)
     return (left, corrected), calibration.figures() | {"left_over_px": left_over}
 

@@ -24,7 +24,9 @@ from slam_bringup.processes.processes import become_node
     help="the bag of the run: pictures with the map's landmarks instead of features",
 )
 @click.option("--agent", "agents", multiple=True, help="with --live: namespace of an agent (may be repeated)")
-@click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="of the page; 0: any")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="port of the page; 0: any free one"
+)
 @click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 lets other machines see the page")
 @click.option("--no-browser", is_flag=True, help="only serve the page")
 def command(

@@ -37,7 +37,7 @@ from slam_core.types import ImuSample
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
 _AHEAD = 8
-"""Images, or what became of them, that a stage may be ahead of the next."""
+"""Items that may wait between two stages."""
 
 
 def run_bag(

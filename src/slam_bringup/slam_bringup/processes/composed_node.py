@@ -101,7 +101,7 @@ def _spin(node: Any, stopped: threading.Event) -> None:
 def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser("slam_composed", description="All nodes of a rig in one process.")
     parser.add_argument("--mode", choices=MODES, default="stereo", help="where depth comes from")
-    parser.add_argument("--odometry", choices=ODOMETRIES, default="none", help="of ToF scans")
+    parser.add_argument("--odometry", choices=ODOMETRIES, default="none", help="scan odometry from the ToF camera")
     parser.add_argument("--agents", default="", help="names of the agents, comma-separated; none: one rig")
     parser.add_argument("--config", type=Path, help="YAML of overrides, one group per node")
     parser.add_argument("--nodes", type=Path, help="file of the nodes to run, as slam nodes --composed writes it")
