@@ -20,6 +20,7 @@ from numba import njit
 
 from ekf_slam_node.models import Frame
 from slam_core.geometry import FloatArray
+from slam_core.least_squares import MAD_TO_SIGMA
 
 _NEIGHBOURS = 0.1
 """Features nearer than this share of the image's width are neighbours."""
@@ -57,7 +58,7 @@ class CommonError:
         """Take in the residuals (n, 2) px of a frame's features at pixels (n, 2), image ``width`` px wide."""
         if self._factor == 0.0 or len(pixels) < 2:
             return
-        spread = 1.4826 * np.median(np.abs(residuals), axis=0)
+        spread = MAD_TO_SIGMA * np.median(np.abs(residuals), axis=0)
         r = np.clip(residuals, -_OUTLIER * spread, _OUTLIER * spread)
         total, pairs = _shared_by_neighbours(pixels, r, _NEIGHBOURS * width)
         self._sum = _FORGETTING * self._sum + total

@@ -10,6 +10,7 @@ import numpy as np
 from ekf_slam_node.calibration import CalibrationErrorConfig
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray
+from slam_core.least_squares import chi_square_bound
 
 NEAREST_ASSOCIATE = 0.15
 """Gate g_A of Algorithm 1."""
@@ -76,7 +77,9 @@ class FeatureAssociationConfig(Config):
     method: str = parameter(
         "mahalanobis", "how a feature chooses among its candidates", choices=("nearest", "mahalanobis", "jcbb", "ccda")
     )
-    gate: float = parameter(16.27, "chi-square gate of one feature, 3 degrees of freedom (99.9 %)", minimum=1.0)
+    probability: float = parameter(
+        0.999, "share of true pairs inside the chi-square gate of one feature", minimum=0.5, maximum=1.0 - 1e-9
+    )
     descriptor_threshold: float = parameter(0.75, "least cosine of the descriptors", minimum=-1.0, maximum=1.0)
     descriptor_weight: float = parameter(
         40.0,
@@ -85,6 +88,11 @@ class FeatureAssociationConfig(Config):
     )
     min_inliers: int = parameter(8, "associations below which the rig is lost", minimum=3)
     seed: int = parameter(0, "seed of the random samples", minimum=0)
+
+    @property
+    def gate(self) -> float:
+        """Gate on the squared Mahalanobis distance of one feature, three coordinates."""
+        return chi_square_bound(self.probability, 3)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ import numpy as np
 
 from ekf_slam_node.config import MotionConfig
 from slam_core.geometry import FloatArray
+from slam_core.least_squares import chi_square_bound
 
-_GATE = 16.27
-"""99.9 % of chi-square with 3 degrees of freedom: a turn that differs more is not the bias's doing."""
+_GATE = chi_square_bound(0.999, 3)
+"""A turn that differs more is not the bias's doing."""
 
 
 class GyroBias:

@@ -17,10 +17,11 @@ from ekf_slam_node.candidates import Candidates
 from ekf_slam_node.models import Frame, rig_points
 from ekf_slam_node.pair_kernels import PairErrors, gated, normal_equations, pair_errors
 from slam_core.geometry import FloatArray, boxplus, invert_transform
+from slam_core.least_squares import chi_square_bound
 from slam_core.rigid_alignment import umeyama
 
-_SAMPLE_GATE = 4.0 * 7.81
-"""What a sample must explain to count in full: 95 % of chi-square with 3 degrees of freedom, at twice the standard
+_SAMPLE_GATE = 4.0 * chi_square_bound(0.95, 3)
+"""Squared error that a sample must explain to count in full: 95 % of true pairs have less, at twice the standard
 deviation, because three points alone do not give the best motion.
 """
 

@@ -26,10 +26,11 @@ from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submap_chain import SubmapChain
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
+from slam_core.least_squares import chi_square_bound
 from slam_core.types import Counters, Features, ImuSample, PoseEstimate, RelativeMotion, Submap
 
-_AID_GATE = 22.46
-"""Chi-square gate of a motion aid, 6 degrees of freedom (99.9 %)."""
+_AID_GATE = chi_square_bound(0.999, 6)
+"""Gate of the motion by another sensor: its six coordinates, 99.9 % of true ones inside."""
 
 _STANDING_VELOCITY = np.repeat([0.02, np.radians(0.5)], 3)
 """Standard deviations (m/s, rad/s) of the velocities of a rig that stands."""

@@ -11,10 +11,11 @@ import numpy as np
 
 from ndt_registration.search import SEPARATION, Candidate, pose_distance
 from slam_core.geometry import FloatArray, boxminus
+from slam_core.least_squares import chi_square_bound
 
 _MARGIN = 0.03
 """Cost by which the answer must beat every rival."""
-_GATE = 22.5
+_GATE = chi_square_bound(0.999, 6)
 """Squared Mahalanobis distance within which a pose is no rival: the covariance covers it."""
 
 

@@ -43,6 +43,10 @@ def whitening(covariance: FloatArray) -> FloatArray:
     return np.asarray(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True))
 
 
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a Gaussian over the median of its absolute deviations."""
+
+
 @lru_cache(maxsize=4096)
 def chi_square_bound(probability: float, dof: int) -> float:
     """Bound that a chi-square variable of ``dof`` degrees of freedom stays below with this probability."""

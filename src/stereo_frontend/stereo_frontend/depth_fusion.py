@@ -16,6 +16,7 @@ import numpy.typing as npt
 from slam_core.camera import Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform
+from slam_core.least_squares import chi_square_bound
 from slam_core.types import DepthImage
 from stereo_frontend.depth_lookup import DepthSamples, sample_depth
 
@@ -33,8 +34,18 @@ _ITERATIONS = 8
 class FusionConfig(Config):
     """Fusion of ToF depth and stereo features."""
 
-    gate: float = parameter(9.0, "chi-square gate (1 DoF) on the disagreement of stereo and ToF depth", minimum=0.1)
+    probability: float = parameter(
+        0.9973,
+        "share of true pairs of stereo and ToF depth inside the gate",
+        minimum=0.5,
+        maximum=1.0 - 1e-9,
+    )
     max_age: float = parameter(0.06, "greatest time between the stereo pair and the depth image", unit="s", minimum=0.0)
+
+    @property
+    def gate(self) -> float:
+        """Gate on the squared difference of both depths over its variance."""
+        return chi_square_bound(self.probability, 1)
 
 
 @dataclass(frozen=True, eq=False)

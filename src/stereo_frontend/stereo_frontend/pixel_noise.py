@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_core.config import Config, parameter
+from slam_core.least_squares import MAD_TO_SIGMA
 from slam_core.types import Float32Array
 
 ROW_FLOOR = 0.06
@@ -28,8 +29,6 @@ _MIN_MATCHES = 30
 """Matches needed in a frame to learn from it."""
 _MIN_FACTOR = 0.7
 """Least factor."""
-
-_MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True)
@@ -74,14 +73,14 @@ class PixelNoise:
             return
         clean = np.sqrt(2.0) * np.hypot(ROW_FLOOR, ROW_SLOPE * size)
         normalised = (row_difference - np.median(row_difference)) / clean
-        measured = float(np.clip(_MAD_TO_SIGMA * np.median(np.abs(normalised)), _MIN_FACTOR, c.max_factor))
+        measured = float(np.clip(MAD_TO_SIGMA * np.median(np.abs(normalised)), _MIN_FACTOR, c.max_factor))
         self.factor = _MEMORY * self.factor + (1.0 - _MEMORY) * measured
 
     def learn_rectification(self, row_shift: Float32Array, row_sigma: Float32Array) -> None:
         """Take in the row shifts (n,) px of aligned patches and their standard deviations (n,) px."""
         if len(row_shift) < _MIN_MATCHES:
             return
-        spread = _MAD_TO_SIGMA * np.median(np.abs(row_shift - np.median(row_shift)))
+        spread = MAD_TO_SIGMA * np.median(np.abs(row_shift - np.median(row_shift)))
         excess = np.sqrt(max(0.0, float(spread**2 - np.median(row_sigma) ** 2)))
         memory = _MEMORY
         self.rectification_sigma = memory * self.rectification_sigma + (1.0 - memory) * excess

@@ -9,8 +9,9 @@ from typing import Any
 
 import click
 
-from slam_bringup.pipeline.configuration import MODES, ODOMETRIES, choose, load_system_config
+from slam_bringup.pipeline.configuration import ODOMETRIES, choose, load_system_config
 from slam_bringup.processes.node_graph import live_nodes
+from stereo_frontend.frontend import MODES
 
 
 @click.command()

@@ -12,8 +12,9 @@ import click
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import ROLES
 from slam_bringup.commands.paths import UserPath, overwrite_option
-from slam_bringup.pipeline.configuration import MAPPERS, MODES, ODOMETRIES
+from slam_bringup.pipeline.configuration import MAPPERS, ODOMETRIES
 from slam_bringup.pipeline.results import RunResult
+from stereo_frontend.frontend import MODES
 
 # fmt: off
 _OPTIONS = (
@@ -25,7 +26,7 @@ _OPTIONS = (
     click.option(
         "--mapper", type=click.Choice(MAPPERS), default="sjsam", show_default=True, help="one filter, or submaps"
     ),
-    click.option("--odometry", type=click.Choice(ODOMETRIES), default="none", show_default=True, help="scan odometry from the ToF camera"),
+    click.option("--odometry", type=click.Choice(ODOMETRIES), default="none", show_default=True, help="scan odometry"),
     click.option("--imu", type=click.Choice(("auto", "on", "off")), help="use of an IMU [auto: if there is one]"),
     click.option(
         "--config", type=UserPath(exists=True, dir_okay=False),

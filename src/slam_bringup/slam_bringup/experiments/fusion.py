@@ -18,9 +18,9 @@ from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_bringup.experiments.true_frames import simulated_frames, true_depth
 from slam_core.geometry import invert_transform, transform_points
 from stereo_frontend.features import FeatureConfig, FeatureExtractor
+from stereo_frontend.frontend import MODES
 
 MODULE = "slam_bringup.experiments.fusion"
-_MODES = ("stereo", "tof", "replace", "fuse")
 _PIXELS = "pixels"
 
 
@@ -48,7 +48,7 @@ def _mapped_pixels(arrays: Mapping[str, np.ndarray]) -> Figure:
 
 def _modes() -> Experiment:
     def jobs(quick: bool) -> Mapping[str, Job]:
-        runs = {mode: mapped("small_room", mode, frames=frames(quick)) for mode in _MODES}
+        runs = {mode: mapped("small_room", mode, frames=frames(quick)) for mode in MODES}
         runs |= {"fuse + ndt": mapped("small_room", "fuse", odometry="ndt", frames=frames(quick))}
         return runs | {_PIXELS: Job(f"{MODULE}:map_pixels", {}, (*RENDERING, "stereo_frontend", "tof_driver"))}
 
@@ -56,9 +56,9 @@ def _modes() -> Experiment:
         mapping = results[_PIXELS].arrays
         results = {name: result for name, result in results.items() if name != _PIXELS}
         ate = {name: 1e3 * r.values["agents"][0]["joined_ate_m"] for name, r in results.items()}
-        best = min(_MODES, key=lambda mode: ate[mode])
+        best = min(MODES, key=lambda mode: ate[mode])
         comparisons = [
-            Comparison(f"ATE, {mode}", "missing from our copy", f"{ate[mode]:.1f} mm") for mode in _MODES
+            Comparison(f"ATE, {mode}", "missing from our copy", f"{ate[mode]:.1f} mm") for mode in MODES
         ] + [Comparison("best of the four", "missing from our copy", best, "fuse", best == "fuse"),
              bounds_comparison("small_room", results["fuse"])]  # fmt: skip
         return Findings(
@@ -66,7 +66,7 @@ def _modes() -> Experiment:
             [Table("The four modes, and with scan odometry", ACCURACY_HEADER,
                    [accuracy_row(name, result) for name, result in results.items()])],
             [Picture(_mapped_pixels(mapping), "11.1", "Pixels of the left picture in the laser camera's."),
-             *(Picture(plots.map_view(results[mode].arrays), "", f"Mode {mode}.") for mode in _MODES)],
+             *(Picture(plots.map_view(results[mode].arrays), "", f"Mode {mode}.") for mode in MODES)],
             f"Weighted by their variances, both cameras give {ate['fuse']:.1f} mm; the stereo camera alone "
             f"{ate['stereo']:.1f} mm, the laser camera alone {ate['tof']:.1f} mm.",
         )  # fmt: skip

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_core.geometry import FloatArray, invert_transform, transform_points
+from slam_core.least_squares import MAD_TO_SIGMA
 from slam_core.types import DepthImage, StereoImages
 from slam_simulation import Scenario, Simulator
 from slam_simulation.simulator import DepthTruth
@@ -73,6 +74,6 @@ def transfer(first: TrueFrame, second: TrueFrame, uv: np.ndarray) -> FloatArray:
 
 
 def spread(values: np.ndarray) -> float:
-    """Robust standard deviation, 1.4826 times the median deviation."""
+    """Robust standard deviation, ``MAD_TO_SIGMA`` times the median deviation."""
     finite = values[np.isfinite(values)]
-    return float(1.4826 * np.median(np.abs(finite - np.median(finite)))) if len(finite) else float("nan")
+    return float(MAD_TO_SIGMA * np.median(np.abs(finite - np.median(finite)))) if len(finite) else float("nan")

@@ -27,7 +27,6 @@ from slam_core.config import Config, from_mapping, group, iterate_parameters
 from stereo_frontend.frontend import FrontendConfig
 from tof_driver.depth import DepthConfig
 
-MODES = ("stereo", "tof", "replace", "fuse")
 MAPPERS = ("ekf", "sjsam")
 ODOMETRIES = ("none", "ndt", "icp")
 

@@ -26,13 +26,14 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from slam_bringup.pipeline.configuration import MODES, ODOMETRIES, choose, load_system_config
+from slam_bringup.pipeline.configuration import ODOMETRIES, choose, load_system_config
 from slam_bringup.processes.node_graph import live_nodes
 from slam_bringup.processes.processes import NodeCommand
 from slam_core.exchange import Exchange
 from slam_core.memory import share_one_heap
 from slam_core.process_life import end_with_parent, on_request_to_end
 from slam_core.ros import spin, use_fast_dds_profile
+from stereo_frontend.frontend import MODES
 
 _NODES = {
     "stereo_driver": "stereo_frontend.driver_node:StereoDriverNode",

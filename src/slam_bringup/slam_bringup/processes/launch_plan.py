@@ -17,9 +17,10 @@ import yaml
 
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, nodes_name, parse_topics
-from slam_bringup.pipeline.configuration import MODES, ODOMETRIES, choose, system_config
+from slam_bringup.pipeline.configuration import ODOMETRIES, choose, system_config
 from slam_bringup.pipeline.overrides import Overrides, overrides_of, parse_assignments, read_overrides
 from slam_bringup.processes.node_graph import NodeGraph, NodeSpec, live_nodes, plan_nodes
+from stereo_frontend.frontend import MODES
 
 AUTO = "auto"
 _BOOLEANS = ("true", "false")
