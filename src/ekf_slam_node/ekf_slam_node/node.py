@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.stage import FilterConfig, FilterStage
-from slam_core.base_node import SlamNode
 from slam_core.config import parameter
 from slam_core.health import State
 from slam_core.messages import (
@@ -31,6 +30,7 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.ros import run_node
+from slam_core.stage_node import StageNode
 from slam_core.types import PoseEstimate, Submap
 
 _STATES = {TrackingState.OK: State.OK, TrackingState.DEGRADED: State.DEGRADED, TrackingState.LOST: State.LOST}
@@ -50,7 +50,7 @@ class EkfNodeConfig(FilterConfig):
     )
 
 
-class EkfNode(SlamNode[EkfNodeConfig]):
+class EkfNode(StageNode[EkfNodeConfig]):
     """Publishes ``odom``, ``path``, ``landmarks``, ``landmark_ellipsoids`` and, as they end, ``submap/*``."""
 
     CHANGEABLE = ("path_length",)
@@ -77,17 +77,17 @@ class EkfNode(SlamNode[EkfNodeConfig]):
     def on_features(self, cloud: Message, descriptors: Message, camera_info: Message) -> None:
         """One frame; it may have to wait for the motion that leads to it."""
         self.stage.add_features(features_from_messages(cloud, descriptors, camera_info))
-        self._publish_ready()
+        self.publish_ready()
 
     def on_motion(self, message: Message) -> None:
         """A motion measured by scan registration, or word that it is not known."""
         self.stage.add_motion(stamp_ns(message), motion_from_message(message))
-        self._publish_ready()
+        self.publish_ready()
 
     def on_imu(self, message: Message) -> None:
         """A reading of the IMU."""
         self.stage.add_imu(imu_from_message(message))
-        self._publish_ready()
+        self.publish_ready()
 
     def on_config(self, config: EkfNodeConfig) -> None:
         """The path may become longer or shorter."""
@@ -101,30 +101,21 @@ class EkfNode(SlamNode[EkfNodeConfig]):
     def on_new_session(self) -> None:
         """Process what waits and publish the open submap, then begin anew."""
         self.stage.give_up()
-        self._publish_ready()
+        self.publish_ready()
         self._publish_submaps(self.stage.start_session())
         self.path.clear()
-
-    def oldest_waiting_ns(self) -> int | None:
-        """Stamp of the oldest frame that waits for another sensor."""
-        return self.stage.oldest_waiting_ns
-
-    def on_overdue(self) -> None:
-        """Go on without the sensor that frames wait for."""
-        self.stage.give_up()
-        self._publish_ready()
 
     def on_finish(self) -> str:
         """The input has ended: process what waits and publish the open submap."""
         self.stage.give_up()
-        self._publish_ready()
+        self.publish_ready()
         submaps = self.stage.finish()
         self._publish_submaps(submaps)
         return f"{len(submaps)} open submap published"
 
     # -- outputs -------------------------------------------------------------------------------------------------------
 
-    def _publish_ready(self) -> None:
+    def publish_ready(self) -> None:
         """Publish the results of all frames that need not wait."""
         for frame in self.stage.ready():
             result = frame.estimate

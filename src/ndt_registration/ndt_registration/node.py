@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from ndt_registration.cloud import finite_points
 from ndt_registration.odometry import OdometryConfig, OdometryResult, OdometryStatus
 from ndt_registration.stage import Scan, ScanOdometryStage
-from slam_core.base_node import SlamNode
 from slam_core.config import parameter
 from slam_core.geometry import FloatArray
 from slam_core.health import State
@@ -33,6 +32,7 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.ros import run_node
+from slam_core.stage_node import StageNode
 from slam_core.types import AnyArray, PoseEstimate, RelativeMotion
 
 
@@ -45,7 +45,7 @@ class NdtNodeConfig(OdometryConfig):
     path_length: int = parameter(2000, "newest poses shown in ``ndt/path``", minimum=1)
 
 
-class NdtNode(SlamNode[NdtNodeConfig]):
+class NdtNode(StageNode[NdtNodeConfig]):
     """Publishes ``ndt/odometry``, ``ndt/motion`` (one for every scan, unknown ones too) and pictures of both."""
 
     def __init__(self) -> None:
@@ -82,12 +82,12 @@ class NdtNode(SlamNode[NdtNodeConfig]):
             raise ValueError(f"scans of {self.source} are registered already: remap the topic that is not wanted")
         self.stage.add_scan(Scan(stamp_ns(message), points_of(message), message.header.frame_id))
         self.source = source
-        self._publish_ready()
+        self.publish_ready()
 
     def on_imu(self, message: Message) -> None:
         """A reading of the IMU."""
         self.stage.add_imu(imu_from_message(message))
-        self._publish_ready()
+        self.publish_ready()
 
     def on_reset(self) -> None:
         """Forget everything: the next scan is the origin."""
@@ -95,22 +95,14 @@ class NdtNode(SlamNode[NdtNodeConfig]):
         self.source = ""
         self.path.clear()
 
-    def oldest_waiting_ns(self) -> int | None:
-        """Stamp of the oldest frame that waits for another sensor."""
-        return self.stage.oldest_waiting_ns
-
-    def on_overdue(self) -> None:
-        """Go on without the sensor that frames wait for."""
-        self.stage.give_up()
-        self._publish_ready()
-
     def on_finish(self) -> str:
         """Register the scans that still wait for the IMU."""
         self.stage.finish()
-        self._publish_ready()
+        self.publish_ready()
         return "all scans registered"
 
-    def _publish_ready(self) -> None:
+    def publish_ready(self) -> None:
+        """Publish the poses of all scans that need not wait."""
         for estimate in self.stage.ready():
             self._publish(estimate.pose, estimate.motion)
             if self.has_listeners("ndt/points_aligned"):

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-from slam_core.base_node import SlamNode
 from slam_core.health import State
 from slam_core.messages import (
     FEATURE_TOPICS,
@@ -20,6 +19,7 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.ros import run_node
+from slam_core.stage_node import StageNode
 from slam_core.types import ByteArray, Features
 from stereo_frontend.annotate import annotated_image
 from stereo_frontend.calibrated_pairs import SIDES
@@ -32,7 +32,7 @@ FEW_FEATURES = 20
 """Fewer features than this are reported as DEGRADED."""
 
 
-class FeatureNode(SlamNode[FrontendConfig]):
+class FeatureNode(StageNode[FrontendConfig]):
     """Publishes features, their descriptors and camera info.
 
     ``features/image`` is published where somebody hears it.
@@ -54,19 +54,10 @@ class FeatureNode(SlamNode[FrontendConfig]):
         self.stage.reset()
         self.pairs.reset()
 
-    def oldest_waiting_ns(self) -> int | None:
-        """Stamp of the oldest frame that waits for another sensor."""
-        return self.stage.oldest_waiting_ns
-
-    def on_overdue(self) -> None:
-        """Go on without the sensor that frames wait for."""
-        self.stage.give_up()
-        self._publish_ready()
-
     def on_finish(self) -> str:
         """Process the pairs that still wait for a depth image."""
         self.stage.finish()
-        return f"{self._publish_ready()} waiting frames processed"
+        return f"{self.publish_ready()} waiting frames processed"
 
     # -- inputs --------------------------------------------------------------------------------------------------------
 
@@ -90,21 +81,21 @@ class FeatureNode(SlamNode[FrontendConfig]):
 
     def _on_info(self, side: str, message: Message) -> None:
         self.pairs.set_info(side, camera_info_from_message(message))
-        self._publish_ready()
+        self.publish_ready()
 
     def _on_pair(self, left: Message, right: Message) -> None:
         pictures = grey_from_message(left), grey_from_message(right)
         self.pairs.add(RawPair(stamp_ns(left), *pictures, left.header.frame_id))
-        self._publish_ready()
+        self.publish_ready()
 
     def _on_depth(self, depth: Message, noise: Message, info: Message, picture: Message | None = None) -> None:
         pictures = {} if picture is None else {self._tof_picture(): picture}
         self.stage.add_depth(depth_from_messages(depth, noise, info, **pictures))
-        self._publish_ready()
+        self.publish_ready()
 
     # -- outputs -------------------------------------------------------------------------------------------------------
 
-    def _publish_ready(self) -> int:
+    def publish_ready(self) -> int:
         """Publish the features of all that need not wait; returns of how many frames."""
         for images in self.pairs.ready():
             self.stage.add_images(images)
