@@ -21,7 +21,7 @@ def answers(entries: Entries) -> list[dict[str, str]]:
 
 
 def _ours(entries: Entries, name: str, quantity: str) -> str:
-    """What we found of the first quantity that begins so."""
+    """Our value of the first quantity that begins so."""
     for comparison in entries[name]["comparisons"]:
         if comparison["quantity"].startswith(quantity):
             return str(comparison["ours"])

@@ -56,7 +56,7 @@ def write_markdown(path: Path, findings: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _summary(findings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """How many marks are met, and those that are not by name."""
+    """Number of the marks met, and the names of the others."""
     marks = [(entry, c) for entry in findings for c in entry["comparisons"] if c["met"] is not None]
     missed = [f"{entry['name']}: {c['quantity']} ({c['ours']}, mark {c['mark']})" for entry, c in marks if not c["met"]]
     if not marks:
