@@ -23,7 +23,7 @@ _FIRST_LANDMARK = 2 * POSE_DIM
 
 
 @dataclass(eq=False)
-class PlanarSubmap:
+class IndependentSubmap:
     """A Gaussian of the pose now, the pose at the submap's start, and landmarks.
 
     mean: (n,); covariance: (n, n).
@@ -56,7 +56,7 @@ class IndependentSubmaps:
     """
 
     def __init__(self, config: PlanarConfig, pose: FloatArray, pose_covariance: FloatArray) -> None:
-        self.maps = [PlanarSubmap(np.tile(pose, 2).astype(np.float64), np.tile(pose_covariance, (2, 2)))]
+        self.maps = [IndependentSubmap(np.tile(pose, 2).astype(np.float64), np.tile(pose_covariance, (2, 2)))]
         self._noise = np.diag([config.sigma_range**2, config.sigma_bearing**2])
         self._home: dict[int, int] = {}  # landmark's id to the newest submap that has it
 
@@ -134,7 +134,7 @@ class IndependentSubmaps:
         m = self.maps[-1]
         taken = np.concatenate([np.tile(np.arange(POSE_DIM), 2), m.points(in_view)])
         rows = {landmark_id: _FIRST_LANDMARK + 2 * k for k, landmark_id in enumerate(in_view)}
-        self.maps.append(PlanarSubmap(m.mean[taken], m.covariance[np.ix_(taken, taken)], rows))
+        self.maps.append(IndependentSubmap(m.mean[taken], m.covariance[np.ix_(taken, taken)], rows))
         self._home |= dict.fromkeys(in_view, len(self.maps) - 1)
 
     def _common(self, k: int) -> tuple[IndexArray, IndexArray]:
