@@ -21,11 +21,12 @@ from pathlib import Path
 from types import FrameType
 
 CHAINS = {
-    "a stereo pair to its features": ("stereo_frontend/frontend.py", ("process", "extract", "measure")),
-    "a frame through the filter": ("ekf_slam_node/slam.py", ("process",)),
-    "a submap to the map": ("sjsam_node/global_map.py", ("add",)),
+    "a stereo pair to its keypoints": ("stereo_frontend/frontend.py", "extract"),
+    "keypoints to features": ("stereo_frontend/frontend.py", "measure"),
+    "a frame through the filter": ("ekf_slam_node/slam.py", "process"),
+    "a submap to the map": ("sjsam_node/global_map.py", "add"),
 }
-"""File and methods with which a chain begins."""
+"""File and method with which a chain begins."""
 
 
 @dataclass
@@ -70,8 +71,8 @@ class Tracer:
 
 def _begun(frame: FrameType) -> Chain | None:
     code = frame.f_code
-    for name, (file, methods) in CHAINS.items():
-        if code.co_name in methods and code.co_filename.endswith(file):
+    for name, (file, method) in CHAINS.items():
+        if code.co_name == method and code.co_filename.endswith(file):
             return Chain(name, file, frame, functions={f"{code.co_filename}:{code.co_firstlineno}"})
     return None
 
