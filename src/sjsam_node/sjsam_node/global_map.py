@@ -201,7 +201,7 @@ class GlobalMap:
         return len(np.unique(self.graph.component_of))
 
     def _fault(self, submap: Submap) -> str:
-        """Why a submap cannot be joined; empty if it can."""
+        """Reason for which a submap cannot be joined; empty if it can."""
         if not (np.all(np.isfinite(submap.covariance)) and np.all(np.isfinite(submap.landmarks))):
             return "not finite"
         if np.abs(submap.landmarks).max(initial=0.0) > FARTHEST_M:

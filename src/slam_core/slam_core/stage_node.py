@@ -3,27 +3,17 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any
 
 from slam_core.base_node import SlamNode
 from slam_core.config import C
 
 
-class WaitingStage(Protocol):
-    """Interface of the stage."""
-
-    @property
-    def oldest_waiting_ns(self) -> int | None:
-        """Stamp of the oldest frame that waits for another sensor."""
-
-    def give_up(self) -> None:
-        """Go on without what frames wait for."""
-
-
 class StageNode(SlamNode[C]):
     """Tells the base how long frames wait, and goes on without what is overdue."""
 
-    stage: WaitingStage
+    stage: Any
+    """Has ``oldest_waiting_ns`` and ``give_up()``; each node knows its own by type."""
 
     def publish_ready(self) -> object:
         """Publish the results of all frames that need not wait."""

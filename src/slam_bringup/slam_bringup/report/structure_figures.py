@@ -62,7 +62,7 @@ def _draw_submaps(axes: Axes, graph: MapGraph, starts: FloatArray) -> None:
 
 
 def sparsity_figure(graph: MapGraph) -> Figure | None:
-    """Which measurement (row) depends on which unknown (column), Fig. 7.1: poses first, then shared landmarks."""
+    """Figure of the measurements (rows) and the unknowns (columns) they depend on, Fig. 7.1: poses, then landmarks."""
     if len(graph.records) < 2:
         return None
     rows, columns = _entries(graph)
