@@ -120,8 +120,9 @@ class LiveMap:
     def mark(self, point: FloatArray) -> Mark:
         """Mark a point (3,) of the map frame, m, at once; ValueError in an empty map."""
         with self._lock:
+            mark = self.global_map.marks.add(self.poses, point)
             self.copy_is_old = True
-            return self.global_map.marks.add(self.poses, point)
+        return mark
 
     def reset(self, *, forget: bool) -> None:
         """Forget where the agents are and what waits, and the map too if it is to be forgotten."""
