@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from planar_monte_carlo import MOTION_COVARIANCE, drive, planar_nees, run_filter
 
 from ekf_slam_node.jcbb import JointPrediction, jcbb
-from ekf_slam_node.planar import PlanarConfig, PlanarEkf, move, place, range_bearing, wrap
-from ekf_slam_node.planar_sam import PlanarGraph, smooth
+from ekf_slam_node.planar import PlanarConfig, PlanarEkf, move, place, range_bearing, turn, wrap
+from ekf_slam_node.planar_sam import PlanarGraph, PlanarMap, cost, pose_covariances, smooth
 from slam_core.evaluation import anees_bounds
 
 STEP = 1e-6
@@ -126,3 +128,28 @@ def test_measurement_between_known_and_new_is_discarded() -> None:
     assert slots.tolist() == [-1]
     assert len(ekf.landmarks) == 1
     assert wrap(3 * np.pi) == pytest.approx(-np.pi)
+
+
+def test_smoothed_poses_are_known_as_well_as_the_cost_is_curved(rng: np.random.Generator) -> None:
+    """Without noise the cost's Hessian is twice the information."""
+    config = PlanarConfig()
+    poses = np.array([[0.0, 0.0, 0.1], [0.5, 0.1, 0.4], [0.8, 0.5, 0.9], [0.7, 1.0, 1.5]])
+    landmarks = rng.uniform(-3.0, 3.0, (4, 2))
+    seen = [range_bearing(pose, landmarks)[0] for pose in poses]
+    motions = [np.append(turn(a[2]).T @ (b - a)[:2], b[2] - a[2]) for a, b in pairwise(poses)]
+    k, n = np.indices((4, 4)).reshape(2, -1)
+    graph = PlanarGraph(np.array(motions), MOTION_COVARIANCE, k, n, np.concatenate(seen))
+    state, size = PlanarMap(poses, landmarks), 9 + 8
+
+    def at(step: np.ndarray) -> float:
+        moved = poses + np.vstack([np.zeros(3), step[:9].reshape(3, 3)])
+        return cost(graph, PlanarMap(moved, landmarks + step[9:].reshape(4, 2)), config)
+
+    steps = 1e-4 * np.eye(size)
+    curvature = [[(at(a + b) - at(a - b) - at(b - a) + at(-a - b)) / 4e-8 for b in steps] for a in steps]
+    expected = np.linalg.inv(0.5 * np.array(curvature))
+    found = pose_covariances(graph, state, config, np.arange(4))
+    np.testing.assert_array_equal(found[0], 0.0)
+    for pose in (1, 2, 3):
+        own = slice(3 * pose - 3, 3 * pose)
+        np.testing.assert_allclose(found[pose], expected[own, own], rtol=1e-3, atol=1e-8)
