@@ -12,6 +12,7 @@ from typing import Any
 import jinja2
 
 from slam_bringup.experiments.answers import answers
+from slam_bringup.experiments.catalogue import EXPERIMENTS
 from slam_core.files import atomic_text
 
 _PREAMBLE = """\
@@ -56,12 +57,16 @@ def write_markdown(path: Path, findings: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _summary(findings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Number of the marks met, and the names of the others."""
+    """Number of the marks met, the names of the others, and the experiments that were not run."""
     marks = [(entry, c) for entry in findings for c in entry["comparisons"] if c["met"] is not None]
     missed = [f"{entry['name']}: {c['quantity']} ({c['ours']}, mark {c['mark']})" for entry, c in marks if not c["met"]]
-    if not marks:
-        return []
-    return [f"{len(marks) - len(missed)} of {len(marks)} marks are met. Not met: {'; '.join(missed) or 'none'}.", ""]
+    lines = []
+    if marks:
+        met = len(marks) - len(missed)
+        lines += [f"{met} of {len(marks)} marks are met. Not met: {'; '.join(missed) or 'none'}.", ""]
+    if absent := [name for name in EXPERIMENTS if name not in {entry["name"] for entry in findings}]:
+        lines += [f"Not part of this run: {', '.join(absent)}.", ""]
+    return lines
 
 
 def _markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -223,14 +223,19 @@ def _table(
     return Table(title, header, rows)
 
 
+def _landmarks_of(numbers: int) -> int:
+    """Number n of landmarks in the map of one EKF, whose covariance has (3 + 2 n)^2 numbers."""
+    return round((float(np.sqrt(numbers)) - 3.0) / 2.0)
+
+
 def _growth_figure(growth: Mapping[str, _Growth], sizes: list[int]) -> Figure:
     figure = Figure(figsize=(10, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     for name, g in growth.items():
         left.loglog(sizes, g.ms, "o-", markersize=3, label=f"{name}, n^{g.time_exponent:.1f}")
         right.loglog(sizes, g.thousands, "o-", markersize=3, label=f"{name}, n^{g.memory_exponent:.1f}")
-    left.set(xlabel="landmarks", ylabel="processor time of a step [ms]")
-    right.set(xlabel="landmarks", ylabel="numbers stored [thousands]")
+    left.set(xlabel="landmarks in the map", ylabel="processor time of a step [ms]")
+    right.set(xlabel="landmarks in the map", ylabel="numbers stored [thousands]")
     for axes in (left, right):
         axes.legend(fontsize=7)
     return figure
@@ -246,8 +251,9 @@ def _experiment() -> Experiment:
         }  # fmt: skip
 
     def report(results: Mapping[str, JobResult]) -> Findings:
-        sizes = sorted({int(key.split("|")[1]) for key in results})
-        growth = {name: _growth([results[f"{name}|{size}"].values for size in sizes], sizes) for name in TECHNIQUES}
+        worlds = sorted({int(key.split("|")[1]) for key in results})
+        sizes = [_landmarks_of(results[f"one EKF|{world}"].values["numbers"]) for world in worlds]
+        growth = {name: _growth([results[f"{name}|{world}"].values for world in worlds], sizes) for name in TECHNIQUES}
         usable = {name: g for name, g in growth.items() if g is not None}
         ours, ekf = usable["joined submaps (ours)"], usable["one EKF"]
         tables = [
@@ -255,7 +261,7 @@ def _experiment() -> Experiment:
             _table("Numbers stored, thousands", usable, sizes, lambda g: g.thousands, lambda g: g.memory_exponent),
             _table("RMSE of the path, m: of filters each pose when it was the newest", usable, sizes, lambda g: g.rmse),
         ]
-        missing = [f"{name}: {results[f'{name}|{sizes[0]}'].values['missing']}" for name in TECHNIQUES
+        missing = [f"{name}: {results[f'{name}|{worlds[0]}'].values['missing']}" for name in TECHNIQUES
                    if name not in usable]  # fmt: skip
         return Findings(
             [
