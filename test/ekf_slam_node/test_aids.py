@@ -81,7 +81,7 @@ def test_constant_error_of_turn_rates_is_learnt() -> None:
         assert aid is not None
         sudden = np.array([0.2, 0.0, 0.0]) if k == 150 else np.zeros(3)
         shown = make_transform(so3_exp(turn * dt + sudden + 5e-4 * rng.standard_normal(3)), np.zeros(3))
-        aids.learn_bias(aid, shown, seen, dt)
+        aids.moved(k * STEP_NS, (k + 1) * STEP_NS, shown, seen)
         aids.forget_before(k * STEP_NS)
     aid = aids.between(199 * STEP_NS, 200 * STEP_NS)
     assert aid is not None

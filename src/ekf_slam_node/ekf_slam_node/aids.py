@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ekf_slam_node.config import MotionConfig
-from ekf_slam_node.gyro_bias import GyroBias
+from ekf_slam_node.config import InertialConfig, MotionConfig
+from ekf_slam_node.inertial import InertialFilter, at_place
+from ekf_slam_node.odometry import Upwards
+from ekf_slam_node.preintegration import ImuReadings, Preintegral
 from slam_core.geometry import (
     FloatArray,
     both_halves,
@@ -16,13 +18,14 @@ from slam_core.geometry import (
     compose_covariance,
     interpolate_transform,
     make_transform,
-    so3_exp,
     so3_log,
 )  # fmt: skip
 from slam_core.types import ImuSample, RelativeMotion
 
 _AID_STAMP_TOLERANCE = 0.005
 """Largest difference of the stamps of a motion aid and of the frames it joins."""
+_SIGMA_TURN_RATE = 0.1
+"""By how much (rad/s) the turn rate of a moment may differ from that of a single reading."""
 
 ALL = slice(0, 6)
 ROTATION = slice(3, 6)
@@ -44,11 +47,13 @@ class MotionAids:
     own length, with the noise of the constant-velocity model on top.
     """
 
-    def __init__(self, config: MotionConfig) -> None:
+    def __init__(self, config: MotionConfig, inertial: InertialConfig | None = None) -> None:
         self._config = config
         self._motions: list[RelativeMotion] = []
-        self._samples: list[ImuSample] = []
-        self._bias = GyroBias(config)
+        self._readings = ImuReadings()
+        self.inertial = InertialFilter(config, inertial or InertialConfig())
+        self._newest: tuple[int, int, Preintegral | None] = (0, 0, None)
+        self._reached_ns = 0
 
     def add_motion(self, motion: RelativeMotion) -> bool:
         """Take a motion; False if it is not finite, not positive definite or not forward in time."""
@@ -61,11 +66,7 @@ class MotionAids:
 
     def add_imu(self, sample: ImuSample) -> bool:
         """Take an IMU reading; False if it is not finite or not newer than the last."""
-        newer = not self._samples or sample.stamp_ns > self._samples[-1].stamp_ns
-        if not (newer and np.isfinite(sample.angular_velocity).all()):
-            return False
-        self._samples.append(sample)
-        return True
+        return self._readings.add(sample)
 
     def between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
         """The best aid that covers the time between two stamps, or None."""
@@ -73,24 +74,62 @@ class MotionAids:
             start_stamp_ns, end_stamp_ns
         )
 
-    def learn_bias(self, aid: Aid, T_previous_now: FloatArray, covariance: FloatArray, dt: float) -> None:
-        """Compare an aid from turn rates with the motion that the images alone have shown.
+    def bridge(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+        """The motion as the IMU alone tells it, from velocity and gravity at the start; None where it does not."""
+        if not self.inertial.can_bridge:
+            return None
+        pre = self._preintegral(start_stamp_ns, end_stamp_ns)
+        if pre is None:
+            return None
+        step = self.inertial.predict(pre)
+        covariance = self.inertial.motion_covariance(step)
+        return Aid(*at_place(step.T, covariance, -self._place()), ALL)
 
-        covariance: (6, 6) along the axes of the previous frame; dt: s.
+    def moved(
+        self, start_stamp_ns: int, end_stamp_ns: int, T_previous_now: FloatArray | None = None,
+        covariance: FloatArray | None = None,
+    ) -> bool:  # fmt: skip
+        """Tell the IMU's filter of the motion that the images alone show, or that they show none.
+
+        covariance: (6, 6) along the axes of the previous frame. False if the IMU contradicts it.
         """
-        if aid.rows != ROTATION:
-            return
-        R = T_previous_now[:3, :3]
-        error = so3_log(R.T @ aid.T[:3, :3]) / dt
-        noise = R.T @ covariance[3:, 3:] @ R / dt**2 + np.eye(3) * self._config.sigma_gyro**2
-        self._bias.learn(error, noise, dt)
+        if self._readings.newest is None:
+            return True
+        pre = self._preintegral(start_stamp_ns, end_stamp_ns)
+        if pre is None or start_stamp_ns != self._reached_ns:
+            self.inertial.forget_motion()
+        self._newest, self._reached_ns = (0, 0, None), end_stamp_ns
+        if pre is None:
+            return True
+        self.inertial.watch(pre)
+        step = self.inertial.predict(pre)
+        if T_previous_now is None or covariance is None:
+            self.inertial.advance(step)
+            return True
+        return self.inertial.measure(step, *at_place(T_previous_now, covariance, self._place()))
+
+    @property
+    def newest_stamp_ns(self) -> int:
+        """Stamp of the newest IMU reading; -1 before the first."""
+        return -1 if self._readings.newest is None else self._readings.newest.stamp_ns
+
+    @property
+    def up(self) -> Upwards | None:
+        """The direction against gravity at the newest linked frame, where an IMU knows it."""
+        return Upwards(self.inertial.up, self.inertial.tilt_covariance) if self.inertial.can_bridge else None
+
+    def velocity(self) -> tuple[FloatArray, FloatArray]:
+        """Velocities (6,) of the rig as the IMU has them, with standard deviations (6,)."""
+        newest = self._readings.newest
+        rate = np.zeros(3) if newest is None else newest.angular_velocity - self.inertial.biases[:3]
+        velocity = np.concatenate([self.inertial.velocity - np.cross(rate, self._place()), rate])
+        return velocity, np.concatenate([self.inertial.sigma_velocity, np.full(3, _SIGMA_TURN_RATE)])
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop what lies before the frame the filter has reached; the last of it stays, it may go on."""
         older = sum(motion.end_stamp_ns <= stamp_ns for motion in self._motions)
         del self._motions[: max(older - 1, 0)]
-        older = sum(sample.stamp_ns <= stamp_ns for sample in self._samples)
-        del self._samples[: max(older - 1, 0)]
+        self._readings.forget_before(stamp_ns)
 
     # ---- scans
     def _motion_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
@@ -123,22 +162,21 @@ class MotionAids:
 
     # ---- turn rates
     def _rotation_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
-        stamps = np.array([sample.stamp_ns for sample in self._samples], dtype=np.int64)
-        gap_limit = 0.5 * (end_stamp_ns - start_stamp_ns)
-        if len(stamps) < 2 or stamps[0] > start_stamp_ns + gap_limit or stamps[-1] < end_stamp_ns - gap_limit:
+        pre = self._preintegral(start_stamp_ns, end_stamp_ns)
+        if pre is None or not self.inertial.uses_turns:
             return None
-        inside = (stamps > start_stamp_ns) & (stamps < end_stamp_ns)
-        edges = np.concatenate([[start_stamp_ns], stamps[inside], [end_stamp_ns]])
-        rates = np.array([sample.angular_velocity for sample in self._samples])
-        middle = 0.5 * (edges[1:] + edges[:-1]) - start_stamp_ns
-        times = (stamps - start_stamp_ns).astype(np.float64)
-        at_middle = np.column_stack([np.interp(middle, times, rates[:, axis]) for axis in range(3)]) - self._bias.rate
-        rotation = np.eye(3)
-        for step in so3_exp(at_middle * np.diff(edges)[:, None] * 1e-9):
-            rotation = rotation @ step
-        dt = (end_stamp_ns - start_stamp_ns) * 1e-9
-        variance = np.eye(3) * self._config.sigma_gyro**2 + self._bias.covariance
-        return Aid(make_transform(rotation, np.zeros(3)), variance * dt**2, ROTATION)
+        variance = np.eye(3) * self._config.sigma_gyro**2 + self.inertial.gyro_bias_covariance
+        return Aid(make_transform(pre.R, np.zeros(3)), variance * pre.dt**2, ROTATION)
+
+    def _place(self) -> FloatArray:
+        return np.zeros(3) if self._readings.newest is None else self._readings.newest.position
+
+    def _preintegral(self, start_stamp_ns: int, end_stamp_ns: int) -> Preintegral | None:
+        """Preintegral with the present biases; the newest one is kept until they change."""
+        if self._newest[:2] != (start_stamp_ns, end_stamp_ns):
+            pre = self._readings.integrate(start_stamp_ns, end_stamp_ns, self.inertial.biases, self.inertial.noise)
+            self._newest = start_stamp_ns, end_stamp_ns, pre
+        return self._newest[2]
 
     def _is_same_time(self, a: int, b: int) -> bool:
         return abs(a - b) <= _AID_STAMP_TOLERANCE * 1e9

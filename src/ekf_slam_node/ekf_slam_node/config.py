@@ -56,6 +56,23 @@ class MotionConfig(Config):
 
 
 @dataclass(frozen=True)
+class InertialConfig(Config):
+    """An IMU with its noise as data sheets give it; the defaults suit consumer sensors."""
+
+    time_offset: float = parameter(
+        0.0, "added to the IMU's stamps, so that they mean the same time as the images'", unit="s", minimum=-1.0,
+        maximum=1.0,
+    )  # fmt: skip
+    gyro_noise: float = parameter(1e-3, "white noise of its turn rates", unit="rad/s/sqrt(Hz)", minimum=1e-6)
+    accelerometer_noise: float = parameter(
+        0.01, "white noise of its specific force", unit="m/s2/sqrt(Hz)", minimum=1e-6
+    )
+    sigma_accelerometer_bias: float = parameter(
+        0.15, "constant error of its specific force, which is learnt", unit="m/s2", minimum=0.0
+    )
+
+
+@dataclass(frozen=True)
 class MeasurementConfig(Config):
     """Selection and noise of the features that are measured."""
 
@@ -135,6 +152,7 @@ class EkfSlamConfig(Config):
         choices=("invariant", "standard"),
     )
     motion: MotionConfig = group(MotionConfig)
+    inertial: InertialConfig = group(InertialConfig)
     measurement: MeasurementConfig = group(MeasurementConfig)
     association: FeatureAssociationConfig = group(FeatureAssociationConfig)
     landmark: LandmarkConfig = group(LandmarkConfig)

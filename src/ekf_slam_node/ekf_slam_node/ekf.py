@@ -133,9 +133,9 @@ class Ekf:
             return UpdateReport(nis, len(innovation), False)
         return self._update(S, np.array(step.increment[:, rows], order="F"), innovation, stay=True)
 
-    def stop(self, sigma: FloatArray) -> None:
-        """Replace what is known of the velocities by zero with standard deviations (6,)."""
-        self.velocity = np.zeros(6)
+    def restart(self, velocity: FloatArray, sigma: FloatArray) -> None:
+        """Replace what is known of the velocities (6,) by these with standard deviations (6,)."""
+        self.velocity = velocity.copy()
         head = self.covariance.head(CORE_DIM)
         head[:, 6:] = 0.0
         head[6:CORE_DIM] = 0.0

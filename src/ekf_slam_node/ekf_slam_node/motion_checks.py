@@ -14,6 +14,8 @@ from ekf_slam_node.models import relative_motion
 from ekf_slam_node.steps import LinkedFrame
 from slam_core.geometry import FloatArray, boxminus
 
+_BRIDGE_SIGMA = 0.3
+"""Frames without association are bridged while the position is known this well, m."""
 _STANDING_SIGMA = np.repeat([0.002, np.radians(0.05)], 3)
 """Motions (m, rad) must be known as well as this for a rig to be seen standing."""
 
@@ -77,3 +79,8 @@ def widened(aid: Aid, common: FloatArray) -> Aid:
     if aid.rows != ALL:
         return aid
     return replace(aid, covariance=aid.covariance + 2.0 * np.diag(common**2))
+
+
+def is_known(aid: Aid) -> bool:
+    """True if the place that a motion leads to is known well enough to go on from it."""
+    return float(np.trace(aid.covariance[:3, :3])) < _BRIDGE_SIGMA**2

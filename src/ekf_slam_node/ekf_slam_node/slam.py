@@ -19,7 +19,7 @@ from ekf_slam_node.frame_input import frame_of_strongest, usable_features
 from ekf_slam_node.linking import Linker
 from ekf_slam_node.missed_frames import MissedFrames
 from ekf_slam_node.models import CORE_DIM, Frame, seconds_between
-from ekf_slam_node.motion_checks import StandingDetector, aided, explaining_sigma, is_surprising, widened
+from ekf_slam_node.motion_checks import StandingDetector, aided, explaining_sigma, is_known, is_surprising, widened
 from ekf_slam_node.noise_monitor import NoiseMonitor
 from ekf_slam_node.open_submap import Sight, pending_of
 from ekf_slam_node.results import EkfResult, TrackingState
@@ -72,7 +72,7 @@ class EkfSlam:
         return submaps
 
     def _forget(self) -> None:
-        self._aids = MotionAids(self.config.motion)
+        self._aids = MotionAids(self.config.motion, self.config.inertial)
         self._noise = NoiseMonitor()
         self._common = CommonError(self.config.measurement.common_error)
         self._chain = SubmapChain(self.config, self._T_rig_optical, self.session)
@@ -131,6 +131,11 @@ class EkfSlam:
         if not self._aids.add_imu(sample):
             self.counters.add("imu_rejected")
 
+    @property
+    def complaint(self) -> str:
+        """Complaint about the IMU, or ""."""
+        return self._aids.inertial.complaint
+
     def finish(self) -> tuple[Submap, ...]:
         """Close the open submap; the next frame begins a new one that does not follow it."""
         return self._chain.finish()
@@ -141,8 +146,17 @@ class EkfSlam:
         dt = seconds_between(self._chain.stamp_ns, frame.stamp_ns)
         aid = self._aids.between(self._chain.stamp_ns, frame.stamp_ns)
         linked = self._link(frame, dt, aid)
+        if linked is None and aid is not None and aid.rows == ALL:
+            return self._coast(frame, dt, aid)
+        bridge = None
+        if linked is None or self._chain.is_bridging:
+            bridge = self._aids.bridge(self._chain.stamp_ns, frame.stamp_ns)
+        if linked is None and bridge is not None:
+            linked = self._link(frame, dt, bridge)
         if linked is None:
-            return self._miss(frame) if aid is None or aid.rows != ALL else self._coast(frame, dt, aid)
+            return self._miss(frame, bridge)
+        if bridge is not None:
+            self._chain.add_bridged_pose(frame.stamp_ns, bridge)
         if self._standing.add(linked):
             return self._stand(linked)
         seen = self._augment(linked)
@@ -190,8 +204,14 @@ class EkfSlam:
                 self.counters.add("aids_rejected")
             else:
                 self._use_aid(step, aid, link.T)
-            self._aids.learn_bias(aid, link.T, linked.motion_covariance, linked.dt)
+        self._tell_imu(linked)
         return step
+
+    def _tell_imu(self, linked: LinkedFrame) -> None:
+        """Let the IMU's filter learn from the motion that the images alone show."""
+        T, covariance = linked.link.T, linked.motion_covariance
+        if not self._aids.moved(self._chain.stamp_ns, linked.frame.stamp_ns, T, covariance):
+            self.counters.add("imu_contradicted")
 
     def _update(self, linked: LinkedFrame, seen: Sight) -> UpdatedFrame:
         """Measurement update; in a submap's last frame with half of the landmarks, the others start the next one."""
@@ -218,7 +238,7 @@ class EkfSlam:
     def _close(self, linked: LinkedFrame, seen: Sight, updated: UpdatedFrame) -> tuple[Submap, ...]:
         """Finish the submap and open the one that follows, at the rig's pose in this frame."""
         submaps = self._chain.close()
-        self._chain.follow(linked.frame, seen, updated.measured)
+        self._chain.follow(linked.frame, seen, updated.measured, self._aids.up)
         return submaps
 
     def _use_aid(self, step: TimeUpdate, aid: Aid, T_previous_now: FloatArray) -> None:
@@ -244,9 +264,8 @@ class EkfSlam:
 
         If it creeps, the frames link to the landmarks at an ever larger motion, which ends the standing.
         """
-        self._chain.local.ekf.stop(_STANDING_VELOCITY)
-        if linked.aid is not None:
-            self._aids.learn_bias(linked.aid, linked.link.T, linked.motion_covariance, linked.dt)
+        self._chain.local.ekf.restart(np.zeros(6), _STANDING_VELOCITY)
+        self._tell_imu(linked)
         self.counters.add("frames_standing")
         self._arrive(linked.frame, standing=True)
         return self._chain.result(linked.frame.stamp_ns, TrackingState.OK, "")
@@ -254,27 +273,51 @@ class EkfSlam:
     # ------------------------------------------------------------------------------------------------ without a link
     def _coast(self, frame: Frame, dt: float, aid: Aid) -> EkfResult:
         """No link, but something else has measured the motion: go with it."""
+        self._go_with(frame, dt, aid)
+        reason = "no visual association, moved by odometry alone"
+        return self._chain.result(frame.stamp_ns, TrackingState.DEGRADED, reason)
+
+    def _go_with(self, frame: Frame, dt: float, aid: Aid) -> None:
+        """Move the filter to a frame that is not linked by a motion that something else has measured."""
         local = self._chain.local
         step = local.ekf.time_update(dt, self.config.motion.sigma, aid.T)
         local.ekf.apply_time_update(step)
         self._use_aid(step, aid, aid.T)
         local.ekf.move_to_mean()
+        self._aids.moved(self._chain.stamp_ns, frame.stamp_ns)
         self._arrive(frame)
         local.pending = pending_of(frame, self._T_rig_optical)
-        reason = "no visual association, moved by odometry alone"
-        return self._chain.result(frame.stamp_ns, TrackingState.DEGRADED, reason)
 
-    def _miss(self, frame: Frame) -> EkfResult:
+    def _miss(self, frame: Frame, bridge: Aid | None) -> EkfResult:
         """No link: nothing is mapped.
 
-        The filter stays at the last linked frame, so that the old map can be found again.
+        The filter stays at the last linked frame, so that the old map can be found again. The IMU tells meanwhile where
+        the rig is, as long as it knows. Two missed frames that link to each other go on in the old map from there, or
+        begin a new one.
         """
-        self.counters.add("frames_lost")
+        is_bridged = bridge is not None and is_known(bridge)
         missed = self._missed.add(frame)
         if missed is not None:
-            return self._restart(missed, frame)
+            return self._cross(missed, frame) if is_bridged else self._restart(missed, frame)
+        if bridge is not None and is_bridged:
+            self.counters.add("frames_bridged")
+            reason = "no visual association, bridged by the IMU"
+            bridged = self._chain.add_bridged_pose(frame.stamp_ns, bridge)
+            return self._chain.result(frame.stamp_ns, TrackingState.DEGRADED, reason, pose=bridged)
+        self.counters.add("frames_lost")
         reason = f"{len(frame)} features, fewer than {self.config.association.min_inliers} associations"
         return self._chain.result(frame.stamp_ns, TrackingState.LOST, reason)
+
+    def _cross(self, missed: Frame, frame: Frame) -> EkfResult:
+        """Go on in the old map from a missed frame, to which the IMU has carried the rig."""
+        start_ns = self._chain.stamp_ns
+        bridge = self._aids.bridge(start_ns, missed.stamp_ns)
+        if bridge is None:
+            return self._restart(missed, frame)
+        self.counters.add("gaps_bridged")
+        self._go_with(missed, seconds_between(start_ns, missed.stamp_ns), bridge)
+        self._chain.local.ekf.restart(*self._aids.velocity())
+        return self._advance(frame)
 
     def _restart(self, missed: Frame, frame: Frame) -> EkfResult:
         """The old map is not found again, but two missed frames agree: a new submap begins at the first of them."""
@@ -298,5 +341,6 @@ class EkfSlam:
         return self._chain.result(frame.stamp_ns, TrackingState.OK, "")
 
     def _start(self, frame: Frame, pose: PoseEstimate | None = None) -> None:
-        self._chain.start(frame, pose)
+        self._aids.moved(self._chain.stamp_ns, frame.stamp_ns)
+        self._chain.start(frame, pose, self._aids.up)
         self._drop_older(frame)

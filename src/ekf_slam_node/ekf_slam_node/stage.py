@@ -98,9 +98,10 @@ class FilterStage:
 
     def add_imu(self, sample: ImuSample) -> None:
         """Take an IMU's reading; ValueError if it is not known where the IMU sits."""
-        R_base_imu = self._frames.lookup(self._base_frame, sample.frame_id)[:3, :3]
-        self._samples.append(sample.turned(R_base_imu, self._base_frame))
-        self._awaited.heard(IMU, sample.stamp_ns)
+        T_base_imu = self._frames.lookup(self._base_frame, sample.frame_id)
+        stamp_ns = sample.stamp_ns + round(self._config.inertial.time_offset * 1e9)
+        self._samples.append(replace(sample.seen_from(T_base_imu, self._base_frame), stamp_ns=stamp_ns))
+        self._awaited.heard(IMU, stamp_ns)
 
     def ready(self) -> Iterator[FrameResult]:
         """Results of the frames that need not wait, oldest first.
@@ -146,7 +147,7 @@ class FilterStage:
         slam = self._filter(features)
         self._give_aids(slam, features.stamp_ns)
         result = slam.process(features)
-        if result.state is TrackingState.OK and (complaint := self._awaited.complaint()):
+        if result.state is TrackingState.OK and (complaint := self._awaited.complaint() or slam.complaint):
             result = replace(result, state=TrackingState.DEGRADED, reason=complaint)
         return FrameResult(result, len(features))
 

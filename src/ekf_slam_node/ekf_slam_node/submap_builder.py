@@ -10,7 +10,7 @@ from ekf_slam_node.covariance import IndexArray
 from ekf_slam_node.ekf import Ekf
 from ekf_slam_node.landmarks import LandmarkBook
 from ekf_slam_node.models import CORE_DIM
-from slam_core.geometry import FloatArray
+from slam_core.geometry import FloatArray, boxminus, boxplus
 from slam_core.linear_algebra import blas
 from slam_core.types import PoseEstimate, Submap
 
@@ -44,11 +44,28 @@ class SubmapBuilder:
         self._session = session
         self._path = [PoseEstimate(start_stamp_ns, np.eye(4), _START_SIGMA**2 * np.eye(6))]
         self._standing = 0
+        self._bridged: list[PoseEstimate] = []
 
     def add_pose(self, stamp_ns: int, ekf: Ekf, standing: bool = False) -> None:
         """Add the filter's present pose to the path; one of a rig that stands does not make the submap older."""
         self._standing += standing
-        self._path.append(PoseEstimate(stamp_ns, ekf.T.copy(), ekf.pose_covariance()))
+        pose = PoseEstimate(stamp_ns, ekf.T.copy(), ekf.pose_covariance())
+        if self._bridged and self._bridged[-1].stamp_ns == stamp_ns:
+            self._path += smoothed(self._path[-1].stamp_ns, self._bridged, pose)
+        self._bridged = []
+        self._path.append(pose)
+
+    @property
+    def is_bridging(self) -> bool:
+        """True if poses that no image confirms wait for one that ends them."""
+        return bool(self._bridged)
+
+    def add_bridged_pose(self, pose: PoseEstimate) -> None:
+        """Add a pose that no image confirms, or the first after these as it was predicted.
+
+        They are in the submap only if a pose of the filter ends them.
+        """
+        self._bridged.append(pose)
 
     def is_complete(self, ekf: Ekf, config: SubmapConfig, shared: int) -> bool:
         """True if the rig is far enough from the start, or the submap large or old enough.
@@ -85,6 +102,22 @@ class SubmapBuilder:
             sightings=book.sightings.copy(), descriptors=book.descriptors.copy(), path=tuple(self._path),
             follows_previous=self._follows_previous, session=self._session,
         )  # fmt: skip
+
+
+def smoothed(start_ns: int, bridged: list[PoseEstimate], end: PoseEstimate) -> list[PoseEstimate]:
+    """The poses since ``start_ns`` that were ``bridged`` but for the last, corrected by what is known of it in the end.
+
+    The error of a way found by accelerations grows with the square of time at most, that of the turn with time.
+    """
+    last = bridged[-1]
+    error, excess = boxminus(end.T, last.T), last.covariance - end.covariance
+    corrected = []
+    for pose in bridged[:-1]:
+        share = (pose.stamp_ns - start_ns) / (end.stamp_ns - start_ns)
+        gain = np.repeat([share**2, share], 3)
+        covariance = _positive_definite(pose.covariance - gain[:, None] * excess * gain)
+        corrected.append(PoseEstimate(pose.stamp_ns, boxplus(pose.T, gain * error), covariance))
+    return corrected
 
 
 def _positive_definite(P: FloatArray) -> FloatArray:

@@ -7,17 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from ekf_slam_node.aids import Aid
 from ekf_slam_node.calibration import widened_by_calibration
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import Ekf
 from ekf_slam_node.landmarks import LandmarkBook, Pending
 from ekf_slam_node.models import CORE_DIM, Frame, relative_motion, seconds_between
-from ekf_slam_node.odometry import OdometryChain
+from ekf_slam_node.odometry import OdometryChain, Upwards
 from ekf_slam_node.open_submap import OpenSubmap, Sight, inheriting, pending_of
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.steps import UpdatedFrame
 from ekf_slam_node.submap_builder import SubmapBuilder, conditional_start
-from slam_core.geometry import FloatArray
+from slam_core.geometry import FloatArray, compose_covariance
 from slam_core.types import PoseEstimate, Submap
 
 _COAST_TIME = 0.5
@@ -68,23 +69,23 @@ class SubmapChain:
         return self._local
 
     # ------------------------------------------------------------------------------------------------------- opening
-    def start(self, frame: Frame, pose: PoseEstimate | None = None) -> OpenSubmap:
+    def start(self, frame: Frame, pose: PoseEstimate | None = None, up: Upwards | None = None) -> OpenSubmap:
         """Open a submap at a frame of which nothing is known before: position zero, velocity unknown.
 
-        ``pose``: T_odom_rig at the frame, or None to start where the chain has ended.
+        ``pose``: T_odom_rig at the frame, or None to start where the chain has ended. ``up``: gravity there, if known.
         """
         if pose is None and self.has_begun:
             pose = self.pose(self.stamp_ns)
         if pose is not None:
-            self._odometry.advance(pose)
+            self._odometry.advance(pose, up)
         pending = pending_of(frame, self._T_rig_optical)
         local = self._empty_map(frame, np.zeros(6), self._config.motion.initial_variance, pending)
         return self._open(local, frame, follows=False)
 
-    def follow(self, frame: Frame, seen: Sight, measured: Sight) -> OpenSubmap:
-        """Open the submap that follows the one just closed, at the rig's pose in this frame."""
+    def follow(self, frame: Frame, seen: Sight, measured: Sight, up: Upwards | None = None) -> OpenSubmap:
+        """Open the submap that follows the one just closed, at the rig's pose in this frame, and gravity if known."""
         local = self.local
-        self._odometry.advance(self.pose(frame.stamp_ns))
+        self._odometry.advance(self.pose(frame.stamp_ns), up)
         if self._config.submap.start == "independent":
             pending = inheriting(frame, self._T_rig_optical, seen, measured, local.book)
             # The velocity is a starting point with a variance so wide that it carries no information over.
@@ -113,6 +114,19 @@ class SubmapChain:
         """Add the filter's pose to the submap's path."""
         self._builder.add_pose(stamp_ns, self.local.ekf, standing)
         self.stamp_ns = stamp_ns
+
+    @property
+    def is_bridging(self) -> bool:
+        """True if poses that no image confirms wait for one that ends them."""
+        return self._builder.is_bridging
+
+    def add_bridged_pose(self, stamp_ns: int, motion: Aid) -> PoseEstimate:
+        """Add the pose after a motion from the filter's pose that no image confirms; returns it as T_odom_rig."""
+        ekf = self.local.ekf
+        covariance = compose_covariance(ekf.T, ekf.pose_covariance(), motion.T, motion.covariance)
+        pose = PoseEstimate(stamp_ns, ekf.T @ motion.T, covariance)
+        self._builder.add_bridged_pose(pose)
+        return self._odometry.pose(stamp_ns, pose.T, covariance)
 
     def is_complete(self, shared: int) -> bool:
         """True if the submap ends with this frame, in which the next one would share so many landmarks with it."""
@@ -153,11 +167,14 @@ class SubmapChain:
 
     def result(
         self, stamp_ns: int, state: TrackingState, reason: str, submaps: tuple[Submap, ...] = (),
-        updated: UpdatedFrame | None = None,
+        updated: UpdatedFrame | None = None, pose: PoseEstimate | None = None,
     ) -> EkfResult:  # fmt: skip
-        """The estimate at a stamp, with the submaps that the frame finished and its measurement update, if any."""
+        """The estimate at a stamp, with the submaps that the frame finished and its measurement update, if any.
+
+        ``pose``: T_odom_rig where it is known otherwise than by :meth:`pose`.
+        """
         ekf = self.local.ekf
-        pose = widened_by_calibration(self.pose(stamp_ns), self._config.calibration)
+        pose = widened_by_calibration(self.pose(stamp_ns) if pose is None else pose, self._config.calibration)
         velocity_covariance = ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:]
         result = EkfResult(
             stamp_ns, pose, ekf.velocity, velocity_covariance, state, reason, submaps, self._landmark_view()

@@ -121,17 +121,21 @@ class RelativeMotion:
 class ImuSample:
     """An IMU reading along the axes of ``frame_id``.
 
-    Angular_velocity (3,) rad/s, linear_acceleration (3,) m/s2 with gravity.
+    Angular_velocity (3,) rad/s, linear_acceleration (3,) m/s2 with gravity. position: (3,) m where the IMU sits in that
+    frame.
     """
 
     stamp_ns: int
     angular_velocity: FloatArray
     linear_acceleration: FloatArray
     frame_id: str = "base_link"
+    position: FloatArray = field(default_factory=lambda: np.zeros(3))
 
-    def turned(self, R: FloatArray, frame_id: str) -> ImuSample:
-        """The same reading along the axes of another frame, ``R`` = R_frame_own (3, 3)."""
-        return ImuSample(self.stamp_ns, R @ self.angular_velocity, R @ self.linear_acceleration, frame_id)
+    def seen_from(self, T: FloatArray, frame_id: str) -> ImuSample:
+        """The same reading along the axes of another frame, ``T`` = T_frame_own (4, 4)."""
+        R = T[:3, :3]
+        position = R @ self.position + T[:3, 3]
+        return ImuSample(self.stamp_ns, R @ self.angular_velocity, R @ self.linear_acceleration, frame_id, position)
 
 
 @dataclass(frozen=True, eq=False)
