@@ -28,6 +28,8 @@ _MAPPING_SIGMA = 0.1
 """Standard deviation of the mapping into the ToF image, px."""
 
 _ITERATIONS = 8
+_STANDS_STILL = 1e-6
+"""A depth (m) that an iteration moves by less is at its place."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +88,18 @@ def map_depth(
     T_tof_left = invert_transform(T_left_tof)
     rays_tof, origin = rays @ T_tof_left[:3, :3].T, T_tof_left[:3, 3]
     depth = np.where(np.isfinite(initial_depth), initial_depth, _median_depth(image))
-    for _ in range(_ITERATIONS):
-        pixels = image.camera.project(rays_tof * depth[:, None] + origin)
-        samples = sample_depth(image, pixels)
-        update = (samples.depth - origin[2]) / rays_tof[:, 2]
-        moved = np.abs(update - depth)
-        depth = np.where(np.isfinite(update), update, depth)
+    moving = np.arange(len(depth))
+    for _ in range(_ITERATIONS - 1):
+        samples = sample_depth(image, image.camera.project(rays_tof[moving] * depth[moving, None] + origin))
+        update = (samples.depth - origin[2]) / rays_tof[moving, 2]
+        moved = np.abs(update - depth[moving])
+        depth[moving] = np.where(np.isfinite(update), update, depth[moving])
+        moving = moving[moved > _STANDS_STILL]
+    pixels = image.camera.project(rays_tof * depth[:, None] + origin)
+    samples = sample_depth(image, pixels)
+    update = (samples.depth - origin[2]) / rays_tof[:, 2]
+    moved = np.abs(update - depth)
+    depth = np.where(np.isfinite(update), update, depth)
     settled = moved <= np.maximum(samples.sigma, 1e-3)
     sigma = _mapped_sigma(samples, image.camera, age) / np.abs(rays_tof[:, 2])
     blank = np.where(settled & (depth > 0.0), 0.0, np.nan)
