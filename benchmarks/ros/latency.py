@@ -22,7 +22,7 @@ from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.node_graph import NodeGraph, plan_nodes
-from slam_bringup.processes.online_run import START_TIMEOUT_S, fastdds_profile
+from slam_bringup.processes.online_run import START_TIMEOUT_S
 from slam_bringup.processes.processes import NodeCommand, NodeGroup, PrivateDomain, node_environment
 from slam_bringup.processes.supervisor_node import Supervisor
 from slam_core.ros import RosTypes, sensor_qos
@@ -98,7 +98,7 @@ def main() -> None:
         folder = Path(name)
         with SensorBag(given.bag) as bag:
             graph = plan_nodes(config, bag.sensors, given.odometry != "none", str(folder / "map"))
-        environment = node_environment(domain, fastdds_profile())
+        environment = node_environment(domain)
         with NodeGroup(environment, folder) as group, Supervisor(environment, group.check) as supervisor:
             for command in commands_of(graph, given.composed, folder):
                 group.start(command)

@@ -32,6 +32,17 @@ class EarConfig(Config):
     fixed: int = parameter(1, "may not")
 
 
+class Sender:
+    """Stands for the publisher of diagnostics; notes what they say is not connected."""
+
+    def __init__(self, heard: list[str]) -> None:
+        self._heard = heard
+
+    def publish(self, message: Any) -> None:
+        values = {v.key: v.value for v in message.status[0].values}
+        self._heard.append(values["unconnected"])
+
+
 class EarNode(SlamNode[EarConfig]):
     """Remembers what it was given and what was made of it."""
 
@@ -119,6 +130,15 @@ def test_a_live_node_leaves_out_what_comes_too_fast_and_says_so(node: EarNode) -
     assert {v.key: v.value for v in status.values}["skipped"] == "8"
     assert "8 frames left out" in status.message
     assert "left out" not in node._diagnostic_message("").status[0].message
+
+
+def test_a_node_reports_at_once_that_its_inputs_are_connected(node: EarNode, monkeypatch: pytest.MonkeyPatch) -> None:
+    reported: list[str] = []
+    monkeypatch.setattr(node, "_diagnostics", Sender(reported))
+    for unconnected in (["/frames"], ["/frames"], [], []):
+        monkeypatch.setattr(node, "_unconnected", lambda topics=unconnected: topics)
+        node._report_connections()
+    assert reported == ["/frames", ""]
 
 
 def test_gaps_of_the_stamps_are_counted(node: EarNode) -> None:

@@ -60,6 +60,7 @@ _POLICIES = {
 """Types whose messages accompany frames: having processed one says nothing of the frame of its stamp."""
 
 PROGRESS_TOPIC = "/progress"
+_CONNECTION_PERIOD_S = 0.2
 
 
 class SlamNode(TransformNode, Generic[C]):
@@ -91,7 +92,9 @@ class SlamNode(TransformNode, Generic[C]):
         self.create_service(SetBool, "~/pause", self._on_pause_service)
         self.create_service(Trigger, "~/finish", self._on_finish_service)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._reported_unconnected: list[str] | None = None
         self.create_timer(1.0, self._tick, clock=steady)
+        self.create_timer(_CONNECTION_PERIOD_S, self._report_connections, clock=steady)
         if self.input_config.policy == "newest":
             self.create_timer(0.25 * self.input_config.overdue, self._look_for_overdue, clock=steady)
 
@@ -325,6 +328,12 @@ class SlamNode(TransformNode, Generic[C]):
             self.get_logger().warning(silence)
         self._silent = bool(silence)
         self._diagnostics.publish(self._diagnostic_message(silence))
+
+    def _report_connections(self) -> None:
+        """Whoever waits for the nodes learns at once that one is there, and when its inputs are connected."""
+        if (unconnected := self._unconnected()) != self._reported_unconnected:
+            self._reported_unconnected = unconnected
+            self._diagnostics.publish(self._diagnostic_message(""))
 
     def _report_change(self) -> None:
         """A change of state is reported at once, with the stamp of the input that brought it."""

@@ -22,8 +22,6 @@ from slam_bringup.pipeline.configuration import choose, system_config
 from slam_bringup.pipeline.overrides import Overrides, read_overrides
 from slam_bringup.processes.interrupt import INTERRUPTED, Interrupt
 from slam_bringup.processes.online_run import run_nodes
-from slam_bringup.processes.recorded_run import collect
-from slam_bringup.report.output import write_results
 from slam_bringup.report.summary_table import summary_table
 from slam_bringup.version import VERSION
 from slam_core.output_folder import LOGS, OutputFolder
@@ -60,6 +58,10 @@ def command(
                 names=names, overrides=overrides, view_port=port,
                 on_progress=lambda done: progress.update(task, completed=done), stopped=lambda: interrupt.asked,
             )  # fmt: skip
+        # What draws and writes is loaded now: the nodes have needed the processor.
+        from slam_bringup.processes.recorded_run import collect
+        from slam_bringup.report.output import write_results
+
         result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)
         require_map(result)
         summary = write_results(folder, result)

@@ -34,6 +34,8 @@ _HURRIED_TIMEOUT_S = 2.0
 _QUIET_S, _HURRIED_QUIET_S = 1.0, 0.3
 _HOPELESS_AFTER_S = 15.0
 """A run in which no frame has reached a filter by then, while messages are rejected, never will."""
+_LAST_REPORT_S = 1.5
+"""Longest wait for the last diagnostics: every node reports once a second."""
 _WINDOW = 4
 _SJSAM = "/sjsam"
 
@@ -219,8 +221,10 @@ class _Choreography:
 
     def finish(self) -> None:
         """Tell the nodes that the input has ended, front to back, and have the map saved when all is joined."""
-        for name in self._graph.finishers:
-            self._patiently(partial(self._supervisor.call, f"{name}/finish"))
+        filters = self._graph.filters
+        for names in ([name for name in self._graph.finishers if name not in filters], filters):
+            for name in names:
+                self._patiently(partial(self._supervisor.call, f"{name}/finish"))
             self._supervisor.wait_until_quiet(_HURRIED_QUIET_S if self._stopped() else _QUIET_S, self._limit_s)
         self._patiently(partial(self._supervisor.wait, self._all_joined, what="joining of the last submap"))
         self._supervisor.call(f"{_SJSAM}/save_map", _SERVICE_TIMEOUT_S)
@@ -239,7 +243,7 @@ class _Choreography:
 
     def last_diagnostics(self) -> dict[str, dict[str, str]]:
         """The final values of all nodes, once they have reported after the end."""
-        self._supervisor.listen(1.5)
+        self._supervisor.wait_for_reports([c.full_name for c in self._graph.commands], _LAST_REPORT_S)
         return dict(self._supervisor.diagnostics)
 
     def _all_joined(self) -> bool:

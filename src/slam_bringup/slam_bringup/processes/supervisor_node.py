@@ -55,6 +55,7 @@ class Supervisor:
         self._executor.add_node(self._node)
         self.diagnostics: dict[str, dict[str, str]] = {}
         """Latest diagnostic values by full node name."""
+        self._reports: Counter[str] = Counter()
         self.progress: Counter[str] = Counter()
         """Inputs processed so far by full node name."""
         self.submaps = 0
@@ -95,6 +96,13 @@ class Supervisor:
             self.listen(_SPIN_S)
             if self.progress.total() != seen:
                 since, seen = time.monotonic(), self.progress.total()
+
+    def wait_for_reports(self, names: Iterable[str], timeout_s: float) -> None:
+        """Listen until every node has reported its diagnostics anew, but no longer than ``timeout_s``."""
+        waiting = {name: self._reports[name] for name in names}
+        deadline = time.monotonic() + timeout_s
+        while any(self._reports[name] == before for name, before in waiting.items()) and time.monotonic() < deadline:
+            self.listen(_SPIN_S)
 
     def listen(self, seconds: float) -> None:
         """Handle what comes in."""
@@ -151,6 +159,7 @@ class Supervisor:
         for status in message.status:
             values = {entry.key: entry.value for entry in status.values}
             self.diagnostics[status.name] = values | {"message": status.message}
+            self._reports[status.name] += 1
 
     def _on_progress(self, header: Any) -> None:
         self.progress[header.frame_id] += 1
