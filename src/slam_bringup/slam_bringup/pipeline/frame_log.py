@@ -15,6 +15,8 @@ from stereo_frontend.tof_features import normalised_picture
 
 _MOST = 1500
 """Frames kept; beyond that every other one goes."""
+_APART_NS = 150_000_000
+"""From one frame that is kept to the next: to draw and pack a picture takes 5 ms."""
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 85)
 _CLIP, _GAMMA = 0.005, 0.7
 """Share of the darkest and of the brightest pixels of a depth camera that are not told apart, and exponent."""
@@ -41,21 +43,20 @@ class LoggedFrame:
 
 
 class FrameLog:
-    """Keeps every frame, then every second, every fourth, ...: between 750 and 1500 of a long run."""
+    """Keeps up to six frames a second, of a long run fewer: between 750 and 1500 in all."""
 
     def __init__(self) -> None:
         self.frames: list[LoggedFrame] = []
-        self._every = 1
-        self._seen = 0
+        self._apart_ns = _APART_NS
 
     def add(self, frame: ExtractedFrame, features: Features) -> None:
         """Take one more frame with what was found in it."""
-        if self._seen % self._every == 0:
-            self.frames.append(_logged(frame, features))
-        self._seen += 1
+        if self.frames and features.stamp_ns - self.frames[-1].stamp_ns < self._apart_ns:
+            return
+        self.frames.append(_logged(frame, features))
         if len(self.frames) > _MOST:
             self.frames = self.frames[::2]
-            self._every *= 2
+            self._apart_ns *= 2
 
 
 def _logged(frame: ExtractedFrame, features: Features) -> LoggedFrame:
