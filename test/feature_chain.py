@@ -43,9 +43,11 @@ class Chain(Probe):
     """``ekf_slam`` of each agent and ``sjsam`` as processes; topics, names and frames below the agents' names."""
 
     def __init__(
-        self, context: Any, domain: int, folder: Path, agents: tuple[str, ...] = ("",), *, joiner: bool = True
-    ) -> None:
+        self, context: Any, domain: int, folder: Path, agents: tuple[str, ...] = ("",), *, joiner: bool = True,
+        small_submaps: bool = True,
+    ) -> None:  # fmt: skip
         super().__init__(context)
+        self.small_submaps = small_submaps
         self.environment = {
             **os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)
         }  # fmt: skip
@@ -79,9 +81,10 @@ class Chain(Probe):
         agent, _, executable = name.rpartition("/")
         module = {"ekf_slam": "ekf_slam_node", "sjsam": "sjsam_node"}[executable]
         own = {
-            "sjsam": (f"map_path:={self.map_path}", "autosave_period_s:=0.5", f"ply_path:={self.map_path}.ply",
+            "sjsam": (f"map_path:={self.map_path}", f"ply_path:={self.map_path}.ply",
+                      *(["autosave_period_s:=0.5"] if self.small_submaps else []),
                       *([f"agents:={list(self.agents)}"] if any(self.agents) else [])),
-            "ekf_slam": ("submap.max_frames:=8", f"agent:='{agent}'"),
+            "ekf_slam": (*(["submap.max_frames:=8"] if self.small_submaps else []), f"agent:='{agent}'"),
         }[executable]  # fmt: skip
         arguments = [word for parameter in own for word in ("-p", parameter)]
         namespace = ["-r", f"__ns:=/{agent}"] if agent else []

@@ -76,6 +76,7 @@ def test_a_killed_node_goes_on_from_its_saved_map(rng: np.random.Generator, tmp_
         with neighbour() as probe:
             send(probe, submaps[:half], half * agent.steps + 1)
             assert call(probe, "save_map").success
+            assert len(GlobalMap.load(tmp_path / "map.autosave").graph.records) == half  # no less than was saved
             assert call(probe, "mark_here").success  # after saving: must be gone
             first.send_signal(signal.SIGKILL)
     finally:

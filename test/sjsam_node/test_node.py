@@ -126,6 +126,31 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
     assert len(bench.node.global_map.graph.records) == len(submaps)
 
 
+def test_a_submap_that_did_not_arrive_is_asked_for_again_and_then_told(bench: Bench, rng: np.random.Generator) -> None:
+    submaps = Agent(ring_world(4.0, rng, 12.0), circle(4.0, 0.5), rng, "").submaps()[:8]
+    publishers = [bench.publisher(topic, kind) for topic, kind in SUBMAP_TOPICS.items()]
+
+    def send(*indices: int) -> None:
+        for index in indices:
+            for publisher, message in zip(publishers, submap_messages(bench.types, submaps[index]), strict=True):
+                publisher.publish(message)
+
+    def joined() -> list[int]:
+        return [record.submap.index for record in bench.node.global_map.graph.records]
+
+    counters = bench.node.health.counters
+    send(0, 1, 3, 4)
+    assert bench.spin_until(lambda: counters.get("submaps sent again", 0) >= 2)  # all are asked for again
+    assert joined() == [0, 1]
+    send(2)
+    assert bench.spin_until(lambda: len(joined()) == 5)
+    assert joined() == [0, 1, 2, 3, 4]
+    assert bench.node.global_map.components == 1
+    send(6)
+    assert bench.spin_until(lambda: counters.get("submaps missed", 0) == 1)
+    assert joined() == [0, 1, 2, 3, 4, 6]
+
+
 def test_services_answer_on_an_empty_map(bench: Bench) -> None:
     assert not bench.call("load_map").success
     assert not bench.call("mark_here").success

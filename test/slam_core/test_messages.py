@@ -344,7 +344,8 @@ def compact_covariance(rng: np.random.Generator, n: int, smallest: float) -> tup
     basis = np.linalg.qr(rng.normal(size=(6 + 3 * n, 6 + 3 * n)))[0]
     correlated = (basis * np.geomspace(1.0, smallest, len(basis))) @ basis.T
     scale = np.geomspace(1e-4, 1.0, len(basis))
-    covariance = scale[:, None] * (0.5 * (correlated + correlated.T)) * scale
+    covariance = np.tril(scale[:, None] * correlated * scale)
+    covariance += np.tril(covariance, -1).T
     return covariance, m.rounded(replace(make_submap(rng, n, "a", True), covariance=covariance)).covariance
 
 
@@ -367,6 +368,12 @@ def test_a_compact_submap_takes_a_quarter_of_its_numbers(rng: np.random.Generato
     submap = make_submap(rng, 150, "a", True)
     sent = sum(len(typestore().serialize_cdr(x, x.__msgtype__)) for x in m.submap_messages(TYPES, submap, compact=True))
     assert sent < 0.29 * (submap.covariance.nbytes + submap.descriptors.nbytes)
+
+
+def test_a_full_submap_sends_each_number_of_the_covariance_once(rng: np.random.Generator) -> None:
+    submap = make_submap(rng, 150, "a", True)
+    gaussian = m.submap_messages(TYPES, submap).gaussian
+    assert len(gaussian.data) < 0.51 * submap.covariance.nbytes
 
 
 def test_compact_descriptors_compare_as_before(rng: np.random.Generator) -> None:

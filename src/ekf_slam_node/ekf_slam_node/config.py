@@ -137,7 +137,7 @@ class SubmapConfig(Config):
     max_landmarks: int = parameter(400, "a submap ends at this number of landmarks", minimum=10)
     max_frames: int = parameter(300, "a submap ends after this number of frames", minimum=2)
     compact: bool = parameter(
-        False, "send submaps rounded, in a quarter of the bytes: 32-bit factor of the covariance, 8-bit descriptors"
+        False, "send submaps rounded, in half the bytes: 32-bit factor of the covariance, 8-bit descriptors"
     )
 
 

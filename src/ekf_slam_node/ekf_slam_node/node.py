@@ -33,6 +33,9 @@ from slam_core.ros import run_node
 from slam_core.stage_node import StageNode
 from slam_core.types import PoseEstimate, Submap
 
+_SUBMAPS_KEPT = 200
+"""For a joiner that comes late or was cut off; each takes about a megabyte."""
+
 _STATES = {TrackingState.OK: State.OK, TrackingState.DEGRADED: State.DEGRADED, TrackingState.LOST: State.LOST}
 
 
@@ -72,7 +75,7 @@ class EkfNode(StageNode[EkfNodeConfig]):
         self.advertise("landmarks", "PointCloud2")
         self.advertise("landmark_ellipsoids", "MarkerArray")
         for topic, kind in SUBMAP_TOPICS.items():
-            self.advertise(topic, kind, latched=True)
+            self.advertise(topic, kind, latched=True, depth=_SUBMAPS_KEPT)
 
     def on_features(self, cloud: Message, descriptors: Message, camera_info: Message) -> None:
         """One frame; it may have to wait for the motion that leads to it."""
@@ -151,4 +154,4 @@ class EkfNode(StageNode[EkfNodeConfig]):
 
 def main() -> None:
     """Entry point of ``ros2 run ekf_slam_node ekf_slam``."""
-    run_node(EkfNode)
+    run_node(EkfNode, small_packets=True)

@@ -143,6 +143,7 @@ class LiveMap:
         if not self.global_map.graph.records and path.exists():
             raise ValueError(f"the map is empty: {path} is left as it is")
         self.global_map.save(path)
+        self._copy_now()  # a node that is killed from now on goes on from no less
 
     def load(self, path: Path, view: Callable[[GlobalMap], T]) -> Future[T]:
         """Take the map of a folder in the place of this one, once it is loaded and viewed; ValueError if it cannot be.
@@ -187,8 +188,14 @@ class LiveMap:
         while wait([joined], 1.0).not_done:
             self.save_copy()
         self._writer.close()
-        if self._autosave.is_on and self.copy_is_old:
-            self._autosave.wait()
-            self._autosave.save(self.global_map.stored(), time.monotonic())
+        self._copy_now()
         self._autosave.put_away()
         self._autosave.close()
+
+    def _copy_now(self) -> None:
+        """Writer, or after its end: bring the copy up to date."""
+        if self._autosave.is_on and self.copy_is_old:
+            self.copy_is_old = False
+            self._autosave.wait()
+            self._autosave.save(self.global_map.stored(), time.monotonic())
+            self._autosave.wait()

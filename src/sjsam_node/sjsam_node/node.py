@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -20,7 +19,7 @@ from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
 from sjsam_node.autosave import Autosave
-from sjsam_node.global_map import ALREADY_JOINED, GlobalMap, GlobalMapConfig
+from sjsam_node.global_map import ALREADY_JOINED, GlobalMap
 from sjsam_node.live_map import Joined, LiveMap
 from sjsam_node.localization import Localization
 from sjsam_node.map_messages import (
@@ -31,9 +30,10 @@ from sjsam_node.map_messages import (
     marks_message,
 )  # fmt: skip
 from sjsam_node.map_writer import result_of
+from sjsam_node.node_config import SjsamNodeConfig
 from sjsam_node.pose_tracker import PoseTracker
+from sjsam_node.submap_order import SubmapOrder, gap_text
 from slam_core.base_node import SlamNode
-from slam_core.config import parameter
 from slam_core.geometry import FloatArray
 from slam_core.health import State
 from slam_core.messages import (
@@ -59,25 +59,6 @@ _LONGEST_SILENCE_S = 1.0
 """``map_to_odom`` is stamped as if time went on for so long after the last odometry."""
 
 
-@dataclass(frozen=True)
-class SjsamNodeConfig(GlobalMapConfig):
-    """The map's parameters and the node's own."""
-
-    agents: tuple[str, ...] = parameter(("",), "namespaces of the agents whose submaps are joined")
-    map_frame: str = parameter("map", "frame of the map")
-    odom_frame: str = parameter("odom", "frame of each agent's odometry, below its namespace")
-    map_path: str = parameter("map", "folder that save_map writes and load_map reads")
-    ply_path: str = parameter("map_landmarks.ply", "file that export_ply writes")
-    localize_only: bool = parameter(False, "locate the agents in the loaded map without changing it")
-    autosave_period_s: float = parameter(
-        10.0, "time between two copies of the map that a killed node goes on from; 0: none", unit="s", minimum=0.0
-    )
-    autosave_path: str = parameter("", "folder of that copy; empty: map_path with the ending .autosave")
-    transform_tolerance_s: float = parameter(
-        0.2, "how far ahead map_to_odom is stamped, so that a lookup at the present time works", unit="s", minimum=0.0
-    )
-
-
 class SjsamNode(SlamNode[SjsamNodeConfig]):
     """Publishes each agent's pose, ``map_to_odom`` and the map.
 
@@ -97,6 +78,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._advertise_outputs()
         self._start_trackers()
         self._go_on_from_last_time()
+        known = () if self.config.localize_only else (r.key for r in self.global_map.graph.records)
+        self._order = SubmapOrder[tuple[str, Submap]](known)
         self._heard_at_s: dict[str, float] = {}
         for agent in self.config.agents:
             self._listen_to(agent)
@@ -183,11 +166,31 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     # -- inputs --------------------------------------------------------------------------------------------------------
 
     def on_submap(self, agent: str, *messages: Message) -> None:
-        """One finished submap: it is joined, or located, when those before it are."""
+        """One finished submap: it is joined, or located, after those before it."""
         submap = submap_from_messages(SubmapMessages(*messages))
         self._stamp_ns = max(self._stamp_ns, submap.end_stamp_ns)
         self.health.count("submaps received")
-        done: Future[Any] = self.map.locate(agent, submap) if self.config.localize_only else self.map.add(submap)
+        if self.config.localize_only:
+            self._hand_over(agent, submap, self.map.locate(agent, submap))
+            return
+        self._join(self._order.add((submap.agent, submap.session, submap.index), (agent, submap)))
+        if self._order.should_ask(time.monotonic()):
+            self.ask_again(_below(agent, topic) for topic in SUBMAP_TOPICS)
+
+    def _join(self, submaps: list[tuple[str, Submap]]) -> None:
+        for agent, submap in submaps:
+            self._hand_over(agent, submap, self.map.add(submap))
+
+    def _go_on_without_the_missing(self) -> None:
+        """Nobody can send them any more."""
+        if missing := self._order.overdue(time.monotonic()):
+            for (agent, _), indices in missing.items():
+                self.health.count("submaps missed", len(indices))
+                self.get_logger().warning(gap_text(agent, indices))
+            self._join(self._order.give_up())
+
+    def _hand_over(self, agent: str, submap: Submap, done: Future[Any]) -> None:
+        """Have another thread do its part, and go on from there."""
         self._show_waiting()
         take = partial(self._take, agent, submap, done)
         done.add_done_callback(
@@ -259,6 +262,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def on_close(self) -> None:
         """Join what waits: no submap that has come is lost."""
         self.finish_work()
+        self._join(self._order.give_up())
         if self.map.waiting:
             self.get_logger().info(f"joining {self.map.waiting} submaps before the end")
         self.map.close()
@@ -338,6 +342,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     # -- outputs -------------------------------------------------------------------------------------------------------
 
     def _publish_news(self) -> None:
+        self._go_on_without_the_missing()
         if self._drawn is not self.map.poses and self._picture.done():
             self._publish_map()
         copy = self.map.save_copy()
@@ -396,4 +401,4 @@ def _below(agent: str, name: str) -> str:
 
 def main() -> None:
     """Entry point of ``ros2 run sjsam_node sjsam``."""
-    run_node(SjsamNode)
+    run_node(SjsamNode, small_packets=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -121,6 +121,12 @@ class ListeningNode(GuardedNode):
     def do_without(self, topic: str) -> None:
         """Another input has taken the place of a required one: its silence is no fault."""
         self._inputs[topic].required = False
+
+    def ask_again(self, topics: Iterable[str]) -> None:
+        """Have latched topics sent again, as far as their publishers still keep what they sent."""
+        for entry in (self._inputs[topic] for topic in topics):
+            if entry.subscription is not None:
+                self._subscribe(entry)
 
     def _unconnected(self) -> list[str]:
         """Required topics that no publisher has been matched with."""

@@ -57,7 +57,7 @@ def run_composed(commands: Sequence[NodeCommand], ros_arguments: Sequence[str] =
         If a node refuses its parameters.
     """
     share_one_heap()
-    use_fast_dds_profile()
+    use_fast_dds_profile(small_packets=True)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()
     on_request_to_end(lambda *_: stopped.set())

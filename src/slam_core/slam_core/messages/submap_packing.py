@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A submap's Gaussian as one matrix; Gaussian and descriptors compact, in a quarter of the bytes.
+"""A submap's Gaussian as one matrix; Gaussian and descriptors compact, in half the bytes.
 
-Compact, the covariance goes out as its Cholesky factor in 32 bits: whatever rounding does to a factor, factor times
-transpose is positive definite. Rounding changes the covariance by about the factor's condition (rows scaled to one)
-times 6e-8, in units of its own standard deviations; where that could be seen, mean and covariance go out in full, in
-64 bits.
+In full, the lower triangle of the covariance goes out in 64 bits. Compact, its Cholesky factor goes out in 32 bits:
+whatever rounding does to a factor, factor times transpose is positive definite. Rounding changes the covariance by
+about the factor's condition (rows scaled to one) times 6e-8, in units of its own standard deviations; where that could
+be seen, mean and covariance go out in full.
 
-Of the lower triangular factor of m rows the first half of the columns stays where it is; the others, which are shorter,
-stand on their heads above the diagonal of those: m rows of m // 2 + 1 columns.
+Of a lower triangle of m rows the first half of the columns stays where it is; the others, which are shorter, stand on
+their heads above the diagonal of those: m rows of m // 2 + 1 columns.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ MAX_ROUNDING = 1e-3
 
 
 def full_gaussian(mean: FloatArray, covariance: FloatArray) -> AnyArray:
-    """Mean (m,) in column 0, then the covariance (m, m), float64."""
-    return np.column_stack([mean, covariance]).astype("<f8")
+    """Mean (m,) in column 0, then the folded lower triangle of the covariance (m, m), float64: exact."""
+    return np.column_stack([mean, _folded(np.tril(covariance))]).astype("<f8")
 
 
 def pack_gaussian(mean: FloatArray, covariance: FloatArray) -> AnyArray:
@@ -58,18 +58,17 @@ def unpack_gaussian(packed: AnyArray) -> tuple[FloatArray, FloatArray]:
         If type and shape are of neither form, or if a number is not finite.
     """
     m, columns = packed.shape
-    if columns != {np.dtype(np.float64): 1 + m, np.dtype(np.float32): 2 + m // 2}.get(packed.dtype):
+    if columns != 2 + m // 2 or packed.dtype not in (np.float32, np.float64):
         raise ValueError(
-            f"submap/gaussian of {m} rows must be 32FC1 of {2 + m // 2} columns or 64FC1 of {1 + m}, "
+            f"submap/gaussian of {m} rows must be 32FC1 or 64FC1 of {2 + m // 2} columns, "
             f"got {packed.dtype} of {columns}"
         )
     if not np.isfinite(packed).all():
         raise ValueError("submap/gaussian contains numbers that are not finite")
     exact = packed.astype(np.float64)
-    if columns == 1 + m:
-        return exact[:, 0].copy(), exact[:, 1:].copy()
     L = _unfolded(exact[:, 1:])
-    return exact[:, 0].copy(), L @ L.T
+    covariance = L @ L.T if packed.dtype == np.float32 else L + np.tril(L, -1).T
+    return exact[:, 0].copy(), covariance
 
 
 def _folded(L: FloatArray) -> FloatArray:

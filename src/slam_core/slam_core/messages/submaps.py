@@ -4,13 +4,13 @@
 ==========================  =================================================================================
 ``submap/landmarks``        PointCloud2 for the eye: x y z, id, sightings, marginal covariances
 ``submap/descriptors``      Image 32FC1, one row per landmark
-``submap/gaussian``         Image 64FC1, 6 + 3n rows: the mean (end pose tangent, landmarks), then the joint covariance
+``submap/gaussian``         Image 64FC1, 6 + 3n rows: the mean (end pose tangent, landmarks), then half the covariance
 ``submap/path``             the rig poses inside, for the eye
 ``submap/path_covariance``  Image 64FC1, one row per pose: the upper 3x4 of T_start_rig, then its 6x6 covariance
 ``submap/info``             DiagnosticArray: agent, session, index, start and end stamp, whether it follows the last
 ==========================  =================================================================================
 
-Over a thin link descriptors and Gaussian can go out compact, in a quarter of the bytes
+Over a thin link descriptors and Gaussian can go out compact, in half the bytes or less
 (:mod:`~slam_core.messages.submap_packing`), which rounds; whoever receives them need not be told. Standard messages
 have no field for what ``submap/info`` says; a DiagnosticArray has a stamp and reads well in any tool.
 """

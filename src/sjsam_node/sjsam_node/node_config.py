@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters of the ``sjsam`` node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sjsam_node.global_map import GlobalMapConfig
+from slam_core.config import parameter
+
+
+@dataclass(frozen=True)
+class SjsamNodeConfig(GlobalMapConfig):
+    """The map's parameters and the node's own."""
+
+    agents: tuple[str, ...] = parameter(("",), "namespaces of the agents whose submaps are joined")
+    map_frame: str = parameter("map", "frame of the map")
+    odom_frame: str = parameter("odom", "frame of each agent's odometry, below its namespace")
+    map_path: str = parameter("map", "folder that save_map writes and load_map reads")
+    ply_path: str = parameter("map_landmarks.ply", "file that export_ply writes")
+    localize_only: bool = parameter(False, "locate the agents in the loaded map without changing it")
+    autosave_period_s: float = parameter(
+        10.0, "time between two copies of the map that a killed node goes on from; 0: none", unit="s", minimum=0.0
+    )
+    autosave_path: str = parameter("", "folder of that copy; empty: map_path with the ending .autosave")
+    transform_tolerance_s: float = parameter(
+        0.2, "how far ahead map_to_odom is stamped, so that a lookup at the present time works", unit="s", minimum=0.0
+    )
