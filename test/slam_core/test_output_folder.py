@@ -24,6 +24,21 @@ def write(path: Path, files: dict[str, str], command: str = "run", source: str =
             (folder / name).write_text(text)
 
 
+def give_up(output: OutputFolder, files: dict[str, str]) -> None:
+    with output, output.staged(rescue="map") as folder:
+        for name, text in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text)
+        raise KeyboardInterrupt
+
+
+def given_up(path: Path, files: dict[str, str]) -> Path | None:
+    output = OutputFolder(path, "run", "bag")
+    with pytest.raises(KeyboardInterrupt):
+        give_up(output, files)
+    return output.rescued
+
+
 def content(path: Path) -> dict[str, str]:
     files = sorted(p for p in path.rglob("*") if p.is_file() and not p.name.startswith(".slam."))
     return {str(p.relative_to(path)): p.read_text() for p in files}
@@ -184,3 +199,15 @@ def test_free_names_are_counted(tmp_path: Path) -> None:
     for name in ("a.mcap", "a_1.mcap"):
         (tmp_path / name).touch()
     assert free_name(tmp_path / "a.mcap").name == "a_2.mcap"
+
+
+def test_who_gives_up_keeps_the_map_alone_and_old_results_as_they_were(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert given_up(out, {"trajectory.tum": "2", "map/arrays": "2"}) == out / "map"
+    assert content(out) == {"map/arrays": "2"}
+    write(out, OLD)  # the map is known as ours
+    assert content(out) == OLD
+    assert given_up(out, {"map/arrays": "3"}) == out / "map_1"
+    assert content(out) == {**OLD, "map_1/arrays": "3"}
+    assert given_up(tmp_path / "new", {"trajectory.tum": "2"}) is None
+    assert not (tmp_path / "new").exists()

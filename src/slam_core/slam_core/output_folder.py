@@ -94,6 +94,8 @@ class OutputFolder:
         results = {name: digests for name, digests in self._old.files.items() if digests}
         self._manifest = Manifest(command, source, results)
         self._made_here = not path.exists()
+        self.rescued: Path | None = None
+        """What :meth:`staged` kept of results that were given up."""
 
     def __enter__(self) -> Self:
         self.path.mkdir(parents=True, exist_ok=True)
@@ -122,12 +124,27 @@ class OutputFolder:
         return self._logs
 
     @contextmanager
-    def staged(self) -> Iterator[Path]:
-        """A new folder whose files move into ``path`` when the block ends well, and vanish when it does not."""
+    def staged(self, rescue: str = "") -> Iterator[Path]:
+        """A new folder whose files move into ``path`` when the block ends well, and vanish when it does not.
+
+        A user who gives up (KeyboardInterrupt) keeps the file or folder named ``rescue`` if it is there; what must be
+        whole has to come there by a rename.
+        """
         remove(self._staging)
         self._staging.mkdir()
-        yield self._staging
+        try:
+            yield self._staging
+        except KeyboardInterrupt:
+            if rescue and (self._staging / rescue).exists():
+                self._rescue(rescue)
+            raise
         self._commit()
+
+    def _rescue(self, name: str) -> None:
+        self.rescued, self._made_here = free_name(self.path / name), False
+        os.replace(self._staging / name, self.rescued)
+        found = [f for f in (self.rescued, *sorted(self.rescued.rglob("*"))) if f.is_file()]
+        self._write(self._manifest.files | {str(f.relative_to(self.path)): [digest(f)] for f in found})
 
     @property
     def _staging(self) -> Path:

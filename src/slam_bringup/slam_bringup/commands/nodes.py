@@ -20,7 +20,7 @@ from slam_bringup.commands.mapping_options import (
 from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, system_config
 from slam_bringup.pipeline.overrides import Overrides, read_overrides
-from slam_bringup.processes.interrupt import INTERRUPTED, Interrupt
+from slam_bringup.processes.interrupt import INTERRUPTED, MAP, Interrupt, giving_up
 from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.report.summary_table import summary_table
 from slam_bringup.version import VERSION
@@ -50,7 +50,7 @@ def command(
         require_stereo(bag, names)
     port = _page(view)
     transcript, results = Transcript(VERSION), OutputFolder(output, "nodes", bag, overwrite=overwrite)
-    with transcript, results, results.staged() as folder:
+    with transcript, results, giving_up(results), results.staged(rescue=MAP) as folder:
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"nodes mapping {bag.name}", total=frames)
             run = run_nodes(
@@ -64,7 +64,7 @@ def command(
 
         result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)
         require_map(result)
-        summary = write_results(folder, result)
+        summary = write_results(folder, result, pictures=not run.stopped)
         transcript.write(folder / LOGS / LOG_NAME, summary_table(summary, output))
     show(summary_table(summary, output))
     if run.stopped:

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,9 +23,9 @@ from slam_bringup.commands.mapping_options import (
 from slam_bringup.commands.paths import UserPath
 from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, load_system_config
-from slam_bringup.pipeline.map_growth import map_growth
+from slam_bringup.pipeline.map_growth import MapGrowth, map_growth
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.processes.interrupt import INTERRUPTED, STOPPED, Interrupt
+from slam_bringup.processes.interrupt import INTERRUPTED, MAP, STOPPED, Interrupt, giving_up
 from slam_bringup.report.summary_table import summary_table
 from slam_bringup.version import VERSION
 from slam_core.output_folder import LOGS, OutputFolder
@@ -60,7 +62,11 @@ def command(
     growth = map_growth(system.sjsam, old_map, localize_only=localize_only)
     if mode != "tof":
         require_stereo(bag, names)
-    with OutputFolder(output, "run", bag, overwrite=overwrite) as results, Transcript(VERSION) as transcript:
+    results, transcript = OutputFolder(output, "run", bag, overwrite=overwrite), Transcript(VERSION)
+    with (
+        results, transcript, giving_up(results), results.staged(rescue=MAP) as folder,
+        _saved_if_given_up(growth, folder / MAP),
+    ):  # fmt: skip
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"mapping {bag.name}", total=2 * readings)
             result, growth = run_bag(
@@ -74,9 +80,9 @@ def command(
         from slam_bringup.report.output import write_results
         from slam_bringup.report.result_bag import write_result_bag
 
-        with results.staged() as folder, Console(stderr=True, quiet=is_quiet()).status(f"writing {output}"):
+        with Console(stderr=True, quiet=is_quiet()).status(f"writing {output}"):
             write_result_bag(folder / "result.mcap", result)
-            summary = write_results(folder, result, growth.save)
+            summary = write_results(folder, result, growth.save, pictures=not interrupt.asked)
             transcript.write(folder / LOGS / LOG_NAME, summary_table(summary, output))
     show(summary_table(summary, output))
     if result.failure:
@@ -84,3 +90,14 @@ def command(
         sys.exit(FAILED)
     if interrupt.asked:
         sys.exit(INTERRUPTED)
+
+
+@contextmanager
+def _saved_if_given_up(growth: MapGrowth, path: Path) -> Iterator[None]:
+    """A user who does not want to wait for the rest keeps the map."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if growth.global_map.graph.records and not path.exists():
+            growth.save(path)
+        raise

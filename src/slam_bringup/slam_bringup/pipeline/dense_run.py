@@ -29,8 +29,9 @@ def dense_model(
     config: SystemConfig,
     trajectories: Mapping[str, Trajectory],
     on_reading: Callable[[], None] = lambda: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> DenseModel:
-    """The model of all agents in the map frame; its surface is not made yet."""
+    """The model of all agents in the map frame, of what was read until ``stopped``; its surface is not made yet."""
     model = DenseModel(config.dense_mapper)
     cameras = {
         agent: AgentDepth(bag.sensors[agent], config, trajectory)
@@ -40,6 +41,8 @@ def dense_model(
     last_ns = max((int(t.stamps_ns[-1]) for t in trajectories.values() if len(t)), default=0)
     for reading in bag.readings(colours=True):
         if isinstance(reading, StereoReading | DepthReading) and reading.stamp_ns > last_ns:
+            break
+        if stopped():
             break
         if reading.agent in cameras:
             cameras[reading.agent].add(reading, model)

@@ -68,7 +68,7 @@ def run_bag(
     on_reading
         Called after every reading of the bag, and again when the dense model has seen it, for a progress bar.
     stopped
-        Asked after every reading: whether to end here, with what is mapped so far.
+        Asked after every reading: whether to end here, with what is mapped so far and without a dense model.
 
     Raises
     ------
@@ -104,9 +104,8 @@ def run_bag(
         _LOG.info("mapped %d submaps in %.1f s; the dense model is next", record.submaps, record.wall_s)
         give_back()
         with times.measure("dense model"):
-            # Who wants the end now does not want to wait for the dense model.
             result = run_result(
-                bag, config, record, mapper=mapper, odometry=odometry, dense=not stopped(), on_reading=on_reading
+                bag, config, record, mapper=mapper, odometry=odometry, on_reading=on_reading, stopped=stopped
             )
     return result, mapping.growth
 

@@ -118,12 +118,13 @@ def run_result(
     *,
     mapper: str,
     odometry: str,
-    dense: bool = True,
     on_reading: Callable[[], None] = lambda: None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> RunResult:
-    """The result of a run over a bag, with the ``dense`` model on its trajectories where it is wanted.
+    """The result of a run over a bag, with the dense model on its trajectories.
 
-    ``on_reading`` is called after every reading that the dense model has seen, for a progress bar.
+    ``on_reading`` is called after every reading that the dense model has seen, for a progress bar; then ``stopped`` is
+    asked: whoever wants the end now does not want to wait for the dense model.
     """
     agents = tuple(
         _agent_result(bag, config, agent, odometry, record.trajectories.get(agent, []), of_agent)
@@ -131,8 +132,8 @@ def run_result(
     )
     surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
     try:
-        if dense:
-            model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading)
+        model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading, stopped)
+        if not stopped():
             surface = model.surface()
             plans = model.floor_plans(surface)
     except Exception as error:  # what was mapped is worth more than its picture

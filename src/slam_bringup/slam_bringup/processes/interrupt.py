@@ -9,18 +9,25 @@ from __future__ import annotations
 import os
 import signal
 import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 import click
 
+from slam_core.output_folder import OutputFolder
 from slam_core.process_life import on_request_to_end
 
 INTERRUPTED = 130
 """Exit code of a program that Ctrl-C has ended."""
 
-STOPPED = "stopped before the end of the bag"
+STOPPED = "stopped before the end: no dense model and no report"
 """What a result says of a run that ended early."""
+
+MAP = "map"
+"""The part of the results that a user who gives up keeps."""
 
 
 class Interrupt:
@@ -51,7 +58,18 @@ class Interrupt:
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
-        click.echo("\nstopping: what is mapped so far will be written; once more to give it up", err=True)
+        click.echo("\nstopping: what is mapped so far will be written; once more to keep the map alone", err=True)
+
+
+@contextmanager
+def giving_up(results: OutputFolder) -> Iterator[None]:
+    """Tell a user who gives up where the map is, and end the program."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        kept = f"the map is in {results.rescued}" if results.rescued else "nothing was mapped yet"
+        click.echo(f"given up: {kept}", err=True)
+        sys.exit(INTERRUPTED)
 
 
 def _forget_the_terminal() -> None:

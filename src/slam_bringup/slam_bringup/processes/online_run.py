@@ -10,6 +10,7 @@ import importlib
 import json
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,8 +30,8 @@ START_TIMEOUT_S = 180.0
 """A cold start compiles kernels."""
 
 _SERVICE_TIMEOUT_S = 300.0
-_HURRIED_TIMEOUT_S = 2.0
-"""Longest wait for each step of the end once somebody wants the run to end."""
+_HURRIED_TIMEOUT_S, _HURRIED_STOP_S = 2.0, 4.0
+"""Longest wait for each step of the end, and for the nodes, once somebody wants the run to end."""
 _QUIET_S, _HURRIED_QUIET_S = 1.0, 0.3
 _HOPELESS_AFTER_S = 15.0
 """A run in which no frame has reached a filter by then, while messages are rejected, never will."""
@@ -100,6 +101,7 @@ def run_nodes(
         Called with the number of frames that the filters have processed.
     stopped
         Asked all the time: whether to end here, with what is mapped so far; KeyboardInterrupt if that is nothing yet.
+        Where KeyboardInterrupt comes from outside the map is saved before it goes on.
 
     Raises
     ------
@@ -117,11 +119,15 @@ def run_nodes(
             for viewer in viewers:
                 group.start(viewer.command)
             started = time.monotonic()
-            run.play(bag, rate, on_progress)
-            run.finish()
+            try:
+                run.play(bag, rate, on_progress)
+                run.finish()
+            except KeyboardInterrupt:
+                run.save_at_once()
+                raise
             wall_s = time.monotonic() - started
             diagnostics = run.last_diagnostics()
-            group.stop()
+            group.stop(*[_HURRIED_STOP_S] * stopped())
     return OnlineRun(out / "result.mcap", out / "map", diagnostics, group.exit_codes, wall_s, stopped())
 
 
@@ -228,6 +234,12 @@ class _Choreography:
             self._supervisor.wait_until_quiet(_HURRIED_QUIET_S if self._stopped() else _QUIET_S, self._limit_s)
         self._patiently(partial(self._supervisor.wait, self._all_joined, what="joining of the last submap"))
         self._supervisor.call(f"{_SJSAM}/save_map", _SERVICE_TIMEOUT_S)
+
+    def save_at_once(self) -> None:
+        """Have the map saved as it is, if there is any and that is quick."""
+        if int(self._supervisor.diagnostics.get(_SJSAM, {}).get("submaps", "0")):
+            with suppress(TimeoutError, ValueError):
+                self._supervisor.call(f"{_SJSAM}/save_map", _HURRIED_TIMEOUT_S)
 
     @property
     def _limit_s(self) -> float:

@@ -35,6 +35,8 @@ _MODULES = {
 _DOMAINS = range(1, 101)
 _STOP_AFTER_S = 10.0
 """Longest that a node may take to end; the recorder needs some of it to complete its bag."""
+_GIVEN_UP_STOP_S = 1.0
+"""The same for a user who does not want to wait for that."""
 
 
 def find_executable(package: str, executable: str, prefixes: Sequence[str] | None = None) -> list[str]:
@@ -194,8 +196,8 @@ class NodeGroup:
     def __enter__(self) -> NodeGroup:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.stop()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.stop(_GIVEN_UP_STOP_S if kind is KeyboardInterrupt else _STOP_AFTER_S)
 
     def start(self, command: NodeCommand) -> NodeProcess:
         """Start one more node."""
@@ -212,11 +214,11 @@ class NodeGroup:
                     f"node {node.command.full_name} ended with code {node.process.returncode}:\n{node.complaint()}"
                 )
 
-    def stop(self) -> None:
-        """Stop all nodes: everybody is asked at once, then waited for, ten seconds for all together."""
+    def stop(self, within_s: float = _STOP_AFTER_S) -> None:
+        """Stop all nodes: everybody is asked at once, then waited for, so long for all together."""
         for node in self.nodes:
             node.interrupt()
-        deadline = time.monotonic() + _STOP_AFTER_S
+        deadline = time.monotonic() + within_s
         for node in reversed(self.nodes):
             self.exit_codes[node.command.full_name] = node.stop(deadline - time.monotonic())
         self.nodes = []

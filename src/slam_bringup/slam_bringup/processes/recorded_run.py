@@ -83,8 +83,7 @@ def collect(
             events=tuple([STOPPED] * run.stopped + unclean_ends(run)),
         )
         record = record.with_front_ends({agent: _front_end(agent, run.diagnostics) for agent in opened.agents})
-        # Who wants the end now does not want to wait for the dense model.
-        result = run_result(opened, config, record, mapper=mapper, odometry=odometry, dense=not run.stopped)
+        result = run_result(opened, config, record, mapper=mapper, odometry=odometry, stopped=lambda: run.stopped)
     return result, global_map
 
 

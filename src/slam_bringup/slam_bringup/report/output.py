@@ -33,14 +33,19 @@ from slam_core.process_life import STARTED_S
 from slam_core.trajectory import write_covariance_csv, write_tum
 
 
-def write_results(out: Path, result: RunResult, save_map: Callable[[Path], object] | None = None) -> dict[str, Any]:
+def write_results(
+    out: Path, result: RunResult, save_map: Callable[[Path], object] | None = None, *, pictures: bool = True
+) -> dict[str, Any]:
     """Write all files of a run into the folder ``out`` (made if absent) and return the summary.
 
-    ``save_map`` is called with the path of ``map/`` and writes the loadable map there. ``summary.json`` comes last, so
-    that a folder that has one is complete.
+    ``save_map`` is called with the path of ``map/`` and writes the loadable map there, before all else. Drawing takes
+    most of the time: without ``pictures`` there is no ``map.png`` and no ``report.html``. ``summary.json`` comes last,
+    so that a folder that has one is complete.
     """
     out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
+    if save_map is not None:
+        save_map(out / "map")
     _write_trajectories(out, result.agents)
     _write_landmarks(out / "landmarks.ply", result.landmarks)
     write_points(out / "map.ply", result.dense)
@@ -49,12 +54,11 @@ def write_results(out: Path, result: RunResult, save_map: Callable[[Path], objec
     _write_plans(out, result.floor_plans)
     if (out / "result.mcap").is_file():
         write_layout(out / "foxglove_layout.json", out / "result.mcap")
-    if save_map is not None:
-        save_map(out / "map")
     summary = summarise(result) | _made()
-    save_png(out / "map.png", map_figure(result))
-    map_png = (out / "map.png").read_bytes()  # drawn once: it is the dearest of the figures
-    write_report(out / "report.html", result, summary | _in_all(result), map_png)
+    if pictures:
+        save_png(out / "map.png", map_figure(result))
+        map_png = (out / "map.png").read_bytes()  # drawn once: it is the dearest of the figures
+        write_report(out / "report.html", result, summary | _in_all(result), map_png)
     summary |= _in_all(result)
     atomic_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
     return summary
