@@ -40,6 +40,15 @@ def test_of_a_good_bag_nothing_is_said() -> None:
     require_stereo(DEMO)
 
 
+@pytest.mark.parametrize("seconds", [2.0, 5.0])
+def test_of_the_beginning_of_a_good_bag_nothing_is_said(
+    bench: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float
+) -> None:
+    """However many pairs there are, the depth that is compared is that of the same moment."""
+    monkeypatch.setattr(bench, "SECONDS", seconds)
+    assert examine(bench.copy(DEMO, tmp_path / "bag", lambda item, _: item)) == []
+
+
 @pytest.mark.parametrize(
     "fault",
     [

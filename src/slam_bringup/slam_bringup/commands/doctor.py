@@ -23,6 +23,9 @@ from slam_bringup.processes.processes import NodeCommand, NodeProcess
 FAULTS = 1
 """Exit code where something is wrong."""
 
+_START_S = 60.0
+"""Longest that the recorder may take to start, and to complete its bag."""
+
 
 @click.command()
 @click.argument("bag", required=False, type=UserPath(exists=True))
@@ -64,12 +67,23 @@ def examine_live(seconds: float, names: BagNames) -> list[Finding]:
         recorder = NodeCommand("slam_bringup", "recorder", tuple(ros_arguments({"bag": str(bag)})))
         process = NodeProcess.start(recorder, log, os.environ)
         try:
+            _wait_until_ready(process)
             time.sleep(seconds)
         finally:
-            code = process.stop()
+            code = process.stop(_START_S)
         if code != 0 or not bag.exists():
             raise ValueError(f"the recorder ended with code {code}:\n{process.complaint()}")
-        return examine(bag, names)
+        try:
+            return examine(bag, names)
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(bag), "the running graph")) from None
+
+
+def _wait_until_ready(recorder: NodeProcess) -> None:
+    """Starting takes long on a busy machine; the seconds count from then on."""
+    end = time.monotonic() + _START_S
+    while recorder.is_running and not recorder.last_line("ready") and time.monotonic() < end:
+        time.sleep(0.1)
 
 
 def _text(findings: list[Finding]) -> str:

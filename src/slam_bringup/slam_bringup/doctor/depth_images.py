@@ -84,11 +84,11 @@ def _depth_ratios(evidence: Evidence) -> FloatArray:
     except ValueError:
         return np.empty(0)
     stereo = stereo_camera_from_infos(infos[0], infos[1])
-    images = [image for *_, image in evidence.pairs_with_depth()]
-    step = max(len(images) // max(int(matches.pair.max(initial=0)) + 1, 1), 1)
     ratios = [np.empty(0)]
-    for k, image in enumerate(images[::step]):
-        of_pair = matches.pair == k
+    for stamp, image in evidence.depth_beside_left().items():
+        of_pair = matches.stamps_ns == stamp
+        if not of_pair.any():
+            continue
         pixels, d = matches.left[of_pair], (matches.left - matches.right)[of_pair]
         good = (d[:, 0] > _SURE_DISPARITY_PX) & (np.abs(d[:, 1]) < 2.0)
         z = stereo.depth_from_disparity(d[good, 0])

@@ -102,10 +102,9 @@ class Evidence:
         """Sampled pairs: the left image's stamp, the left image, and the right image nearest in time."""
         return [(stamp, left, right) for stamp, left, right in self._nearest("left", "right")]
 
-    def pairs_with_depth(self) -> list[tuple[AnyArray, AnyArray, AnyArray]]:
-        """Sampled pairs with the depth image nearest in time."""
-        depth = {stamp: image for stamp, _, image in self._nearest("left", self.depth_role)}
-        return [(left, right, depth[stamp]) for stamp, left, right in self.pairs() if stamp in depth]
+    def depth_beside_left(self) -> dict[int, AnyArray]:
+        """The depth image nearest in time to each sampled left image, by its stamp."""
+        return {stamp: image for stamp, _, image in self._nearest("left", self.depth_role)}
 
     def _nearest(self, first: str, second: str) -> list[tuple[int, AnyArray, AnyArray]]:
         others = self.images.get(second, {})

@@ -25,11 +25,11 @@ _DARK, _BRIGHT, _FLICKER, _EXPOSED_APART, _FROZEN = 6.0, 249.0, 0.12, 0.4, 0.25
 
 @dataclass(frozen=True, eq=False)
 class PixelMatches:
-    """PixelMatches of some pairs: rectified pixels (n, 2) left and right, the pair of each, keypoints found in all."""
+    """Matches of some pairs: rectified pixels (n, 2) left and right, stamp of each left image, keypoints in all."""
 
     left: FloatArray
     right: FloatArray
-    pair: AnyArray
+    stamps_ns: AnyArray
     keypoints: int
 
 
@@ -61,9 +61,9 @@ def match_pairs(evidence: Evidence) -> PixelMatches | None:
     except ValueError:
         return None
     found = [_match(pair.left, pair.right) for pair in images]
-    which = np.repeat(np.arange(len(found)), [len(a) for a, _, _ in found])
+    stamps = np.repeat(np.array([stamp for stamp, *_ in chosen], dtype=np.int64), [len(a) for a, _, _ in found])
     a, b = (np.concatenate([f[i] for f in found]) if found else np.empty((0, 2)) for i in (0, 1))
-    return PixelMatches(a, b, which, sum(n for _, _, n in found))
+    return PixelMatches(a, b, stamps, sum(n for _, _, n in found))
 
 
 def _match(left: AnyArray, right: AnyArray) -> tuple[FloatArray, FloatArray, int]:
