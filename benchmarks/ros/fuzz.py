@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random messages on every topic of every node as real processes: nobody dies, all is counted, the map stays.
 
-    python benchmarks/ros/fuzz.py [MESSAGES]        100 000 by default
+    python benchmarks/ros/fuzz.py [MESSAGES] [--composed]       100 000 by default
 
 Every field of a message is drawn: numbers from zero, ordinary ones, infinities, NaN and 1e297, sizes that fit their
 data and that do not, stamps that go on, stand still, or are an hour off. Prints, per node, whether it is alive, how
-many messages it has counted as rejected, its faults (exceptions that were caught), and the growth of its memory.
+many messages it has counted as rejected, its faults (exceptions that were caught), and the growth of its memory. With
+--composed the six nodes of a rig are one process.
 """
 
 from __future__ import annotations
 
+import argparse
 import array
+import json
 import os
 import subprocess
 import sys
@@ -43,8 +46,16 @@ from slam_core.ros import sensor_qos  # noqa: E402
 NODES = {
     "stereo_driver": "stereo_frontend.driver_node", "tof_driver": "tof_driver.node",
     "feature_extractor": "stereo_frontend.node", "ndt_odometry": "ndt_registration.node",
-    "ekf_slam": "ekf_slam_node.node", "sjsam": "sjsam_node.node",
+    "ekf_slam": "ekf_slam_node.node", "sjsam": "sjsam_node.node", "dense_mapper": "dense_mapping.node",
+    "viewer": "slam_bringup.viewer.viewer_node",
 }  # fmt: skip
+OF_A_RIG = {
+    "stereo_driver": "stereo_frontend", "tof_driver": "tof_driver", "feature_extractor": "stereo_frontend",
+    "ndt_odometry": "ndt_registration", "ekf_slam": "ekf_slam_node", "sjsam": "sjsam_node",
+}  # fmt: skip
+"""Packages of the nodes that can share a process."""
+
+COMPOSED = "slam_bringup.processes.composed_node"
 TOPICS = {
     **{f"stereo/{s}/image_raw": "Image" for s in ("left", "right")},
     **{f"stereo/{s}/image_rect": "Image" for s in ("left", "right")},
@@ -52,7 +63,10 @@ TOPICS = {
     "tof/range/image_raw": "Image", "tof/amplitude/image_raw": "Image", "tof/intensity/image_raw": "Image",
     **DEPTH_TOPICS, **FEATURE_TOPICS, **SUBMAP_TOPICS, "tof/points": "PointCloud2", "ndt/motion":
     "PoseWithCovarianceStamped", "imu": "Imu", "odom": "Odometry", "clicked_point": "PointStamped", "initialpose":
-    "PoseWithCovarianceStamped", "static_transforms": "TransformStamped",
+    "PoseWithCovarianceStamped", "static_transforms": "TransformStamped", "map/path": "Path", "map/landmarks":
+    "PointCloud2", "map/dense_cloud": "PointCloud2", "map/occupancy": "OccupancyGrid", "map/graph": "MarkerArray",
+    "map/marks": "MarkerArray", "map_to_odom": "TransformStamped", "pose": "PoseWithCovarianceStamped",
+    "features/image": "Image", "tof/color/image": "Image",
 }  # fmt: skip
 HEARD = ("stereo/left/image_raw", "stereo/left/image_rect", "tof/range/image_raw", "tof/depth/image", "tof/points",
          "features", "submap/info", "odom")  # fmt: skip
@@ -86,6 +100,8 @@ class Fuzzer:
         if kind.__name__ == "Image" and self.rng.random() < 0.6:
             self._fit(message)
         stamp = self._stamp()
+        if not hasattr(message, "header"):
+            return message
         message.header.stamp.sec, message.header.stamp.nanosec = stamp // 10**9, stamp % 10**9
         return message
 
@@ -158,17 +174,32 @@ class Outcome:
     grown_mib: float
 
 
-def run(count: int, domain: int, folder: Path) -> tuple[dict[str, Outcome], bool]:
+def commands(folder: Path, composed: bool) -> dict[str, tuple[str, list[str]]]:
+    """Module and arguments of each process."""
+    own = {
+        "sjsam": ["-p", f"map_path:={folder / 'map'}"], "feature_extractor": ["-p", "mode:=fuse"],
+        "viewer": ["-p", "port:=0"], "dense_mapper": ["-p", f"output_path:={folder / 'dense'}"],
+    }  # fmt: skip
+    separate = {name: (module, ["--ros-args", *own.get(name, [])]) for name, module in NODES.items()}
+    if not composed:
+        return separate
+    nodes = [(package, name, separate[name][1], "") for name, package in OF_A_RIG.items()]
+    (folder / "nodes.json").write_text(json.dumps(nodes))
+    rest = {name: command for name, command in separate.items() if name not in OF_A_RIG}
+    return {"slam_composed": (COMPOSED, ["--nodes", str(folder / "nodes.json")]), **rest}
+
+
+def run(count: int, domain: int, folder: Path, *, composed: bool = False) -> tuple[dict[str, Outcome], bool]:
     """Fuzz all nodes; what became of each, and whether the map is the same as before."""
     environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    own = {"sjsam": ["-p", f"map_path:={folder / 'map'}"], "feature_extractor": ["-p", "mode:=fuse"]}
-    logs = {name: (folder / f"{name}.log").open("w") for name in NODES}
+    started = commands(folder, composed)
+    logs = {name: (folder / f"{name}.log").open("w") for name in started}
     processes = {
         name: subprocess.Popen(
-            [sys.executable, "-c", f"from {module} import main; main()", "--ros-args", *own.get(name, [])],
+            [sys.executable, "-c", f"from {module} import main; main()", *arguments],
             env=environment, stdout=logs[name], stderr=subprocess.STDOUT,
         )
-        for name, module in NODES.items()
+        for name, (module, arguments) in started.items()
     }  # fmt: skip
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
@@ -179,10 +210,13 @@ def run(count: int, domain: int, folder: Path) -> tuple[dict[str, Outcome], bool
         _send(probe, count)
         after = _saved(probe, folder)
         counts = _counts(probe)
+        inside = {"slam_composed": tuple(OF_A_RIG)}
         outcome = {
             name: Outcome(
-                process.poll() is None, counts.get(f"/{name}", {}).get("rejected", 0),
-                counts.get(f"/{name}", {}).get("faults", 0), _rss_mib(process) - start[name],
+                process.poll() is None, *(
+                    sum(counts.get(f"/{node}", {}).get(what, 0) for node in inside.get(name, (name,)))
+                    for what in ("rejected", "faults")
+                ), _rss_mib(process) - start[name],
             )
             for name, process in processes.items()
         }  # fmt: skip
@@ -203,7 +237,7 @@ def _map_before(probe: Probe, folder: Path) -> tuple[GlobalMap, int]:
     """A small map that must not change."""
     probe.listen("/diagnostics", probe.types.DiagnosticArray)
     for topic, kind in TOPICS.items():
-        latched = topic == "static_transforms" or topic in SUBMAP_TOPICS
+        latched = topic in ("static_transforms", "map_to_odom") or topic in SUBMAP_TOPICS or topic.startswith("map/")
         probe.senders[topic] = probe.node.create_publisher(getattr(probe.types, kind), topic, sensor_qos(100, latched))
     probe.wait(lambda: all(probe.senders[t].get_subscription_count() for t in HEARD), "nodes do not listen", 300.0)
     rng = np.random.default_rng(1)
@@ -273,9 +307,13 @@ def _rss_mib(process: subprocess.Popen[bytes]) -> float:
 
 
 def main() -> None:
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("count", type=int, nargs="?", default=100_000)
+    parser.add_argument("--composed", action="store_true")
+    given = parser.parse_args()
+    count = given.count
     with tempfile.TemporaryDirectory() as folder:
-        outcome, same = run(count, 1 + os.getpid() % 100, Path(folder))
+        outcome, same = run(count, 1 + os.getpid() % 100, Path(folder), composed=given.composed)
     print(f"{count} messages on {len(TOPICS)} topics")
     print(f"{'node':20} {'alive':6} {'rejected':>9} {'faults':>7} {'grown MiB':>10}")
     for name, o in outcome.items():

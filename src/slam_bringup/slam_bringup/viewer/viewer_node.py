@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -131,7 +132,8 @@ class ViewerNode(SlamNode[ViewerConfig]):
         )
         # Markers have no stamp of their own, which the inputs of estimators need.
         for topic, show in (("map/graph", self._on_graph), ("map/marks", self._on_marks)):
-            self.create_subscription(self.types.MarkerArray, topic, show, sensor_qos(1, latched=True))
+            take = partial(self._take_markers, topic, show)
+            self.create_subscription(self.types.MarkerArray, topic, take, sensor_qos(1, latched=True))
         # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
         self.create_subscription(self.types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
         self.listen(
@@ -198,6 +200,15 @@ class ViewerNode(SlamNode[ViewerConfig]):
                 covariances[:, i, j] = cloud[f"cov_{min(a, b)}{max(a, b)}"]
         positions = np.stack([cloud[axis] for axis in "xyz"], axis=1).astype(np.float64)
         self.page.show_landmarks(positions, covariances, cloud["sightings"].astype(np.int64))
+
+    def _take_markers(self, topic: str, show: Callable[[Message], None], message: Message) -> None:
+        """Rejects what is no marker of ours, as :meth:`listen` does for messages with a stamp."""
+        try:
+            if not np.isfinite([[p.x, p.y, p.z] for marker in message.markers for p in marker.points]).all():
+                raise ValueError("a point is not finite")
+            show(message)
+        except ValueError as error:
+            self._reject(f"{topic}: message rejected: {error}")
 
     def _on_graph(self, message: Message) -> None:
         for marker in message.markers:
