@@ -78,8 +78,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._advertise_outputs()
         self._start_trackers()
         self._go_on_from_last_time()
-        known = () if self.config.localize_only else (r.key for r in self.global_map.graph.records)
-        self._order = SubmapOrder[tuple[str, Submap]](known)
+        self._order = SubmapOrder[tuple[str, Submap]](r.key for r in self.global_map.graph.records)
         self._heard_at_s: dict[str, float] = {}
         for agent in self.config.agents:
             self._listen_to(agent)
@@ -171,8 +170,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._stamp_ns = max(self._stamp_ns, submap.end_stamp_ns)
         self.health.count("submaps received")
         if self.config.localize_only:
-            self._hand_over(agent, submap, self.map.locate(agent, submap))
-            return
+            return self._hand_over(agent, submap, self.map.locate(agent, submap))
         self._join(self._order.add((submap.agent, submap.session, submap.index), (agent, submap)))
         if self._order.should_ask(time.monotonic()):
             self.ask_again(_below(agent, topic) for topic in SUBMAP_TOPICS)
@@ -180,14 +178,6 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def _join(self, submaps: list[tuple[str, Submap]]) -> None:
         for agent, submap in submaps:
             self._hand_over(agent, submap, self.map.add(submap))
-
-    def _go_on_without_the_missing(self) -> None:
-        """Nobody can send them any more."""
-        if missing := self._order.overdue(time.monotonic()):
-            for (agent, _), indices in missing.items():
-                self.health.count("submaps missed", len(indices))
-                self.get_logger().warning(gap_text(agent, indices))
-            self._join(self._order.give_up())
 
     def _hand_over(self, agent: str, submap: Submap, done: Future[Any]) -> None:
         """Have another thread do its part, and go on from there."""
@@ -342,7 +332,11 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     # -- outputs -------------------------------------------------------------------------------------------------------
 
     def _publish_news(self) -> None:
-        self._go_on_without_the_missing()
+        if missing := self._order.overdue(time.monotonic()):
+            for (agent, _), indices in missing.items():
+                self.health.count("submaps missed", len(indices))
+                self.get_logger().warning(gap_text(agent, indices))
+            self._join(self._order.give_up())
         if self._drawn is not self.map.poses and self._picture.done():
             self._publish_map()
         copy = self.map.save_copy()

@@ -34,7 +34,7 @@ NODE_CONFIGS = {
     "feature_extractor": ("stereo_frontend.node", "FrontendConfig"),
     "ndt_odometry": ("ndt_registration.node", "NdtNodeConfig"),
     "ekf_slam": ("ekf_slam_node.node", "EkfNodeConfig"),
-    "sjsam": ("sjsam_node.node", "SjsamNodeConfig"),
+    "sjsam": ("sjsam_node.node_config", "SjsamNodeConfig"),
     "dense_mapper": ("dense_mapping.node", "DenseNodeConfig"),
 }
 """Module and class of each node's own configuration; the modules need ROS."""

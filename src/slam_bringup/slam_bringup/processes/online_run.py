@@ -237,7 +237,7 @@ class _Choreography:
 
     def save_at_once(self) -> None:
         """Have the map saved as it is, if there is any and that is quick."""
-        if int(self._supervisor.diagnostics.get(_SJSAM, {}).get("submaps", "0")):
+        if int(self._supervisor.diagnostics.get(_SJSAM, {}).get("submaps joined", "0")):
             with suppress(TimeoutError, ValueError):
                 self._supervisor.call(f"{_SJSAM}/save_map", _HURRIED_TIMEOUT_S)
 
