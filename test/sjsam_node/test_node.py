@@ -148,7 +148,7 @@ def test_a_submap_that_did_not_arrive_is_asked_for_again_and_then_told(bench: Be
     assert bench.node.global_map.components == 1
     send(6)
     assert bench.spin_until(lambda: counters.get("submaps missed", 0) == 1)
-    assert joined() == [0, 1, 2, 3, 4, 6]
+    assert bench.spin_until(lambda: joined() == [0, 1, 2, 3, 4, 6])
 
 
 def test_services_answer_on_an_empty_map(bench: Bench) -> None:
