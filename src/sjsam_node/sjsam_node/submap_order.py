@@ -49,7 +49,7 @@ class SubmapOrder(Generic[T]):
         return {chain: range(self._next[chain], min(held)) for chain, held in self._held.items()}
 
     def should_ask(self, now_s: float) -> bool:
-        """Whether to ask for what is missing, which is done once. Times are those of any steady clock, s."""
+        """True once after something is found missing: ask for it. Times are those of any steady clock, s."""
         if not self._held:
             self._asked_at_s = None
         elif self._asked_at_s is None:
@@ -58,7 +58,7 @@ class SubmapOrder(Generic[T]):
         return False
 
     def overdue(self, now_s: float) -> dict[Chain, range]:
-        """What is missing although it was asked for some time ago."""
+        """The indices that are missing although they were asked for some time ago."""
         is_over = self._asked_at_s is not None and now_s > self._asked_at_s + _PATIENCE_S
         return self.missing() if is_over else {}
 
@@ -81,7 +81,7 @@ class SubmapOrder(Generic[T]):
 
 
 def gap_text(agent: str, indices: range) -> str:
-    """What to tell a user whose submaps did not arrive."""
+    """Text for a user whose submaps did not arrive."""
     return (
         f"submaps {indices.start} to {indices.stop - 1} of agent '{agent}' did not arrive: what follows becomes part "
         "of the map when a place is recognised. Filters keep their last submaps only: start sjsam before them, and "
