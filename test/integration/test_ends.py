@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from sjsam_node.global_map import GlobalMap
+
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "bags" / "demo"
 
@@ -91,6 +93,20 @@ def test_a_run_that_is_asked_to_end_writes_what_is_mapped(run: Run, number: sign
     assert 0 < summary["frames"] < 52
     assert any("stopped before the end" in event for event in summary["events"])
     assert (run.out / "map" / "manifest.json").exists()
+
+
+def test_a_second_ctrl_c_leaves_at_once_with_the_map(run: Run) -> None:
+    assert wait_for(lambda: is_playing(run))
+    time.sleep(6.0)
+    run.process.send_signal(signal.SIGINT)
+    assert wait_for(lambda: any(run.out.glob(".slam.*.part/map/manifest.json")))
+    run.process.send_signal(signal.SIGINT)
+    assert run.process.wait(60.0) == 130
+    assert run.process.stdout is not None
+    assert f"the map is in {run.out / 'map'}" in run.process.stdout.read()
+    assert GlobalMap.load(run.out / "map").graph.records
+    assert not (run.out / "summary.json").exists()
+    assert not run.nodes()
 
 
 def test_nohup_is_respected(workspace: dict[str, str], tmp_path: Path) -> None:
