@@ -207,6 +207,7 @@ def test_reset_leaves_out_what_waits_and_what_is_being_joined(
     slow = SlowJoiner(monkeypatch, before=2)
     bench.send(submaps[:-1])
     assert bench.spin_until(lambda: bench.counters["submaps received"] == len(submaps) - 1 and slow.is_held.is_set())
+    assert bench.spin_until(lambda: bench.counters["submaps joined"] == 2)
     assert bench.call("reset").success
     bench.send(submaps[-1:])
     assert bench.spin_until(lambda: bench.counters["submaps received"] == len(submaps))
