@@ -60,7 +60,7 @@ class EkfNode(StageNode[EkfNodeConfig]):
 
     def __init__(self) -> None:
         super().__init__("ekf_slam", EkfNodeConfig)
-        self.stage = FilterStage(self.config, self.frames, self.config.base_frame, self.config.session)
+        self.stage: FilterStage = FilterStage(self.config, self.frames, self.config.base_frame, self.config.session)
         self.path = deque[PoseEstimate](maxlen=self.config.path_length)
         prefix = f"{self.config.agent}/" if self.config.agent else ""
         self.odom_frame = prefix + self.config.odom_frame

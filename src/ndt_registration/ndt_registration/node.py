@@ -50,7 +50,7 @@ class NdtNode(StageNode[NdtNodeConfig]):
 
     def __init__(self) -> None:
         super().__init__("ndt_odometry", NdtNodeConfig)
-        self.stage = ScanOdometryStage(self.config, self.frames, self.config.base_frame)
+        self.stage: ScanOdometryStage = ScanOdometryStage(self.config, self.frames, self.config.base_frame)
         self.source = ""
         self.path = deque[PoseEstimate](maxlen=self.config.path_length)
         self.advertise("ndt/odometry", "Odometry")

@@ -21,7 +21,8 @@ class StageNode(SlamNode[C]):
 
     def oldest_waiting_ns(self) -> int | None:
         """Stamp of the oldest frame that waits for another sensor."""
-        return self.stage.oldest_waiting_ns
+        oldest: int | None = self.stage.oldest_waiting_ns
+        return oldest
 
     def on_overdue(self) -> None:
         """Go on without the sensor that frames wait for."""

@@ -12,6 +12,7 @@ camera infos from YAML files. ``stereo/{left,right}/set_camera_info`` writes new
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +64,7 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
         self._open_files()
         for side in SIDES:
             self.advertise(f"stereo/{side}/image_rect", "Image")
-            self.create_service(
-                SetCameraInfo, f"stereo/{side}/set_camera_info", lambda q, a, s=side: self._on_set_info(s, q, a)
-            )
+            self.create_service(SetCameraInfo, f"stereo/{side}/set_camera_info", partial(self._on_set_info, side))
         self.source = None if self.config.source == "topics" else self._open_source()
         if self.source is None:
             self._listen_to_topics()
@@ -86,7 +85,7 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
     def _listen_to_topics(self) -> None:
         for side in SIDES:
             if not self.files[side]:
-                self.listen(f"stereo/{side}/camera_info", "CameraInfo", lambda m, s=side: self._on_info(s, m))
+                self.listen(f"stereo/{side}/camera_info", "CameraInfo", partial(self._on_info, side))
         ending, kind = ("/compressed", "CompressedImage") if self.config.compressed else ("", "Image")
         self.listen_together({f"stereo/{side}/image_raw{ending}": kind for side in SIDES}, self._on_pair)
 

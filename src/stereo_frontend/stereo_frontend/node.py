@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from slam_core.health import State
 from slam_core.messages import (
     FEATURE_TOPICS,
@@ -41,7 +43,7 @@ class FeatureNode(StageNode[FrontendConfig]):
     def __init__(self) -> None:
         super().__init__("feature_extractor", FrontendConfig)
         self.pairs = StereoStage(rectified=True)
-        self.stage = FeatureStage(self.config, self.frames)
+        self.stage: FeatureStage = FeatureStage(self.config, self.frames)
         for topic, kind in (*FEATURE_TOPICS.items(), ("features/image", "Image")):
             self.advertise(topic, kind)
         if self.config.mode != "tof":
@@ -63,7 +65,7 @@ class FeatureNode(StageNode[FrontendConfig]):
 
     def _listen_to_stereo(self) -> None:
         for side in SIDES:
-            self.listen(f"stereo/{side}/camera_info", "CameraInfo", lambda m, s=side: self._on_info(s, m))
+            self.listen(f"stereo/{side}/camera_info", "CameraInfo", partial(self._on_info, side))
         self.listen_together({f"stereo/{side}/image_rect": "Image" for side in SIDES}, self._on_pair)
 
     def _listen_to_depth(self) -> None:

@@ -9,6 +9,7 @@ Topics are discovered while it runs. The bag is complete only when the node has 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -56,7 +57,7 @@ class RecorderNode(Node):
             self._writer = self._open()
         except OSError as error:
             raise ValueError(f"cannot write {self.config.bag}: {error}") from error
-        self._stamps = RecordingClock()
+        self._stamps: RecordingClock[Callable[[int], None]] = RecordingClock()
         self._known: set[str] = set()
         self._count = 0
         self.create_timer(_DISCOVERY_PERIOD_S, self._discover, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -90,7 +90,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
         self.create_timer(self.config.post_period_s, self._show_post, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f"the page is at {self.page.url}")
 
-    def on_shutdown(self) -> None:
+    def on_shutdown(self) -> None:  # type: ignore[override]  # no lifecycle node: rclpy's own takes a state
         """Close the page."""
         self.page.stop()
 
