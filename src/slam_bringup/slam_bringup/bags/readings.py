@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+from ndt_registration.stage import Scan
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
@@ -14,6 +15,7 @@ from slam_core.messages import (
     grey_from_message,
     imu_from_message,
     picture_from_message,
+    points_from_scan,
     stamp_ns,
 )
 from slam_core.messages.base import Message
@@ -65,6 +67,19 @@ class ImuReading:
 
 
 @dataclass(frozen=True, eq=False)
+class LaserReading:
+    """A scan of a laser scanner, points (n, 2) in its own frame."""
+
+    agent: str
+    scan: Scan
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the scan."""
+        return self.scan.stamp_ns
+
+
+@dataclass(frozen=True, eq=False)
 class ColourReading:
     """A colour picture (h, w, 3) uint8, red first, in the pixels of the raw depth image."""
 
@@ -73,7 +88,7 @@ class ColourReading:
     image: ByteArray
 
 
-Reading = StereoReading | DepthReading | ImuReading | ColourReading
+Reading = StereoReading | DepthReading | LaserReading | ImuReading | ColourReading
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +114,11 @@ class AgentSensors:
         """T_target_source between "base", "left" and "tof"; ValueError if the bag does not know it."""
         names = {"base": self.base_frame, "left": self.left_frame, "tof": self.tof_frame}
         return self.frames.lookup(names[target], names[source])
+
+    @property
+    def scanner(self) -> str:
+        """Role whose scans are registered: "depth", "scan" of a rig without a depth camera, "" of one with neither."""
+        return next((role for role in ("depth", "scan") if role in self.topics), "")
 
     def is_mounted(self, camera: str) -> bool:
         """True if the bag has "left" or "tof" and knows where it sits on the rig."""
@@ -130,6 +150,9 @@ class AgentPairing:
         self._ready = []
         if role == "imu":
             self._on_imu(message)
+        elif role == "scan":
+            scan = Scan(stamp_ns(message), points_from_scan(message), message.header.frame_id)
+            self._hand_on(LaserReading(self._sensors.agent, scan))
         elif role == "color":
             self._hand_on(ColourReading(self._sensors.agent, stamp_ns(message), colour_from_message(message)))
         elif role in ("left", "right"):

@@ -3,7 +3,7 @@
 
     with SensorBag(path) as bag:
         for reading in bag.readings():
-            ...  # StereoReading, DepthReading or ImuReading, in the order of the bag
+            ...  # StereoReading, DepthReading, LaserReading or ImuReading, in the order of the bag
 
 Topics are those of the nodes, or given by role, see :mod:`slam_bringup.bags.sensor_topics`:
 
@@ -12,7 +12,7 @@ Topics are those of the nodes, or given by role, see :mod:`slam_bringup.bags.sen
   ``tof/camera_info`` and, where there are any, ``tof/{amplitude,intensity}/image_raw``, and ``tof/color/image_raw``
   in the pixels of the depth image: colours of the dense model, and the picture that features come from where there is
   no other;
-- ``imu`` and ``ground_truth/pose``.
+- ``scan`` of a laser scanner, ``imu`` and ``ground_truth/pose``.
 
 Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts. A
 message that is broken, has no partner, or is older than what came before it is left out and counted.
@@ -35,6 +35,7 @@ from slam_bringup.bags.readings import (
     ColourReading,
     DepthReading,
     ImuReading,
+    LaserReading,
     Reading,
     StereoReading,
 )
@@ -49,7 +50,7 @@ from slam_core.messages import (
 )
 from slam_core.trajectory import Trajectory
 
-_READ = ("left", "right", "depth", "amplitude", "intensity", "imu")
+_READ = ("left", "right", "depth", "amplitude", "intensity", "imu", "scan")
 
 
 class SensorBag:
@@ -209,4 +210,4 @@ class SensorBag:
 
 
 def _rank(reading: Reading) -> int:
-    return (ImuReading, ColourReading, DepthReading, StereoReading).index(type(reading))
+    return (ImuReading, ColourReading, DepthReading, LaserReading, StereoReading).index(type(reading))

@@ -20,6 +20,7 @@ _CANDIDATES = {
     "intensity": ("tof/intensity/image_raw",),
     "color": ("tof/color/image_raw", "tof/color/image_raw/compressed"),
     "imu": ("imu",),
+    "scan": ("scan",),
     "ground_truth": ("ground_truth/pose",),
 }
 _INFO_OF = {"left_info": ("left",), "right_info": ("right",), "tof_info": ("range", "depth")}

@@ -3,6 +3,7 @@ r"""The stages of one agent's sensors, joined up without ROS: readings in, what 
 
 stereo -> StereoStage -> FeatureStage -> features
 depth  -> DepthStage ----^   \-> ScanOdometryStage -> motions
+laser  -------------------------^
 IMU    -------------------------^----------------> turn rates
 """
 
@@ -12,7 +13,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from ndt_registration.stage import Scan, ScanEstimate, ScanOdometryStage
-from slam_bringup.bags.readings import AgentSensors, DepthReading, ImuReading, Reading, StereoReading
+from slam_bringup.bags.readings import (
+    AgentSensors,
+    DepthReading,
+    ImuReading,
+    LaserReading,
+    Reading,
+    StereoReading,
+)
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.frame_log import FrameLog
 from slam_bringup.pipeline.stage_times import StageTimes
@@ -44,7 +52,8 @@ class SensorPipeline:
         self._agent = sensors.agent
         self._times = times
         self._uses_stereo = mode != "tof"
-        self._uses_depth = mode != "stereo" or odometry
+        self._scanner = sensors.scanner if odometry else ""
+        self._uses_depth = mode != "stereo" or self._scanner == "depth"
         self.log = FrameLog()
         """Pictures with their features, for people to look at."""
         self._require(mode, sensors, odometry)
@@ -63,6 +72,9 @@ class SensorPipeline:
             yield from self._on_pair(reading)
         elif isinstance(reading, DepthReading) and self._uses_depth:
             yield from self._on_depth(reading)
+        elif isinstance(reading, LaserReading) and self._odometry is not None and self._scanner == "scan":
+            self._odometry.add_scan(reading.scan)
+            yield from self._scans()
 
     def finish(self) -> Iterator[AgentItem]:
         """Yield what still waits when the input has ended."""
@@ -120,11 +132,12 @@ class SensorPipeline:
         who = f"agent '{sensors.agent}'" if sensors.agent else "the bag"
         if self._uses_stereo and not {"left", "right"} <= sensors.topics.keys():
             raise ValueError(f"mode '{mode}' needs stereo images, and {who} has none: try --mode tof")
-        if self._uses_depth and "depth" not in sensors.topics:
-            if mode == "stereo":
-                raise ValueError(f"scan odometry needs ToF images, and {who} has none: leave --odometry out")
-            hint = "--mode stereo without --odometry" if odometry else "--mode stereo"
+        no_scans = odometry and not sensors.scanner
+        if mode != "stereo" and "depth" not in sensors.topics:
+            hint = "--mode stereo without --odometry" if no_scans else "--mode stereo"
             raise ValueError(f"mode '{mode}' needs ToF images, and {who} has none: try {hint}")
+        if no_scans:
+            raise ValueError(f"scan odometry needs ToF images or laser scans, and {who} has none: leave --odometry out")
 
 
 def stereo_stage(sensors: AgentSensors) -> StereoStage:

@@ -75,22 +75,24 @@ def live_nodes(
     extra: Mapping[str, Mapping[str, Any]] | None = None,
     base_frames: Mapping[str, str] | None = None,
     with_imu: Iterable[str] = (),
+    with_laser: Iterable[str] = (),
     overrides: Overrides | None = None,
 ) -> list[NodeSpec]:
     """Nodes for rigs with the sensors that the mode of ``config`` needs.
 
     ``rectified``: their stereo images are. ``extra``: parameters by executable. ``base_frames``: frame of each agent's
     rig, by default ``base_link`` below the agent's name. ``with_imu``: agents whose IMU is known to report; another's
-    is used as well, once it does. ``overrides``: what of them is not in ``config``.
+    is used as well, once it does. ``with_laser``: agents whose scan odometry registers the scans of a laser.
+    ``overrides``: what of them is not in ``config``.
     """
-    base_frames, with_imu = base_frames or {}, set(with_imu)
+    base_frames, with_imu, with_laser = base_frames or {}, set(with_imu), set(with_laser)
     mode, extra, agents = config.feature_extractor.mode, extra or {}, tuple(agents)
     specs = []
     for agent in agents:
         base = {"base_frame": base_frames[agent]} if agent in base_frames else _below(agent, base_frame="base_link")
         if mode != "tof" and not rectified:
             specs.append(_spec("stereo_frontend", "stereo_driver", None, agent, extra))
-        if mode != "stereo" or odometry:
+        if mode != "stereo" or (odometry and agent not in with_laser):
             specs.append(_spec("tof_driver", "tof_driver", config.tof_driver, agent, extra))
         if odometry:
             frames = base | _below(agent, odom_frame="odom")
@@ -118,6 +120,7 @@ def plan_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
         extra=_bag_parameters(config, first, map_path), base_frames=base_frames, overrides=overrides,
         with_imu=[a for a, s in sensors.items() if "imu" in s.topics and config.ekf_slam.motion.imu != "off"],
+        with_laser=[a for a, s in sensors.items() if s.scanner == "scan"],
     )  # fmt: skip
     specs = [replace(spec, parameters=spec.parameters | _REPLAY) for spec in specs]
     names = {e: tuple(s.command.full_name for s in specs if s.executable == e) for e in _FINISHERS}
@@ -161,7 +164,9 @@ def _topics(sensor: AgentSensors, mode: str, odometry: bool) -> dict[str, str]:
     roles = ["imu"]
     if mode != "tof":
         roles += ["left", "right", "left_info", "right_info"]
-    if mode != "stereo" or odometry:
+    if odometry and sensor.scanner == "scan":
+        roles += ["scan"]
+    if mode != "stereo" or (odometry and sensor.scanner == "depth"):
         roles += ["depth", "amplitude", "intensity", "color", "tof_info"]
     return {sensor.topics[role]: _heard(sensor, role) for role in roles if role in sensor.topics}
 
@@ -175,7 +180,7 @@ def _pace(sensor: AgentSensors, mode: str, odometry: bool) -> Iterable[str]:
     agent = sensor.agent
     yield f"{join(agent, 'ekf_slam')}={_heard(sensor, 'depth' if mode == 'tof' else 'left')}"
     if odometry:
-        yield f"{join(agent, 'ndt_odometry')}={_heard(sensor, 'depth')}"
+        yield f"{join(agent, 'ndt_odometry')}={_heard(sensor, sensor.scanner)}"
     elif mode in ("replace", "fuse"):
         yield f"{join(agent, 'tof_driver')}={_heard(sensor, 'depth')}"
 
