@@ -33,6 +33,7 @@ from stereo_frontend.matching import (
     swapped_share,
 )
 from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
+from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.self_calibration import SelfCalibrationConfig, StereoSelfCalibration
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
 from stereo_frontend.two_view_consistency import StereoView
@@ -70,12 +71,14 @@ class FrontendReport:
     """Findings of the front end about its images.
 
     rectification: figures of the stereo pair; advice: to the user, a sentence each; picture: what features are searched
-    in: "stereo", "amplitude", "intensity", "range" or "" before the first image.
+    in: "stereo", "amplitude", "intensity", "range" or "" before the first image; correction: what the right image's
+    rectification is wrong by, where disparities are corrected for it.
     """
 
     rectification: Mapping[str, float | str] = field(default_factory=dict)
     advice: tuple[str, ...] = ()
     picture: str = ""
+    correction: RectificationError | None = None
 
 
 def _more(config: FeatureConfig, factor: float) -> FeatureConfig:
@@ -173,7 +176,10 @@ class Frontend:
         """Findings about the images so far."""
         advice = (self.self_calibration.advice(), self._tof.advice())
         picture = "+".join(self._tof.used) if self.config.mode == "tof" else "stereo"
-        return FrontendReport(self.self_calibration.figures(), tuple(text for text in advice if text), picture)
+        correction = self.self_calibration.error if self.self_calibration.corrects else None
+        return FrontendReport(
+            self.self_calibration.figures(), tuple(text for text in advice if text), picture, correction
+        )
 
     def _stereo_depth(self, images: StereoImages, left: Keypoints, right: Keypoints) -> DepthEstimate:
         stereo, calibration = images.stereo, self.self_calibration

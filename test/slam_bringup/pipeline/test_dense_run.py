@@ -7,17 +7,23 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from slam_bringup.bags.bag import BagReader, BagWriter
-from slam_bringup.bags.readings import ColourReading, DepthReading
+from slam_bringup.bags.readings import AgentSensors, ColourReading, DepthReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.bags.sensor_writer import SensorWriter
 from slam_bringup.datasets.rgbd import RgbdDataset
+from slam_bringup.pipeline import dense_run
 from slam_bringup.pipeline.configuration import load_system_config
-from slam_bringup.pipeline.dense_run import dense_model
+from slam_bringup.pipeline.dense_run import AgentDepth, dense_model
+from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
+from stereo_frontend.corrected_info import corrected_right
+from stereo_frontend.rectification_error import NAMES, RectificationError
 
+DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
 ORANGE = (240, 130, 20)
 
 
@@ -75,3 +81,18 @@ def test_a_colour_image_alone_is_also_the_picture_that_features_come_from(tmp_pa
         assert depth.raw.amplitude[90, 5] == cv2.cvtColor(np.uint8([[ORANGE]]), cv2.COLOR_RGB2GRAY)[0, 0]
         _, colours = surface_colours(bag)
     assert np.abs(colours - ORANGE).max(axis=1).min() <= 2
+
+
+def test_dense_stereo_is_rectified_as_self_calibration_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    with SensorBag(DEMO) as bag:
+        sensors = bag.sensors[bag.agents[0]]
+    used: list[AgentSensors] = []
+    made = dense_run.stereo_stage
+    monkeypatch.setattr(dense_run, "stereo_stage", lambda s: (used.append(s), made(s))[1])
+    error = RectificationError(sensors.left.rectified, np.full(len(NAMES), 1e-4), np.eye(len(NAMES)))
+    for correction in (None, error):
+        AgentDepth(sensors, load_system_config(None), Trajectory.from_estimates([]), correction)
+    wrong, right = (s.right for s in used)
+    assert wrong == sensors.right
+    np.testing.assert_array_equal(right.R, corrected_right(sensors.right, error)[0].R)
+    assert np.abs(right.R - sensors.right.R).max() > 1e-5

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray, DepthImage
+from stereo_frontend.corrected_info import corrected_right
+from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.stage import StereoStage
 from tof_driver.stage import DepthStage
 
@@ -30,11 +33,15 @@ def dense_model(
     trajectories: Mapping[str, Trajectory],
     on_reading: Callable[[], None] = lambda: None,
     stopped: Callable[[], bool] = lambda: False,
+    corrections: Mapping[str, RectificationError | None] | None = None,
 ) -> DenseModel:
-    """The model of all agents in the map frame, of what was read until ``stopped``; its surface is not made yet."""
+    """The model of all agents in the map frame, of what was read until ``stopped``; its surface is not made yet.
+
+    ``corrections``: by agent, what the rectification of its right images is wrong by, where that is sure.
+    """
     model = DenseModel(config.dense_mapper)
     cameras = {
-        agent: AgentDepth(bag.sensors[agent], config, trajectory)
+        agent: AgentDepth(bag.sensors[agent], config, trajectory, (corrections or {}).get(agent))
         for agent, trajectory in trajectories.items()
         if len(trajectory)
     }
@@ -56,7 +63,13 @@ def dense_model(
 class AgentDepth:
     """Key frames of one agent's cameras on its trajectory."""
 
-    def __init__(self, sensors: AgentSensors, config: SystemConfig, trajectory: Trajectory) -> None:
+    def __init__(
+        self,
+        sensors: AgentSensors,
+        config: SystemConfig,
+        trajectory: Trajectory,
+        correction: RectificationError | None = None,
+    ) -> None:
         self._config: DenseConfig = config.dense_mapper
         self._agent, self._trajectory, self._sensors = sensors.agent, trajectory, sensors
         self._depth: DepthStage | None = None
@@ -69,6 +82,8 @@ class AgentDepth:
             self._depth = depth_stage(config, sensors)
             self._T_base_tof = sensors.transform("base", "tof")
         if self._config.use_stereo and sensors.right is not None and sensors.is_mounted("left"):
+            if correction is not None:
+                sensors = replace(sensors, right=corrected_right(sensors.right, correction)[0])
             self._stereo = stereo_stage(sensors)
             self._T_base_left = sensors.transform("base", "left")
 

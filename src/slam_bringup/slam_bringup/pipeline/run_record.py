@@ -132,7 +132,8 @@ def run_result(
     )
     surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
     try:
-        model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading, stopped)
+        corrections = {agent: known.front_end.correction for agent, known in record.agents.items()}
+        model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading, stopped, corrections)
         if not stopped():
             surface = model.surface()
             plans = model.floor_plans(surface)
