@@ -14,11 +14,11 @@ import pytest
 SRC = Path(__file__).resolve().parent.parent / "src"
 LAYER = {
     "slam_core": 0,
-    "slam_simulation": 1,
     "slam_calibration": 1,
     "stereo_frontend": 1,
     "tof_driver": 1,
     "ndt_registration": 1,
+    "slam_simulation": 2,
     "ekf_slam_node": 2,
     "sjsam_node": 2,
     "dense_mapping": 2,

@@ -46,7 +46,7 @@ def main() -> None:
 
 
 def mapped(bag: Path, mode: str) -> AgentResult:
-    config = choose(load_system_config(None), "stereo", "sjsam", "none")
+    config = choose(load_system_config(None, bag), "stereo", "sjsam", "none")
     front = config.feature_extractor
     front = replace(front, self_calibration=replace(front.self_calibration, mode=mode))
     return run_bag(bag, replace(config, feature_extractor=front))[0].agents[0]

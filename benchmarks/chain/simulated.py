@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thesis's experiments on simulated bags (chapter 9): render, map offline, compare with the truth.
 
-    python benchmarks/chain/simulated.py [SCENARIO[/EVERY][:MODE] ...] [--keep FOLDER]
+    python benchmarks/chain/simulated.py [SCENARIO[/EVERY][:MODE] ...] [--keep FOLDER] [--profile ideal|real]
 
-EVERY keeps each n-th frame, MODE is stereo, tof, replace or fuse. Bags are kept in FOLDER and used again. The second
+EVERY keeps each n-th frame, MODE is stereo, tof, replace or fuse; the scale error is positive for a map that is too
+large. Bags are kept in FOLDER and used again. The second
 table has one row per agent of the runs with several: what it sends (bytes of its submap messages per metre of way), how
 far the map is from a central one, to which all submaps are given agent after agent, and how far it was while they came
 in, in the order in which they were finished.
@@ -20,6 +21,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from self_calibration import scale_error_percent
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.smoothing.estimator import EstimatorConfig
@@ -33,6 +35,7 @@ from slam_core.evaluation import Evaluation
 from slam_core.messages import submap_messages
 from slam_core.trajectory import Trajectory
 from slam_core.types import Submap
+from slam_simulation.profiles import PROFILES
 
 DEFAULT = (
     "workshop_rig", "workshop_handheld", "fireman_10hz", "fireman_5hz", "sweep", "conference", "two_rooms/2",
@@ -40,8 +43,8 @@ DEFAULT = (
     "small_room/3:fuse", "firemen_2", "firemen_3/2",
 )  # fmt: skip
 HEADINGS = (
-    "run", "frames", "path m", "submaps", "closures", "lost", "landmarks", "ATE mm", "end mm", "end deg", "ANEES",
-    "ANEES block", "filter: ATE mm", "end mm", "ANEES", "ms features", "ms ekf", "merge ms/submap", "max",
+    "run", "frames", "path m", "submaps", "closures", "lost", "landmarks", "scale %", "ATE mm", "end mm", "end deg",
+    "ANEES", "ANEES block", "filter: ATE mm", "end mm", "ANEES", "ms features", "ms ekf", "merge ms/submap", "max",
     "x real time",
 )  # fmt: skip
 AGENT_HEADINGS = ("run", "agent", "path m", "submaps", "sent kB/m", "compact", "ATE mm", "end mm", "ANEES",
@@ -52,6 +55,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="*", default=DEFAULT, metavar="RUN")
     parser.add_argument("--keep", type=Path, help="folder for the bags")
+    parser.add_argument("--profile", choices=PROFILES, default="ideal", help="how hard the rendering is")
     arguments = parser.parse_args()
     table, agents = Table(title="simulated experiments, against the truth"), Table(title="several agents in one map")
     for heading in HEADINGS:
@@ -61,8 +65,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         for run in track(arguments.runs, description="mapping", console=Console(stderr=True)):
             name, _, mode = run.partition(":")
-            bag = bag_of(name, arguments.keep or Path(scratch))
-            result, mapping = run_bag(bag, choose(load_system_config(None), mode or "stereo", "sjsam", "none"))
+            bag = bag_of(name, arguments.keep or Path(scratch), arguments.profile)
+            result, mapping = run_bag(bag, choose(load_system_config(None, bag), mode or "stereo", "sjsam", "none"))
             submaps = [record.submap for record in mapping.global_map.graph.records]
             table.add_row(run, *row(result, submaps))
             if len(result.agents) > 1:
@@ -88,8 +92,8 @@ def row(result: RunResult, submaps: list[Submap]) -> list[str]:
     times = [np.median(front_end), np.median(ms["ekf"]), np.median(ms["sjsam"]), np.max(ms["sjsam"])]
     return [
         str(summary["frames"]), f"{joined.truth_length_m:.1f}", *map(str, counts), str(lost), str(summary["landmarks"]),
-        *accuracy(joined), f"{by_blocks.anees:.2f}", f"{1e3 * filtered.ate.rmse:.1f}",
-        f"{1e3 * filtered.end_error_m:.1f}", f"{filtered.anees:.2f}",
+        f"{scale_error_percent(agent):+.2f}", *accuracy(joined), f"{by_blocks.anees:.2f}",
+        f"{1e3 * filtered.ate.rmse:.1f}", f"{1e3 * filtered.end_error_m:.1f}", f"{filtered.anees:.2f}",
         *(f"{t:.0f}" for t in times), f"{summary['real_time_factor']:.1f}",
     ]  # fmt: skip
 
@@ -136,11 +140,11 @@ def accuracy(e: Evaluation) -> list[str]:
     ]  # fmt: skip
 
 
-def bag_of(name: str, folder: Path) -> Path:
+def bag_of(name: str, folder: Path, profile: str = "ideal") -> Path:
     scenario, _, every = name.partition("/")
-    bag = folder / f"{name.replace('/', '_every_')}.mcap"
+    bag = folder / f"{name.replace('/', '_every_')}{'_real' * (profile == 'real')}.mcap"
     if not bag.exists():
-        command = ["simulate", scenario, "--profile", "ideal", "-o", str(bag), "--images", "jpeg", "--compact"]
+        command = ["simulate", scenario, "--profile", profile, "-o", str(bag), "--images", "jpeg", "--compact"]
         command += ["--every", every or "1"]
         slam(command, standalone_mode=False)
     return bag

@@ -20,6 +20,7 @@ setup(
         "matplotlib",
         "numpy",
         "opencv-python-headless",
+        "PyYAML",
     ],
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",

@@ -17,6 +17,7 @@ setup(
     install_requires=[
         "setuptools",
         "slam_core",
+        "slam_calibration",
         "numba",
         "numpy",
         "opencv-python-headless",

@@ -8,7 +8,9 @@ import pytest
 from judging import errors, join
 from submap_world import Agent, circle, ring_world
 
+from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.map_view import _smoothing
+from slam_core.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, make_transform
 from slam_core.types import PoseEstimate, Submap
 
@@ -81,3 +83,24 @@ def test_a_correction_turns_about_the_lever_arm_of_what_is_left_of_the_way() -> 
     lever = np.eye(6)
     lever[1, 5], lever[2, 4] = 1.0, -1.0  # turns about z and y move a point 1 m ahead
     assert gain @ submap.covariance[:6, :6] == pytest.approx(1.5 * lever.T)
+
+
+def test_a_wrong_scale_widens_what_goes_out_and_leaves_the_map(rng: np.random.Generator) -> None:
+    agent = Agent(ring_world(3.0, rng, 12.0), circle(3.0, 0.6), rng, "a")
+    submaps, doubt = agent.submaps(), CalibrationErrorConfig(sigma_scale=0.05, sigma_mounting=0.01)
+    exact, doubted = GlobalMap(), GlobalMap(GlobalMapConfig(calibration=doubt))
+    for joined in (exact, doubted):
+        for submap in submaps:
+            joined.add(submap)
+    far = 0
+    for before, after in zip(exact.trajectory("a"), doubted.trajectory("a"), strict=True):
+        np.testing.assert_array_equal(after.T, before.T)
+        added, position = after.covariance - before.covariance, before.T[:3, 3]
+        assert position @ added[:3, :3] @ position == pytest.approx((0.05 * position @ position) ** 2, abs=1e-9)
+        far += np.linalg.norm(position) > 2.0
+    assert far
+    before, after = exact.landmarks(), doubted.landmarks()
+    np.testing.assert_array_equal(after.positions, before.positions)
+    along = np.einsum("ni,nij,nj->n", before.positions, after.covariances - before.covariances, before.positions)
+    np.testing.assert_allclose(along, (0.05 * np.square(before.positions).sum(axis=1)) ** 2, atol=1e-6)
+    assert doubted.end_pose("a").covariance[0, 0] > exact.end_pose("a").covariance[0, 0]

@@ -27,7 +27,7 @@ def under(scenario: Scenario, **effects: object) -> Scenario:
 def test_profiles_are_named_and_ideal_changes_nothing(scenario: Scenario) -> None:
     assert scenario.with_profile("ideal").suite == scenario.suite
     assert scenario.with_profile("real").suite.realism == REAL
-    assert scenario.with_profile("real").suite.stereo.calibration_error_px > 0.0
+    assert scenario.with_profile("real").suite.stereo.calibration_pictures == 20
     with pytest.raises(ValueError, match="unknown profile 'hard', known: ideal, real"):
         scenario.with_profile("hard")
 

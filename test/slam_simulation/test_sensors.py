@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slam_core.geometry import OPTICAL_FROM_RIG, make_transform, so3_exp
+from slam_core.camera import CameraInfo
+from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, invert_transform, make_transform, so3_exp, transform_points
 from slam_simulation import Simulator
+from slam_simulation.calibrated_pair import CalibratedPair, calibrated_pair
 from slam_simulation.imu import GRAVITY, ImuSensor, ImuSensorConfig, ideal_reading
 from slam_simulation.raycaster import camera_rays
 from slam_simulation.scenario import Scenario
@@ -16,7 +18,6 @@ from slam_simulation.stereo_sensor import (
     StereoSensorConfig,
     camera_twist,
     expose,
-    miscalibrated,
     motion_blur,
 )
 from slam_simulation.surface_table import SurfaceTable, compile_world
@@ -158,10 +159,30 @@ def test_imu_noise_and_bias_are_as_stated(scenario: Scenario) -> None:
     assert error.std(axis=0) == pytest.approx(0.01, rel=0.2)
 
 
-def test_calibration_is_wrong_by_what_it_says() -> None:
-    camera = StereoSensor(StereoSensorConfig()).infos[0].camera
-    rng = np.random.default_rng(0)
-    wrong = [miscalibrated(camera, 0.1, rng) for _ in range(400)]
-    assert np.std([c.cx - camera.cx for c in wrong]) == pytest.approx(0.1, rel=0.15)
-    border = [c.fx / camera.fx * 320 - 320 for c in wrong]
-    assert np.std(border) == pytest.approx(0.1, rel=0.15)
+def disparity_error(pair: CalibratedPair, infos: tuple[CameraInfo, ...]) -> FloatArray:
+    """Error (n,) px of the disparities of points at 3 m, rectified as the camera infos say."""
+    rays = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.4, 0.4, 5)), axis=-1).reshape(-1, 2)
+    points, u = 3.0 * np.column_stack([rays, np.ones(len(rays))]), []
+    for camera, T, info in zip(pair.cameras, pair.T_rectified_raw, infos, strict=True):
+        pixels = camera.project(transform_points(invert_transform(T), points))
+        xy = info.camera.normalised_from_pixels(pixels)
+        turned = np.column_stack([xy, np.ones(len(xy))]) @ info.R.T
+        u.append(info.P[0, 0] * turned[:, 0] / turned[:, 2])
+    return u[0] - u[1] + infos[1].P[0, 3] / 3.0
+
+
+def test_a_calibration_from_pictures_errs_by_hundredths_of_a_pixel_and_says_so() -> None:
+    config = StereoSensorConfig()
+    infos = StereoSensor(config).infos
+    exact = calibrated_pair(infos, config.baseline, 0, 0.15, np.random.default_rng(0))
+    np.testing.assert_allclose(disparity_error(exact, infos), 0.0, atol=1e-9)
+    assert exact.error.is_exact
+    errors, nees = [], []
+    for seed in range(6):
+        pair = calibrated_pair(infos, config.baseline, 20, 0.15, np.random.default_rng(seed))
+        wrong = disparity_error(pair, infos)
+        errors.append(wrong)
+        disparity = -infos[1].P[0, 3] / 3.0
+        nees.append((np.mean(wrong) / disparity / pair.error.sigma_scale) ** 2)
+    assert 0.01 < np.sqrt(np.mean(np.square(errors))) < 0.1
+    assert 0.1 < np.mean(nees) < 2.5

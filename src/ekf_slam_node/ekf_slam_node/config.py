@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekf_slam_node.calibration import CalibrationErrorConfig
+from slam_core.calibration_error import CalibrationErrorConfig
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray
 from slam_core.least_squares import chi_square_bound

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from ekf_slam_node.aids import Aid
-from ekf_slam_node.calibration import widened_by_calibration
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import Ekf
 from ekf_slam_node.landmarks import LandmarkBook, Pending
@@ -18,6 +17,7 @@ from ekf_slam_node.open_submap import OpenSubmap, Sight, inheriting, pending_of
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.steps import UpdatedFrame
 from ekf_slam_node.submap_builder import SubmapBuilder, conditional_start
+from slam_core.calibration_error import widened_by_calibration
 from slam_core.geometry import FloatArray, compose_covariance
 from slam_core.types import PoseEstimate, Submap
 

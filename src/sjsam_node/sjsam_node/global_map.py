@@ -30,6 +30,7 @@ from sjsam_node.map_view import MapLandmarks, MapView
 from sjsam_node.marks import Marks
 from sjsam_node.smoothing.smoother import Smoother, SmootherConfig
 from sjsam_node.storage import StoredMap
+from slam_core.calibration_error import CalibrationErrorConfig
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
 from slam_core.types import Counters, PoseEstimate, Submap
@@ -68,6 +69,7 @@ class GlobalMapConfig(Config):
     smoothing: SmootherConfig = group(SmootherConfig)
     closure: ClosureConfig = group(ClosureConfig)
     consistency: ConsistencyConfig = group(ConsistencyConfig)
+    calibration: CalibrationErrorConfig = group(CalibrationErrorConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,7 @@ class GlobalMap:
         self.smoother = Smoother(graph, self.config.smoothing)
         self.detector = LoopDetector(self.smoother, self.config.closure)
         self.consistency = Consistency(self.smoother, self.config.consistency, self.config.closure)
-        self.view = MapView(self.smoother, self.config.unlinked_sigma)
+        self.view = MapView(self.smoother, self.config.unlinked_sigma, self.config.calibration)
 
     def add(self, submap: Submap) -> JoinReport:
         """Join one submap; a faulty one is refused with the reason, counted, and changes nothing."""

@@ -6,7 +6,8 @@ gain with which the end, once known better, corrects it (a Rauch-Tung-Striebel s
 
 Submaps that contradict one another more than they claim possible are too sure of themselves, each as much as the
 others as far as the map can tell: every covariance that goes out is multiplied by the component's variance factor, chi2
-per degree of freedom (the "variance of unit weight"; Baarda 1968), never below one.
+per degree of freedom (the "variance of unit weight"; Baarda 1968), never below one. What the cameras' calibration errs
+by, common to all submaps, is added to what goes out and nowhere else (:mod:`slam_core.calibration_error`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,11 @@ import numpy as np
 from sjsam_node.graph.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.smoothing.marginals import ComponentMarginals
 from sjsam_node.smoothing.smoother import Smoother
+from slam_core.calibration_error import (
+    CalibrationErrorConfig,
+    covariance_of_calibration,
+    point_covariances_of_calibration,
+)
 from slam_core.geometry import (
     FloatArray,
     boxminus,
@@ -73,6 +79,7 @@ class MapView:
 
     smoother: Smoother
     unlinked_sigma: float
+    calibration: CalibrationErrorConfig = field(default_factory=CalibrationErrorConfig)
     _gains: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     _stacked: _Stacked = field(default_factory=lambda: _Stacked([], np.empty((0, 4, 4)), np.empty((0, 6, 6))))
 
@@ -110,6 +117,7 @@ class MapView:
             for i in (i for i in marginals.records if i >= since):
                 record = self.graph.records[i]
                 poses, covariances = _with_covariances(self.graph, marginals, i, *self._gain(i))
+                covariances += np.array([covariance_of_calibration(T, self.calibration) for T in poses])
                 own = record.submap.path
                 out.setdefault(record.submap.agent, []).extend(
                     PoseEstimate(p.stamp_ns, T, P + widening) for p, T, P in zip(own, poses, covariances, strict=True)
@@ -119,7 +127,8 @@ class MapView:
     def node(self, node: int) -> FloatArray:
         """Covariance (6, 6) of a node in the map frame."""
         component = int(self.graph.component_of[node])
-        return self.smoother.marginals(component).node(node) + self._widening(component)
+        common = covariance_of_calibration(self.graph.poses[node], self.calibration)
+        return self.smoother.marginals(component).node(node) + common + self._widening(component)
 
     def landmarks(self) -> MapLandmarks:
         """Every landmark once; what one submap alone saw counts only if that submap showed something new."""
@@ -133,8 +142,10 @@ class MapView:
         for c in np.unique(component).tolist():
             own = component == c
             covariances[own] = self.smoother.marginals(c).landmarks(rows[own]) + self._widening(c)[:3, :3]
+        points = graph.points[rows]
+        covariances += point_covariances_of_calibration(points, self.calibration)
         main = graph.component(0) if graph.records else 0
-        return MapLandmarks(ids, graph.points[rows], covariances, _descriptors(graph, rows), counts, component == main)
+        return MapLandmarks(ids, points, covariances, _descriptors(graph, rows), counts, component == main)
 
     def _widening(self, component: int) -> FloatArray:
         """Covariance (6, 6) that is added in a component whose frame nothing ties to the map's."""

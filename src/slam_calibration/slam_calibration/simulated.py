@@ -29,6 +29,20 @@ def random_view(rng: np.random.Generator, tilt: float = 0.6) -> FloatArray:
     return make_transform(rotation, np.array([*rng.uniform(-0.15, 0.15, 2), rng.uniform(0.45, 0.9)]))
 
 
+def covering_view(rng: np.random.Generator, camera: LensState, tilt: float = 0.6) -> FloatArray:
+    """T_first_board: the board anywhere in the picture, 0.35 to 0.8 m away, turned to the camera but for ``tilt`` rad.
+
+    A lens is known where the board was seen: twenty such views fill the picture, as a user is asked to.
+    """
+    depth = rng.uniform(0.35, 0.8)
+    reach = 0.75 * np.array([camera.width / camera.parameters[0], camera.height / camera.parameters[1]]) / 2.0
+    position = depth * np.array([*rng.uniform(-reach, reach), 1.0])
+    turn = np.array([-position[1], position[0], 0.0]) / depth
+    facing = so3_exp(turn * np.arctan(np.linalg.norm(turn)) / max(float(np.linalg.norm(turn)), 1e-9))
+    tilted = so3_exp(np.array([*rng.uniform(-tilt, tilt, 2), rng.uniform(-0.5, 0.5)]))
+    return make_transform(facing @ tilted, position)
+
+
 def simulate_views(
     rng: np.random.Generator,
     board_points: FloatArray,

@@ -42,5 +42,5 @@ REAL = RealismConfig(
     exposure_step_ev=1.0 / 3.0,
 )
 """One person about, a chair that is moved, thin smoke, some dark and some shiny things, a ToF camera as they are."""
-REAL_STEREO = {"calibration_error_px": 0.1, "exposure_ms": 10.0, "gain_jitter": 0.02}
+REAL_STEREO = {"calibration_pictures": 20, "exposure_ms": 10.0, "gain_jitter": 0.02}
 """What the stereo camera has at least under ``real``."""

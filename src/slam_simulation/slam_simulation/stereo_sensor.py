@@ -9,7 +9,7 @@ stands ``baseline`` to the right of it.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from slam_core.camera import Camera, CameraInfo, StereoCamera
 from slam_core.config import Config, parameter
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, make_transform, so3_exp
 from slam_core.types import ByteArray, Float32Array
+from slam_simulation.calibrated_pair import calibrated_pair
 from slam_simulation.profiles import RealismConfig
 from slam_simulation.raycaster import TILE, Rays, camera_rays, for_tile_rows, make_view, trace
 from slam_simulation.shading import render
@@ -62,12 +63,8 @@ class StereoSensorConfig(Config):
     blur_px: float = parameter(0.7, "lens blur, standard deviation", unit="px", minimum=0.0)
     read_noise: float = parameter(1.5, "noise of a dark pixel, of 255", minimum=0.0)
     electrons_per_level: float = parameter(20.0, "electrons per grey level: sets the shot noise", minimum=0.1)
-    calibration_error_px: float = parameter(
-        0.0,
-        "spread of what the calibration is wrong by, at the principal point and at the border",
-        unit="px",
-        minimum=0.0,
-    )
+    calibration_pictures: int = parameter(0, "pictures of a board that the calibration is made from; 0: it is exact")
+    calibration_corner_px: float = parameter(0.15, "noise of a corner in these pictures", unit="px", minimum=0.0)
     vignetting: float = parameter(0.8, "strength of the cos^4 darkening towards the corners", minimum=0.0, maximum=1.0)
     drop_probability: float = parameter(0.0, "share of frames lost", minimum=0.0, maximum=0.9)
     stamp_jitter_us: float = parameter(
@@ -91,10 +88,11 @@ class StereoSensor:
         rng = np.random.default_rng([seed, 78])
         self.infos = tuple(camera_info(c, side, rectified=rectified) for side in SIDES)
         self.stereo = StereoCamera(self.infos[0].rectified, c.baseline)
-        self.rays = tuple(camera_rays(miscalibrated(i.camera, c.calibration_error_px, rng)) for i in self.infos)
-        self.T_rig_raw = tuple(
-            _mounting(info, offset) for info, offset in zip(self.infos, (0.0, c.baseline), strict=True)
-        )
+        pair = calibrated_pair(self.infos, c.baseline, c.calibration_pictures, c.calibration_corner_px, rng)
+        self.calibration_error = pair.error
+        self.rays = tuple(camera_rays(camera) for camera in pair.cameras)
+        T_rig_left = make_transform(OPTICAL_FROM_RIG.T, np.zeros(3))
+        self.T_rig_raw = tuple(np.asarray(T_rig_left @ T) for T in pair.T_rectified_raw)
         self._shading = tuple(vignette(rays, c.vignetting) for rays in self.rays)
         self._gain = 0.0
 
@@ -150,19 +148,6 @@ def camera_info(config: StereoSensorConfig, side: str, *, rectified: bool = Fals
     distortion = tuple((1.0 + c.distortion_spread * right) * d for d in c.distortion)
     camera = Camera(c.width, c.height, focal, focal, cx + offset[0], cy + offset[1], "plumb_bob", distortion)
     return CameraInfo(camera, so3_exp(np.radians(c.right_tilt_deg if right else c.left_tilt_deg)), P)
-
-
-def miscalibrated(camera: Camera, error_px: float, rng: np.random.Generator) -> Camera:
-    """The true camera behind a calibration that is wrong by ``error_px`` at the principal point and at the border."""
-    du, dv, df = error_px * rng.standard_normal(3)
-    scale = 1.0 + 2.0 * df / camera.width
-    return replace(camera, fx=camera.fx * scale, fy=camera.fy * scale, cx=camera.cx + du, cy=camera.cy + dv)
-
-
-def _mounting(info: CameraInfo, offset: float) -> FloatArray:
-    """``T_rig_raw`` of a camera ``offset`` m to the right of the rig's origin."""
-    T_rig_left = make_transform(OPTICAL_FROM_RIG.T, np.zeros(3))
-    return np.asarray(T_rig_left @ make_transform(info.R, np.array([offset, 0.0, 0.0])))
 
 
 def camera_twist(twist: FloatArray, T_rig_camera: FloatArray) -> FloatArray:

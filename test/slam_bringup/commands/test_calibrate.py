@@ -41,7 +41,12 @@ def test_stereo_writes_what_the_drivers_read(data_dir: Path, tmp_path: Path) -> 
     assert np.linalg.norm(np.array(written["T_left_right"])[:3, 3]) == pytest.approx(right.info.baseline)
     assert written["rms_px"] < 0.45
     expected = {"left.yaml", "right.yaml", "extrinsics.yaml", "report.md", "summary.json", "residuals.png"}
-    assert {path.name for path in tmp_path.iterdir()} == {*expected, "board_poses.png", ".slam.json"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *expected,
+        "board_poses.png",
+        "calibration.yaml",
+        ".slam.json",
+    }
     assert "left01.jpg | 54 | 54" in (tmp_path / "report.md").read_text()
 
 

@@ -9,9 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from slam_bringup.bags.bag import BagReader
+from slam_bringup.bags.bag_calibration import calibration_file
 from slam_bringup.bags.readings import DepthReading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.commands.simulate import BagOptions, command, write_bag
+from slam_bringup.pipeline.configuration import load_system_config
 from slam_core.config import from_mapping
 from slam_core.messages import image_from_message
 from slam_simulation import Scenario, Simulator
@@ -119,6 +121,23 @@ def test_rectified_images_need_no_rectification(scenario: Scenario, tmp_path: Pa
         assert left is not None
         assert left.is_rectified
         assert source.sensors["one"].topics["left"] == "/one/stereo/left/image_rect"
+
+
+def test_a_calibration_that_errs_says_so_beside_the_bag(tmp_path: Path) -> None:
+    plan = ROOM | {"frames": 1, "stereo": ROOM["stereo"] | {"calibration_pictures": 20}, "sensors": ["stereo"]}
+    path = tmp_path / "room"
+    for _ in range(2):  # a bag of ours is replaced together with its file
+        write_bag(Scenario.from_mapping("room", plan), path, BagOptions(overwrite=True), threads=1)
+    known = load_system_config(None, path)
+    assert 1e-4 < known.ekf_slam.calibration.sigma_scale < 0.02
+    assert known.sjsam.calibration == known.ekf_slam.calibration
+    own = tmp_path / "own.yaml"
+    own.write_text("sjsam: {calibration.sigma_scale: 0.1}")
+    assert load_system_config(own, path).sjsam.calibration.sigma_scale == 0.1
+    assert load_system_config(own, path).ekf_slam.calibration == known.ekf_slam.calibration
+    calibration_file(path).write_text("mine: {}")
+    with pytest.raises(ValueError, match="other files are with it"):
+        write_bag(Scenario.from_mapping("room", plan), path, BagOptions(overwrite=True), threads=1)
 
 
 def test_true_depth_is_stored(bag: Path) -> None:

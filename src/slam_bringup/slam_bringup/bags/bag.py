@@ -29,11 +29,12 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, ReaderError, StoragePlugin, Writer
 
+from slam_bringup.bags.bag_calibration import FILE_NAME, calibration_file
 from slam_bringup.bags.bag_owner import OWNER, require_free
 from slam_bringup.bags.bag_salvage import is_whole_mcap, salvage_mcap
 from slam_bringup.bags.bag_types import typestore
 from slam_bringup.bags.ros1_bag import Ros1Reader
-from slam_core.files import replace
+from slam_core.files import atomic_text, replace
 from slam_core.messages.base import Message
 from slam_core.output_folder import free_name
 
@@ -103,7 +104,8 @@ class BagWriter:
         If there is something at ``path`` that must not be replaced.
     """
 
-    def __init__(self, path: Path, storage: str = "mcap", *, overwrite: bool = True, compression: str = "zstd") -> None:
+    def __init__(self, path: Path, storage: str = "mcap", *, overwrite: bool = True, compression: str = "zstd",
+                 calibration: str = "") -> None:  # fmt: skip
         if storage not in ("mcap", "sqlite3"):
             raise ValueError(f"bag storage must be mcap or sqlite3, got '{storage}'")
         if compression not in COMPRESSIONS:
@@ -117,6 +119,7 @@ class BagWriter:
         self._overwrite = overwrite
         self._storage = StoragePlugin[storage.upper()]
         self._connections: dict[str, Connection] = {}
+        self._calibration = calibration
 
     def __enter__(self) -> Self:
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -124,6 +127,8 @@ class BagWriter:
         name = self.path.stem if self._single_file else self.path.name
         self._writer = Writer(self._workshop / name, version=9, storage_plugin=self._storage)
         self._writer.set_custom_data(*OWNER)
+        if self._calibration:
+            self._writer.set_custom_data(FILE_NAME, self._calibration)
         if self._is_compressed:
             self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._writer.open()
@@ -173,6 +178,8 @@ class BagWriter:
         except ValueError:
             self.path = free_name(self.path)
         replace(made, self.path)
+        if self._calibration:
+            atomic_text(calibration_file(self.path), self._calibration)
 
 
 class BagReader:

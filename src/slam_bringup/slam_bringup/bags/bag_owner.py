@@ -13,6 +13,8 @@ from typing import Any, BinaryIO
 
 import yaml
 
+from slam_bringup.bags.bag_calibration import FILE_NAME
+
 OWNER = ("written_by", "slam")
 """Key and value in the custom data of the bag's metadata."""
 
@@ -45,7 +47,7 @@ def is_own_bag(path: Path) -> bool:
             return _is_own(yaml.safe_load(_mcap_metadata(path)))
         information = yaml.safe_load((path / "metadata.yaml").read_text(encoding="utf-8"))
         information = information["rosbag2_bagfile_information"]
-        return _is_own(information) and _holds_only(path, information["relative_file_paths"])
+        return _is_own(information) and _holds_only(path, information)
     except (OSError, ValueError, KeyError, TypeError, struct.error, yaml.YAMLError):
         return False
 
@@ -55,8 +57,11 @@ def _is_own(information: dict[str, Any]) -> bool:
     return bool((information["custom_data"] or {}).get(key) == value)
 
 
-def _holds_only(folder: Path, files: list[str]) -> bool:
-    return {p.name for p in folder.iterdir()} <= {"metadata.yaml", *files}
+def _holds_only(folder: Path, information: dict[str, Any]) -> bool:
+    """True for the bag's own files; that of the calibration is as it was written."""
+    calibration = information["custom_data"].get(FILE_NAME, "")
+    own = [FILE_NAME] if calibration and (folder / FILE_NAME).read_text(encoding="utf-8") == calibration else []
+    return {p.name for p in folder.iterdir()} <= {"metadata.yaml", *own, *information["relative_file_paths"]}
 
 
 def _mcap_metadata(path: Path) -> str:

@@ -11,12 +11,14 @@ import click
 import numpy as np
 import yaml
 
+from slam_bringup.bags.bag_calibration import FILE_NAME
 from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.commands.refine import refine, write_refined
 from slam_bringup.report.figures import save_png
 from slam_calibration.board import Board, parse_board
 from slam_calibration.bundle import BundleResult
+from slam_calibration.length_error import length_error, parameter_file
 from slam_calibration.lens import DISTORTION_PARAMETERS, parameter_names
 from slam_calibration.pictures import BoardViews, find_views, pair_pictures
 from slam_calibration.rectification import stereo_infos
@@ -125,6 +127,9 @@ def _write(
         CameraInfoFile(info, name, camera_deviations(result, c)).write(output / f"{name}.yaml")
     if len(names) > 1:
         atomic_text(output / "extrinsics.yaml", _extrinsics(result, names, infos))
+    if kind == "stereo":
+        error = length_error(result.rig.cameras, result.covariance)
+        atomic_text(output / FILE_NAME, parameter_file(error))
     save_png(output / "residuals.png", residual_figure(result, names))
     save_png(output / "board_poses.png", board_poses_figure(result, board.points, names))
     atomic_text(output / "report.md", f"# Calibration\n\n{tables(result, names)}\n{_picture_table(result, views)}")

@@ -18,7 +18,7 @@ from slam_bringup.commands.mapping_options import (
     require_map,
 )
 from slam_bringup.doctor.examination import require_stereo
-from slam_bringup.pipeline.configuration import choose, system_config
+from slam_bringup.pipeline.configuration import choose, overrides_for, system_config
 from slam_bringup.pipeline.overrides import Overrides, read_overrides
 from slam_bringup.processes.interrupt import INTERRUPTED, MAP, Interrupt, giving_up
 from slam_bringup.processes.online_run import run_nodes
@@ -44,7 +44,7 @@ def command(
     with SensorBag(bag, names) as opened:
         mode = mode_for(opened, mode)
         frames = sum(opened.count(agent, "depth" if mode == "tof" else "left") for agent in opened.agents)
-    overrides = read_overrides(config) if config is not None else Overrides()
+    overrides = overrides_for(bag, read_overrides(config) if config is not None else Overrides())
     system = choose(system_config(overrides), mode, mapper, odometry, imu)
     if mode != "tof":
         require_stereo(bag, names)

@@ -58,7 +58,7 @@ def command(
     with SensorBag(bag, names) as opened:
         readings = sum(opened.count(agent, role) for agent in opened.agents for role in ("left", "depth", "imu"))
         mode = mode_for(opened, mode)
-    system = choose(load_system_config(config), mode, mapper, odometry, imu)
+    system = choose(load_system_config(config, bag), mode, mapper, odometry, imu)
     growth = map_growth(system.sjsam, old_map, localize_only=localize_only)
     if mode != "tof":
         require_stereo(bag, names)

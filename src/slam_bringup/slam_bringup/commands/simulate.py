@@ -29,6 +29,7 @@ from slam_bringup.bags.sensor_writer import (
 )
 from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_calibration.length_error import parameter_file
 from slam_core.camera import CameraInfo
 from slam_core.geometry import FloatArray
 from slam_core.messages import compressed_image_message, header_message, transform_message
@@ -115,7 +116,9 @@ def write_bag(
         Simulator(scenario, k, world, threads, truth=options.truth, rectified=options.rectified)
         for k in range(len(scenario.agents))
     ]
-    with BagWriter(output, options.storage, overwrite=options.overwrite) as bag:
+    error = agents[0].stereo.calibration_error
+    calibration = "" if error.is_exact else parameter_file(error)
+    with BagWriter(output, options.storage, overwrite=options.overwrite, calibration=calibration) as bag:
         writers = {s.scenario.agents[s.agent].name: SimulationWriter(bag, s, options) for s in agents}
         for writer in writers.values():
             writer.mountings(min(s.stamp_ns(0) for s in agents))

@@ -14,6 +14,7 @@ from dense_mapping.dense_model import DenseConfig
 from ekf_slam_node.stage import IMU, MOTION, FilterConfig
 from ndt_registration.odometry import OdometryConfig
 from sjsam_node.global_map import GlobalMapConfig
+from slam_bringup.bags.bag_calibration import calibration_file
 from slam_bringup.bags.readings import AgentSensors
 from slam_bringup.pipeline.overrides import (
     NODE_CONFIGS,
@@ -43,9 +44,21 @@ class SystemConfig(Config):
     dense_mapper: DenseConfig = group(DenseConfig)
 
 
-def load_system_config(path: Path | None) -> SystemConfig:
-    """Defaults, overridden by a YAML file where one is given; ValueError as :func:`system_config`."""
-    return SystemConfig() if path is None else system_config(read_overrides(path))
+def load_system_config(path: Path | None, bag: Path | None = None) -> SystemConfig:
+    """Defaults, overridden by what is known of a bag's calibration, then by a YAML file, where they are given.
+
+    ValueError as :func:`system_config`.
+    """
+    return system_config(overrides_for(bag, Overrides() if path is None else read_overrides(path)))
+
+
+def overrides_for(bag: Path | None, own: Overrides) -> Overrides:
+    """A user's own overrides, after those of the file of a bag's calibration, if it has one."""
+    file = None if bag is None else calibration_file(bag)
+    if file is None or not file.is_file():
+        return own
+    known = read_overrides(file)
+    return Overrides(own.origin or known.origin, (*known.rules, *own.rules))
 
 
 def system_config(overrides: Overrides) -> SystemConfig:

@@ -17,7 +17,7 @@ import yaml
 
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, nodes_name, parse_topics
-from slam_bringup.pipeline.configuration import ODOMETRIES, choose, system_config
+from slam_bringup.pipeline.configuration import ODOMETRIES, choose, overrides_for, system_config
 from slam_bringup.pipeline.overrides import Overrides, overrides_of, parse_assignments, read_overrides
 from slam_bringup.processes.node_graph import NodeGraph, NodeSpec, live_nodes, plan_nodes
 from stereo_frontend.frontend import MODES
@@ -127,6 +127,7 @@ def _for_bag(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
     path = Path(values["bag"]).expanduser().resolve()
     with SensorBag(path, names) as bag:
         has_stereo = bool(bag.count(bag.agents[0], "left"))
+        overrides = overrides_for(path, overrides)
         mode = ("stereo" if has_stereo else "tof") if values["mode"] == AUTO else values["mode"]
         config = choose(system_config(overrides), mode, "sjsam", values["odometry"])
         map_path = values["map_path"] or "map"

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from feature_world import T_RIG_OPTICAL, loop, room
 
-from ekf_slam_node.calibration import CalibrationErrorConfig, pose_sensitivity
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.slam import EkfSlam
+from slam_core.calibration_error import CalibrationErrorConfig, pose_sensitivity
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, make_transform, so3_exp
 from slam_core.types import Submap

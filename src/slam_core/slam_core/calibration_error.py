@@ -6,9 +6,10 @@ all lengths alike, ``t -> (1 + s) t``, and a camera mounted a little turned turn
 ``T -> E T E^-1``. Neither shows in any innovation, so neither can be estimated; their effect on a pose or a landmark is
 known exactly, and with it what they add to the covariance (a consider parameter, Schmidt 1966).
 
-They are one and the same in a whole run, so a pose takes them from the start of everything. Submaps are handed on
-without: their errors count as independent in a joined map, and a common error of all of them, taken as an own one of
-each, would let every submap turn as it likes (joined maps of simulated rooms became six times less accurate).
+They are one and the same in a whole run, so a pose takes them from the start of everything: of its odometry, or of the
+joined map. Submaps are handed on without: their errors count as independent in a joined map, and a common error of all
+of them, taken as an own one of each, would let every submap turn as it likes (joined maps of simulated rooms became six
+times less accurate).
 """
 
 from __future__ import annotations
@@ -50,12 +51,23 @@ def pose_sensitivity(T: FloatArray) -> FloatArray:
     return J
 
 
+def covariance_of_calibration(T: FloatArray, config: CalibrationErrorConfig) -> FloatArray:
+    """Covariance (6, 6) that the calibration's errors give a pose (4, 4) relative to the start of everything."""
+    J = pose_sensitivity(T) * _sigmas(config)
+    return np.asarray(J @ J.T)
+
+
+def point_covariances_of_calibration(points: FloatArray, config: CalibrationErrorConfig) -> FloatArray:
+    """Covariances (n, 3, 3) that they give points (n, 3) m."""
+    J = np.concatenate([points[:, :, None], -skew(points)], axis=2) * _sigmas(config)
+    return np.asarray(J @ np.swapaxes(J, 1, 2))
+
+
 def widened_by_calibration(pose: PoseEstimate, config: CalibrationErrorConfig) -> PoseEstimate:
     """A pose relative to the start of everything, its covariance widened."""
     if config.is_exact:
         return pose
-    J = pose_sensitivity(pose.T) * _sigmas(config)
-    return replace(pose, covariance=pose.covariance + J @ J.T)
+    return replace(pose, covariance=pose.covariance + covariance_of_calibration(pose.T, config))
 
 
 def _sigmas(config: CalibrationErrorConfig) -> FloatArray:
