@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Submaps of real and rendered bags, filtered once and kept, so that joining is measured without the rest.
 
-    python benchmarks/joining/recorded_submaps.py BAG OUT.pickle [--mode stereo] [--odometry none] [--to-and-fro 200]
+    python benchmarks/joining/recorded_submaps.py BAG OUT.pickle [--mode stereo] [--to-and-fro 200 [--frames 4]]
 
-``--to-and-fro`` shows the bag's features to the filter forwards and backwards until it has made so many submaps.
+``--to-and-fro`` shows the bag's features to the filter forwards and backwards until it has made so many submaps;
+``--frames`` only its first ones: a rig that stands still.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ def record(bag: Path, mode: str, odometry: str) -> tuple[Recording, list[Submap]
     return Recording(len(submaps), truth, filtered, result.sensor_s, features_s), submaps
 
 
-def record_to_and_fro(bag: Path, mode: str, count: int) -> tuple[Recording, list[Submap]]:
-    """``count`` submaps of a bag whose features are seen forwards, backwards, forwards again and so on."""
+def record_to_and_fro(bag: Path, mode: str, count: int, frames: int | None) -> tuple[Recording, list[Submap]]:
+    """``count`` submaps of a bag whose (first) features are seen forwards, backwards, forwards again and so on."""
     seen: list[tuple[EkfSlam, Features]] = []
     process = EkfSlam.process
 
@@ -67,7 +68,7 @@ def record_to_and_fro(bag: Path, mode: str, count: int) -> tuple[Recording, list
 
     with patch.object(EkfSlam, "process", remember):
         once, _ = record(bag, mode, "none")
-    features = [f for _, f in seen]
+    features = [f for _, f in seen][:frames]
     ekf = EkfSlam(seen[0][0].config, seen[0][0]._T_rig_optical)
     stamps = np.array([f.stamp_ns for f in features])
     step, (agent, truth) = int(np.median(np.diff(stamps))), next(iter(once.truth.items()))
@@ -83,7 +84,7 @@ def record_to_and_fro(bag: Path, mode: str, count: int) -> tuple[Recording, list
         estimates.append(found.pose)
         if not 0 <= k + direction < len(features):
             direction = -direction
-        k += direction
+        k = min(max(k + direction, 0), len(features) - 1)
     walked = Trajectory(np.array(stamps_ns), np.array(true_poses))
     filtered = Trajectory.from_estimates(estimates)
     passes = len(stamps_ns) / len(features)
@@ -113,9 +114,10 @@ def main() -> None:
     parser.add_argument("--mode", default="stereo")
     parser.add_argument("--odometry", default="none")
     parser.add_argument("--to-and-fro", type=int, default=0, metavar="SUBMAPS")
+    parser.add_argument("--frames", type=int)
     arguments = parser.parse_args()
     if arguments.to_and_fro:
-        recording, submaps = record_to_and_fro(arguments.bag, arguments.mode, arguments.to_and_fro)
+        recording, submaps = record_to_and_fro(arguments.bag, arguments.mode, arguments.to_and_fro, arguments.frames)
     else:
         recording, submaps = record(arguments.bag, arguments.mode, arguments.odometry)
     store(arguments.output, recording, submaps)

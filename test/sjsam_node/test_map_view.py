@@ -9,7 +9,7 @@ from judging import errors, join
 from submap_world import Agent, circle, ring_world
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
-from sjsam_node.map_view import _smoothing
+from sjsam_node.map_view import STILL, _moving, _smoothing
 from slam_core.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, make_transform
 from slam_core.types import PoseEstimate, Submap
@@ -104,3 +104,21 @@ def test_a_wrong_scale_widens_what_goes_out_and_leaves_the_map(rng: np.random.Ge
     along = np.einsum("ni,nij,nj->n", before.positions, after.covariances - before.covariances, before.positions)
     np.testing.assert_allclose(along, (0.05 * np.square(before.positions).sum(axis=1)) ** 2, atol=1e-6)
     assert doubted.end_pose("a").covariance[0, 0] > exact.end_pose("a").covariance[0, 0]
+
+
+def test_a_path_shows_every_movement_and_little_of_standing_still(rng: np.random.Generator) -> None:
+    def pose(k: int, x: float) -> PoseEstimate:
+        T = np.eye(4)
+        T[:3, 3] = [x, *rng.normal(scale=2e-4, size=2)]
+        return PoseEstimate(k, T, np.eye(6))
+
+    standing = [pose(k, 0.0) for k in range(300)]
+    creeping = [pose(300 + k, 0.001 * k) for k in range(1, 101)]
+    kept = _moving([*standing, *creeping])
+    assert len(kept) < 60
+    assert kept[0] is standing[0]
+    assert kept[-1] is creeping[-1]
+    stamps, x = [p.stamp_ns for p in kept], [p.T[0, 3] for p in kept]
+    for p in (*standing, *creeping):
+        before = [i for i, stamp in enumerate(stamps) if stamp <= p.stamp_ns][-1]
+        assert abs(x[before] - p.T[0, 3]) < STILL[0] + 1e-9

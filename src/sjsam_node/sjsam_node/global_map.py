@@ -188,12 +188,10 @@ class GlobalMap:
     def _put_away(self, old: int) -> None:
         """Keep the large arrays of a submap on disk from here on."""
         if old >= 0:
-            submap = self.graph.records[old].submap
-            small = replace(
-                submap,
-                covariance=self._offload.put(submap.covariance),
-                descriptors=self._offload.put(submap.descriptors),
-            )
+            submap, put = self.graph.records[old].submap, self._offload.put
+            on_the_way = put(np.array([p.covariance for p in submap.path]))
+            path = tuple(replace(p, covariance=c) for p, c in zip(submap.path, on_the_way, strict=True))
+            small = replace(submap, covariance=put(submap.covariance), descriptors=put(submap.descriptors), path=path)
             self.graph.records[old] = replace(self.graph.records[old], submap=small)
             self.detector.index.move(old, small.descriptors)
 
@@ -281,13 +279,12 @@ class GlobalMap:
             if not missed:
                 break
         for _ in range(_PASSES):
-            self.smoother.settle()
+            self.smoother.settle(coarse=True)
             verdict = self.consistency.settle(newest)
             self._account(verdict, 0)
             if not verdict.removed and not verdict.dropped:
                 break
-        else:
-            self.smoother.settle()
+        self.smoother.settle()
         self._account(self.consistency.relieve(), 0)
         self._has_moved, self._is_settled = False, True
 

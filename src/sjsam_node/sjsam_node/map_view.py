@@ -40,6 +40,9 @@ from slam_core.types import Float32Array, PoseEstimate, Submap
 _ORIGIN_SIGMA = 1e-6
 """Standard deviation of the map's first pose (m, rad): the origin by definition, but no covariance may be singular."""
 
+STILL = 0.003, 0.001
+"""Movement (m, rad) that a path need not show."""
+
 
 @dataclass(frozen=True, eq=False)
 class MapLandmarks:
@@ -60,17 +63,18 @@ class MapLandmarks:
 
 @dataclass(frozen=True, eq=False)
 class _Stacked:
-    """The poses inside all submaps so far, how many each has, and the gains of their ends."""
+    """The poses inside all submaps so far that show how an agent moved, how many each has, and the ends' gains."""
 
     count: list[int]
+    inside: list[PoseEstimate]
     poses: FloatArray
     gains: FloatArray
 
-    def with_one(self, submap: Submap, gains: FloatArray) -> _Stacked:
-        own = np.array([p.T for p in submap.path])
-        return _Stacked(
-            [*self.count, len(own)], np.concatenate([self.poses, own]), np.concatenate([self.gains, gains])
-        )  # fmt: skip
+    def with_one(self, submap: Submap) -> _Stacked:
+        kept = _moving(submap.path)
+        poses = np.concatenate([self.poses, [p.T for p in kept]])
+        gains = np.concatenate([self.gains, [_smoothing(submap, p)[0] for p in kept]])
+        return _Stacked([*self.count, len(kept)], [*self.inside, *kept], poses, gains)
 
 
 @dataclass
@@ -80,8 +84,7 @@ class MapView:
     smoother: Smoother
     unlinked_sigma: float
     calibration: CalibrationErrorConfig = field(default_factory=CalibrationErrorConfig)
-    _gains: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    _stacked: _Stacked = field(default_factory=lambda: _Stacked([], np.empty((0, 4, 4)), np.empty((0, 6, 6))))
+    _stacked: _Stacked = field(default_factory=lambda: _Stacked([], [], np.empty((0, 4, 4)), np.empty((0, 6, 6))))
 
     @property
     def graph(self) -> MapGraph:
@@ -89,18 +92,20 @@ class MapView:
         return self.smoother.graph
 
     def path(self) -> dict[str, list[PoseEstimate]]:
-        """Poses of every agent in the order of their stamps, with no more covariance than inside their submaps."""
+        """Poses of every agent in the order of their stamps, with no more covariance than inside their submaps.
+
+        Of an agent that stands still there are few: a path through them is nowhere off by more than ``STILL``.
+        """
         records, stacked = self.graph.records, self._stacked
         for i in range(len(stacked.count), len(records)):
-            stacked = self._stacked = stacked.with_one(records[i].submap, self._gain(i)[0])
+            stacked = self._stacked = stacked.with_one(records[i].submap)
         if not records:
             return {}
         of = np.repeat(np.arange(len(records)), stacked.count)
         poses = _on_skeleton(self.graph, records, of, stacked.poses, stacked.gains)
         parts: dict[str, list[PoseEstimate]] = {}
-        inside = [p for r in records for p in r.submap.path]
         agents = [r.submap.agent for r, n in zip(records, stacked.count, strict=True) for _ in range(n)]
-        for agent, p, T in zip(agents, inside, poses, strict=True):
+        for agent, p, T in zip(agents, stacked.inside, poses, strict=True):
             parts.setdefault(agent, []).append(PoseEstimate(p.stamp_ns, T, p.covariance))
         return {agent: _unique_stamps(part) for agent, part in sorted(parts.items())}
 
@@ -116,7 +121,7 @@ class MapView:
             marginals, widening = self.smoother.marginals(component), self._widening(component)
             for i in (i for i in marginals.records if i >= since):
                 record = self.graph.records[i]
-                poses, covariances = _with_covariances(self.graph, marginals, i, *self._gain(i))
+                poses, covariances = _with_covariances(self.graph, marginals, i, *_gains(record.submap))
                 covariances += np.array([covariance_of_calibration(T, self.calibration) for T in poses])
                 own = record.submap.path
                 out.setdefault(record.submap.agent, []).extend(
@@ -152,14 +157,6 @@ class MapView:
         if component == self.graph.component(0):
             return np.asarray(_ORIGIN_SIGMA**2 * np.eye(6))
         return np.diag(np.square([*[self.unlinked_sigma] * 3, np.pi, np.pi, np.pi]))
-
-    def _gain(self, record: int) -> tuple[FloatArray, FloatArray]:
-        """Of each pose of a submap: how its end corrects it, and what covariance that leaves; they never change."""
-        if record not in self._gains:
-            submap = self.graph.records[record].submap
-            found = [_smoothing(submap, pose) for pose in submap.path]
-            self._gains[record] = np.array([g for g, _ in found]), np.array([r for _, r in found])
-        return self._gains[record]
 
 
 def _estimated(graph: MapGraph) -> IntArray:
@@ -216,6 +213,23 @@ def _with_covariances(
         # The map's first pose has no covariance of its own.
         covariances[k] = _positive(J @ joint @ J.T + marginals.factor * J_pose @ remaining[k] @ J_pose.T)
     return poses, covariances
+
+
+def _moving(path: Sequence[PoseEstimate]) -> list[PoseEstimate]:
+    """The poses of a path without those that lie within ``STILL`` of the last one kept; the end stays."""
+    moved = boxminus(np.array([p.T for p in path]), np.eye(4)) / np.repeat(STILL, 3)
+    kept, last = [], np.full(6, np.inf)
+    for pose, here in zip(path[:-1], moved, strict=False):
+        if np.abs(here - last).max() > 1.0:
+            kept.append(pose)
+            last = here
+    return [*kept, path[-1]]
+
+
+def _gains(submap: Submap) -> tuple[FloatArray, FloatArray]:
+    """Of each pose of a submap: how its end corrects it, and what covariance that leaves, (n, 6, 6) each."""
+    found = [_smoothing(submap, pose) for pose in submap.path]
+    return np.array([g for g, _ in found]), np.array([r for _, r in found])
 
 
 def _smoothing(submap: Submap, pose: PoseEstimate) -> tuple[FloatArray, FloatArray]:

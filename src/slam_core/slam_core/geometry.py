@@ -219,17 +219,18 @@ def boxminus(T: FloatArray, reference: FloatArray) -> FloatArray:
 
 
 def both_halves(rotation: FloatArray) -> FloatArray:
-    """(6, 6) that turns translation and rotation of a pose error by the same rotation (3, 3)."""
-    R = np.zeros((6, 6))
-    R[:3, :3] = R[3:, 3:] = rotation
+    """(..., 6, 6) that turns translation and rotation of a pose error by the same rotation (..., 3, 3)."""
+    R = np.zeros((*rotation.shape[:-2], 6, 6))
+    R[..., :3, :3] = R[..., 3:, 3:] = rotation
     return R
 
 
 def compose_jacobians(T_a_b: FloatArray, T_b_c: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Jacobians (6, 6) of ``T_a_b @ T_b_c`` with respect to the errors of its two factors."""
-    R = T_a_b[:3, :3]
-    J_ab = np.eye(6)
-    J_ab[:3, 3:] = -skew(R @ T_b_c[:3, 3])
+    """Jacobians (..., 6, 6) of ``T_a_b @ T_b_c`` with respect to the errors of its two factors, (..., 4, 4) each."""
+    R = T_a_b[..., :3, :3]
+    J_ab = np.zeros((*R.shape[:-2], 6, 6))
+    J_ab[..., range(6), range(6)] = 1.0
+    J_ab[..., :3, 3:] = -skew((R @ T_b_c[..., :3, 3:])[..., 0])
     return J_ab, both_halves(R)
 
 

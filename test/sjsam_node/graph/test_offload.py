@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from sjsam_node.graph.offload import Offload
+
+OPEN = Path("/proc/self/fd")
 
 
 def test_arrays_on_disk_are_the_same_and_cannot_be_written(rng: np.random.Generator) -> None:
@@ -16,3 +20,14 @@ def test_arrays_on_disk_are_the_same_and_cannot_be_written(rng: np.random.Genera
         assert np.array_equal(a, b)
     with pytest.raises(ValueError, match="read-only"):
         stored[0][0, 0] = 1.0
+
+
+@pytest.mark.skipif(not OPEN.exists(), reason="counts open files as Linux does")
+def test_many_arrays_open_few_files(rng: np.random.Generator) -> None:
+    disk, before = Offload(), len(list(OPEN.iterdir()))
+    stored = [disk.put(np.full((k + 1, 3), k, np.int16)) for k in range(1200)]
+    large = rng.integers(0, 255, (70, 1 << 20), np.uint8)
+    on_disk = disk.put(large)
+    assert len(list(OPEN.iterdir())) - before < 5
+    assert all((a == k).all() and a.shape == (k + 1, 3) for k, a in enumerate(stored))
+    assert np.array_equal(on_disk, large)

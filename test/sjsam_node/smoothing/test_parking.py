@@ -49,9 +49,12 @@ def test_parked_submaps_stay_where_they_are_and_claim_no_more_than_they_know(
     laps: tuple[GlobalMap, list[int]], agent: Agent
 ) -> None:
     joined, _ = laps
+    marginals = joined.smoother.marginals(0)
     e, nees = errors(joined, agent)
     assert ate(e) < 0.1
     assert nees.mean() / 6.0 < 2.0
+    one_by_one = [marginals._hung([n]) for n in joined.graph.starts.tolist()]
+    assert np.allclose(marginals._hung_alone(joined.graph.starts), one_by_one, rtol=1e-9, atol=1e-15)
     before = {r.key: joined.graph.poses[r.start].copy() for r in joined.graph.records}
     parked = joined.smoother.parked.records.tolist()
     joined.settle()

@@ -87,6 +87,7 @@ class MapGraph:
     _pairs: dict[Link, IntArray] = field(default_factory=dict)
     _rank: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _variable_of: IntArray | None = None
+    _oldest: dict[int, Record] = field(default_factory=dict)
 
     @property
     def landmark_of(self) -> IntArray:
@@ -147,6 +148,9 @@ class MapGraph:
         self.use_all_ties(False)
         self._variable_of = None
         self.records.append(record)
+        known = self._oldest.get(self.component(-1))
+        if known is not None and record.key < known.key:
+            self._oldest.clear()
         return record
 
     def _new_node(self, T: FloatArray, component: int, stretch: int, chained: FloatArray, way: float) -> int:
@@ -223,10 +227,15 @@ class MapGraph:
         self.move(second, T_map_moved @ invert_transform(self.poses[self.records[moved].start]))
         members = np.isin(self.component_of, [first, second])
         self.component_of[members] = min(first, second)
+        self._oldest.clear()
 
     def oldest(self, component: int) -> Record:
         """The record of a component with the least key: its start defines the component's frame."""
-        return min((self.records[i] for i in self.records_of(component)), key=lambda r: r.key)
+        known = self._oldest.get(component)
+        if known is None:
+            known = min((self.records[i] for i in self.records_of(component)), key=lambda r: r.key)
+            self._oldest[component] = known
+        return known
 
     def move(self, component: int, T: FloatArray) -> None:
         """Transform the estimate of a whole component by ``T``, on the left."""
@@ -255,6 +264,7 @@ class MapGraph:
         _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
         first = np.unique(label, return_index=True)[1]
         self.component_of = first[label].astype(np.int64)
+        self._oldest.clear()
 
     def snapshot(self) -> Snapshot:
         """The beliefs and the estimate, to come back to."""
@@ -268,6 +278,7 @@ class MapGraph:
         self._variable_of = None
         self.poses, self.points = snapshot.poses.copy(), snapshot.points.copy()
         self._fusion, self.component_of = snapshot.fusion.copy(), snapshot.component_of.copy()
+        self._oldest.clear()
 
     def shared(self) -> BoolArray:
         """Mask (observations,) of those whose landmark more than one submap sees."""

@@ -11,18 +11,32 @@ import numpy as np
 
 from slam_core.types import AnyArray
 
+_SEGMENT = 1 << 26
+"""Bytes that are mapped at once: each mapping takes one of the files that a process may have open."""
+_ALIGNMENT = 64
+
 
 @dataclass
 class Offload:
     """Arrays that are read from disk where they are used; the operating system keeps what is used often."""
 
     _file: IO[Any] = field(default_factory=tempfile.TemporaryFile)
+    _segment: AnyArray = field(default_factory=lambda: np.empty(0, np.uint8))
+    _first: int = 0
+    _end: int = 0
 
     def put(self, array: AnyArray) -> AnyArray:
         """The same array, on disk and read only."""
         if not array.size:
             return array
-        start = self._file.seek(0, 2)
+        if self._end + array.nbytes > self._first + len(self._segment):
+            self._first += len(self._segment)
+            self._end, size = self._first, max(_SEGMENT, -(-array.nbytes // _SEGMENT) * _SEGMENT)
+            self._file.truncate(self._first + size)
+            self._segment = np.asarray(np.memmap(self._file, np.uint8, "r", self._first, (size,)))
+        self._file.seek(self._end)
         self._file.write(np.ascontiguousarray(array).data)
         self._file.flush()
-        return np.asarray(np.memmap(self._file, array.dtype, "r", start, array.shape))
+        at = self._end - self._first
+        self._end += -(-array.nbytes // _ALIGNMENT) * _ALIGNMENT
+        return self._segment[at : at + array.nbytes].view(array.dtype).reshape(array.shape)

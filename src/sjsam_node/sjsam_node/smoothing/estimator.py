@@ -126,7 +126,10 @@ class Assembled:
 
 @dataclass
 class Estimator:
-    """Optimises components of a map graph; keeps the reduced submaps, which change only where links change."""
+    """Optimises components of a map graph; keeps the reduced submaps, which change only where links change.
+
+    Of those alone that take part in the last update: what is parked or inside a region is reduced anew where needed.
+    """
 
     config: EstimatorConfig = field(default_factory=EstimatorConfig)
     _cache: dict[int, tuple[bytes, ReducedMap]] = field(default_factory=dict)
@@ -197,6 +200,8 @@ class Estimator:
         ``coarse``: to where a step promises less than ``live_tolerance``.
         """
         assembled = self.assemble(graph, component, regions, parked)
+        for i in set(graph.records_of(component)).difference(assembled.records):
+            self._cache.pop(i, None)
         tolerance = self.config.live_tolerance if coarse else self.config.relative_tolerance
         most = min(self.config.iterations, self.config.live_iterations) if coarse else self.config.iterations
         optimizer = LevenbergMarquardtConfig(most, tolerance)

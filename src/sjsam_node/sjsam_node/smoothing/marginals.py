@@ -72,9 +72,22 @@ class ComponentMarginals:
         out, is_held = np.empty((len(records), 6, 6)), np.isin(records, self._assembled.records)
         held = self._graph.starts[records[is_held]]
         out[is_held] = self._marginals.pose_blocks(np.searchsorted(self._assembled.nodes, held))
-        for k in np.nonzero(~is_held)[0].tolist():
-            out[k] = self._hung([int(self._graph.starts[records[k]])])
+        if not is_held.all():
+            out[~is_held] = self._hung_alone(self._graph.starts[records[~is_held]])
         return np.asarray(out[back])
+
+    def _hung_alone(self, nodes: IntArray) -> FloatArray:
+        """Covariance (n, 6, 6) of each of some nodes that move with a reference, or are held at the border of what is.
+
+        The same as :meth:`_hung` gives for each by itself.
+        """
+        still = np.eye(4), np.zeros((6, 6))
+        moving = [self._assembled.moving_with(n) or (n, *still) for n in nodes.tolist()]
+        references, T, own = (np.array(part) for part in zip(*moving, strict=True))
+        J_reference, J_node = compose_jacobians(self._poses[references], T)
+        known = self._marginals.pose_blocks(np.searchsorted(self._assembled.nodes, references))
+        carried = J_reference @ known @ np.swapaxes(J_reference, 1, 2)
+        return np.asarray(carried + J_node @ own @ np.swapaxes(J_node, 1, 2))
 
     def landmarks(self, observations: IntArray) -> FloatArray:
         """Covariance (n, 3, 3) in the map frame of the landmarks of some observations."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
@@ -104,14 +105,15 @@ class Region:
 
         ``sightings`` of every observation's landmark, ``uses`` of every node, the ``anchor`` of the component.
         """
-        nodes, known = np.concatenate([[self.reference], self.separator, self.inner]), graph.variable_of[self.landmarks]
+        nodes, variable_of = np.concatenate([[self.reference], self.separator, self.inner]), graph.variable_of
+        known = variable_of[self.landmarks]
         return bool(
             np.all(graph.component_of[nodes] == graph.component_of[anchor])
             and np.all(self.inner != anchor)
             and np.array_equal(uses[self.inner], self.uses)
-            and np.array_equal(graph.variable_of[self.inner_observations], self.landmark_of)
+            and np.array_equal(variable_of[self.inner_observations], self.landmark_of)
             and np.array_equal(sightings[self.inner_observations], self.sightings)
-            and np.array_equal(graph.variable_of[self.separator_observations], known[self.group])
+            and np.array_equal(variable_of[self.separator_observations], known[self.group])
             and len(np.unique(known)) == len(known)
         )
 
@@ -124,12 +126,14 @@ class Region:
 
     def local_map(self, graph: MapGraph, nodes: IntArray, landmarks: IntArray) -> LocalMap:
         """As the joining problem takes it, over sorted lists of nodes and landmarks."""
-        turns = boxminus(self.poses, np.eye(4))
         return LocalMap(
             int(np.searchsorted(nodes, self.reference)), np.searchsorted(nodes, self.separator),
-            np.searchsorted(landmarks, graph.variable_of[self.landmarks]),
-            np.concatenate([turns.ravel(), self.points.ravel()]), self.information, self.pull,
+            np.searchsorted(landmarks, graph.variable_of[self.landmarks]), self._mean, self.information, self.pull,
         )  # fmt: skip
+
+    @cached_property
+    def _mean(self) -> FloatArray:
+        return np.concatenate([boxminus(self.poses, np.eye(4)).ravel(), self.points.ravel()])
 
     def carry(self, graph: MapGraph) -> float:
         """Move what is inside with the reference, after that and the separator were estimated.
@@ -143,10 +147,14 @@ class Region:
         graph.points[self.inner_observations] = transform_points(T, self.inner_points)
         T_reference = invert_transform(T)
         shifted = transform_points(T_reference, graph.points[graph.variable_of[self.landmarks]]) - self.points
-        moved = boxminus(T_reference @ graph.poses[self.separator], self.poses)
+        moved = T_reference @ graph.poses[self.separator]
+        turned = moved[:, :3, :3] @ np.swapaxes(self.poses[:, :3, :3], 1, 2) - np.eye(3)
         extent = max(float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self.points) else 0.0, 1.0)
-        sheared = np.linalg.norm(np.concatenate([moved[:, :3], shifted]), axis=1).max(initial=0.0) / extent
-        return max(float(np.linalg.norm(moved[:, 3:], axis=1).max(initial=0.0)), float(sheared))
+        shifted = np.concatenate([moved[:, :3, 3] - self.poses[:, :3, 3], shifted])
+        sheared = np.linalg.norm(shifted, axis=1).max(initial=0.0) / extent
+        # The Frobenius norm of R - I is that of a rotation by an angle a: sqrt(8) sin(a / 2).
+        half = np.minimum(np.linalg.norm(turned, axis=(1, 2)).max(initial=0.0) / np.sqrt(8.0), 1.0)
+        return max(2.0 * float(np.arcsin(half)), float(sheared))
 
 
 @dataclass

@@ -149,16 +149,16 @@ class Smoother:
             covariances[k] = relative_pose(graph.poses[reference], graph.poses[node], joint[np.ix_(rows, rows)])[1]
         self.parked = self.parked.with_one(graph, record, reference, covariances)
 
-    def settle(self) -> None:
+    def settle(self, *, coarse: bool = False) -> None:
         """Bring all to its optimum, with every submap on its own and all shared landmarks, where that is affordable.
 
-        And where they do not contradict each other: then fewer say more.
+        And where they do not contradict each other: then fewer say more. ``coarse``: as near to it as an update does.
         """
         self._choose_ties()
         self.parked = Parked()
         self.regions.open(self.regions.closed, len(self.graph.records))
         for component in np.unique(self.graph.component_of).tolist():
-            self._solve(component, coarse=False)
+            self._solve(component, coarse=coarse)
 
     def resume(self) -> None:
         """Keep nothing but the graph and its estimate, which is at its optimum: after loading as after saving."""
