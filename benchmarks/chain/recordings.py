@@ -134,13 +134,15 @@ def _own(name: str, bag: Path, recording: Recording, run: str, output: Path) -> 
     write_results(output, result, mapping.global_map.save)
     agent = result.agents[0]
     lost = result.rejections.get("frames_lost", 0)
-    yield _row(name, run, agent.trajectory, agent.truth, recording.truth, lost, ms)
-    yield _row(name, f"{run}, filter", agent.filtered, agent.truth, recording.truth, lost, None)
+    yield row_of(name, run, agent.trajectory, agent.truth, recording.truth, lost, ms)
+    yield row_of(name, f"{run}, filter", agent.filtered, agent.truth, recording.truth, lost, None)
     if len(agent.scan_odometry):
-        yield _row(name, f"{run}, scans", agent.scan_odometry, agent.truth, recording.truth, 0, None)
+        yield row_of(name, f"{run}, scans", agent.scan_odometry, agent.truth, recording.truth, 0, None)
 
 
-def _row(name: str, run: str, estimate: Trajectory, truth: Trajectory, known: str, lost: int, ms: float | None) -> Row:
+def row_of(
+    name: str, run: str, estimate: Trajectory, truth: Trajectory, known: str, lost: int, ms: float | None
+) -> Row:
     matched, true_poses = associate(estimate, truth, _TRUTH_GAP_S, interpolate=True)
     e = evaluate(estimate, truth, interpolate=True, max_difference_s=_TRUTH_GAP_S)
     sigma = in_doubt = None
@@ -181,7 +183,7 @@ def _pnp(name: str, bag: Path, recording: Recording) -> Row:
                 poses.append(poses[-1] @ T_base @ motion @ invert_transform(T_base))
             before = frame
     assert truth is not None
-    return _row(name, "SIFT + PnP", _trajectory(stamps, poses), truth, "", lost, None)
+    return row_of(name, "SIFT + PnP", _trajectory(stamps, poses), truth, "", lost, None)
 
 
 def _points(reading: Reading, sensors: AgentSensors) -> tuple | None:
@@ -258,7 +260,7 @@ def _gicp(name: str, bag: Path) -> Iterator[Row]:
                 poses.append(poses[-1] @ T_base @ motion @ invert_transform(T_base))
             target = cloud
     assert truth is not None
-    yield _row(name, "GICP", _trajectory(stamps, poses), truth, "", 0, None)
+    yield row_of(name, "GICP", _trajectory(stamps, poses), truth, "", 0, None)
 
 
 def _trajectory(stamps: list[int], poses: list[FloatArray]) -> Trajectory:
