@@ -23,6 +23,7 @@ from ekf_slam_node.motion_checks import StandingDetector, aided, explaining_sigm
 from ekf_slam_node.noise_monitor import NoiseMonitor
 from ekf_slam_node.open_submap import Sight, pending_of
 from ekf_slam_node.results import EkfResult, TrackingState
+from ekf_slam_node.rolling_shutter import RollingShutter
 from ekf_slam_node.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submap_chain import SubmapChain
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
@@ -60,6 +61,7 @@ class EkfSlam:
         self.config = config
         self._T_rig_optical = T_rig_optical
         self._linker = Linker(config.association, T_rig_optical)
+        self._shutter = RollingShutter(T_rig_optical)
         self.counters = Counters()
         self.session = session
         self._forget()
@@ -136,6 +138,11 @@ class EkfSlam:
         """Complaint about the IMU, or ""."""
         return self._aids.inertial.complaint
 
+    @property
+    def readout_s(self) -> float:
+        """Time from the picture's first row to its last, s; 0 where rows are exposed at once or nothing is known."""
+        return self._shutter.readout_s
+
     def finish(self) -> tuple[Submap, ...]:
         """Close the open submap; the next frame begins a new one that does not follow it."""
         return self._chain.finish()
@@ -170,15 +177,19 @@ class EkfSlam:
         local = self._chain.local
         velocity_covariance = local.ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:]
         expected = motion_prior(local.ekf.velocity, velocity_covariance, self.config.motion.sigma, dt)
-        link = self._linker.link(local.candidates(), frame, aided(expected, aid))
+        prior = aided(expected, aid)
+        known = None if aid is None else prior.T
+        predicted = self._shutter.corrected(frame, dt, known)
+        link = self._linker.link(local.candidates(), predicted, prior)
         if link is None:
             return None
-        frame = self._noise.learn(frame, link.excess)
+        measured = self._noise.learn(frame, link.excess)
+        frame = self._shutter.corrected(measured, dt, link.T if known is None else known)
         self._common.learn(frame.z[link.columns, :2], link.error[:, :2], frame.camera.width)
         surprising = is_surprising(link, expected, self.config.association.gate)
         common = self._common.sigma(frame)
         aid = None if aid is None else widened(aid, common)
-        return LinkedFrame(frame, dt, link, aid, common, surprising, len(local.book))
+        return LinkedFrame(frame, measured, dt, link, aid, common, surprising, len(local.book))
 
     def _augment(self, linked: LinkedFrame) -> Sight:
         """Add the landmarks that the frame confirms, at the previous pose; returns all landmarks that it sees."""
@@ -227,6 +238,7 @@ class EkfSlam:
             self.counters.add("updates_failed")
         self._arrive(linked.frame)
         ids, index = local.book.ids[measured.slots], linked.frame.index[measured.columns]
+        self._shutter.learn(linked.measured, ids, measured.columns, linked.link.T, linked.dt)
         return UpdatedFrame(report, measured, closes, ids, index)
 
     def _maintain(self, linked: LinkedFrame, updated: UpdatedFrame) -> tuple[Submap, ...]:

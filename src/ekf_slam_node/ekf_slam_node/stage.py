@@ -114,6 +114,13 @@ class FilterStage:
         while self._waiting and not self._awaited.must_wait(self._waiting[0].stamp_ns):
             yield self._process(self._waiting.popleft())
 
+    @property
+    def finding(self) -> str:
+        """Finding about the camera that a user should know of, or ""."""
+        readout = 0.0 if self._slam is None else self._slam.readout_s
+        found = f"rolling shutter: {1e3 * abs(readout):.0f} ms from the first row to the last, corrected"
+        return found if readout else ""
+
     def give_up(self) -> None:
         """Stop waiting for what a live node has not heard for long, until it is heard again."""
         if self._waiting:

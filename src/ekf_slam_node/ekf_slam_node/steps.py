@@ -18,7 +18,7 @@ from slam_core.geometry import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class LinkedFrame:
-    """A frame that is associated with the map.
+    """A frame that is associated with the map, its features moved to one instant; ``measured``: as they were seen.
 
     dt: since the previous linked frame, s. aid: motion from other sensors, if any. common: (6,) standard deviations of
     the pose error that all its features share. surprising: its motion contradicts constant velocity. landmarks: how
@@ -26,6 +26,7 @@ class LinkedFrame:
     """
 
     frame: Frame
+    measured: Frame
     dt: float
     link: FrameLink
     aid: Aid | None

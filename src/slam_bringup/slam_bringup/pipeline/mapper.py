@@ -73,6 +73,7 @@ class Mapper:
             stage.give_up()
             self._take_results(agent)
             last += stage.finish()
+            self._events += [stage.finding] if stage.finding else []
         self._join(in_order(last))
         for join in self._joins:
             error = join.exception()
