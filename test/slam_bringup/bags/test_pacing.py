@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slam_bringup.bags.bag_types import BagTypes, typestore
-from slam_bringup.bags.pacing import Audience, FlowControl, ReplayClock, header_stamp_ns
+from slam_bringup.bags.pacing import Audience, Connections, FlowControl, ReplayClock, header_stamp_ns
 from slam_core.messages import header_message, image_message
 
 STAMP = 1_403_715_273_262_142_976
@@ -92,3 +92,12 @@ def test_an_audience_is_missing_until_every_topic_has_its_subscribers() -> None:
 def test_an_audience_of_another_form_is_refused(pair: str) -> None:
     with pytest.raises(ValueError, match="topic>=<number"):
         Audience((pair,))
+
+
+def test_nodes_are_an_obstacle_until_they_report_all_inputs_connected() -> None:
+    connections = Connections()
+    connections.report("/a", {"unconnected": "/left /tf"})
+    assert connections.obstacles(("/a", "/b")) == ["/a has no publisher of /left, /tf", "/b has not reported itself"]
+    assert connections.obstacles(("/a",), from_outside=("/left", "/tf")) == []
+    connections.report("/a", {"unconnected": ""})
+    assert connections.obstacles(("/a",)) == []

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Node ``bag_player``: publishes a bag's messages as they are, at a rate or as fast as the nodes can follow.
-
-In an installation without tf2_msgs, /tf_static is published as ``static_transforms``, one TransformStamped each.
-"""
+"""Node ``bag_player``: publishes a bag's messages as they are, at a rate or as fast as the nodes can follow."""
 
 # rclpy is annotated in part only.
 # mypy: allow-untyped-calls, disable-error-code="attr-defined,union-attr,arg-type,misc"
@@ -11,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from slam_bringup.bags.bag import BagReader, RawMessage
-from slam_bringup.bags.pacing import Audience, FlowControl, ReplayClock, header_stamp_ns
+from slam_bringup.bags.pacing import Audience, Connections, FlowControl, ReplayClock, header_stamp_ns
 from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.config import Config, parameter
 from slam_core.messages import (
@@ -56,6 +54,9 @@ class PlayerConfig(Config):
     subscribers: tuple[str, ...] = parameter(
         (), "'<topic>=<number>' as published: do not begin before it has so many subscribers, or patience runs out"
     )
+    nodes: tuple[str, ...] = parameter(
+        (), "full names: do not begin before these nodes have all inputs connected, or patience runs out"
+    )
 
 
 class BagPlayerNode(Node):
@@ -69,6 +70,7 @@ class BagPlayerNode(Node):
         self._types = RosTypes()
         self._flow = FlowControl(self.config.pace, self.config.window, self.config.patience)
         self._audience = Audience(self.config.subscribers)
+        self._connections = Connections()
         self._names = dict(pair.split("=", 1) for pair in self.config.rename)
         self._stop = threading.Event()
         self._start = threading.Event()
@@ -81,6 +83,7 @@ class BagPlayerNode(Node):
         self._clock_output = self.create_publisher(self._types.Clock, "/clock", 10) if self.config.clock else None
         self._clock_ns = 0
         self.create_subscription(self._types.Header, PROGRESS_TOPIC, self._on_progress, sensor_qos(1000))
+        self.create_subscription(self._types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(1000))
         self.create_service(Trigger, "~/start", self._on_start)
         self._thread = threading.Thread(target=self._run, name="player")
         self._thread.start()
@@ -96,6 +99,10 @@ class BagPlayerNode(Node):
     def _on_progress(self, header: Any) -> None:
         self._flow.progress(header.frame_id, header.stamp.sec * 1_000_000_000 + header.stamp.nanosec)
 
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            self._connections.report(status.name, {entry.key: entry.value for entry in status.values})
+
     def _on_start(self, _: Any, response: Any) -> Any:
         self._start.set()
         response.success = True
@@ -108,6 +115,7 @@ class BagPlayerNode(Node):
                 self._start.wait()
             else:
                 self._wait_for_subscribers()
+            self._wait_until(lambda: self._connections.obstacles(self.config.nodes))
             self._wait_for_audience()
             self._static_output.wait_for_all_acked(Duration(seconds=5))
             self._play_once()
@@ -164,14 +172,14 @@ class BagPlayerNode(Node):
             if kind is not None:
                 profile = sensor_qos(_DEPTH, info.latched, best_effort=info.best_effort)
                 publishers[topic] = self.create_publisher(kind, self._names.get(topic, topic), profile)
-            elif not topic.endswith("/tf_static"):
+            else:
                 self.get_logger().warning(f"{topic} is not played: {info.type_name} is not installed")
         if not publishers:
             raise ValueError(f"{self.config.bag} holds none of the topics to play")
         return publishers
 
     def _send_static_transforms(self) -> None:
-        """Transforms first: what comes later needs them. Sent as TransformStamped whether or not tf2_msgs is there."""
+        """Transforms first, as ``static_transforms``: what comes later needs them."""
         topics = [t for t in self._reader.topics if t.endswith("/tf_static")]
         for _, _, message in self._reader.messages(topics):
             for transform in message.transforms:
@@ -194,12 +202,19 @@ class BagPlayerNode(Node):
         """Until this end knows of everybody who is to hear: discovery takes both ends their own time."""
         outputs = {self._names.get(topic, topic): publisher for topic, publisher in self._outputs.items()}
         self._audience.forget_all_but(outputs)
+        missing = self._audience.missing
+        self._wait_until(lambda: [
+            f"{topic} has not all its subscribers" for topic in missing(lambda t: outputs[t].get_subscription_count())
+        ])  # fmt: skip
+
+    def _wait_until(self, obstacles: Callable[[], list[str]]) -> None:
+        """Until there are none any more, or patience runs out."""
         deadline = time.monotonic() + self.config.patience
-        while missing := self._audience.missing(lambda topic: outputs[topic].get_subscription_count()):
+        while found := obstacles():
             if self._stop.wait(0.02):
                 return
             if time.monotonic() > deadline:
-                self.get_logger().warning(f"going on without all subscribers of {', '.join(missing)}")
+                self.get_logger().warning(f"going on although {'; '.join(found)}")
                 return
 
 

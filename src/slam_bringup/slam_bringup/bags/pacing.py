@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pacing of a player by those who process: the stamps on their way to each node, and the clock of a replay."""
+"""Pacing of a player by those who process: who is there, the stamps on their way to each node, a replay's clock."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 
 def header_stamp_ns(data: bytes) -> int:
@@ -126,6 +126,27 @@ class Audience:
     def missing(self, matched: Callable[[str], int]) -> list[str]:
         """Topics that fewer subscribers are matched with than expected, sorted."""
         return sorted(topic for topic, number in self._expected.items() if matched(topic) < number)
+
+
+class Connections:
+    """Last diagnostics of the nodes, as far as they tell whether these are there and connected to each other."""
+
+    def __init__(self) -> None:
+        self._unconnected: dict[str, set[str]] = {}
+
+    def report(self, name: str, values: Mapping[str, str]) -> None:
+        """Diagnostic values of the node of this full name."""
+        self._unconnected[name] = set(values.get("unconnected", "").split())
+
+    def obstacles(self, names: Iterable[str], from_outside: Iterable[str] = ()) -> list[str]:
+        """Nodes that have not reported themselves, or lack a publisher of an input that is not ``from_outside``."""
+        found, outside = [], set(from_outside)
+        for name in names:
+            if name not in self._unconnected:
+                found.append(f"{name} has not reported itself")
+            elif lacking := self._unconnected[name] - outside:
+                found.append(f"{name} has no publisher of {', '.join(sorted(lacking))}")
+        return found
 
 
 class ReplayClock:

@@ -24,7 +24,6 @@ from stereo_frontend.frontend import MODES
 
 AUTO = "auto"
 _BOOLEANS = ("true", "false")
-_WAIT_FOR_SUBSCRIBERS_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,7 @@ def _for_bag(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
         mode = ("stereo" if has_stereo else "tof") if values["mode"] == AUTO else values["mode"]
         config = choose(system_config(overrides), mode, "sjsam", values["odometry"])
         map_path = values["map_path"] or "map"
-        graph = plan_nodes(config, bag.sensors, values["odometry"] != "none", map_path, overrides)
+        graph = plan_nodes(config, bag.sensors, values["odometry"] != "none", map_path, overrides, autosave=True)
     return LaunchPlan((*graph.specs, _player(path, graph, values)))
 
 
@@ -139,7 +138,8 @@ def _player(path: Path, graph: NodeGraph, values: Mapping[str, str]) -> NodeSpec
     parameters = {
         "bag": str(path), "rate": float(yaml.safe_load(values["rate"])), "topics": tuple(graph.played),
         "pace": graph.pace, "rename": tuple(f"{topic}={name}" for topic, name in graph.played.items() if name != topic),
-        "wait_for_subscribers": _WAIT_FOR_SUBSCRIBERS_S,
+        "wait_for_subscribers": 0.0, "nodes": tuple(command.full_name for command in graph.commands),
+        "subscribers": tuple(f"{name}=1" for name in graph.played.values()),
     }  # fmt: skip
     parameters = {name: value for name, value in parameters.items() if value != ()}
     return NodeSpec("slam_bringup", "bag_player", "", parameters)

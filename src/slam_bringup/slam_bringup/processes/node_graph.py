@@ -111,14 +111,16 @@ def plan_nodes(
     odometry: bool,
     map_path: str,
     overrides: Overrides | None = None,
+    *,
+    autosave: bool = False,
 ) -> NodeGraph:
-    """The nodes of a run over the agents of a bag."""
+    """The nodes of a run over the agents of a bag; ``autosave`` where nobody has the map saved at the end."""
     mode = config.feature_extractor.mode
     first = next(iter(sensors.values()))
     base_frames = {agent: sensor.base_frame for agent, sensor in sensors.items()}
     specs = live_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
-        extra=_bag_parameters(config, first, map_path), base_frames=base_frames, overrides=overrides,
+        extra=_bag_parameters(config, first, map_path, autosave), base_frames=base_frames, overrides=overrides,
         with_imu=[a for a, s in sensors.items() if "imu" in s.topics and config.ekf_slam.motion.imu != "off"],
         with_laser=[a for a, s in sensors.items() if s.scanner == "scan"],
     )  # fmt: skip
@@ -144,7 +146,9 @@ def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port
     return [model, page]
 
 
-def _bag_parameters(config: SystemConfig, sensor: AgentSensors, map_path: str) -> dict[str, dict[str, Any]]:
+def _bag_parameters(
+    config: SystemConfig, sensor: AgentSensors, map_path: str, autosave: bool
+) -> dict[str, dict[str, Any]]:
     """Parameters of the nodes that follow from a bag's topics."""
     pictures = [name for name in ("amplitude", "intensity") if name in sensor.topics]
     chosen = {0: "none", 2: "both"}.get(len(pictures)) or pictures[0]
@@ -156,7 +160,7 @@ def _bag_parameters(config: SystemConfig, sensor: AgentSensors, map_path: str) -
         "stereo_driver": {"compressed": True} if compressed else {},
         "tof_driver": {"measurement": sensor.measurement, "pictures": chosen},
         "feature_extractor": {"tof.images": pictures[0] if pictures else "range"} if chooses else {},
-        "sjsam": {"map_path": map_path, "autosave_period_s": 0.0},
+        "sjsam": {"map_path": map_path} | ({} if autosave else {"autosave_period_s": 0.0}),
     }
 
 

@@ -20,6 +20,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
+from slam_bringup.bags.pacing import Connections
 from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.ros import RosTypes, sensor_qos
 
@@ -56,6 +57,7 @@ class Supervisor:
         self.diagnostics: dict[str, dict[str, str]] = {}
         """Latest diagnostic values by full node name."""
         self._reports: Counter[str] = Counter()
+        self._connections = Connections()
         self.progress: Counter[str] = Counter()
         """Inputs processed so far by full node name."""
         self.submaps = 0
@@ -112,16 +114,8 @@ class Supervisor:
         self._check()
 
     def obstacles(self, names: Iterable[str], from_outside: Iterable[str]) -> list[str]:
-        """Nodes that have not reported themselves, or lack a publisher of an input that is not ``from_outside``."""
-        found = []
-        for name in names:
-            values = self.diagnostics.get(name)
-            lacking = set() if values is None else set(values.get("unconnected", "").split()) - set(from_outside)
-            if values is None:
-                found.append(f"{name} has not reported itself")
-            elif lacking:
-                found.append(f"{name} has no publisher of {', '.join(sorted(lacking))}")
-        return found
+        """As :meth:`Connections.obstacles`."""
+        return self._connections.obstacles(names, from_outside)
 
     def subscribers(self, topic: str) -> set[str]:
         """Names of the nodes that subscribe to a topic."""
@@ -160,6 +154,7 @@ class Supervisor:
             values = {entry.key: entry.value for entry in status.values}
             self.diagnostics[status.name] = values | {"message": status.message}
             self._reports[status.name] += 1
+            self._connections.report(status.name, values)
 
     def _on_progress(self, header: Any) -> None:
         self.progress[header.frame_id] += 1
