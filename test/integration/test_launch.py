@@ -70,7 +70,13 @@ def launched(*given: object) -> Iterator[Launch]:
 
 
 def test_the_launch_file_plays_the_demo_through_all_nodes(domain_environment: dict[str, str], tmp_path: Path) -> None:
-    options = ("mode:=fuse", "odometry:=ndt", "rate:=0", "set:=ekf_slam.submap.max_distance=1.0")
+    options = (
+        "mode:=fuse",
+        "odometry:=ndt",
+        "rate:=0",
+        f"map_path:={tmp_path / 'map'}",
+        "set:=ekf_slam.submap.max_distance=1.0",
+    )
     with launched(domain_environment, tmp_path, *options) as launch:
         launch.wait(lambda: "played" in launch.text)
         text = launch.text

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions of a sensor become motions of its rig; their covariances by Monte-Carlo."""
+"""Motions of a sensor become motions of its rig, and velocities; their covariances by Monte-Carlo."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from slam_core.geometry import boxminus, boxplus, invert_transform
-from slam_core.motion import motion_of_rig
+from slam_core.geometry import boxminus, boxplus, invert_transform, so3_exp
+from slam_core.motion import mean_twist, motion_of_rig
 from slam_core.types import RelativeMotion
 
 
@@ -23,3 +24,19 @@ def test_motion_and_covariance_of_the_rig(rng):
     measured = errors.T @ errors / len(errors)
     scale = np.sqrt(np.outer(np.diag(P), np.diag(P))).max()
     np.testing.assert_allclose(motion.covariance, measured, atol=0.05 * max(scale, np.abs(measured).max()))
+
+
+def test_velocity_and_covariance_of_a_motion(rng):
+    T = boxplus(np.eye(4), np.array([0.05, 0.01, -0.02, 0.1, 0.3, -0.6]))
+    A = rng.normal(size=(6, 6)) * 1e-3
+    P = A @ A.T
+    velocity, covariance = mean_twist(RelativeMotion(10**9, 10**9 + 2 * 10**8, T, P))
+    step = np.eye(4)
+    step[:3, :3], step[:3, 3] = so3_exp(velocity[3:] * 2e-6), velocity[:3] * 2e-6
+    np.testing.assert_allclose(np.linalg.matrix_power(step, 100_000), T, atol=1e-6)
+    samples = boxplus(T, rng.multivariate_normal(np.zeros(6), P, 20000))
+    twists = [mean_twist(RelativeMotion(0, 2 * 10**8, sample, P))[0] for sample in samples]
+    measured = np.cov(np.array(twists).T)
+    np.testing.assert_allclose(covariance, measured, atol=0.05 * np.abs(measured).max())
+    with pytest.raises(ValueError, match="take time"):
+        mean_twist(RelativeMotion(5, 5, T, P))

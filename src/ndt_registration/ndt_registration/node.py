@@ -31,6 +31,7 @@ from slam_core.messages import (
     stamp_ns,
 )
 from slam_core.messages.base import Message
+from slam_core.motion import mean_twist
 from slam_core.ros import run_node
 from slam_core.stage_node import StageNode
 from slam_core.types import AnyArray, PoseEstimate, RelativeMotion
@@ -114,7 +115,8 @@ class NdtNode(StageNode[NdtNodeConfig]):
         odom, base = self.config.odom_frame, self.config.base_frame
         self.path.append(pose)
         self.publish("ndt/motion", motion_message(self.types, base, pose.stamp_ns, motion))
-        self.publish("ndt/odometry", odometry_message(self.types, odom, base, pose))
+        twist = None if motion is None else mean_twist(motion)
+        self.publish("ndt/odometry", odometry_message(self.types, odom, base, pose, twist))
         if self.has_listeners("ndt/path"):
             self.publish("ndt/path", path_message(self.types, pose.stamp_ns, odom, self.path))
 

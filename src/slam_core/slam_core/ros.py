@@ -34,6 +34,7 @@ from slam_core.memory import share_one_heap
 from slam_core.messages import MessageTypes
 from slam_core.messages.base import Message
 from slam_core.process_life import end_with_parent, on_request_to_end
+from slam_core.tf_message import tf_message_class
 from slam_core.types import AnyArray
 
 C = TypeVar("C", bound=Config)
@@ -47,7 +48,9 @@ class RosTypes(MessageTypes):
     """Makes rclpy messages."""
 
     def load(self, package: str, name: str) -> Any:
-        """The message class."""
+        """The message class; without tf2_msgs, one whose messages are bytes."""
+        if package == "tf2_msgs" and not has_tf2_msgs():
+            return tf_message_class(self.TransformStamped)
         return getattr(importlib.import_module(f"{package}.msg"), name)
 
     def octets(self, values: AnyArray) -> Any:
@@ -146,10 +149,10 @@ def has_tf2_msgs() -> bool:
 
 
 def message_class(type_name: str) -> Any:
-    """The class of ``package/msg/Name``, or None where the package is not installed."""
+    """The class of ``package/msg/Name``, to send and receive bytes, or None where the package is not installed."""
     package, _, name = type_name.split("/")
     try:
-        return getattr(importlib.import_module(f"{package}.msg"), name)
+        return RosTypes().load(package, name)
     except (ImportError, AttributeError):
         return None
 

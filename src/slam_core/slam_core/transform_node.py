@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node's transforms: static ones in, ``/tf`` out where tf2_msgs is installed."""
+"""A node's transforms: static ones in, ``/tf`` out."""
 
 # rclpy is annotated in part only.
 # mypy: allow-untyped-calls, disable-error-code="attr-defined,union-attr,arg-type,misc"
@@ -15,6 +15,7 @@ from slam_core.listening_node import LATCHED_DEPTH, ListeningNode
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC, transform_from_message
 from slam_core.messages.base import Message
 from slam_core.ros import RosTypes, has_tf2_msgs, sensor_qos
+from slam_core.tf_message import transforms_from_octets
 
 
 class TransformNode(ListeningNode):
@@ -32,7 +33,7 @@ class TransformNode(ListeningNode):
         return self.frames.lookup(target, source)
 
     def broadcast(self, *transforms: Message) -> None:
-        """Send TransformStamped messages on /tf where tf2_msgs is installed."""
+        """Send TransformStamped messages on /tf."""
         if self._tf is not None:
             self._tf.publish(self._ros_types.TFMessage(transforms=as_ros(list(transforms))))
 
@@ -50,13 +51,19 @@ class TransformNode(ListeningNode):
         self._static_inputs = [
             self.create_subscription(kind, STATIC_TRANSFORMS_TOPIC, self._on_static_transform, profile)
         ]
-        if has_tf2_msgs():
+        if (kind := self._tf_class()) is not None:
             self._static_inputs.append(
-                self.create_subscription(self._ros_types.TFMessage, "/tf_static", self._on_tf_static, profile)
+                self.create_subscription(kind, "/tf_static", self._on_tf_static, profile, raw=not has_tf2_msgs())
             )
 
     def _on_tf_static(self, message: Message) -> None:
-        for transform in message.transforms:
+        try:
+            is_raw = isinstance(message, bytes)
+            transforms = transforms_from_octets(self._ros_types, message) if is_raw else message.transforms
+        except ValueError as error:
+            self._reject(f"/tf_static: message rejected: {error}")
+            return
+        for transform in transforms:
             self._on_static_transform(transform)
 
     def _on_static_transform(self, message: Message) -> None:
@@ -66,7 +73,12 @@ class TransformNode(ListeningNode):
             self._reject(f"static transform rejected: {error}")
 
     def _advertise_tf(self) -> Any:
-        if has_tf2_msgs():
-            return self.create_publisher(self._ros_types.TFMessage, "/tf", sensor_qos(100))
-        self.get_logger().info("tf2_msgs is not installed: transforms are published as TransformStamped topics only")
-        return None
+        kind = self._tf_class()
+        return None if kind is None else self.create_publisher(kind, "/tf", sensor_qos(100))
+
+    def _tf_class(self) -> Any:
+        try:
+            return self._ros_types.TFMessage
+        except ImportError as error:
+            self.get_logger().warning(f"{error}: transforms are published as TransformStamped topics only", once=True)
+            return None

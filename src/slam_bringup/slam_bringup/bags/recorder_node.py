@@ -25,7 +25,7 @@ from slam_bringup.bags.pacing import header_stamp_ns
 from slam_bringup.bags.recording_clock import RecordingClock, has_header, topic_name
 from slam_bringup.bags.tf_recording import transform_topic, transforms_of
 from slam_core.config import Config, parameter
-from slam_core.ros import declare_config, has_tf2_msgs, message_class, run_node, sensor_qos
+from slam_core.ros import declare_config, message_class, run_node, sensor_qos
 
 _DEPTH = 1000
 _DISCOVERY_PERIOD_S = 0.2
@@ -96,11 +96,11 @@ class RecorderNode(Node):
 
     def _callback(self, topic: str, type_name: str) -> Any:
         is_frame = has_header(type_name) and type_name not in _OTHER_CLOCK and topic_name(topic) not in LATCHED_TOPICS
-        carried = None if has_tf2_msgs() else transform_topic(topic)
+        carried = transform_topic(topic)
 
         def write(data: bytes, stamp: int) -> None:
             self._writer.write_raw(topic, type_name, data, stamp)
-            if carried is not None:
+            if carried is not None and carried not in self._known:
                 message = typestore().deserialize_cdr(data, type_name)
                 self._writer.write(carried, transforms_of(message), stamp)
 

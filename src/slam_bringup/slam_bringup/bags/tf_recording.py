@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Transforms for a recording made without tf2_msgs: /tf and /tf_static from the topics that carry the same.
-
-tf2_msgs has no wheel on PyPI, so in a pip installation the nodes publish TransformStamped only; the bag gets /tf
-anyway, because every viewer needs it.
-"""
+"""Transforms for a recording without /tf or /tf_static, from topics that carry the same: every viewer needs them."""
 
 from __future__ import annotations
 

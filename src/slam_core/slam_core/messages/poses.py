@@ -19,7 +19,9 @@ FASTEST_RAD_S, STRONGEST_M_S2 = 1e3, 1e5
 """Beyond what an IMU can measure."""
 
 STATIC_TRANSFORMS_TOPIC = "/static_transforms"
-"""TransformStamped, latched, one message per transform: /tf_static for installations without tf2_msgs."""
+"""TransformStamped, latched, one message per transform: /tf_static for whoever has no tf2_msgs."""
+
+_UNKNOWN_VARIANCE = 1e6  # of a velocity, m2/s2 and rad2/s2
 
 
 def pose_message(types: MessageTypes, T: FloatArray) -> Message:
@@ -54,8 +56,8 @@ def odometry_message(
 ) -> Message:
     """nav_msgs/Odometry of T_frame_child.
 
-    ``twist``: linear m/s and angular rad/s (6,) in the child frame, and its covariance (6, 6); marked unknown
-    (covariance -1) where there is none.
+    ``twist``: linear m/s and angular rad/s (6,) in the child frame, and its covariance (6, 6); where there is none,
+    zero with variances of 1e6, since readers such as robot_localization take whatever variance they find.
     """
     return types.Odometry(
         header=header_message(types, estimate.stamp_ns, frame_id), child_frame_id=child_frame_id,
@@ -64,11 +66,7 @@ def odometry_message(
 
 
 def _twist(types: MessageTypes, twist: tuple[FloatArray, FloatArray] | None) -> Message:
-    if twist is None:
-        unknown = np.zeros(36)
-        unknown[0] = -1.0
-        return types.TwistWithCovariance(covariance=unknown)
-    velocity, covariance = twist
+    velocity, covariance = (np.zeros(6), _UNKNOWN_VARIANCE * np.eye(6)) if twist is None else twist
     parts = types.Twist(linear=_vector(types, velocity[:3]), angular=_vector(types, velocity[3:]))
     return types.TwistWithCovariance(twist=parts, covariance=np.asarray(covariance, dtype=np.float64).ravel())
 
