@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import os
 import signal
@@ -39,9 +40,11 @@ def end_with_parent() -> None:
 def on_request_to_end(handler: _Handler) -> dict[signal.Signals, object]:
     """Install ``handler`` for SIGINT, SIGTERM and SIGHUP; returns what was there before.
 
-    A hang-up that is ignored stays so: that is what ``nohup`` asks for.
+    A hang-up that is ignored stays so: that is what ``nohup`` asks for. While Python ends all are ignored: a terminal
+    and ``ros2 launch`` each send one, and the second would kill a process that has put its handler away.
     """
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
+    atexit.register(lambda: [signal.signal(number, signal.SIG_IGN) for number in numbers])
     return {number: signal.signal(number, handler) for number in numbers}
