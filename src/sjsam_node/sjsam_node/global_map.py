@@ -51,21 +51,20 @@ SMALLEST_VARIANCE = 1e-15
 class GlobalMapConfig(Config):
     """The joined map."""
 
-    unlinked_sigma: float = parameter(
-        100.0, "standard deviation given to poses of a stretch that nothing ties to the map yet", unit="m", minimum=1.0
-    )
-    compared_at_once: int = parameter(
-        2, "pairs of submaps that a closure has brought near each other, compared with each new submap", minimum=0
-    )
-    compared_at_settling: int = parameter(2, "the same per submap when the map settles", minimum=0)
-    joined_at_once: int = parameter(
-        12, "closures found when the map settles that are joined, and refused, together", minimum=1
-    )
+    unlinked_sigma: float = 100.0
+    """Standard deviation given to poses of a stretch that nothing ties to the map yet (m)."""
+    compared_at_once: int = 2
+    """Pairs of submaps that a closure has brought near each other, compared with each new submap."""
+    compared_at_settling: int = 2
+    """The same per submap when the map settles."""
+    joined_at_once: int = 12
+    """Closures found when the map settles that are joined, and refused, together."""
     ties: int = parameter(8, "landmarks by which two submaps are tied together, at most", minimum=3)
     redundant_share: float = parameter(
         0.6, "share of a submap's landmarks that closures match from which on it shows nothing new", minimum=0.0
     )
-    redundant_matches: int = parameter(24, "least number of these landmarks", minimum=3)
+    redundant_matches: int = 24
+    """Least number of these landmarks."""
     smoothing: SmootherConfig = group(SmootherConfig)
     closure: ClosureConfig = group(ClosureConfig)
     consistency: ConsistencyConfig = group(ConsistencyConfig)

@@ -161,10 +161,17 @@ def _can_be_set(config: Config, name: str) -> bool:
     return "parameter" in info or isinstance(getattr(config, name), Config)
 
 
+def is_fixed_now(config: Config, name: str) -> bool:
+    """True if a dotted name was a parameter of a configuration once and is a constant now."""
+    head, _, rest = name.partition(".")
+    inner = getattr(config, head, None)
+    return is_fixed(type(config), head) or (isinstance(inner, Config) and bool(rest) and is_fixed_now(inner, rest))
+
+
 def _unknown(config: Config, name: str) -> str:
     kind, known = type(config), [f.name for f in dataclasses.fields(config) if _can_be_set(config, f.name)]
     if is_fixed(kind, name):
-        return f"parameter '{name}' of {kind.__name__} is fixed now and cannot be set: leave it out"
+        return f"parameter '{name}' of {kind.__name__} is fixed now: remove it"
     near = difflib.get_close_matches(name, known, 1)
     hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(sorted(known))}"
     return f"unknown parameter '{name}' of {kind.__name__}{hint}"

@@ -55,6 +55,18 @@ FIXED = {
     "TsdfConfig": "truncation_voxels",
     "SurfaceConfig": "min_images sigma_floor correlation min_triangles",
     "FloorPlanConfig": "clear_below min_points min_rays ray_step storey_height max_cells",
+    "GlobalMapConfig": "unlinked_sigma compared_at_once compared_at_settling joined_at_once redundant_matches",
+    "SmootherConfig": "settled_work",
+    "EstimatorConfig": "iterations relative_tolerance live_tolerance live_iterations",
+    "RobustConfig": "probability",
+    "RegionConfig": "open quiet relinearize",
+    "ClosureConfig": (
+        "near_candidates least_news alike_candidates informative_sigma ratio place_threshold "
+        "ransac_distance min_near_inliers min_spread min_overlap confirmations probability"
+    ),
+    "AssociationConfig": "probability max_variance_factor joint_pairs position_noise",
+    "PlaceRecognitionConfig": "branching depth training_descriptors proposals",
+    "ConsistencyConfig": "outlier_probability outlier_share rounds settling_rounds view_change retry waiting",
 }
 """Names by class of the configuration; a group that is gone stands for all its parameters."""
 

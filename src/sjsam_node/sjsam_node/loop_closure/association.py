@@ -32,20 +32,15 @@ class AssociationConfig(Config):
     descriptor_threshold: float = parameter(
         0.6, "least scalar product of two descriptors (7.5)", minimum=-1.0, maximum=1.0
     )
-    probability: float = parameter(
-        0.999, "share of true pairs inside a chi-square gate", minimum=0.5, maximum=0.9999999
-    )
+    probability: float = 0.999
+    """Share of true pairs inside a chi-square gate."""
     nearest_gate: float = parameter(0.3, "distance below which the nearest neighbour is taken", unit="m", minimum=0.0)
-    max_variance_factor: float = parameter(
-        16.0, "submaps too sure of themselves by up to this factor are matched all the same", minimum=1.0
-    )
-    joint_pairs: int = parameter(
-        64, "pairs that are tested together; where there are more, the others are tested against what these say",
-        minimum=3,
-    )  # fmt: skip
-    position_noise: float = parameter(
-        0.005, "standard deviation added to each landmark when gating: submaps are linearised", unit="m", minimum=0.0
-    )
+    max_variance_factor: float = 16.0
+    """Submaps too sure of themselves by up to this factor are matched all the same."""
+    joint_pairs: int = 64
+    """Pairs that are tested together; where there are more, the others are tested against what these say."""
+    position_noise: float = 0.005
+    """Standard deviation added to each landmark when gating: submaps are linearised (m)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,30 +37,28 @@ _RELIEF = 0.5
 class ConsistencyConfig(Config):
     """Conditions on a joined map for a closure to be held."""
 
-    outlier_probability: float = parameter(
-        0.99999, "share of true matches that a joined map keeps", minimum=0.9, maximum=0.99999999
-    )
-    outlier_share: float = parameter(
-        0.1, "largest share of a submap's matches that are let go at once", minimum=0.0, maximum=1.0
-    )
-    rounds: int = parameter(1, "updates that a submap may cost beyond its first, to let closures go", minimum=0)
-    settling_rounds: int = parameter(6, "the same when the map settles", minimum=0)
+    outlier_probability: float = 0.99999
+    """Share of true matches that a joined map keeps."""
+    outlier_share: float = 0.1
+    """Largest share of a submap's matches that are let go at once."""
+    rounds: int = 1
+    """Updates that a submap may cost beyond its first, to let closures go."""
+    settling_rounds: int = 6
+    """The same when the map settles."""
     closure_probability: float = parameter(
         0.9999, "share of true closures whose rise of chi2 is accepted", minimum=0.9, maximum=0.9999999
     )
-    view_change: float = parameter(
-        2.0, "how much larger squared errors of matches from another view are than those in a whole map", minimum=1.0
-    )
+    view_change: float = 2.0
+    """How much larger squared errors of matches from another view are than those in a whole map."""
     max_variance_factor: float = parameter(
         16.0,
         "a map whose submaps seem too sure of themselves by more than this factor holds false closures",
         minimum=1.0,
     )
-    retry: float = parameter(
-        1.2, "how many times the landmarks of closures that were refused must speak for them to be tried again",
-        minimum=1.0,
-    )  # fmt: skip
-    waiting: int = parameter(40, "refused closures that are remembered", minimum=1)
+    retry: float = 1.2
+    """How many times the landmarks of closures that were refused must speak for them to be tried again."""
+    waiting: int = 40
+    """Refused closures that are remembered."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,10 +25,14 @@ Descriptors = npt.NDArray[np.float32]
 class PlaceRecognitionConfig(Config):
     """The vocabulary and how many places are looked at."""
 
-    branching: int = parameter(10, "children of a node of the vocabulary tree", minimum=2)
-    depth: int = parameter(3, "levels of the vocabulary tree", minimum=1, maximum=6)
-    training_descriptors: int = parameter(1500, "descriptors from which the tree is grown", minimum=10)
-    proposals: int = parameter(5, "times as many places as are checked that the vocabulary proposes", minimum=1)
+    branching: int = 10
+    """Children of a node of the vocabulary tree."""
+    depth: int = 3
+    """Levels of the vocabulary tree."""
+    training_descriptors: int = 1500
+    """Descriptors from which the tree is grown."""
+    proposals: int = 5
+    """Times as many places as are checked that the vocabulary proposes."""
     candidates: int = parameter(6, "best ranked submaps that are proposed", minimum=1)
 
 

@@ -37,37 +37,35 @@ class ClosureConfig(Config):
     proximity: float = parameter(
         3.0, "distance between the middles of submaps that are tried as near", unit="m", minimum=0.0
     )
-    near_candidates: int = parameter(3, "near submaps tried per new one", minimum=0)
-    least_news: float = parameter(
-        0.1, "share of a submap's landmarks that a near one must tell of for the next to be tried", minimum=0.0
-    )
-    alike_candidates: int = parameter(2, "submaps that look alike tried per new one", minimum=0)
-    informative_sigma: float = parameter(
-        0.5, "largest standard deviation of a relative position that can tell two places apart", unit="m", minimum=0.0
-    )
+    near_candidates: int = 3
+    """Near submaps tried per new one."""
+    least_news: float = 0.1
+    """Share of a submap's landmarks that a near one must tell of for the next to be tried."""
+    alike_candidates: int = 2
+    """Submaps that look alike tried per new one."""
+    informative_sigma: float = 0.5
+    """Largest standard deviation of a relative position that can tell two places apart (m)."""
     drift: float = parameter(
         0.01, "drift of odometry to expect beyond its covariance, per metre of way, one sigma", unit="m/m", minimum=0.0
     )
     drift_angle: float = parameter(0.003, "the same for rotation", unit="rad/m", minimum=0.0)
-    ratio: float = parameter(
-        0.9, "second best to best angle of descriptors, where no prior helps", minimum=0.1, maximum=1.0
-    )
-    place_threshold: float = parameter(0.7, "least scalar product of descriptors, where no prior helps", maximum=1.0)
-    ransac_distance: float = parameter(
-        0.15, "largest distance of an inlier of the first alignment", unit="m", minimum=0.001
-    )
-    min_near_inliers: int = parameter(5, "least matches of a link to a near submap", minimum=3)
+    ratio: float = 0.9
+    """Second best to best angle of descriptors, where no prior helps."""
+    place_threshold: float = 0.7
+    """Least scalar product of descriptors, where no prior helps."""
+    ransac_distance: float = 0.15
+    """Largest distance of an inlier of the first alignment (m)."""
+    min_near_inliers: int = 5
+    """Least matches of a link to a near submap."""
     min_inliers: int = parameter(10, "least matches of a link to a submap found by its looks", minimum=3)
-    min_spread: float = parameter(
-        0.25, "least second-largest standard deviation of the matched landmarks", unit="m", minimum=0.0
-    )
-    min_overlap: float = parameter(
-        0.3, "least share of the landmarks expected in both that match", minimum=0.0, maximum=1.0
-    )
-    confirmations: int = parameter(2, "links that must agree where the map cannot judge", minimum=1)
-    probability: float = parameter(
-        0.9999, "share of true closures inside the chi-square gate", minimum=0.9, maximum=0.9999999
-    )
+    min_spread: float = 0.25
+    """Least second-largest standard deviation of the matched landmarks (m)."""
+    min_overlap: float = 0.3
+    """Least share of the landmarks expected in both that match."""
+    confirmations: int = 2
+    """Links that must agree where the map cannot judge."""
+    probability: float = 0.9999
+    """Share of true closures inside the chi-square gate."""
     seed: int = parameter(1, "seed of the random samples", minimum=0)
     association: AssociationConfig = group(AssociationConfig)
     places: PlaceRecognitionConfig = group(PlaceRecognitionConfig)

@@ -34,15 +34,15 @@ class EstimatorConfig(Config):
     rows: str = parameter(
         "joint", "noise of a submap: its joint covariance, or per landmark", choices=("joint", "block")
     )
-    iterations: int = parameter(30, "Gauss-Newton iterations per closure; 1 is Algorithm 4 as written", minimum=1)
+    iterations: int = 30
+    """Gauss-Newton iterations per closure; 1 is Algorithm 4 as written."""
     solver: str = parameter("auto", "sparse solver", choices=BACKENDS)
-    relative_tolerance: float = parameter(
-        1e-9, "stop when a step promises to lower chi2 by less than this share", minimum=0.0
-    )
-    live_tolerance: float = parameter(
-        1e-4, "the same while submaps come in; the map is brought to its optimum when it settles", minimum=0.0
-    )
-    live_iterations: int = parameter(6, "iterations of an update while submaps come in, at most", minimum=1)
+    relative_tolerance: float = 1e-9
+    """Stop when a step promises to lower chi2 by less than this share."""
+    live_tolerance: float = 1e-4
+    """The same while submaps come in; the map is brought to its optimum when it settles."""
+    live_iterations: int = 6
+    """Iterations of an update while submaps come in, at most."""
     robust: RobustConfig = group(RobustConfig)
 
     @property

@@ -40,11 +40,12 @@ class RegionConfig(Config):
     """Parameters of condensing: which submaps are joined to larger ones until a closure needs them."""
 
     size: int = parameter(96, "submaps that are joined to a larger one, at most", minimum=2)
-    open: int = parameter(64, "submaps of a component that take part in each update one by one, about", minimum=2)
-    quiet: int = parameter(10, "submaps that came since one was needed, before it may be joined to others", minimum=0)
-    relinearize: float = parameter(
-        0.002, "turn of a region's separator since it was linearised beyond which it is opened", unit="rad", minimum=0.0
-    )
+    open: int = 64
+    """Submaps of a component that take part in each update one by one, about."""
+    quiet: int = 10
+    """Submaps that came since one was needed, before it may be joined to others."""
+    relinearize: float = 0.002
+    """Turn of a region's separator since it was linearised beyond which it is opened (rad)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,12 +39,8 @@ class RobustConfig(Config):
     """Treatment of closures that the rest of the map contradicts."""
 
     loss: str = parameter("none", "loss of rows that close something", choices=LOSSES)
-    probability: float = parameter(
-        0.9999,
-        "share of true rows that are kept; their bound is the scale of the loss",
-        minimum=0.5,
-        maximum=0.99999999,
-    )
+    probability: float = 0.9999
+    """Share of true rows that are kept; their bound is the scale of the loss."""
 
 
 def weight(loss: str, nis: float, bound: float) -> float:

@@ -24,7 +24,7 @@ from sjsam_node.smoothing.estimator import Assembled, Estimator, EstimatorConfig
 from sjsam_node.smoothing.marginals import ComponentMarginals, prior_of_pair, relative_pose, seen_from
 from sjsam_node.smoothing.parking import Parked, anchor_of, is_tied
 from sjsam_node.smoothing.regions import Region, RegionConfig, Regions
-from slam_core.config import Config, group, parameter
+from slam_core.config import Config, group
 from slam_core.geometry import FloatArray, compose_covariance
 
 
@@ -32,10 +32,8 @@ from slam_core.geometry import FloatArray, compose_covariance
 class SmootherConfig(Config):
     """Parameters of keeping the estimate."""
 
-    settled_work: float = parameter(
-        3e7, "entries of the submaps' information matrices up to which a map settles with all its landmarks",
-        minimum=0.0,
-    )  # fmt: skip
+    settled_work: float = 3e7
+    """Entries of the submaps' information matrices up to which a map settles with all its landmarks."""
     estimator: EstimatorConfig = group(EstimatorConfig)
     region: RegionConfig = group(RegionConfig)
 

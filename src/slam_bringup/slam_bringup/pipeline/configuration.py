@@ -24,7 +24,7 @@ from slam_bringup.pipeline.overrides import (
     require_known_nodes,
     require_known_parameters,
 )
-from slam_core.config import Config, from_mapping, group, iterate_parameters
+from slam_core.config import Config, from_mapping, group, is_fixed_now, iterate_parameters
 from stereo_frontend.frontend import FrontendConfig
 from tof_driver.depth import DepthConfig
 
@@ -74,7 +74,9 @@ def system_config(overrides: Overrides) -> SystemConfig:
     known = {name: {parameter for parameter, _, _ in iterate_parameters(config)} for name, config in groups.items()}
     for name in overrides.of_all:
         if not any(name in k for k in known.values()) and not any(is_parameter_of(n, name) for n in NODE_CONFIGS):
-            raise ValueError(f"{overrides.origin}: no node has a parameter '{name}'")
+            is_old = any(is_fixed_now(config, name) for config in groups.values())
+            problem = f"parameter '{name}' is fixed now: remove it" if is_old else f"no node has a parameter '{name}'"
+            raise ValueError(f"{overrides.origin}: {problem}")
     for node in NODE_CONFIGS.keys() - groups.keys():
         require_known_parameters(overrides, node)
     parsed: dict[str, Any] = {name: _group(name, type(groups[name]), known[name], overrides) for name in groups}
