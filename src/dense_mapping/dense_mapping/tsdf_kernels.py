@@ -7,16 +7,16 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 from slam_core.types import ByteArray, Float32Array
 
 BLOCK = 8
 """Voxels along the edge of a block."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@in_place(error_model="numpy")
 def _look_up(u: float, v: float, depth: Float32Array, jump: float) -> float:  # pragma: no cover - compiled
     """Depth at a pixel, bilinear where the four neighbours belong to one surface, else of the nearest; 0: none."""
     height, width = depth.shape
@@ -32,7 +32,7 @@ def _look_up(u: float, v: float, depth: Float32Array, jump: float) -> float:  # 
     return float(depth[int(v + 0.5), int(u + 0.5)])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@in_place(error_model="numpy")
 def integrate(
     blocks: npt.NDArray[np.int64],
     origins: FloatArray,
@@ -111,7 +111,7 @@ def integrate(
                 _blend(colours[b, i], picture[row, column])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@in_place(error_model="numpy")
 def _blend(mean: ByteArray, colour: ByteArray) -> None:  # pragma: no cover - compiled
     """Take one more colour into a mean over at most 16: bytes could not follow a longer one."""
     count = min(int(mean[3]) + 1, 16)

@@ -16,10 +16,10 @@ On simulated images of exact cameras neighbours share nothing, and the error is 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from ekf_slam_node.models import Frame
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 from slam_core.least_squares import MAD_TO_SIGMA
 
 _NEIGHBOURS = 0.1
@@ -76,7 +76,7 @@ class CommonError:
         return np.repeat([angle * distance, angle], 3)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _shared_by_neighbours(pixels, residuals, reach):  # type: ignore[no-untyped-def]
     """Sum, over all pairs of pixels (n, 2) nearer than ``reach``, of the residuals' mean product; number of pairs."""
     total, pairs = 0.0, 0

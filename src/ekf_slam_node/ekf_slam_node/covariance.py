@@ -13,6 +13,7 @@ from numba import njit
 from scipy.linalg import lapack
 
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 from slam_core.linear_algebra import blas
 
 IndexArray = npt.NDArray[np.int64]
@@ -20,7 +21,7 @@ _GROWTH = 1.4
 """Room for so much larger a state is taken when it runs out."""
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _gather_columns(P, index, size, out):  # type: ignore[no-untyped-def]
     """``out[:size, k] = P[:size, index[k]]`` of the symmetric matrix whose lower triangle is P's."""
     for k in range(len(index)):
@@ -46,7 +47,7 @@ def _cross_covariance(P, size, core, J_pose, J_point, rows, out):  # type: ignor
             _combine(x, y, z, core, J_point[k, m], J_pose[k, m], out[:, 3 * k + m])
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _combine(x, y, z, core, a, b, out):  # type: ignore[no-untyped-def]
     a0, a1, a2, b0, b1, b2, b3, b4, b5 = a[0], a[1], a[2], b[0], b[1], b[2], b[3], b[4], b[5]
     for i in range(len(x)):

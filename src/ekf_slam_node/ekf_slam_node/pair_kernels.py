@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +75,7 @@ def pair_errors(points, covariances, z, variance, T, centre, lens, error, S, J, 
             S[n, i, i] += variance[n, i]
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _factor(S, scale, L):  # type: ignore[no-untyped-def]
     """Lower Cholesky factor of S scaled by rows and columns."""
     L[0, 0] = np.sqrt(S[0, 0]) * scale[0]

@@ -14,6 +14,7 @@ from numba import njit
 
 from ndt_registration.visibility import MEAN_BIN, direction_bin
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 
 Int32Array = npt.NDArray[np.int32]
 
@@ -48,7 +49,7 @@ def _sorted_by_bin(points: FloatArray, size: int) -> tuple[FloatArray, FloatArra
     return directions, ranges, sorted_bins, first
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _nearest_behind(
     i: int, size: int, reach: float, step: float, d: FloatArray, r: FloatArray, bins: Int32Array, first: Int32Array
 ) -> int:
@@ -66,7 +67,7 @@ def _nearest_behind(
     return best
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _surface_goes_on(
     i: int, behind: int, size: int, step: float, d: FloatArray, r: FloatArray, bins: Int32Array, first: Int32Array
 ) -> bool:
@@ -91,8 +92,18 @@ def _surface_goes_on(
 def _rims(points: FloatArray, size: int, reach: float, step: float) -> FloatArray:
     d, r, bins, first = _sorted_by_bin(points, size)
     out = np.empty((points.shape[0], 3))
+    used = _find_rims(size, reach, step, d, r, bins, first, out)
+    return out[:used].copy()
+
+
+@in_place()
+def _find_rims(
+    size: int, reach: float, step: float, d: FloatArray, r: FloatArray, bins: Int32Array, first: Int32Array,
+    out: FloatArray,
+) -> int:  # fmt: skip
+    """Write the rims to ``out``; returns their number."""
     used = 0
-    for i in range(points.shape[0]):
+    for i in range(len(r)):
         behind = _nearest_behind(i, size, reach, step, d, r, bins, first)
         if behind < 0 or _surface_goes_on(i, behind, size, step, d, r, bins, first):
             continue
@@ -100,7 +111,7 @@ def _rims(points: FloatArray, size: int, reach: float, step: float) -> FloatArra
         for c in range(3):
             out[used, c] = 0.5 * r[i] * (d[i, c] + d[behind, c])
         used += 1
-    return out[:used].copy()
+    return used
 
 
 def rim_points(points: FloatArray, spacing: float, step: float) -> FloatArray:

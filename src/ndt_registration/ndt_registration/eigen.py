@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 
 _NEARLY_EQUAL = 1e-6
 """One less the cosine that shows two equal eigenvalues, below which the closed form loses digits."""
@@ -17,7 +18,7 @@ _LEAST_RADIUS = 1e-90
 """Spread of the eigenvalues whose cube is still a number."""
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def symmetric_eigen3(a: FloatArray, vectors: FloatArray, values: FloatArray) -> None:
     """Eigenvalues (ascending) and eigenvectors (columns) of a symmetric matrix, shape (3, 3).
 
@@ -48,7 +49,7 @@ def symmetric_eigen3(a: FloatArray, vectors: FloatArray, values: FloatArray) -> 
         vectors[i, 1] = vectors[j, 2] * vectors[k, 0] - vectors[k, 2] * vectors[j, 0]
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _null_vector(a: FloatArray, value: float, out: FloatArray) -> None:
     """Unit vector that ``a - value I`` (3, 3) of rank two maps to zero: the longest cross product of its rows."""
     longest = -1.0
@@ -69,14 +70,14 @@ def _null_vector(a: FloatArray, value: float, out: FloatArray) -> None:
     _normalise(out)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _normalise(v: FloatArray) -> None:
     length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     for i in range(3):
         v[i] /= length
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _jacobi_eigen3(a: FloatArray, vectors: FloatArray, values: FloatArray) -> None:
     """The same by cyclic Jacobi rotations."""
     for i in range(3):
@@ -94,7 +95,7 @@ def _jacobi_eigen3(a: FloatArray, vectors: FloatArray, values: FloatArray) -> No
     _sort3(vectors, values)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _rotate3(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
     if a[p, q] == 0.0:
         return
@@ -115,7 +116,7 @@ def _rotate3(a: FloatArray, vectors: FloatArray, p: int, q: int) -> None:
         vectors[k, p], vectors[k, q] = c * kp - s * kq, s * kp + c * kq
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _sort3(vectors: FloatArray, values: FloatArray) -> None:
     for i in range(2):
         low = i

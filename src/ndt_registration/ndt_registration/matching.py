@@ -11,6 +11,7 @@ from numba import njit
 from ndt_registration.ndt import Layer
 from ndt_registration.voxel_grid import NormalGrid, find_block
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 
 
 class Fit(NamedTuple):
@@ -83,12 +84,32 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
 
     A point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m of its plane.
     """
-    n = points.shape[0]
     hessian_moments, majorant_moments = np.zeros(10), np.zeros(10)
+    inliers, squares, cx, cy, cz, second = _sums_of_fit(
+        points, R, t, grid, max_distance, hessian_moments, majorant_moments
+    )
+    centre = np.array([cx, cy, cz]) / max(inliers, 1)
+    radius = np.sqrt(max(second / max(inliers, 1) - (centre * centre).sum(), 1e-12))
+    return Fit(
+        inliers / max(points.shape[0], 1),
+        np.sqrt(squares / max(inliers, 1)),
+        centre,
+        radius,
+        _hessian_of_weights(hessian_moments),
+        _hessian_of_weights(majorant_moments),
+    )
+
+
+@in_place()
+def _sums_of_fit(points, R, t, grid, max_distance, hessian_moments, majorant_moments):  # type: ignore[no-untyped-def]
+    """Number of inliers, the sum of their squared distances, of their coordinates (three) and of these squared.
+
+    Adds to the moments (10,) of both weights.
+    """
     inliers = 0
     squares = 0.0
     cx = cy = cz = second = 0.0
-    for i in range(n):
+    for i in range(points.shape[0]):
         px = R[0, 0] * points[i, 0] + R[0, 1] * points[i, 1] + R[0, 2] * points[i, 2]
         py = R[1, 0] * points[i, 0] + R[1, 1] * points[i, 1] + R[1, 2] * points[i, 2]
         pz = R[2, 0] * points[i, 0] + R[2, 1] * points[i, 1] + R[2, 2] * points[i, 2]
@@ -128,27 +149,24 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
             continue
         _add_moments(px, py, pz, majorant_weight, majorant_moments)
         _add_moments(px, py, pz, hessian_weight, hessian_moments)
-    centre = np.array([cx, cy, cz]) / max(inliers, 1)
-    radius = np.sqrt(max(second / max(inliers, 1) - (centre * centre).sum(), 1e-12))
-    rmse = np.sqrt(squares / max(inliers, 1))
-    return Fit(
-        inliers / max(n, 1),
-        rmse,
-        centre,
-        radius,
-        _hessian_of_weights(hessian_moments),
-        _hessian_of_weights(majorant_moments),
-    )
+    return inliers, squares, cx, cy, cz, second
 
 
 @njit(cache=True, nogil=True)
 def block_gradients(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
     """Gradient (b, 6) of the cost of one layer at a pose, summed over each of the grid's blocks, half a cell's edge."""
-    grid, n = layer.grid, layer.points.shape[0]
-    gradients = np.zeros((grid.cells.shape[0], 6))
-    touched = np.zeros(grid.cells.shape[0], np.bool_)
+    blocks = layer.grid.cells.shape[0]
+    gradients, touched = np.zeros((blocks, 6)), np.zeros(blocks, np.bool_)
+    _add_gradients(layer, R, t, gradients, touched)
+    return gradients[touched]
+
+
+@in_place()
+def _add_gradients(layer, R, t, gradients, touched):  # type: ignore[no-untyped-def]
+    """Add to the gradients (b, 6) of all blocks, and mark those that hold points."""
+    grid = layer.grid
     s = 1.0 / grid.block_size
-    for i in range(n):
+    for i in range(layer.points.shape[0]):
         x, y, z = layer.points[i, 0], layer.points[i, 1], layer.points[i, 2]
         px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
         py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
@@ -174,4 +192,3 @@ def block_gradients(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
         gradients[row, 3] += py * vz - pz * vy
         gradients[row, 4] += pz * vx - px * vz
         gradients[row, 5] += px * vy - py * vx
-    return gradients[touched]

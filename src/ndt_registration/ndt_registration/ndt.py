@@ -24,6 +24,7 @@ from numba import njit
 from ndt_registration.eigen import cholesky_solve6
 from ndt_registration.voxel_grid import NormalGrid, find_block
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 
 Int32Array = npt.NDArray[np.int32]
 
@@ -45,11 +46,13 @@ class Neighbours(NamedTuple):
     """Cells around each of n points, from the last evaluation.
 
     block (n, 4): integer coordinates of the block and its row in the grid, -1 where there is none. cells (n, 10, 8):
-    mean from the block's corner (3), information (6) and 1 for each of eight cells, 0 where there is none.
+    mean from the block's corner (3), information (6) and 1 for each of eight cells, 0 where there is none. sums (16,):
+    room for those of one point.
     """
 
     block: Int32Array
     cells: FloatArray
+    sums: FloatArray
 
 
 class NdtOptimum(NamedTuple):
@@ -72,10 +75,10 @@ class NdtOptimum(NamedTuple):
 @njit(cache=True, nogil=True)
 def no_neighbours(points: int) -> Neighbours:
     """Room for so many points, none of them looked up yet."""
-    return Neighbours(np.full((points, 4), _NOWHERE, np.int32), np.empty((points, 10, 8)))
+    return Neighbours(np.full((points, 4), _NOWHERE, np.int32), np.empty((points, 10, 8)), np.empty(16))
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _look_up(grid: NormalGrid, ix: int, iy: int, iz: int, block: Int32Array, cells: FloatArray) -> None:
     """Write a block, its row and its cells."""
     row = find_block(grid.keys, grid.rows, ix, iy, iz)
@@ -98,7 +101,7 @@ def _look_up(grid: NormalGrid, ix: int, iy: int, iz: int, block: Int32Array, cel
 
 # Sums may be reordered, which vectorising takes, but products not fused with them: a copy of this compiled into another
 # kernel would then round otherwise than one from the cache.
-@njit(cache=True, nogil=True, fastmath={"reassoc"})
+@in_place(fastmath={"reassoc"})
 def _sum_over_cells(cells: FloatArray, x: float, y: float, z: float, factor: float, out: FloatArray) -> None:
     """Sums over eight cells of ``w = factor exp(-1/2 q' B q)``, ``w B q``, ``w B`` and ``w B q q' B``, out (16,)."""
     w = vx = vy = vz = bxx = bxy = bxz = byy = byz = bzz = sxx = sxy = sxz = syy = syz = szz = 0.0
@@ -140,7 +143,7 @@ def _sum_over_cells(cells: FloatArray, x: float, y: float, z: float, factor: flo
     out[10], out[11], out[12], out[13], out[14], out[15] = sxx, sxy, sxz, syy, syz, szz
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def ndt_derivatives(
     layer: Layer,
     R: FloatArray,
@@ -159,7 +162,7 @@ def ndt_derivatives(
     """
     points, size = layer.points, layer.grid.block_size
     inverse_size, factor = 1.0 / size, 0.125 * layer.factor
-    sums = np.empty(16)
+    sums = neighbours.sums
     cost = 0.0
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -205,7 +208,7 @@ def ndt_derivatives(
     return cost
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def cost_and_derivatives(
     layers: tuple[Layer, ...],
     R: FloatArray,

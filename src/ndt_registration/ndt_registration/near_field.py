@@ -11,6 +11,7 @@ from numba import njit
 
 from ndt_registration.visibility import Prices, RangeImage, direction_bin
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 
 
 class NearField(NamedTuple):
@@ -47,7 +48,7 @@ def near_field(points: FloatArray, edge: float, reach: float) -> NearField:
     return NearField(values, edge, reach)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def pose_cost(
     points: FloatArray,
     t: FloatArray,

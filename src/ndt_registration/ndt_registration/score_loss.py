@@ -14,6 +14,7 @@ from numba import njit
 from ndt_registration.ndt import Layer
 from ndt_registration.voxel_grid import find_block
 from slam_core.geometry import FloatArray, boxplus
+from slam_core.in_place import in_place
 
 
 class ScoreLoss:
@@ -43,10 +44,16 @@ class ScoreLoss:
 @njit(cache=True, nogil=True)
 def point_fits(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
     """Mean of ``exp(-1/2 q' B q)`` (Eq. 8.5) over the cells that cover each point, -1 where none does, shape (n,)."""
-    grid, n = layer.grid, layer.points.shape[0]
-    out = np.full(n, -1.0)
+    out = np.full(layer.points.shape[0], -1.0)
+    _fill_fits(layer, R, t, out)
+    return out
+
+
+@in_place()
+def _fill_fits(layer: Layer, R: FloatArray, t: FloatArray, out: FloatArray) -> None:
+    grid = layer.grid
     s = 1.0 / grid.block_size
-    for i in range(n):
+    for i in range(layer.points.shape[0]):
         x, y, z = layer.points[i, 0], layer.points[i, 1], layer.points[i, 2]
         mx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
         my = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
@@ -67,4 +74,3 @@ def point_fits(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
             total += np.exp(-min(0.5 * (qx * ux + qy * uy + qz * uz), 30.0))
             cells += 1
         out[i] = total / cells
-    return out

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 
 
 class RangeImage(NamedTuple):
@@ -68,7 +69,7 @@ def range_image(points: FloatArray, size: int) -> RangeImage:
     return RangeImage(size, near, far)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolerance: float, prices: Prices) -> float:
     """Mean cost of points (n, 3), moved by ``t`` (3,).
 
@@ -97,7 +98,7 @@ def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolera
     return float(cost / points.shape[0] + max(1.0 - share / LEAST_MATCH, 0.0))
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def mean_spacing(points: FloatArray, image: RangeImage, planar: bool) -> float:
     """Mean angle (rad) between neighbouring points (n, 3), from the part of the sphere, or circle, that they cover."""
     occupied = 0

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from slam_core.in_place import in_place
 from slam_core.types import ByteArray
 from stereo_frontend.keypoints import Keypoints, Selector
 from stereo_frontend.surf import SurfConfig, describe
@@ -77,7 +78,7 @@ def responses(image: ByteArray):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _octagon_area(octagon):  # type: ignore[no-untyped-def]
     side, slant = octagon
     return (side + 2 * slant) ** 2 - 2 * slant * (slant + 1)
@@ -147,7 +148,7 @@ def find_extrema(response, threshold, found):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _is_extremum(response, size, y, x):  # type: ignore[no-untyped-def]
     value = response[size, y, x]
     sign = np.float32(1.0) if value > 0 else np.float32(-1.0)
@@ -159,7 +160,7 @@ def _is_extremum(response, size, y, x):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _is_on_line(response, y, x, size):  # type: ignore[no-untyped-def]
     """Harris's test of the response's gradients around a pixel: one direction in which it hardly changes."""
     reach = int(_LINE_REACH * _WIDTHS[size] / _WIDTHS[0])

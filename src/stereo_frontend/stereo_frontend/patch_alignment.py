@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from slam_core.in_place import in_place
+
 UNKNOWNS = 4
 REORDER = {"reassoc", "contract"}
 """What a sum needs to be vectorised; the rest of fastmath would forget that NaN exists."""
@@ -68,7 +70,7 @@ def align_patches(left, right, uv_left, u_right, row_offset, radius, max_shift, 
                 p[i] += scale * step[i]
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _take_template(image, u, v, radius, template, jacobian):  # type: ignore[no-untyped-def]
     """Patch around the whole pixel nearest to (u, v), its Jacobian, means removed.
 
@@ -96,7 +98,7 @@ def _take_template(image, u, v, radius, template, jacobian):  # type: ignore[no-
     return _dot(template, template)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _sample_patch(image, u, v, u_right, row_offset, p, radius, line, patch):  # type: ignore[no-untyped-def]
     """Right patch, ``row_offset`` px lower and under the correction ``p``, bilinear, mean removed.
 
@@ -129,7 +131,7 @@ def _sample_patch(image, u, v, u_right, row_offset, p, radius, line, patch):  # 
     return _dot(patch, patch)
 
 
-@njit(cache=True, nogil=True, fastmath=REORDER)
+@in_place(fastmath=REORDER)
 def _remove_mean(values):  # type: ignore[no-untyped-def]
     total = np.float32(0.0)
     for i in range(len(values)):
@@ -139,7 +141,7 @@ def _remove_mean(values):  # type: ignore[no-untyped-def]
         values[i] -= mean
 
 
-@njit(cache=True, nogil=True, fastmath=REORDER)
+@in_place(fastmath=REORDER)
 def _dot(a, b):  # type: ignore[no-untyped-def]
     total = np.float32(0.0)
     for i in range(len(a)):
@@ -147,7 +149,7 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _normal_matrix(jacobian, hessian):  # type: ignore[no-untyped-def]
     for i in range(UNKNOWNS):
         for j in range(i + 1):
@@ -155,7 +157,7 @@ def _normal_matrix(jacobian, hessian):  # type: ignore[no-untyped-def]
             hessian[j, i] = hessian[i, j]
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _right_hand_side(template, patch, jacobian, energy, power, out):  # type: ignore[no-untyped-def]
     """Turn ``patch`` into the residual r after the best gain, fill ``out`` with ``J^T r``.
 
@@ -171,7 +173,7 @@ def _right_hand_side(template, patch, jacobian, energy, power, out):  # type: ig
     return _dot(patch, patch) / freedom + _ROUNDING_VARIANCE, cross / np.sqrt(power * energy)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _correlation_factor(residual, radius):  # type: ignore[no-untyped-def]
     """Factor of the variance that correlated noise leaves over that of white noise, ``(1 + 2 rho_u) (1 + 2 rho_v)``.
 
@@ -197,7 +199,7 @@ def _diagonal_of_inverse(matrix, index):  # type: ignore[no-untyped-def]
     return unit[index] if _solve(matrix.copy(), unit) else np.inf
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _solve(matrix, vector):  # type: ignore[no-untyped-def]
     """Solve in place by Cholesky; False if the matrix is not positive definite."""
     n = len(vector)

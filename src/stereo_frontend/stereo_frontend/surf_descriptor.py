@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from slam_core.in_place import in_place
 from slam_core.types import Float32Array
-from stereo_frontend.surf_lattice import STRIDE, haar_wavelets, lattice_room, read_lattice
+from stereo_frontend.surf_lattice import STRIDE, haar_wavelets, lattice_room, read_lattice, row_room
 
 SAMPLES = 20
 UPRIGHT_CORNERS = SAMPLES + 2
@@ -78,16 +79,18 @@ def merged_signs(descriptors: Float32Array) -> Float32Array:
 @njit(cache=True, nogil=True)
 def describe_upright(integral, keypoints, weights, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` (n, 128) for keypoints (n, 3) of u, v, scale with wavelets along the axes of the image."""
-    lattice, line, row = lattice_room(UPRIGHT_CORNERS), lattice_room(UPRIGHT_CORNERS), np.empty(integral.shape[1])
+    lattice, line, room = (
+        lattice_room(UPRIGHT_CORNERS),
+        lattice_room(UPRIGHT_CORNERS),
+        row_room(integral.shape[1], UPRIGHT_CORNERS),
+    )
     dx, dy = np.empty(SAMPLES * STRIDE, np.float32), np.empty(SAMPLES * STRIDE, np.float32)
-    split = np.empty((SAMPLES, _ROW), np.float32)
+    split, total = np.empty((SAMPLES, _ROW), np.float32), np.empty(_ROW, np.float32)
     for k in range(keypoints.shape[0]):
-        inside = read_lattice(integral, keypoints[k], UPRIGHT_CORNERS, lattice, row)
+        inside = read_lattice(integral, keypoints[k], UPRIGHT_CORNERS, lattice, room)
         haar_wavelets(lattice, UPRIGHT_CORNERS, inside, 1, 0, line, dx, dy)
-        for j in range(SAMPLES):
-            for i in range(SAMPLES):
-                _split(dx[j * STRIDE + i], dy[j * STRIDE + i], split[j], _TERMS * i)
-        _sum_regions(split, weights, out[k])
+        _split_samples(dx, dy, split)
+        _sum_regions(split, weights, total, out[k])
 
 
 @njit(cache=True, nogil=True)
@@ -96,23 +99,27 @@ def describe_oriented(integral, keypoints, weights, out):  # type: ignore[no-unt
 
     Wavelets are taken on a lattice along the image axes, one per s, and interpolated at the turned samples.
     """
-    lattice, line, row = lattice_room(TURNED_CORNERS), lattice_room(TURNED_CORNERS), np.empty(integral.shape[1])
+    lattice, line, room = (
+        lattice_room(TURNED_CORNERS),
+        lattice_room(TURNED_CORNERS),
+        row_room(integral.shape[1], TURNED_CORNERS),
+    )
     dx, dy = np.empty(_NODES * STRIDE, np.float32), np.empty(_NODES * STRIDE, np.float32)
     nodes, samples = np.empty(2 * _NODES * STRIDE, np.float32), np.empty(2 * SAMPLES, np.float32)
-    split = np.empty((SAMPLES, _ROW), np.float32)
+    split, total = np.empty((SAMPLES, _ROW), np.float32), np.empty(_ROW, np.float32)
     for k in range(keypoints.shape[0]):
-        inside = read_lattice(integral, keypoints[k], TURNED_CORNERS, lattice, row)
+        inside = read_lattice(integral, keypoints[k], TURNED_CORNERS, lattice, room)
         angle = _dominant_direction(lattice, inside, line)
         haar_wavelets(lattice, TURNED_CORNERS, inside, 1, 0, line, dx, dy)
         _turned_samples(dx, dy, np.float32(np.cos(angle)), np.float32(np.sin(angle)), nodes, samples, split)
-        _sum_regions(split, weights, out[k])
+        _sum_regions(split, weights, total, out[k])
 
 
 @njit(cache=True, nogil=True)
 def orientation(integral, keypoint):  # type: ignore[no-untyped-def]
     """Dominant direction (rad) of the image around a keypoint (u, v, scale)."""
     lattice = lattice_room(TURNED_CORNERS)
-    inside = read_lattice(integral, keypoint, TURNED_CORNERS, lattice, np.empty(integral.shape[1]))
+    inside = read_lattice(integral, keypoint, TURNED_CORNERS, lattice, row_room(integral.shape[1], TURNED_CORNERS))
     return _dominant_direction(lattice, inside, lattice_room(TURNED_CORNERS))
 
 
@@ -162,7 +169,7 @@ def _directions(x, y):  # type: ignore[no-untyped-def]
     return index
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _turned_samples(dx, dy, cosine, sine, nodes, samples, split):  # type: ignore[no-untyped-def]
     """Wavelets at the samples of a turned square, bilinear between nodes, along the square's axes and split by sign.
 
@@ -179,7 +186,7 @@ def _turned_samples(dx, dy, cosine, sine, nodes, samples, split):  # type: ignor
             _split(cosine * a + sine * b, cosine * b - sine * a, split[j], _TERMS * i)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _between_nodes(nodes, start_x, start_y, step_x, step_y, out):  # type: ignore[no-untyped-def]
     """Pairs (dx, dy) along a line of samples through the middle (start_x, start_y), one step apart."""
     for i in range(SAMPLES):
@@ -195,7 +202,15 @@ def _between_nodes(nodes, start_x, start_y, step_x, step_y, out):  # type: ignor
             out[2 * i + c] = upper + fy * (lower - upper)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
+def _split_samples(dx, dy, split):  # type: ignore[no-untyped-def]
+    """The terms of all samples of a square along the axes of the image."""
+    for j in range(SAMPLES):
+        for i in range(SAMPLES):
+            _split(dx[j * STRIDE + i], dy[j * STRIDE + i], split[j], _TERMS * i)
+
+
+@in_place()
 def _split(x, y, out, at):  # type: ignore[no-untyped-def]
     """Write the eight terms of one sample: x and |x| where y is not negative, where it is, then y by the sign of x."""
     zero = np.float32(0.0)
@@ -207,10 +222,12 @@ def _split(x, y, out, at):  # type: ignore[no-untyped-def]
     out[at + 6], out[at + 7] = y - positive_y, abs(y - positive_y)
 
 
-@njit(cache=True, nogil=True)
-def _sum_regions(split, weights, out):  # type: ignore[no-untyped-def]
-    """Weighted sums (128,) of the samples' terms (20, 20 * 8) over 4 x 4 subregions, scaled to unit length."""
-    row = np.empty(_ROW, np.float32)
+@in_place()
+def _sum_regions(split, weights, row, out):  # type: ignore[no-untyped-def]
+    """Weighted sums (128,) of the samples' terms (20, 20 * 8) over 4 x 4 subregions, scaled to unit length.
+
+    ``row`` is room for one row of terms.
+    """
     for region in range(4):
         row[:] = np.float32(0.0)
         for j in range(SAMPLES):
@@ -227,13 +244,13 @@ def _sum_regions(split, weights, out):  # type: ignore[no-untyped-def]
         out[i] *= scale
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _add_row(values, weight, out):  # type: ignore[no-untyped-def]
     for i in range(_ROW):
         out[i] += weight * values[i]
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _sum_samples(row, weights, out):  # type: ignore[no-untyped-def]
     """Weighted sum of the samples of a row, term by term; the terms by name keep them in one vector register."""
     a = b = c = d = e = f = g = h = np.float32(0.0)

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from slam_core.in_place import in_place
 from slam_core.types import ByteArray
 
 FILTER_SIZES = (9, 15, 21, 27)
@@ -85,7 +86,7 @@ def integral_image(image: ByteArray) -> IntegralImage:
     return out
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def hessian_row(integral, size, y, sums, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` with ``Dxx Dyy - (0.9 Dxy)^2`` of a row, normalised by the filter's area; its ends stay as they are.
 
@@ -108,33 +109,33 @@ def hessian_row(integral, size, y, sums, out):  # type: ignore[no-untyped-def]
 
 # Each of these loops has one array to write and few to read: with more of them the compiler gives up proving that they
 # do not overlap, and vectorises nothing.
-@njit(cache=True, nogil=True)
+@in_place()
 def _difference(plus, minus, out):  # type: ignore[no-untyped-def]
     for x in range(len(out)):
         out[x] = plus[x] - minus[x]
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _outer_less_inner(plus, minus, inner_plus, inner_minus, out):  # type: ignore[no-untyped-def]
     """Sums of a box less three times those of its middle third."""
     for x in range(len(out)):
         out[x] = plus[x] - minus[x] - 3 * (inner_plus[x] - inner_minus[x])
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _crossed(first, second, third, fourth, out):  # type: ignore[no-untyped-def]
     for x in range(len(out)):
         out[x] = first[x] - second[x] - third[x] + fourth[x]
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _determinants(xx, yy, xy, scale, out):  # type: ignore[no-untyped-def]
     for x in range(len(out)):
         dxx, dyy, dxy = np.float32(xx[x]) * scale, np.float32(yy[x]) * scale, np.float32(xy[x]) * scale
         out[x] = dxx * dyy - np.float32(0.81) * dxy * dxy
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _determinant_at(integral, x, y, size):  # type: ignore[no-untyped-def]
     """The same as :func:`hessian_row` at one pixel."""
     lobe, half = size // 3, size // 2
@@ -154,7 +155,7 @@ def _determinant_at(integral, x, y, size):  # type: ignore[no-untyped-def]
     return dxx * dyy - np.float32(0.81) * dxy * dxy
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _box(integral, x, y, reach):  # type: ignore[no-untyped-def]
     """Sum over the pixels at most ``reach`` (columns, rows) away."""
     upper, lower = integral[y - reach[1]], integral[y + reach[1] + 1]
@@ -170,10 +171,17 @@ def find_maxima(integral, threshold, found):  # type: ignore[no-untyped-def]
 
     Both middle layers are filtered row by row and searched right behind, while their last rows are in the cache.
     """
-    height, width = integral.shape[0] - 1, integral.shape[1] - 1
+    width = integral.shape[1] - 1
     sums = np.empty((6, width + 1), np.int32)
     layers = np.zeros((2, _KEPT_ROWS, width), np.float32)
     marks, cube = np.zeros(-(-width // 8) * 8, np.uint8), np.empty((3, 3, 3), np.float32)
+    return _find_in_rows(integral, threshold, sums, layers, marks, cube, np.empty(3), found)
+
+
+@in_place()
+def _find_in_rows(integral, threshold, sums, layers, marks, cube, offset, found):  # type: ignore[no-untyped-def]
+    """The same; what comes before ``found`` is room."""
+    height = integral.shape[0] - 1
     count = 0
     for y in range(height):
         for place in range(2):
@@ -182,12 +190,12 @@ def find_maxima(integral, threshold, found):  # type: ignore[no-untyped-def]
                 hessian_row(integral, size, y, sums, layers[place, y % _KEPT_ROWS])
         for place in range(2):
             if _BORDERS[place] <= y - 1 < height - _BORDERS[place]:
-                count += _find_in_row(integral, layers, place, y - 1, threshold, marks, cube, found[count:])
+                count += _find_in_row(integral, layers, place, y - 1, threshold, marks, cube, offset, found[count:])
     return count
 
 
-@njit(cache=True, nogil=True)
-def _find_in_row(integral, layers, place, y, threshold, marks, cube, found):  # type: ignore[no-untyped-def]
+@in_place()
+def _find_in_row(integral, layers, place, y, threshold, marks, cube, offset, found):  # type: ignore[no-untyped-def]
     """Maxima of one row of one layer.
 
     Their position and scale are those of the vertex of the parabola through the neighbourhood (Brown and Lowe 2002).
@@ -197,7 +205,6 @@ def _find_in_row(integral, layers, place, y, threshold, marks, cube, found):  # 
     own, other = layers[place], layers[1 - place]
     above, here, below = own[rows[0]], own[rows[1]], own[rows[2]]
     other_above, other_here, other_below = other[rows[0]], other[rows[1]], other[rows[2]]
-    offset = np.empty(3)
     count, end = 0, layers.shape[2] - border
     _mark_peaks(above, here, below, threshold, marks)
     eights = marks.view(np.uint64)
@@ -228,7 +235,7 @@ def _find_in_row(integral, layers, place, y, threshold, marks, cube, found):  # 
     return count
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _mark_peaks(above, here, below, threshold, marks):  # type: ignore[no-untyped-def]
     """Mark values of a row that are above ``threshold`` and their four neighbours."""
     for x in range(1, len(here) - 1):
@@ -236,13 +243,13 @@ def _mark_peaks(above, here, below, threshold, marks):  # type: ignore[no-untype
         marks[x] = here[x] > max(around, threshold)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _is_higher(row, x, value):  # type: ignore[no-untyped-def]
     """Than the three pixels of another row or layer that are next to it."""
     return value > row[x - 1] and value > row[x] and value > row[x + 1]
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _fill_outer(integral, x, y, size, value, out):  # type: ignore[no-untyped-def]
     """Determinants (3, 3) of a layer that is not filtered everywhere; False as soon as one is not below ``value``."""
     for j in range(3):
@@ -253,7 +260,7 @@ def _fill_outer(integral, x, y, size, value, out):  # type: ignore[no-untyped-de
     return True
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def vertex(c, offset):  # type: ignore[no-untyped-def]
     """Vertex of the parabola through a neighbourhood (scale, v, u) relative to its centre; False if it lies outside."""
     centre = np.float64(c[1, 1, 1])

@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from slam_core.in_place import in_place
+
 STRIDE = 32
 """Numbers from one row of a lattice to the next; at least the corners along a side."""
 
@@ -22,10 +24,16 @@ def lattice_room(corners):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def read_lattice(integral, keypoint, corners, lattice, row):  # type: ignore[no-untyped-def]
+def row_room(width, corners):  # type: ignore[no-untyped-def]
+    """Room for a row of an image, and for the column beside each corner and the corner's share of the next one."""
+    return np.empty(width), np.empty(corners, np.int64), np.empty(corners)
+
+
+@in_place()
+def read_lattice(integral, keypoint, corners, lattice, room):  # type: ignore[no-untyped-def]
     """Fill ``lattice`` with the integral image at corners one s apart around the keypoint (u, v, scale).
 
-    ``row`` is room for one row of the integral image. Returns first and last column, first and last row of the corners
+    ``room`` is that of :func:`row_room`. Returns first and last column, first and last row of the corners
     that lie in the image; the others are left as they were.
     """
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
@@ -36,8 +44,8 @@ def read_lattice(integral, keypoint, corners, lattice, row):  # type: ignore[no-
     first_y, last_y = max(0, int(np.ceil(-top / scale))), min(corners - 1, int(np.floor((height - top) / scale)))
     begin = min(max(int(left + first_x * scale), 0), width - 1)
     end = min(max(int(left + last_x * scale), 0), width - 1) + 2
+    row, places, shares = room
     # Which columns lie beside a corner is the same for every row.
-    places, shares = np.empty(corners, np.int64), np.empty(corners)
     for i in range(first_x, last_x + 1):
         x = left + i * scale
         x0 = min(max(int(x), 0), width - 1)
@@ -50,20 +58,20 @@ def read_lattice(integral, keypoint, corners, lattice, row):  # type: ignore[no-
     return first_x, last_x, first_y, last_y
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _blend(above, below, share, out):  # type: ignore[no-untyped-def]
     for x in range(len(above)):
         out[x] = above[x] + share * (below[x] - above[x])
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _between(row, places, shares, out):  # type: ignore[no-untyped-def]
     for i in range(len(places)):
         value = row[places[i]]
         out[i] = value + shares[i] * (row[places[i] + 1] - value)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def haar_wavelets(lattice, corners, inside, half, first_row, line, dx, dy):  # type: ignore[no-untyped-def]
     """Haar responses of size ``2 half`` s: at ``j * STRIDE + i`` the one whose first corner is (first_row + j, i).
 
@@ -87,7 +95,7 @@ def haar_wavelets(lattice, corners, inside, half, first_row, line, dx, dy):  # t
         _clear_outside((first_x, last_x - far, first_y - first_row, last_y - far - first_row), dx, dy)
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _clear_outside(inside, dx, dy):  # type: ignore[no-untyped-def]
     first_x, last_x, first_y, last_y = inside
     for j in range(len(dx) // STRIDE):

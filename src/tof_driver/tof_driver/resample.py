@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from slam_core.camera import Camera
+from slam_core.in_place import in_place
 from slam_core.types import ByteArray, Float32Array
 
 
@@ -91,7 +92,7 @@ def _resample(q, s, map_u, map_v, slope, noise_multiple):  # type: ignore[no-unt
     return out, out_sigma
 
 
-@njit(cache=True, nogil=True)
+@in_place()
 def _without_missing_corner(q, s, w):  # type: ignore[no-untyped-def]
     """Corners and weights with a missing corner as the plane through the others; all NaN if two are missing."""
     zero = np.float32(0.0)
