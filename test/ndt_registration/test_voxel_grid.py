@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 
 from ndt_registration.eigen import cholesky_solve6, symmetric_eigen3
-from ndt_registration.voxel_grid import NormalGrid, adopt_planes, block_moments, coarser, find_block, normal_grid
+from ndt_registration.voxel_grid import (
+    NormalGrid,
+    adopt_planes,
+    block_counts,
+    block_moments,
+    coarser,
+    find_block,
+    normal_grid,
+)
 from slam_core.geometry import FloatArray
 
 
@@ -126,3 +134,8 @@ def test_cells_at_a_step_keep_their_own_normal(rng: np.random.Generator) -> None
     assert beside.sum() > 40
     upwards = changed.normal[beside] * np.sign(changed.normal[beside, 2:])
     assert abs(upwards[:, 0].mean()) < 0.015
+
+
+def test_counts_are_those_of_the_moments(rng: np.random.Generator) -> None:
+    points = rng.normal(0.0, 1.0, (500, 3))
+    np.testing.assert_array_equal(block_counts(points, 0.4), block_moments(points, 0.4).counts)

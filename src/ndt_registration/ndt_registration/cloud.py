@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ndt_registration.edges import rim_points
 from ndt_registration.visibility import mean_spacing, range_image
-from ndt_registration.voxel_grid import block_moments
+from ndt_registration.voxel_grid import block_counts, block_moments
 from slam_core.geometry import FloatArray
 
 _COVERAGE_SIZE = 64
@@ -101,7 +101,9 @@ def _without_strays(points: FloatArray) -> FloatArray:
     """The points but those so far off that cells of a useful size could not be numbered up to them."""
     distance = _distances(points)
     median = float(np.median(distance)) if len(points) else 0.0
-    return points[distance <= _FARTHEST * median] if median > 0.0 else points
+    if median == 0.0 or distance.max() <= _FARTHEST * median:
+        return points
+    return points[distance <= _FARTHEST * median]
 
 
 def _evened(points: FloatArray) -> FloatArray:
@@ -112,9 +114,12 @@ def _evened(points: FloatArray) -> FloatArray:
     if len(points) == 0:
         return points
     size = _EVEN_SIZE * max(float(np.percentile(_distances(points), 90.0)), 1e-6)
+    counts = block_counts(points, size)
+    crowding = float((counts**2).sum() / counts.sum() / np.median(counts))
+    if not crowding > _CROWDED:
+        return points
     blocks = block_moments(points, size)
-    crowding = float((blocks.counts**2).sum() / blocks.counts.sum() / np.median(blocks.counts))
-    return blocks.sums / blocks.counts[:, None] if crowding > _CROWDED else points
+    return blocks.sums / blocks.counts[:, None]
 
 
 def viewpoint(points: FloatArray) -> FloatArray:
