@@ -22,11 +22,13 @@ def annotated_image(image: ByteArray, features: Features) -> ByteArray:
     """
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     colours = _depth_colours(features.depth)
-    for uv, source, colour in zip(np.round(features.uv).astype(int), features.source, colours, strict=True):
-        u, v = int(uv[0]), int(uv[1])
-        if source != FeatureSource.TOF:
+    circles = (features.source != FeatureSource.TOF).tolist()
+    squares = (features.source != FeatureSource.STEREO).tolist()
+    places = np.round(features.uv).astype(int).tolist()
+    for (u, v), circle, square, colour in zip(places, circles, squares, colours, strict=True):
+        if circle:
             cv2.circle(picture, (u, v), 4, colour, 1, cv2.LINE_AA)
-        if source != FeatureSource.STEREO:
+        if square:
             cv2.rectangle(picture, (u - 4, v - 4), (u + 4, v + 4), colour, 1)
     cv2.putText(picture, f"{len(features)} features", (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1)
     return np.asarray(picture)
@@ -37,4 +39,4 @@ def _depth_colours(depth: np.ndarray) -> list[tuple[int, int, int]]:
     if not len(share):
         return []
     table = cv2.applyColorMap((255 * share).astype(np.uint8)[:, None], cv2.COLORMAP_JET)[:, 0]
-    return [(int(b), int(g), int(r)) for b, g, r in table]
+    return [(b, g, r) for b, g, r in table.tolist()]

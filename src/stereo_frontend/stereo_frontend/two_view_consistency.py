@@ -99,8 +99,9 @@ def consistency_equations(first: StereoView, second: StereoView, known: Rectific
     prior = np.linalg.inv(known.covariance)
     theta = known.parameters
     noise = 1.0
+    bases = _column_jacobian(first), _column_jacobian(second)
     for _ in range(_ITERATIONS):
-        residual, J_motion, J_theta, covariance = _linearised(first, second, T, theta, known)
+        residual, J_motion, J_theta, covariance = _linearised(first, second, bases, T, theta)
         weight = np.linalg.inv(covariance)
         squares = np.einsum("ni,nij,nj->n", residual, weight, residual)
         noise = max(1.0, float(np.median(squares)) / _MEDIAN_CHI_SQUARE_3)
@@ -163,15 +164,21 @@ def _first_motion(first: StereoView, second: StereoView, known: RectificationErr
     return make_transform(so3_exp(turn), shift)
 
 
+def _column_jacobian(view: StereoView) -> FloatArray:
+    c = view.stereo.camera
+    return c.fx * column_basis((view.uv_right - [c.cx, c.cy]) / [c.fx, c.fy])
+
+
 def _linearised(
-    first: StereoView, second: StereoView, T: FloatArray, theta: FloatArray, known: RectificationError
+    first: StereoView, second: StereoView, bases: tuple[FloatArray, FloatArray], T: FloatArray, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Residuals (n, 3) px of (u, v, disparity), with Jacobians and covariance.
 
-    Jacobians by motion (n, 3, 6) and calibration (n, 3, 10); covariance (n, 3, 3).
+    Jacobians by motion (n, 3, 6) and calibration (n, 3, 10); covariance (n, 3, 3). ``bases``: what
+    :func:`_column_jacobian` has of both views.
     """
     c, fb = first.stereo.camera, first.stereo.camera.fx * first.stereo.baseline
-    basis1, basis2 = (c.fx * column_basis((v.uv_right - [c.cx, c.cy]) / [c.fx, c.fy]) for v in (first, second))
+    basis1, basis2 = bases
     d1 = np.maximum(first.disparity + basis1 @ theta, _LEAST_DISPARITY)
     d2 = second.disparity + basis2 @ theta
     points = c.unproject(first.uv, fb / d1) @ T[:3, :3].T
