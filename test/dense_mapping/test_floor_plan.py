@@ -64,7 +64,9 @@ def both_rooms() -> DenseModel:
 
 
 def plan_of(model: DenseModel) -> FloorPlan:
-    (plan,) = model.floor_plans(model.surface())
+    surface = model.surface()
+    model.release_field()  # is not needed for a plan
+    (plan,) = model.floor_plans(surface)
     return plan
 
 

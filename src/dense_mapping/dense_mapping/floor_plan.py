@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from dense_mapping.keyframes import PlacedKeyframe
 from dense_mapping.levelling import floor_heights, level_transform, storey_of, up_direction
@@ -21,6 +20,7 @@ from dense_mapping.surface import Surface
 from slam_core.camera import MIN_DEPTH
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, make_transform, transform_points
+from slam_core.in_place import in_place
 
 _CLEAR_BELOW = 0.6
 """Only rays lower than this above the floor make a cell free: a ray over a table does not."""
@@ -156,10 +156,10 @@ def _rays(placed: PlacedKeyframe, T_level_camera: FloatArray, step: int) -> Floa
 def _plan(
     obstacles: Obstacles, rays: list[FloatArray], floor: float, config: FloorPlanConfig, T_level_map: FloatArray
 ) -> FloorPlan:
-    everything = np.concatenate(rays)
-    corners = np.concatenate([obstacles.middles[:, :2], everything[:, :2], everything[:, 3:5]])
-    low = np.floor(corners.min(axis=0) / config.resolution) - 2.0
-    shape = (np.ceil(corners.max(axis=0) / config.resolution) - low + 2.0).astype(np.int64)[::-1]
+    places = [obstacles.middles[:, :2], *(ends for ray in rays for ends in (ray[:, :2], ray[:, 3:5]))]
+    lowest, highest = (np.array([edge(p, axis=0) for p in places if len(p)]) for edge in (np.min, np.max))
+    low = np.floor(lowest.min(axis=0) / config.resolution) - 2.0
+    shape = (np.ceil(highest.max(axis=0) / config.resolution) - low + 2.0).astype(np.int64)[::-1]
     if shape.prod() > _MAX_CELLS:
         raise ValueError(
             f"a floor plan of {shape[1]} x {shape[0]} cells of {config.resolution} m is more than max_cells "
@@ -168,7 +168,8 @@ def _plan(
     corner = low * config.resolution
     through = np.zeros(tuple(shape), dtype=np.int32)
     band = np.array([floor - 0.5 * config.lowest, floor + _CLEAR_BELOW])
-    _trace(everything, corner, config.resolution, band, through)
+    for ray in rays:
+        _trace(ray, corner, config.resolution, band, through)
     cells = np.where(through >= _MIN_RAYS, FREE, UNKNOWN).astype(np.int8)
     cells[_occupied(obstacles, corner, config, through.shape)] = OCCUPIED
     for ray in rays:
@@ -194,7 +195,7 @@ def _occupied(
     return np.asarray(occupied & (around > 1))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@in_place(error_model="numpy")
 def _trace(
     rays: FloatArray, corner: FloatArray, resolution: float, band: FloatArray, through: npt.NDArray[np.int32]
 ) -> None:  # pragma: no cover - compiled

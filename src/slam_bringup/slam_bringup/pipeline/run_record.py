@@ -136,6 +136,7 @@ def run_result(
         model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading, stopped, corrections)
         if not stopped():
             surface = model.surface()
+            model.release_field()
             plans = model.floor_plans(surface)
     except Exception as error:  # what was mapped is worth more than its picture
         failure = failure or told(error, "no dense model was made")
