@@ -35,3 +35,17 @@ print(before - resident_mib())
 def test_what_threads_have_freed_goes_back_to_the_system() -> None:
     given_back = float(subprocess.check_output([sys.executable, "-c", SCRIPT], text=True))
     assert given_back > 100.0
+
+
+def test_what_is_loaded_is_not_searched_for_garbage_and_cycles_made_later_are() -> None:
+    script = """
+import gc, weakref
+from slam_core.memory import search_less_garbage
+class Knot: pass
+search_less_garbage()
+knot = Knot(); knot.itself = knot
+left = weakref.ref(knot); del knot
+rooms = [[] for _ in range(50_000)]
+print(gc.get_freeze_count() > 1000, left() is None)
+"""
+    assert subprocess.check_output([sys.executable, "-c", script], text=True).split() == ["True", "True"]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import sys
@@ -12,7 +13,7 @@ import click
 import slam_core.process_life  # noqa: F401  # its clock starts with the program
 from slam_bringup.commands.console import log_to_terminal, with_verbosity
 from slam_bringup.version import VERSION
-from slam_core.memory import share_one_heap
+from slam_core.memory import search_less_garbage, share_one_heap
 
 # The stages of a run have threads of their own: BLAS threads beside them only wait for each other, spinning. NumPy and
 # SciPy read this when they are loaded, here and in the nodes that are started from here. One number of threads also
@@ -61,6 +62,7 @@ def slam(context: click.Context) -> None:
     """Map indoor areas with a stereo camera and a time-of-flight camera."""
     log_to_terminal(context)
     share_one_heap()
+    search_less_garbage()
 
 
 with_verbosity(slam)
@@ -68,6 +70,7 @@ with_verbosity(slam)
 
 def main() -> None:
     """Entry point: a ``ValueError`` or ``OSError`` of any command becomes one clear line and exit code 2."""
+    gc.disable()  # while modules are loaded; the command enables it
     try:
         slam(prog_name="slam")
     except (ValueError, OSError) as error:

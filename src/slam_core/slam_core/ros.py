@@ -30,7 +30,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from slam_core.config import Config, ParameterInfo, changed, from_mapping, iterate_parameters
 from slam_core.guarded_node import GuardedNode
-from slam_core.memory import share_one_heap
+from slam_core.memory import search_less_garbage, share_one_heap
 from slam_core.messages import MessageTypes
 from slam_core.messages.base import Message
 from slam_core.process_life import end_with_parent, on_request_to_end
@@ -208,6 +208,7 @@ def run_node(
     (:func:`use_fast_dds_profile`).
     """
     share_one_heap()
+    search_less_garbage()
     use_fast_dds_profile(small_packets=small_packets)
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()

@@ -30,7 +30,7 @@ from slam_bringup.pipeline.configuration import ODOMETRIES, choose, load_system_
 from slam_bringup.processes.node_graph import live_nodes
 from slam_bringup.processes.processes import NodeCommand
 from slam_core.exchange import Exchange
-from slam_core.memory import share_one_heap
+from slam_core.memory import search_less_garbage, share_one_heap
 from slam_core.process_life import end_with_parent, on_request_to_end
 from slam_core.ros import spin, use_fast_dds_profile
 from stereo_frontend.frontend import MODES
@@ -67,6 +67,7 @@ def run_composed(commands: Sequence[NodeCommand], ros_arguments: Sequence[str] =
         exchange = Exchange()
         for command in commands:
             nodes.append(_make(exchange, command, ros_arguments))
+        search_less_garbage()
         threads = [threading.Thread(target=_spin, args=(node, stopped), name=node.get_name()) for node in nodes]
         for thread in threads:
             thread.start()
