@@ -19,7 +19,7 @@ from dense_mapping.tsdf import TsdfVolume
 from dense_mapping.tsdf_kernels import BLOCK
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
-from slam_core.types import ByteArray, Float32Array
+from slam_core.types import AnyArray, ByteArray, Float32Array
 
 _SIGMA_FLOOR = 0.002
 """Standard deviation that no number of images improves: calibration, grid."""
@@ -120,12 +120,11 @@ def _chunk_surface(
     colours = np.zeros((size, size, size, 3), dtype=np.uint8)
     inside = np.flatnonzero(((volume.coordinates >= corner) & (volume.coordinates <= corner + _CHUNK)).all(axis=1))
     means, sigmas = voxel_statistics(volume.voxels[inside], config)
-    for row, mean, uncertain in zip(inside, means, sigmas, strict=True):
-        x, y, z = ((volume.coordinates[row] - corner) * BLOCK).tolist()
-        place = np.s_[x : x + BLOCK, y : y + BLOCK, z : z + BLOCK]
-        distance[place], sigma[place] = mean.reshape((BLOCK,) * 3), uncertain.reshape((BLOCK,) * 3)
-        known = volume.colours[row, :, 3:] > 0
-        colours[place] = np.where(known, volume.colours[row, :, :3], _UNSEEN).reshape(BLOCK, BLOCK, BLOCK, 3)
+    shown = volume.colours[inside]
+    for values, target in (
+        (means, distance), (sigmas, sigma), (np.where(shown[..., 3:] > 0, shown[..., :3], _UNSEEN), colours)
+    ):  # fmt: skip
+        _put_blocks(values, volume.coordinates[inside] - corner, target)
     edge = _CHUNK * BLOCK + 1
     distance = distance[:edge, :edge, :edge]
     if not (distance < 0.0).any() or not (distance > 0.0).any():
@@ -137,6 +136,13 @@ def _chunk_surface(
     nearest = tuple(np.rint(vertices).astype(np.int64).T)
     points = (corner * volume.block_size + (vertices + 0.5) * volume.config.voxel_size).astype(np.float32)
     return points, faces[:, ::-1].astype(np.int32), colours[nearest], sigma[nearest]
+
+
+def _put_blocks(values: AnyArray, places: npt.NDArray[np.int64], target: AnyArray) -> None:
+    """Write the voxels (n, 512, ...) of blocks at places (n, 3), counted in blocks, into a cube of voxels."""
+    blocks, rest = len(target) // BLOCK, target.shape[3:]
+    x, y, z = places.T
+    target.reshape(*(blocks, BLOCK) * 3, *rest)[x, :, y, :, z] = values.reshape(-1, BLOCK, BLOCK, BLOCK, *rest)
 
 
 def _nothing() -> tuple[Float32Array, npt.NDArray[np.int32], ByteArray, Float32Array]:
