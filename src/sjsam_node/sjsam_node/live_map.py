@@ -21,8 +21,8 @@ from typing import TypeVar
 
 from sjsam_node.autosave import Autosave
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
+from sjsam_node.joiner_stage import JoinerStage
 from sjsam_node.localization import Localization, Localizer
-from sjsam_node.map_writer import MapWriter
 from sjsam_node.marks import Mark
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate, Submap
@@ -63,8 +63,8 @@ class LiveMap:
         self._localizers: dict[str, Localizer] = {}
         self._take(GlobalMap(config))
         self.copy_is_old = False
-        self._writer = MapWriter()
-        self._copy: Future[None] = self._writer.when_idle()
+        self._joiner = JoinerStage()
+        self._copy: Future[None] = self._joiner.when_idle()
 
     def _take(self, other: GlobalMap) -> None:
         """Go on with another map."""
@@ -77,19 +77,24 @@ class LiveMap:
     @property
     def waiting(self) -> int:
         """Number of submaps that are not joined yet, the one at hand included."""
-        return self._writer.waiting
+        return self._joiner.waiting
+
+    @property
+    def waiting_at_most(self) -> int:
+        """Largest number of submaps that waited at once."""
+        return self._joiner.waiting_at_most
 
     def add(self, submap: Submap) -> Future[Joined | None]:
         """Join a submap when those before it are; None if the map was reset meanwhile."""
-        return self._writer.join(self._unless_reset(partial(self._join, submap)))
+        return self._joiner.join(self._unless_reset(partial(self._join, submap)))
 
     def locate(self, agent: str, submap: Submap) -> Future[Localization | None]:
         """Locate an agent by a submap in the map as it is; None if the agents were reset meanwhile."""
-        return self._writer.join(self._unless_reset(lambda: self._localizer(agent).process(submap)))
+        return self._joiner.join(self._unless_reset(lambda: self._localizer(agent).process(submap)))
 
     def set_pose(self, agent: str, pose: PoseEstimate) -> None:
         """Tell where an agent is believed to be."""
-        self._writer.ask(lambda: self._localizer(agent).set_pose(pose))
+        self._joiner.ask(lambda: self._localizer(agent).set_pose(pose))
 
     def _unless_reset(self, task: Callable[[], T]) -> Callable[[], T | None]:
         resets = self._resets
@@ -115,7 +120,7 @@ class LiveMap:
 
     def read(self, view: Callable[[GlobalMap], T]) -> Future[T]:
         """A view of the map as soon as the submap at hand is joined."""
-        return self._writer.ask(lambda: view(self.global_map))
+        return self._joiner.ask(lambda: view(self.global_map))
 
     def mark(self, point: FloatArray) -> Mark:
         """Mark a point (3,) of the map frame, m, at once; ValueError in an empty map."""
@@ -130,13 +135,13 @@ class LiveMap:
         if forget:
             self._take(GlobalMap(self._config))
             self.copy_is_old = False
-            self._writer.ask(self._autosave.put_away)
+            self._joiner.ask(self._autosave.put_away)
         else:
             self._localizers = {}
 
     def save(self, path: Path) -> Future[None]:
         """Save the map with the submaps joined so far; ValueError for an empty one where there is another."""
-        return self._writer.ask(partial(self._save, path))
+        return self._joiner.ask(partial(self._save, path))
 
     def _save(self, path: Path) -> None:
         """Writer: save the map."""
@@ -150,7 +155,7 @@ class LiveMap:
 
         Submaps that wait are joined to it.
         """
-        return self._writer.ask(partial(self._load, path, view))
+        return self._joiner.ask(partial(self._load, path, view))
 
     def _load(self, path: Path, view: Callable[[GlobalMap], T]) -> T:
         """Writer: load a map and view it: whatever is wrong with it shows before anything changes."""
@@ -169,7 +174,7 @@ class LiveMap:
         """Hand a copy of the map to the autosave if one is due; the future raises what went wrong with the last one."""
         if not self.copy_is_old or not self._copy.done():
             return None
-        self._copy = self._writer.ask(self._hand_copy)
+        self._copy = self._joiner.ask(self._hand_copy)
         return self._copy
 
     def _hand_copy(self) -> None:
@@ -180,14 +185,14 @@ class LiveMap:
 
     def finish(self) -> Future[None]:
         """A future that is done when all submaps are joined."""
-        return self._writer.when_idle()
+        return self._joiner.when_idle()
 
     def close(self) -> None:
         """Join what waits, write what no copy has, and put the copy away: nobody needs to go on from it."""
         joined = self.finish()
         while wait([joined], 1.0).not_done:
             self.save_copy()
-        self._writer.close()
+        self._joiner.close()
         self._copy_now()
         self._autosave.put_away()
         self._autosave.close()

@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 
 from sjsam_node.autosave import Autosave
 from sjsam_node.global_map import ALREADY_JOINED, GlobalMap
+from sjsam_node.joiner_stage import result_of
 from sjsam_node.live_map import Joined, LiveMap
 from sjsam_node.localization import Localization
 from sjsam_node.map_messages import (
@@ -29,7 +30,6 @@ from sjsam_node.map_messages import (
     landmarks_message,
     marks_message,
 )  # fmt: skip
-from sjsam_node.map_writer import result_of
 from sjsam_node.node_config import SjsamNodeConfig
 from sjsam_node.pose_tracker import PoseTracker
 from sjsam_node.submap_order import SubmapOrder, gap_text
@@ -215,9 +215,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._follow(agent, found.pose)
 
     def _show_waiting(self) -> None:
-        waiting, counters = self.map.waiting, self.health.counters
-        counters["submaps waiting"] = waiting
-        counters["submaps waiting at most"] = max(waiting, counters["submaps waiting at most"])
+        self.health.take({"submaps waiting": self.map.waiting, "submaps waiting at most": self.map.waiting_at_most})
 
     def on_odometry(self, agent: str, message: Message) -> None:
         """Publish the pose of an agent in the map at a pose of its odometry."""

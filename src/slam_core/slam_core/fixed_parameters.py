@@ -57,7 +57,7 @@ FIXED = {
     "FloorPlanConfig": "clear_below min_points min_rays ray_step storey_height max_cells",
     "GlobalMapConfig": "unlinked_sigma compared_at_once compared_at_settling joined_at_once redundant_matches",
     "SmootherConfig": "settled_work",
-    "EstimatorConfig": "iterations relative_tolerance live_tolerance live_iterations",
+    "EstimatorConfig": "relative_tolerance live_tolerance live_iterations",
     "RobustConfig": "probability",
     "RegionConfig": "open quiet relinearize",
     "ClosureConfig": (

@@ -34,8 +34,7 @@ class EstimatorConfig(Config):
     rows: str = parameter(
         "joint", "noise of a submap: its joint covariance, or per landmark", choices=("joint", "block")
     )
-    iterations: int = 30
-    """Gauss-Newton iterations per closure; 1 is Algorithm 4 as written."""
+    iterations: int = parameter(30, "Gauss-Newton iterations per closure; 1 is Algorithm 4 as written", minimum=1)
     solver: str = parameter("auto", "sparse solver", choices=BACKENDS)
     relative_tolerance: float = 1e-9
     """Stop when a step promises to lower chi2 by less than this share."""

@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filters of all agents and the one map that their submaps are joined into.
 
-Joining runs on a thread of its own, submap after submap: no filter waits for the map, which it does not need. Where the
-nodes would send compact submaps, their rounding is in the map here too.
+Joining runs on a thread of its own (:mod:`sjsam_node.joiner_stage`). Where the nodes would send compact submaps, their
+rounding is in the map here too.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from functools import partial
 
 from ekf_slam_node.stage import FilterStage, FrameResult
 from ndt_registration.stage import ScanEstimate
 from sjsam_node.agents import in_order
+from sjsam_node.joiner_stage import JoinerStage
 from slam_bringup.bags.readings import AgentSensors
 from slam_bringup.pipeline.configuration import SystemConfig, filter_config
 from slam_bringup.pipeline.map_growth import MapGrowth
@@ -46,9 +48,9 @@ class Mapper:
             for agent, s in sensors.items()
         }
         self._diaries = {agent: _Diary() for agent in sensors}
-        self._joiner = ThreadPoolExecutor(1, thread_name_prefix="joining")
+        self._joiner = JoinerStage()
         self._joins: list[Future[None]] = []
-        self._submaps = self._tried = self._most_waiting = 0
+        self._submaps = 0
         self._events: list[str] = []
 
     def process(self, item: AgentItem) -> None:
@@ -85,7 +87,7 @@ class Mapper:
 
     def stop(self) -> None:
         """End the thread that joins, at the latest after the submap it is at."""
-        self._joiner.shutdown(cancel_futures=True)
+        self._joiner.stop()
 
     @property
     def has_frames(self) -> bool:
@@ -111,7 +113,8 @@ class Mapper:
         )
 
     def _backlog(self) -> dict[str, int]:
-        counts = len(self._joins), self._submaps, len(self._joins) - self._tried, self._most_waiting
+        joiner = self._joiner
+        counts = joiner.received, self._submaps, joiner.waiting, joiner.waiting_at_most
         return dict(zip(BACKLOG, counts, strict=True))
 
     def rejections(self) -> dict[str, int]:
@@ -127,15 +130,11 @@ class Mapper:
             self._join(frame.estimate.submaps)
 
     def _join(self, submaps: Iterable[Submap]) -> None:
-        self._joins += [self._joiner.submit(self._add, submap) for submap in submaps]
-        self._most_waiting = max(self._most_waiting, len(self._joins) - self._tried)
+        self._joins += [self._joiner.join(partial(self._add, submap)) for submap in submaps]
 
     def _add(self, submap: Submap) -> None:
-        try:
-            with self._times.measure("sjsam"):
-                self.growth.add(rounded(submap) if self._compact else submap)
-        finally:
-            self._tried += 1
+        with self._times.measure("sjsam"):
+            self.growth.add(rounded(submap) if self._compact else submap)
 
 
 class _Diary:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The thread that alone writes the map: submaps one after the other, and between two of them what else is asked for.
+"""The stage that joins: one thread alone writes the map, submap after submap, and between two what else is asked for.
 
 Whoever hands something over goes on at once. So a node answers and publishes from the last estimate, however long
-joining takes and however many submaps wait.
+joining takes and however many submaps wait; and no filter of an offline run waits for the map, which it does not need.
 """
 
 from __future__ import annotations
@@ -16,17 +16,26 @@ from queue import PriorityQueue
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-_REQUEST, _SUBMAP, _LATER, _END = range(4)
+_STOP, _REQUEST, _SUBMAP, _LATER, _END = range(5)
 """What is done first of all that waits."""
 
 
-class MapWriter:
-    """Does what it is given, on one thread; the future of each task holds what it returns or raises."""
+class JoinerStage:
+    """Does what it is given, on one thread; the future of each task holds what it returns or raises.
+
+    Attributes
+    ----------
+    received
+        Number of submaps that were handed over.
+    waiting_at_most
+        Largest number of them that waited at once.
+    """
 
     def __init__(self) -> None:
         self._tasks = PriorityQueue[tuple[int, int, Callable[[], None]]]()
         self._number = itertools.count()
         self._submaps: list[Future[Any]] = []
+        self.received = self.waiting_at_most = 0
         self._is_open = True
         self._thread = threading.Thread(target=self._run, name="joining", daemon=True)
         self._thread.start()
@@ -41,6 +50,8 @@ class MapWriter:
         """Join a submap when all before it are joined."""
         future = self._put(_SUBMAP, task)
         self._submaps.append(future)
+        self.received += 1
+        self.waiting_at_most = max(self.waiting_at_most, self.waiting)
         return future
 
     def ask(self, task: Callable[[], T]) -> Future[T]:
@@ -53,7 +64,12 @@ class MapWriter:
 
     def close(self) -> None:
         """Do all that waits and end the thread."""
-        self._put(_END, self._stop)
+        self._put(_END, self._end)
+        self._thread.join()
+
+    def stop(self) -> None:
+        """End the thread after the submap it is at; what waits is left undone."""
+        self._put(_STOP, self._end)
         self._thread.join()
 
     def _put(self, priority: int, task: Callable[[], T]) -> Future[T]:
@@ -70,7 +86,7 @@ class MapWriter:
         self._tasks.put((priority, next(self._number), run))
         return future
 
-    def _stop(self) -> None:
+    def _end(self) -> None:
         self._is_open = False
 
     def _run(self) -> None:
