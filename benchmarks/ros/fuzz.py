@@ -6,7 +6,8 @@
 Every field of a message is drawn: numbers from zero, ordinary ones, infinities, NaN and 1e297, sizes that fit their
 data and that do not, stamps that go on, stand still, or are an hour off. Prints, per node, whether it is alive, how
 many messages it has counted as rejected, its faults (exceptions that were caught), and the growth of its memory. With
---composed the six nodes of a rig are one process.
+--composed the six nodes of a rig are one process, which hears from outside what none of them publishes: the sensors,
+and the submaps of another agent.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,6 +73,9 @@ TOPICS = {
 HEARD = ("stereo/left/image_raw", "stereo/left/image_rect", "tof/range/image_raw", "tof/depth/image", "tof/points",
          "features", "submap/info", "odom")  # fmt: skip
 """One topic or two of each node."""
+
+OTHER_AGENT = "b"
+HEARD_COMPOSED = ("stereo/left/image_raw", "tof/range/image_raw", f"{OTHER_AGENT}/submap/info", "odom")
 
 START = 1_700_000_000 * 10**9
 NUMBERS = (0.0, 1.0, -1.0, 0.5, 30.0, 1e-12, 1e12, 1e297, -1e297, np.inf, -np.inf, np.nan)
@@ -183,6 +188,7 @@ def commands(folder: Path, composed: bool) -> dict[str, tuple[str, list[str]]]:
     separate = {name: (module, ["--ros-args", *own.get(name, [])]) for name, module in NODES.items()}
     if not composed:
         return separate
+    separate["sjsam"][1].extend(["-p", f"agents:=[{OTHER_AGENT}]"])
     nodes = [(package, name, separate[name][1], "") for name, package in OF_A_RIG.items()]
     (folder / "nodes.json").write_text(json.dumps(nodes))
     rest = {name: command for name, command in separate.items() if name not in OF_A_RIG}
@@ -205,9 +211,14 @@ def run(count: int, domain: int, folder: Path, *, composed: bool = False) -> tup
     rclpy.init(context=context, domain_id=domain)
     probe = Probe(context)
     try:
-        before, records = _map_before(probe, folder)
+        topics = {
+            f"{OTHER_AGENT}/{topic}" if composed and topic in SUBMAP_TOPICS else topic: kind
+            for topic, kind in TOPICS.items()
+        }
+        _offer(probe, topics, HEARD_COMPOSED if composed else HEARD)
+        before, records = _map_before(probe, folder, OTHER_AGENT if composed else "")
         start = {name: _rss_mib(process) for name, process in processes.items()}
-        _send(probe, count)
+        _send(probe, topics, count)
         after = _saved(probe, folder)
         counts = _counts(probe)
         inside = {"slam_composed": tuple(OF_A_RIG)}
@@ -233,18 +244,22 @@ def run(count: int, domain: int, folder: Path, *, composed: bool = False) -> tup
         rclpy.shutdown(context=context)
 
 
-def _map_before(probe: Probe, folder: Path) -> tuple[GlobalMap, int]:
-    """A small map that must not change."""
+def _offer(probe: Probe, topics: dict[str, str], heard: Sequence[str]) -> None:
+    """Publishers of all topics, once the nodes listen."""
     probe.listen("/diagnostics", probe.types.DiagnosticArray)
-    for topic, kind in TOPICS.items():
-        latched = topic in ("static_transforms", "map_to_odom") or topic in SUBMAP_TOPICS or topic.startswith("map/")
+    for topic, kind in topics.items():
+        latched = topic in ("static_transforms", "map_to_odom") or "submap/" in topic or topic.startswith("map/")
         probe.senders[topic] = probe.node.create_publisher(getattr(probe.types, kind), topic, sensor_qos(100, latched))
-    probe.wait(lambda: all(probe.senders[t].get_subscription_count() for t in HEARD), "nodes do not listen", 300.0)
+    probe.wait(lambda: all(probe.senders[t].get_subscription_count() for t in heard), "nodes do not listen", 300.0)
+
+
+def _map_before(probe: Probe, folder: Path, agent: str) -> tuple[GlobalMap, int]:
+    """A small map that must not change."""
     rng = np.random.default_rng(1)
-    submaps = Agent(ring_world(3.0, rng, 12.0), circle(3.0, 0.4), rng, "").submaps()
+    submaps = Agent(ring_world(3.0, rng, 12.0), circle(3.0, 0.4), rng, agent).submaps()
     for submap in submaps:
         for topic, message in zip(SUBMAP_TOPICS, submap_messages(probe.types, submap), strict=True):
-            probe.send(topic, message)
+            probe.send(f"{agent}/{topic}" if agent else topic, message)
     probe.wait(
         lambda: _counts(probe).get("/sjsam", {}).get("submaps joined", 0) == len(submaps),
         "submaps are not joined",
@@ -254,12 +269,12 @@ def _map_before(probe: Probe, folder: Path) -> tuple[GlobalMap, int]:
     return _saved(probe, folder), len(submaps)
 
 
-def _send(probe: Probe, count: int) -> None:
+def _send(probe: Probe, topics: dict[str, str], count: int) -> None:
     fuzzer = Fuzzer(np.random.default_rng(2))
-    topics = list(TOPICS)
+    names = list(topics)
     for k in range(count):
-        topic = topics[k % len(topics)]
-        probe.senders[topic].publish(fuzzer.message(getattr(probe.types, TOPICS[topic])))
+        topic = names[k % len(names)]
+        probe.senders[topic].publish(fuzzer.message(getattr(probe.types, topics[topic])))
         if k % 50 == 0:
             probe.executor.spin_once(timeout_sec=0.01)
     _settle(probe)

@@ -83,5 +83,5 @@ def _page(view: bool) -> int:
                 continue
             port = int(probe.getsockname()[1])
             break
-    click.echo(f"the nodes at work: http://localhost:{port}", err=True)
+    click.echo(f"the nodes at work, once they have started: http://localhost:{port}", err=True)
     return port

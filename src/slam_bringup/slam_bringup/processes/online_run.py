@@ -254,9 +254,10 @@ class _Choreography:
                 raise
 
     def last_diagnostics(self) -> dict[str, dict[str, str]]:
-        """The final values of all nodes, once they have reported after the end."""
-        self._supervisor.wait_for_reports([c.full_name for c in self._graph.commands], _LAST_REPORT_S)
-        return dict(self._supervisor.diagnostics)
+        """The final values of the nodes that map, once they have reported after the end; a page's own are none."""
+        names = [command.full_name for command in self._graph.commands]
+        self._supervisor.wait_for_reports(names, _LAST_REPORT_S)
+        return {name: self._supervisor.diagnostics[name] for name in names if name in self._supervisor.diagnostics}
 
     def _all_joined(self) -> bool:
         values = self._supervisor.diagnostics.get(_SJSAM, {})
