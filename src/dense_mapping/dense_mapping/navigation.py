@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -71,6 +72,20 @@ def way(plan: FloorPlan, start: FloatArray, goal: FloatArray, half_width: float 
             length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
             return Way(points, length, float(clearance[cells[:, 0], cells[:, 1]].min()))
     return None
+
+
+def walked(plan: FloorPlan, path: FloatArray, width: float = 0.5) -> FloorPlan:
+    """The plan with what somebody has walked on as free, ``path`` (n, 3) m in the map, whatever was seen there.
+
+    Cameras look ahead, not at one's feet, and take those who went before for obstacles.
+    """
+    trodden = np.zeros(plan.cells.shape, dtype=np.uint8)
+    corners = plan.cell_of(path)[:, ::-1]
+    thickness = max(1, round(width / plan.resolution))
+    for a, b in itertools.pairwise(corners):
+        if np.linalg.norm(b - a) * plan.resolution <= _REACH_M:  # else nobody knows what was between
+            cv2.line(trodden, (int(a[0]), int(a[1])), (int(b[0]), int(b[1])), 1, thickness)
+    return replace(plan, cells=np.where(trodden > 0, np.int8(FREE), plan.cells))
 
 
 def _clearance(plan: FloorPlan) -> FloatArray:

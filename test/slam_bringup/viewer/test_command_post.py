@@ -41,7 +41,7 @@ def agent_at(x: float, y: float, z: float = 1.2, sigma: float = 0.02) -> PoseEst
 
 
 def test_the_way_out_goes_through_the_door_and_says_how_sure_it_is():
-    (out,) = ways_out([drawn_plan()], {"one": agent_at(1.0, 1.0)}, {"one": np.array([5.5, 1.0, 0.0])})
+    (out,) = ways_out([drawn_plan()], {"one": agent_at(1.0, 1.0)}, {"one": np.array([[5.5, 1.0, 0.0]])})
     assert out.way is not None
     at_wall = out.way.points[np.abs(out.way.points[:, 0] - 3.75) < 0.2]
     assert np.all(np.abs(at_wall[:, 1] - 1.75) < 0.3)
@@ -54,14 +54,29 @@ def test_the_way_out_goes_through_the_door_and_says_how_sure_it_is():
 def test_an_agent_behind_a_wall_without_a_door_has_no_way_out():
     plan = drawn_plan()
     plan.cells[:, 40:45] = OCCUPIED
-    (out,) = ways_out([plan], {"one": agent_at(1.0, 1.0)}, {"one": np.array([5.5, 1.0, 0.0])})
+    (out,) = ways_out([plan], {"one": agent_at(1.0, 1.0)}, {"one": np.array([[5.5, 1.0, 0.0]])})
     assert out.way is None
-    assert out.text == "no way out through what was seen free"
+    assert out.text == "no way out through what was seen free or walked on"
+
+
+def test_who_has_walked_through_what_nobody_saw_finds_the_way_back():
+    plan = drawn_plan()
+    plan.cells[:, 30:45] = UNKNOWN
+    x = np.arange(1.0, 5.6, 0.3)
+    path = np.stack([x, np.where(x < 3.0, 1.0, 1.7), np.full_like(x, 1.2)], axis=1)
+    agents = {"one": agent_at(*path[0]), "two": agent_at(5.5, 1.7)}
+    two = path[-1:]
+    assert ways_out([plan], agents, {"one": path[-2:], "two": two})[0].way is None
+    one, _ = ways_out([plan], agents, {"one": path[::-1], "two": two})
+    assert one.way is not None
+    assert 4.5 < one.way.length < 6.0
+    crossing = path[[0, -1]]
+    assert ways_out([plan], agents, {"one": crossing[::-1], "two": two})[0].way is None, "nobody saw what is between"
 
 
 def test_a_position_that_nothing_ties_to_the_map_is_not_told_in_metres():
     lost = {"one": agent_at(1.0, 1.0, sigma=100.0)}
-    (out,) = ways_out([drawn_plan()], lost, {"one": np.array([5.5, 1.0, 0.0])})
+    (out,) = ways_out([drawn_plan()], lost, {"one": np.array([[5.5, 1.0, 0.0]])})
     assert "not tied to the map" in out.text
 
 
@@ -71,7 +86,7 @@ def test_each_agent_is_on_the_highest_floor_below_it():
     assert storey_at(plans, np.array([1.0, 1.0, 4.2])) is plans[1]
     assert storey_at([], np.zeros(3)) is None
     upstairs = {"two": agent_at(1.0, 1.0, 4.2)}
-    (out,) = ways_out(plans, upstairs, {"two": np.array([5.5, 1.0, 0.0])})
+    (out,) = ways_out(plans, upstairs, {"two": np.array([[5.5, 1.0, 0.0]])})
     assert out.way is None, "stairs are on no plan"
 
 

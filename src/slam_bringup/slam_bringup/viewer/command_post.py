@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.navigation import Frontier, Way, frontiers, way
+from dense_mapping.navigation import Frontier, Way, frontiers, walked, way
 from slam_core.chi_square import chi_square_quantile
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate
@@ -39,7 +39,7 @@ class WayOut:
     def text(self) -> str:
         """The same in words."""
         if self.way is None:
-            return "no way out through what was seen free"
+            return "no way out through what was seen free or walked on"
         narrow = f", {2 * self.way.clearance:.1f} m wide at its narrowest" if self.way.clearance < 0.5 else ""
         return f"{self.way.length:.1f} m to the exit{narrow}, {radius_text(self.radius)}"
 
@@ -52,13 +52,24 @@ def storey_at(plans: Sequence[FloorPlan], point: FloatArray) -> FloorPlan | None
 
 
 def ways_out(
-    plans: Sequence[FloorPlan], agents: Mapping[str, PoseEstimate], exits: Mapping[str, FloatArray]
+    plans: Sequence[FloorPlan], agents: Mapping[str, PoseEstimate], paths: Mapping[str, FloatArray]
 ) -> list[WayOut]:
-    """The way of each agent to its exit (3,) m; who is on another storey than the exit gets none."""
+    """The way of each agent to where its path (n, 3) m began; who is on another storey than that gets none.
+
+    Where somebody has walked one can walk, so at worst the way is the one by which the agent came.
+    """
+    trodden = {id(plan): plan for plan in plans}
+    for path in paths.values():
+        storeys = [storey_at(plans, step) for step in path]
+        for storey in plans:
+            own = [step for step, its in zip(path, storeys, strict=True) if its is storey]
+            trodden[id(storey)] = walked(trodden[id(storey)], np.array(own).reshape(-1, 3))
     out = []
     for name, pose in agents.items():
-        plan, target = storey_at(plans, pose.T[:3, 3]), storey_at(plans, exits[name])
-        found = way(plan, pose.T[:3, 3], exits[name]) if plan is not None and plan is target else None
+        exit_ = paths[name][0]
+        plan, target = storey_at(plans, pose.T[:3, 3]), storey_at(plans, exit_)
+        same = plan is not None and plan is target
+        found = way(trodden[id(plan)], pose.T[:3, 3], exit_) if same else None
         out.append(WayOut(name, found, position_radius(pose)))
     return out
 

@@ -65,7 +65,7 @@ class FinishedView:
             self.page.show_submaps(lines[:, 0], lines[:, 1])
             self.page.show_closures(self.run.closure_lines(stamp_ns))
             poses = self._show_agents(stamp_ns)
-            self._show_ways_out(poses)
+            self._show_ways_out(poses, stamp_ns)
 
     def _show_agents(self, stamp_ns: int) -> dict[str, PoseEstimate]:
         rows, poses = [], {}
@@ -88,10 +88,14 @@ class FinishedView:
             self.page.show_picture(picture.image, picture.caption)
             self.page.show_camera(T_map_base, picture.image)
 
-    def _show_ways_out(self, poses: dict[str, PoseEstimate]) -> None:
-        exits = {agent: t.poses[0, :3, 3] for agent, t in self.run.trajectories.items() if len(t)}
+    def _show_ways_out(self, poses: dict[str, PoseEstimate], stamp_ns: int) -> None:
+        paths = {
+            agent: t.poses[t.stamps_ns <= stamp_ns, :3, 3]
+            for agent, t in self.run.trajectories.items()
+            if agent in poses
+        }
         texts = []
-        for out in ways_out(self.run.plans, poses, exits):
+        for out in ways_out(self.run.plans, poses, paths):
             index = list(self.run.trajectories).index(out.agent)
             points = np.empty((0, 3)) if out.way is None else out.way.points
             self.page.show_way(out.agent, index, points, out.label)

@@ -61,7 +61,7 @@ class _Agent:
     T_odom_base: FloatArray | None = None
     heard_at_ns: int = 0
     picture_at_ns: int = 0
-    exit: FloatArray | None = None
+    path: FloatArray | None = None
 
 
 class ViewerNode(SlamNode[ViewerConfig]):
@@ -170,7 +170,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
         if len(poses) < 2:
             return
         matrices = np.stack([T for _, T in poses])
-        self._agents[agent].exit = matrices[0, :3, 3]
+        self._agents[agent].path = matrices[:, :3, 3]
         self.page.show_trajectory(agent, index, matrices)
 
     def _on_picture(self, agent: str, message: Message) -> None:
@@ -243,16 +243,16 @@ class ViewerNode(SlamNode[ViewerConfig]):
     # -- command post --------------------------------------------------------------------------------------------------
 
     def _show_post(self) -> None:
-        rows, poses, exits = [], {}, {}
+        rows, poses, paths = [], {}, {}
         for agent, own in self._agents.items():
             rows.append(self._row(agent, own))
-            if own.T_odom_base is not None and own.exit is not None:
+            if own.T_odom_base is not None and own.path is not None:
                 covariance = np.zeros((6, 6)) if own.pose is None else own.pose.covariance
                 poses[agent] = PoseEstimate(0, own.T_map_odom @ own.T_odom_base, covariance)
-                exits[agent] = own.exit
+                paths[agent] = own.path
         self.page.show_agent_table(rows)
         texts = []
-        for out in ways_out(tuple(self._plans.values()), poses, exits) if self._plans else ():
+        for out in ways_out(tuple(self._plans.values()), poses, paths) if self._plans else ():
             points = np.empty((0, 3)) if out.way is None else out.way.points
             self.page.show_way(out.agent, list(self._agents).index(out.agent), points, out.label)
             texts.append(f"- **{out.agent or 'rig'}**: {out.text}")
