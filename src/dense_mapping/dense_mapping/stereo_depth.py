@@ -8,7 +8,8 @@ Semi-global matching (Hirschmueller 2008, OpenCV) fills textureless walls with w
 measured disparity from a guessed one is the image itself: the right image, warped by the disparity, leaves a residual
 ``r``, and a window whose gradient along the row is ``g`` fixes the disparity to ``s^2 = var(r) / sum(g^2)`` (the
 Cramer-Rao bound of a shift). The same sums give the Gauss-Newton step ``sum(g r) / sum(g^2)``, which removes the
-matcher's preference for whole pixels.
+matcher's preference for whole pixels. Where there is no texture the matcher's own disparity, an observation with the
+sigma that its errors were found to have, outweighs that step.
 """
 
 from __future__ import annotations
@@ -42,8 +43,12 @@ _SIGMA_SCALE = 2.0
 """Factor on the standard deviation from residual and gradient: neighbours share their errors."""
 _SIGMA_FLOOR = 0.12
 """Standard deviation of a perfect window's disparity, px."""
-_MAX_SIGMA = 1.0
-"""Disparities with a larger sigma are dropped, px."""
+_MATCHED_SIGMA = 0.7
+"""Standard deviation of what the matcher alone says, px."""
+_LARGEST_STEP = 0.6
+"""Disparities that the step moves by more are dropped: matcher and picture contradict each other, px."""
+_LEAST_KNOWN = 0.9
+"""Share of a window whose disparity is known, below which its middle is dropped: a hole is an edge as a rule."""
 
 Mask = npt.NDArray[np.bool_]
 
@@ -79,7 +84,7 @@ def _disparity(images: StereoImages, config: StereoDepthConfig) -> tuple[Float32
     """Disparity and its standard deviation (height, width) px, NaN where either is not trusted."""
     disparity = _checked_disparity(images, config)
     refined, sigma = _refined(images.left, images.right, disparity)
-    dropped = ~(sigma < _MAX_SIGMA) | ~(np.abs(refined - disparity) < 1.0) | ~(refined > 0.5)
+    dropped = np.isnan(sigma) | ~(np.abs(refined - disparity) < _LARGEST_STEP) | ~(refined > 0.5)
     refined[dropped] = np.nan
     sigma[dropped] = np.nan
     return refined, sigma
@@ -147,7 +152,10 @@ def _mask(values: AnyArray) -> Mask:
 
 
 def _refined(left: ByteArray, right: ByteArray, disparity: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Disparity after one Gauss-Newton step, and its standard deviation, from a window around each pixel."""
+    """Disparity after one Gauss-Newton step, and its standard deviation, from a window around each pixel.
+
+    The matcher's disparity counts as an observation of its own: without texture the step is short instead of wild.
+    """
     known = np.isfinite(disparity)
     warped = _warped(right, np.where(known, disparity, np.float32(0.0)))
     image = left.astype(np.float32)
@@ -160,8 +168,11 @@ def _refined(left: ByteArray, right: ByteArray, disparity: Float32Array) -> tupl
     product = sums(gradient * residual) - sums.count * slope * offset
     variance = np.maximum(sums(residual**2) / sums.count - offset**2, 2.0 * noise)
     # warped(u) = R(u - d): a larger d moves the right image to the right, so dr/dd = -g.
-    refined = np.where(known, disparity + np.clip(product / energy, -2.0, 2.0), np.nan).astype(np.float32)
-    sigma = np.hypot(_SIGMA_SCALE * np.sqrt(variance / energy), _SIGMA_FLOOR)
+    spread = _SIGMA_SCALE**2 * variance
+    information = energy + spread / _MATCHED_SIGMA**2
+    refined = np.where(known, disparity + product / information, np.nan).astype(np.float32)
+    sigma = np.hypot(np.sqrt(spread / information), _SIGMA_FLOOR)
+    known = known & (sums.count >= _LEAST_KNOWN * _WINDOW**2)
     return refined, np.where(known, sigma, np.nan).astype(np.float32)
 
 
