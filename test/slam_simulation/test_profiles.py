@@ -11,7 +11,7 @@ import pytest
 from slam_core.config import from_mapping
 from slam_simulation import Scenario, Simulator
 from slam_simulation.finishes import FinishConfig, finished
-from slam_simulation.moving import MovingThings
+from slam_simulation.moving import MovingConfig, MovingThings
 from slam_simulation.profiles import REAL, RealismConfig
 from slam_simulation.shutter import pixel_velocity, rolled, stepped
 from slam_simulation.smoke import SmokeConfig, echo_through, seen_through
@@ -69,11 +69,22 @@ def test_people_walk_and_chairs_are_moved_and_nothing_else(scenario: Scenario) -
 
 def test_a_person_is_seen(scenario: Scenario) -> None:
     frames = [
-        next(Simulator(s, threads=1, truth=True).run(first=8, frames=9))
+        next(Simulator(s, threads=1, truth=True).run(first=19, frames=20))
         for s in (scenario, under(scenario, moving__people=1))
     ]
     nearer = frames[1].truth.depth < frames[0].truth.depth - 0.05
     assert nearer.mean() > 0.005
+
+
+def test_nobody_walks_into_the_rig(scenario: Scenario) -> None:
+    path = scenario.path()
+    things = MovingThings(MovingConfig(people=2), path)
+    gaps = [
+        np.linalg.norm(things.person(k, t)[:2, 3] - path.pose(t)[:2, 3])
+        for k in (0, 1)
+        for t in np.arange(0.0, path.duration, 0.1)
+    ]
+    assert 1.0 < min(gaps) < 2.5
 
 
 def test_finishes_change_the_share_asked_for(simulator: Simulator) -> None:

@@ -19,8 +19,8 @@ from slam_simulation.surface_table import SurfaceTable
 from slam_simulation.trajectory import Path
 from slam_simulation.world import Material, World
 
-_AHEAD_S, _ASIDE_M, _STEP_HZ = 4.0, 0.7, 0.13
-"""A person walks where the rig will be, to and fro across its way."""
+_EVERY_S, _SPEED, _AHEAD_M = 12.0, 1.2, 1.8
+"""A person crosses the view so often (s), so fast (m/s), so far ahead of where the rig is then (m)."""
 _CHAIR_AT = (0.3, 0.5)
 """Shares of the recording: where on the rig's way the chair stands, and when it is moved."""
 _CHAIR_SHIFT = np.array([0.5, 0.3, 0.0])
@@ -67,10 +67,12 @@ class MovingThings:
         return table._replace(origin=parts[0], edge_u=parts[1], edge_v=parts[2], normal=parts[3]) if motions else table
 
     def person(self, k: int, t: float) -> FloatArray:
-        """Pose (4, 4) of a person's feet at time ``t`` s, x forward."""
-        when = t + _AHEAD_S * (1 + k)
-        aside = _ASIDE_M * np.sin(2.0 * np.pi * _STEP_HZ * when + k)
-        return self._beside_the_way(when, aside)
+        """Pose (4, 4) of a person's feet at time ``t`` s, x ahead of the rig; now from one side, now from the other."""
+        first = (0.4 + 0.37 * k) * _EVERY_S
+        number = round((t - first) / _EVERY_S)
+        crossing = first + number * _EVERY_S
+        aside = (-1) ** (number + k) * _SPEED * (t - crossing)
+        return self._beside_the_way(crossing, aside, _AHEAD_M)
 
     def chair(self, k: int, t: float) -> FloatArray:
         """Pose (4, 4) of a chair at time ``t`` s."""
@@ -80,11 +82,11 @@ class MovingThings:
             T = T @ make_transform(rotation_from_euler(1.2), _CHAIR_SHIFT)
         return T
 
-    def _beside_the_way(self, t: float, aside: float) -> FloatArray:
+    def _beside_the_way(self, t: float, aside: float, ahead: float = 0.0) -> FloatArray:
         T = self._path.pose(min(max(t, 0.0), self._path.duration))
         heading = np.arctan2(T[1, 0], T[0, 0])
         R = rotation_from_euler(float(heading))
-        return make_transform(R, np.array([T[0, 3], T[1, 3], 0.0]) + R @ [0.0, aside, 0.0])
+        return make_transform(R, np.array([T[0, 3], T[1, 3], 0.0]) + R @ [ahead, aside, 0.0])
 
 
 def _person(world: World, spot: Spot) -> None:
