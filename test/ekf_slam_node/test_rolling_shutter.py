@@ -11,7 +11,7 @@ from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, room
 
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.models import Frame, frame_from_features
-from ekf_slam_node.rolling_shutter import RollingShutter
+from ekf_slam_node.rolling_shutter import RollingShutter, _robust_mean
 from ekf_slam_node.slam import EkfSlam
 from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform, so3_exp, transform_points
 from slam_core.types import Features
@@ -87,6 +87,13 @@ def test_rows_exposed_at_once_are_left_alone(rng: np.random.Generator) -> None:
     frame, _ = measured(world, 60 / RATE, 0.0, rng)
     assert shutter.readout_s == 0.0
     assert shutter.corrected(frame, 1.0 / RATE, motion(60)) is frame
+
+
+def test_a_few_pairs_that_agree_by_chance_prove_nothing(rng: np.random.Generator) -> None:
+    alike = 0.005 + 1e-4 * rng.standard_normal(16)
+    mean, standard_error = _robust_mean(alike, np.full(16, 0.005))
+    assert mean == pytest.approx(0.005, abs=2e-4)
+    assert standard_error == pytest.approx(0.005 / 4.0)
 
 
 def test_a_frame_that_does_not_follow_the_last_takes_no_velocity_from_it(rng: np.random.Generator) -> None:

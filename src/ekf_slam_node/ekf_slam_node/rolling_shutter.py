@@ -210,7 +210,8 @@ def _solve(pairs: PairErrors, slope: FloatArray, excess: FloatArray) -> tuple[fl
 def _robust_mean(values: FloatArray, sigma: FloatArray) -> tuple[float, float]:
     """Mean of values (n,) weighted by their sigma, far-off ones bounded (Huber 1964), and its standard error.
 
-    The latter is the sandwich estimate over groups of neighbours, which share frames (White 1980).
+    The latter is the sandwich estimate over groups of neighbours, which share frames (White 1980), and no less than what
+    the sigma say: the few groups of a run's beginning may agree by chance.
     """
     mean, weight = float(np.median(values)), sigma**-2.0
     scale = MAD_TO_SIGMA * np.median(np.abs(values - mean) / sigma)
@@ -219,4 +220,4 @@ def _robust_mean(values: FloatArray, sigma: FloatArray) -> tuple[float, float]:
         inside = np.abs(values - mean) < _BOUND * sigma * scale
         mean += float(weight @ pull / (weight @ inside))
     groups = np.add.reduceat(weight * pull, np.arange(0, len(values), _GROUP))
-    return mean, float(np.sqrt(groups @ groups) / (weight @ inside))
+    return mean, float(max(np.sqrt(groups @ groups) / (weight @ inside), 1.0 / np.sqrt(weight.sum())))
