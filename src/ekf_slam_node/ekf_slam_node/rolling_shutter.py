@@ -210,8 +210,8 @@ def _solve(pairs: PairErrors, slope: FloatArray, excess: FloatArray) -> tuple[fl
 def _robust_mean(values: FloatArray, sigma: FloatArray) -> tuple[float, float]:
     """Mean of values (n,) weighted by their sigma, far-off ones bounded (Huber 1964), and its standard error.
 
-    The latter is the sandwich estimate over groups of neighbours, which share frames (White 1980), and no less than what
-    the sigma say: the few groups of a run's beginning may agree by chance.
+    The latter is the sandwich estimate over groups of neighbours, which share frames (White 1980), and no less than
+    what the sigma say: the few groups of a run's beginning may agree by chance.
     """
     mean, weight = float(np.median(values)), sigma**-2.0
     scale = MAD_TO_SIGMA * np.median(np.abs(values - mean) / sigma)
