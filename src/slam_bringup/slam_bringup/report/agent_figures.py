@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from slam_bringup.pipeline.results import AgentResult, RunResult
-from slam_bringup.report.canvas import blank
+from slam_bringup.report.canvas import blank, draw_to_scale
 from slam_core.geometry import FloatArray
 
 _AXES = ("x", "y", "z")
@@ -32,7 +32,7 @@ def side_view(result: RunResult) -> Figure | None:
         axes.set_ylim(min(low[2], path[:, 2].min()) - 0.3, max(high[2], path[:, 2].max()) + 0.3)
     for agent, positions in zip(result.agents, paths, strict=False):
         axes.plot(positions[:, along], positions[:, 2], linewidth=1.4, label=agent.name or "trajectory")
-    axes.set_aspect("equal", adjustable="box")
+    draw_to_scale(figure, axes)
     axes.set(xlabel=f"{_AXES[along]} [m]", ylabel="z [m]")
     axes.legend(fontsize=8, loc="upper right")
     return figure

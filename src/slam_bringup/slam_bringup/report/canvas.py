@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.75, 0.15, 0.5, 0.35
 """Room (inches) for labels and titles around the axes."""
+_LOWEST = 1.5
+"""Height (inches) that axes keep for their legend."""
 _BETWEEN = (0.65, 0.3)
 """Room (inches) between columns and between rows of axes."""
 
@@ -26,3 +29,15 @@ def blank(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple
         },
     )  # fmt: skip
     return figure, axes
+
+
+def draw_to_scale(figure: Figure, axes: Axes) -> None:
+    """Give the only axes of a figure equal scales, and the figure no more height than they then fill."""
+    axes.set_aspect("equal", adjustable="box")
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    width, height = figure.get_size_inches()
+    filled = (width - _LEFT - _RIGHT) * (high - low) / (right - left)
+    height = min(height, max(filled, _LOWEST) + _BOTTOM + _TOP)
+    figure.set_figheight(height)
+    across, along = 1.0 - (_LEFT + _RIGHT) / width, 1.0 - (_BOTTOM + _TOP) / height
+    axes.set_position((_LEFT / width, _BOTTOM / height, across, along))

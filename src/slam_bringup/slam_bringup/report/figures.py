@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from dense_mapping.floor_plan import FREE, OCCUPIED, FloorPlan
 from dense_mapping.navigation import frontiers
 from slam_bringup.pipeline.results import AgentResult, RunResult
-from slam_bringup.report.canvas import blank
+from slam_bringup.report.canvas import blank, draw_to_scale
 from slam_core.chi_square import chi_square_quantile
 from slam_core.evaluation import align, associate
 from slam_core.files import atomic_path
@@ -40,7 +40,6 @@ def map_figure(result: RunResult) -> Figure:
     _draw_landmarks(axes, result)
     for agent, colour in zip(result.agents, COLOURS * len(result.agents), strict=False):
         _draw_agent(axes, agent, colour)
-    axes.set_aspect("equal", adjustable="box")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.set_title(
@@ -53,6 +52,7 @@ def map_figure(result: RunResult) -> Figure:
     if named:
         axes.legend(named.values(), named.keys(), loc="upper right", framealpha=0.9)
     _limit_to_content(axes, result)
+    draw_to_scale(figure, axes)
     return figure
 
 
