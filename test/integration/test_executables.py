@@ -25,6 +25,7 @@ TOOLS = (
     ("dense_mapping", "dense_mapper"),
     *(("slam_bringup", name) for name in ("bag_player", "recorder", "slam_composed", "viewer")),
 )
+RECORDED = ("/stereo/left/image_rect", "/tof/points", "/features", "/odom", "/ndt/odometry", "/diagnostics")
 
 
 @pytest.mark.parametrize(("package", "executable"), [*ESTIMATORS, *TOOLS])
@@ -51,7 +52,10 @@ def test_every_node_starts_publishes_and_stops_on_sigint(
         nodes += [group.start(recorder), group.start(player)]
         heard = supervisor.diagnostics
         supervisor.wait(lambda: all(f"/{e}" in heard for _, e in ESTIMATORS), 60.0, "a report of every node")
-        supervisor.wait(lambda: supervisor.progress["/ekf_slam"] > 0, 60.0, "a frame through the whole chain")
+        log = nodes[-2].log
+        supervisor.wait(lambda: all(f"recording {t}" in log.read_text() for t in RECORDED), 60.0, "the recorder")
+        before = supervisor.progress["/ekf_slam"]
+        supervisor.wait(lambda: supervisor.progress["/ekf_slam"] > before, 60.0, "a frame through the whole chain")
         supervisor.listen(1.0)
         group.stop()
         codes = dict(group.exit_codes)
@@ -60,7 +64,7 @@ def test_every_node_starts_publishes_and_stops_on_sigint(
         check_log(node)
     with BagReader(recording) as bag:
         topics = bag.topics
-    for topic in ("/stereo/left/image_rect", "/tof/points", "/features", "/odom", "/ndt/odometry", "/diagnostics"):
+    for topic in RECORDED:
         assert topics[topic].count > 0, topic
 
 
