@@ -13,10 +13,11 @@ from submap_world import Agent, Sensor, World, circle, path_through, ring_world,
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.graph.links import Link, Prior, Status
+from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.association import match
-from sjsam_node.loop_closure.consistency import Verdict
+from sjsam_node.loop_closure.consistency import Consistency, Verdict
 from sjsam_node.loop_closure.point_sets import at_start
-from sjsam_node.smoothing.smoother import UpdateResult
+from sjsam_node.smoothing.smoother import Smoother, UpdateResult
 from slam_core.geometry import boxminus, invert_transform
 from slam_core.types import Submap
 
@@ -165,3 +166,20 @@ def test_honest_submaps_with_few_landmarks_are_joined_and_kept() -> None:
     joined.settle()
     assert not joined.doubt
     assert ate(errors(joined, agent)[0]) < 0.5 * chain_ate(agent, submaps)
+
+
+def test_a_closure_that_waits_takes_nothing_with_it_that_a_new_one_does_not_contradict(monkeypatch) -> None:
+    def link(first: int, second: int) -> Link:
+        return Link(first, second, np.zeros((5, 2), int), np.eye(4), np.eye(6), is_closure=True)
+
+    found, same, false = link(0, 9), link(1, 10), link(3, 20)
+    rival, true = link(1, 8), link(4, 21)
+    contradicts = {(found.ends, rival.ends), (same.ends, rival.ends), (false.ends, true.ends)}
+    monkeypatch.setattr(
+        Consistency, "_excluded", lambda _, one, others: np.array([(one.ends, k.ends) in contradicts for k in others])
+    )
+    consistency = Consistency(Smoother(MapGraph()))
+    group, rivals = consistency._with_rivals([found, same, false], [rival, true], {found.ends})
+    assert group == [found, same]
+    assert rivals == [rival]
+    assert consistency._with_rivals([found, false], [], {found.ends}) == ([found, false], [])

@@ -198,14 +198,28 @@ class Consistency:
         agreeing = [
             k for k, is_off in zip(offered, self._excluded(best, offered), strict=True) if k is best or not is_off
         ]
-        excluded = np.any([self._excluded(k, held) for k in agreeing], axis=0) if held else []
-        rivals = [k for k, is_off in zip(held, excluded, strict=True) if is_off]
+        agreeing, rivals = self._with_rivals(agreeing, held, ends)
         group = agreeing if rivals or not sure else [k for k in agreeing if _is_in(k, sure)]
         support = self._support(group)
         enough = support >= self._support(rivals) if rivals else bool(sure) or len(group) > len(found)
         if not sure:  # what was refused is tried again once clearly more speaks for it
             enough = enough and support > self.config.retry * self._refused_support
         return ([k.with_status(Status.CONSISTENT) for k in group], rivals) if enough else ([], [])
+
+    def _with_rivals(
+        self, agreeing: list[Link], held: list[Link], found: set[tuple[int, int]]
+    ) -> tuple[list[Link], list[Link]]:
+        """Closures that would be held together, and those held that they exclude.
+
+        One that waits speaks only against what a ``found`` one (by its ends) speaks against too: a false one, of other
+        stretches of way, would else take true closures from the map with it.
+        """
+        if not held:
+            return agreeing, []
+        excluded = [self._excluded(k, held) for k in agreeing]
+        by_found = np.any([x for k, x in zip(agreeing, excluded, strict=True) if k.ends in found], axis=0)
+        group = [k for k, x in zip(agreeing, excluded, strict=True) if not np.any(x & ~by_found)]
+        return group, [k for k, is_off in zip(held, by_found, strict=True) if is_off]
 
     def _support(self, links: Sequence[Link]) -> int:
         """Number of landmarks that links match, each counted once however often it was seen."""

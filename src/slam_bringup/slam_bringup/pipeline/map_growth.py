@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -100,13 +101,19 @@ class Joining:
         return [*self._apart(), *filter(None, [self.global_map.doubt])]
 
     def _apart(self) -> list[str]:
-        """Tell of new submaps that hang on nothing of the map that was there before."""
+        """Tell of new submaps whose place in the map nothing knows: in the old one, or beside the first agent's."""
         graph = self.global_map.graph
         new = graph.records[self._known :]
-        tied = sum(graph.component_of[r.start] == graph.component(0) for r in new)
-        if not self._known or tied == len(new):
-            return []
-        return [f"{len(new) - tied} of {len(new)} submaps are not tied to the old map: no place of it was recognised"]
+        loose = Counter(r.key[0] for r in new if graph.component_of[r.start] != graph.component(0))
+        if self._known and loose:
+            count = loose.total()
+            return [f"{count} of {len(new)} submaps are not tied to the old map: no place of it was recognised"]
+        every = Counter(r.key[0] for r in new)
+        return [
+            f"{count} of {every[agent]} submaps of {agent or 'the rig'} are not tied to the rest of the map: no place "
+            "was recognised, and where they are beside it is not known"
+            for agent, count in sorted(loose.items())
+        ]
 
     def trajectories(self) -> Mapping[str, Sequence[PoseEstimate]]:
         """Smoothed poses of this run, without those that were in the map before."""
