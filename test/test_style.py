@@ -27,11 +27,11 @@ def test_the_tree_is_clean(command):
 
 
 def summaries(path: Path) -> list[str]:
-    """Summary lines of all docstrings of a file, as ``file:line: text``."""
+    """Summary lines of all docstrings of a file, those of constants and attributes too, as ``file:line: text``."""
     found = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
-            found.append(f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}: {text.splitlines()[0]}")
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            found.append(f"{path.relative_to(ROOT)}:{node.lineno}: {node.value.value.strip().splitlines()[0]}")
     return found
 
 

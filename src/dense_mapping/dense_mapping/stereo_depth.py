@@ -26,7 +26,7 @@ from slam_core.types import AnyArray, ByteArray, DepthImage, Float32Array, Stere
 _BLOCK_SIZE = 7
 """Window that is compared, odd, px."""
 _UNIQUENESS_PERCENT = 5
-"""How much better the best disparity must be than the second best, %."""
+"""Share by which the best disparity must be better than the second best, %."""
 _MAX_LEFT_RIGHT = 1.0
 """Largest difference between the disparities left to right and right to left, px."""
 _SPECKLE_SIZE = 200

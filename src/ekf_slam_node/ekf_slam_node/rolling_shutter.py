@@ -41,7 +41,7 @@ _MEMORY = 400
 _MIN_PAIRS = 16
 """Pairs of frames before which nothing is corrected."""
 _PAIR_SIGMA_S = 0.005
-"""What the readout of a single pair errs by beside its noise: velocities are known from motions between frames only."""
+"""Error of the readout of a single pair beside its noise: velocities are known from motions between frames only."""
 _LONGEST_READOUT_S = 0.1
 """A pair that shows more shows something else."""
 _SMOOTHING = np.array([0.75, 0.5, -0.25])

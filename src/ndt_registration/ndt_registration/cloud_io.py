@@ -210,4 +210,4 @@ READERS = {
     ".pcd": read_pcd, ".ply": read_ply, ".vtk": read_vtk, ".csv": read_text, ".txt": read_text, ".xyz": read_text,
     ".yaml": read_laser_scan,
 }  # fmt: skip
-"""What reads the content of a file, by its suffix."""
+"""Reader of the content of a file, by its suffix."""

@@ -19,7 +19,7 @@ from slam_core.in_place import in_place
 Int32Array = npt.NDArray[np.int32]
 
 REACH_SPACINGS = 3.0
-"""How far a point looks for what is beside it, in mean angles between neighbouring points."""
+"""Distance within which a point looks for what is beside it, in mean angles between neighbouring points."""
 MAX_IMAGE_SIZE = 512
 
 

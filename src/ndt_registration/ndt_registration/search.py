@@ -39,7 +39,7 @@ _JUDGE_POINTS = 500
 _JUDGE_TOLERANCE = 0.02
 """Deviation along the ray that costs nothing there, over the scale."""
 _SCORE_GAIN = 0.3
-"""What a full score takes off the cost of a pose."""
+"""Amount that a full score takes off the cost of a pose."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from slam_core.config import Config
 from slam_core.geometry import FloatArray, skew
 
 _PROBE = 0.03
-"""How far the pose is moved to see whether it is determined, over the scale."""
+"""Distance by which the pose is moved to see whether it is determined, over the scale."""
 _FREE_SIGMA = 1.0
 """Largest standard deviation given to a free direction, over the scale."""
 _SIGMA_FLOOR = 1e-5

@@ -38,7 +38,7 @@ from slam_core.types import Counters, PoseEstimate, Submap
 ALREADY_JOINED = "already joined"
 
 _PASSES = 2
-"""How often settling looks for closures, and lets go what the map contradicts: one finding lets another follow."""
+"""Times that settling looks for closures, and lets go what the map contradicts: one finding lets another follow."""
 
 FARTHEST_M = 1e6
 """Landmarks beyond are none of a building."""

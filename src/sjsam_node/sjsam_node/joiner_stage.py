@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 _STOP, _REQUEST, _SUBMAP, _LATER, _END = range(5)
-"""What is done first of all that waits."""
+"""Priorities of what waits, the first one first."""
 
 
 class JoinerStage:

@@ -26,7 +26,7 @@ class Exchange:
 
     def __init__(self) -> None:
         self.node_options: dict[str, Any] = {}
-        """What the node that is being made hands to rclpy's."""
+        """Arguments that the node that is being made hands to rclpy's."""
         self._publishers: set[str] = set()
         self._listeners: dict[str, list[Callable[[Message], None]]] = defaultdict(list)
 

@@ -25,7 +25,7 @@ _NEAR = 0.2
 _REUSE_RATE = 0.25
 """And as long as each step promises less than this share of what the one before did."""
 _DOUBT = 4.0
-"""How many times more a step may promise than the linear model was wrong by at the one before."""
+"""Factor by which a step may promise more than the linear model was wrong by at the one before."""
 
 
 def whitening(covariance: FloatArray) -> FloatArray:

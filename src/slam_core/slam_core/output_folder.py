@@ -95,7 +95,7 @@ class OutputFolder:
         self._manifest = Manifest(command, source, results)
         self._made_here = not path.exists()
         self.rescued: Path | None = None
-        """What :meth:`staged` kept of results that were given up."""
+        """Results that were given up, as far as :meth:`staged` kept them."""
 
     def __enter__(self) -> Self:
         self.path.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from types import FrameType
 
 STARTED_S = time.monotonic()
-"""When this program started; whoever measures it imports this module first."""
+"""Start of this program; whoever measures it imports this module first."""
 
 PARENT = "SLAM_PARENT_PID"
 """Environment variable with the process that started this one and without which it is of no use."""

@@ -43,4 +43,4 @@ REAL = RealismConfig(
 )
 """One person about, a chair that is moved, thin smoke, some dark and some shiny things, a ToF camera as they are."""
 REAL_STEREO = {"calibration_pictures": 20, "exposure_ms": 10.0, "gain_jitter": 0.02}
-"""What the stereo camera has at least under ``real``."""
+"""Errors that the stereo camera has at least under ``real``."""

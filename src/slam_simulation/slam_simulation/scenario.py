@@ -104,7 +104,7 @@ class Scenario:
     full_frames: int = 0
     """Frames of the whole motion, if ``frames`` has been cut."""
     profile: str = ""
-    """How hard it is, see :mod:`slam_simulation.profiles`; "" is ``ideal`` as long as nobody chooses."""
+    """Profile, see :mod:`slam_simulation.profiles`; "" is ``ideal`` as long as nobody chooses."""
 
     def __post_init__(self) -> None:
         if self.rate <= 0.0 or self.frames < 1:

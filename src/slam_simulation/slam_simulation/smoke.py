@@ -17,7 +17,7 @@ from slam_core.types import Float32Array
 _BACKSCATTER = 0.1
 """Light that comes back from the smoke, over that of a white surface at 1 m, per unit of density."""
 _BACKSCATTER_RANGE = 0.5
-"""Where most of it comes from, m."""
+"""Length of the way that most of it comes from, m."""
 
 
 @dataclass(frozen=True)

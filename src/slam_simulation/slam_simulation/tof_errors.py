@@ -20,7 +20,7 @@ from slam_core.geometry import FloatArray
 _SPREAD = 0.12
 """Standard deviation of the indirect light over the image, as a share of its side."""
 _DETOUR = 0.4
-"""How much farther indirect light has travelled, m."""
+"""Length by which indirect light has travelled farther, m."""
 _WIGGLES = 4.0
 
 

@@ -30,7 +30,7 @@ _GRID_ROWS = 8
 _SURPLUS = 1.5
 """Candidates wanted per feature kept: the grid chooses among them."""
 _ADAPTATION = 0.7
-"""How fast the threshold follows the number of candidates; 0 keeps it fixed."""
+"""Rate at which the threshold follows the number of candidates; 0 keeps it fixed."""
 
 DETECTORS = ("surf", "sift", "rootsift", "orb", "censure")
 _THRESHOLD_RANGE = (0.02, 20.0)

@@ -10,7 +10,7 @@ from slam_core.in_place import in_place
 
 UNKNOWNS = 4
 REORDER = {"reassoc", "contract"}
-"""What a sum needs to be vectorised; the rest of fastmath would forget that NaN exists."""
+"""Licence that a sum needs to be vectorised; the rest of fastmath would forget that NaN exists."""
 _MOST_ITERATIONS = 20
 _CONVERGED = 0.01
 _LEAST_ENERGY = 1.0

@@ -36,7 +36,7 @@ class DepthStage:
     def __init__(self, config: DepthConfig) -> None:
         self.info: CameraInfo | None = None
         self.complaint = ""
-        """What is wrong with the newest image, or ""."""
+        """Fault of the newest image, or ""."""
         self._config = config
         self._processor: DepthProcessor | None = None
         self._waiting: deque[RawDepth] = deque()

@@ -9,6 +9,7 @@ import pytest
 from slam_bringup.bags.bag import BagWriter
 from slam_bringup.bags.readings import DepthReading, ImuReading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.bags.sensor_topics import topics_of
 from slam_bringup.bags.sensor_writer import (
     IMU_FRAME,
     LEFT_FRAME,
@@ -106,3 +107,11 @@ def test_bags_without_cameras_or_calibration_are_refused(tmp_path: Path) -> None
             SensorWriter(bag).picture(f"stereo/{side}/image_raw", 1, frame, picture(0))
     with pytest.raises(ValueError, match="no camera info on /stereo/left/camera_info"):
         SensorBag(tmp_path / "bag").__enter__()
+
+
+def test_a_laser_is_used_where_there_is_no_depth_camera():
+    left, tof = ("/stereo/left/image_raw", "/stereo/right/image_raw", "/scan"), "/tof/depth/image_raw"
+    assert topics_of("", left, {})["scan"] == "/scan"
+    assert "scan" not in topics_of("", (*left, tof), {})
+    with pytest.raises(ValueError, match="leave the topic of 'scan' out"):
+        topics_of("", (*left, tof), {"scan": "/scan"})

@@ -49,14 +49,14 @@ class ConsistencyConfig(Config):
         0.9999, "share of true closures whose rise of chi2 is accepted", minimum=0.9, maximum=0.9999999
     )
     view_change: float = 2.0
-    """How much larger squared errors of matches from another view are than those in a whole map."""
+    """Factor by which squared errors of matches from another view are larger than those in a whole map."""
     max_variance_factor: float = parameter(
         16.0,
         "a map whose submaps seem too sure of themselves by more than this factor holds false closures",
         minimum=1.0,
     )
     retry: float = 1.2
-    """How many times the landmarks of closures that were refused must speak for them to be tried again."""
+    """Growth of the landmarks that speak for refused closures, from which these are tried again."""
     waiting: int = 40
     """Refused closures that are remembered."""
 

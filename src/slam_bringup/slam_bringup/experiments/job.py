@@ -37,7 +37,7 @@ EVERYTHING = (
     "ekf_slam_node", "sjsam_node", "slam_bringup.pipeline", "slam_bringup.bags",
 )  # fmt: skip
 Kept = tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]
-"""What a job's function returns: values as JSON knows them, and arrays by name."""
+"""Result of a job's function: values as JSON knows them, and arrays by name."""
 _VALUES, _ARRAYS = "result.json", "arrays.npz"
 
 

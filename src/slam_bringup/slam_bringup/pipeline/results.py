@@ -34,11 +34,11 @@ class AgentResult:
     truth: Trajectory = EMPTY_TRAJECTORY
     feature_counts: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     front_end: FrontendReport = field(default_factory=FrontendReport)
-    """What the images told."""
+    """Findings about the images."""
     lost_share: float = 0.0
     """Share of its frames at which it was lost."""
     sensors: tuple[str, ...] = ()
-    """What its map is made of, in words."""
+    """Sensors that its map is made of, in words."""
     frames: tuple[LoggedFrame, ...] = ()
     """Some of its pictures, with the features found in them."""
     base_frame: str = "base_link"

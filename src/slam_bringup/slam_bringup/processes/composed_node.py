@@ -43,7 +43,7 @@ _NODES = {
     "ekf_slam": "ekf_slam_node.node:EkfNode",
     "sjsam": "sjsam_node.node:SjsamNode",
 }
-"""Where the node of an executable is."""
+"""Module and class of the node of each executable."""
 
 _JOIN_S = 10.0
 

@@ -24,7 +24,7 @@ INTERRUPTED = 130
 """Exit code of a program that Ctrl-C has ended."""
 
 STOPPED = "stopped before the end: no dense model and no report"
-"""What a result says of a run that ended early."""
+"""Words of a result about a run that ended early."""
 
 MAP = "map"
 """The part of the results that a user who gives up keeps."""

@@ -21,7 +21,7 @@ RESULT_TOPICS = (
     "odom", "pose", "features", "landmarks", "ndt/odometry", "ndt/motion", "map_to_odom", "submap/landmarks",
     "submap/info", "submap/path", "map/landmarks", "map/path", "map/graph", "map/ellipsoids", "map/cloud", "map/marks",
 )  # fmt: skip
-"""What ``slam nodes`` records, below each agent's namespace and at the root."""
+"""Topics that ``slam nodes`` records, below each agent's namespace and at the root."""
 
 _FINISHERS = ("ndt_odometry", "feature_extractor", "ekf_slam")
 """Nodes that hold frames back, front to back."""

@@ -30,7 +30,7 @@ _MODULES = {
     ("slam_bringup", "viewer"): "slam_bringup.viewer.viewer_node",
     ("dense_mapping", "dense_mapper"): "dense_mapping.node",
 }
-"""Where each executable's ``main`` is, for a workspace that has not been built."""
+"""Module of each executable's ``main``, for a workspace that has not been built."""
 
 _DOMAINS = range(1, 101)
 _STOP_AFTER_S = 10.0
