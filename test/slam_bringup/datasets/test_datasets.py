@@ -150,6 +150,33 @@ def test_numbered_frames_are_paired_by_name_and_what_has_no_partner_is_named(tmp
     np.testing.assert_allclose(truth.poses[2][:3, :3] @ truth.poses[2][:3, :3].T, np.eye(3), atol=1e-12)
 
 
+def test_a_folder_that_states_no_camera_matrix_asks_for_one(tmp_path: Path) -> None:
+    source = make_numbered(tmp_path / "office")
+    calibration = (source / "K.txt").rename(tmp_path / "camera.txt")
+    with pytest.raises(ValueError, match="states no camera matrix: give it by --calibration"):
+        RgbdDataset(source)
+    with convert(RgbdDataset(source, calibration), tmp_path / "bag") as bag:
+        assert bag.sensors[""].tof is not None
+        assert bag.sensors[""].tof.camera.fx == 50.0
+
+
+def test_stamps_that_a_source_does_not_have_are_told(tmp_path: Path) -> None:
+    source = make_numbered(tmp_path / "office")
+    assert RgbdDataset(source).assumed == ["10 frames per second, as the source has no stamps (--rate HZ)"]
+    dataset = RgbdDataset(source, rate=20.0)
+    assert not dataset.assumed
+    with convert(dataset, tmp_path / "bag") as bag:
+        stamps = [r.stamp_ns for r in bag.readings() if isinstance(r, DepthReading)]
+    assert stamps == [10**9, 10**9 + 100_000_000]
+    tum = make_tum(tmp_path / "tum")
+    assert RgbdDataset(tum).assumed == [
+        "fx 525, fy 525, cx 319.5, cy 239.5, as TUM RGB-D gives for all its cameras (--calibration FILE)"
+    ]
+    for kind, folder in ((RgbdDataset, tum), (EurocDataset, make_euroc(tmp_path / "euroc")[0])):
+        with pytest.raises(ValueError, match="has the stamps of the frames: leave --rate out"):
+            kind(folder, rate=20.0)
+
+
 def test_an_excerpt_of_euroc_with_text_tables(tmp_path: Path) -> None:
     source, _ = make_euroc(tmp_path / "euroc")
     mav = source / "mav0"

@@ -18,7 +18,7 @@ from slam_bringup.datasets.files import Dataset
 from slam_bringup.datasets.kitti import KittiDataset
 from slam_bringup.datasets.rgbd import RgbdDataset
 
-DATASETS: dict[str, Callable[[Path, Path | None, Path | None], Dataset]] = {
+DATASETS: dict[str, Callable[[Path, Path | None, Path | None, float | None], Dataset]] = {
     "euroc": EurocDataset,
     "kitti": KittiDataset,
     "rgbd": RgbdDataset,
@@ -42,26 +42,29 @@ def convert(
 @click.option("-o", "--output", type=UserPath(), required=True, help="the bag to write")
 @click.option("--calibration", type=UserPath(), help="calibration, where the source has none")
 @click.option("--ground-truth", type=UserPath(), help="poses, where the source has none")
+@click.option("--rate", type=click.FloatRange(0.1, 1000.0), help="frames per second, where the source has no stamps")
 @click.option("--storage", type=click.Choice(["mcap", "sqlite3"]), default="mcap", show_default=True)
 @click.option(
     "--compression", type=click.Choice(COMPRESSIONS), default="zstd", show_default=True, help="compression of mcap bags"
 )
 @overwrite_option("a bag that slam wrote")
 def command(
-    kind: str, source: Path, output: Path, calibration: Path | None, ground_truth: Path | None, storage: str,
-    compression: str, overwrite: bool,
+    kind: str, source: Path, output: Path, calibration: Path | None, ground_truth: Path | None, rate: float | None,
+    storage: str, compression: str, overwrite: bool,
 ) -> None:  # fmt: skip
-    """Convert a public data set to a bag, and say what of it is left out.
+    """Convert a public data set to a bag, and say what of it is left out and what is assumed.
 
     KIND is euroc (folders with mav0, or key frames), kitti (odometry) or rgbd (7-Scenes, TUM RGB-D, plain folders of
     pictures and depth). Logs without images, such as MRCLAM's, have no place in a bag of images.
     """
     require_free(output, overwrite=overwrite)
-    dataset = DATASETS[kind](source, calibration, ground_truth)
+    dataset = DATASETS[kind](source, calibration, ground_truth, rate)
     frames = convert(dataset, output, storage, overwrite=overwrite, compression=compression)
     if is_quiet():
         return
     click.echo(f"{output}: {frames} frames")
+    for assumption in dataset.assumed:
+        click.echo(f"assumed: {assumption}")
     for reason, count in dataset.left_out.items():
         if count:
             click.echo(f"left out: {count} {reason}")

@@ -24,7 +24,7 @@ import numpy as np
 import yaml
 
 from slam_bringup.bags.sensor_writer import IMU_FRAME, LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
-from slam_bringup.datasets.files import StampedPair, existing, read_grey
+from slam_bringup.datasets.files import StampedPair, existing, read_grey, refuse_rate
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import FloatArray, invert_transform, make_transform
 from slam_core.trajectory import Trajectory, read_trajectory
@@ -56,8 +56,12 @@ class EurocDataset:
         the source.
     """
 
-    def __init__(self, source: Path, calibration: Path | None = None, ground_truth: Path | None = None) -> None:
+    def __init__(
+        self, source: Path, calibration: Path | None = None, ground_truth: Path | None = None, rate: float | None = None
+    ) -> None:
         root = _root(source)
+        refuse_rate(rate, root)
+        self.assumed: list[str] = []
         sensors = _root(calibration) if calibration else root
         left, right = (_read_mount(sensors / name / "sensor.yaml") for name in ("cam0", "cam1"))
         self._infos, T_rectified_left = rectify(left, right)

@@ -22,10 +22,12 @@ START_NS = 1_000_000_000
 class Dataset(Protocol):
     """A data set that can be written to a bag frame by frame.
 
-    ``left_out`` counts, by reason, what of the source does not go into the bag.
+    ``left_out`` counts, by reason, what of the source does not go into the bag. ``assumed`` names what the source does
+    not state, in words.
     """
 
     left_out: Counter[str]
+    assumed: list[str]
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -41,6 +43,32 @@ class StampedPair:
     stamp_ns: int
     first: Path
     second: Path
+
+
+class Clock:
+    """Stamps of frames whose source has none: those of a constant rate.
+
+    Parameters
+    ----------
+    usual
+        Rate of the camera, Hz.
+    given
+        Rate that the user gives instead, Hz.
+    """
+
+    def __init__(self, usual: float, given: float | None) -> None:
+        self._rate = usual if given is None else given
+        self.assumed = [] if given else [f"{usual:g} frames per second, as the source has no stamps (--rate HZ)"]
+
+    def stamps_ns(self, count: int) -> list[int]:
+        """Stamps of so many frames in turn."""
+        return [START_NS + i * round(1e9 / self._rate) for i in range(count)]
+
+
+def refuse_rate(rate: float | None, stamped: Path) -> None:
+    """ValueError if a rate is given although the source has stamps."""
+    if rate is not None:
+        raise ValueError(f"{stamped} has the stamps of the frames: leave --rate out")
 
 
 def read_grey(path: Path) -> ByteArray:

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 
 from slam_bringup.bags.sensor_writer import LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
-from slam_bringup.datasets.files import START_NS, StampedPair, existing, read_grey
+from slam_bringup.datasets.files import START_NS, Clock, StampedPair, existing, read_grey, refuse_rate
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import FloatArray, invert_transform, make_transform
 from slam_core.trajectory import read_trajectory
 
 _FOLDERS = (("image_0", "image_1"), ("image_l", "image_r"), ("image_2", "image_3"))
-_PERIOD_NS = 100_000_000
+_RATE = 10.0
 
 
 class KittiDataset:
@@ -35,11 +35,15 @@ class KittiDataset:
         File with the projection matrices; default: ``calib.txt`` of the source.
     ground_truth
         File with one 3x4 pose of the left camera per frame; default: ``poses.txt`` of the source.
+    rate
+        Frames per second where the source has no ``times.txt``; default: 10.
     """
 
-    def __init__(self, source: Path, calibration: Path | None = None, ground_truth: Path | None = None) -> None:
+    def __init__(
+        self, source: Path, calibration: Path | None = None, ground_truth: Path | None = None, rate: float | None = None
+    ) -> None:
         self._folders = _image_folders(existing(source, "KITTI sequence"))
-        self._pairs = _pairs(source, self._folders)
+        self._pairs, self.assumed = _pairs(source, self._folders, rate)
         self._projections = _read_projections(calibration or source / "calib.txt", self._folders[0].name)
         self._truth = _read_truth(ground_truth or source / "poses.txt", len(self._pairs))
         names = [{path.name for path in folder.glob("*.png")} for folder in self._folders]
@@ -72,22 +76,25 @@ def _image_folders(source: Path) -> tuple[Path, Path]:
     raise ValueError(f"{source} holds none of the image folders {names}")
 
 
-def _pairs(source: Path, folders: tuple[Path, Path]) -> list[StampedPair]:
+def _pairs(source: Path, folders: tuple[Path, Path], rate: float | None) -> tuple[list[StampedPair], list[str]]:
+    """The pairs in turn, and what is assumed of their stamps."""
     left = sorted(folders[0].glob("*.png"))
     if not left:
         raise ValueError(f"{folders[0]} holds no png images")
-    stamps = _read_times(source / "times.txt", len(left))
+    stamps, assumed = _read_times(source / "times.txt", len(left), rate)
     right = [existing(folders[1] / path.name, "right image") for path in left]
-    return [StampedPair(s, a, b) for s, a, b in zip(stamps, left, right, strict=True)]
+    return [StampedPair(s, a, b) for s, a, b in zip(stamps, left, right, strict=True)], assumed
 
 
-def _read_times(path: Path, count: int) -> list[int]:
+def _read_times(path: Path, count: int, rate: float | None) -> tuple[list[int], list[str]]:
     if not path.exists():
-        return [START_NS + i * _PERIOD_NS for i in range(count)]
+        clock = Clock(_RATE, rate)
+        return clock.stamps_ns(count), clock.assumed
+    refuse_rate(rate, path)
     stamps = [START_NS + int(Decimal(line) * 10**9) for line in path.read_text().split()]
     if len(stamps) < count:
         raise ValueError(f"{path} has {len(stamps)} times for {count} images")
-    return stamps[:count]
+    return stamps[:count], []
 
 
 def _read_projections(path: Path, left_folder: str) -> tuple[FloatArray, FloatArray]:

@@ -5,9 +5,12 @@
   ``.pose.txt`` (camera to world); 30 Hz; ``camera-intrinsics.txt`` if there is one.
 - TUM RGB-D (Sturm et al. 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; depth in 1/5000 m; paired by time, and
   stamped as the picture: what a frame says of the motion is in its pixels, the depth changes little within 20 ms.
-- plain: ``color/<n>.png``, ``depth/<n>.png`` (mm), ``pose.txt`` with x y z qx qy qz qw per frame; 30 Hz.
+- plain: ``color/<n>.png``, ``depth/<n>.png`` (mm), ``K.txt``, ``pose.txt`` with x y z qx qy qz qw per frame; no stamps,
+  taken as 30 Hz.
 - numbered, as deep-video-mvs (Duzceker et al. 2021) has it: ``images/<n>.png``, ``depth/<n>.png`` (mm, registered),
   ``K.txt``, ``poses.txt`` with a 4x4 camera-to-world matrix per line; no stamps, taken as 10 Hz.
+
+``K.txt`` is the 3x3 camera matrix. A folder without one needs ``calibration``: cameras of one make differ by 2 %.
 
 The depth is along z, so it goes to ``tof/depth/image_raw`` as it is; the picture, registered to it, becomes the
 amplitude in grey, which features come from, and ``tof/color/image_raw``.
@@ -25,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_bringup.bags.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
-from slam_bringup.datasets.files import START_NS, StampedPair, existing, read_colour, read_depth, read_grey
+from slam_bringup.datasets.files import Clock, StampedPair, existing, read_colour, read_depth, read_grey, refuse_rate
 from slam_bringup.datasets.picture_registration import ColourCamera, register_pictures
 from slam_core.camera import Camera, CameraInfo
 from slam_core.camera_info import read_camera_info
@@ -34,8 +37,8 @@ from slam_core.messages import rectified_info
 from slam_core.trajectory import read_trajectory
 from slam_core.types import AnyArray
 
-_PERIOD_NS = 33_333_333
-_NUMBERED_PERIOD_NS = 100_000_000
+_RATE = 30.0
+_NUMBERED_RATE = 10.0
 _MILLIMETRES_INVALID = 65535
 _PAIRING_NS = 20_000_000
 _KINECT_SEVEN_SCENES = (585.0, 585.0, 320.0, 240.0)
@@ -44,17 +47,24 @@ _KINECT_SEVEN_SCENES_COLOUR = ColourCamera((530.0, 530.0, 320.0, 240.0), (0.0256
 _KINECT_TUM = (525.0, 525.0, 319.5, 239.5)
 
 
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy, px."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Files, unit of the depth (units per metre), default intrinsics fx fy cx cy, and poses T_world_camera by stamp."""
+    """Files, unit of the depth (units per metre), stated intrinsics, and poses T_world_camera by stamp."""
 
     pairs: list[StampedPair]
     units_per_metre: float
-    intrinsics: tuple[float, float, float, float]
+    intrinsics: Intrinsics | None
     poses: list[tuple[int, FloatArray]]
     colour: ColourCamera | None = None
     """The camera of the pictures where they are not registered to the depth."""
     left_out: Counter[str] = field(default_factory=Counter)
+    assumed: list[str] = field(default_factory=list)
+    usual: str = ""
+    """Intrinsics that are those of the data set, not of this recording, in words."""
 
 
 class RgbdDataset:
@@ -68,11 +78,22 @@ class RgbdDataset:
         Camera info YAML or a text file with the 3x3 camera matrix; default: what the data set states.
     ground_truth
         TUM file of camera poses; default: those of the source.
+    rate
+        Frames per second where the source has no stamps; default: that of its layout.
     """
 
-    def __init__(self, source: Path, calibration: Path | None = None, ground_truth: Path | None = None) -> None:
-        self._layout = _find_layout(existing(source, "RGB-D folder"))
+    def __init__(
+        self, source: Path, calibration: Path | None = None, ground_truth: Path | None = None, rate: float | None = None
+    ) -> None:
+        self._layout = _find_layout(existing(source, "RGB-D folder"), rate)
         self.left_out = self._layout.left_out
+        self.assumed = list(self._layout.assumed)
+        if self._layout.intrinsics is None and calibration is None:
+            raise ValueError(
+                f"{source} states no camera matrix: give it by --calibration (3x3 text or camera info YAML)"
+            )
+        if calibration is None and self._layout.usual:
+            self.assumed.append(self._layout.usual)
         self._calibration = calibration
         self._poses = _read_tum(ground_truth) if ground_truth else self._layout.poses
 
@@ -102,6 +123,7 @@ class RgbdDataset:
         numbers = self._layout.intrinsics
         if self._calibration is not None:
             numbers = _read_camera_matrix(existing(self._calibration, "calibration"))
+        assert numbers is not None, "asked for when the folder was read"
         return rectified_info(Camera(shape[1], shape[0], *numbers))
 
 
@@ -117,34 +139,37 @@ def _clean(depth: AnyArray, units_per_metre: float) -> AnyArray:
     return depth if units_per_metre == 1000.0 else depth.astype(np.float32) / np.float32(units_per_metre)
 
 
-def _find_layout(source: Path) -> _Layout:
+def _find_layout(source: Path, rate: float | None) -> _Layout:
     for candidate in (source, source / "data"):
         if any(candidate.glob("frame-*.depth.png")):
-            return _seven_scenes(candidate)
+            return _seven_scenes(candidate, Clock(_RATE, rate))
         if (candidate / "depth.txt").exists():
+            refuse_rate(rate, candidate / "depth.txt")
             return _tum(candidate)
         if (candidate / "depth").is_dir() and (candidate / "color").is_dir():
-            return _plain(candidate)
+            return _plain(candidate, Clock(_RATE, rate))
         if (candidate / "depth").is_dir() and (candidate / "images").is_dir():
-            return _numbered(candidate)
+            return _numbered(candidate, Clock(_NUMBERED_RATE, rate))
     raise ValueError(
         f"{source} is no RGB-D folder: no frame-*.depth.png, no depth.txt, no depth/ beside color/ or images/"
     )
 
 
-def _seven_scenes(folder: Path) -> _Layout:
+def _seven_scenes(folder: Path, clock: Clock) -> _Layout:
     pairs, poses = [], []
-    for number, depth in enumerate(sorted(folder.glob("frame-*.depth.png"))):
+    depths = sorted(folder.glob("frame-*.depth.png"))
+    for stamp, depth in zip(clock.stamps_ns(len(depths)), depths, strict=True):
         stem = depth.name.removesuffix(".depth.png")
         colour = [p for p in (folder / f"{stem}.color.{kind}" for kind in ("png", "jpg")) if p.exists()]
-        stamp = START_NS + number * _PERIOD_NS
         pairs.append(StampedPair(stamp, existing((colour or [folder / f"{stem}.color.png"])[0], "colour image"), depth))
         pose = folder / f"{stem}.pose.txt"
         if pose.exists():
             poses.append((stamp, _read_matrix(pose)))
-    matrix = folder / "camera-intrinsics.txt"
-    intrinsics = _read_camera_matrix(matrix) if matrix.exists() else _KINECT_SEVEN_SCENES
-    return _Layout(pairs, 1000.0, intrinsics, poses, _KINECT_SEVEN_SCENES_COLOUR)
+    stated = _stated(folder / "camera-intrinsics.txt")
+    return _Layout(
+        pairs, 1000.0, stated or _KINECT_SEVEN_SCENES, poses, _KINECT_SEVEN_SCENES_COLOUR, assumed=clock.assumed,
+        usual="" if stated else _usual(_KINECT_SEVEN_SCENES, "7-Scenes"),
+    )  # fmt: skip
 
 
 def _tum(folder: Path) -> _Layout:
@@ -162,7 +187,8 @@ def _tum(folder: Path) -> _Layout:
         "pictures without depth near in time": len(colour) - len(pairs),
         "depth images without a picture near in time": len(depth) - len(pairs),
     })  # fmt: skip
-    return _Layout(pairs, 5000.0, _KINECT_TUM, _read_tum(truth) if truth.exists() else [], left_out=left_out)
+    poses = _read_tum(truth) if truth.exists() else []
+    return _Layout(pairs, 5000.0, _KINECT_TUM, poses, left_out=left_out, usual=_usual(_KINECT_TUM, "TUM RGB-D"))
 
 
 def _nearest(stamps: list[int], stamp: int) -> int | None:
@@ -171,35 +197,35 @@ def _nearest(stamps: list[int], stamp: int) -> int | None:
     return min(stamps[max(after - 1, 0) : after + 1], key=lambda s: abs(s - stamp), default=None)
 
 
-def _plain(folder: Path) -> _Layout:
+def _plain(folder: Path, clock: Clock) -> _Layout:
     depths = sorted((folder / "depth").iterdir(), key=lambda p: (len(p.stem), p.stem))
     pairs = [
-        StampedPair(START_NS + i * _PERIOD_NS, existing(folder / "color" / f"{p.stem}.png", "colour image"), p)
-        for i, p in enumerate(depths)
+        StampedPair(stamp, existing(folder / "color" / f"{p.stem}.png", "colour image"), p)
+        for stamp, p in zip(clock.stamps_ns(len(depths)), depths, strict=True)
     ]
     pose_file = folder / "pose.txt"
     rows = np.loadtxt(pose_file, ndmin=2) if pose_file.exists() else np.empty((0, 7))
     poses = [(pair.stamp_ns, transform_from_pose7(row)) for pair, row in zip(pairs, rows, strict=False)]
-    return _Layout(pairs, 1000.0, _KINECT_TUM, poses)
+    return _Layout(pairs, 1000.0, _stated(folder / "K.txt"), poses, assumed=clock.assumed)
 
 
-def _numbered(folder: Path) -> _Layout:
+def _numbered(folder: Path, clock: Clock) -> _Layout:
     """Frames of equal name in ``images`` and ``depth``; line k of ``poses.txt`` belongs to the k-th picture."""
     pictures = sorted(p for p in (folder / "images").iterdir() if p.suffix in (".png", ".jpg"))
-    stamps = [START_NS + i * _NUMBERED_PERIOD_NS for i in range(len(pictures))]
+    stamps = clock.stamps_ns(len(pictures))
     depths = [folder / "depth" / f"{p.stem}.png" for p in pictures]
     pairs = [StampedPair(*frame) for frame in zip(stamps, pictures, depths, strict=True) if frame[2].exists()]
     if not pairs:
         raise ValueError(f"{folder}: no picture of images/ has a depth image of the same name in depth/")
-    matrix, pose_file = folder / "K.txt", folder / "poses.txt"
+    pose_file = folder / "poses.txt"
     rows = np.loadtxt(pose_file, ndmin=2).reshape(-1, 4, 4) if pose_file.exists() else np.empty((0, 4, 4))
     usable = [(stamp, T) for stamp, T in zip(stamps, rows, strict=False) if np.isfinite(T).all()]
     left_out = Counter({
         "pictures without a depth image": len(pictures) - len(pairs),
         "poses that are not finite or have no picture": len(rows) - len(usable),
     })  # fmt: skip
-    intrinsics = _read_camera_matrix(matrix) if matrix.exists() else _KINECT_TUM
-    return _Layout(pairs, 1000.0, intrinsics, [(s, _rigid(T)) for s, T in usable], left_out=left_out)
+    poses = [(s, _rigid(T)) for s, T in usable]
+    return _Layout(pairs, 1000.0, _stated(folder / "K.txt"), poses, left_out=left_out, assumed=clock.assumed)
 
 
 def _read_file_list(folder: Path, name: str) -> dict[int, Path]:
@@ -226,7 +252,16 @@ def _rigid(T: FloatArray) -> FloatArray:
     return make_transform(U @ Vt, T[:3, 3])
 
 
-def _read_camera_matrix(path: Path) -> tuple[float, float, float, float]:
+def _usual(intrinsics: Intrinsics, name: str) -> str:
+    fx, fy, cx, cy = intrinsics
+    return f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}, as {name} gives for all its cameras (--calibration FILE)"
+
+
+def _stated(path: Path) -> Intrinsics | None:
+    return _read_camera_matrix(path) if path.exists() else None
+
+
+def _read_camera_matrix(path: Path) -> Intrinsics:
     K = np.loadtxt(path)
     if K.shape != (3, 3):
         raise ValueError(f"{path} holds no 3x3 camera matrix, found {K.shape}")
