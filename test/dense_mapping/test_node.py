@@ -123,7 +123,7 @@ def test_key_frames_take_the_colour_of_their_time_whether_it_comes_before_or_aft
     def send_colour(pose: PoseEstimate) -> None:
         red = np.full((60, 80, 3), (200, 10, 10 * round(pose.stamp_ns / 1e8)), np.uint8)
         header = header_message(TYPES, pose.stamp_ns + 10**7, "tof_optical_frame")
-        node._on_colour("", image_message(TYPES, header, red, "rgb8"))
+        node._on_colour("", "tof", image_message(TYPES, header, red, "rgb8"))
 
     for k, pose in enumerate(poses):
         node._on_odometry("", odometry_message(TYPES, "odom", "base_link", pose))

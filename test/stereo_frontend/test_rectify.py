@@ -50,6 +50,18 @@ def test_a_rectified_point_lies_on_one_row_at_the_right_disparity():
     assert found[0][0] - found[1][0] == pytest.approx(200 * 0.12 / 2.0, abs=0.05)
 
 
+def test_colours_lie_on_the_rectified_left_image(rng):
+    left, right = (
+        CameraInfo(raw_camera("plumb_bob"), so3_exp(np.array([0.02, -0.01, 0.03])), P) for P in (P_LEFT, P_RIGHT)
+    )
+    colour = rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    for channel in range(3):
+        pair = StereoRectifier(left, right)(
+            7, np.ascontiguousarray(colour[..., channel]), colour[..., 0].copy(), colour
+        )
+        np.testing.assert_array_equal(pair.colour[..., channel], pair.left)
+
+
 def spot(pixel: np.ndarray) -> np.ndarray:
     u, v = np.meshgrid(np.arange(320), np.arange(240))
     return (250 * np.exp(-((u - pixel[0]) ** 2 + (v - pixel[1]) ** 2) / 18.0)).astype(np.uint8)

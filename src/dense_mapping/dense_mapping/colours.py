@@ -1,15 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The colour pictures of a depth camera, found again by the stamps of its depth images."""
+"""Pictures that colour the dense model: of a stereo pair, or of a colour camera, found again by their stamps."""
 
 from __future__ import annotations
 
 from collections import deque
 
-from slam_core.types import ByteArray
+import numpy as np
+
+from slam_core.types import ByteArray, StereoImages
 
 TOLERANCE_NS = 20_000_000
 """A colour camera beside a depth camera has a clock of its own; in more time a moving camera looks elsewhere."""
 _KEPT = 8
+NO_PICTURE: ByteArray = np.empty((0, 0, 3), dtype=np.uint8)
+""":func:`~dense_mapping.keyframes.make_keyframe` takes it for a surface without colour."""
+
+
+def stereo_picture(images: StereoImages, has_other_colours: bool) -> ByteArray:
+    """The left image in colour, else in grey; of no size where another camera gives colours, between which grey blots.
+
+    Shape (height, width, 3) or (height, width) uint8.
+    """
+    if images.colour is not None:
+        return images.colour
+    return NO_PICTURE if has_other_colours else images.left
 
 
 class RecentColours:

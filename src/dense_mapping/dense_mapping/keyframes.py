@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from dense_mapping.colours import NO_PICTURE
 from slam_core.camera import Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus
@@ -19,7 +20,6 @@ _MAX_PIXELS = 320 * 240
 
 _DEPTH_UNIT = 0.00025
 _SIGMA_UNIT = 0.0005
-_NO_PICTURE: ByteArray = np.empty((0, 0, 3), dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray 
         camera,
         np.rint(depth / _DEPTH_UNIT).astype(np.uint16),
         np.where(depth > 0.0, np.clip(np.rint(sigma / _SIGMA_UNIT), 1, 255), 0).astype(np.uint8),
-        _NO_PICTURE if picture is None else np.ascontiguousarray(picture),
+        NO_PICTURE if picture is None else np.ascontiguousarray(picture),
     )
 
 

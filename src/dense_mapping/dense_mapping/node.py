@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
+from dense_mapping.colours import NO_PICTURE, stereo_picture
 from dense_mapping.dense_model import DenseConfig
 from dense_mapping.keyframes import Keyframe, make_keyframe
 from dense_mapping.live_mapper import LiveMapper
@@ -29,6 +29,7 @@ from slam_core.messages import (
     cloud_message,
     colour_from_message,
     depth_from_messages,
+    grey_and_colour_from_message,
     grey_from_message,
     header_message,
     occupancy_message,
@@ -98,13 +99,15 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
             topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
             topics = {below(topic): kind for topic, kind in topics.items()}
             self.listen_together(topics, partial(self._on_depth, agent), required=False)
-            self.listen(below("tof/color/image"), "Image", partial(self._on_colour, agent), required=False)
+            self.listen(below("tof/color/image"), "Image", partial(self._on_colour, agent, "tof"), required=False)
         if self.config.use_stereo:
             for side in SIDES:
                 topic = below(f"stereo/{side}/camera_info")
                 self.listen(topic, "CameraInfo", partial(self._on_info, agent, side), required=False)
             pairs = {below(f"stereo/{side}/image_rect"): "Image" for side in SIDES}
             self.listen_together(pairs, partial(self._on_pair, agent), required=False)
+            colours = below("stereo/left/image_rect_color")
+            self.listen(colours, "Image", partial(self._on_colour, agent, "stereo"), required=False)
 
     def _on_odometry(self, agent: str, message: Message) -> None:
         self.mapper.add_odometry(agent, pose_from_message(message.pose.pose))
@@ -113,13 +116,12 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         T_base_camera = self.lookup(_below(agent, self.config.base_frame), depth.header.frame_id)
 
         def make() -> Keyframe:
-            nothing = np.empty((0, 0, 3), dtype=np.uint8)
-            return make_keyframe(depth_from_messages(depth, noise, info), self.config.keyframe, nothing)
+            return make_keyframe(depth_from_messages(depth, noise, info), self.config.keyframe, NO_PICTURE)
 
         self.mapper.add_image(agent, "tof", T_base_camera, make)
 
-    def _on_colour(self, agent: str, message: Message) -> None:
-        self.mapper.add_colour(agent, "tof", stamp_ns(message), colour_from_message(message))
+    def _on_colour(self, agent: str, sensor: str, message: Message) -> None:
+        self.mapper.add_colour(agent, sensor, stamp_ns(message), colour_from_message(message))
 
     def _on_info(self, agent: str, side: str, message: Message) -> None:
         self._pairs[agent].set_info(side, camera_info_from_message(message))
@@ -127,13 +129,13 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
     def _on_pair(self, agent: str, left: Message, right: Message) -> None:
         T_base_camera = self.lookup(_below(agent, self.config.base_frame), left.header.frame_id)
         stage = self._pairs[agent]
-        stage.add(RawPair(stamp_ns(left), grey_from_message(left), grey_from_message(right), left.header.frame_id))
+        grey, colour = grey_and_colour_from_message(left)
+        stage.add(RawPair(stamp_ns(left), grey, grey_from_message(right), left.header.frame_id, colour))
         for images in stage.ready():
 
             def make() -> Keyframe:
                 depth = stereo_depth(images, self.config.stereo)  # noqa: B023 - called before the next turn
-                # Where another camera gives colours, grey beside them would be blotches.
-                picture = np.empty((0, 0, 3), np.uint8) if self.mapper.has_colours(agent) else images.left  # noqa: B023
+                picture = stereo_picture(images, self.mapper.has_colours(agent))  # noqa: B023
                 return make_keyframe(depth, self.config.keyframe, picture)
 
             self.mapper.add_image(agent, "stereo", T_base_camera, make)

@@ -32,13 +32,17 @@ class FeatureSource(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class StereoImages:
-    """A rectified pair: ``left`` and ``right`` uint8, shape (height, width), of ``stereo``, left in ``frame_id``."""
+    """A rectified pair: ``left`` and ``right`` uint8, shape (height, width), of ``stereo``, left in ``frame_id``.
+
+    ``colour``: the left image (height, width, 3), red first, or None of a grey camera.
+    """
 
     stamp_ns: int
     left: ByteArray
     right: ByteArray
     stereo: StereoCamera
     frame_id: str = "stereo_left_optical_frame"
+    colour: ByteArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

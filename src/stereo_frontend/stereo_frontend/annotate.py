@@ -16,11 +16,11 @@ _NEAR, _FAR = 0.5, 8.0
 
 
 def annotated_image(image: ByteArray, features: Features) -> ByteArray:
-    """Colour picture (height, width, 3), BGR, of a grey image and its features.
+    """Colour picture (height, width, 3), BGR, of an image, grey or red first, and its features.
 
     Stereo circles, ToF squares, fused both.
     """
-    picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if image.ndim == 2 else cv2.COLOR_RGB2BGR)
     colours = _depth_colours(features.depth)
     circles = (features.source != FeatureSource.TOF).tolist()
     squares = (features.source != FeatureSource.STEREO).tolist()

@@ -25,6 +25,7 @@ from slam_core.config import Config, parameter
 from slam_core.messages import (
     camera_info_from_message,
     camera_info_message,
+    grey_and_colour_from_message,
     grey_from_message,
     header_message,
     image_message,
@@ -35,6 +36,8 @@ from slam_core.ros import run_node
 from stereo_frontend.calibrated_pairs import SIDES
 from stereo_frontend.sources import FolderSource, RawPair, SideBySideSource
 from stereo_frontend.stage import StereoStage
+
+_COLOUR_TOPIC = "stereo/left/image_rect_color"
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,10 @@ class StereoDriverConfig(Config):
 
 
 class StereoDriverNode(SlamNode[StereoDriverConfig]):
-    """Publishes ``stereo/{left,right}/image_rect``; with a source of its own ``image_raw`` and ``camera_info`` too."""
+    """Publishes ``stereo/{left,right}/image_rect``; with a source of its own ``image_raw`` and ``camera_info`` too.
+
+    ``image_rect`` is grey; of a colour camera there is ``stereo/left/image_rect_color`` beside it.
+    """
 
     def __init__(self) -> None:
         super().__init__("stereo_driver", StereoDriverConfig)
@@ -65,6 +71,7 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
         for side in SIDES:
             self.advertise(f"stereo/{side}/image_rect", "Image")
             self.create_service(SetCameraInfo, f"stereo/{side}/set_camera_info", partial(self._on_set_info, side))
+        self.advertise(_COLOUR_TOPIC, "Image")
         self.source = None if self.config.source == "topics" else self._open_source()
         if self.source is None:
             self._listen_to_topics()
@@ -95,8 +102,8 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
 
     def _on_pair(self, left: Message, right: Message) -> None:
         self.right_frame = right.header.frame_id
-        pictures = grey_from_message(left), grey_from_message(right)
-        self.stage.add(RawPair(stamp_ns(left), *pictures, left.header.frame_id))
+        grey, colour = grey_and_colour_from_message(left)
+        self.stage.add(RawPair(stamp_ns(left), grey, grey_from_message(right), left.header.frame_id, colour))
         self._publish_rectified()
 
     # -- own sources ---------------------------------------------------------------------------------------------------
@@ -142,9 +149,11 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
         frames = self.config.left_frame, self.config.right_frame
         infos = self.stage.infos
         assert infos is not None
-        for side, frame, image, info in zip(SIDES, frames, (pair.left, pair.right), infos, strict=True):
+        left = pair.left if pair.colour is None else pair.colour
+        for side, frame, image, info in zip(SIDES, frames, (left, pair.right), infos, strict=True):
             header = header_message(self.types, pair.stamp_ns, frame)
-            self.publish(f"stereo/{side}/image_raw", image_message(self.types, header, image))
+            encoding = "mono8" if image.ndim == 2 else "rgb8"
+            self.publish(f"stereo/{side}/image_raw", image_message(self.types, header, image, encoding))
             self.publish(f"stereo/{side}/camera_info", camera_info_message(self.types, header, info))
         self.stage.add(replace(pair, frame_id=self.config.left_frame))
         self._publish_rectified()
@@ -158,6 +167,9 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
             for side, frame, image in zip(SIDES, frames, (images.left, images.right), strict=True):
                 header = header_message(self.types, images.stamp_ns, frame)
                 self.publish(f"stereo/{side}/image_rect", image_message(self.types, header, image))
+            if images.colour is not None:
+                header = header_message(self.types, images.stamp_ns, images.frame_id)
+                self.publish(_COLOUR_TOPIC, image_message(self.types, header, images.colour, "rgb8"))
         self.health.take(self.stage.counters)
 
     # -- calibration ---------------------------------------------------------------------------------------------------

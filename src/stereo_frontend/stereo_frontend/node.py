@@ -14,6 +14,7 @@ from slam_core.messages import (
     camera_info_from_message,
     depth_from_messages,
     features_messages,
+    grey_and_colour_from_message,
     grey_from_message,
     header_message,
     image_message,
@@ -86,8 +87,8 @@ class FeatureNode(StageNode[FrontendConfig]):
         self.publish_ready()
 
     def _on_pair(self, left: Message, right: Message) -> None:
-        pictures = grey_from_message(left), grey_from_message(right)
-        self.pairs.add(RawPair(stamp_ns(left), *pictures, left.header.frame_id))
+        grey, colour = grey_and_colour_from_message(left)
+        self.pairs.add(RawPair(stamp_ns(left), grey, grey_from_message(right), left.header.frame_id, colour))
         self.publish_ready()
 
     def _on_depth(self, depth: Message, noise: Message, info: Message, picture: Message | None = None) -> None:
@@ -118,7 +119,7 @@ class FeatureNode(StageNode[FrontendConfig]):
 
     def _picture(self, frame: ExtractedFrame) -> ByteArray:
         if frame.images is not None:
-            return frame.images.left
+            return frame.images.left if frame.images.colour is None else frame.images.colour
         assert frame.depth is not None
         depth = frame.depth
         grey = next((picture for picture in (depth.amplitude, depth.intensity) if picture is not None), None)

@@ -69,6 +69,15 @@ class Rectifier:
         ValueError
             If the image is not uint8 grey or not of the size of the camera info.
         """
+        if image.ndim != 2:
+            raise ValueError(f"a camera image must be grey (height, width), got {image.shape}")
+        return self._mapped(image)
+
+    def colour(self, image: ByteArray) -> ByteArray:
+        """Rectified image in colour, uint8 (height, width, 3); ValueError as for a grey one."""
+        return self._mapped(image)
+
+    def _mapped(self, image: ByteArray) -> ByteArray:
         _check_image(image, self.source)
         if self._maps is None:
             # Not the image itself: a message's is read-only, for which every kernel would be compiled once more.
@@ -92,9 +101,12 @@ class StereoRectifier:
         self._left = Rectifier(left, self.stereo.camera)
         self._right = Rectifier(right, self.stereo.camera)
 
-    def __call__(self, stamp_ns: int, left: ByteArray, right: ByteArray) -> StereoImages:
-        """Rectify one pair of raw images, uint8 (height, width) each, of one stamp."""
-        return StereoImages(stamp_ns, self._left(left), self._right(right), self.stereo)
+    def __call__(
+        self, stamp_ns: int, left: ByteArray, right: ByteArray, colour: ByteArray | None = None
+    ) -> StereoImages:
+        """Rectify one pair of raw images, uint8 (height, width) each, of one stamp; ``colour``: the left one's."""
+        rectified_colour = None if colour is None else self._left.colour(colour)
+        return StereoImages(stamp_ns, self._left(left), self._right(right), self.stereo, colour=rectified_colour)
 
 
 def rectification_map(info: CameraInfo, target: Camera) -> FloatArray:
@@ -114,8 +126,8 @@ def _fixed_point_maps(info: CameraInfo, target: Camera) -> tuple[AnyArray, AnyAr
 
 
 def _check_image(image: ByteArray, camera: Camera) -> None:
-    if image.ndim != 2 or image.dtype != np.uint8:
-        raise ValueError(f"a camera image must be uint8 grey (height, width), got {image.dtype} {image.shape}")
+    if image.dtype != np.uint8:
+        raise ValueError(f"a camera image must be uint8, got {image.dtype}")
     expected = (camera.height, camera.width)
-    if image.shape != expected:
-        raise ValueError(f"image (height, width) is {image.shape} px but its camera info says {expected} px")
+    if image.shape[:2] != expected:
+        raise ValueError(f"image (height, width) is {image.shape[:2]} px but its camera info says {expected} px")

@@ -30,12 +30,16 @@ _NAME_ENDS = (("_left", "_right"), ("_l", "_r"), ("_0", "_1"), ("left", "right")
 
 @dataclass(frozen=True, eq=False)
 class RawPair:
-    """One unrectified pair: left and right uint8 (height, width), the left one in ``frame_id``."""
+    """One unrectified pair: left and right uint8 (height, width), the left one in ``frame_id``.
+
+    ``colour``: the left image (height, width, 3), red first, or None of a grey camera.
+    """
 
     stamp_ns: int
     left: ByteArray
     right: ByteArray
     frame_id: str = "stereo_left_optical_frame"
+    colour: ByteArray | None = None
 
 
 class SideBySideSource:
@@ -117,7 +121,7 @@ class FolderSource:
         stamp = _stamp_in_name(left)
         stamp = round(self._next / self.rate * 1e9) if stamp is None else stamp
         self._next += 1
-        return RawPair(stamp, read_grey(left), read_grey(right))
+        return RawPair(stamp, read_grey(left), read_grey(right), colour=_read_colour(left))
 
     def close(self) -> None:
         """Nothing to let go of."""
@@ -135,7 +139,8 @@ def split_side_by_side(stamp_ns: int, frame: AnyArray) -> RawPair:
         raise ValueError(f"a side-by-side frame must have an even width, got {frame.shape[1]} px")
     grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
     half = grey.shape[1] // 2
-    return RawPair(stamp_ns, np.ascontiguousarray(grey[:, :half]), np.ascontiguousarray(grey[:, half:]))
+    colour = None if frame.ndim == 2 else np.asarray(cv2.cvtColor(frame[:, :half], cv2.COLOR_BGR2RGB), np.uint8)
+    return RawPair(stamp_ns, np.ascontiguousarray(grey[:, :half]), np.ascontiguousarray(grey[:, half:]), colour=colour)
 
 
 def find_pairs(folder: Path) -> list[tuple[Path, Path]]:
@@ -168,6 +173,12 @@ def read_grey(path: Path) -> ByteArray:
     if image is None:
         raise OSError(f"cannot read image {path}")
     return np.asarray(image, np.uint8)
+
+
+def _read_colour(path: Path) -> ByteArray | None:
+    """Colours of an image file, red first; None if it is grey."""
+    image = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR)
+    return None if image is None or image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 
 
 def _images(folder: Path) -> list[Path]:

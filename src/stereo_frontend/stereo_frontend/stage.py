@@ -66,7 +66,8 @@ class StereoStage:
         while self.infos is not None and (pair := self._pairs.pop()) is not None:
             if self._rectifier is None:
                 self._rectifier = StereoRectifier(*self.infos)
-            yield replace(self._rectifier(pair.stamp_ns, pair.left, pair.right), frame_id=pair.frame_id)
+            images = self._rectifier(pair.stamp_ns, pair.left, pair.right, pair.colour)
+            yield replace(images, frame_id=pair.frame_id)
 
     def reset(self) -> None:
         """Forget what waits; the calibration stays."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dense model of a bag takes the colours of the colour camera, at the depth image that they belong to."""
+"""The dense model of a bag takes the colours of the colour camera, at the images that they belong to."""
 
 from __future__ import annotations
 
@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 
 from slam_bringup.bags.bag import BagReader, BagWriter
-from slam_bringup.bags.readings import AgentSensors, ColourReading, DepthReading
+from slam_bringup.bags.bag_types import BagTypes
+from slam_bringup.bags.readings import AgentSensors, ColourReading, DepthReading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
-from slam_bringup.bags.sensor_writer import SensorWriter
+from slam_bringup.bags.sensor_writer import LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_bringup.datasets.rgbd import RgbdDataset
 from slam_bringup.pipeline import dense_run
 from slam_bringup.pipeline.configuration import load_system_config
 from slam_bringup.pipeline.dense_run import AgentDepth, dense_model
+from slam_core.camera import Camera, CameraInfo
+from slam_core.geometry import make_transform
+from slam_core.messages import compressed_image_message, header_message, image_message
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
 from stereo_frontend.corrected_info import corrected_right
@@ -45,6 +49,43 @@ def bag_of(root: Path, path: Path) -> Path:
     with BagWriter(path) as bag:
         list(RgbdDataset(root, root / "K.txt").write(SensorWriter(bag)))
     return path
+
+
+def stereo_bag_of_colour(path: Path, encoding: str) -> Path:
+    """Six frames of a textured orange wall 2 m before a colour stereo camera of 0.1 m, 0.25 m aside each."""
+    texture = np.random.default_rng(3).uniform(0.2, 1.0, (120, 256)).astype(np.float32)
+    wall = (cv2.resize(texture, (512, 240))[..., None] * ORANGE).astype(np.uint8)
+    P = np.array([[240.0, 0, 159.5, 0], [0, 240.0, 119.5, 0], [0, 0, 1, 0]])
+    infos = [CameraInfo(Camera(320, 240, 240.0, 240.0, 159.5, 119.5), P=P.copy()) for _ in range(2)]
+    infos[1].P[0, 3] = -240.0 * 0.1
+    types = BagTypes()
+    with BagWriter(path) as bag:
+        writer = SensorWriter(bag)
+        writer.extrinsics(10**9, {LEFT_FRAME: T_BASE_OPTICAL})
+        for i in range(6):
+            stamp = 10**9 + i * 10**8
+            writer.ground_truth(stamp, make_transform(np.eye(3), np.array([0.0, -0.25 * i, 0.0])))
+            for side, frame, shift, info in zip(
+                ("left", "right"), (LEFT_FRAME, RIGHT_FRAME), (0, 12), infos, strict=True
+            ):
+                image = np.ascontiguousarray(wall[:, 30 * i + shift : 30 * i + shift + 320])
+                header = header_message(types, stamp, frame)
+                topic = f"/stereo/{side}/image_raw"
+                if encoding == "jpeg":
+                    jpeg = cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 98))[1].tobytes()
+                    bag.write(f"{topic}/compressed", compressed_image_message(types, header, jpeg, "jpeg"), stamp)
+                else:
+                    bag.write(topic, image_message(types, header, _encoded(image, encoding), encoding), stamp)
+                writer.info(f"stereo/{side}/camera_info", stamp, frame, info)
+    return path
+
+
+def _encoded(image: np.ndarray, encoding: str) -> np.ndarray:
+    if encoding == "bayer_rggb8":
+        mosaic = image[..., 1].copy()
+        mosaic[::2, ::2], mosaic[1::2, 1::2] = image[::2, ::2, 0], image[1::2, 1::2, 2]
+        return mosaic
+    return {"rgb8": image, "bgr8": image[..., ::-1], "mono8": cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)}[encoding]
 
 
 def surface_colours(bag: SensorBag) -> tuple[np.ndarray, np.ndarray]:
@@ -81,6 +122,17 @@ def test_a_colour_image_alone_is_also_the_picture_that_features_come_from(tmp_pa
         assert depth.raw.amplitude[90, 5] == cv2.cvtColor(np.uint8([[ORANGE]]), cv2.COLOR_RGB2GRAY)[0, 0]
         _, colours = surface_colours(bag)
     assert np.abs(colours - ORANGE).max(axis=1).min() <= 2
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "bayer_rggb8", "jpeg", "mono8"])
+def test_a_stereo_camera_in_colour_colours_the_surface_and_features_see_grey(tmp_path, encoding):
+    with SensorBag(stereo_bag_of_colour(tmp_path / "bag", encoding)) as bag:
+        pair = next(r.pair for r in bag.readings() if isinstance(r, StereoReading))
+        assert pair.left.shape == pair.right.shape == (240, 320)
+        _, colours = surface_colours(bag)
+    share = colours.mean(axis=0) / colours.mean(axis=0).max()
+    np.testing.assert_allclose(share, [1.0, 1.0, 1.0] if encoding == "mono8" else np.array(ORANGE) / 240, atol=0.03)
+    assert colours.mean() > 40, "as bright as the wall"
 
 
 def test_dense_stereo_is_rectified_as_self_calibration_says(monkeypatch: pytest.MonkeyPatch) -> None:

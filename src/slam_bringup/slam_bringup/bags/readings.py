@@ -12,6 +12,7 @@ from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
 from slam_core.messages import (
     colour_from_message,
+    grey_and_colour_from_message,
     grey_from_message,
     imu_from_message,
     picture_from_message,
@@ -168,8 +169,8 @@ class AgentPairing:
             self._left_out[_UNPAIRED] += unpaired
 
     def _on_stereo(self, stamp: int, messages: tuple[Message, ...]) -> None:
-        left, right = (grey_from_message(m) for m in messages)
-        pair = RawPair(stamp, left, right, self._sensors.left_frame)
+        left, colour = grey_and_colour_from_message(messages[0])
+        pair = RawPair(stamp, left, grey_from_message(messages[1]), self._sensors.left_frame, colour)
         self._hand_on(StereoReading(self._sensors.agent, pair))
 
     def _on_depth(self, stamp: int, messages: tuple[Message, ...]) -> None:

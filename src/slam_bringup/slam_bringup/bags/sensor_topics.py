@@ -69,12 +69,13 @@ def find_agents(known: Collection[str], given: Mapping[str, str]) -> tuple[str, 
 def topics_of(agent: str, known: Collection[str], given: Mapping[str, str]) -> dict[str, str]:
     """The topics of an agent's sensors by role; a role that the bag has no topic for is absent.
 
-    So is a laser's scan beside a depth camera, whose scans are registered instead.
+    So is a laser's scan beside a depth camera, whose scans are registered instead, and colours without a depth camera.
 
     Raises
     ------
     ValueError
-        If a topic that is ``given`` is not among those ``known``, or is a laser's scan beside a depth camera.
+        If a topic that is ``given`` is not among those ``known``, or is a laser's scan beside a depth camera or colours
+        without one.
     """
     if missing := sorted(set(given.values()) - set(known)):
         raise ValueError(f"the bag has no topic {', '.join(missing)}; it has {', '.join(sorted(known)) or 'none'}")
@@ -89,6 +90,10 @@ def topics_of(agent: str, known: Collection[str], given: Mapping[str, str]) -> d
         raise ValueError("a rig with a depth camera registers what that measures: leave the topic of 'scan' out")
     if {"range", "depth"} & found.keys():
         found.pop("scan", None)
+    elif "color" in given:
+        raise ValueError("'color' is beside a depth camera; a stereo camera in colour is given as 'left' and 'right'")
+    else:
+        found.pop("color", None)
     for role, images in _INFO_OF.items():
         beside = [topic for image in images if image in found for topic in _infos_beside(found[image])]
         if role not in given and beside:

@@ -58,7 +58,7 @@ class SensorWriter:
         self._bag.write("/tf_static", self._types.TFMessage(transforms=transforms), stamp_ns)
 
     def stereo(self, stamp_ns: int, left: ByteArray, right: ByteArray, infos: tuple[CameraInfo, CameraInfo]) -> None:
-        """A raw pair, uint8 (height, width), with the left and right camera info."""
+        """A raw pair, uint8 (height, width) or (height, width, 3), red first, with the left and right camera info."""
         for side, frame, image, info in zip(
             ("left", "right"), (LEFT_FRAME, RIGHT_FRAME), (left, right), infos, strict=True
         ):

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dense_mapping.colours import RecentColours
+from dense_mapping.colours import NO_PICTURE, RecentColours, stereo_picture
 from dense_mapping.dense_model import DenseConfig, DenseModel
 from dense_mapping.keyframes import grey_levels
 from dense_mapping.stereo_depth import stereo_depth
@@ -23,8 +23,6 @@ from stereo_frontend.corrected_info import corrected_right
 from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.stage import StereoStage
 from tof_driver.stage import DepthStage
-
-_NO_PICTURE: ByteArray = np.empty((0, 0, 3), dtype=np.uint8)
 
 
 def dense_model(
@@ -105,7 +103,8 @@ class AgentDepth:
             for camera, T in self._wanted(model, "stereo", reading.stamp_ns, self._T_base_left):
                 self._stereo.add(reading.pair)
                 for images in self._stereo.ready():
-                    model.add(camera, T, stereo_depth(images, self._config.stereo), self._grey(images.left))
+                    depth = stereo_depth(images, self._config.stereo)
+                    model.add(camera, T, depth, stereo_picture(images, self._has_colours))
 
     def _add_depth(self, model: DenseModel, camera: str, T: FloatArray, image: DepthImage) -> None:
         """Put a depth image into the model, or keep it until its colours have come."""
@@ -119,7 +118,7 @@ class AgentDepth:
         while self._uncoloured and (until_ns is None or self._uncoloured[0][2].stamp_ns <= until_ns):
             camera, T, image = self._uncoloured.pop(0)
             picture = self._colours.near(image.stamp_ns)
-            model.add(camera, T, image, _NO_PICTURE if picture is None else picture)
+            model.add(camera, T, image, NO_PICTURE if picture is None else picture)
 
     def finish(self, model: DenseModel) -> None:
         """Give the model what waits, and what the accelerometer read along the trajectory: poses cost one by one."""
@@ -147,14 +146,10 @@ class AgentDepth:
             return None
         return np.asarray(self._trajectory.interpolate(np.array([stamp_ns]))[0])
 
-    def _grey(self, left: ByteArray) -> ByteArray:
-        """The left image, or nothing where another camera gives colours: grey beside them would be blotches."""
-        return _NO_PICTURE if self._has_colours else left
-
     def _picture(self, image: DepthImage) -> ByteArray | None:
         """A ToF amplitude is no picture where stereo gives one: two kinds of grey on one wall are blotches."""
         if self._stereo is None and image.amplitude is not None:
             return grey_levels(image.amplitude)
         if self._stereo is None and image.intensity is not None:
             return np.asarray(np.rint(255.0 * image.intensity), dtype=np.uint8)
-        return _NO_PICTURE
+        return NO_PICTURE

@@ -60,15 +60,15 @@ class FrameLog:
 
 
 def _logged(frame: ExtractedFrame, features: Features) -> LoggedFrame:
-    _, jpeg = cv2.imencode(".jpg", annotated_image(_grey(frame), features), _JPEG)
+    _, jpeg = cv2.imencode(".jpg", annotated_image(_picture(frame), features), _JPEG)
     bare = replace(features, descriptors=np.empty((len(features), 0), dtype=np.float32))
     return LoggedFrame(jpeg.tobytes(), bare)
 
 
-def _grey(frame: ExtractedFrame) -> ByteArray:
-    """The left image, or what a depth camera gives beside depth, or depth itself."""
+def _picture(frame: ExtractedFrame) -> ByteArray:
+    """The left image in its colours, or what a depth camera gives beside depth, or depth itself."""
     if frame.images is not None:
-        return frame.images.left
+        return frame.images.left if frame.images.colour is None else frame.images.colour
     assert frame.depth is not None, "a frame has one or the other"
     depth = frame.depth
     picture = next((p for p in (depth.amplitude, depth.intensity) if p is not None), depth.depth)

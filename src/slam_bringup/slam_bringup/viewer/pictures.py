@@ -103,23 +103,23 @@ class BagPictures(StampedPictures):
 
     def _keep(self, run: RunFolder, sensors: AgentSensors, reading: StereoReading | DepthReading) -> None:
         trajectory = run.trajectories.get(reading.agent)
-        grey, camera, mount = _grey_of(sensors, reading)
-        if trajectory is None or not len(trajectory) or grey is None or camera is None:
+        image, camera, mount = _image_of(sensors, reading)
+        if trajectory is None or not len(trajectory) or image is None or camera is None:
             return
         stamp = reading.stamp_ns
         if not trajectory.stamps_ns[0] <= stamp <= trajectory.stamps_ns[-1]:
             return
         T_map_camera = trajectory.interpolate(np.array([stamp]))[0] @ sensors.transform("base", mount)
-        picture = draw_landmarks(grey, camera, T_map_camera, self._points, self._sightings)
+        picture = draw_landmarks(image, camera, T_map_camera, self._points, self._sightings)
         self._stamps[reading.agent].append(stamp)
         self._jpegs[reading.agent].append(cv2.imencode(".jpg", picture, _JPEG)[1].tobytes())
 
 
 def draw_landmarks(
-    grey: ByteArray, camera: Camera, T_map_camera: FloatArray, points: FloatArray, sightings: npt.NDArray[np.int64]
+    image: ByteArray, camera: Camera, T_map_camera: FloatArray, points: FloatArray, sightings: npt.NDArray[np.int64]
 ) -> ByteArray:
     """BGR picture (h, w, 3) with landmarks (n, 3) of the map nearer than 6 m, by in how many submaps they are."""
-    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR if image.ndim == 2 else cv2.COLOR_RGB2BGR)
     local = transform_points(invert_transform(T_map_camera), points)
     near = (local[:, 2] > 0.3) & (local[:, 2] < 6.0)
     pixels, depth = camera.project(local[near]), local[near, 2]
@@ -131,12 +131,13 @@ def draw_landmarks(
     return np.asarray(picture, dtype=np.uint8)
 
 
-def _grey_of(
+def _image_of(
     sensors: AgentSensors, reading: StereoReading | DepthReading
 ) -> tuple[ByteArray | None, Camera | None, str]:
-    """The grey image of a reading, its raw camera, and the name of its mount."""
+    """The image of a reading, grey or red first, its raw camera, and the name of its mount."""
     if isinstance(reading, StereoReading):
-        return reading.pair.left, sensors.left.camera if sensors.left else None, "left"
+        pair = reading.pair
+        return pair.left if pair.colour is None else pair.colour, sensors.left.camera if sensors.left else None, "left"
     amplitude = reading.raw.amplitude
     grey = None if amplitude is None else np.clip(amplitude, 0, 255).astype(np.uint8)
     return grey, sensors.tof.camera if sensors.tof else None, "tof"

@@ -24,6 +24,7 @@ from slam_core.messages.grids import occupancy_from_message, occupancy_message
 from slam_core.messages.images import (
     colour_from_message,
     compressed_image_message,
+    grey_and_colour_from_message,
     grey_from_message,
     image_from_message,
     image_message,
@@ -71,6 +72,7 @@ __all__ = [
     "estimate_from_message",
     "features_from_messages",
     "features_messages",
+    "grey_and_colour_from_message",
     "grey_from_message",
     "header_message",
     "image_from_message",

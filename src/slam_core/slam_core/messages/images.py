@@ -91,13 +91,19 @@ def grey_from_message(message: Message) -> ByteArray:
     ValueError
         For floating-point images, whose scale is not known here.
     """
-    image = image_from_message(message)
-    encoding = getattr(message, "encoding", "mono8" if image.ndim == 2 else "bgr8")
-    if image.dtype == np.uint16 and image.ndim == 2:
-        return np.asarray(image >> 8, dtype=np.uint8)
-    if image.dtype != np.uint8:
-        raise ValueError(f"a grey or colour image with 8 or 16 bits is needed, got {image.dtype}")
-    return np.asarray(cv2.cvtColor(image, _TO_GREY[encoding])) if encoding in _TO_GREY else image
+    return _grey(*_decoded(message))
+
+
+def grey_and_colour_from_message(message: Message) -> tuple[ByteArray, ByteArray | None]:
+    """The grey image of :func:`grey_from_message` and, of a colour camera, its colours (height, width, 3), red first.
+
+    Raises
+    ------
+    ValueError
+        For floating-point images, whose scale is not known here.
+    """
+    image, encoding = _decoded(message)
+    return _grey(image, encoding), _colours(image, encoding) if encoding in _TO_GREY else None
 
 
 def picture_from_message(message: Message) -> AnyArray:
@@ -114,15 +120,7 @@ def colour_from_message(message: Message) -> ByteArray:
     ValueError
         For images of other than 8 bits.
     """
-    image = image_from_message(message)
-    encoding = getattr(message, "encoding", "mono8" if image.ndim == 2 else "bgr8")
-    if image.dtype != np.uint8:
-        raise ValueError(f"a colour image with 8 bits is needed, got {image.dtype}")
-    if encoding in ("rgb8", "rgba8"):
-        return np.ascontiguousarray(image[..., :3])
-    if encoding in _TO_RGB:
-        return np.asarray(cv2.cvtColor(image, _TO_RGB[encoding]))
-    return np.repeat(image[..., None], 3, axis=2)
+    return _colours(*_decoded(message))
 
 
 def metres_from_message(message: Message) -> Float32Array:
@@ -138,6 +136,30 @@ def metres_from_message(message: Message) -> Float32Array:
 def compressed_image_message(types: MessageTypes, header: Message, encoded: bytes, kind: str) -> Message:
     """sensor_msgs/CompressedImage of an encoded file; ``kind`` is "jpeg" or "png"."""
     return types.CompressedImage(header=header, format=kind, data=types.octets(np.frombuffer(encoded, dtype=np.uint8)))
+
+
+def _decoded(message: Message) -> tuple[AnyArray, str]:
+    """Pixels and their encoding; OpenCV decodes a compressed image to grey or to blue first."""
+    image = image_from_message(message)
+    return image, getattr(message, "encoding", "mono8" if image.ndim == 2 else "bgr8")
+
+
+def _grey(image: AnyArray, encoding: str) -> ByteArray:
+    if image.dtype == np.uint16 and image.ndim == 2:
+        return np.asarray(image >> 8, dtype=np.uint8)
+    if image.dtype != np.uint8:
+        raise ValueError(f"a grey or colour image with 8 or 16 bits is needed, got {image.dtype}")
+    return np.asarray(cv2.cvtColor(image, _TO_GREY[encoding])) if encoding in _TO_GREY else image
+
+
+def _colours(image: AnyArray, encoding: str) -> ByteArray:
+    if image.dtype != np.uint8:
+        raise ValueError(f"a colour image with 8 bits is needed, got {image.dtype}")
+    if encoding in ("rgb8", "rgba8"):
+        return np.ascontiguousarray(image[..., :3])
+    if encoding in _TO_RGB:
+        return np.asarray(cv2.cvtColor(image, _TO_RGB[encoding]))
+    return np.repeat(image[..., None], 3, axis=2)
 
 
 def _decompress(message: Message) -> AnyArray:
