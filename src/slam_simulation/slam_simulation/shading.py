@@ -15,11 +15,11 @@ from numba import njit
 
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray, Float32Array
-from slam_simulation.raycaster import TILE, Hits, Rays, View, for_tile_rows, nearest
+from slam_simulation.pixel_surfaces import EDGE_RAYS, meet, surfaces_of_pixel
+from slam_simulation.raycaster import TILE, Hits, Rays, View, for_tile_rows
 from slam_simulation.surface_table import Look, SurfaceTable
-from slam_simulation.texture_sampling import sample_texture, trilinear
+from slam_simulation.texture_sampling import interpolate, sample_texture, trilinear
 
-EDGE_RAYS = 4
 SHININESS = 80.0
 SHIFT_U, SHIFT_V, SCALE_U, SCALE_V = Look.SHIFT_U, Look.SHIFT_V, Look.SCALE_U, Look.SCALE_V
 OVERLAY_U, OVERLAY_V, OVERLAY_SCALE_U = Look.OVERLAY_U, Look.OVERLAY_V, Look.OVERLAY_SCALE_U
@@ -57,9 +57,7 @@ def surface_light(
     x0, y0 = min(int(x), columns - 2), min(int(y), rows - 2)
     ax, ay = x - x0, y - y0
     k = lookup[w, 2] + y0 * columns + x0
-    upper = light[k] * (1.0 - ax) + light[k + 1] * ax
-    lower = light[k + columns] * (1.0 - ax) + light[k + columns + 1] * ax
-    return float(upper * (1.0 - ay) + lower * ay)
+    return interpolate(light, k, k + 1, k + columns, k + columns + 1, ax, ay)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -134,12 +132,10 @@ def _radiance(
 ) -> float:  # pragma: no cover - compiled
     """Radiance of surface ``w`` (row ``q`` of the view) along the ray (x, y, 1), over the footprint of pixel (i, j)."""
     p = planes
-    z = 1.0 / (p[q, 0] * x + p[q, 1] * y + p[q, 2])
+    z, u, v = meet(planes, shifts, q, x, y)
     xu, yu, xv, yv = rays[i, j, 2], rays[i, j, 3], rays[i, j, 4], rays[i, j, 5]
     # u = z (e . r) - shift and z = 1 / (n . r), so du = z e . dr - z^2 (n . dr) (e . r).
     e1, e2 = p[q, 3] * x + p[q, 4] * y + p[q, 5], p[q, 6] * x + p[q, 7] * y + p[q, 8]
-    u = min(max(z * e1 - shifts[q, 0], 0.0), 1.0)
-    v = min(max(z * e2 - shifts[q, 1], 0.0), 1.0)
     na, nb = z * z * (p[q, 0] * xu + p[q, 1] * yu), z * z * (p[q, 0] * xv + p[q, 1] * yv)
     au, av = z * (p[q, 3] * xu + p[q, 4] * yu) - na * e1, z * (p[q, 6] * xu + p[q, 7] * yu) - na * e2
     bu, bv = z * (p[q, 3] * xv + p[q, 4] * yv) - nb * e1, z * (p[q, 6] * xv + p[q, 7] * yv) - nb * e2
@@ -149,62 +145,6 @@ def _radiance(
     if gloss > 0.0:
         value += gloss * _highlight(lamps, lookup[w, 5], p, q, x, y, z)
     return float(value)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def is_edge(surface: npt.NDArray[np.int32], i: int, j: int) -> bool:  # pragma: no cover - compiled
-    """True if one of the four neighbours of a pixel sees another surface."""
-    q = surface[i, j]
-    height, width = surface.shape
-    return bool(
-        (i > 0 and surface[i - 1, j] != q)
-        or (j > 0 and surface[i, j - 1] != q)
-        or (i + 1 < height and surface[i + 1, j] != q)
-        or (j + 1 < width and surface[i, j + 1] != q)
-    )
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def split_pixel(
-    i: int,
-    j: int,
-    tile: int,
-    rays: Float32Array,
-    candidates: npt.NDArray[np.int32],
-    counts: npt.NDArray[np.int32],
-    planes: FloatArray,
-    shifts: FloatArray,
-    near: FloatArray,
-    parts: FloatArray,
-) -> int:  # pragma: no cover - compiled
-    """Surfaces that share a pixel, by EDGE_RAYS x EDGE_RAYS rays, gathered by surface.
-
-    Fills a row of ``parts`` (EDGE_RAYS^2, 4) for each: row of the view, share of the pixel, mean x and mean y of its
-    rays; returns their number.
-    """
-    found = 0
-    for k in range(EDGE_RAYS * EDGE_RAYS):
-        s, t = (k // EDGE_RAYS + 0.5) / EDGE_RAYS - 0.5, (k % EDGE_RAYS + 0.5) / EDGE_RAYS - 0.5
-        x = rays[i, j, 0] + s * rays[i, j, 2] + t * rays[i, j, 4]
-        y = rays[i, j, 1] + s * rays[i, j, 3] + t * rays[i, j, 5]
-        q, _, _, _ = nearest(x, y, candidates, counts[tile], tile, planes, shifts, near)
-        if q < 0:
-            continue
-        m = 0
-        while m < found and parts[m, 0] != q:
-            m += 1
-        if m == found:
-            parts[m, 0] = q
-            parts[m, 1] = parts[m, 2] = parts[m, 3] = 0.0
-            found += 1
-        parts[m, 1] += 1.0
-        parts[m, 2] += x
-        parts[m, 3] += y
-    for m in range(found):
-        parts[m, 2] /= parts[m, 1]
-        parts[m, 3] /= parts[m, 1]
-        parts[m, 1] /= EDGE_RAYS * EDGE_RAYS
-    return found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -229,11 +169,8 @@ def _render_rows(
     parts = np.empty((EDGE_RAYS * EDGE_RAYS, 4))
     for i in range(first * TILE, min(last * TILE, height)):
         for j in range(width):
-            found = 1 if surface[i, j] >= 0 else 0
-            parts[0, 0], parts[0, 1], parts[0, 2], parts[0, 3] = surface[i, j], 1.0, rays[i, j, 0], rays[i, j, 1]
-            if is_edge(surface, i, j):
-                tile = (i // TILE) * columns + j // TILE
-                found = split_pixel(i, j, tile, rays, candidates, counts, planes, shifts, near, parts)
+            tile = (i // TILE) * columns + j // TILE
+            found = surfaces_of_pixel(i, j, tile, rays, surface, candidates, counts, planes, shifts, near, parts)
             for m in range(found):
                 q, x, y = int(parts[m, 0]), parts[m, 2], parts[m, 3]
                 image[i, j] += parts[m, 1] * _radiance(

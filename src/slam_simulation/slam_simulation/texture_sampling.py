@@ -16,6 +16,16 @@ from slam_core.types import ByteArray
 MAX_SAMPLES = 4
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def interpolate(
+    values: npt.NDArray[np.number], a: int, b: int, c: int, d: int, x: float, y: float
+) -> float:  # pragma: no cover - compiled
+    """Bilinear mean at (x, y), 0 to 1, of four flat positions: upper left and right, lower left and right."""
+    upper = values[a] * (1.0 - x) + values[b] * x
+    lower = values[c] * (1.0 - x) + values[d] * x
+    return float(upper * (1.0 - y) + lower * y)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bilinear(
     texels: ByteArray, offset: int, width: int, height: int, clamp: int, u: float, v: float
@@ -32,9 +42,7 @@ def _bilinear(
     else:
         x0, x1, y0, y1 = x0 & (width - 1), x1 & (width - 1), y0 & (height - 1), y1 & (height - 1)
     top, bottom = offset + y0 * width, offset + y1 * width
-    upper = texels[top + x0] * (1.0 - ax) + texels[top + x1] * ax
-    lower = texels[bottom + x0] * (1.0 - ax) + texels[bottom + x1] * ax
-    return float(upper * (1.0 - ay) + lower * ay)
+    return interpolate(texels, top + x0, top + x1, bottom + x0, bottom + x1, ax, ay)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -20,9 +20,10 @@ from slam_core.camera import Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, make_transform, so3_exp
 from slam_core.types import ByteArray, Float32Array
+from slam_simulation.pixel_surfaces import EDGE_RAYS, meet, surfaces_of_pixel
 from slam_simulation.profiles import RealismConfig
 from slam_simulation.raycaster import TILE, Hits, Rays, View, camera_rays, for_tile_rows, make_view, trace
-from slam_simulation.shading import EDGE_RAYS, is_edge, reflectance, split_pixel, surface_light
+from slam_simulation.shading import reflectance, surface_light
 from slam_simulation.smoke import echo_through
 from slam_simulation.surface_table import Look, SurfaceTable
 from slam_simulation.tof_errors import wiggle, with_indirect_light
@@ -154,9 +155,7 @@ def _echo(
     The ray is (x, y, 1), the row ``q``, the place (u, v).
     """
     p = planes
-    z = 1.0 / (p[q, 0] * x + p[q, 1] * y + p[q, 2])
-    u = min(max(z * (p[q, 3] * x + p[q, 4] * y + p[q, 5]) - shifts[q, 0], 0.0), 1.0)
-    v = min(max(z * (p[q, 6] * x + p[q, 7] * y + p[q, 8]) - shifts[q, 1], 0.0), 1.0)
+    z, u, v = meet(planes, shifts, q, x, y)
     ray_length = np.sqrt(x * x + y * y + 1.0)
     distance = z * ray_length
     # planes[:3] is normal / (normal . p), its product with the ray is 1/z.
@@ -183,11 +182,8 @@ def _phasor_rows(
     parts = np.empty((EDGE_RAYS * EDGE_RAYS, 4))
     for i in range(first * TILE, min(last * TILE, height)):
         for j in range(width):
-            found = 1 if surface[i, j] >= 0 else 0
-            parts[0, 0], parts[0, 1], parts[0, 2], parts[0, 3] = surface[i, j], 1.0, rays[i, j, 0], rays[i, j, 1]
-            if is_edge(surface, i, j):
-                tile = (i // TILE) * columns + j // TILE
-                found = split_pixel(i, j, tile, rays, candidates, counts, planes, shifts, near, parts)
+            tile = (i // TILE) * columns + j // TILE
+            found = surfaces_of_pixel(i, j, tile, rays, surface, candidates, counts, planes, shifts, near, parts)
             for m in range(found):
                 q, share = int(parts[m, 0]), parts[m, 1]
                 distance, amplitude, infrared, u, v = _echo(
