@@ -49,8 +49,10 @@ class Chain(Probe):
         super().__init__(context)
         self.small_submaps = small_submaps
         self.environment = {
-            **os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)
-        }  # fmt: skip
+            **os.environ,
+            "ROS_DOMAIN_ID": str(domain),
+            "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+        }
         self.map_path, self.agents = folder / "map", agents
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.rng = np.random.default_rng(4)
@@ -81,11 +83,14 @@ class Chain(Probe):
         agent, _, executable = name.rpartition("/")
         module = {"ekf_slam": "ekf_slam_node", "sjsam": "sjsam_node"}[executable]
         own = {
-            "sjsam": (f"map_path:={self.map_path}", f"ply_path:={self.map_path}.ply",
-                      *(["autosave_period_s:=0.5"] if self.small_submaps else []),
-                      *([f"agents:={list(self.agents)}"] if any(self.agents) else [])),
+            "sjsam": (
+                f"map_path:={self.map_path}",
+                f"ply_path:={self.map_path}.ply",
+                *(["autosave_period_s:=0.5"] if self.small_submaps else []),
+                *([f"agents:={list(self.agents)}"] if any(self.agents) else []),
+            ),
             "ekf_slam": (*(["submap.max_frames:=8"] if self.small_submaps else []), f"agent:='{agent}'"),
-        }[executable]  # fmt: skip
+        }[executable]
         arguments = [word for parameter in own for word in ("-p", parameter)]
         namespace = ["-r", f"__ns:=/{agent}"] if agent else []
         command = [

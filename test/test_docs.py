@@ -64,9 +64,13 @@ def test_the_tutorial_runs_as_typed(clone):
     sources = os.pathsep.join(str(p) for p in sorted((ROOT / "src").iterdir()))
     for line in lines:
         done = subprocess.run(
-            ["bash", "-c", line], cwd=clone, capture_output=True, text=True, check=False,
+            ["bash", "-c", line],
+            cwd=clone,
+            capture_output=True,
+            text=True,
+            check=False,
             env=os.environ | {"PYTHONPATH": sources},
-        )  # fmt: skip
+        )
         assert done.returncode == 0, f"{line}: {done.stdout}{done.stderr}"
     named = re.findall(r"^\| (`.*?) \|", (ROOT / "docs/tutorial.md").read_text(), flags=re.M)
     for file in re.findall(r"`([^`]+)`", " ".join(named)):
@@ -107,7 +111,10 @@ def test_the_site_builds_without_warnings(tmp_path):
         pytest.skip("mkdocs is not installed (requirements-dev.txt)")
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(tmp_path)],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     assert (tmp_path / "nodes" / "index.html").exists()

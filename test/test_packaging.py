@@ -15,9 +15,11 @@ PACKAGES = sorted(path.name for path in SRC.iterdir() if (path / "setup.py").exi
 PIP_NAME = {"cv2": "opencv-python-headless", "yaml": "PyYAML", "jinja2": "Jinja2", "mcubes": "PyMCubes"}
 ROSDEP_KEY = {
     **{name: f"python3-{name}" for name in ("numpy", "scipy", "numba", "click", "rich", "jinja2", "yaml")},
-    "matplotlib": "python3-matplotlib", "cv2": "python3-opencv", "cvxopt": "python3-cvxopt",
+    "matplotlib": "python3-matplotlib",
+    "cv2": "python3-opencv",
+    "cvxopt": "python3-cvxopt",
     "rosbags": "python3-rosbags-pip",
-}  # fmt: skip
+}
 """Of the others there is no key in rosdep."""
 
 FROM_ROS = re.compile(r"rclpy|launch(_ros)?|ament_index_python|std_srvs|rcl_interfaces|\w+_msgs|builtin_interfaces")

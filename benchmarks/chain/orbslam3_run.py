@@ -29,9 +29,7 @@ def main() -> None:
     pictures = [f"{k:05d}.png" for k in range(len(stamps))]
     chosen = pictures[:: max(1, len(pictures) // _PICTURES)]
     write_vocabulary(folder / "vocabulary.txt", [folder / "left" / name for name in chosen])
-    system = orbslam3.System(
-        str(folder / "vocabulary.txt"), str(folder / "settings.yaml"), orbslam3.Sensor.STEREO
-    )  # fmt: skip
+    system = orbslam3.System(str(folder / "vocabulary.txt"), str(folder / "settings.yaml"), orbslam3.Sensor.STEREO)
     system.set_use_viewer(False)
     system.initialize()
     wall, start, began = [], time.process_time(), time.perf_counter()
@@ -48,10 +46,12 @@ def main() -> None:
     cpu = time.process_time() - start - loading
     points = system.get_trajectory_points()
     np.savez(
-        folder / "trajectory.npz", stamps=np.array([float(t) for t, _ in points]),
+        folder / "trajectory.npz",
+        stamps=np.array([float(t) for t, _ in points]),
         T_camera_world=np.array([np.asarray(T, dtype=np.float64)[:3, :4] for _, T in points]),
-        wall_ms=1e3 * np.array(wall), cpu_ms=1e3 * cpu / len(stamps),
-    )  # fmt: skip
+        wall_ms=1e3 * np.array(wall),
+        cpu_ms=1e3 * cpu / len(stamps),
+    )
     system.shutdown()
 
 

@@ -60,9 +60,11 @@ class Recording:
 
 _DEPTH_RUNS = ("alone", "ndt")
 _EUROC = (
-    "--calibration", DATA / "euroc_v101_micro95" / "MicroEurocDataset",
-    "--ground-truth", DATA / "traj_gt_openvins" / "euroc_mav" / "V1_01_easy.txt",
-)  # fmt: skip
+    "--calibration",
+    DATA / "euroc_v101_micro95" / "MicroEurocDataset",
+    "--ground-truth",
+    DATA / "traj_gt_openvins" / "euroc_mav" / "V1_01_easy.txt",
+)
 RECORDINGS = {
     "mh01": Recording(("euroc", DATA / "euroc_mh01_10hz"), "stereo", ("imu", "alone"), "euroc"),
     "v101": Recording(("euroc", DATA / "euroc_v101_visnav100" / "euroc_V1", *_EUROC), "stereo", ("alone",), "euroc"),

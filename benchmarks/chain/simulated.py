@@ -117,9 +117,7 @@ def agent_rows(result: RunResult, submaps: list[Submap]) -> Iterator[list[str]]:
         assert joined is not None
         assert early is not None
         at = central[agent.name].poses[:, :3, 3]
-        gaps = [
-            np.linalg.norm(t.poses[:, :3, 3] - at, axis=1).max() for t in (agent.trajectory, online[agent.name])
-        ]  # fmt: skip
+        gaps = [np.linalg.norm(t.poses[:, :3, 3] - at, axis=1).max() for t in (agent.trajectory, online[agent.name])]
         sent = [sum(size_of(s, compact) for s in own) / joined.truth_length_m for compact in (False, True)]
         yield [
             agent.name, f"{joined.truth_length_m:.1f}", str(len(own)), *(f"{1e-3 * s:.0f}" for s in sent),
@@ -136,8 +134,11 @@ def size_of(submap: Submap, compact: bool) -> int:
 
 def accuracy(e: Evaluation) -> list[str]:
     return [
-        f"{1e3 * e.ate.rmse:.1f}", f"{1e3 * e.end_error_m:.1f}", f"{e.end_error_deg:.3f}", f"{e.anees:.2f}",
-    ]  # fmt: skip
+        f"{1e3 * e.ate.rmse:.1f}",
+        f"{1e3 * e.end_error_m:.1f}",
+        f"{e.end_error_deg:.3f}",
+        f"{e.anees:.2f}",
+    ]
 
 
 def bag_of(name: str, folder: Path, profile: str = "ideal") -> Path:

@@ -46,9 +46,13 @@ def main() -> None:
     near = cKDTree(centres[0]).query(surfaces[0].points)[0] <= NEAR_M
     distance = 1000 * cKDTree(surfaces[1].points).query(surfaces[0].points[near])[0]
     table.add_row(
-        arguments.bag.name, str(int(near.sum())), f"{np.median(distance):.1f}", f"{np.percentile(distance, 95):.1f}",
-        f"{100 * np.mean(distance > 100):.2f}", f"{1000 * np.median(surfaces[0].sigma[near]):.1f}",
-    )  # fmt: skip
+        arguments.bag.name,
+        str(int(near.sum())),
+        f"{np.median(distance):.1f}",
+        f"{np.percentile(distance, 95):.1f}",
+        f"{100 * np.mean(distance > 100):.2f}",
+        f"{1000 * np.median(surfaces[0].sigma[near]):.1f}",
+    )
     Console(width=140).print(table)
 
 

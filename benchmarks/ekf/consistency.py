@@ -35,9 +35,11 @@ from planar_monte_carlo import planar_nees
 WALK_SIGMA = np.repeat([0.5, 0.4], 3)
 WALK_START = np.repeat([0.3, 0.2], 3)
 WALK: dict[str, object] = {
-    "motion.sigma_acceleration": 0.5, "motion.sigma_angular_acceleration": 0.4,
-    "motion.sigma_initial_velocity": 0.3, "motion.sigma_initial_turn_rate": 0.2,
-}  # fmt: skip
+    "motion.sigma_acceleration": 0.5,
+    "motion.sigma_angular_acceleration": 0.4,
+    "motion.sigma_initial_velocity": 0.3,
+    "motion.sigma_initial_turn_rate": 0.2,
+}
 ENDLESS: dict[str, object] = {"submap.max_distance": 1e6, "submap.max_landmarks": 10**6, "submap.max_frames": 10**6}
 SPARSE: dict[str, object] = {"landmark.target_in_view": 25}
 
@@ -99,11 +101,15 @@ def line(name: str, case: Case, runs: list[Run]) -> str:
     nis, low, high = mean_nis(runs, FeatureAssociationConfig().gate, case.make_poses is walk)
     claimed, wrong = ([value(r) for r in runs] for value in (_heading_variance, _squared_heading_error))
     cells = (
-        f"{first:6.3f} {bounds}", _mean([s.landmark_nees / 3 for s in submaps]),
-        _mean([s.joint_nees for s in submaps]), _mean(seams), f"{nis:.3f} [{low:.3f} {high:.3f}]",
-        f"{end:6.3f} {bounds}", f"{_rms_degrees(claimed):.2f}, wrong {_rms_degrees(wrong):.2f}",
+        f"{first:6.3f} {bounds}",
+        _mean([s.landmark_nees / 3 for s in submaps]),
+        _mean([s.joint_nees for s in submaps]),
+        _mean(seams),
+        f"{nis:.3f} [{low:.3f} {high:.3f}]",
+        f"{end:6.3f} {bounds}",
+        f"{_rms_degrees(claimed):.2f}, wrong {_rms_degrees(wrong):.2f}",
         f"{np.median([run.ms[-10:] for run in runs]):.1f}",
-    )  # fmt: skip
+    )
     return f"{name:32}" + "".join(f"{cell:>21}" for cell in cells)
 
 

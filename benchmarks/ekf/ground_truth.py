@@ -80,8 +80,10 @@ def report(name: str, pairs: list[StereoImages], truth: FloatArray) -> None:
     for label, a, b in (("filter - truth", ours, true), ("PnP - truth", theirs, true), ("filter - PnP", ours, theirs)):
         d = turns(a[known], b[known])
         squares.append(np.median(np.sum(d**2, axis=1)))
-        print(f"  {label:15} median turn {np.sqrt(squares[-1]):5.2f} mrad a step; sum over the first ten "
-              f"{_text(d[:10].sum(axis=0))}, over the others {_text(d[10:].sum(axis=0))} mrad")  # fmt: skip
+        print(
+            f"  {label:15} median turn {np.sqrt(squares[-1]):5.2f} mrad a step; sum over the first ten "
+            f"{_text(d[:10].sum(axis=0))}, over the others {_text(d[10:].sum(axis=0))} mrad"
+        )
     each = np.sqrt(np.maximum(0.5 * sum(squares) - np.array(squares)[[1, 2, 0]], 0.0))
     print("  on its own, mrad a step: filter {:.2f}, truth {:.2f}, PnP {:.2f}".format(*each), flush=True)
 

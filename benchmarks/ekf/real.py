@@ -30,7 +30,7 @@ from slam_core.geometry import (
     invert_transform,
     make_transform,
     transform_from_pose7,
-)  # fmt: skip
+)
 from slam_core.trajectory import Trajectory
 from slam_core.types import StereoImages
 from stereo_frontend.frontend import Frontend
@@ -91,20 +91,23 @@ def report(name: str, pairs: list[StereoImages], truth: FloatArray) -> None:
     print(f"{name}: {len(pairs)} frames, path {length:.1f} m, {submaps} submaps, frames lost: {lost or 'none'}")
     shift = 1e3 * np.linalg.norm(steps[linked, :3], axis=1)
     turn = np.degrees(np.linalg.norm(steps[linked, 3:], axis=1))
-    print(f"  bridged {len(linked)} of {len(steps)} gaps, error of a step: median {np.median(shift):.1f} mm, "
-          f"{np.median(turn):.3f} deg, worst {shift.max():.1f} mm, {turn.max():.2f} deg")  # fmt: skip
+    print(
+        f"  bridged {len(linked)} of {len(steps)} gaps, error of a step: median {np.median(shift):.1f} mm, "
+        f"{np.median(turn):.3f} deg, worst {shift.max():.1f} mm, {turn.max():.2f} deg"
+    )
     if not lost:
         print(f"  end error {np.linalg.norm(end[:3]):.2f} m = {100 * np.linalg.norm(end[:3]) / length:.2f} %")
     known = lost[0] if lost else len(results)
     trajectory = Trajectory.from_estimates([result.pose for result in results[:known]])
     cases = ((trajectory, EXACT_TRUTH), (trajectory, TRUTH[name]), (doubted(trajectory), TRUTH[name]))
     exact, with_truth, with_both = (anees(poses, truth[:known], accuracy) for poses, accuracy in cases)
-    print(f"  ANEES of the first {known} poses {exact:.1f}, with the truth's own error {with_truth:.1f}, "
-          f"and the calibration's {with_both:.1f}")  # fmt: skip
+    print(
+        f"  ANEES of the first {known} poses {exact:.1f}, with the truth's own error {with_truth:.1f}, "
+        f"and the calibration's {with_both:.1f}"
+    )
     nis = np.array([result.nis / result.nis_dof for result in results if result.nis_dof])
     times = f"{np.median(filter_ms):.1f} ms (95 %: {np.percentile(filter_ms, 95):.1f})"
-    print(f"  NIS/dof {np.median(nis):.2f}, filter {times}, "
-          f"front end {eyes_ms:.1f} ms", flush=True)  # fmt: skip
+    print(f"  NIS/dof {np.median(nis):.2f}, filter {times}, front end {eyes_ms:.1f} ms", flush=True)
 
 
 def anees(poses: Trajectory, truth: FloatArray, accuracy: TruthAccuracy) -> float:

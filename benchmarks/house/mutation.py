@@ -36,12 +36,14 @@ PACKAGES = ("slam_core", "ekf_slam_node", "ndt_registration", "stereo_frontend",
 KINDS = {
     "sums": ("ReplaceBinaryOperator_Add_Sub", "ReplaceBinaryOperator_Sub_Add"),
     "products": ("ReplaceBinaryOperator_Mul_Div", "ReplaceBinaryOperator_Div_Mul"),
-    "comparisons": tuple(f"ReplaceComparisonOperator_{a}_{b}" for a, b in (
-        ("Lt", "Gt"), ("Gt", "Lt"), ("LtE", "GtE"), ("GtE", "LtE"), ("Eq", "NotEq"), ("NotEq", "Eq"))),
+    "comparisons": tuple(
+        f"ReplaceComparisonOperator_{a}_{b}"
+        for a, b in (("Lt", "Gt"), ("Gt", "Lt"), ("LtE", "GtE"), ("GtE", "LtE"), ("Eq", "NotEq"), ("NotEq", "Eq"))
+    ),
     "conditions": ("AddNot", "ReplaceAndWithOr", "ReplaceOrWithAnd"),
     "numbers": ("NumberReplacer", "ReplaceTrueWithFalse", "ReplaceFalseWithTrue"),
     "loops": ("ZeroIterationForLoop", "ReplaceContinueWithBreak", "ReplaceBreakWithContinue"),
-}  # fmt: skip
+}
 """Cosmic Ray's operators, in kinds of which each gives as many mutants."""
 NOT_ESTIMATORS = ("node.py", "__init__.py", "_node.py")
 TIMEOUT_S = 900
@@ -171,9 +173,12 @@ def tests_pass(copy: Path, package: str, path: Path, *, has_kernels: bool) -> bo
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow and not ros", "-p", "no:cacheprovider",
                    *(str(t) for t in tests)]  # fmt: skip
         try:
-            return subprocess.run(
-                command, cwd=copy, env=environment, capture_output=True, timeout=TIMEOUT_S, check=False
-            ).returncode == 0  # fmt: skip
+            return (
+                subprocess.run(
+                    command, cwd=copy, env=environment, capture_output=True, timeout=TIMEOUT_S, check=False
+                ).returncode
+                == 0
+            )
         except subprocess.TimeoutExpired:
             return False
 

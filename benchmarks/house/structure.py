@@ -106,9 +106,10 @@ def count_constants(tree: ast.Module) -> int:
         for leaf in ast.walk(node)
     }
     floats = (
-        node for node in ast.walk(tree)
+        node
+        for node in ast.walk(tree)
         if isinstance(node, ast.Constant) and isinstance(node.value, float) and id(node) not in inside
-    )  # fmt: skip
+    )
     return sum(abs(node.value) not in (0.0, 0.5, 1.0, 2.0) for node in floats)
 
 

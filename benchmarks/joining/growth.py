@@ -34,8 +34,10 @@ def grow(count: int, laps: float, label: str) -> None:
     print(f"{label}: {count} submaps, {len(problem.submaps[0].landmarks)} landmarks in the first, {laps} laps")
     for first in range(0, count, step):
         part = milliseconds[first : first + step]
-        print(f"  {first:5d}-{first + len(part):5d}  median {np.median(part):8.1f} ms  mean {part.mean():8.1f} ms"
-              f"  unknowns {unknowns[first + len(part) - 1]:6d}")  # fmt: skip
+        print(
+            f"  {first:5d}-{first + len(part):5d}  median {np.median(part):8.1f} ms  mean {part.mean():8.1f} ms"
+            f"  unknowns {unknowns[first + len(part) - 1]:6d}"
+        )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"  total {sum(times):.1f} s, final batch with all covariances {settled:.2f} s, peak {peak:.0f} MiB")
 

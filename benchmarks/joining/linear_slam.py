@@ -34,8 +34,11 @@ def row(
     result = join_text_maps(maps, dimension, TextJoiningConfig(solver=solver))
     seconds = time.perf_counter() - began
     expected = "" if exact is None else _expected(maps, exact, dimension, result)
-    print(f"{name:36s} {dimension}D {len(maps):5d} {result.solver:12s} {seconds:7.2f} s  chi2 {result.chi2:14.6f}"
-          f"  {expected}  start {result.start_chi2:10.4g}  best {result.start}", flush=True)  # fmt: skip
+    print(
+        f"{name:36s} {dimension}D {len(maps):5d} {result.solver:12s} {seconds:7.2f} s  chi2 {result.chi2:14.6f}"
+        f"  {expected}  start {result.start_chi2:10.4g}  best {result.start}",
+        flush=True,
+    )
 
 
 def _expected(maps: list[TextMap], exact: list[TextMap], dimension: int, result: TextJoiningResult) -> str:

@@ -159,8 +159,11 @@ def compare(count: int, solvers: list[str], repeat: int, folder: Path) -> None:
         ours = results.get("ours in turn" if solver in INCREMENTAL else "ours")
         shown = [statistics.median(result[key]) if key in result else float("nan") for key in ("batch", "covariances")]
         ratios = "" if ours is None or solver.startswith("ours") else _ratios(ours, result)
-        print(f"  {solver:18s} {shown[0]:10.4f} {result['chi2']:14.3f} {shown[1]:10.4f}"
-              f" {result['memory']:8.0f}   {ratios}", flush=True)  # fmt: skip
+        print(
+            f"  {solver:18s} {shown[0]:10.4f} {result['chi2']:14.3f} {shown[1]:10.4f}"
+            f" {result['memory']:8.0f}   {ratios}",
+            flush=True,
+        )
 
 
 def _ratios(ours: dict[str, Any], theirs: dict[str, Any]) -> str:

@@ -74,9 +74,12 @@ def measure(path: Path, is_read: bool, every: bool, most: int) -> None:
         memory.append(resident_mb())
         if every:
             r = reports[-1]
-            print(f"{len(adding):4d} add {1e3 * adding[-1]:8.1f} read {1e3 * reading[-1]:8.1f} ms {memory[-1]:7.1f} MB"
-                  f" landmarks {len(submap.landmarks):4d} closures {len(r.closures):3d} dropped {r.dropped:4d}"
-                  f" iterations {r.iterations} {'redundant' * r.redundant}", flush=True)  # fmt: skip
+            print(
+                f"{len(adding):4d} add {1e3 * adding[-1]:8.1f} read {1e3 * reading[-1]:8.1f} ms {memory[-1]:7.1f} MB"
+                f" landmarks {len(submap.landmarks):4d} closures {len(r.closures):3d} dropped {r.dropped:4d}"
+                f" iterations {r.iterations} {'redundant' * r.redundant}",
+                flush=True,
+            )
     live = closed(global_map)
     began = time.process_time()
     final = global_map.centrally()

@@ -54,10 +54,12 @@ def judge_by_relations(path: Path, scans: list[LaserScan], trajectories: Traject
 def judge_by_loops(closer: LoopCloser, trajectories: Trajectories) -> None:
     ends = [(closer.nodes[loop.earlier], closer.nodes[loop.later]) for loop in closer.loops]
     for name, poses in trajectories.items():
-        d = np.array([
-            relative(planar(poses[a]), planar(poses[b])) - loop.pose
-            for (a, b), loop in zip(ends, closer.loops, strict=True)
-        ])  # fmt: skip
+        d = np.array(
+            [
+                relative(planar(poses[a]), planar(poses[b])) - loop.pose
+                for (a, b), loop in zip(ends, closer.loops, strict=True)
+            ]
+        )
         turn = np.rad2deg(np.abs(np.arctan2(np.sin(d[:, 2]), np.cos(d[:, 2]))))
         print(f"{name:14s} from closing its loops: {statistics(np.column_stack([np.hypot(d[:, 0], d[:, 1]), turn]))}")
 

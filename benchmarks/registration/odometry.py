@@ -140,10 +140,12 @@ def row(name: str, method: str, scans: list[Scan], run: Run) -> str:
     errors = np.array([boxminus(T, G) for T, G in zip(world, truths, strict=True)])
     fit = umeyama(np.array([T[:3, 3] for T in world]), np.array([G[:3, 3] for G in truths]))
     apart = np.array([(fit @ T)[:3, 3] - G[:3, 3] for T, G in zip(world, truths, strict=True)])
-    steps = np.array([
-        boxminus(invert_transform(a) @ b, invert_transform(g) @ h)
-        for (a, b), (g, h) in zip(pairwise(world), pairwise(truths), strict=True)
-    ])  # fmt: skip
+    steps = np.array(
+        [
+            boxminus(invert_transform(a) @ b, invert_transform(g) @ h)
+            for (a, b), (g, h) in zip(pairwise(world), pairwise(truths), strict=True)
+        ]
+    )
     drift, turn = 100 * np.linalg.norm(errors[-1, :3]) / path, np.rad2deg(np.linalg.norm(errors[-1, 3:]))
     step, step_turn = (rms(np.linalg.norm(half, axis=1)) for half in (steps[:, :3], steps[:, 3:]))
     nees = (

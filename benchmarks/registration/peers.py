@@ -61,9 +61,13 @@ def small_gicp(kind: str, threads: int) -> Method:
     def run(source: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
         began = time.perf_counter()
         result = library.align(
-            target, source, registration_type=kind, downsampling_resolution=0.02, max_correspondence_distance=1.0,
+            target,
+            source,
+            registration_type=kind,
+            downsampling_resolution=0.02,
+            max_correspondence_distance=1.0,
             num_threads=threads,
-        )  # fmt: skip
+        )
         return np.asarray(result.T_target_source), 1e3 * (time.perf_counter() - began)
 
     return run

@@ -46,15 +46,23 @@ from slam_core.messages import DEPTH_TOPICS, FEATURE_TOPICS, SUBMAP_TOPICS, subm
 from slam_core.ros import sensor_qos  # noqa: E402
 
 NODES = {
-    "stereo_driver": "stereo_frontend.driver_node", "tof_driver": "tof_driver.node",
-    "feature_extractor": "stereo_frontend.node", "ndt_odometry": "ndt_registration.node",
-    "ekf_slam": "ekf_slam_node.node", "sjsam": "sjsam_node.node", "dense_mapper": "dense_mapping.node",
+    "stereo_driver": "stereo_frontend.driver_node",
+    "tof_driver": "tof_driver.node",
+    "feature_extractor": "stereo_frontend.node",
+    "ndt_odometry": "ndt_registration.node",
+    "ekf_slam": "ekf_slam_node.node",
+    "sjsam": "sjsam_node.node",
+    "dense_mapper": "dense_mapping.node",
     "viewer": "slam_bringup.viewer.viewer_node",
-}  # fmt: skip
+}
 OF_A_RIG = {
-    "stereo_driver": "stereo_frontend", "tof_driver": "tof_driver", "feature_extractor": "stereo_frontend",
-    "ndt_odometry": "ndt_registration", "ekf_slam": "ekf_slam_node", "sjsam": "sjsam_node",
-}  # fmt: skip
+    "stereo_driver": "stereo_frontend",
+    "tof_driver": "tof_driver",
+    "feature_extractor": "stereo_frontend",
+    "ndt_odometry": "ndt_registration",
+    "ekf_slam": "ekf_slam_node",
+    "sjsam": "sjsam_node",
+}
 """Packages of the nodes that can share a process."""
 
 COMPOSED = "slam_bringup.processes.composed_node"
@@ -182,9 +190,11 @@ class Outcome:
 def commands(folder: Path, composed: bool) -> dict[str, tuple[str, list[str]]]:
     """Module and arguments of each process."""
     own = {
-        "sjsam": ["-p", f"map_path:={folder / 'map'}"], "feature_extractor": ["-p", "mode:=fuse"],
-        "viewer": ["-p", "port:=0"], "dense_mapper": ["-p", f"output_path:={folder / 'dense'}"],
-    }  # fmt: skip
+        "sjsam": ["-p", f"map_path:={folder / 'map'}"],
+        "feature_extractor": ["-p", "mode:=fuse"],
+        "viewer": ["-p", "port:=0"],
+        "dense_mapper": ["-p", f"output_path:={folder / 'dense'}"],
+    }
     separate = {name: (module, ["--ros-args", *own.get(name, [])]) for name, module in NODES.items()}
     if not composed:
         return separate
@@ -203,10 +213,12 @@ def run(count: int, domain: int, folder: Path, *, composed: bool = False) -> tup
     processes = {
         name: subprocess.Popen(
             [sys.executable, "-c", f"from {module} import main; main()", *arguments],
-            env=environment, stdout=logs[name], stderr=subprocess.STDOUT,
+            env=environment,
+            stdout=logs[name],
+            stderr=subprocess.STDOUT,
         )
         for name, (module, arguments) in started.items()
-    }  # fmt: skip
+    }
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     probe = Probe(context)
@@ -224,13 +236,15 @@ def run(count: int, domain: int, folder: Path, *, composed: bool = False) -> tup
         inside = {"slam_composed": tuple(OF_A_RIG)}
         outcome = {
             name: Outcome(
-                process.poll() is None, *(
+                process.poll() is None,
+                *(
                     sum(counts.get(f"/{node}", {}).get(what, 0) for node in inside.get(name, (name,)))
                     for what in ("rejected", "faults")
-                ), _rss_mib(process) - start[name],
+                ),
+                _rss_mib(process) - start[name],
             )
             for name, process in processes.items()
-        }  # fmt: skip
+        }
         same = len(after.graph.records) == records and np.array_equal(after.graph.poses, before.graph.poses)
         return outcome, same
     finally:

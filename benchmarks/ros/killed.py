@@ -122,10 +122,14 @@ def composed_of(graph: NodeGraph, folder: Path) -> NodeCommand:
 def player(graph: NodeGraph, names: list[str]) -> NodeCommand:
     """The bag, once all nodes are connected."""
     parameters = {
-        "bag": str(DEMO), "rate": RATE, "topics": tuple(graph.played), "nodes": tuple(names),
+        "bag": str(DEMO),
+        "rate": RATE,
+        "topics": tuple(graph.played),
+        "nodes": tuple(names),
         "rename": tuple(f"{topic}={name}" for topic, name in graph.played.items() if name != topic),
-        "subscribers": tuple(f"{name}=1" for name in graph.played.values()), "wait_for_subscribers": 0.0,
-    }  # fmt: skip
+        "subscribers": tuple(f"{name}=1" for name in graph.played.values()),
+        "wait_for_subscribers": 0.0,
+    }
     return NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters)))
 
 

@@ -106,9 +106,11 @@ def main() -> None:
             supervisor.wait(lambda: all(n in supervisor.diagnostics for n in names), START_TIMEOUT_S, "start")
             watch = Stopwatch(supervisor, "/stereo/left/camera_info", "/odom")
             parameters = {
-                "bag": str(given.bag), "rate": given.rate, "topics": tuple(graph.played),
+                "bag": str(given.bag),
+                "rate": given.rate,
+                "topics": tuple(graph.played),
                 "rename": tuple(f"{t}={n}" for t, n in graph.played.items() if t != n),
-            }  # fmt: skip
+            }
             player = group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
             end = time.monotonic() + given.seconds
             while player.is_running and time.monotonic() < end:

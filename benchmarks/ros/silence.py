@@ -129,8 +129,10 @@ def print_row(submaps: int, listener: Listener) -> None:
     took = {name: listener.call(name) for name in ("load_map", "save_map", "export_ply")}
     gaps = {topic: np.diff(times).max() for topic, times in listener.arrivals.items()}
     print(f"{submaps} submaps: " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in took.items()))
-    print(f"longest time without map_to_odom {gaps['map_to_odom']:.2f} s, without pose {gaps['pose']:.2f} s, "
-          f"longest wait for an answer {max(listener.answers):.2f} s of {len(listener.answers)}")  # fmt: skip
+    print(
+        f"longest time without map_to_odom {gaps['map_to_odom']:.2f} s, without pose {gaps['pose']:.2f} s, "
+        f"longest wait for an answer {max(listener.answers):.2f} s of {len(listener.answers)}"
+    )
 
 
 if __name__ == "__main__":

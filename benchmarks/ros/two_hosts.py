@@ -54,9 +54,10 @@ def run(name: str, folder: Path) -> Outcome:
     """One drive over one link."""
     loss, cut_s = LINKS[name]
     environment = os.environ | {
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
-    }  # fmt: skip
+    }
     with two_hosts(HOSTS, loss) as link:
         node = "from sjsam_node.node import main; main()"
         parameters = ["--ros-args", "-p", f"map_path:={folder / 'map'}"]

@@ -235,13 +235,15 @@ def real_bags(data: Path, folder: Path) -> Iterator[tuple[str, Path, int, str]]:
                 data / "euroc_v101_visnav100/euroc_V1",
                 data / "euroc_v101_micro95/MicroEurocDataset/mav0",
                 data / "traj_gt_openvins/euroc_mav/V1_01_easy.txt",
-            ), 1, "stereo",
+            ),
+            1,
+            "stereo",
         ),
         "EuRoC MH_01 (each 2nd)": (lambda: EurocDataset(data / "euroc_mh01_10hz"), 2, "stereo"),
         "KITTI (outdoors)": (lambda: KittiDataset(data / "kitti_stereo_51x2/KITTI_sequence_1"), 1, "stereo"),
         "HoloLens (each 3rd), depth": (lambda: RgbdDataset(data / "hololens_office_120"), 3, "depth"),
         "redkitchen (each 5th), depth": (lambda: RgbdDataset(data / "rgbd_tsdf_1000"), 5, "depth"),
-    }  # fmt: skip
+    }
     for name, (make, stride, camera) in sources.items():
         try:
             bag = folder / name.replace(" ", "_").split("(")[0]
@@ -253,9 +255,12 @@ def real_bags(data: Path, folder: Path) -> Iterator[tuple[str, Path, int, str]]:
 
 
 SIMULATED = (
-    ("figure_eight", 25, ("stereo",)), ("small_room", 16, ("stereo", "depth")), ("workshop_handheld", 12, ("stereo",)),
-    ("conference", 12, ("stereo",)), ("workshop_rig", 6, ("stereo", "depth")),
-)  # fmt: skip
+    ("figure_eight", 25, ("stereo",)),
+    ("small_room", 16, ("stereo", "depth")),
+    ("workshop_handheld", 12, ("stereo",)),
+    ("conference", 12, ("stereo",)),
+    ("workshop_rig", 6, ("stereo", "depth")),
+)
 """Scenario, stride and cameras: neighbours about as far apart as EuRoC's keyframes, the last as MH_01's frames."""
 
 

@@ -21,10 +21,12 @@ from slam_simulation.surface_table import compile_world
 CAMERA = Camera(160, 120, 90.0, 90.0, 79.5, 59.5)
 SIGMA = 0.01
 ROOM = {
-    "seed": 3, "rate": 10.0, "frames": 10,
+    "seed": 3,
+    "rate": 10.0,
+    "frames": 10,
     "rooms": [{"name": "room", "x": [0, 4], "y": [0, 3], "style": "office"}],
     "agents": [{"motion": "rig", "height": 1.2, "path": [[1, 1], [3, 2, 90]]}],
-}  # fmt: skip
+}
 
 
 class Room:

@@ -28,14 +28,16 @@ from slam_simulation.surface_table import compile_world
 
 CAMERA = Camera(160, 120, 80.0, 80.0, 79.5, 59.5)
 FLAT = {
-    "seed": 5, "rate": 10.0, "frames": 10,
+    "seed": 5,
+    "rate": 10.0,
+    "frames": 10,
     "rooms": [
         {"name": "a", "x": [0, 4], "y": [0, 3], "style": "office"},
         {"name": "b", "x": [4.2, 8], "y": [0, 3], "style": "office"},
     ],
     "doorways": [{"at": [4.1, 1.5], "width": 1.0}],
     "agents": [{"motion": "rig", "height": 1.2, "path": [[1, 1], [3, 2, 90]]}],
-}  # fmt: skip
+}
 
 
 def flat_model(stations: list[tuple[float, float]], tilt: np.ndarray | None = None) -> DenseModel:

@@ -21,7 +21,7 @@ from slam_core.geometry import (
     rotation_from_euler,
     so3_exp,
     transform_points,
-)  # fmt: skip
+)
 from slam_core.types import Features
 
 CAMERA = Camera(640, 480, 283.0, 283.0, 320.0, 240.0)

@@ -120,10 +120,13 @@ def _part(submap: Submap, index: np.ndarray) -> Submap:
     """The submap with these landmarks alone: those never measured again have no known truth."""
     rows = np.concatenate([np.arange(6), (6 + 3 * index[:, None] + np.arange(3)).ravel()])
     return replace(
-        submap, landmarks=submap.landmarks[index], covariance=submap.covariance[np.ix_(rows, rows)],
-        landmark_ids=submap.landmark_ids[index], sightings=submap.sightings[index],
+        submap,
+        landmarks=submap.landmarks[index],
+        covariance=submap.covariance[np.ix_(rows, rows)],
+        landmark_ids=submap.landmark_ids[index],
+        sightings=submap.sightings[index],
         descriptors=submap.descriptors[index],
-    )  # fmt: skip
+    )
 
 
 def _pose_nees(path: tuple[PoseEstimate, ...], poses: list[FloatArray]) -> FloatArray:

@@ -46,9 +46,11 @@ def badly_calibrated(seed: int, calibration: CalibrationErrorConfig) -> tuple[Ek
     for k, T in enumerate(poses):
         seen, _ = world.features(T, k * 100_000_000, rng)
         wrong = replace(
-            seen, xyz=seen.xyz * np.float32(stretch), depth=seen.depth * np.float32(stretch),
+            seen,
+            xyz=seen.xyz * np.float32(stretch),
+            depth=seen.depth * np.float32(stretch),
             sigma_depth=seen.sigma_depth * np.float32(stretch),
-        )  # fmt: skip
+        )
         result = slam.process(wrong)
         submaps += result.submaps
     return result, submaps, invert_transform(poses[0]) @ poses[-1]

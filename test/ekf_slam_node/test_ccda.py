@@ -43,9 +43,10 @@ def test_the_largest_set_is_that_of_an_exhaustive_search(rng):
         fits = np.triu(rng.random((n, n)) < 0.6, 1)
         fits |= fits.T
         best = max(
-            size for size in range(n + 1)
+            size
+            for size in range(n + 1)
             if any(all(fits[a, b] for a, b in combinations(chosen, 2)) for chosen in combinations(range(n), size))
-        )  # fmt: skip
+        )
         found = ccda(np.arange(n), np.arange(n), np.arange(float(n)), fits.copy(), n)
         chosen = np.flatnonzero(found >= 0)
         assert len(chosen) == best

@@ -64,9 +64,12 @@ def test_innovations_of_a_rig_that_moves_as_the_model_says_are_as_large_as_claim
     """Also tells whether pairs were chosen for their small errors: then it falls below the bounds."""
     acceleration, first = np.repeat([0.5, 0.4], 3), np.repeat([0.3, 0.2], 3)
     motion = {
-        "motion.sigma_acceleration": 0.5, "motion.sigma_angular_acceleration": 0.4,
-        "motion.sigma_initial_velocity": 0.3, "motion.sigma_initial_turn_rate": 0.2, "submap.max_distance": 1e6,
-    }  # fmt: skip
+        "motion.sigma_acceleration": 0.5,
+        "motion.sigma_angular_acceleration": 0.4,
+        "motion.sigma_initial_velocity": 0.3,
+        "motion.sigma_initial_turn_rate": 0.2,
+        "submap.max_distance": 1e6,
+    }
     config = from_mapping(EkfSlamConfig, motion)
     done = [simulate(seed, config, lambda rng: wander(26, 0.1, acceleration, first, rng, 3.0)) for seed in range(RUNS)]
     value, low, high = mean_nis(done, config.association.gate, own_motion=True)

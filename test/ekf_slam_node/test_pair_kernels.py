@@ -50,8 +50,11 @@ def test_errors_covariances_and_jacobians(
     S = innovation_covariance(seen, scene[0], None)
     S[:, np.arange(3), np.arange(3)] += scene[1].variance
     for value, expected in (
-        (filled.error, scene[1].z - seen.z), (filled.S, S), (filled.J, seen.J_pose), (filled.depth, seen.depth),
-    ):  # fmt: skip
+        (filled.error, scene[1].z - seen.z),
+        (filled.S, S),
+        (filled.J, seen.J_pose),
+        (filled.depth, seen.depth),
+    ):
         np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-9 * np.abs(expected[1:]).max())
 
 

@@ -38,8 +38,11 @@ class Launch:
         with self._log.open("wb") as output:
             self.process = subprocess.Popen(
                 [sys.executable, "-c", ROS2, "launch", "slam_bringup", "slam.launch.py", f"bag:={DEMO}", *arguments],
-                env=environment, stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
-            )  # fmt: skip
+                env=environment,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
 
     @property
     def text(self) -> str:

@@ -78,11 +78,15 @@ def same_reports(one: list[JoinReport], other: list[JoinReport]) -> bool:
 def same_map(one: GlobalMap, other: GlobalMap) -> bool:
     """Whether two maps are the same to the last bit, covariances included."""
     pairs = [
-        (one.graph.poses, other.graph.poses), (one.graph.points, other.graph.points),
+        (one.graph.poses, other.graph.poses),
+        (one.graph.points, other.graph.points),
         (one.landmarks().covariances, other.landmarks().covariances),
-        *((p.covariance, q.covariance) for k in "ab"
-          for p, q in zip(one.trajectory(k), other.trajectory(k), strict=True)),
-    ]  # fmt: skip
+        *(
+            (p.covariance, q.covariance)
+            for k in "ab"
+            for p, q in zip(one.trajectory(k), other.trajectory(k), strict=True)
+        ),
+    ]
     return all(np.array_equal(a, b) for a, b in pairs)
 
 
@@ -286,9 +290,13 @@ def test_an_empty_submap_is_joined_by_its_odometry(rng: np.random.Generator) -> 
     submaps = ring_agent(rng, turns=0.3).submaps()
     s = submaps[1]
     empty = replace(
-        s, landmarks=s.landmarks[:0], covariance=s.covariance[:6, :6], landmark_ids=s.landmark_ids[:0],
-        sightings=s.sightings[:0], descriptors=s.descriptors[:0],
-    )  # fmt: skip
+        s,
+        landmarks=s.landmarks[:0],
+        covariance=s.covariance[:6, :6],
+        landmark_ids=s.landmark_ids[:0],
+        sightings=s.sightings[:0],
+        descriptors=s.descriptors[:0],
+    )
     joined, reports = join([submaps[0], empty, *submaps[2:]])
     assert all(r.accepted for r in reports)
     assert joined.components == 1

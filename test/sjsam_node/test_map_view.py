@@ -22,9 +22,13 @@ def mean_nees(claim: float) -> float:
         rng = np.random.default_rng(seed)
         agent = Agent(ring_world(3.0, rng, 12.0), circle(3.0, 1.25), rng, "a")
         submaps = [
-            replace(s, covariance=claim * s.covariance, path=tuple(replace(p, covariance=claim * p.covariance)
-                    for p in s.path)) for s in agent.submaps()
-        ]  # fmt: skip
+            replace(
+                s,
+                covariance=claim * s.covariance,
+                path=tuple(replace(p, covariance=claim * p.covariance) for p in s.path),
+            )
+            for s in agent.submaps()
+        ]
         joined, _ = join(submaps)
         joined.settle()
         values.append(errors(joined, agent)[1].mean() / 6.0)

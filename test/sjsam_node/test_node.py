@@ -94,9 +94,13 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
     agent = Agent(ring_world(4.0, rng, 12.0), circle(4.0, 0.5), rng, "")
     submaps = agent.submaps()
     for topic, kind in (
-        ("map/path", "Path"), ("map_to_odom", "TransformStamped"), ("pose", "PoseWithCovarianceStamped"),
-        ("map/landmarks", "PointCloud2"), ("map/graph", "MarkerArray"), ("map/marks", "MarkerArray"),
-    ):  # fmt: skip
+        ("map/path", "Path"),
+        ("map_to_odom", "TransformStamped"),
+        ("pose", "PoseWithCovarianceStamped"),
+        ("map/landmarks", "PointCloud2"),
+        ("map/graph", "MarkerArray"),
+        ("map/marks", "MarkerArray"),
+    ):
         bench.listen(topic, kind)
     bench.send(submaps)
     assert bench.spin_until(lambda: len(bench.node.global_map.graph.records) == len(submaps))

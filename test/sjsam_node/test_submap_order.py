@@ -11,8 +11,11 @@ A, B = ("a", 0), ("b", 7)
 def test_what_comes_in_order_is_let_through_for_each_agent_and_session() -> None:
     order = SubmapOrder[str]()
     assert [order.add((*chain, k), f"{chain[0]}{k}") for k in range(2) for chain in (A, B)] == [
-        ["a0"], ["b0"], ["a1"], ["b1"]
-    ]  # fmt: skip
+        ["a0"],
+        ["b0"],
+        ["a1"],
+        ["b1"],
+    ]
     assert order.add((*A, 0), "again") == ["again"]
     assert not order.missing()
     assert not order.should_ask(0.0)

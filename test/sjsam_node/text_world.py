@@ -154,9 +154,13 @@ def _local_map(
     size = len(sigma) // len(poses)
     information = np.linalg.inv(covariance)
     return TextMap(
-        sign * k, sign * np.array(poses), mean[: len(sigma)].reshape(-1, size), near + 1,
-        mean[len(sigma) :].reshape(-1, d), 0.5 * (information + information.T),
-    )  # fmt: skip
+        sign * k,
+        sign * np.array(poses),
+        mean[: len(sigma)].reshape(-1, size),
+        near + 1,
+        mean[len(sigma) :].reshape(-1, d),
+        0.5 * (information + information.T),
+    )
 
 
 SETS: dict[str, Callable[[int, float], list[TextMap]]] = {

@@ -168,10 +168,13 @@ def test_metres_of_millimetres_and_of_metres() -> None:
 
 @pytest.mark.parametrize(
     "camera",
-    [CAMERA, Camera(8, 6, 50.0, 51.0, 3.5, 2.5, "plumb_bob", (-0.28, 0.07, 1e-4, 2e-5, 0.0)),
-     Camera(8, 6, 50.0, 51.0, 3.5, 2.5, "rational_polynomial", (0.1, 0.2, 0.0, 0.0, 0.3, 0.1, 0.2, 0.3)),
-     Camera(8, 6, 50.0, 51.0, 3.5, 2.5, "equidistant", (0.1, 0.2, 0.3, 0.4))],
-)  # fmt: skip
+    [
+        CAMERA,
+        Camera(8, 6, 50.0, 51.0, 3.5, 2.5, "plumb_bob", (-0.28, 0.07, 1e-4, 2e-5, 0.0)),
+        Camera(8, 6, 50.0, 51.0, 3.5, 2.5, "rational_polynomial", (0.1, 0.2, 0.0, 0.0, 0.3, 0.1, 0.2, 0.3)),
+        Camera(8, 6, 50.0, 51.0, 3.5, 2.5, "equidistant", (0.1, 0.2, 0.3, 0.4)),
+    ],
+)
 def test_camera_infos_survive(camera: Camera) -> None:
     R = boxplus(np.eye(4), np.array([0, 0, 0, 0.01, 0.02, -0.01]))[:3, :3]
     info = CameraInfo(camera, R, np.array([[40.0, 0, 4, -5], [0, 40, 3, 0], [0, 0, 1, 0]]))
@@ -243,9 +246,13 @@ def test_a_laser_scan_has_points_where_it_measured() -> None:
 
 @pytest.mark.parametrize(
     ("changes", "reason"),
-    [({"ranges": np.zeros(0, np.float32)}, "no ranges"), ({"angle_increment": 0.0}, "angle_increment 0"),
-     ({"angle_min": np.nan}, "angle_min nan"), ({"range_max": 0.1}, "from 0.2")],
-)  # fmt: skip
+    [
+        ({"ranges": np.zeros(0, np.float32)}, "no ranges"),
+        ({"angle_increment": 0.0}, "angle_increment 0"),
+        ({"angle_min": np.nan}, "angle_min nan"),
+        ({"range_max": 0.1}, "from 0.2"),
+    ],
+)
 def test_a_laser_scan_without_points_is_named(changes: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         m.points_from_scan(laser_scan(**changes))
@@ -329,8 +336,12 @@ def test_submaps_survive_exactly_or_rounded(
     for name in ("end_pose", "landmark_ids", "sightings"):
         np.testing.assert_array_equal(getattr(back, name), getattr(submap, name), err_msg=name)
     assert [getattr(back, k) for k in ("agent", "index", "start_stamp_ns", "end_stamp_ns", "follows_previous")] == [
-        agent, 7, STAMP, STAMP + 2, follows
-    ]  # fmt: skip
+        agent,
+        7,
+        STAMP,
+        STAMP + 2,
+        follows,
+    ]
     assert back.session == submap.session == 3
     for a, b in zip(back.path, submap.path, strict=True):
         assert a.stamp_ns == b.stamp_ns

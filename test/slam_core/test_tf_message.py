@@ -57,9 +57,10 @@ def test_hash_is_that_of_the_description():
     kind = {"type_id": 145, "capacity": 0, "string_capacity": 0, "nested_type_name": TRANSFORM}
     whole = {
         "type_description": described("tf2_msgs/msg/TFMessage", [{"name": "transforms", "type": kind}]),
-        "referenced_type_descriptions": sorted((described(**{k: p[k] for k in ("type_name", "fields")}) for p in parts),
-                                               key=lambda part: part["type_name"]),
-    }  # fmt: skip
+        "referenced_type_descriptions": sorted(
+            (described(**{k: p[k] for k in ("type_name", "fields")}) for p in parts), key=lambda part: part["type_name"]
+        ),
+    }
     assert hashlib.sha256(json.dumps(whole).encode()).digest() == TYPE_HASH[1:]
 
 

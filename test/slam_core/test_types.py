@@ -58,9 +58,13 @@ def test_selecting_features_keeps_every_column_in_step(rng: np.random.Generator)
     columns = {name: rng.normal(size=(n, k)).astype(np.float32) for name, k in (("xyz", 3), ("uv", 2), ("sigma_uv", 2))}
     singles = {name: rng.normal(size=n).astype(np.float32) for name in ("depth", "sigma_depth", "response")}
     features = Features(
-        5, source=np.arange(n, dtype=np.uint8), descriptors=rng.normal(size=(n, 128)).astype(np.float32),
-        camera=Camera(8, 6, 10.0, 11.0, 3.5, 2.0), **columns, **singles,
-    )  # fmt: skip
+        5,
+        source=np.arange(n, dtype=np.uint8),
+        descriptors=rng.normal(size=(n, 128)).astype(np.float32),
+        camera=Camera(8, 6, 10.0, 11.0, 3.5, 2.0),
+        **columns,
+        **singles,
+    )
     chosen = features.select(np.array([5, 2]))
     assert len(chosen) == 2
     for name in (*columns, *singles, "source", "descriptors"):

@@ -34,9 +34,12 @@ def test_profiles_are_named_and_ideal_changes_nothing(scenario: Scenario) -> Non
 
 def test_a_scenario_file_may_name_its_profile_or_single_effects() -> None:
     plan = {
-        "seed": 1, "rate": 2.0, "frames": 2, "rooms": [{"name": "a", "x": [0, 4], "y": [0, 4]}],
+        "seed": 1,
+        "rate": 2.0,
+        "frames": 2,
+        "rooms": [{"name": "a", "x": [0, 4], "y": [0, 4]}],
         "agents": [{"path": [[1, 1], [2, 2]]}],
-    }  # fmt: skip
+    }
     assert Scenario.from_mapping("plain", plan).profile == ""
     assert Scenario.from_mapping("hard", plan | {"profile": "real"}).suite.realism == REAL
     smoky = Scenario.from_mapping("smoky", plan | {"realism": {"smoke.density": 0.3}})

@@ -119,9 +119,13 @@ def test_shortened_scenario_keeps_its_motion() -> None:
 )
 def test_bad_scenarios_are_refused(scenario: Scenario, change: dict[str, object], word: str) -> None:
     values = {
-        "seed": 1, "rate": 10.0, "frames": 5, "rooms": [{"name": "x", "x": [0, 5], "y": [0, 5]}],
-        "agents": [{"motion": "rig", "path": [[1, 1], [2, 2]]}], **change,
-    }  # fmt: skip
+        "seed": 1,
+        "rate": 10.0,
+        "frames": 5,
+        "rooms": [{"name": "x", "x": [0, 5], "y": [0, 5]}],
+        "agents": [{"motion": "rig", "path": [[1, 1], [2, 2]]}],
+        **change,
+    }
     with pytest.raises(ValueError, match=word):
         Scenario.from_mapping("bad", values).world()
 

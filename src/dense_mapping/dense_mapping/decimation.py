@@ -24,9 +24,12 @@ def at_most(surface: Surface, faces: int) -> Surface:
 def coarser(surface: Surface, size: float) -> Surface:
     """The surface with one vertex in each cell of ``size`` m, in the middle of those that were there."""
     _, first, cell, count = np.unique(
-        np.floor(surface.points / size).astype(np.int64), axis=0, return_index=True, return_inverse=True,
+        np.floor(surface.points / size).astype(np.int64),
+        axis=0,
+        return_index=True,
+        return_inverse=True,
         return_counts=True,
-    )  # fmt: skip
+    )
     cell = cell.ravel()
 
     def mean(values: np.ndarray) -> np.ndarray:

@@ -144,11 +144,15 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         self._stamp_ns = max(self._stamp_ns, stamp_ns(message))
         if self.mapper.set_path(agent, path_from_message(message)):
             self._is_news = True
-        self.health.take({
-            "key frames": len(self.mapper.model.keyframes), "waiting for a pose": self.mapper.waiting,
-            "dropped without a pose": self.mapper.dropped, "key frames moved": self.mapper.model.moved,
-            "blocks refused": self.mapper.model.volume.refused_blocks,
-        })  # fmt: skip
+        self.health.take(
+            {
+                "key frames": len(self.mapper.model.keyframes),
+                "waiting for a pose": self.mapper.waiting,
+                "dropped without a pose": self.mapper.dropped,
+                "key frames moved": self.mapper.model.moved,
+                "blocks refused": self.mapper.model.volume.refused_blocks,
+            }
+        )
         full = self.mapper.model.volume.refused_blocks > 0
         self.health.set(State.DEGRADED if full else State.OK, "the grid is full (tsdf.max_blocks)" if full else "")
 

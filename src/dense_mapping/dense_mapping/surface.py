@@ -122,8 +122,10 @@ def _chunk_surface(
     means, sigmas = voxel_statistics(volume.voxels[inside], config)
     shown = volume.colours[inside]
     for values, target in (
-        (means, distance), (sigmas, sigma), (np.where(shown[..., 3:] > 0, shown[..., :3], _UNSEEN), colours)
-    ):  # fmt: skip
+        (means, distance),
+        (sigmas, sigma),
+        (np.where(shown[..., 3:] > 0, shown[..., :3], _UNSEEN), colours),
+    ):
         _put_blocks(values, volume.coordinates[inside] - corner, target)
     edge = _CHUNK * BLOCK + 1
     distance = distance[:edge, :edge, :edge]

@@ -19,7 +19,7 @@ from slam_core.geometry import (
     interpolate_transform,
     make_transform,
     so3_log,
-)  # fmt: skip
+)
 from slam_core.types import ImuSample, RelativeMotion
 
 _AID_STAMP_TOLERANCE = 0.005
@@ -86,9 +86,12 @@ class MotionAids:
         return Aid(*at_place(step.T, covariance, -self._place()), ALL)
 
     def moved(
-        self, start_stamp_ns: int, end_stamp_ns: int, T_previous_now: FloatArray | None = None,
+        self,
+        start_stamp_ns: int,
+        end_stamp_ns: int,
+        T_previous_now: FloatArray | None = None,
         covariance: FloatArray | None = None,
-    ) -> bool:  # fmt: skip
+    ) -> bool:
         """Tell the IMU's filter of the motion that the images alone show, or that they show none.
 
         covariance: (6, 6) along the axes of the previous frame. False if the IMU contradicts it.

@@ -179,9 +179,13 @@ def associate_ccda(
 
 
 def _clearest_pairs(
-    candidates: Candidates, frame: Frame, similarity: Similarity, seen: Observation, motion_covariance: FloatArray,
+    candidates: Candidates,
+    frame: Frame,
+    similarity: Similarity,
+    seen: Observation,
+    motion_covariance: FloatArray,
     config: FeatureAssociationConfig,
-) -> tuple[IndexArray, IndexArray, FloatArray]:  # fmt: skip
+) -> tuple[IndexArray, IndexArray, FloatArray]:
     """Rows, columns and costs of the gated pairs of the features with the fewest candidates."""
     S = innovation_covariance(seen, candidates, motion_covariance)
     rows, columns, costs = _gated_pairs(

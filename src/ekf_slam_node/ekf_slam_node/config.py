@@ -27,13 +27,15 @@ class MotionConfig(Config):
     )
     sigma_initial_turn_rate: float = parameter(2.0, "the same for its turn rate", unit="rad/s", minimum=0.0)
     standing_frames: int = parameter(
-        5, "frames without motion after which the rig counts as standing: nothing is mapped until it moves; 0: never",
+        5,
+        "frames without motion after which the rig counts as standing: nothing is mapped until it moves; 0: never",
         minimum=0,
-    )  # fmt: skip
+    )
     imu: str = parameter(
-        "auto", "whether an IMU is used: where there is one, never, or always (a run without one is refused)",
+        "auto",
+        "whether an IMU is used: where there is one, never, or always (a run without one is refused)",
         choices=("auto", "off", "on"),
-    )  # fmt: skip
+    )
     sigma_gyro: float = parameter(
         0.02, "noise of the mean turn rate of an IMU between two frames", unit="rad/s", minimum=1e-6
     )
@@ -60,9 +62,12 @@ class InertialConfig(Config):
     """An IMU with its noise as data sheets give it; the defaults suit consumer sensors."""
 
     time_offset: float = parameter(
-        0.0, "added to the IMU's stamps, so that they mean the same time as the images'", unit="s", minimum=-1.0,
+        0.0,
+        "added to the IMU's stamps, so that they mean the same time as the images'",
+        unit="s",
+        minimum=-1.0,
         maximum=1.0,
-    )  # fmt: skip
+    )
     gyro_noise: float = parameter(1e-3, "white noise of its turn rates", unit="rad/s/sqrt(Hz)", minimum=1e-6)
     accelerometer_noise: float = parameter(
         0.01, "white noise of its specific force", unit="m/s2/sqrt(Hz)", minimum=1e-6
@@ -130,9 +135,10 @@ class SubmapConfig(Config):
     """End of a submap and start of the next one (section 7.1)."""
 
     start: str = parameter(
-        "independent", "what the next submap takes over: nothing but the last frame's own measurement, or Eq. 7.1",
+        "independent",
+        "what the next submap takes over: nothing but the last frame's own measurement, or Eq. 7.1",
         choices=("independent", "conditional"),
-    )  # fmt: skip
+    )
     max_distance: float = parameter(1.0, "a submap ends this far from its start", unit="m", minimum=0.05)
     max_landmarks: int = parameter(400, "a submap ends at this number of landmarks", minimum=10)
     max_frames: int = parameter(300, "a submap ends after this number of frames", minimum=2)

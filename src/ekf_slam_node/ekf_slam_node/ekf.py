@@ -26,7 +26,7 @@ from ekf_slam_node.models import (
     noise_gain,
     relative_motion,
     velocity_of_motion,
-)  # fmt: skip
+)
 from slam_core.geometry import FloatArray, make_transform, skew, so3_exp, so3_left_jacobian
 
 

@@ -18,7 +18,7 @@ from ekf_slam_node.association import (
     associate_mahalanobis,
     associate_nearest,
     match_descriptors,
-)  # fmt: skip
+)
 from ekf_slam_node.candidates import Candidates, MotionPrior
 from ekf_slam_node.config import NEAREST_ASSOCIATE, FeatureAssociationConfig
 from ekf_slam_node.models import Frame

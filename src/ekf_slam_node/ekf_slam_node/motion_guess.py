@@ -86,9 +86,13 @@ def guess_motion(
 
 
 def _best_sample(
-    candidates: Candidates, frame: Frame, T_rig_optical: FloatArray, rng: np.random.Generator, hypotheses: int,
+    candidates: Candidates,
+    frame: Frame,
+    T_rig_optical: FloatArray,
+    rng: np.random.Generator,
+    hypotheses: int,
     initial: FloatArray | None,
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     n = len(candidates)
     now, _ = rig_points(frame, T_rig_optical)
     samples = np.argpartition(rng.random((hypotheses, n)), 2, axis=1)[:, :3]

@@ -69,9 +69,10 @@ class OpenSubmap:
         points, covariances = self.ekf.landmarks_in_rig()
         pending = self.pending.candidates
         return Candidates(
-            np.concatenate([points, pending.points]), np.concatenate([covariances, pending.covariances]),
+            np.concatenate([points, pending.points]),
+            np.concatenate([covariances, pending.covariances]),
             np.concatenate([self.book.descriptors, pending.descriptors]),
-        )  # fmt: skip
+        )
 
     # ---------------------------------------------------------------------------------------------- one frame, in order
     def confirm(self, frame: Frame, link: FrameLink, wanted: int, new_ids: IndexArray) -> Sight:
@@ -152,9 +153,11 @@ def pending_of(frame: Frame, T_rig_optical: FloatArray) -> Pending:
     points, covariances = rig_points(frame, T_rig_optical)
     n = len(frame)
     return Pending(
-        Candidates(points, covariances, frame.descriptors), np.full(n, -1, dtype=np.int64), np.ones(n, dtype=np.int32),
+        Candidates(points, covariances, frame.descriptors),
+        np.full(n, -1, dtype=np.int64),
+        np.ones(n, dtype=np.int32),
         np.ones(n, dtype=bool),
-    )  # fmt: skip
+    )
 
 
 def inheriting(frame: Frame, T_rig_optical: FloatArray, sight: Sight, used: Sight, book: LandmarkBook) -> Pending:

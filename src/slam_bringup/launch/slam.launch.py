@@ -39,12 +39,16 @@ def _nodes(context: LaunchContext) -> list[Node]:
     plan = plan_launch({a.name: LaunchConfiguration(a.name).perform(context) for a in ARGUMENTS})
     nodes = [
         Node(
-            package=spec.package, executable=spec.executable, name=spec.executable, namespace=spec.namespace,
+            package=spec.package,
+            executable=spec.executable,
+            name=spec.executable,
+            namespace=spec.namespace,
             parameters=[{k: list(v) if isinstance(v, tuple) else v for k, v in spec.parameters.items()}],
-            remappings=list(plan.remappings), output="screen",
+            remappings=list(plan.remappings),
+            output="screen",
         )
         for spec in plan.nodes
-    ]  # fmt: skip
+    ]
     if LaunchConfiguration("rviz").perform(context) == "true":
         nodes.append(Node(package="rviz2", executable="rviz2", arguments=["-d", str(SHARE / "rviz" / "slam.rviz")]))
     return nodes

@@ -54,9 +54,12 @@ C = TypeVar("C", bound=Config)
 
 
 _POLICIES = {
-    "CameraInfo": StampPolicy.ANY, "PointStamped": StampPolicy.ANY, "Imu": StampPolicy.FOLLOWS,
-    "PoseWithCovarianceStamped": StampPolicy.FOLLOWS, "Odometry": StampPolicy.FOLLOWS,
-}  # fmt: skip
+    "CameraInfo": StampPolicy.ANY,
+    "PointStamped": StampPolicy.ANY,
+    "Imu": StampPolicy.FOLLOWS,
+    "PoseWithCovarianceStamped": StampPolicy.FOLLOWS,
+    "Odometry": StampPolicy.FOLLOWS,
+}
 """Types whose messages accompany frames: having processed one says nothing of the frame of its stamp."""
 
 PROGRESS_TOPIC = "/progress"

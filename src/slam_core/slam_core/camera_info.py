@@ -95,9 +95,7 @@ def _from_document(document: Mapping[str, Any]) -> CameraInfoFile:
     if model != "equidistant" and not any(distortion):
         model, distortion = "none", ()
     width, height = int(_required(document, "image_width")), int(_required(document, "image_height"))
-    camera = Camera(
-        width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), model, distortion
-    )  # fmt: skip
+    camera = Camera(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), model, distortion)
     R = _read_matrix(document, "rectification_matrix", (3, 3)) if "rectification_matrix" in document else np.eye(3)
     P = _read_matrix(document, "projection_matrix", (3, 4)) if "projection_matrix" in document else np.zeros((3, 4))
     deviations = {str(k): float(v) for k, v in dict(document.get("standard_deviations") or {}).items()}

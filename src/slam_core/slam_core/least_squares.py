@@ -58,8 +58,9 @@ class LevenbergMarquardtConfig(Config):
     """Stopping rules and damping."""
 
     max_iterations: int = parameter(100, "linearisations at most", minimum=1)
-    relative_tolerance: float = parameter(1e-12, "stop when a step promises to lower the cost by less than this share",
-                                          minimum=0.0)  # fmt: skip
+    relative_tolerance: float = parameter(
+        1e-12, "stop when a step promises to lower the cost by less than this share", minimum=0.0
+    )
     initial_damping: float = parameter(
         1e-9, "first damping, relative to the diagonal of the normal matrix", minimum=0.0
     )

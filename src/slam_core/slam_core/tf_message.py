@@ -42,9 +42,13 @@ class _Handle(ctypes.Structure):
     """``rosidl_message_type_support_t``."""
 
     _fields_ = (
-        ("identifier", ctypes.c_char_p), ("data", ctypes.c_void_p), ("get_handle", ctypes.c_void_p),
-        ("get_hash", ctypes.c_void_p), ("get_description", ctypes.c_void_p), ("get_sources", ctypes.c_void_p),
-    )  # fmt: skip
+        ("identifier", ctypes.c_char_p),
+        ("data", ctypes.c_void_p),
+        ("get_handle", ctypes.c_void_p),
+        ("get_hash", ctypes.c_void_p),
+        ("get_description", ctypes.c_void_p),
+        ("get_sources", ctypes.c_void_p),
+    )
 
 
 class _Functions(ctypes.Structure):
@@ -95,9 +99,13 @@ class _TypeSupport:
             name=b"transforms", type_id=header.type_id, members=ctypes.addressof(as_fields), is_array=True
         )
         self._message = _copy(
-            message, namespace=b"tf2_msgs__msg", name=b"TFMessage", count=1, size=_SEQUENCE_BYTES,
+            message,
+            namespace=b"tf2_msgs__msg",
+            name=b"TFMessage",
+            count=1,
+            size=_SEQUENCE_BYTES,
             fields=ctypes.addressof(self._field),
-        )  # fmt: skip
+        )
         self._handles = {
             _BYTES: self._handle(as_bytes, data=ctypes.addressof(self._functions)),
             _FIELDS: self._handle(as_fields, data=ctypes.addressof(self._message)),

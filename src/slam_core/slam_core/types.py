@@ -173,9 +173,12 @@ class Submap:
     def __post_init__(self) -> None:
         n = len(self.landmarks)
         expected = {
-            "end_pose": (4, 4), "landmarks": (n, 3), "covariance": (6 + 3 * n, 6 + 3 * n), "landmark_ids": (n,),
+            "end_pose": (4, 4),
+            "landmarks": (n, 3),
+            "covariance": (6 + 3 * n, 6 + 3 * n),
+            "landmark_ids": (n,),
             "sightings": (n,),
-        }  # fmt: skip
+        }
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"submap {name} must have shape {shape}, got {getattr(self, name).shape}")

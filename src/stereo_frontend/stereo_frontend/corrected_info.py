@@ -52,7 +52,5 @@ def _parameters(info: CameraInfo) -> FloatArray:
 def _with(info: CameraInfo, x: FloatArray) -> CameraInfo:
     fx, fy, cx, cy = (float(v) for v in x[:4])
     distortion = tuple(float(v) for v in x[7:])
-    camera = replace(
-        info.camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion_model=_model(info), distortion=distortion
-    )  # fmt: skip
+    camera = replace(info.camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion_model=_model(info), distortion=distortion)
     return CameraInfo(camera, so3_exp(x[4:7]), info.P)

@@ -72,9 +72,9 @@ class NormalEquations:
         return NormalEquations(self.information + other.information, self.vector + other.vector)
 
 
-def match_views(first: StereoView, second: StereoView, min_similarity: float, max_ratio: float) -> tuple[
-    npt.NDArray[np.intp], npt.NDArray[np.intp]
-]:  # fmt: skip
+def match_views(
+    first: StereoView, second: StereoView, min_similarity: float, max_ratio: float
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Indices (k,) of the matches of both that look alike: mutually best, and better than the second best."""
     if not len(first) or not len(second) or first.descriptors.shape[1] != second.descriptors.shape[1]:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)

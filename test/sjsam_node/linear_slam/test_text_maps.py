@@ -49,10 +49,14 @@ def walk(dimension: int, count: int, rng: np.random.Generator, noise: float) -> 
         information = np.eye(len(values)) / 0.01**2
         maps.append(
             TextMap(
-                -k, np.array([-k - 1]), values[:size].reshape(1, -1), near + 1,
-                values[size:].reshape(-1, dimension), information,
+                -k,
+                np.array([-k - 1]),
+                values[:size].reshape(1, -1),
+                near + 1,
+                values[size:].reshape(-1, dimension),
+                information,
             )
-        )  # fmt: skip
+        )
     return maps, (t - t[0]) @ R[0]
 
 

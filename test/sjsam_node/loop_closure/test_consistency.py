@@ -45,8 +45,12 @@ def false_link(joined: GlobalMap, agent: Agent) -> Link:
             shift[0, 3] -= 14.0
             T = invert_transform(agent.true_start(first)) @ shift
             prior = Prior(T, 1e-2 * np.eye(6))
-            found = match(at_start(graph.records[first]), at_start(graph.records[second]), prior,
-                          joined.config.closure.association)  # fmt: skip
+            found = match(
+                at_start(graph.records[first]),
+                at_start(graph.records[second]),
+                prior,
+                joined.config.closure.association,
+            )
             if best is None or len(found.pairs) > len(best.pairs):
                 best = Link(first, second, found.pairs, found.T, found.covariance, is_closure=True)
     assert best is not None

@@ -54,9 +54,10 @@ def test_links_found_tie_to_all_that_see_the_same_landmarks(joined: GlobalMap) -
     ends = (link.first, link.second)
     third = max(
         (i for i in range(len(graph.records)) if i not in ends),
-        key=lambda i: np.isin(graph.landmark_of[graph.records[i].observations],
-                              graph.landmark_of[graph.records[link.first].observations]).sum(),
-    )  # fmt: skip
+        key=lambda i: np.isin(
+            graph.landmark_of[graph.records[i].observations], graph.landmark_of[graph.records[link.first].observations]
+        ).sum(),
+    )
     others = [k for k in graph.links if link.second not in (k.first, k.second)]
     graph.replace_links(others)
     assert not known.is_all_known(third, link.second)

@@ -94,8 +94,9 @@ def with_false_loops(
         false.append(replace(m, pose_ids=wrong))
         clean.append(
             replace(m, pose_ids=m.pose_ids[:1], poses=m.poses[:1], information=np.linalg.inv(covariance[:3, :3]))
-            if spoilt else m
-        )  # fmt: skip
+            if spoilt
+            else m
+        )
     return false, clean, count
 
 

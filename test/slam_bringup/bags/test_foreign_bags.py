@@ -148,8 +148,11 @@ def test_poses_are_those_of_base_link_or_of_the_root_above_the_camera(tmp_path: 
     other = tmp_path / "b.mcap"
     T = make_transform(so3_exp(np.array([0.1, 0.0, 0.0])), np.array([1.0, 0.0, 0.0]))
     with BagReader(bag) as old, BagWriter(other) as new:
-        new.write("/tf_static", BagTypes().TFMessage(transforms=[
-            transform_message(BagTypes(), 1, "camera_link", LEFT_FRAME, T)]), 1)  # fmt: skip
+        new.write(
+            "/tf_static",
+            BagTypes().TFMessage(transforms=[transform_message(BagTypes(), 1, "camera_link", LEFT_FRAME, T)]),
+            1,
+        )
         for topic, stamp, message in old.messages():
             if topic != "/tf_static":
                 new.write(topic, message, stamp)
@@ -174,9 +177,8 @@ def test_bags_of_ros_1_are_read(tmp_path: Path) -> None:
     ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
     with BagReader(new) as source, Ros1Writer(tmp_path / "old.bag") as target:
         connections = {
-            topic: target.add_connection(topic, info.type_name, typestore=ros1)
-            for topic, info in source.topics.items()
-        }  # fmt: skip
+            topic: target.add_connection(topic, info.type_name, typestore=ros1) for topic, info in source.topics.items()
+        }
         types = {name: info.type_name for name, info in source.topics.items()}
         for topic, stamp, data in source.raw():
             target.write(connections[topic], stamp, bytes(typestore().cdr_to_ros1(data, types[topic])))

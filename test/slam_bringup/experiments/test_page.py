@@ -46,8 +46,12 @@ def test_every_figure_of_the_thesis_is_drawn():
 
 def test_every_scenario_is_held_to_its_bounds():
     """Those too long for a test, at full length: the page says of each whether it keeps bags/expected.yaml."""
-    judged = {c["quantity"].rsplit(", ", 1)[-1]: c["met"] for entry in PAGE for c in entry["comparisons"]
-              if c["quantity"].startswith("bounds of bags/expected.yaml")}  # fmt: skip
+    judged = {
+        c["quantity"].rsplit(", ", 1)[-1]: c["met"]
+        for entry in PAGE
+        for c in entry["comparisons"]
+        if c["quantity"].startswith("bounds of bags/expected.yaml")
+    }
     absent = {"firemen_2", "firemen_3"} if "firemen" not in NAMES else set()
     assert set(judged) == set(expected()) - {"demo"} - absent
     assert set(judged.values()) == {True}

@@ -86,9 +86,12 @@ def test_changes_of_state_are_told_with_the_time_since_the_start():
 
 @pytest.mark.parametrize(
     ("mode", "odometry", "hint"),
-    [("stereo", "ndt", "leave --odometry out"), ("fuse", "ndt", "--mode stereo without --odometry"),
-     ("fuse", "none", "try --mode stereo")],
-)  # fmt: skip
+    [
+        ("stereo", "ndt", "leave --odometry out"),
+        ("fuse", "ndt", "--mode stereo without --odometry"),
+        ("fuse", "none", "try --mode stereo"),
+    ],
+)
 def test_who_lacks_a_tof_camera_is_told_what_would_do(mode, odometry, hint):
     sensors = AgentSensors("", None, None, None, "depth", FrameTree(), topics={"left": "/l", "right": "/r"})
     config = choose(load_system_config(None), mode, "sjsam", odometry)

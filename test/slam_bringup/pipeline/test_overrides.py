@@ -94,8 +94,10 @@ def test_the_last_rule_and_the_rule_for_a_node_win() -> None:
 def test_parameters_in_one_line() -> None:
     text = "ekf_slam.submap.max_distance=1.5, sjsam.agents=[a, b]; tof_driver.pictures=none"
     assert parse_assignments(text) == {
-        "ekf_slam": {"submap.max_distance": 1.5}, "sjsam": {"agents": ["a", "b"]}, "tof_driver": {"pictures": "none"}
-    }  # fmt: skip
+        "ekf_slam": {"submap.max_distance": 1.5},
+        "sjsam": {"agents": ["a", "b"]},
+        "tof_driver": {"pictures": "none"},
+    }
     with pytest.raises(ValueError, match=r"is not NODE.PARAMETER=VALUE"):
         parse_assignments("max_distance=1.5")
 

@@ -24,10 +24,14 @@ def robot_log(run: PlanarRun, name: str = "robot") -> RobotLog:
     c = run.config
     Q = np.diag(np.array([c.sigma_step, c.sigma_step, c.sigma_turn]) ** 2)
     return RobotLog(
-        name, np.arange(float(len(run.poses))), run.odometry, np.broadcast_to(Q, (len(run.odometry), 3, 3)),
+        name,
+        np.arange(float(len(run.poses))),
+        run.odometry,
+        np.broadcast_to(Q, (len(run.odometry), 3, 3)),
         tuple(np.column_stack([o.ranges, o.bearings]) for o in run.observations),
-        tuple(o.ids for o in run.observations), run.poses,
-    )  # fmt: skip
+        tuple(o.ids for o in run.observations),
+        run.poses,
+    )
 
 
 def planar_log(seed: int) -> PlanarLog:

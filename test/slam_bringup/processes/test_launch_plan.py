@@ -44,9 +44,11 @@ def test_a_rig_may_name_its_topics_frames_and_files() -> None:
     assert found["ekf_slam"]["submap.max_distance"] == 2.0
     assert (found["sjsam"]["map_path"], found["sjsam"]["localize_only"]) == ("/maps/a", True)
     assert set(plan.remappings) == {
-        ("/stereo/left/image_raw", "/cam/left/image_raw"), ("/stereo/left/camera_info", "/cam/info"),
-        ("/tof/depth/image_raw", "/cam/depth/image_raw"), ("/tof/camera_info", "/d/info"),
-    }  # fmt: skip
+        ("/stereo/left/image_raw", "/cam/left/image_raw"),
+        ("/stereo/left/camera_info", "/cam/info"),
+        ("/tof/depth/image_raw", "/cam/depth/image_raw"),
+        ("/tof/camera_info", "/d/info"),
+    }
     assert "stereo_driver" not in {s.executable for s in plan_launch({"rectified": "true"}).nodes}
 
 

@@ -16,10 +16,12 @@ CONFIG_FILES = sorted((Path(__file__).resolve().parents[3] / "src" / "slam_bring
 def sensors(agent: str = "") -> AgentSensors:
     below = f"/{agent}" if agent else ""
     topics = {
-        "left": f"{below}/stereo/left/image_raw/compressed", "right": f"{below}/stereo/right/image_raw/compressed",
-        "depth": f"{below}/tof/depth/image_raw", "amplitude": f"{below}/tof/amplitude/image_raw",
+        "left": f"{below}/stereo/left/image_raw/compressed",
+        "right": f"{below}/stereo/right/image_raw/compressed",
+        "depth": f"{below}/tof/depth/image_raw",
+        "amplitude": f"{below}/tof/amplitude/image_raw",
         "tof_info": f"{below}/tof/camera_info",
-    }  # fmt: skip
+    }
     return AgentSensors(agent, None, None, None, "depth", FrameTree(), topics=topics)
 
 
@@ -50,8 +52,9 @@ def test_parameters_follow_from_the_choice_and_the_bag() -> None:
     assert graph.filters == ("/one/ekf_slam",)
     assert graph.finishers == ("/one/ndt_odometry", "/one/feature_extractor", "/one/ekf_slam")
     assert set(graph.pace) == {
-        "/one/ekf_slam=/one/stereo/left/image_raw/compressed", "/one/ndt_odometry=/one/tof/depth/image_raw"
-    }  # fmt: skip
+        "/one/ekf_slam=/one/stereo/left/image_raw/compressed",
+        "/one/ndt_odometry=/one/tof/depth/image_raw",
+    }
     assert "/one/tof/camera_info" in graph.played.values()
 
 

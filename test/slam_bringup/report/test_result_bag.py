@@ -22,10 +22,13 @@ from slam_core.trajectory import read_trajectory
 SCENE = {
     f"{package}/msg/{name}"
     for package, names in {
-        "geometry_msgs": ("PoseStamped", "PoseWithCovarianceStamped"), "nav_msgs": ("Path", "OccupancyGrid"),
-        "sensor_msgs": ("PointCloud2", "CompressedImage", "CameraInfo"), "visualization_msgs": ("MarkerArray",),
-    }.items() for name in names
-}  # fmt: skip
+        "geometry_msgs": ("PoseStamped", "PoseWithCovarianceStamped"),
+        "nav_msgs": ("Path", "OccupancyGrid"),
+        "sensor_msgs": ("PointCloud2", "CompressedImage", "CameraInfo"),
+        "visualization_msgs": ("MarkerArray",),
+    }.items()
+    for name in names
+}
 
 
 def messages(out: Path) -> list:
@@ -74,8 +77,9 @@ def test_the_truth_lies_on_the_trajectory(out):
     poses = dict(zip(estimate.stamps_ns.tolist(), estimate.poses, strict=True))
     gaps = [
         np.linalg.norm((T_map_world @ pose_from_message(m.message.pose))[:3, 3] - poses[stamp_ns(m.message)][:3, 3])
-        for m in read if m.topic == "/ground_truth/pose" and stamp_ns(m.message) in poses
-    ]  # fmt: skip
+        for m in read
+        if m.topic == "/ground_truth/pose" and stamp_ns(m.message) in poses
+    ]
     assert len(gaps) >= 50
     assert max(gaps) < 0.02
 

@@ -203,9 +203,12 @@ class BagPlayerNode(Node):
         outputs = {self._names.get(topic, topic): publisher for topic, publisher in self._outputs.items()}
         self._audience.forget_all_but(outputs)
         missing = self._audience.missing
-        self._wait_until(lambda: [
-            f"{topic} has not all its subscribers" for topic in missing(lambda t: outputs[t].get_subscription_count())
-        ])  # fmt: skip
+        self._wait_until(
+            lambda: [
+                f"{topic} has not all its subscribers"
+                for topic in missing(lambda t: outputs[t].get_subscription_count())
+            ]
+        )
 
     def _wait_until(self, obstacles: Callable[[], list[str]]) -> None:
         """Until there are none any more, or patience runs out."""

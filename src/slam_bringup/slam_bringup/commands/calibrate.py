@@ -45,19 +45,23 @@ FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_fr
 @click.argument("kind", type=click.Choice([*CAMERAS, "refine"]))
 @click.argument("images", nargs=-1, required=True)
 @click.option(
-    "--board", "board_text",
+    "--board",
+    "board_text",
     help="not for refine. chessboard:9x6:0.025 (inner corners, square in m), aprilgrid:6x6:0.088:0.3 (tags, edge in m, "
     "gap over edge) "
     "or charuco:11x8:0.03:0.022 (squares, square and marker in m)",
-)  # fmt: skip
+)
 @click.option(
-    "--model", default="plumb_bob", show_default=True,
+    "--model",
+    default="plumb_bob",
+    show_default=True,
     help=f"lens model, or one per camera with a comma between: {', '.join(DISTORTION_PARAMETERS)}",
-)  # fmt: skip
+)
 @click.option(
-    "--left-info", type=UserPath(exists=True, dir_okay=False),
+    "--left-info",
+    type=UserPath(exists=True, dir_okay=False),
     help="stereo-tof: left.yaml of the stereo calibration, so that the extrinsics are those of its rectified frame",
-)  # fmt: skip
+)
 @click.option("-o", "--output", required=True, type=UserPath(file_okay=False), help="folder to write")
 @overwrite_option("results of other images, or results that were changed since")
 def command(
@@ -121,7 +125,7 @@ def _find(board: Board, files: list[list[Path]]) -> BoardViews:
 
 def _write(
     output: Path, kind: str, result: BundleResult, board: Board, views: BoardViews, infos: Sequence[CameraInfo]
-) -> None:  # fmt: skip
+) -> None:
     names = CAMERAS[kind]
     for c, (name, info) in enumerate(zip(names, infos, strict=True)):
         CameraInfoFile(info, name, camera_deviations(result, c)).write(output / f"{name}.yaml")

@@ -73,9 +73,13 @@ def progress_bar() -> Progress:
     Lines that ``-v`` prints take its place.
     """
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _Rate(),
+        TimeRemainingColumn(),
         TextColumn("left"),
-    )  # fmt: skip
+    )
     return Progress(*columns, console=Console(stderr=True), disable=_verbosity() != 0)
 
 

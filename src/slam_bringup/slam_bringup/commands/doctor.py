@@ -34,14 +34,17 @@ _START_S = 60.0
     "--seconds", type=click.FloatRange(min=1.0), default=10.0, show_default=True, help="how long, with --live"
 )
 @click.option(
-    "--topic", "topics", multiple=True, metavar="ROLE=TOPIC",
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="ROLE=TOPIC",
     help=f"a topic that is not named like the nodes' (may be repeated); roles: {', '.join(ROLES)}",
-)  # fmt: skip
+)
 @click.option("--base-frame", default="", metavar="FRAME", help="the rig's frame [base_link]")
 @click.option("--json", "as_json", is_flag=True, help="print the findings as JSON")
 def command(
     bag: Path | None, live: bool, seconds: float, topics: tuple[str, ...], base_frame: str, as_json: bool
-) -> None:  # fmt: skip
+) -> None:
     """Check the topics, stamps, calibration, frames and images of BAG, or of what is published now (--live).
 
     Ends with exit code 1 if anything is wrong.

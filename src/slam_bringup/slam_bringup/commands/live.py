@@ -29,9 +29,10 @@ from stereo_frontend.frontend import MODES
 )
 @click.option("--agents", default="", help="names of the agents, comma-separated [one rig]")
 @click.option(
-    "--config", type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    "--config",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="YAML, one group per node, as in docs/parameters.md",
-)  # fmt: skip
+)
 def command(
     camera: str | None, topics: bool, left_info: str | None, right_info: str | None, mode: str, odometry: str,
     agents: str, config: Path | None,

@@ -16,9 +16,7 @@ class UserPath(click.Path):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options, path_type=Path)
 
-    def convert(
-        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
-    ) -> Any:  # fmt: skip
+    def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The path, with the checks that the options ask for."""
         return super().convert(os.path.expanduser(value), param, ctx)
 

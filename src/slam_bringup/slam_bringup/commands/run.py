@@ -64,9 +64,12 @@ def command(
         require_stereo(bag, names)
     results, transcript = OutputFolder(output, "run", bag, overwrite=overwrite), Transcript(VERSION)
     with (
-        results, transcript, giving_up(results), results.staged(rescue=MAP) as folder,
+        results,
+        transcript,
+        giving_up(results),
+        results.staged(rescue=MAP) as folder,
         _saved_if_given_up(growth, folder / MAP),
-    ):  # fmt: skip
+    ):
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"mapping {bag.name}", total=2 * readings)
             result, growth = run_bag(

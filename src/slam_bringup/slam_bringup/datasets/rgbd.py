@@ -183,10 +183,12 @@ def _tum(folder: Path) -> _Layout:
     if not pairs:
         raise ValueError(f"{folder}: no depth image has a colour image within {_PAIRING_NS / 1e6:.0f} ms")
     truth = folder / "groundtruth.txt"
-    left_out = Counter({
-        "pictures without depth near in time": len(colour) - len(pairs),
-        "depth images without a picture near in time": len(depth) - len(pairs),
-    })  # fmt: skip
+    left_out = Counter(
+        {
+            "pictures without depth near in time": len(colour) - len(pairs),
+            "depth images without a picture near in time": len(depth) - len(pairs),
+        }
+    )
     poses = _read_tum(truth) if truth.exists() else []
     return _Layout(pairs, 5000.0, _KINECT_TUM, poses, left_out=left_out, usual=_usual(_KINECT_TUM, "TUM RGB-D"))
 
@@ -220,10 +222,12 @@ def _numbered(folder: Path, clock: Clock) -> _Layout:
     pose_file = folder / "poses.txt"
     rows = np.loadtxt(pose_file, ndmin=2).reshape(-1, 4, 4) if pose_file.exists() else np.empty((0, 4, 4))
     usable = [(stamp, T) for stamp, T in zip(stamps, rows, strict=False) if np.isfinite(T).all()]
-    left_out = Counter({
-        "pictures without a depth image": len(pictures) - len(pairs),
-        "poses that are not finite or have no picture": len(rows) - len(usable),
-    })  # fmt: skip
+    left_out = Counter(
+        {
+            "pictures without a depth image": len(pictures) - len(pairs),
+            "poses that are not finite or have no picture": len(rows) - len(usable),
+        }
+    )
     poses = [(s, _rigid(T)) for s, T in usable]
     return _Layout(pairs, 1000.0, _stated(folder / "K.txt"), poses, left_out=left_out, assumed=clock.assumed)
 

@@ -79,9 +79,12 @@ def associate(folder: Path, before: list[Path], method: str, every: int, frames:
 
 
 def _pairs(
-    first: FeatureFrame, second: FeatureFrame, prior: MotionPrior, T_rig_optical: FloatArray,
+    first: FeatureFrame,
+    second: FeatureFrame,
+    prior: MotionPrior,
+    T_rig_optical: FloatArray,
     config: FeatureAssociationConfig,
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:  # fmt: skip
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Candidates of the first frame and features of the second that the method pairs."""
     before, now = _frame(first), _frame(second)
     candidates = Candidates(*rig_points(before, T_rig_optical), before.descriptors)
@@ -106,8 +109,9 @@ def _experiment() -> Experiment:
             f"{method}, {rate} Hz": Job(
                 f"{MODULE}:associate", {"method": method, "every": 10 // rate, "frames": frames}, packages
             )
-            for method in METHODS for rate in _RATES
-        }  # fmt: skip
+            for method in METHODS
+            for rate in _RATES
+        }
 
     def report(results: Mapping[str, JobResult]) -> Findings:
         rows = [

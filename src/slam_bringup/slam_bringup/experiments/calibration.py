@@ -69,8 +69,9 @@ def _experiment() -> Experiment:
             rows.append([rig, str(result.arrays["normalised"].shape[1]), f"{spread:.2f}", f"{100 * inside:.1f}"])
         table = Table(
             f"{_VIEWS} views, corner noise {_CORNER_SIGMA_PX} px: errors over their claimed sigma",
-            ("Tables 2.1, 2.2, 2.3", "parameters", "standard deviation (1 is honest)", "within 3 sigma %"), rows,
-        )  # fmt: skip
+            ("Tables 2.1, 2.2, 2.3", "parameters", "standard deviation (1 is honest)", "within 3 sigma %"),
+            rows,
+        )
         return Findings(comparisons, [table], [Picture(_histogram(results), "", "Errors over claimed sigma.")])
 
     return Experiment("calibration", "2.4", "Calibration recovers what it claims", jobs, report)

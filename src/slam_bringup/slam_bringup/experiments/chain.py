@@ -70,9 +70,7 @@ def _agent_values(result: RunResult) -> list[dict[str, Any]]:
 def _agent_arrays(agent: AgentResult, prefix: str) -> dict[str, npt.NDArray[Any]]:
     """Trajectory, its covariances and the truth where the two meet; the filter's; scan odometry's."""
     arrays: dict[str, npt.NDArray[Any]] = {}
-    for name, trajectory in (
-        ("joined", agent.trajectory), ("filter", agent.filtered), ("scans", agent.scan_odometry)
-    ):  # fmt: skip
+    for name, trajectory in (("joined", agent.trajectory), ("filter", agent.filtered), ("scans", agent.scan_odometry)):
         if len(trajectory) < 2:
             continue
         poses = trajectory.poses

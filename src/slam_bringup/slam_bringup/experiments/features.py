@@ -78,8 +78,12 @@ def _found_again(views: Sequence[TrueFrame], found: Sequence[Keypoints]) -> dict
         errors.append(error[good])
         matched, right = matched + len(i), right + int(good.sum())
     pairs = len(views) - 1
-    return {"repeatability": float(np.mean(repeated)), "right": right / pairs, "precision": right / max(matched, 1),
-            "spread_px": spread(np.concatenate(errors))}  # fmt: skip
+    return {
+        "repeatability": float(np.mean(repeated)),
+        "right": right / pairs,
+        "precision": right / max(matched, 1),
+        "spread_px": spread(np.concatenate(errors)),
+    }
 
 
 def mutual_matches(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, np.ndarray]:
@@ -121,8 +125,12 @@ def _tof_found_again(views: Sequence[TrueFrame], kind: str) -> dict[str, float]:
         i, j = mutual_matches(a, b)
         i, j = i[visible[i]], j[visible[i]]
         right, matched = right + int((distance[i, j] < _SAME_PX).sum()), matched + len(i)
-    return {"features": float(np.mean([len(f[0]) for f in found])), "repeatability": float(np.mean(repeated)),
-            "right": right / (len(views) - 1), "precision": right / max(matched, 1)}  # fmt: skip
+    return {
+        "features": float(np.mean([len(f[0]) for f in found])),
+        "repeatability": float(np.mean(repeated)),
+        "right": right / (len(views) - 1),
+        "precision": right / max(matched, 1),
+    }
 
 
 def _with_depth(extractor: FeatureExtractor, image: DepthImage, kind: str) -> tuple[Keypoints, FloatArray]:

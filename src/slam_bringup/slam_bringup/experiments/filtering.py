@@ -74,11 +74,12 @@ def _workshop(name: str, thesis_landmarks: str, sections: str, title: str, numbe
             Picture(plots.map_view(run.arrays, 2), numbers[1], "From the side."),
             Picture(plots.map_in_3d(run.arrays), numbers[2], "In three dimensions."),
             Picture(
-                plots.standard_deviations(run.arrays, kind="filter"), numbers[3],
+                plots.standard_deviations(run.arrays, kind="filter"),
+                numbers[3],
                 "Standard deviations of the filter, within its own odometry.",
             ),
             Picture(plots.standard_deviations(run.arrays), numbers[3], "The same of the joined map."),
-        ]  # fmt: skip
+        ]
         return Findings(
             comparisons=[
                 landmarks_comparison(run, thesis_landmarks),
@@ -107,11 +108,13 @@ def _fireman() -> Experiment:
             end = results[name].values["agents"][0]["joined_end_m"]
             comparisons.append(
                 Comparison(
-                    f"{name.removeprefix('fireman_')}, looking round", thesis,
-                    f"lost {lost} times, end error {1e3 * end:.1f} mm", "never lost, <= 15 mm",
+                    f"{name.removeprefix('fireman_')}, looking round",
+                    thesis,
+                    f"lost {lost} times, end error {1e3 * end:.1f} mm",
+                    "never lost, <= 15 mm",
                     lost == 0 and end <= 0.015,
                 )
-            )  # fmt: skip
+            )
         comparisons += [bounds_comparison(name, results[name]) for name in rates]
         rows = [accuracy_row(name, results[name]) for name in rates]
         pictures = [
@@ -174,10 +177,11 @@ def _conference() -> Experiment:
 
 
 EXPERIMENTS = (
-    _workshop("workshop_rig", "349", "9.1.1", "A loop round the workshop, camera on a rig",
-              ("9.2", "9.3", "9.4", "9.5")),
+    _workshop(
+        "workshop_rig", "349", "9.1.1", "A loop round the workshop, camera on a rig", ("9.2", "9.3", "9.4", "9.5")
+    ),
     _workshop("workshop_handheld", "356", "9.1.2", "The same loop, camera in the hand", ("9.7", "9.3", "9.4", "9.8")),
     _fireman(),
     _sweep(),
     _conference(),
-)  # fmt: skip
+)

@@ -57,10 +57,10 @@ def _modes() -> Experiment:
         results = {name: result for name, result in results.items() if name != _PIXELS}
         ate = {name: 1e3 * r.values["agents"][0]["joined_ate_m"] for name, r in results.items()}
         best = min(MODES, key=lambda mode: ate[mode])
-        comparisons = [
-            Comparison(f"ATE, {mode}", "missing from our copy", f"{ate[mode]:.1f} mm") for mode in MODES
-        ] + [Comparison("best of the four", "missing from our copy", best, "fuse", best == "fuse"),
-             bounds_comparison("small_room", results["fuse"])]  # fmt: skip
+        comparisons = [Comparison(f"ATE, {mode}", "missing from our copy", f"{ate[mode]:.1f} mm") for mode in MODES] + [
+            Comparison("best of the four", "missing from our copy", best, "fuse", best == "fuse"),
+            bounds_comparison("small_room", results["fuse"]),
+        ]
         return Findings(
             comparisons,
             [Table("The four modes, and with scan odometry", ACCURACY_HEADER,

@@ -29,9 +29,13 @@ import numpy as np
 import numpy.typing as npt
 
 RENDERING = (
-    "slam_core.geometry", "slam_core.camera", "slam_core.types", "slam_core.messages.images",
-    "slam_core.messages.cameras", "slam_simulation",
-)  # fmt: skip
+    "slam_core.geometry",
+    "slam_core.camera",
+    "slam_core.types",
+    "slam_core.messages.images",
+    "slam_core.messages.cameras",
+    "slam_simulation",
+)
 EVERYTHING = (
     "slam_core", "slam_simulation", "slam_calibration", "stereo_frontend", "tof_driver", "ndt_registration",
     "ekf_slam_node", "sjsam_node", "slam_bringup.pipeline", "slam_bringup.bags",

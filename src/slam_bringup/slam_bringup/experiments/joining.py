@@ -72,9 +72,12 @@ def _joined(
             Comparison("submaps", thesis["submaps"], str(summary["submaps"])),
             speed_comparison(run, thesis["time"]),
             Comparison("joining, s", thesis["joining"], f"{merge.sum() / 1e3:.1f} in all"),
-            Comparison("joining, ms a submap, first and second half", "spikes at closures",
-                       f"{np.mean(merge[:half]):.0f}, {np.mean(merge[-half:]):.0f}"),
-        ]  # fmt: skip
+            Comparison(
+                "joining, ms a submap, first and second half",
+                "spikes at closures",
+                f"{np.mean(merge[:half]):.0f}, {np.mean(merge[-half:]):.0f}",
+            ),
+        ]
         if mark_m is not None:
             comparisons.append(end_comparison(run, thesis["end"], mark_m))
         else:

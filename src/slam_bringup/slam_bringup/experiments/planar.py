@@ -41,18 +41,23 @@ def monte_carlo(folder: Path, before: list[Path], sigma_bearing: float, known: b
         error[2] = wrap(error[2])
         rows.append(
             [
-                float(nees(error, ekf.covariance.head(3)[:3])) / 3.0, _rmse(poses, run), _rmse(smoothed.poses, run),
-                cost(graph, filtered, ekf.config), cost(graph, smoothed, ekf.config),
-                _wrong_share(run, slots), len(ekf.landmarks),
+                float(nees(error, ekf.covariance.head(3)[:3])) / 3.0,
+                _rmse(poses, run),
+                _rmse(smoothed.poses, run),
+                cost(graph, filtered, ekf.config),
+                cost(graph, smoothed, ekf.config),
+                _wrong_share(run, slots),
+                len(ekf.landmarks),
             ]
-        )  # fmt: skip
+        )
         if seed == 0:
             arrays = {"truth": run.poses, "world": run.landmarks, "filter poses": poses, "filter map": ekf.landmarks,
                       "smoothed poses": smoothed.poses, "smoothed map": smoothed.landmarks,
                       **_before_closure(run, known)}  # fmt: skip
     names = ("nees", "filter rmse", "smoother rmse", "filter cost", "smoother cost", "wrong", "landmarks")
-    return {"runs": runs}, arrays | {name: np.array(column) for name, column in zip(names, np.transpose(rows),
-                                                                                   strict=True)}  # fmt: skip
+    return {"runs": runs}, arrays | {
+        name: np.array(column) for name, column in zip(names, np.transpose(rows), strict=True)
+    }
 
 
 def filter_run(run: PlanarRun, known: bool) -> tuple[PlanarEkf, FloatArray, list[np.ndarray]]:
@@ -87,8 +92,9 @@ def _before_closure(run: PlanarRun, known: bool) -> dict[str, FloatArray]:
     """The smoothed map just before the start is seen again (Fig. 6.5)."""
     first = set(run.observations[0].ids.tolist())
     half = len(run.poses) // 2
-    again = next((k for k in range(half, len(run.poses)) if first & set(run.observations[k].ids.tolist())),
-                 len(run.poses))  # fmt: skip
+    again = next(
+        (k for k in range(half, len(run.poses)) if first & set(run.observations[k].ids.tolist())), len(run.poses)
+    )
     part = PlanarRun(run.config, run.poses[:again], run.landmarks, run.odometry[: again - 1], run.observations[:again])
     ekf, _, slots = filter_run(part, known)
     smoothed = smooth(graph_of(part, slots), part.poses[0], ekf.config)[0]
@@ -114,8 +120,11 @@ def _wrong_share(run: PlanarRun, slots: list[np.ndarray]) -> float:
 def _experiment() -> Experiment:
     def jobs(quick: bool) -> Mapping[str, Job]:
         runs = 5 if quick else 50
-        return {f"{'known' if known else 'unknown'}, {s:g} rad": _case(s, known, runs)
-                for known in (True, False) for s in _BEARINGS}  # fmt: skip
+        return {
+            f"{'known' if known else 'unknown'}, {s:g} rad": _case(s, known, runs)
+            for known in (True, False)
+            for s in _BEARINGS
+        }
 
     def report(results: Mapping[str, JobResult]) -> Findings:
         known = {name: r.arrays for name, r in results.items() if name.startswith("known")}

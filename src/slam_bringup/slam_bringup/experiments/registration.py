@@ -57,9 +57,11 @@ def register_motions(folder: Path, before: list[Path], method: str, share: float
             true.append(boxminus(room.motion(motion), np.eye(4)))
     shape = (len(THESIS_MOTIONS), scans)
     return {"method": method, "share": share}, {
-        "found": np.reshape(found, (*shape, 6)), "true": np.reshape(true, (*shape, 6)),
-        "seconds": np.reshape(seconds, shape), "iterations": np.reshape(iterations, shape),
-    }  # fmt: skip
+        "found": np.reshape(found, (*shape, 6)),
+        "true": np.reshape(true, (*shape, 6)),
+        "seconds": np.reshape(seconds, shape),
+        "iterations": np.reshape(iterations, shape),
+    }
 
 
 def register_on_one_grid(folder: Path, before: list[Path], edge: float, scans: int) -> Kept:
@@ -90,8 +92,12 @@ def _registration() -> Experiment:
         scans = 2 if quick else SCANS
         chosen = {f"{method} 0.2": _motions(method, 0.2, scans) for method in _METHODS}
         if not quick:
-            chosen |= {f"{method} {share}": _motions(method, share, 5) for method in ("ndt", "icp_plane")
-                       for share in _SHARES if share != 0.2}  # fmt: skip
+            chosen |= {
+                f"{method} {share}": _motions(method, share, 5)
+                for method in ("ndt", "icp_plane")
+                for share in _SHARES
+                if share != 0.2
+            }
         return chosen | {f"grid {edge}": _one_grid(edge, scans) for edge in _GRIDS}
 
     def report(results: Mapping[str, JobResult]) -> Findings:
@@ -99,19 +105,22 @@ def _registration() -> Experiment:
         scans = success["ndt"].shape[1]
         comparisons = [
             Comparison(
-                f"{name}: motions with all {scans} scans registered", _THESIS_NDT if method == "ndt" else _THESIS_ICP,
+                f"{name}: motions with all {scans} scans registered",
+                _THESIS_NDT if method == "ndt" else _THESIS_ICP,
                 f"{int(np.all(success[method], axis=1).sum())} of {len(THESIS_MOTIONS)}",
-                "all" if method == "ndt" else "", bool(success[method].all()) if method == "ndt" else None,
+                "all" if method == "ndt" else "",
+                bool(success[method].all()) if method == "ndt" else None,
             )
             for method, name in _METHODS.items()
-        ]  # fmt: skip
+        ]
         seconds = float(np.median(results["ndt 0.2"].arrays["seconds"]))
         comparisons.append(
             Comparison("time of one NDT registration, 20 % of the points", "about 2 s", f"{seconds:.3f} s", "<= 0.1 s",
                        seconds <= 0.1)
         )  # fmt: skip
-        return Findings(comparisons, [_success_table(success), _grid_table(results), _time_table(results)],
-                        _scan_pictures(results))  # fmt: skip
+        return Findings(
+            comparisons, [_success_table(success), _grid_table(results), _time_table(results)], _scan_pictures(results)
+        )
 
     return Experiment("registration", "10.2-10.3", "ICP against NDT, fifteen scans a motion", jobs, report)
 
@@ -142,9 +151,11 @@ def _time_table(results: Mapping[str, JobResult]) -> Table:
         cells = []
         for method in ("icp_plane", "ndt"):
             result = results.get(f"{method} {share}")
-            cells += ["", ""] if result is None else [
-                f"{1e3 * np.median(result.arrays['seconds']):.0f}", f"{100.0 * _successes(result).mean():.0f}"
-            ]  # fmt: skip
+            cells += (
+                ["", ""]
+                if result is None
+                else [f"{1e3 * np.median(result.arrays['seconds']):.0f}", f"{100.0 * _successes(result).mean():.0f}"]
+            )
         rows.append([f"{100 * share:g}", *cells])
     header = ("points %", "ICP ms", "ICP success %", "NDT ms", "NDT success %")
     return Table("Table 10.2: time of a registration by share of the points (processor time)", header, rows)
@@ -161,12 +172,14 @@ def _scan_pictures(results: Mapping[str, JobResult]) -> list[Picture]:
     )  # fmt: skip
     pictures = [
         Picture(
-            plots.registrations(results[f"{method} 0.2"].arrays["found"][names.index(motion)],
-                                f"{_METHODS[method]}, {motion}"),
-            number, f"{_METHODS[method]}: what each scan of '{motion}' was registered to (camera's axes).",
+            plots.registrations(
+                results[f"{method} 0.2"].arrays["found"][names.index(motion)], f"{_METHODS[method]}, {motion}"
+            ),
+            number,
+            f"{_METHODS[method]}: what each scan of '{motion}' was registered to (camera's axes).",
         )
         for method, motion, number in wanted
-    ]  # fmt: skip
+    ]
     return [*pictures, Picture(_registered_clouds(), "10.17", "Two scans after registration, seen from above.")]
 
 
@@ -201,10 +214,14 @@ def _trajectory() -> Experiment:
             height = float(np.abs(aligned[:, 2, 3] - truth[:, 2, 3]).max())
             drift = 100.0 * error[-1] / way
             comparisons.append(
-                Comparison(f"{name.upper()}: drift, largest error of height", thesis,
-                           f"{drift:.2f} % of {way:.1f} m, {1e3 * height:.1f} mm", "< 1 %" if name == "ndt" else "",
-                           bool(drift < 1.0) if name == "ndt" else None)
-            )  # fmt: skip
+                Comparison(
+                    f"{name.upper()}: drift, largest error of height",
+                    thesis,
+                    f"{drift:.2f} % of {way:.1f} m, {1e3 * height:.1f} mm",
+                    "< 1 %" if name == "ndt" else "",
+                    bool(drift < 1.0) if name == "ndt" else None,
+                )
+            )
             rows.append([name, f"{1e3 * np.sqrt(np.mean(error**2)):.1f}", f"{1e3 * error[-1]:.1f}", f"{drift:.2f}"])
             axes.plot(aligned[:, 0, 3], aligned[:, 1, 3], linewidth=1.2, label=name.upper())
             axes.plot(truth[:, 0, 3], truth[:, 1, 3], "--", color="0.2", linewidth=0.8)

@@ -49,9 +49,13 @@ def world(size: int) -> PlanarWorldConfig:
     """A drive once round among ``size`` landmarks of the same density, a step about as long whatever the size."""
     scale = float(np.sqrt(size / 40.0))
     return replace(
-        PlanarWorldConfig(), landmarks=size, size=10.0 * scale, radius=3.0 * scale, samples=max(50, round(60 * scale)),
+        PlanarWorldConfig(),
+        landmarks=size,
+        size=10.0 * scale,
+        radius=3.0 * scale,
+        samples=max(50, round(60 * scale)),
         sigma_turn=0.005,
-    )  # fmt: skip
+    )
 
 
 def cost_of_a_step(folder: Path, before: list[Path], technique: str, size: int) -> Kept:
@@ -116,10 +120,14 @@ def _submaps(run: PlanarRun) -> tuple[float, FloatArray, int]:
     config, Q = _noise(run)
     n = len(run.odometry)
     robot = RobotLog(
-        "robot", np.arange(float(n + 1)), run.odometry, np.broadcast_to(Q, (n, 3, 3)),
+        "robot",
+        np.arange(float(n + 1)),
+        run.odometry,
+        np.broadcast_to(Q, (n, 3, 3)),
         tuple(np.column_stack([o.ranges, o.bearings]) for o in run.observations),
-        tuple(o.ids for o in run.observations), run.poses,
-    )  # fmt: skip
+        tuple(o.ids for o in run.observations),
+        run.poses,
+    )
     began = time.process_time()
     texts = []
     for submap in submaps_of(robot, config):
@@ -165,9 +173,13 @@ def _isam2(run: PlanarRun) -> tuple[float, FloatArray, int]:
 
 
 _RUNNERS = {
-    "one_filter": _one_filter, "seif": _seif, "independent": _independent, "batch": _batch, "isam2": _isam2,
+    "one_filter": _one_filter,
+    "seif": _seif,
+    "independent": _independent,
+    "batch": _batch,
+    "isam2": _isam2,
     "submaps": _submaps,
-}  # fmt: skip
+}
 
 
 def _noise(run: PlanarRun) -> tuple[PlanarConfig, FloatArray]:
@@ -212,9 +224,12 @@ _STEP = (
 
 
 def _table(
-    title: str, growth: Mapping[str, _Growth], sizes: list[int], values: Callable[[_Growth], list[float]],
+    title: str,
+    growth: Mapping[str, _Growth],
+    sizes: list[int],
+    values: Callable[[_Growth], list[float]],
     exponent: Callable[[_Growth], float] | None = None,
-) -> Table:  # fmt: skip
+) -> Table:
     """One quantity of all techniques by size, with the exponent of its growth."""
     header = ["technique", *(f"{size} landmarks" for size in sizes), *(["exponent"] if exponent else [])]
     rows = []
@@ -247,8 +262,9 @@ def _experiment() -> Experiment:
         packages = (*RENDERING, "ekf_slam_node", "sjsam_node", "slam_bringup.planar")
         return {
             f"{name}|{size}": Job(f"{MODULE}:cost_of_a_step", {"technique": technique, "size": size}, packages)
-            for name, technique in TECHNIQUES.items() for size in sizes
-        }  # fmt: skip
+            for name, technique in TECHNIQUES.items()
+            for size in sizes
+        }
 
     def report(results: Mapping[str, JobResult]) -> Findings:
         worlds = sorted({int(key.split("|")[1]) for key in results})
@@ -261,8 +277,9 @@ def _experiment() -> Experiment:
             _table("Numbers stored, thousands", usable, sizes, lambda g: g.thousands, lambda g: g.memory_exponent),
             _table("RMSE of the path, m: of filters each pose when it was the newest", usable, sizes, lambda g: g.rmse),
         ]
-        missing = [f"{name}: {results[f'{name}|{worlds[0]}'].values['missing']}" for name in TECHNIQUES
-                   if name not in usable]  # fmt: skip
+        missing = [
+            f"{name}: {results[f'{name}|{worlds[0]}'].values['missing']}" for name in TECHNIQUES if name not in usable
+        ]
         return Findings(
             [
                 Comparison("growth of a step's time: one EKF, joined submaps", "O(n^2); O(1) to O(n)",

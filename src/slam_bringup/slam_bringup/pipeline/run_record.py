@@ -105,10 +105,13 @@ class RunRecord:
     ) -> RunRecord:
         """The same with what the agents' front ends report, and some of their pictures, by agent."""
         pictures = frames or {}
-        return replace(self, agents={
-            agent: replace(record, front_end=reports[agent], frames=pictures.get(agent, ()))
-            for agent, record in self.agents.items()
-        })  # fmt: skip
+        return replace(
+            self,
+            agents={
+                agent: replace(record, front_end=reports[agent], frames=pictures.get(agent, ()))
+                for agent, record in self.agents.items()
+            },
+        )
 
 
 def run_result(

@@ -94,9 +94,10 @@ def map_log(log: PlanarLog, method: str, association: str = "known") -> PlanarRe
         If several robots are to be joined without known landmarks, or share too few of them.
     """
     config = PlanarConfig(
-        sigma_range=log.sigma_range, sigma_bearing=log.sigma_bearing,
+        sigma_range=log.sigma_range,
+        sigma_bearing=log.sigma_bearing,
         method="jcbb" if association == "known" else association,
-    )  # fmt: skip
+    )
     known = association == "known"
     if len(log.robots) > 1 and not (known and method == "sam"):
         raise ValueError(
@@ -105,11 +106,14 @@ def map_log(log: PlanarLog, method: str, association: str = "known") -> PlanarRe
     began = time.process_time()
     drive = _joined if known and method != "ekf" else _filtered
     drives = [drive(robot, config, known) for robot in log.robots]
-    paths = tuple(RobotPath(r.name, d.poses, np.arange(len(d.covariances)), d.covariances)
-                  for r, d in zip(log.robots, drives, strict=True))  # fmt: skip
+    paths = tuple(
+        RobotPath(r.name, d.poses, np.arange(len(d.covariances)), d.covariances)
+        for r, d in zip(log.robots, drives, strict=True)
+    )
     alone = drives[0]
-    result = PlanarResult(paths, alone.landmarks, alone.ids, sum(d.rejected for d in drives), alone.chi2,
-                          alone.freedom, 0.0)  # fmt: skip
+    result = PlanarResult(
+        paths, alone.landmarks, alone.ids, sum(d.rejected for d in drives), alone.chi2, alone.freedom, 0.0
+    )
     if method == "sam":
         result = _smoothed(log, drives, config)
     return replace(result, seconds=time.process_time() - began)
@@ -178,8 +182,12 @@ def _without_outliers(
     """Smoothed again and again without the sightings that the others contradict, the worst ones first."""
     state, whole, kept = start, graph, np.ones(len(graph.measured), dtype=bool)
     for gate in _NARROWING_GATES:
-        graph = replace(whole, pose_index=whole.pose_index[kept], landmark_index=whole.landmark_index[kept],
-                        measured=whole.measured[kept])  # fmt: skip
+        graph = replace(
+            whole,
+            pose_index=whole.pose_index[kept],
+            landmark_index=whole.landmark_index[kept],
+            measured=whole.measured[kept],
+        )
         state, optimum = smooth(graph, state.poses[0], config, state, _OPTIMIZER)
         before, kept = kept, sighting_nis(whole, state, config) < gate
         if gate == _NARROWING_GATES[-1] and np.array_equal(before, kept):
@@ -211,10 +219,13 @@ def _graph(log: PlanarLog, drives: list[_Drive], ids: Indices) -> PlanarGraph:
             landmark.append(number[rows[used]])
             measured.append(z[used])
     return PlanarGraph(
-        np.concatenate([r.motions for r in log.robots]), np.concatenate([r.motion_covariances for r in log.robots]),
-        np.concatenate(pose).astype(np.int64), np.concatenate(landmark).astype(np.int64), np.concatenate(measured),
+        np.concatenate([r.motions for r in log.robots]),
+        np.concatenate([r.motion_covariances for r in log.robots]),
+        np.concatenate(pose).astype(np.int64),
+        np.concatenate(landmark).astype(np.int64),
+        np.concatenate(measured),
         starts,
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,9 +272,13 @@ def submaps_of(robot: RobotLog, config: PlanarConfig) -> Iterator[PlanarSubmap]:
         if not is_last:
             ekf.predict(robot.motions[last - 1], robot.motion_covariances[last - 1])
         text = TextMap(
-            number, np.array([number + 1]), ekf.pose[None].copy(), np.array(ekf.ids, dtype=np.int64),
-            ekf.landmarks.copy(), np.asarray(np.linalg.inv(ekf.covariance.dense()), dtype=np.float64),
-        )  # fmt: skip
+            number,
+            np.array([number + 1]),
+            ekf.pose[None].copy(),
+            np.array(ekf.ids, dtype=np.int64),
+            ekf.landmarks.copy(),
+            np.asarray(np.linalg.inv(ekf.covariance.dense()), dtype=np.float64),
+        )
         yield PlanarSubmap(np.array(poses), text, seen)
 
 

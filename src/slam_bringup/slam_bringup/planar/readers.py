@@ -115,10 +115,12 @@ def read_lost_in_the_woods(path: Path) -> PlanarLog:
         raise ValueError(f"{path} is not Lost in the Woods: {error}") from error
     truth = wheels.copy()
     truth[:, :2] += d * np.column_stack([np.cos(wheels[:, 2]), np.sin(wheels[:, 2])])
-    motions = np.array([
-        [*(turn(0.5 * angle) @ [forward, 0.0] + turn(angle) @ [d, 0.0] - [d, 0.0]), angle]
-        for forward, angle in zip(v[:-1], omega[:-1], strict=True)
-    ])  # fmt: skip
+    motions = np.array(
+        [
+            [*(turn(0.5 * angle) @ [forward, 0.0] + turn(angle) @ [d, 0.0] - [d, 0.0]), angle]
+            for forward, angle in zip(v[:-1], omega[:-1], strict=True)
+        ]
+    )
     G = np.array([[dt, 0.0], [0.0, d * dt], [0.0, dt]])
     Q = G @ np.diag(variances[:2]) @ G.T + 1e-12 * np.eye(3)
     seen = [np.flatnonzero(row > 0.0).astype(np.int64) for row in data["r"]]
@@ -163,9 +165,11 @@ def _symmetric(upper: FloatArray) -> FloatArray:
 
 
 def _from_lines(
-    path: Path, odometry: dict[int, tuple[int, FloatArray, FloatArray]], seen: dict[int, list[tuple[int, FloatArray]]],
+    path: Path,
+    odometry: dict[int, tuple[int, FloatArray, FloatArray]],
+    seen: dict[int, list[tuple[int, FloatArray]]],
     sigma: float,
-) -> PlanarLog:  # fmt: skip
+) -> PlanarLog:
     poses = [min(odometry)]
     while poses[-1] in odometry:
         poses.append(odometry[poses[-1]][0])

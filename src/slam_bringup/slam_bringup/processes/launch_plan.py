@@ -53,7 +53,7 @@ ARGUMENTS = (
     LaunchArgument("bag", "", "a bag to play; topics, frames and sensors are then the bag's"),
     LaunchArgument("rate", "1.0", "speed of the bag; 0: as fast as the nodes follow"),
     LaunchArgument("use_sim_time", "false", "take time from /clock", _BOOLEANS),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -105,10 +105,14 @@ def _for_rig(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
     config = choose(system_config(overrides), mode, "sjsam", values["odometry"])
     chosen = {k: values[k] for k in ("pictures", "measurement") if values[k] != AUTO}
     specs = live_nodes(
-        config, agents, odometry=values["odometry"] != "none", rectified=values["rectified"] == "true",
+        config,
+        agents,
+        odometry=values["odometry"] != "none",
+        rectified=values["rectified"] == "true",
         extra={"tof_driver": chosen, "stereo_driver": {"compressed": True} if values["compressed"] == "true" else {}},
-        base_frames=dict.fromkeys(agents, names.base_frame) if names.base_frame else None, overrides=overrides,
-    )  # fmt: skip
+        base_frames=dict.fromkeys(agents, names.base_frame) if names.base_frame else None,
+        overrides=overrides,
+    )
     return LaunchPlan(tuple(specs), tuple(_remapped(names.topics)))
 
 
@@ -136,10 +140,14 @@ def _for_bag(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
 
 def _player(path: Path, graph: NodeGraph, values: Mapping[str, str]) -> NodeSpec:
     parameters = {
-        "bag": str(path), "rate": float(yaml.safe_load(values["rate"])), "topics": tuple(graph.played),
-        "pace": graph.pace, "rename": tuple(f"{topic}={name}" for topic, name in graph.played.items() if name != topic),
-        "wait_for_subscribers": 0.0, "nodes": tuple(command.full_name for command in graph.commands),
+        "bag": str(path),
+        "rate": float(yaml.safe_load(values["rate"])),
+        "topics": tuple(graph.played),
+        "pace": graph.pace,
+        "rename": tuple(f"{topic}={name}" for topic, name in graph.played.items() if name != topic),
+        "wait_for_subscribers": 0.0,
+        "nodes": tuple(command.full_name for command in graph.commands),
         "subscribers": tuple(f"{name}=1" for name in graph.played.values()),
-    }  # fmt: skip
+    }
     parameters = {name: value for name, value in parameters.items() if value != ()}
     return NodeSpec("slam_bringup", "bag_player", "", parameters)

@@ -191,11 +191,15 @@ class _Choreography:
     def play(self, bag: Path, rate: float, on_progress: Callable[[int], None]) -> None:
         """Play the bag to its end; the player ends when the paced nodes have processed everything."""
         parameters = {
-            "bag": str(bag), "rate": rate, "topics": tuple(self._graph.played), "pace": self._graph.pace,
+            "bag": str(bag),
+            "rate": rate,
+            "topics": tuple(self._graph.played),
+            "pace": self._graph.pace,
             "rename": tuple(f"{topic}={name}" for topic, name in self._graph.played.items() if name != topic),
-            "window": _WINDOW, "wait_for_start": True,
+            "window": _WINDOW,
+            "wait_for_start": True,
             "subscribers": tuple(f"{t}={len(self._supervisor.subscribers(t))}" for t in self._graph.played.values()),
-        }  # fmt: skip
+        }
         player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
         self._supervisor.count_submaps(f"{name.rpartition('/')[0]}/submap/info" for name in self._graph.filters)
         self._wait_until_ready(from_outside=())

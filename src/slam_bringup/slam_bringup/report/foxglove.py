@@ -38,9 +38,12 @@ def layout(topics: Collection[str]) -> dict[str, Any]:
     panels["Plot!sigma"] = _plot("position: standard deviation [m]", agents, topics)
     beside = [*(f"Image!{i}" for i in range(len(pictures))), "Plot!sigma"]
     return {
-        "configById": panels, "globalVariables": {}, "userNodes": {}, "playbackConfig": {"speed": 1},
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
         "layout": {"direction": "row", "first": "3D!map", "second": _column(beside), "splitPercentage": 66},
-    }  # fmt: skip
+    }
 
 
 def _scene(topics: Collection[str], agents: list[str]) -> dict[str, Any]:
@@ -49,8 +52,10 @@ def _scene(topics: Collection[str], agents: list[str]) -> dict[str, Any]:
         "map/occupancy": {"colorMode": "map", "alpha": 0.6},
         "map/landmarks": {"colorMode": "flat", "flatColor": _LANDMARKS, "pointSize": 4},
         "map/cloud": {"colorMode": "flat", "flatColor": _LANDMARKS, "pointSize": 4},
-        "map/graph": {}, "map/marks": {}, "map/ellipsoids": {},
-    }  # fmt: skip
+        "map/graph": {},
+        "map/marks": {},
+        "map/ellipsoids": {},
+    }
     settings = {f"/{name}": {"visible": name not in _HIDDEN, **how} for name, how in shown.items()}
     for agent, colour in zip(agents, COLOURS * len(agents), strict=False):
         line = {"visible": True, "type": "line", "lineWidth": 0.04}
@@ -88,5 +93,8 @@ def _column(panels: list[str]) -> Any:
     if not rest:
         return first
     return {
-        "direction": "column", "first": first, "second": _column(rest), "splitPercentage": round(100 / len(panels), 1),
-    }  # fmt: skip
+        "direction": "column",
+        "first": first,
+        "second": _column(rest),
+        "splitPercentage": round(100 / len(panels), 1),
+    }

@@ -50,9 +50,8 @@ def _lost(summary: dict[str, Any]) -> str:
     dropped = summary["dropped"]
     unused = f"{dropped / max(dropped + summary['frames'], 1):.0%} of the messages not used" if dropped else ""
     lost = [
-        f"{name} lost {share:.0%} of the frames".strip()
-        for name, share in summary["lost_share"].items() if share > 0.0
-    ]  # fmt: skip
+        f"{name} lost {share:.0%} of the frames".strip() for name, share in summary["lost_share"].items() if share > 0.0
+    ]
     return ", ".join(filter(None, [unused, *lost])) or "none dropped"
 
 

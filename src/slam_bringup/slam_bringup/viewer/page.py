@@ -178,9 +178,13 @@ class ViewerPage:
         # viser takes no empty list of colours.
         tint = (230, 140, 0) if sightings is None or not len(sightings) else _age_colours(sightings)
         self.server.scene.add_point_cloud(
-            "/landmarks/points", positions.astype(np.float32), tint, point_size=0.018, point_shape="circle",
+            "/landmarks/points",
+            positions.astype(np.float32),
+            tint,
+            point_size=0.018,
+            point_shape="circle",
             precision="float32",
-        )  # fmt: skip
+        )
         if len(positions):
             self._ellipsoids("/ellipsoids/landmarks", positions, covariances, (230, 159, 0))
 
@@ -188,9 +192,13 @@ class ViewerPage:
         """Submaps as lines from where they start to where they end, (n, 3) m each, with a ball at each start."""
         self._lines("/submaps/lines", np.stack([starts, ends], axis=1), (25, 100, 255), 0.02)
         self.server.scene.add_point_cloud(
-            "/submaps/starts", starts.astype(np.float32), (25, 100, 255), point_size=0.12, point_shape="circle",
+            "/submaps/starts",
+            starts.astype(np.float32),
+            (25, 100, 255),
+            point_size=0.12,
+            point_shape="circle",
             precision="float32",
-        )  # fmt: skip
+        )
 
     def show_closures(self, lines: FloatArray) -> None:
         """Closures as lines (n, 2, 3) m between the submaps that they tie together."""
@@ -201,8 +209,9 @@ class ViewerPage:
         self._remove("/frontiers")
         for k, (point, length) in enumerate(zip(points, lengths, strict=True)):
             above = point + np.array([0, 0, 0.15])
-            self.server.scene.add_icosphere(f"/frontiers/{k}", radius=0.08 + 0.02 * min(length, 5.0),
-                                            color=(255, 80, 200), position=above)  # fmt: skip
+            self.server.scene.add_icosphere(
+                f"/frontiers/{k}", radius=0.08 + 0.02 * min(length, 5.0), color=(255, 80, 200), position=above
+            )
 
     def show_way(self, agent: str, index: int, points: FloatArray, note: str) -> None:
         """The way back out of an agent, (n, 3) m on the floor."""

@@ -60,8 +60,9 @@ def analyze(pattern: BlockPattern) -> Symbolic:
     has_parent = np.diff(row_ptr) > 0
     up = np.full(len(eliminated), -1, dtype=np.int64)
     up[has_parent] = supernode[front_rows[row_ptr[:-1][has_parent]]]
-    return Symbolic(given, label, width, start, column_ptr, row_ptr, front_rows, size, eliminated,
-                    pointers(size * eliminated), up)  # fmt: skip
+    return Symbolic(
+        given, label, width, start, column_ptr, row_ptr, front_rows, size, eliminated, pointers(size * eliminated), up
+    )
 
 
 def update_stack_size(symbolic: Symbolic) -> int:

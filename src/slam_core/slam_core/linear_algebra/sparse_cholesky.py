@@ -248,8 +248,10 @@ class SparseCholesky:
 
 
 _IMPLEMENTATIONS: dict[str, Callable[[BlockPattern], _Backend]] = {
-    "multifrontal": Multifrontal, "cholmod": _Cholmod, "superlu": _SuperLu,
-}  # fmt: skip
+    "multifrontal": Multifrontal,
+    "cholmod": _Cholmod,
+    "superlu": _SuperLu,
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,11 +19,15 @@ def camera_info_message(types: MessageTypes, header: Message, info: CameraInfo) 
     camera = info.camera
     plain = camera.distortion_model == "none"
     return types.CameraInfo(
-        header=header, height=camera.height, width=camera.width,
+        header=header,
+        height=camera.height,
+        width=camera.width,
         distortion_model="plumb_bob" if plain else camera.distortion_model,
         d=[0.0] * 5 if plain else list(camera.distortion),
-        k=camera.K.ravel(), r=info.R.ravel(), p=info.P.ravel(),
-    )  # fmt: skip
+        k=camera.K.ravel(),
+        r=info.R.ravel(),
+        p=info.P.ravel(),
+    )
 
 
 def camera_info_from_message(message: Message) -> CameraInfo:

@@ -26,9 +26,13 @@ class DepthMessages(NamedTuple):
 
 
 DEPTH_TOPICS = {
-    "tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo",
-    "tof/points": "PointCloud2", "tof/amplitude/image": "Image", "tof/intensity/image": "Image",
-}  # fmt: skip
+    "tof/depth/image": "Image",
+    "tof/noise/image": "Image",
+    "tof/camera_info": "CameraInfo",
+    "tof/points": "PointCloud2",
+    "tof/amplitude/image": "Image",
+    "tof/intensity/image": "Image",
+}
 """Topic and type of each field of :class:`DepthMessages`, in its order."""
 
 
@@ -40,9 +44,13 @@ def depth_messages(types: MessageTypes, image: DepthImage) -> DepthMessages:
         return None if pixels is None else image_message(types, header, np.asarray(pixels, dtype="<f4"))
 
     return DepthMessages(
-        picture(image.depth), picture(image.sigma), camera_info_message(types, header, rectified_info(image.camera)),
-        points_message(types, header, image.points()), picture(image.amplitude), picture(image.intensity),
-    )  # fmt: skip
+        picture(image.depth),
+        picture(image.sigma),
+        camera_info_message(types, header, rectified_info(image.camera)),
+        points_message(types, header, image.points()),
+        picture(image.amplitude),
+        picture(image.intensity),
+    )
 
 
 def depth_from_messages(
@@ -63,7 +71,11 @@ def depth_from_messages(
         return pixels
 
     return DepthImage(
-        stamp_ns(depth), picture("depth", depth), picture("noise", noise), camera,
+        stamp_ns(depth),
+        picture("depth", depth),
+        picture("noise", noise),
+        camera,
         None if amplitude is None else picture("amplitude", amplitude),
-        None if intensity is None else picture("intensity", intensity), depth.header.frame_id,
-    )  # fmt: skip
+        None if intensity is None else picture("intensity", intensity),
+        depth.header.frame_id,
+    )

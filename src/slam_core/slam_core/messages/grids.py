@@ -17,9 +17,12 @@ def occupancy_message(
     """Grid of cells (rows, columns) int8, -1 unknown, 0 free to 100 occupied; row 0 lies at the grid's lowest y."""
     rows, columns = cells.shape
     info = types.MapMetaData(
-        map_load_time=header.stamp, resolution=float(resolution), width=columns, height=rows,
+        map_load_time=header.stamp,
+        resolution=float(resolution),
+        width=columns,
+        height=rows,
         origin=pose_message(types, T_map_grid),
-    )  # fmt: skip
+    )
     flat = np.ascontiguousarray(cells, dtype=np.int8).ravel()
     return types.OccupancyGrid(header=header, info=info, data=types.signed_octets(flat))
 

@@ -60,9 +60,11 @@ def odometry_message(
     zero with variances of 1e6, since readers such as robot_localization take whatever variance they find.
     """
     return types.Odometry(
-        header=header_message(types, estimate.stamp_ns, frame_id), child_frame_id=child_frame_id,
-        pose=_with_covariance(types, estimate), twist=_twist(types, twist),
-    )  # fmt: skip
+        header=header_message(types, estimate.stamp_ns, frame_id),
+        child_frame_id=child_frame_id,
+        pose=_with_covariance(types, estimate),
+        twist=_twist(types, twist),
+    )
 
 
 def _twist(types: MessageTypes, twist: tuple[FloatArray, FloatArray] | None) -> Message:
@@ -134,10 +136,12 @@ def imu_message(types: MessageTypes, frame_id: str, sample: ImuSample) -> Messag
     unknown = np.zeros(9)
     unknown[0] = -1.0
     return types.Imu(
-        header=header_message(types, sample.stamp_ns, frame_id), orientation=types.Quaternion(w=1.0),
-        orientation_covariance=unknown, angular_velocity=_vector(types, sample.angular_velocity),
+        header=header_message(types, sample.stamp_ns, frame_id),
+        orientation=types.Quaternion(w=1.0),
+        orientation_covariance=unknown,
+        angular_velocity=_vector(types, sample.angular_velocity),
         linear_acceleration=_vector(types, sample.linear_acceleration),
-    )  # fmt: skip
+    )
 
 
 def imu_from_message(message: Message) -> ImuSample:

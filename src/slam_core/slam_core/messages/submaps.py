@@ -51,9 +51,13 @@ class SubmapMessages(NamedTuple):
 
 
 SUBMAP_TOPICS = {
-    "submap/landmarks": "PointCloud2", "submap/descriptors": "Image", "submap/gaussian": "Image", "submap/path": "Path",
-    "submap/path_covariance": "Image", "submap/info": "DiagnosticArray",
-}  # fmt: skip
+    "submap/landmarks": "PointCloud2",
+    "submap/descriptors": "Image",
+    "submap/gaussian": "Image",
+    "submap/path": "Path",
+    "submap/path_covariance": "Image",
+    "submap/info": "DiagnosticArray",
+}
 """Topic and type of each field of :class:`SubmapMessages`, in its order."""
 
 
@@ -157,11 +161,14 @@ def _matrix(message: Message, name: str, rows: int, columns: int) -> AnyArray:
 
 def _info_message(types: MessageTypes, header: Message, submap: Submap) -> Message:
     values = {
-        "agent": submap.agent, "session": str(submap.session), "index": str(submap.index),
+        "agent": submap.agent,
+        "session": str(submap.session),
+        "index": str(submap.index),
         "start_stamp_ns": str(submap.start_stamp_ns),
-        "end_stamp_ns": str(submap.end_stamp_ns), "follows_previous": "true" if submap.follows_previous else "false",
+        "end_stamp_ns": str(submap.end_stamp_ns),
+        "follows_previous": "true" if submap.follows_previous else "false",
         "landmarks": str(len(submap.landmarks)),
-    }  # fmt: skip
+    }
     entries = [types.KeyValue(key=key, value=value) for key, value in values.items()]
     status = types.DiagnosticStatus(name=submap.frame_id, message="submap finished", values=entries)
     return types.DiagnosticArray(header=header, status=[status])
