@@ -7,17 +7,28 @@ Schemas: docs.foxglove.dev/docs/visualization/panels/3d ("Supported messages") a
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from slam_bringup.bags.bag import BagReader
+from dense_mapping.surface import Surface
+from slam_bringup.bags.bag import BagReader, BagWriter
+from slam_bringup.bags.bag_types import BagTypes
 from slam_bringup.bags.recording_clock import RecordingClock
+from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult
 from slam_bringup.report.foxglove import layout
+from slam_bringup.report.result_bag import complete_recording
 from slam_core.frame_tree import FrameTree
-from slam_core.messages import pose_from_message, stamp_ns, transform_from_message
-from slam_core.trajectory import read_trajectory
+from slam_core.messages import (
+    path_message,
+    pose_from_message,
+    stamp_ns,
+    transform_from_message,
+    transform_message,
+)
+from slam_core.trajectory import Trajectory, read_trajectory
 
 SCENE = {
     f"{package}/msg/{name}"
@@ -29,6 +40,10 @@ SCENE = {
     }.items()
     for name in names
 }
+
+EMPTY = RunResult(
+    "bag", "tof", "sjsam", "none", (), LandmarkMap.empty(), Surface.empty(), (), 0, 0, 0, {}, {}, 0.0, 0.0, {}
+)
 
 
 def messages(out: Path) -> list:
@@ -82,6 +97,76 @@ def test_the_truth_lies_on_the_trajectory(out):
     ]
     assert len(gaps) >= 50
     assert max(gaps) < 0.02
+
+
+def test_a_recording_of_the_nodes_is_completed_by_what_only_the_end_knows(tmp_path):
+    """Dense model, floor plan and truth are added; what was recorded stays, and no frame gets a second parent."""
+    types, path = BagTypes(), tmp_path / "result.mcap"
+    with BagWriter(path) as bag:
+        statics = [transform_message(types, 50, "base_link", "tof_optical_frame", np.eye(4))]
+        bag.write("/tf_static", types.TFMessage(transforms=statics), 50)
+        bag.write("/map/path", path_message(types, 90, "map", []), 90)
+        bag.write("/map/graph", types.MarkerArray(markers=[]), 90)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = range(4)
+    way = Trajectory(np.arange(60, 100, 10), poses)
+    agent = AgentResult("", way, filtered=way, truth=way, mounts={"tof_optical_frame": np.eye(4)})
+    complete_recording(path, replace(EMPTY, agents=(agent,)))
+    with BagReader(path) as bag:
+        read = list(bag.messages())
+    topics = [m.topic for m in read]
+    assert {"/map/dense_cloud", "/ground_truth/path"} <= set(topics)
+    assert topics.count("/map/path") == topics.count("/map/graph") == 1
+    children = [t.child_frame_id for m in read if m.topic == "/tf_static" for t in m.message.transforms]
+    assert sorted(children) == ["tof_optical_frame", "world"]
+    assert {m.stamp_ns for m in read} == {50, 90}
+
+
+KEYS = {
+    "3D": "foxglovePanelTitle followMode followTf cameraState scene transforms topics",
+    "Image": "foxglovePanelTitle imageMode",
+    "Plot": "foxglovePanelTitle paths showLegend isSynced xAxisVal",
+    "cameraState": "distance perspective phi target targetOffset targetOrientation thetaOffset fovy near far",
+    "imageMode": "imageTopic calibrationTopic",
+    "path": "value label enabled timestampMethod",
+    "sensor_msgs/msg/PointCloud2": "visible colorMode colorField colorMap flatColor pointSize",
+    "nav_msgs/msg/OccupancyGrid": "visible colorMode alpha",
+    "nav_msgs/msg/Path": "visible type lineWidth gradient",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "visible type color showCovariance",
+    "visualization_msgs/msg/MarkerArray": "visible",
+}
+"""Settings that Foxglove knows, of those that we set: names of foxglove.layouts in foxglove-sdk 0.30.3, in camel case.
+
+A panel's title has another name in the files that the app exports.
+"""
+VALUES = {
+    "colorMode": {"flat", "gradient", "colormap", "rgb", "rgba", "rgba-fields", "custom", "costmap", "map", "raw"},
+    "colorMap": {"turbo", "rainbow"}, "type": {"axis", "arrow", "line"}, "xAxisVal": {"timestamp"},
+    "followMode": {"follow-pose", "follow-heading", "follow-position", "follow-none"},
+    "timestampMethod": {"receiveTime", "publishTime", "headerStamp", "customField"},
+}  # fmt: skip
+
+
+def assert_known(settings: dict, kind: str) -> None:
+    assert set(settings) <= set(KEYS[kind].split()), kind
+    for key, value in settings.items():
+        assert key not in VALUES or value in VALUES[key], (kind, key, value)
+
+
+@pytest.mark.slow
+def test_the_layout_has_panels_and_settings_that_foxglove_knows(out):
+    with BagReader(out / "result.mcap") as bag:
+        types = {topic: info.type_name for topic, info in bag.topics.items()}
+    read = json.loads((out / "foxglove_layout.json").read_text())
+    assert set(read) == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
+    for name, panel in read["configById"].items():
+        assert_known(panel, name.split("!")[0])
+        assert_known(panel.get("cameraState", {}), "cameraState")
+        assert_known(panel.get("imageMode", {}), "imageMode")
+        for path in panel.get("paths", []):
+            assert_known(path, "path")
+        for topic, settings in panel.get("topics", {}).items():
+            assert_known(settings, types[topic])
 
 
 @pytest.mark.slow

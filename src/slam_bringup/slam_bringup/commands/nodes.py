@@ -61,9 +61,11 @@ def command(
         # What draws and writes is loaded now: the nodes have needed the processor.
         from slam_bringup.processes.recorded_run import collect
         from slam_bringup.report.output import write_results
+        from slam_bringup.report.result_bag import complete_recording
 
         result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)
         require_map(result)
+        complete_recording(run.recording, result)
         summary = write_results(folder, result, pictures=not run.stopped)
         transcript.write(folder / LOGS / LOG_NAME, summary_table(summary, output))
     show(summary_table(summary, output))

@@ -2,7 +2,8 @@
 """A Foxglove layout that shows ``result.mcap`` at once: import it by "Layouts > Import from file".
 
 Only topics that the bag has are named. The settings are those that Foxglove documents for its panels 3D, Image and
-Plot (docs.foxglove.dev/docs/visualization/panels).
+Plot (docs.foxglove.dev/docs/visualization/panels), under the names that its own SDK gives them (foxglove.layouts of
+foxglove-sdk 0.30); a panel's title is ``foxglovePanelTitle`` in a layout that the app exports and imports.
 """
 
 from __future__ import annotations
@@ -62,9 +63,10 @@ def _scene(topics: Collection[str], agents: list[str]) -> dict[str, Any]:
         settings[f"{agent}/map/path"] = {**line, "gradient": [colour, colour]}
         settings[f"{agent}/ground_truth/path"] = {**line, "lineWidth": 0.02, "gradient": [_TRUTH, _TRUTH]}
         settings[f"{agent}/pose"] = {"visible": True, "type": "arrow", "showCovariance": True, "color": colour}
-        settings[f"{agent}/features"] = {"visible": False, "colorMode": "colormap", "colorField": "depth"}
+        depth = {"colorMode": "colormap", "colorMap": "turbo", "colorField": "depth"}
+        settings[f"{agent}/features"] = {"visible": False, **depth}
     return {
-        "followMode": "follow-none", "followTf": "map",
+        "foxglovePanelTitle": "map", "followMode": "follow-none", "followTf": "map",
         "cameraState": {"perspective": True, "distance": 18, "phi": 45, "thetaOffset": 30, "targetOffset": [0, 0, 0],
                         "target": [0, 0, 0], "targetOrientation": [0, 0, 0, 1], "fovy": 45, "near": 0.1, "far": 5000},
         "scene": {"transforms": {"axisScale": 0.5}}, "transforms": {},
@@ -74,7 +76,11 @@ def _scene(topics: Collection[str], agents: list[str]) -> dict[str, Any]:
 
 def _image(topic: str, topics: Collection[str]) -> dict[str, Any]:
     calibration = topic.removesuffix("image/compressed") + "camera_info"
-    return {"imageMode": {"imageTopic": topic, **({"calibrationTopic": calibration} if calibration in topics else {})}}
+    title = topic.removesuffix("/features/image/compressed").strip("/") or "left camera"
+    return {
+        "foxglovePanelTitle": title,
+        "imageMode": {"imageTopic": topic, **({"calibrationTopic": calibration} if calibration in topics else {})},
+    }
 
 
 def _plot(title: str, agents: list[str], topics: Collection[str]) -> dict[str, Any]:
@@ -84,7 +90,7 @@ def _plot(title: str, agents: list[str], topics: Collection[str]) -> dict[str, A
          "enabled": True, "timestampMethod": "receiveTime"}
         for agent in agents if f"{agent}/pose" in topics for axis, index in (("x", 0), ("y", 7))
     ]  # fmt: skip
-    return {"title": title, "paths": paths, "showLegend": True, "isSynced": True, "xAxisVal": "timestamp"}
+    return {"foxglovePanelTitle": title, "paths": paths, "showLegend": True, "isSynced": True, "xAxisVal": "timestamp"}
 
 
 def _column(panels: list[str]) -> Any:

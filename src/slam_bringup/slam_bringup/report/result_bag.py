@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``result.mcap`` of an offline run: the topics and transforms of the nodes, for Foxglove, RViz and evo.
+"""``result.mcap``: the topics and transforms of the nodes, for Foxglove, RViz and evo.
 
 map -> odom is the one of the finished map, so that the trajectory shown is the smoothed one. What does not change in
 time (the finished map, paths, static transforms) stands at the beginning, so that it is seen wherever one looks. All
@@ -15,7 +15,7 @@ import numpy as np
 
 from dense_mapping.surface_cloud import cloud_of
 from sjsam_node.map_messages import graph_message, marks_message
-from slam_bringup.bags.bag import BagWriter
+from slam_bringup.bags.bag import BagReader, BagWriter
 from slam_bringup.bags.bag_types import BagTypes
 from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_bringup.pipeline.results import AgentResult, RunResult
@@ -55,6 +55,21 @@ def write_result_bag(path: Path, result: RunResult) -> None:
     with BagWriter(path) as bag:
         for stamp, topic, message in sorted(messages, key=lambda m: (m[0], m[1])):
             bag.write(topic, message, stamp)
+
+
+def complete_recording(path: Path, result: RunResult) -> None:
+    """Add to a bag that was recorded from the nodes what only the finished run knows: dense model, plans, truth."""
+    with BagReader(path) as recorded:
+        stamp, types = recorded.start_ns, {topic: info.type_name for topic, info in recorded.topics.items()}
+        with BagWriter(path) as bag:
+            for _, topic, message in _lasting_messages(result, stamp):
+                if topic not in types:
+                    bag.write(topic, message, stamp)
+            if (T_map_world := _truth_frame(result)) is not None and "/tf_static" in types:
+                transform = transform_message(_TYPES, stamp, "map", WORLD, T_map_world)
+                bag.write("/tf_static", _TYPES.TFMessage(transforms=[transform]), stamp)
+            for topic, time, data in recorded.raw():
+                bag.write_raw(topic, types[topic], data, time)
 
 
 def _agent_messages(agent: AgentResult) -> Iterator[_Stamped]:
@@ -133,10 +148,14 @@ def _lasting_messages(result: RunResult, stamp: int) -> Iterator[_Stamped]:
 def _static_transforms(result: RunResult, stamp: int) -> Message:
     """Every sensor's frame below its rig, so that none has two parents, and the truth's frame below the map."""
     mounts = [(agent.base_frame, frame, T) for agent in result.agents for frame, T in agent.mounts.items()]
-    T_map_world = next((T for a in result.agents if (T := _map_from_world(a)) is not None), None)
-    if T_map_world is not None:
+    if (T_map_world := _truth_frame(result)) is not None:
         mounts.append(("map", WORLD, T_map_world))
     return _TYPES.TFMessage(transforms=[transform_message(_TYPES, stamp, *mount) for mount in mounts])
+
+
+def _truth_frame(result: RunResult) -> FloatArray | None:
+    """T_map_world of the first agent that has a truth."""
+    return next((T for a in result.agents if (T := _map_from_world(a)) is not None), None)
 
 
 def _map_from_world(agent: AgentResult) -> FloatArray | None:
