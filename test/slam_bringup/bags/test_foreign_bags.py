@@ -206,3 +206,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_run(tmp_path: Pat
     bag = write_stereo(tmp_path / "a.mcap", [SECOND])
     result = CliRunner().invoke(slam, ["run", str(bag), "-o", str(bag / "out")])
     assert "cannot write to" in str(result.exception)
+
+
+def test_a_folder_of_ros_2_may_have_the_ending_of_ros_1(tmp_path: Path) -> None:
+    assert stamps_of(write_stereo(tmp_path / "my.bag", [SECOND])) == [SECOND]

@@ -298,7 +298,7 @@ def _storage_of(path: Path) -> Path:
 
 def _opened(path: Path) -> Reader | Ros1Reader:
     try:
-        reader = Ros1Reader(path) if path.suffix == ".bag" else Reader(path)
+        reader = Ros1Reader(path) if path.suffix == ".bag" and path.is_file() else Reader(path)
         reader.open()
     except (ReaderError, FileNotFoundError, AssertionError, struct.error, OSError, TypeError, ValueError) as error:
         hint = "; each of its files can be read alone" if path.is_dir() else ""
