@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dense_mapping.tsdf_kernels import BLOCK, integrate
+from dense_mapping.tsdf_kernels import BLOCK, DepthView, integrate
 from slam_core.camera import Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, transform_points
@@ -99,10 +99,9 @@ class TsdfVolume:
         T_camera_map = invert_transform(T)
         blocks = self._visible(T_camera_map, camera, float(depth.max(initial=0.0)))
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        integrate(
-            blocks, self._origins(), self._voxels, self._colours, self.config.voxel_size, self.truncation,
-            T_camera_map, intrinsics, depth, sigma, picture, sign,
-        )  # fmt: skip
+        view = DepthView(T_camera_map, intrinsics, depth, sigma, picture)
+        size = self.config.voxel_size
+        integrate(blocks, self._origins(), self._voxels, self._colours, size, self.truncation, view, sign)
 
     def _origins(self) -> FloatArray:
         return np.asarray(self.coordinates * self.block_size, dtype=np.float64)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,22 @@ from slam_core.types import ByteArray, Float32Array
 
 BLOCK = 8
 """Voxels along the edge of a block."""
+NEAREST = 0.05
+"""Least depth (m) at which a voxel may lie before the camera."""
+
+
+class DepthView(NamedTuple):
+    """A depth image with its pose.
+
+    T_camera_map (4, 4); intrinsics fx, fy, cx, cy (px); depth and sigma (height, width) m, 0 where there is none;
+    picture (height, width, 3), or of no size where there is none.
+    """
+
+    T_camera_map: FloatArray
+    intrinsics: FloatArray
+    depth: Float32Array
+    sigma: Float32Array
+    picture: ByteArray
 
 
 @in_place(error_model="numpy")
@@ -33,6 +50,22 @@ def _look_up(u: float, v: float, depth: Float32Array, jump: float) -> float:  # 
 
 
 @in_place(error_model="numpy")
+def _add_distance(
+    voxel: Float32Array, distance: float, noise: float, voxel_size: float, truncation: float, sign: float
+) -> float:  # pragma: no cover - compiled
+    """Distance of a voxel before the surface, cut off at ``truncation``, when it is added with its weight."""
+    weight = 1.0 / (noise * noise)
+    if distance < -voxel_size:  # behind the surface nothing was seen: what is told of it fades
+        weight *= (truncation + distance) / (truncation - voxel_size)
+    distance = min(distance, truncation)
+    voxel[0] += sign * weight * distance
+    voxel[1] += sign * weight
+    voxel[2] += sign * weight * distance * distance
+    voxel[3] += sign
+    return distance
+
+
+@in_place(error_model="numpy")
 def integrate(
     blocks: npt.NDArray[np.int64],
     origins: FloatArray,
@@ -40,40 +73,16 @@ def integrate(
     colours: ByteArray,
     voxel_size: float,
     truncation: float,
-    T: FloatArray,
-    intrinsics: FloatArray,
-    depth: Float32Array,
-    sigma: Float32Array,
-    picture: ByteArray,
+    view: DepthView,
     sign: float,
 ) -> None:  # pragma: no cover - compiled
-    """Add (sign 1) or take away (sign -1) one depth image.
+    """Add (sign 1) or take away (sign -1) one depth image in ``blocks`` (m,); their corners are ``origins`` (n, 3) m.
 
-    Parameters
-    ----------
-    blocks
-        (m,) rows of ``voxels`` to visit.
-    origins
-        (n, 3) corner of each block, m.
-    voxels
-        (n, 512, 4): sum of weighted distance, of weight, of weighted squared distance, and number of images.
-    colours
-        (n, 512, 4): mean red, green, blue and how many images it is the mean of, up to 16.
-    voxel_size, truncation
-        Edge of a voxel and largest distance kept, m.
-    T
-        T_camera_map (4, 4).
-    intrinsics
-        fx, fy, cx, cy, px.
-    depth, sigma
-        (height, width) m; 0 where there is none.
-    picture
-        (height, width, 3), or of no size where there is no picture.
-    sign
-        1.0 or -1.0.
+    voxels: (n, 512, 4) sum of weighted distance, of weight, of weighted squared distance, and number of images.
+    colours: (n, 512, 4) mean red, green, blue and of how many images. truncation: largest distance kept, m.
     """
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    has_picture = picture.shape[0] > 0
+    T = view.T_camera_map
+    fx, fy, cx, cy = view.intrinsics[0], view.intrinsics[1], view.intrinsics[2], view.intrinsics[3]
     for b in blocks:
         for i in range(BLOCK * BLOCK * BLOCK):
             if i % BLOCK == 0:  # the next column of voxels along z
@@ -84,31 +93,19 @@ def integrate(
                 column_z = T[2, 0] * x + T[2, 1] * y + T[2, 3]
             z = origins[b, 2] + (i % BLOCK + 0.5) * voxel_size
             pz = column_z + T[2, 2] * z
-            if pz < 0.05:
+            if pz < NEAREST:
                 continue
-            px = (column_x + T[0, 2] * z) / pz
-            py = (column_y + T[1, 2] * z) / pz
-            u, v = fx * px + cx, fy * py + cy
-            measured = _look_up(u, v, depth, truncation)
-            if not measured > 0.0:
-                continue
-            distance = measured - pz
-            if distance < -truncation:
+            u, v = fx * ((column_x + T[0, 2] * z) / pz) + cx, fy * ((column_y + T[1, 2] * z) / pz) + cy
+            measured = _look_up(u, v, view.depth, truncation)
+            if not measured > 0.0 or measured - pz < -truncation:
                 continue
             row, column = int(v + 0.5), int(u + 0.5)
-            noise = sigma[row, column]
+            noise = view.sigma[row, column]
             if not noise > 0.0:
                 continue
-            weight = 1.0 / (noise * noise)
-            if distance < -voxel_size:  # behind the surface nothing was seen: what is told of it fades
-                weight *= (truncation + distance) / (truncation - voxel_size)
-            distance = min(distance, truncation)
-            voxels[b, i, 0] += sign * weight * distance
-            voxels[b, i, 1] += sign * weight
-            voxels[b, i, 2] += sign * weight * distance * distance
-            voxels[b, i, 3] += sign
-            if has_picture and sign > 0.0 and abs(distance) < 1.5 * voxel_size:
-                _blend(colours[b, i], picture[row, column])
+            distance = _add_distance(voxels[b, i], measured - pz, noise, voxel_size, truncation, sign)
+            if view.picture.shape[0] > 0 and sign > 0.0 and abs(distance) < 1.5 * voxel_size:
+                _blend(colours[b, i], view.picture[row, column])
 
 
 @in_place(error_model="numpy")

@@ -13,6 +13,9 @@ from ndt_registration.voxel_grid import NormalGrid, find_block
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 
+_MATCHED = 4.5
+"""A point with an exponent below this (three standard deviations) lies on a surface of the target."""
+
 
 class Fit(NamedTuple):
     """Fit of a cloud to the target's surfaces.
@@ -101,6 +104,32 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
 
 
 @in_place()
+def _fit_of_cells(grid, row, mx, my, mz):  # type: ignore[no-untyped-def]
+    """Weight of a point in cost, majorant and Hessian; least exponent of its cells and the distance there."""
+    weight = majorant_weight = hessian_weight = 0.0
+    best, distance = _MATCHED, 0.0
+    for k in range(8):
+        cell = grid.cells[row, k]
+        if cell < 0:
+            continue
+        qx, qy, qz, ux, uy, uz = _offset(grid, cell, mx, my, mz)
+        exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
+        e = 0.125 * np.exp(-min(exponent, 30.0))
+        weight += e
+        # In the plane the least variance is that of z, which is zero, and the second is across the wall.
+        flat = grid.variance[cell, 0] <= 1e-9 * grid.variance[cell, 2]
+        spread = grid.variance[cell, 2] if flat else grid.variance[cell, 1]
+        b = grid.information[cell]
+        information = e * min(1.0 / max(grid.counts[cell] * spread, 1e-300), b[0] + b[3] + b[5])
+        majorant_weight += information
+        hessian_weight += information * (1.0 - 2.0 * min(exponent, 30.0))
+        if exponent < best:
+            best = exponent
+            distance = abs(qx * grid.normal[cell, 0] + qy * grid.normal[cell, 1] + qz * grid.normal[cell, 2])
+    return weight, majorant_weight, hessian_weight, best, distance
+
+
+@in_place()
 def _sums_of_fit(points, R, t, grid, max_distance, hessian_moments, majorant_moments):  # type: ignore[no-untyped-def]
     """Number of inliers, the sum of their squared distances, of their coordinates (three) and of these squared.
 
@@ -118,27 +147,8 @@ def _sums_of_fit(points, R, t, grid, max_distance, hessian_moments, majorant_mom
         row = find_block(grid.keys, grid.rows, int(np.floor(mx * s)), int(np.floor(my * s)), int(np.floor(mz * s)))
         if row < 0:
             continue
-        weight = majorant_weight = hessian_weight = 0.0
-        best, distance = 4.5, 0.0
-        for k in range(8):
-            cell = grid.cells[row, k]
-            if cell < 0:
-                continue
-            qx, qy, qz, ux, uy, uz = _offset(grid, cell, mx, my, mz)
-            exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
-            e = 0.125 * np.exp(-min(exponent, 30.0))
-            weight += e
-            # In the plane the least variance is that of z, which is zero, and the second is across the wall.
-            flat = grid.variance[cell, 0] <= 1e-9 * grid.variance[cell, 2]
-            spread = grid.variance[cell, 2] if flat else grid.variance[cell, 1]
-            b = grid.information[cell]
-            information = e * min(1.0 / max(grid.counts[cell] * spread, 1e-300), b[0] + b[3] + b[5])
-            majorant_weight += information
-            hessian_weight += information * (1.0 - 2.0 * min(exponent, 30.0))
-            if exponent < best:
-                best = exponent
-                distance = abs(qx * grid.normal[cell, 0] + qy * grid.normal[cell, 1] + qz * grid.normal[cell, 2])
-        if best < 4.5 and distance < max_distance:
+        weight, majorant_weight, hessian_weight, best, distance = _fit_of_cells(grid, row, mx, my, mz)
+        if best < _MATCHED and distance < max_distance:
             inliers += 1
             squares += distance * distance
             cx += px

@@ -144,6 +144,27 @@ def _sum_over_cells(cells: FloatArray, x: float, y: float, z: float, factor: flo
 
 
 @in_place()
+def _add_slope(
+    px: float, py: float, pz: float, vx: float, vy: float, vz: float, gradient: FloatArray, hessian: FloatArray
+) -> None:
+    """Add one point's part of the gradient, and what the bend of its rotation makes of it in the Hessian."""
+    gradient[0] += vx
+    gradient[1] += vy
+    gradient[2] += vz
+    gradient[3] += py * vz - pz * vy
+    gradient[4] += pz * vx - px * vz
+    gradient[5] += px * vy - py * vx
+    # v . d2x'/dw_i dw_j = (p_i v_j + p_j v_i) / 2 - delta_ij (p . v)
+    dot = px * vx + py * vy + pz * vz
+    hessian[3, 3] += px * vx - dot
+    hessian[4, 4] += py * vy - dot
+    hessian[5, 5] += pz * vz - dot
+    hessian[3, 4] += 0.5 * (px * vy + py * vx)
+    hessian[3, 5] += 0.5 * (px * vz + pz * vx)
+    hessian[4, 5] += 0.5 * (py * vz + pz * vy)
+
+
+@in_place()
 def ndt_derivatives(
     layer: Layer,
     R: FloatArray,
@@ -170,11 +191,8 @@ def ndt_derivatives(
         py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
         pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
         mx, my, mz = px + t[0], py + t[1], pz + t[2]
-        ix, iy, iz = (
-            int(np.floor(mx * inverse_size)),
-            int(np.floor(my * inverse_size)),
-            int(np.floor(mz * inverse_size)),
-        )
+        ix, iy = int(np.floor(mx * inverse_size)), int(np.floor(my * inverse_size))
+        iz = int(np.floor(mz * inverse_size))
         block, cells = neighbours.block[first + i], neighbours.cells[first + i]
         if block[0] != ix or block[1] != iy or block[2] != iz:
             _look_up(layer.grid, ix, iy, iz, block, cells)
@@ -191,20 +209,7 @@ def ndt_derivatives(
             px, py, pz, vx, vy, vz,
             bxx - sums[10], bxy - sums[11], bxz - sums[12], byy - sums[13], byz - sums[14], bzz - sums[15], hessian,
         )  # fmt: skip
-        gradient[0] += vx
-        gradient[1] += vy
-        gradient[2] += vz
-        gradient[3] += py * vz - pz * vy
-        gradient[4] += pz * vx - px * vz
-        gradient[5] += px * vy - py * vx
-        # v . d2x'/dw_i dw_j = (p_i v_j + p_j v_i) / 2 - delta_ij (p . v)
-        dot = px * vx + py * vy + pz * vz
-        hessian[3, 3] += px * vx - dot
-        hessian[4, 4] += py * vy - dot
-        hessian[5, 5] += pz * vz - dot
-        hessian[3, 4] += 0.5 * (px * vy + py * vx)
-        hessian[3, 5] += 0.5 * (px * vz + pz * vx)
-        hessian[4, 5] += 0.5 * (py * vz + pz * vy)
+        _add_slope(px, py, pz, vx, vy, vz, gradient, hessian)
     return cost
 
 
@@ -282,6 +287,19 @@ def _rotated(R: FloatArray, w: FloatArray) -> FloatArray:
 
 
 @njit(cache=True, nogil=True)
+def _damped_step(
+    H: FloatArray, M: FloatArray, g: FloatArray, scale: FloatArray, fixed: FloatArray, damping: float, step: FloatArray
+) -> tuple[bool, bool]:
+    """Fill ``step`` (6,); True if there is one, and True if it is Newton's, not the majorant's."""
+    curvature = 0.0
+    for k in range(3):
+        curvature = max(curvature, M[k, k])
+    penalty = scale * (damping * curvature + 1e-300) + fixed * (1e12 * curvature + 1e-300) * scale
+    newton = cholesky_solve6(H, penalty, g, step)
+    return newton or cholesky_solve6(M, penalty + 1e-9 * curvature * scale, g, step), newton
+
+
+@njit(cache=True, nogil=True)
 def ndt_align(
     layers: tuple[Layer, ...],
     rotation: FloatArray,
@@ -325,12 +343,8 @@ def ndt_align(
     iteration = 0
     while iteration < max_iterations and cost < 0.0:
         iteration += 1
-        curvature = 0.0
-        for k in range(3):
-            curvature = max(curvature, M[k, k])
-        penalty = scale * (damping * curvature + 1e-300) + fixed * (1e12 * curvature + 1e-300) * scale
-        newton = cholesky_solve6(H, penalty, g, step)
-        if not newton and not cholesky_solve6(M, penalty + 1e-9 * curvature * scale, g, step):
+        solved, newton = _damped_step(H, M, g, scale, fixed, damping, step)
+        if not solved:
             damping = max(10.0 * damping, 1e-6)
             continue
         size = np.sqrt((step * step * scale).sum())

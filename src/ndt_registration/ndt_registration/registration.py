@@ -161,10 +161,7 @@ def register(
     config
         Settings; the defaults serve rooms and vehicles alike.
 
-    Returns
-    -------
-    RegistrationResult
-        Also for clouds that cannot be registered: then ``converged`` is False and ``reason`` says why.
+    Clouds that cannot be registered have a result too: ``converged`` is False and ``reason`` says why.
 
     Raises
     ------

@@ -79,27 +79,14 @@ def sandwich(
     off the curvature, else the directions that little determines would seem far better known than they are. How far
     the pose may be off along a free direction follows from the loss: chance makes up for so much of it.
 
-    Parameters
-    ----------
-    curvature
-        Of the cost at the optimum.
-    scatter
-        Covariance of the cost's gradient, shape (6, 6); see :func:`gradient_scatter`.
-    extent
-        Rotations are taken about the centre of what was matched, and angles times its radius: only there can the
-        curvatures of translations and rotations be compared (Zhang and Singh 2016 on degeneracy).
-    loss
-        Share of the score that is lost when the pose is moved by a vector (6,).
-    scale
-        Free directions get ``free_sigma`` times this, m.
-    fixed
-        Components of the pose error that were constrained, shape (6,); their variance is that of the floor.
-    config
-        Settings.
+    Rotations are taken about the centre of what was matched, and angles times its radius: only there can the curvatures
+    of translations and rotations be compared (Zhang and Singh 2016 on degeneracy).
+
+    scatter: covariance (6, 6) of the cost's gradient, see :func:`gradient_scatter`. loss: share of the score that is
+    lost when the pose is moved by a vector (6,). scale: m, free directions get ``_FREE_SIGMA`` times this. fixed: (6,)
+    components of the pose error that were constrained; their variance is that of the floor.
     """
-    to_pose = np.eye(6)
-    to_pose[:3, 3:] = skew(extent.centre) / extent.radius
-    to_pose[3:, 3:] /= extent.radius
+    to_pose = _about(extent)
     H, M, F, spurious, C = (to_pose.T @ A @ to_pose for A in (*curvature, scatter))
     for A in (H, M, F, spurious, C):
         A[fixed], A[:, fixed] = 0.0, 0.0
@@ -109,20 +96,33 @@ def sandwich(
     for k in np.flatnonzero(~constrained):
         v = vectors[:, k]
         step = _PROBE * scale * (to_pose @ v)
-        least = config.least_loss * (_SPURIOUS_FACTOR if v @ H @ v < v @ spurious @ v else 1.0)
         lost = min(loss(step), loss(-step))
-        free[k] = v @ M @ v <= v @ spurious @ v or lost < least
+        free[k] = _is_free(v @ H @ v, v @ M @ v, v @ spurious @ v, lost, config)
         sigma[k] = scale * min(_FREE_SIGMA, _PROBE * config.loss_noise / max(lost, 1e-9))
         if not free[k] and lost > _WELL_DETERMINED * config.least_loss:
             break
-    known = vectors[:, ~free & ~constrained]
     covariance = (_SIGMA_FLOOR * scale) ** 2 * np.eye(6)
+    known = vectors[:, ~free & ~constrained]
     if known.shape[1]:
         inverse = _inverse(known.T @ (H - F) @ known, known.T @ M @ known)
         covariance += known @ inverse @ (known.T @ C @ known) @ inverse @ known.T
     covariance += (vectors[:, free] * sigma[free] ** 2) @ vectors[:, free].T
     covariance = to_pose @ covariance @ to_pose.T
     return Uncertainty(0.5 * (covariance + covariance.T), vectors[:, free].T)
+
+
+def _about(extent: Extent) -> FloatArray:
+    """Pose error (6,) from translation and scaled rotation about the centre of what was matched, as a matrix (6, 6)."""
+    to_pose = np.eye(6)
+    to_pose[:3, 3:] = skew(extent.centre) / extent.radius
+    to_pose[3:, 3:] /= extent.radius
+    return to_pose
+
+
+def _is_free(hessian: float, majorant: float, spurious: float, lost: float, config: UncertaintyConfig) -> bool:
+    """True if a direction of these curvatures, along which so much of the score is lost, is not determined."""
+    least = config.least_loss * (_SPURIOUS_FACTOR if hessian < spurious else 1.0)
+    return bool(majorant <= spurious or lost < least)
 
 
 def gradient_scatter(block_gradients: Iterable[FloatArray], density_ratio: float) -> FloatArray:

@@ -308,6 +308,28 @@ _TINY = 1e-12
 
 
 @in_place()
+def _nearest_cell(grid: NormalGrid, x: float, y: float, z: float) -> int:
+    """Of the eight cells around a place (in edges of a block), that whose centre is nearest; -1: none."""
+    ix, iy, iz = np.floor(x), np.floor(y), np.floor(z)
+    row = find_block(grid.keys, grid.rows, int(ix), int(iy), int(iz))
+    if row < 0:
+        return -1
+    return int(grid.cells[row, int(x - ix < 0.5) + 2 * int(y - iy < 0.5) + 4 * int(z - iz < 0.5)])
+
+
+@in_place()
+def _set_plane_information(grid: NormalGrid, i: int, n: FloatArray, floor: float, slack: float) -> None:
+    """Information of a cell across its plane alone."""
+    thickness = max(grid.variance[i, 0], floor)
+    information = max(1.0 / thickness - slack / max(grid.variance[i, 2], thickness), 0.0)
+    m = 0
+    for r in range(3):
+        for c in range(r, 3):
+            grid.information[i, m] = information * n[r] * n[c]
+            m += 1
+
+
+@in_place()
 def adopt_planes(
     grid: NormalGrid, wider: NormalGrid, flatness: float, agreement: float, floor: float, slack: float
 ) -> None:
@@ -320,29 +342,13 @@ def adopt_planes(
     while that of a wider plane with a step in it is wrong for either side. Cells are changed in place; with ``slack``
     >= 0 their information becomes that of the plane alone.
 
-    Parameters
-    ----------
-    grid, wider
-        The grid to change, and the next coarser one, changed before.
-    flatness
-        Largest ratio of the wider cell's thickness to the cell's own, as variances.
-    agreement
-        How far the cell's mean may lie off the wider plane, and its normal off the wider one, in standard deviations.
-    floor
-        Least variance across the plane, m2.
-    slack
-        See :func:`normal_grid`; below 0 the information stays.
+    wider: the next coarser grid, changed before. flatness: largest ratio of the wider cell's thickness to the cell's
+    own, as variances. agreement: how far the cell's mean may lie off the wider plane, and its normal off the wider one,
+    in standard deviations. floor: least variance across the plane, m2. slack: see :func:`normal_grid`.
     """
     size = wider.block_size
     for i in range(grid.mean.shape[0]):
-        x, y, z = grid.mean[i, 0] / size, grid.mean[i, 1] / size, grid.mean[i, 2] / size
-        ix, iy, iz = np.floor(x), np.floor(y), np.floor(z)
-        row = find_block(wider.keys, wider.rows, int(ix), int(iy), int(iz))
-        if row < 0:
-            continue
-        # Of the eight cells, that whose centre is nearest.
-        child = int(x - ix < 0.5) + 2 * int(y - iy < 0.5) + 4 * int(z - iz < 0.5)
-        cell = wider.cells[row, child]
+        cell = _nearest_cell(wider, grid.mean[i, 0] / size, grid.mean[i, 1] / size, grid.mean[i, 2] / size)
         across = max(grid.variance[i, 0], floor)
         if cell < 0 or wider.variance[cell, 0] > flatness * across:
             continue
@@ -359,10 +365,4 @@ def adopt_planes(
             grid.variance[i, k] = wider.variance[cell, k]
         grid.counts[i] = wider.counts[cell]
         if slack >= 0.0:
-            thickness = max(grid.variance[i, 0], floor)
-            information = max(1.0 / thickness - slack / max(grid.variance[i, 2], thickness), 0.0)
-            m = 0
-            for r in range(3):
-                for c in range(r, 3):
-                    grid.information[i, m] = information * n[r] * n[c]
-                    m += 1
+            _set_plane_information(grid, i, n, floor, slack)

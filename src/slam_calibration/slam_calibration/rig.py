@@ -71,10 +71,9 @@ def calibrate(
         _calibrate_alone(board_points, [view[c] for view in views], size, lens, c, config)
         for c, (size, lens) in enumerate(zip(sizes, lenses, strict=True))
     ]
-    if len(alone) == 1:
-        result = alone[0]
-    else:
-        result = _calibrate_together(board_points, views, [a.rig.cameras[0] for a in alone], config)
+    several = len(alone) > 1
+    cameras = [a.rig.cameras[0] for a in alone]
+    result = _calibrate_together(board_points, views, cameras, config) if several else alone[0]
     _check_observable(result, config)
     return result
 

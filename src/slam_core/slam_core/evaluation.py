@@ -210,22 +210,17 @@ def evaluate(
     """Compare a trajectory with ground truth.
 
     A constant difference of the body frames is found where there is one, and taken off the truth with ``align_body``.
-    ``drift_percent`` is the end error relative to the true path length. The ANEES bounds assume independent poses,
-    which those of one run are not: over one run it is an indication, over many runs a test.
+    The ANEES bounds assume independent poses, which those of one run are not: it is an indication, over many a test.
     """
     matched, true_poses = associate(estimate, truth, max_difference_s, interpolate)
     offset = body_offset(matched.poses, true_poses)
     if align_body and offset is not None:
         true_poses = true_poses @ invert_transform(offset)
-    aligned = align(matched.poses, true_poses, alignment)
-    distance, angle = absolute_errors(aligned, true_poses)
+    distance, angle = absolute_errors(align(matched.poses, true_poses, alignment), true_poses)
     step, turn = relative_errors(matched.poses, true_poses, min(delta, len(matched) - 1))
     length = Trajectory(matched.stamps_ns, true_poses).length_m
     end, end_angle = end_error(matched.poses, true_poses)
-    values = None if matched.covariances is None else pose_nees(matched, true_poses, accuracy)
-    anees = low = high = None
-    if values is not None and len(values):
-        anees, (low, high) = float(np.mean(values) / 6.0), anees_bounds(6, len(values))
+    anees, anees_low, anees_high = _anees(matched, true_poses, accuracy)
     return Evaluation(
         ate=ErrorStatistics.of(distance),
         ate_rotation_deg=ErrorStatistics.of(np.rad2deg(angle)),
@@ -236,8 +231,18 @@ def evaluate(
         drift_percent=100.0 * end / length if length > 0 else 0.0,
         truth_length_m=length,
         anees=anees,
-        anees_low=low,
-        anees_high=high,
+        anees_low=anees_low,
+        anees_high=anees_high,
         body_offset=None if offset is None else offset.tolist(),
         body_aligned=align_body and offset is not None,
     )
+
+
+def _anees(
+    matched: Trajectory, true_poses: FloatArray, accuracy: TruthAccuracy
+) -> tuple[float, float, float] | tuple[None, None, None]:
+    """ANEES and its bounds, or None where the trajectory has no covariances."""
+    values = [] if matched.covariances is None else pose_nees(matched, true_poses, accuracy)
+    if not len(values):
+        return None, None, None
+    return float(np.mean(values) / 6.0), *anees_bounds(6, len(values))

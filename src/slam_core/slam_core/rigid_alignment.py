@@ -10,6 +10,8 @@ import numpy.typing as npt
 
 from slam_core.geometry import FloatArray, make_transform
 
+_MOST_REFITS = 10
+
 
 def umeyama(source: FloatArray, target: FloatArray, weights: FloatArray | None = None) -> FloatArray:
     """Rigid ``T_target_source`` minimising ``sum w |target - T source|^2`` (Umeyama 1991, without scale).
@@ -73,9 +75,8 @@ def ransac_rigid_transform(
         Fewer inliers than this are no success.
     """
     n = len(source)
-    failure = AlignmentResult(np.eye(4), np.zeros(n, dtype=bool), False)
     if n < max(3, min_inliers):
-        return failure
+        return _failed(n)
     threshold_sq = np.square(np.broadcast_to(np.asarray(threshold, dtype=np.float64), (n,)))
     samples = np.argpartition(rng.random((hypotheses, n)), 2, axis=1)[:, :3]
     T = umeyama(source[samples], target[samples])
@@ -84,11 +85,21 @@ def ransac_rigid_transform(
     # Truncated cost (MSAC, Torr and Zisserman 2000) tells apart hypotheses with equal numbers of inliers.
     cost = np.minimum(distance_sq / threshold_sq, 1.0).sum(axis=1)
     best = int(np.argmin(cost))
-    inliers = distance_sq[best] < threshold_sq
-    estimate = T[best]
-    for _ in range(10):
+    return _refitted(source, target, threshold_sq, T[best], distance_sq[best] < threshold_sq, min_inliers)
+
+
+def _refitted(
+    source: FloatArray,
+    target: FloatArray,
+    threshold_sq: FloatArray,
+    estimate: FloatArray,
+    inliers: npt.NDArray[np.bool_],
+    min_inliers: int,
+) -> AlignmentResult:
+    """The transform fitted to its inliers until these stay the same."""
+    for _ in range(_MOST_REFITS):
         if inliers.sum() < max(3, min_inliers):
-            return failure
+            return _failed(len(source))
         estimate = umeyama(source[inliers], target[inliers], 1.0 / threshold_sq[inliers])
         error = source @ estimate[:3, :3].T + estimate[:3, 3] - target
         updated = np.einsum("ni,ni->n", error, error) < threshold_sq
@@ -96,3 +107,7 @@ def ransac_rigid_transform(
             break
         inliers = updated
     return AlignmentResult(estimate, inliers, bool(inliers.sum() >= min_inliers))
+
+
+def _failed(n: int) -> AlignmentResult:
+    return AlignmentResult(np.eye(4), np.zeros(n, dtype=bool), False)

@@ -98,9 +98,8 @@ def map_depth(
     pixels = image.camera.project(rays_tof * depth[:, None] + origin)
     samples = sample_depth(image, pixels)
     update = (samples.depth - origin[2]) / rays_tof[:, 2]
-    moved = np.abs(update - depth)
+    settled = np.abs(update - depth) <= np.maximum(samples.sigma, 1e-3)
     depth = np.where(np.isfinite(update), update, depth)
-    settled = moved <= np.maximum(samples.sigma, 1e-3)
     sigma = _mapped_sigma(samples, image.camera, age) / np.abs(rays_tof[:, 2])
     blank = np.where(settled & (depth > 0.0), 0.0, np.nan)
     return MappedDepth(update + blank, sigma + blank, pixels)

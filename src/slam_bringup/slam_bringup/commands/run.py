@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
@@ -25,6 +26,7 @@ from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.map_growth import MapGrowth, map_growth
 from slam_bringup.pipeline.offline import run_bag
+from slam_bringup.pipeline.results import RunResult
 from slam_bringup.processes.interrupt import INTERRUPTED, MAP, STOPPED, Interrupt, giving_up
 from slam_bringup.report.summary_table import summary_table
 from slam_bringup.version import VERSION
@@ -63,13 +65,8 @@ def command(
     if mode != "tof":
         require_stereo(bag, names)
     results, transcript = OutputFolder(output, "run", bag, overwrite=overwrite), Transcript(VERSION)
-    with (
-        results,
-        transcript,
-        giving_up(results),
-        results.staged(rescue=MAP) as folder,
-        _saved_if_given_up(growth, folder / MAP),
-    ):
+    staged = results.staged(rescue=MAP)
+    with results, transcript, giving_up(results), staged as folder, _saved_if_given_up(growth, folder / MAP):
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"mapping {bag.name}", total=2 * readings)
             result, growth = run_bag(
@@ -79,13 +76,8 @@ def command(
         require_map(result)
         if interrupt.asked:
             result = replace(result, events=(STOPPED, *result.events))
-        # What draws and writes is loaded when there is something to write: mapping needs the memory.
-        from slam_bringup.report.output import write_results
-        from slam_bringup.report.result_bag import write_result_bag
-
         with Console(stderr=True, quiet=is_quiet()).status(f"writing {output}"):
-            write_result_bag(folder / "result.mcap", result)
-            summary = write_results(folder, result, growth.save, pictures=not interrupt.asked)
+            summary = _write(folder, result, growth, pictures=not interrupt.asked)
             transcript.write(folder / LOGS / LOG_NAME, summary_table(summary, output))
     show(summary_table(summary, output))
     if result.failure:
@@ -93,6 +85,15 @@ def command(
         sys.exit(FAILED)
     if interrupt.asked:
         sys.exit(INTERRUPTED)
+
+
+def _write(folder: Path, result: RunResult, growth: MapGrowth, *, pictures: bool) -> dict[str, Any]:
+    # What draws and writes is loaded when there is something to write: mapping needs the memory.
+    from slam_bringup.report.output import write_results
+    from slam_bringup.report.result_bag import write_result_bag
+
+    write_result_bag(folder / "result.mcap", result)
+    return write_results(folder, result, growth.save, pictures=pictures)
 
 
 @contextmanager

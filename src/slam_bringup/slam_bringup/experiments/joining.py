@@ -64,33 +64,8 @@ def _joined(
 
     def report(results: Mapping[str, JobResult]) -> Findings:
         run = results["run"]
-        summary, agent = run.values["summary"], run.values["agents"][0]
-        merge = run.arrays["ms sjsam"]
-        half = max(1, len(merge) // 2)
-        comparisons = [
-            landmarks_comparison(run, thesis["landmarks"]),
-            Comparison("submaps", thesis["submaps"], str(summary["submaps"])),
-            speed_comparison(run, thesis["time"]),
-            Comparison("joining, s", thesis["joining"], f"{merge.sum() / 1e3:.1f} in all"),
-            Comparison(
-                "joining, ms a submap, first and second half",
-                "spikes at closures",
-                f"{np.mean(merge[:half]):.0f}, {np.mean(merge[-half:]):.0f}",
-            ),
-        ]
-        if mark_m is not None:
-            comparisons.append(end_comparison(run, thesis["end"], mark_m))
-        else:
-            closed = summary["loop_closures"] > 0 and agent["joined_end_m"] < 0.01 * agent["path_m"]
-            comparisons.append(
-                Comparison("loop", thesis["end"], f"{summary['loop_closures']} closures, end error "
-                           f"{1e3 * agent['joined_end_m']:.1f} mm", "closed, end error < 1 % of the way", closed)
-            )  # fmt: skip
-        comparisons.append(bounds_comparison(name, run))
-        drift = np.ptp(run.arrays["0 filter poses"][:, 2, 3])
-        comparisons.append(Comparison("range of height before joining", thesis["height"], f"{drift:.2f} m"))
         return Findings(
-            comparisons,
+            _comparisons(name, run, thesis, mark_m),
             [Table("Accuracy", ACCURACY_HEADER, [accuracy_row(name, run)])],
             [
                 Picture(plots.submaps(run.arrays, "chained"), numbers["before"], "Submaps before joining."),
@@ -103,6 +78,35 @@ def _joined(
         )
 
     return Experiment(name, sections, title, jobs, report)
+
+
+def _comparisons(name: str, run: JobResult, thesis: Mapping[str, str], mark_m: float | None) -> list[Comparison]:
+    summary, agent = run.values["summary"], run.values["agents"][0]
+    merge = run.arrays["ms sjsam"]
+    half = max(1, len(merge) // 2)
+    comparisons = [
+        landmarks_comparison(run, thesis["landmarks"]),
+        Comparison("submaps", thesis["submaps"], str(summary["submaps"])),
+        speed_comparison(run, thesis["time"]),
+        Comparison("joining, s", thesis["joining"], f"{merge.sum() / 1e3:.1f} in all"),
+        Comparison(
+            "joining, ms a submap, first and second half",
+            "spikes at closures",
+            f"{np.mean(merge[:half]):.0f}, {np.mean(merge[-half:]):.0f}",
+        ),
+    ]
+    if mark_m is not None:
+        comparisons.append(end_comparison(run, thesis["end"], mark_m))
+    else:
+        closed = summary["loop_closures"] > 0 and agent["joined_end_m"] < 0.01 * agent["path_m"]
+        comparisons.append(
+            Comparison("loop", thesis["end"], f"{summary['loop_closures']} closures, end error "
+                       f"{1e3 * agent['joined_end_m']:.1f} mm", "closed, end error < 1 % of the way", closed)
+        )  # fmt: skip
+    comparisons.append(bounds_comparison(name, run))
+    drift = np.ptp(run.arrays["0 filter poses"][:, 2, 3])
+    comparisons.append(Comparison("range of height before joining", thesis["height"], f"{drift:.2f} m"))
+    return comparisons
 
 
 def _workshop() -> Experiment:

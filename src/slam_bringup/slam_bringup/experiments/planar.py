@@ -126,42 +126,43 @@ def _experiment() -> Experiment:
             for s in _BEARINGS
         }
 
-    def report(results: Mapping[str, JobResult]) -> Findings:
-        known = {name: r.arrays for name, r in results.items() if name.startswith("known")}
-        runs = next(iter(results.values())).values["runs"]
-        low, high = anees_bounds(3, runs, 0.99)
-        comparisons = []
-        for name, arrays in known.items():
-            mean = float(arrays["nees"].mean())
-            comparisons.append(
-                Comparison(f"NEES of the last pose, {name}", "not measured", f"{mean:.2f}",
-                           f"{low:.2f} to {high:.2f}", low <= mean <= high)
-            )  # fmt: skip
-        below = all(np.all(r.arrays["smoother cost"] <= r.arrays["filter cost"] + 1e-9) for r in results.values())
-        comparisons.append(
-            Comparison("SAM's cost below the filter's", "SAM smooths the whole path",
-                       "in every run" if below else "not in every run", "in every run", below)
-        )  # fmt: skip
-        rows = [
-            [name, f"{1e3 * a['filter rmse'].mean():.0f}", f"{1e3 * a['smoother rmse'].mean():.0f}",
-             f"{a['nees'].mean():.2f}", f"{a['filter cost'].mean():.0f}", f"{a['smoother cost'].mean():.0f}",
-             f"{100 * a['wrong'].mean():.2f}", f"{a['landmarks'].mean():.1f}"]
-            for name, a in ((name, r.arrays) for name, r in results.items())
-        ]  # fmt: skip
-        header = ("association, bearing noise", "EKF RMSE mm", "SAM RMSE mm", "EKF NEES", "EKF cost", "SAM cost",
-                  "wrong pairs %", "landmarks (40)")  # fmt: skip
-        arrays = results[f"unknown, {_BEARINGS[0]:g} rad"].arrays
-        return Findings(
-            comparisons,
-            [Table(f"50 samples, {runs} worlds", header, rows)],
-            [
-                Picture(_drawn(arrays, "open"), "6.5", "SAM before the loop closes."),
-                Picture(_drawn(arrays, "smoothed"), "6.6", "SAM after the loop closed."),
-                Picture(_drawn(arrays, "filter"), "6.1", "The filter on the same drive."),
-            ],
-        )
+    return Experiment("planar", "1.7, 5.1, 6.5", "EKF-SLAM and SAM in the plane", jobs, _report)
 
-    return Experiment("planar", "1.7, 5.1, 6.5", "EKF-SLAM and SAM in the plane", jobs, report)
+
+def _report(results: Mapping[str, JobResult]) -> Findings:
+    known = {name: r.arrays for name, r in results.items() if name.startswith("known")}
+    runs = next(iter(results.values())).values["runs"]
+    low, high = anees_bounds(3, runs, 0.99)
+    comparisons = []
+    for name, arrays in known.items():
+        mean = float(arrays["nees"].mean())
+        comparisons.append(
+            Comparison(f"NEES of the last pose, {name}", "not measured", f"{mean:.2f}",
+                       f"{low:.2f} to {high:.2f}", low <= mean <= high)
+        )  # fmt: skip
+    below = all(np.all(r.arrays["smoother cost"] <= r.arrays["filter cost"] + 1e-9) for r in results.values())
+    comparisons.append(
+        Comparison("SAM's cost below the filter's", "SAM smooths the whole path",
+                   "in every run" if below else "not in every run", "in every run", below)
+    )  # fmt: skip
+    rows = [
+        [name, f"{1e3 * a['filter rmse'].mean():.0f}", f"{1e3 * a['smoother rmse'].mean():.0f}",
+         f"{a['nees'].mean():.2f}", f"{a['filter cost'].mean():.0f}", f"{a['smoother cost'].mean():.0f}",
+         f"{100 * a['wrong'].mean():.2f}", f"{a['landmarks'].mean():.1f}"]
+        for name, a in ((name, r.arrays) for name, r in results.items())
+    ]  # fmt: skip
+    header = ("association, bearing noise", "EKF RMSE mm", "SAM RMSE mm", "EKF NEES", "EKF cost", "SAM cost",
+              "wrong pairs %", "landmarks (40)")  # fmt: skip
+    arrays = results[f"unknown, {_BEARINGS[0]:g} rad"].arrays
+    return Findings(
+        comparisons,
+        [Table(f"50 samples, {runs} worlds", header, rows)],
+        [
+            Picture(_drawn(arrays, "open"), "6.5", "SAM before the loop closes."),
+            Picture(_drawn(arrays, "smoothed"), "6.6", "SAM after the loop closed."),
+            Picture(_drawn(arrays, "filter"), "6.1", "The filter on the same drive."),
+        ],
+    )
 
 
 def _drawn(arrays: Mapping[str, FloatArray], kind: str) -> Figure:

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import cv2
 
@@ -36,6 +36,7 @@ from slam_core.types import ImuSample
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
+Batches: TypeAlias = queue.Queue[tuple[list[T] | None, BaseException | None]]
 _AHEAD = 8
 """Items that may wait between two stages."""
 
@@ -84,18 +85,7 @@ def run_bag(
     with SensorBag(path, names) as bag:
         pipelines = {a: SensorPipeline(config, bag.sensors[a], odometry != "none", times) for a in bag.agents}
         mapping = Mapper(config, bag.sensors, times, growth or map_growth(config.sjsam))
-        failure = ""
-        try:
-            try:
-                for item in _ahead(_measured(bag, pipelines, on_reading, stopped), _is_of_an_image):
-                    mapping.process(item)
-            except Exception as error:
-                if not mapping.has_frames:
-                    raise
-                failure = told(error, "the run ended early")
-            mapping.finish()
-        finally:
-            mapping.stop()
+        failure = _map(mapping, _measured(bag, pipelines, on_reading, stopped))
         record = mapping.record(time.perf_counter() - start, dict(bag.left_out), failure)
         record = record.with_front_ends(
             {agent: pipeline.front_end() for agent, pipeline in pipelines.items()},
@@ -108,6 +98,23 @@ def run_bag(
                 bag, config, record, mapper=mapper, odometry=odometry, on_reading=on_reading, stopped=stopped
             )
     return result, mapping.growth
+
+
+def _map(mapping: Mapper, items: Generator[AgentItem, None, None]) -> str:
+    """Why the run ended early, if it did; an error before the first frame is raised."""
+    failure = ""
+    try:
+        try:
+            for item in _ahead(items, _is_of_an_image):
+                mapping.process(item)
+        except Exception as error:
+            if not mapping.has_frames:
+                raise
+            failure = told(error, "the run ended early")
+        mapping.finish()
+    finally:
+        mapping.stop()
+    return failure
 
 
 def _measured(
@@ -136,33 +143,36 @@ def _is_of_an_image(item: Reading | AgentItem) -> bool:
     return not isinstance(item.value if isinstance(item, AgentItem) else item, ImuReading | ImuSample)
 
 
+def _fill(
+    made: Batches[T], items: Generator[T, None, None], ends_batch: Callable[[T], bool], stopped: threading.Event
+) -> None:
+    """Put the items into the queue by batches, then None, with the error that has ended them if one has."""
+    error: BaseException | None = None
+    batch: list[T] = []
+    with closing(items):
+        try:
+            for item in items:
+                batch.append(item)
+                if not ends_batch(item):
+                    continue
+                made.put((batch, None))
+                batch = []
+                if stopped.is_set():
+                    return
+        except BaseException as caught:  # handed to the consumer, who raises it
+            error = caught
+    made.put((batch, None))
+    made.put((None, error))
+
+
 def _ahead(items: Generator[T, None, None], ends_batch: Callable[[T], bool]) -> Generator[T, None, None]:
     """The same items, made by another thread a few batches ahead of their use.
 
     Handing over wakes threads: IMU samples, ten to a frame, go together with the image that they come before.
     """
-    made: queue.Queue[tuple[list[T] | None, BaseException | None]] = queue.Queue(_AHEAD)
+    made: Batches[T] = queue.Queue(_AHEAD)
     stopped = threading.Event()
-
-    def make() -> None:
-        error: BaseException | None = None
-        batch: list[T] = []
-        with closing(items):
-            try:
-                for item in items:
-                    batch.append(item)
-                    if not ends_batch(item):
-                        continue
-                    made.put((batch, None))
-                    batch = []
-                    if stopped.is_set():
-                        return
-            except BaseException as caught:  # handed to the consumer, who raises it
-                error = caught
-        made.put((batch, None))
-        made.put((None, error))
-
-    thread = threading.Thread(target=make, name="images", daemon=True)
+    thread = threading.Thread(target=_fill, args=(made, items, ends_batch, stopped), name="images", daemon=True)
     thread.start()
     try:
         while True:

@@ -107,7 +107,7 @@ class RunResult:
 def summarise(result: RunResult) -> dict[str, Any]:
     """The content of ``summary.json``; figures against ground truth only where there is one."""
     first = result.agents[0] if result.agents else AgentResult("", EMPTY_TRAJECTORY)
-    summary: dict[str, Any] = {
+    summary = {
         "bag": result.bag,
         "mode": result.mode,
         "mapper": result.mapper,
@@ -137,6 +137,12 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "events": list(result.events),
         **_accuracy(first, first.trajectory),
     }
+    return summary | _only_some_have(result, first)
+
+
+def _only_some_have(result: RunResult, first: AgentResult) -> dict[str, Any]:
+    """Entries of the summary that runs have by their sensors and options."""
+    summary: dict[str, Any] = {}
     if len(first.scan_odometry):
         summary["scan_odometry"] = {
             "path_length_m": first.scan_odometry.length_m,

@@ -133,21 +133,10 @@ def run_result(
         _agent_result(bag, config, agent, odometry, record.trajectories.get(agent, []), of_agent)
         for agent, of_agent in record.agents.items()
     )
-    surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
-    try:
-        corrections = {agent: known.front_end.correction for agent, known in record.agents.items()}
-        model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading, stopped, corrections)
-        if not stopped():
-            surface = model.surface()
-            model.release_field()
-            plans = model.floor_plans(surface)
-    except Exception as error:  # what was mapped is worth more than its picture
-        failure = failure or told(error, "no dense model was made")
+    surface, plans, failure = _dense(bag, config, record, agents, on_reading, stopped)
     landmarks = record.global_map.landmarks()
     stamps = [agent.filtered.stamps_ns for agent in agents if len(agent.filtered)]
-    events = (*(failure,) * bool(failure), *bag.warnings, *record.events, *_events(record.agents))
-    for event in events:
-        _LOG.info("%s", event)
+    events = _logged((*(failure,) * bool(failure), *bag.warnings, *record.events, *_events(record.agents)))
     return RunResult(
         bag=bag.reader.path.name,
         mode=config.feature_extractor.mode,
@@ -179,6 +168,34 @@ def told(error: Exception, consequence: str) -> str:
     _LOG.debug(consequence, exc_info=error)
     kind = "" if isinstance(error, ValueError | OSError) else f"{type(error).__name__}: "
     return f"{consequence}: {kind}{error}"
+
+
+def _logged(events: tuple[str, ...]) -> tuple[str, ...]:
+    for event in events:
+        _LOG.info("%s", event)
+    return events
+
+
+def _dense(
+    bag: SensorBag,
+    config: SystemConfig,
+    record: RunRecord,
+    agents: tuple[AgentResult, ...],
+    on_reading: Callable[[], None],
+    stopped: Callable[[], bool],
+) -> tuple[Surface, tuple[FloorPlan, ...], str]:
+    """The dense model's surface and floor plans, and why the run or the model failed, if so."""
+    surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
+    try:
+        corrections = {agent: known.front_end.correction for agent, known in record.agents.items()}
+        model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading, stopped, corrections)
+        if not stopped():
+            surface = model.surface()
+            model.release_field()
+            plans = model.floor_plans(surface)
+    except Exception as error:  # what was mapped is worth more than its picture
+        failure = failure or told(error, "no dense model was made")
+    return surface, plans, failure
 
 
 def _agent_result(

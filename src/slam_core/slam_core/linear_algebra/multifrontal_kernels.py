@@ -17,9 +17,21 @@ from slam_core.linear_algebra.blas_kernels import cholesky, solve_right, subtrac
 
 
 @njit(cache=True, nogil=True)
+def _number_slots(symbolic, s, slot):
+    """Fill ``slot`` with the place of each block in the front of supernode ``s``: its columns, then its rows."""
+    _, _, width, start, column_ptr, row_ptr, rows, _, eliminated, _, _ = symbolic
+    for c in range(column_ptr[s], column_ptr[s + 1]):
+        slot[c] = start[c] - start[column_ptr[s]]
+    below = eliminated[s]
+    for k in range(row_ptr[s], row_ptr[s + 1]):
+        slot[rows[k]] = below
+        below += width[rows[k]]
+
+
+@njit(cache=True, nogil=True)
 def factorize(values, entries, symbolic, panels, stack):
     """Eliminate front after front; what a front leaves over waits on the stack for its parent."""
-    _, _, width, start, column_ptr, row_ptr, rows, size, eliminated, panel_ptr, parent = symbolic
+    _, _, width, _, _, row_ptr, rows, size, eliminated, panel_ptr, parent = symbolic
     supernodes = len(size)
     slot = np.empty(len(width), np.int64)
     latest, earlier = np.full(supernodes, -1, np.int64), np.full(supernodes, -1, np.int64)
@@ -27,12 +39,7 @@ def factorize(values, entries, symbolic, panels, stack):
     for s in range(supernodes):
         m, w = size[s], eliminated[s]
         h = m - w
-        for c in range(column_ptr[s], column_ptr[s + 1]):
-            slot[c] = start[c] - start[column_ptr[s]]
-        below = w
-        for k in range(row_ptr[s], row_ptr[s + 1]):
-            slot[rows[k]] = below
-            below += width[rows[k]]
+        _number_slots(symbolic, s, slot)
         P = panels[panel_ptr[s] : panel_ptr[s + 1]].reshape((m, w))
         P[:] = 0.0
         _assemble(values, entries, symbolic, s, slot, P)
@@ -217,13 +224,27 @@ def unit_columns(symbolic, panels, position):
 
 
 @njit(cache=True, nogil=True)
+def _part_of_parent(above, rows, width, slot, h):
+    """Rows and columns (h, h) of the parent's front of the inverse that belong to a child."""
+    source, target, length = _runs(rows, width, slot)
+    known = np.empty((h, h))
+    for a in range(len(source)):
+        for i in range(length[a]):
+            for b in range(len(source)):
+                known[source[a] + i, source[b] : source[b] + length[b]] = above[
+                    target[a] + i, target[b] : target[b] + length[b]
+                ]
+    return known
+
+
+@njit(cache=True, nogil=True)
 def invert(symbolic, panels, inverse, stack):
     """Panels of the inverse, from the root down.
 
     With ``Y = L_IJ L_JJ^-1`` the front of the inverse is ``Z_IJ = -Z_II Y`` and ``Z_JJ = L_JJ^-T L_JJ^-1 - Y^T Z_IJ``;
     ``Z_II`` is part of the parent's front.
     """
-    _, _, width, start, column_ptr, row_ptr, rows, size, eliminated, panel_ptr, parent = symbolic
+    _, _, width, _, _, row_ptr, rows, size, eliminated, panel_ptr, parent = symbolic
     supernodes = len(size)
     children, at = np.zeros(supernodes, np.int64), np.zeros(supernodes, np.int64)
     for s in range(supernodes):
@@ -238,21 +259,9 @@ def invert(symbolic, panels, inverse, stack):
         triangle = _inverse_of_lower(panels[panel_ptr[s] : panel_ptr[s + 1]].reshape((m, w)), 0, w)
         corner = np.dot(triangle.T, triangle)
         if p >= 0:
-            for c in range(column_ptr[p], column_ptr[p + 1]):
-                slot[c] = start[c] - start[column_ptr[p]]
-            below = eliminated[p]
-            for k in range(row_ptr[p], row_ptr[p + 1]):
-                slot[rows[k]] = below
-                below += width[rows[k]]
+            _number_slots(symbolic, p, slot)
             above = stack[at[p] : at[p] + size[p] * size[p]].reshape((size[p], size[p]))
-            source, target, length = _runs(rows[row_ptr[s] : row_ptr[s + 1]], width, slot)
-            known = np.empty((h, h))
-            for a in range(len(source)):
-                for i in range(length[a]):
-                    for b in range(len(source)):
-                        known[source[a] + i, source[b] : source[b] + length[b]] = above[
-                            target[a] + i, target[b] : target[b] + length[b]
-                        ]
+            known = _part_of_parent(above, rows[row_ptr[s] : row_ptr[s + 1]], width, slot, h)
             children[p] -= 1
             if children[p] == 0:
                 top = at[p]

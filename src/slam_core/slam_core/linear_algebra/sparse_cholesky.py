@@ -296,15 +296,7 @@ def takahashi(indptr, indices, data):  # type: ignore[no-untyped-def]
         w = last - first
         rows = indices[indptr[first] + w : indptr[first + 1]]
         h = len(rows)
-        for k in range(h):
-            slot[rows[k]] = k
-        Z = np.zeros((h, h))
-        for k in range(h):
-            for p in range(indptr[rows[k]], indptr[rows[k] + 1]):
-                s = slot[indices[p]]
-                if s >= 0:
-                    Z[s, k] = out[p]
-                    Z[k, s] = out[p]
+        Z = _gather_square(indptr, indices, out, rows, slot)
         top, below = np.zeros((w, w)), np.zeros((h, w))
         for j in range(w):
             start = indptr[first + j]
@@ -318,10 +310,24 @@ def takahashi(indptr, indices, data):  # type: ignore[no-untyped-def]
             start = indptr[first + j]
             out[start : start + w - j] = Z_JJ[j:, j]
             out[start + w - j : indptr[first + j + 1]] = Z_IJ[:, j]
-        for k in range(h):
-            slot[rows[k]] = -1
         last = first
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather_square(indptr, indices, values, rows, slot):  # type: ignore[no-untyped-def]
+    """Symmetric (h, h) of the entries in ``rows`` and their columns; ``slot`` is all -1 before and after."""
+    Z = np.zeros((len(rows), len(rows)))
+    for k in range(len(rows)):
+        slot[rows[k]] = k
+    for k in range(len(rows)):
+        for p in range(indptr[rows[k]], indptr[rows[k] + 1]):
+            s = slot[indices[p]]
+            if s >= 0:
+                Z[s, k] = values[p]
+                Z[k, s] = values[p]
+    slot[rows] = -1
+    return Z
 
 
 @numba.njit(cache=True, nogil=True)
