@@ -19,6 +19,7 @@ setup(
         "slam_core",
         "numba",
         "numpy",
+        "plyfile",
         "scipy",
         "PyYAML",
     ],

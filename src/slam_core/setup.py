@@ -20,6 +20,7 @@ setup(
         "numba",
         "numpy",
         "opencv-python-headless",
+        "plyfile",
         "PyYAML",
         "scipy",
     ],

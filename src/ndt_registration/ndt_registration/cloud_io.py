@@ -7,21 +7,18 @@ Files without z hold clouds in the plane. A laser scan is the YAML of a sensor_m
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import plyfile
 import yaml
 
 from ndt_registration.lzf import lzf_decompress
 from slam_core.geometry import FloatArray
 from slam_core.messages import points_from_scan
 
-PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16":
-    "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8",
-    "float64": "f8",
-}  # fmt: skip
 VTK_TYPES = {"float": ">f4", "double": ">f8"}
 
 
@@ -102,39 +99,13 @@ def _pcd_compressed(body: bytes, count: int, names: list[str], layout: np.dtype[
 
 
 def read_ply(content: bytes) -> FloatArray:
-    """Vertices of a PLY file, ascii or binary of either byte order; the vertices must be the first element."""
-    end = content.find(b"end_header")
-    if not content.startswith(b"ply") or end < 0:
-        raise ValueError("no PLY header")
-    body = content[content.index(b"\n", end) + 1 :]
-    encoding, count, properties = _ply_vertices(content[:end].decode("ascii", errors="replace").splitlines())
-    names = [name for name, _ in properties]
-    axes = _axes(names)
-    if encoding == "ascii":
-        return _ascii_columns(body, count, len(names), [names.index(axis) for axis in axes])
-    order = {"binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
-    layout = np.dtype([(name, order + kind) for name, kind in properties])
-    records = np.frombuffer(_exactly(body, count * layout.itemsize), dtype=layout)
-    return np.column_stack([records[axis] for axis in axes]).astype(np.float64)
-
-
-def _ply_vertices(lines: list[str]) -> tuple[str, int, list[tuple[str, str]]]:
-    encoding, count, properties, elements = "", -1, [], 0
-    for words in (line.split() for line in lines):
-        if words[:1] == ["format"]:
-            encoding = words[1]
-        elif words[:1] == ["element"]:
-            elements += 1
-            if elements == 1 and words[1] != "vertex":
-                raise ValueError(f"the first element is '{words[1]}', not 'vertex'")
-            count = int(words[2]) if elements == 1 else count
-        elif words[:1] == ["property"] and elements == 1:
-            if words[1] == "list":
-                raise ValueError("vertices with lists are not supported")
-            properties.append((words[2], PLY_TYPES[words[1]]))
-    if count < 0:
-        raise ValueError("no vertices")
-    return encoding, count, properties
+    """Vertices of a PLY file, ascii or binary of either byte order."""
+    try:
+        vertices = plyfile.PlyData.read(io.BytesIO(content))["vertex"]
+    except plyfile.PlyParseError as error:
+        raise ValueError(str(error)) from error
+    axes = _axes([p.name for p in vertices.properties])
+    return np.column_stack([vertices[axis] for axis in axes]).astype(np.float64)
 
 
 def read_vtk(content: bytes) -> FloatArray:

@@ -242,7 +242,7 @@ def _anees(
     matched: Trajectory, true_poses: FloatArray, accuracy: TruthAccuracy
 ) -> tuple[float, float, float] | tuple[None, None, None]:
     """ANEES and its bounds, or None where the trajectory has no covariances."""
-    values = [] if matched.covariances is None else pose_nees(matched, true_poses, accuracy)
+    values = np.empty(0) if matched.covariances is None else pose_nees(matched, true_poses, accuracy)
     if not len(values):
         return None, None, None
     return float(np.mean(values) / 6.0), *anees_bounds(6, len(values))

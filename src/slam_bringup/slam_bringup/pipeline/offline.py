@@ -101,7 +101,7 @@ def run_bag(
 
 
 def _map(mapping: Mapper, items: Generator[AgentItem, None, None]) -> str:
-    """Why the run ended early, if it did; an error before the first frame is raised."""
+    """Map all items; the reason is returned if an error ended the run early, and raised before the first frame."""
     failure = ""
     try:
         try:
