@@ -3,7 +3,8 @@
 
 ``my.bag``, ``d435.bag`` ... are the first second of bags/demo, on the topics that the commands name; where a topic is
 called rectified, its images are. ``truth.tum`` is the demo's truth, ``V1_01_easy`` a data set of its images, and
-``left_*.png`` are pictures of a board. The tutorial runs with the whole demo, in ``test_docs.py``.
+``left_*.png``, ``left/`` and the like are pictures of a board. The tutorial runs with the whole demo, in
+``test_docs.py``.
 
 :data:`NOT_RUN` holds what does not run here, and the reason.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 from glob import glob
 from itertools import islice
 from pathlib import Path
@@ -21,6 +23,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from calibration_folder import write_calibrations
 from slam_bringup.bags.bag import BagReader, BagWriter
 from slam_bringup.bags.readings import DepthReading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
@@ -43,6 +46,7 @@ NOT_RUN = {
     r"\./slam (demo|test|setup)": "makes the environment that runs this test; the demo runs in test/integration",
     r"\./slam nodes": "starts processes; test/integration/test_executables.py runs it",
     r"\./slam view": "serves a page until Ctrl-C; test/slam_bringup/viewer looks at it",
+    r"\./slam live ": "needs a camera",
     r"docker ": "needs a Docker daemon",
     r"source |rosdep |colcon |pip |ros2 bag ": "needs a ROS installation or the network",
     r"ros2 launch (realsense2_camera|depthai_ros_driver|zed_wrapper)|ros2 param ": "needs a vendor's driver and camera",
@@ -115,6 +119,14 @@ def prepare(line: str, request: pytest.FixtureRequest) -> None:
         write_bag(path, topics)
     if "V1_01_easy" in words:
         write_euroc(Path("V1_01_easy"))
+    if "calibrate" in words and words[3].endswith("/"):
+        for source, folder in zip(("left", "right"), words[3:5], strict=True):
+            Path(folder).mkdir()
+            for jpg in request.getfixturevalue("data_dir").glob(f"calib_opencv_left_right/{source}0[1-8].jpg"):
+                shutil.copy(jpg, folder)
+    if "run" in words and "--calibration" in words:
+        shutil.rmtree("calibration")  # the board's pictures are not those of the demo's cameras
+        write_calibrations(DEMO, Path("calibration"))
     if "left_*.png" in words:
         for jpg in sorted(request.getfixturevalue("data_dir").glob("calib_opencv_left_right/*0[1-8].jpg")):
             assert cv2.imwrite(jpg.stem.replace("0", "_0") + ".png", cv2.imread(str(jpg)))

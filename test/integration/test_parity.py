@@ -10,8 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration_folder import write_calibrations
 from slam_bringup.bags.bag import BagReader, BagWriter
+from slam_bringup.bags.rig_calibration import read_rig_calibration
 from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.bags.sensor_writer import IMU_FRAME, SensorWriter
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
@@ -62,15 +65,20 @@ def turn_rates(start_ns: int) -> deque[ImuSample]:
 
 
 @pytest.mark.parametrize(
-    ("mode", "odometry", "composed"), [("stereo", "none", False), ("fuse", "ndt", False), ("fuse", "ndt", True)]
+    ("mode", "odometry", "composed", "calibrated"),
+    [("stereo", "none", False, False), ("fuse", "ndt", False, True), ("fuse", "ndt", True, False)],
 )
 def test_nodes_and_the_offline_pipeline_agree(
-    domain_environment: dict[str, str], short_bag: Path, tmp_path: Path, mode: str, odometry: str, composed: bool
-) -> None:
+    domain_environment: dict[str, str], short_bag: Path, tmp_path: Path, mode: str, odometry: str, composed: bool,
+    calibrated: bool,
+) -> None:  # fmt: skip
     config = choose(load_system_config(None), mode, "sjsam", odometry)
-    run = run_nodes(short_bag, config, tmp_path, odometry=odometry != "none", composed=composed)
-    online, _ = collect(short_bag, config, run, mapper="sjsam", odometry=odometry)
-    offline, _ = run_bag(short_bag, config, odometry=odometry)
+    folders = write_calibrations(DEMO, tmp_path / "calibration") if calibrated else ()
+    names = BagNames(calibration=read_rig_calibration(folders))
+    out = tmp_path / "out"
+    run = run_nodes(short_bag, config, out, odometry=odometry != "none", composed=composed, names=names)
+    online, _ = collect(short_bag, config, run, mapper="sjsam", odometry=odometry, names=names)
+    offline, _ = run_bag(short_bag, config, odometry=odometry, names=names)
     assert set(run.exit_codes.values()) == {0}, run.exit_codes
     assert sum(online.dropped.values()) == 0, online.dropped
     assert (online.frames, online.submaps) == (offline.frames, offline.submaps)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -139,6 +140,20 @@ def test_a_node_reports_at_once_that_its_inputs_are_connected(node: EarNode, mon
         monkeypatch.setattr(node, "_unconnected", lambda topics=unconnected: topics)
         node._report_connections()
     assert reported == ["/frames", ""]
+
+
+def test_another_publisher_of_what_a_node_alone_should_say_is_reported(node: EarNode) -> None:
+    node.advertise("info", "CameraInfo", alone=True)
+    node.advertise("image", "Image")
+    assert node._rivals() == ""
+    rival = rclpy.create_node("rival")
+    rival.create_publisher(node.types.CameraInfo, "info", 1)
+    rival.create_publisher(node.types.Image, "image", 1)
+    end = time.monotonic() + 60.0
+    while not node._rivals() and time.monotonic() < end:
+        time.sleep(0.05)
+    assert node._rivals() == "info is published by /rival too: remap it there"
+    rival.destroy_node()
 
 
 def test_gaps_of_the_stamps_are_counted(node: EarNode) -> None:

@@ -81,6 +81,7 @@ class SlamNode(TransformNode, Generic[C]):
         self._synchronizers: list[StampSynchronizer[Message]] = []
         self._outputs: dict[str, Any] = {}
         self._latched: set[str] = set()
+        self._alone: set[str] = set()
         self._silent = False
         self._skipped = 0
         self._held_back = False
@@ -148,12 +149,18 @@ class SlamNode(TransformNode, Generic[C]):
                 topic, type_name, lambda stamp, m, t=topic: pairs.add(t, stamp, m), latched, required, stamps
             )
 
-    def advertise(self, topic: str, type_name: str, *, latched: bool = False, depth: int | None = None) -> None:
-        """Offer a topic: reliable; ``latched`` ones (maps) keep what they sent for those who come later."""
+    def advertise(
+        self, topic: str, type_name: str, *, latched: bool = False, depth: int | None = None, alone: bool = False
+    ) -> None:
+        """Offer a topic: reliable; ``latched`` ones (maps) keep what they sent for those who come later.
+
+        ``alone``: another publisher of the same topic is reported, since those who listen could not tell them apart.
+        """
         depth = depth or (LATCHED_DEPTH if latched else self.input_config.depth)
         kind = getattr(self._ros_types, type_name)
         self._outputs[topic] = self.create_publisher(kind, topic, sensor_qos(depth, latched))
         self._latched |= {topic} if latched else set()
+        self._alone |= {topic} if alone else set()
         if self._exchange is not None:
             self._exchange.advertise(self.resolve_topic_name(topic))
 
@@ -326,11 +333,22 @@ class SlamNode(TransformNode, Generic[C]):
 
     def _tick(self) -> None:
         self._match_publishers()
-        silence = self._silence()
+        silence = "; ".join(filter(None, (self._silence(), self._rivals())))
         if silence and not self._silent:
             self.get_logger().warning(silence)
         self._silent = bool(silence)
         self._diagnostics.publish(self._diagnostic_message(silence))
+
+    def _rivals(self) -> str:
+        """Other nodes that publish what only this one should, or ""."""
+        texts = []
+        for topic in sorted(self._alone):
+            publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
+            others = {f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers}
+            others -= {self.get_fully_qualified_name()}
+            if others:
+                texts.append(f"{topic} is published by {', '.join(sorted(others))} too: remap it there")
+        return "; ".join(texts)
 
     def _report_connections(self) -> None:
         """Whoever waits for the nodes learns at once that one is there, and when its inputs are connected."""

@@ -18,9 +18,12 @@ class FrameTree:
         self._parents: dict[str, str] = {}
 
     def add(self, parent: str, child: str, T_parent_child: FloatArray) -> None:
-        """Set or replace one transform (4, 4)."""
+        """Set or replace one transform (4, 4); a frame has one parent, so that an earlier one is forgotten."""
         if not is_rigid_transform(T_parent_child):
             raise ValueError(f"transform {parent} <- {child} is not rigid: {T_parent_child.tolist()}")
+        earlier = self._parents.get(child, parent)
+        if earlier != parent:
+            del self._neighbours[earlier][child], self._neighbours[child][earlier]
         self._parents[child] = parent
         self._neighbours.setdefault(parent, {})[child] = T_parent_child
         self._neighbours.setdefault(child, {})[parent] = invert_transform(T_parent_child)

@@ -37,6 +37,7 @@ from stereo_frontend.calibrated_pairs import SIDES
 from stereo_frontend.sources import FolderSource, RawPair, SideBySideSource
 from stereo_frontend.stage import StereoStage
 
+_INFO_TOPIC = "stereo/{}/camera_info"
 _COLOUR_TOPIC = "stereo/left/image_rect_color"
 
 
@@ -72,6 +73,8 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
             self.advertise(f"stereo/{side}/image_rect", "Image")
             self.create_service(SetCameraInfo, f"stereo/{side}/set_camera_info", partial(self._on_set_info, side))
         self.advertise(_COLOUR_TOPIC, "Image")
+        for side in filter(self.files.get, SIDES):
+            self.advertise(_INFO_TOPIC.format(side), "CameraInfo", alone=True)
         self.source = None if self.config.source == "topics" else self._open_source()
         if self.source is None:
             self._listen_to_topics()
@@ -129,7 +132,6 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
     def _start_source(self, rate: float) -> None:
         for side in SIDES:
             self.advertise(f"stereo/{side}/image_raw", "Image")
-            self.advertise(f"stereo/{side}/camera_info", "CameraInfo")
         self._timer = self.create_timer(1.0 / (self.config.rate or rate), self._on_timer)
 
     def _on_timer(self) -> None:
@@ -147,25 +149,26 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
 
     def _publish_pair(self, pair: RawPair) -> None:
         frames = self.config.left_frame, self.config.right_frame
-        infos = self.stage.infos
-        assert infos is not None
         left = pair.left if pair.colour is None else pair.colour
-        for side, frame, image, info in zip(SIDES, frames, (left, pair.right), infos, strict=True):
+        for side, frame, image in zip(SIDES, frames, (left, pair.right), strict=True):
             header = header_message(self.types, pair.stamp_ns, frame)
             encoding = "mono8" if image.ndim == 2 else "rgb8"
             self.publish(f"stereo/{side}/image_raw", image_message(self.types, header, image, encoding))
-            self.publish(f"stereo/{side}/camera_info", camera_info_message(self.types, header, info))
         self.stage.add(replace(pair, frame_id=self.config.left_frame))
         self._publish_rectified()
 
     # -- both ----------------------------------------------------------------------------------------------------------
 
     def _publish_rectified(self) -> None:
-        """Both rectified images have the left one's stamp: they are one instant."""
+        """Both rectified images, with the left one's stamp: they are one instant; camera infos that come from files."""
         for images in self.stage.ready():
             frames = images.frame_id, self.right_frame
-            for side, frame, image in zip(SIDES, frames, (images.left, images.right), strict=True):
+            infos = self.stage.infos
+            assert infos is not None
+            for side, frame, image, info in zip(SIDES, frames, (images.left, images.right), infos, strict=True):
                 header = header_message(self.types, images.stamp_ns, frame)
+                if self.files[side]:
+                    self.publish(_INFO_TOPIC.format(side), camera_info_message(self.types, header, info))
                 self.publish(f"stereo/{side}/image_rect", image_message(self.types, header, image))
             if images.colour is not None:
                 header = header_message(self.types, images.stamp_ns, images.frame_id)

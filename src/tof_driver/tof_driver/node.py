@@ -98,7 +98,7 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
         self.advertise(_COLOUR, "Image")
         used = tuple(topic for topic in DEPTH_TOPICS if topic not in unused)
         for topic in used:
-            self.advertise(topic, DEPTH_TOPICS[topic])
+            self.advertise(topic, DEPTH_TOPICS[topic], alone=topic == "tof/camera_info")
         return used
 
     def _listen_to_inputs(self) -> None:

@@ -45,6 +45,7 @@ def test_stereo_writes_what_the_drivers_read(data_dir: Path, tmp_path: Path) -> 
         *expected,
         "board_poses.png",
         "calibration.yaml",
+        "extrinsics.urdf",
         ".slam.json",
     }
     assert "left01.jpg | 54 | 54" in (tmp_path / "report.md").read_text()

@@ -19,6 +19,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from slam_bringup.bags.bag import BagReader, RawMessage
+from slam_bringup.bags.extrinsics import StaticTransform
 from slam_bringup.bags.pacing import Audience, Connections, FlowControl, ReplayClock, header_stamp_ns
 from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.config import Config, parameter
@@ -54,6 +55,9 @@ class PlayerConfig(Config):
     subscribers: tuple[str, ...] = parameter(
         (), "'<topic>=<number>' as published: do not begin before it has so many subscribers, or patience runs out"
     )
+    transforms: tuple[str, ...] = parameter(
+        (), "'<parent> <child> x y z qx qy qz qw': static transforms instead of the bag's"
+    )
     nodes: tuple[str, ...] = parameter(
         (), "full names: do not begin before these nodes have all inputs connected, or patience runs out"
     )
@@ -71,6 +75,7 @@ class BagPlayerNode(Node):
         self._flow = FlowControl(self.config.pace, self.config.window, self.config.patience)
         self._audience = Audience(self.config.subscribers)
         self._connections = Connections()
+        self._transforms = [StaticTransform.parse(text) for text in self.config.transforms]
         self._names = dict(pair.split("=", 1) for pair in self.config.rename)
         self._stop = threading.Event()
         self._start = threading.Event()
@@ -180,11 +185,15 @@ class BagPlayerNode(Node):
 
     def _send_static_transforms(self) -> None:
         """Transforms first, as ``static_transforms``: what comes later needs them."""
+        own = {t.child for t in self._transforms}
         topics = [t for t in self._reader.topics if t.endswith("/tf_static")]
         for _, _, message in self._reader.messages(topics):
             for transform in message.transforms:
                 parent, child, T = transform_from_message(transform)
-                self._static_output.publish(transform_message(self._types, stamp_ns(transform), parent, child, T))
+                if child not in own:
+                    self._static_output.publish(transform_message(self._types, stamp_ns(transform), parent, child, T))
+        for t in self._transforms:
+            self._static_output.publish(transform_message(self._types, 0, t.parent, t.child, t.T))
 
     def _wait_for_subscribers(self) -> None:
         """Until nobody new has subscribed for a second: what is sent before discovery ends is lost to latecomers."""

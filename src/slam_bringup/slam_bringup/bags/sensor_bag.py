@@ -21,7 +21,7 @@ message that is broken, has no partner, or is older than what came before it is 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Self
@@ -39,6 +39,7 @@ from slam_bringup.bags.readings import (
     Reading,
     StereoReading,
 )
+from slam_bringup.bags.rig_calibration import RigCalibration
 from slam_bringup.bags.sensor_topics import BagNames, find_agents, is_rectified, join, topics_of
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
@@ -126,6 +127,11 @@ class SensorBag:
             self._warnings.append(text)
 
     @property
+    def calibration(self) -> RigCalibration:
+        """The calibration that a user gives instead of the bag's."""
+        return self._names.calibration
+
+    @property
     def warnings(self) -> list[str]:
         """Warnings about this bag, as far as it has been read."""
         return self._warnings + [self.reader.warning] * bool(self.reader.warning)
@@ -156,6 +162,8 @@ class SensorBag:
 
     def _find_sensors(self) -> dict[str, AgentSensors]:
         tree = self._read_frames()
+        if self._names.calibration.is_given and len(self.agents) > 1:
+            raise ValueError(f"a calibration is that of one rig, and {self.reader.path} has {len(self.agents)}")
         return {agent: self._sensors_of(agent, tree) for agent in self.agents}
 
     def _sensors_of(self, agent: str, tree: FrameTree) -> AgentSensors:
@@ -168,6 +176,8 @@ class SensorBag:
         left, left_frame = self._camera_info(topics, "left", "left_info")
         right, _ = self._camera_info(topics, "right", "right_info")
         tof, tof_frame = self._camera_info(topics, "depth", "tof_info")
+        for transform in self._names.calibration.transforms(left_frame, tof_frame):
+            tree.add(transform.parent, transform.child, transform.T)
         base = self._base_frame(agent, tree, left_frame or tof_frame)
         return AgentSensors(agent, left, right, tof, measurement, tree, left_frame, tof_frame, base, topics)
 
@@ -190,6 +200,10 @@ class SensorBag:
         if role not in topics:
             return None, ""
         topic = topics[info_role]
+        if (given := self._names.calibration.info("tof" if role == "depth" else role)) is not None:
+            if role != "depth" and is_rectified(topics[role]):
+                raise ValueError(f"the images on {topics[role]} are rectified: a calibration is for raw images")
+            return given, self._frame_of((topic, topics[role]))
         for _, _, message in self.reader.messages([topic]):
             info = camera_info_from_message(message)
             if role != "depth" and is_rectified(topics[role]):
@@ -199,6 +213,12 @@ class SensorBag:
             f"{self.reader.path} has images but no camera info on {topic}: record it (slam calibrate makes one), or "
             f"say where it is: --topic {info_role}=/..."
         )
+
+    def _frame_of(self, topics: Sequence[str]) -> str:
+        """Frame of the first message on the first of the topics that has one."""
+        present = [topic for topic in topics if topic in self.reader.topics]
+        messages = (m for topic in present for _, _, m in self.reader.messages([topic]))
+        return next((str(m.header.frame_id) for m in messages), "")
 
     def _read_frames(self) -> FrameTree:
         tree = FrameTree()

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
+from slam_bringup.bags.rig_calibration import RigCalibration
+
 _LEFT = ("stereo/left/image_raw", "stereo/left/image_rect", "stereo/left/image_raw/compressed")
 _CANDIDATES = {
     "left": _LEFT,
@@ -31,7 +33,7 @@ ROLES = (*_CANDIDATES, *_INFO_OF)
 
 @dataclass(frozen=True)
 class BagNames:
-    """Names of a bag that differ from those of the nodes.
+    """Names of a bag that differ from those of the nodes, and a calibration instead of its own.
 
     topics: by role. base_frame: the frame whose poses are wanted; "": ``base_link``, or where there is none the root
     above the camera in the tree of frames.
@@ -39,6 +41,7 @@ class BagNames:
 
     topics: Mapping[str, str] = field(default_factory=dict)
     base_frame: str = ""
+    calibration: RigCalibration = field(default_factory=RigCalibration)
 
 
 def parse_topics(assignments: Iterable[str]) -> dict[str, str]:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import click
 import numpy as np
-import yaml
 
 from slam_bringup.bags.bag_calibration import FILE_NAME
+from slam_bringup.bags.extrinsics import EXTRINSICS, URDF, extrinsics_text, extrinsics_urdf
 from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.commands.refine import refine, write_refined
@@ -34,7 +34,7 @@ from slam_calibration.rig import calibrate
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.files import atomic_text
-from slam_core.geometry import both_halves, make_transform, quaternion_from_rotation
+from slam_core.geometry import FloatArray, both_halves, make_transform
 from slam_core.output_folder import OutputFolder
 
 CAMERAS = {"mono": ("camera",), "stereo": ("left", "right"), "stereo-tof": ("left", "tof")}
@@ -130,7 +130,10 @@ def _write(
     for c, (name, info) in enumerate(zip(names, infos, strict=True)):
         CameraInfoFile(info, name, camera_deviations(result, c)).write(output / f"{name}.yaml")
     if len(names) > 1:
-        atomic_text(output / "extrinsics.yaml", _extrinsics(result, names, infos))
+        T, covariance = _extrinsics(result, infos)
+        frames = FRAMES[names[0]], FRAMES[names[1]]
+        atomic_text(output / EXTRINSICS, extrinsics_text(*frames, T, covariance))
+        atomic_text(output / URDF, extrinsics_urdf(*frames, T))
     if kind == "stereo":
         error = length_error(result.rig.cameras, result.covariance)
         atomic_text(output / FILE_NAME, parameter_file(error))
@@ -150,23 +153,12 @@ def _infos(kind: str, result: BundleResult, rectified_left: CameraInfo | None) -
     return infos
 
 
-def _extrinsics(result: BundleResult, names: Sequence[str], infos: Sequence[CameraInfo]) -> str:
-    """The static transform between the *rectified* optical frames, those that the nodes' images are in."""
+def _extrinsics(result: BundleResult, infos: Sequence[CameraInfo]) -> tuple[FloatArray, FloatArray]:
+    """Transform and covariance between the *rectified* optical frames, those that the nodes' images are in."""
     T, covariance = extrinsics_of(result, 1)
     rotate = both_halves(infos[0].R)
     T = make_transform(infos[0].R, np.zeros(3)) @ T @ make_transform(infos[1].R.T, np.zeros(3))
-    covariance = rotate @ covariance @ rotate.T
-    document = {
-        "parent_frame": FRAMES[names[0]],
-        "child_frame": FRAMES[names[1]],
-        "translation_m": T[:3, 3].tolist(),
-        "rotation_xyzw": quaternion_from_rotation(T[:3, :3]).tolist(),
-        "standard_deviations": dict(
-            zip(("x", "y", "z", "rx", "ry", "rz"), np.sqrt(np.diag(covariance)).tolist(), strict=True)
-        ),
-        "covariance": covariance.tolist(),
-    }
-    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
+    return T, rotate @ covariance @ rotate.T
 
 
 def _picture_table(result: BundleResult, views: BoardViews) -> str:

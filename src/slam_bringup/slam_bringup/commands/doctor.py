@@ -13,8 +13,9 @@ from pathlib import Path
 
 import click
 
+from slam_bringup.bags.rig_calibration import read_rig_calibration
 from slam_bringup.bags.sensor_topics import ROLES, BagNames, parse_topics
-from slam_bringup.commands.paths import UserPath
+from slam_bringup.commands.paths import UserPath, calibration_option
 from slam_bringup.doctor.examination import CHECKS, examine
 from slam_bringup.doctor.finding import Finding
 from slam_bringup.processes.node_arguments import ros_arguments
@@ -40,10 +41,17 @@ _START_S = 60.0
     metavar="ROLE=TOPIC",
     help=f"a topic that is not named like the nodes' (may be repeated); roles: {', '.join(ROLES)}",
 )
+@calibration_option()
 @click.option("--base-frame", default="", metavar="FRAME", help="the rig's frame [base_link]")
 @click.option("--json", "as_json", is_flag=True, help="print the findings as JSON")
 def command(
-    bag: Path | None, live: bool, seconds: float, topics: tuple[str, ...], base_frame: str, as_json: bool
+    bag: Path | None,
+    live: bool,
+    seconds: float,
+    topics: tuple[str, ...],
+    calibrations: tuple[Path, ...],
+    base_frame: str,
+    as_json: bool,
 ) -> None:
     """Check the topics, stamps, calibration, frames and images of BAG, or of what is published now (--live).
 
@@ -51,7 +59,7 @@ def command(
     """
     if (bag is None) != live:
         raise ValueError("name a bag, or say --live")
-    names = BagNames(parse_topics(topics), base_frame)
+    names = BagNames(parse_topics(topics), base_frame, read_rig_calibration(calibrations))
     findings = examine(bag, names) if bag is not None else examine_live(seconds, names)
     click.echo(json.dumps([asdict(f) for f in findings], indent=2) if as_json else _text(findings))
     sys.exit(FAULTS if findings else 0)

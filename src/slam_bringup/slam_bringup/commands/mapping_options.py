@@ -11,7 +11,7 @@ import click
 
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import ROLES
-from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_bringup.commands.paths import UserPath, calibration_option, overwrite_option
 from slam_bringup.pipeline.configuration import MAPPERS, ODOMETRIES
 from slam_bringup.pipeline.results import RunResult
 from stereo_frontend.frontend import MODES
@@ -36,6 +36,7 @@ _OPTIONS = (
         "--topic", "topics", multiple=True, metavar="ROLE=TOPIC",
         help=f"a topic that is not named like the nodes' (may be repeated); roles: {', '.join(ROLES)}",
     ),
+    calibration_option(),
     click.option(
         "--base-frame", default="", metavar="FRAME",
         help="the frame whose poses are wanted [base_link; else the root above the camera]",

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from slam_bringup.bags.rig_calibration import read_rig_calibration
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, parse_topics
 from slam_bringup.commands.console import LOG_NAME, Transcript, progress_bar, show
@@ -18,7 +19,7 @@ from slam_bringup.commands.mapping_options import (
     require_map,
 )
 from slam_bringup.doctor.examination import require_stereo
-from slam_bringup.pipeline.configuration import choose, overrides_for, system_config
+from slam_bringup.pipeline.configuration import choose, overrides_for, system_config, with_files
 from slam_bringup.pipeline.overrides import Overrides, read_overrides
 from slam_bringup.processes.interrupt import INTERRUPTED, MAP, Interrupt, giving_up
 from slam_bringup.processes.online_run import run_nodes
@@ -37,14 +38,16 @@ _PAGE_PORT = 8080
 @click.option("--composed", is_flag=True, help="all nodes in one process, on a thread each")
 def command(
     bag: Path, output: Path, rate: float, mode: str | None, mapper: str, odometry: str, imu: str | None,
-    config: Path | None, topics: tuple[str, ...], base_frame: str, overwrite: bool, composed: bool, view: bool,
+    config: Path | None, topics: tuple[str, ...], calibrations: tuple[Path, ...], base_frame: str, overwrite: bool,
+    composed: bool, view: bool,
 ) -> None:  # fmt: skip
     """Map BAG with the nodes of the workspace: starts them, plays the bag, and writes what ``slam run`` does."""
-    names = BagNames(parse_topics(topics), base_frame)
+    names = BagNames(parse_topics(topics), base_frame, read_rig_calibration(calibrations))
     with SensorBag(bag, names) as opened:
         mode = mode_for(opened, mode)
         frames = sum(opened.count(agent, "depth" if mode == "tof" else "left") for agent in opened.agents)
-    overrides = overrides_for(bag, read_overrides(config) if config is not None else Overrides())
+    own = read_overrides(config) if config is not None else Overrides()
+    overrides = overrides_for(bag, with_files(own, names.calibration.parameters))
     system = choose(system_config(overrides), mode, mapper, odometry, imu)
     if mode != "tof":
         require_stereo(bag, names)

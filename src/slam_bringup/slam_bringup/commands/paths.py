@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Paths as users write them, and the option to write where results of ours are already."""
+"""Paths as users write them, and options that name them in several commands."""
 
 from __future__ import annotations
 
@@ -24,3 +24,11 @@ class UserPath(click.Path):
 def overwrite_option(what: str) -> Any:
     """The flag ``--overwrite``; ``what`` says what it replaces."""
     return click.option("--overwrite", is_flag=True, help=f"replace {what}; what slam did not write always stays")
+
+
+def calibration_option() -> Any:
+    """The option ``--calibration``, which may be repeated."""
+    return click.option(
+        "--calibration", "calibrations", multiple=True, metavar="FOLDER", type=UserPath(exists=True, file_okay=False),
+        help="cameras as slam calibrate wrote them into FOLDER, instead of their camera infos (may be repeated)",
+    )  # fmt: skip

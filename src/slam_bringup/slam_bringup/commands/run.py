@@ -13,6 +13,7 @@ from typing import Any
 import click
 from rich.console import Console
 
+from slam_bringup.bags.rig_calibration import read_rig_calibration
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, parse_topics
 from slam_bringup.commands.console import LOG_NAME, Transcript, is_quiet, progress_bar, show
@@ -47,7 +48,8 @@ FAILED = 1
 @click.option("--localize-only", is_flag=True, help="with --map: only find the way in that map, which stays as it is")
 def command(
     bag: Path, output: Path, mode: str | None, mapper: str, odometry: str, imu: str | None, config: Path | None,
-    topics: tuple[str, ...], base_frame: str, overwrite: bool, old_map: Path | None, localize_only: bool,
+    topics: tuple[str, ...], calibrations: tuple[Path, ...], base_frame: str, overwrite: bool, old_map: Path | None,
+    localize_only: bool,
 ) -> None:  # fmt: skip
     """Map BAG without ROS: same classes as the nodes, no drops, the same bytes every time.
 
@@ -56,11 +58,11 @@ def command(
 
     With --map all results are in the frame of that map; OUT gets a map of its own, the old one is only read.
     """
-    names = BagNames(parse_topics(topics), base_frame)
+    names = BagNames(parse_topics(topics), base_frame, read_rig_calibration(calibrations))
     with SensorBag(bag, names) as opened:
         readings = sum(opened.count(agent, role) for agent in opened.agents for role in ("left", "depth", "imu"))
         mode = mode_for(opened, mode)
-    system = choose(load_system_config(config, bag), mode, mapper, odometry, imu)
+    system = choose(load_system_config(config, bag, names.calibration.parameters), mode, mapper, odometry, imu)
     growth = map_growth(system.sjsam, old_map, localize_only=localize_only)
     if mode != "tof":
         require_stereo(bag, names)

@@ -6,6 +6,7 @@ The form of the file: :mod:`slam_bringup.pipeline.overrides`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -44,21 +45,28 @@ class SystemConfig(Config):
     dense_mapper: DenseConfig = group(DenseConfig)
 
 
-def load_system_config(path: Path | None, bag: Path | None = None) -> SystemConfig:
+def load_system_config(path: Path | None, bag: Path | None = None, known: Iterable[Path] = ()) -> SystemConfig:
     """Defaults, overridden by what is known of a bag's calibration, then by a YAML file, where they are given.
 
-    ValueError as :func:`system_config`.
+    ``known``: files of parameters of a calibration that is used instead of the bag's. ValueError as
+    :func:`system_config`.
     """
-    return system_config(overrides_for(bag, Overrides() if path is None else read_overrides(path)))
+    own = Overrides() if path is None else read_overrides(path)
+    return system_config(overrides_for(bag, with_files(own, known)))
 
 
 def overrides_for(bag: Path | None, own: Overrides) -> Overrides:
     """A user's own overrides, after those of the file of a bag's calibration, if it has one."""
     file = None if bag is None else calibration_file(bag)
-    if file is None or not file.is_file():
-        return own
-    known = read_overrides(file)
-    return Overrides(own.origin or known.origin, (*known.rules, *own.rules))
+    return own if file is None or not file.is_file() else with_files(own, (file,))
+
+
+def with_files(own: Overrides, files: Iterable[Path]) -> Overrides:
+    """A user's own overrides, after those of files."""
+    for file in files:
+        known = read_overrides(file)
+        own = Overrides(own.origin or known.origin, (*known.rules, *own.rules))
+    return own
 
 
 def system_config(overrides: Overrides) -> SystemConfig:

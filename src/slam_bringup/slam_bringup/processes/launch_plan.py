@@ -15,9 +15,10 @@ from typing import Any
 
 import yaml
 
+from slam_bringup.bags.rig_calibration import read_rig_calibration
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, nodes_name, parse_topics
-from slam_bringup.pipeline.configuration import ODOMETRIES, choose, overrides_for, system_config
+from slam_bringup.pipeline.configuration import ODOMETRIES, choose, overrides_for, system_config, with_files
 from slam_bringup.pipeline.overrides import Overrides, overrides_of, parse_assignments, read_overrides
 from slam_bringup.processes.node_graph import NodeGraph, NodeSpec, live_nodes, plan_nodes
 from stereo_frontend.frontend import MODES
@@ -44,6 +45,7 @@ ARGUMENTS = (
     LaunchArgument("set", "", "parameters in one line: ekf_slam.submap.max_distance=1.5, tof_driver.pictures=both"),
     LaunchArgument("topics", "", "topics that are named otherwise: left=/cam/left/image_raw, right_info=/..."),
     LaunchArgument("base_frame", "", "frame of the rig [base_link, below the agent's name]"),
+    LaunchArgument("calibration", "", "folders of slam calibrate, comma-separated, instead of the drivers' infos"),
     LaunchArgument("rectified", "false", "the stereo images are rectified: image_rect", _BOOLEANS),
     LaunchArgument("compressed", "false", "the stereo images are compressed: image_raw/compressed", _BOOLEANS),
     LaunchArgument("pictures", AUTO, "ToF pictures beside depth: auto, none, amplitude, both"),
@@ -75,7 +77,9 @@ def plan_launch(values: Mapping[str, str]) -> LaunchPlan:
     values = {argument.name: argument.default for argument in ARGUMENTS} | dict(values)
     overrides = _overrides(values)
     topics = parse_topics(part.strip() for part in values["topics"].split(",") if part.strip())
-    names = BagNames(topics, values["base_frame"])
+    folders = [Path(part.strip()).expanduser() for part in values["calibration"].split(",") if part.strip()]
+    names = BagNames(topics, values["base_frame"], read_rig_calibration(folders))
+    overrides = with_files(overrides, names.calibration.parameters)
     plan = _for_bag(values, overrides, names) if values["bag"] else _for_rig(values, overrides, names)
     if values["use_sim_time"] != "true":
         return plan
@@ -103,13 +107,20 @@ def _for_rig(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
         raise ValueError("topics can be given for one rig; with several agents remap them in their drivers")
     mode = "stereo" if values["mode"] == AUTO else values["mode"]
     config = choose(system_config(overrides), mode, "sjsam", values["odometry"])
+    if names.calibration.is_given and (len(agents) > 1 or values["rectified"] == "true"):
+        raise ValueError("a calibration is that of one rig, and of its raw images")
+    drivers = names.calibration.driver_parameters()
+    compressed = {"compressed": True} if values["compressed"] == "true" else {}
     chosen = {k: values[k] for k in ("pictures", "measurement") if values[k] != AUTO}
     specs = live_nodes(
         config,
         agents,
         odometry=values["odometry"] != "none",
         rectified=values["rectified"] == "true",
-        extra={"tof_driver": chosen, "stereo_driver": {"compressed": True} if values["compressed"] == "true" else {}},
+        extra={
+            "tof_driver": drivers["tof_driver"] | chosen,
+            "stereo_driver": drivers["stereo_driver"] | compressed,
+        },
         base_frames=dict.fromkeys(agents, names.base_frame) if names.base_frame else None,
         overrides=overrides,
     )
@@ -134,7 +145,15 @@ def _for_bag(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
         mode = ("stereo" if has_stereo else "tof") if values["mode"] == AUTO else values["mode"]
         config = choose(system_config(overrides), mode, "sjsam", values["odometry"])
         map_path = values["map_path"] or "map"
-        graph = plan_nodes(config, bag.sensors, values["odometry"] != "none", map_path, overrides, autosave=True)
+        graph = plan_nodes(
+            config,
+            bag.sensors,
+            values["odometry"] != "none",
+            map_path,
+            overrides,
+            autosave=True,
+            calibration=names.calibration,
+        )
     return LaunchPlan((*graph.specs, _player(path, graph, values)))
 
 
@@ -148,6 +167,7 @@ def _player(path: Path, graph: NodeGraph, values: Mapping[str, str]) -> NodeSpec
         "wait_for_subscribers": 0.0,
         "nodes": tuple(command.full_name for command in graph.commands),
         "subscribers": tuple(f"{name}=1" for name in graph.played.values()),
+        "transforms": graph.transforms,
     }
     parameters = {name: value for name, value in parameters.items() if value != ()}
     return NodeSpec("slam_bringup", "bag_player", "", parameters)

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 from ekf_slam_node.stage import IMU
 from slam_bringup.bags.readings import AgentSensors
+from slam_bringup.bags.rig_calibration import RigCalibration
 from slam_bringup.bags.sensor_topics import is_rectified, join, nodes_name
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.overrides import Overrides, is_parameter_of
@@ -54,7 +55,8 @@ class NodeGraph:
     """Nodes in the order of their start, and what the bag player and the recorder must know of them.
 
     played: topics of the bag, and what the nodes call them. filters: full names of the ekf_slam nodes, one per agent.
-    finishers: full names of the nodes that are told that the input has ended, in this order.
+    finishers: full names of the nodes that are told that the input has ended, in this order. transforms: static
+    transforms that replace the bag's, as the player takes them.
     """
 
     specs: tuple[NodeSpec, ...]
@@ -64,6 +66,7 @@ class NodeGraph:
     recorded_topics: tuple[str, ...]
     filters: tuple[str, ...]
     finishers: tuple[str, ...]
+    transforms: tuple[str, ...] = ()
 
 
 def live_nodes(
@@ -113,14 +116,20 @@ def plan_nodes(
     overrides: Overrides | None = None,
     *,
     autosave: bool = False,
+    calibration: RigCalibration | None = None,
 ) -> NodeGraph:
-    """The nodes of a run over the agents of a bag; ``autosave`` where nobody has the map saved at the end."""
+    """The nodes of a run over the agents of a bag; ``autosave`` where nobody has the map saved at the end.
+
+    ``calibration``: instead of the bag's.
+    """
+    calibration = calibration or RigCalibration()
     mode = config.feature_extractor.mode
     first = next(iter(sensors.values()))
     base_frames = {agent: sensor.base_frame for agent, sensor in sensors.items()}
     specs = live_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
-        extra=_bag_parameters(config, first, map_path, autosave), base_frames=base_frames, overrides=overrides,
+        extra=_bag_parameters(config, first, map_path, autosave, calibration), base_frames=base_frames,
+        overrides=overrides,
         with_imu=[a for a, s in sensors.items() if "imu" in s.topics and config.ekf_slam.motion.imu != "off"],
         with_laser=[a for a, s in sensors.items() if s.scanner == "scan"],
     )  # fmt: skip
@@ -130,11 +139,12 @@ def plan_nodes(
     return NodeGraph(
         specs=tuple(specs),
         commands=tuple(spec.command for spec in specs),
-        played={t: name for s in sensors.values() for t, name in _topics(s, mode, odometry).items()},
+        played={t: name for s in sensors.values() for t, name in _topics(s, mode, odometry, calibration.files).items()},
         pace=tuple(p for s in sensors.values() for p in _pace(s, mode, odometry)),
         recorded_topics=(*sorted(recorded), "/diagnostics", STATIC_TRANSFORMS_TOPIC),
         filters=names["ekf_slam"],
         finishers=tuple(name for executable in _FINISHERS for name in names[executable]),
+        transforms=tuple(t.text for t in calibration.transforms(first.left_frame, first.tof_frame)),
     )
 
 
@@ -147,7 +157,7 @@ def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port
 
 
 def _bag_parameters(
-    config: SystemConfig, sensor: AgentSensors, map_path: str, autosave: bool
+    config: SystemConfig, sensor: AgentSensors, map_path: str, autosave: bool, calibration: RigCalibration
 ) -> dict[str, dict[str, Any]]:
     """Parameters of the nodes that follow from a bag's topics."""
     pictures = [name for name in ("amplitude", "intensity") if name in sensor.topics]
@@ -156,15 +166,17 @@ def _bag_parameters(
         chosen = "color"
     chooses = config.feature_extractor.mode == "tof" and config.feature_extractor.tof.images == "auto"
     compressed = sensor.topics.get("left", "").endswith("/compressed")
+    drivers = calibration.driver_parameters()
     return {
-        "stereo_driver": {"compressed": True} if compressed else {},
-        "tof_driver": {"measurement": sensor.measurement, "pictures": chosen},
+        "stereo_driver": drivers["stereo_driver"] | ({"compressed": True} if compressed else {}),
+        "tof_driver": drivers["tof_driver"] | {"measurement": sensor.measurement, "pictures": chosen},
         "feature_extractor": {"tof.images": pictures[0] if pictures else "range"} if chooses else {},
         "sjsam": {"map_path": map_path} | ({} if autosave else {"autosave_period_s": 0.0}),
     }
 
 
-def _topics(sensor: AgentSensors, mode: str, odometry: bool) -> dict[str, str]:
+def _topics(sensor: AgentSensors, mode: str, odometry: bool, calibrated: Collection[str]) -> dict[str, str]:
+    """Topics to play by the nodes' names; the camera infos of cameras that are ``calibrated`` come from files."""
     roles = ["imu"]
     if mode != "tof":
         roles += ["left", "right", "left_info", "right_info"]
@@ -172,6 +184,8 @@ def _topics(sensor: AgentSensors, mode: str, odometry: bool) -> dict[str, str]:
         roles += ["scan"]
     if mode != "stereo" or (odometry and sensor.scanner == "depth"):
         roles += ["depth", "amplitude", "intensity", "color", "tof_info"]
+    from_files = {f"{camera}_info" for camera in calibrated}
+    roles = [role for role in roles if role not in from_files]
     return {sensor.topics[role]: _heard(sensor, role) for role in roles if role in sensor.topics}
 
 

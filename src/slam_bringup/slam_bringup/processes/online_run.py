@@ -109,7 +109,9 @@ def run_nodes(
         If a node does not start, ends by itself, or does not answer; the message holds the end of its log.
     """
     with SensorBag(bag, names) as opened:
-        graph = plan_nodes(config, opened.sensors, odometry, str(out / "map"), overrides)
+        graph = plan_nodes(
+            config, opened.sensors, odometry, str(out / "map"), overrides, calibration=opened.calibration
+        )
         viewers = viewer_nodes(config, opened.sensors, view_port) if view_port else []
     with PrivateDomain() as domain:
         environment = node_environment(domain)
@@ -198,6 +200,7 @@ class _Choreography:
             "rename": tuple(f"{topic}={name}" for topic, name in self._graph.played.items() if name != topic),
             "window": _WINDOW,
             "wait_for_start": True,
+            "transforms": self._graph.transforms,
             "subscribers": tuple(f"{t}={len(self._supervisor.subscribers(t))}" for t in self._graph.played.values()),
         }
         player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
