@@ -126,17 +126,24 @@ def from_mapping(config_type: type[C], values: Mapping[str, Any]) -> C:
     return changed(config_type(), values)
 
 
-def changed(config: C, values: Mapping[str, Any]) -> C:
-    """A configuration with some values replaced, as :func:`from_mapping`; what is not named stays as it is."""
-    known = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+def changed(config: C, values: Mapping[str, Any], prefix: str = "") -> C:
+    """A configuration with some values replaced, as :func:`from_mapping`; what is not named stays as it is.
+
+    ``prefix``: what stands before the names where a user writes them, for messages.
+    """
+    known = {f.name: (getattr(config, f.name), f.metadata.get("parameter")) for f in dataclasses.fields(config)}
+    types = typing.get_type_hints(type(config))
     replaced: dict[str, Any] = {}
     for name, value in _nested(values).items():
         if not (name in known and _can_be_set(config, name)):
-            raise ValueError(_unknown(config, name))
-        if isinstance(known[name], Config):
+            raise ValueError(_unknown(config, name, prefix))
+        current, info = known[name]
+        if info is not None:
+            value = _checked(prefix + name, value, types[name], info)
+        else:
             if not isinstance(value, Mapping):
-                raise ValueError(f"parameter group '{name}' of {type(config).__name__} needs a mapping, got {value!r}")
-            value = changed(known[name], value)
+                raise ValueError(f"parameter group '{prefix}{name}' needs a mapping, got {value!r}")
+            value = changed(current, value, f"{prefix}{name}.")
         replaced[name] = value
     return dataclasses.replace(config, **replaced)
 
@@ -168,10 +175,12 @@ def is_fixed_now(config: Config, name: str) -> bool:
     return is_fixed(type(config), head) or (isinstance(inner, Config) and bool(rest) and is_fixed_now(inner, rest))
 
 
-def _unknown(config: Config, name: str) -> str:
+def _unknown(config: Config, name: str, prefix: str) -> str:
     kind, known = type(config), [f.name for f in dataclasses.fields(config) if _can_be_set(config, f.name)]
     if is_fixed(kind, name):
-        return f"parameter '{name}' of {kind.__name__} is fixed now: remove it"
+        return f"parameter '{prefix}{name}' is fixed now: remove it"
     near = difflib.get_close_matches(name, known, 1)
-    hint = f"; did you mean '{near[0]}'?" if near else f"; known: {', '.join(sorted(known))}"
-    return f"unknown parameter '{name}' of {kind.__name__}{hint}"
+    hint = (
+        f"; did you mean '{prefix}{near[0]}'?" if near else f"; known: {', '.join(prefix + n for n in sorted(known))}"
+    )
+    return f"unknown parameter '{prefix}{name}'{hint}"

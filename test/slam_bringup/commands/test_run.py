@@ -141,7 +141,7 @@ def test_bad_bags_and_bad_configurations_are_refused(tmp_path):
     config = tmp_path / "c.yaml"
     config.write_text("ekf_slam:\n  submap.max_distanc: 2.0\n")
     error = run(str(DEMO), "-o", str(tmp_path / "out"), "--config", str(config)).exception
-    assert "did you mean 'max_distance'" in str(error)
+    assert "did you mean 'submap.max_distance'" in str(error)
     config.write_text("ekf_slam: [1]\n")
     assert "must be a mapping" in str(run(str(DEMO), "-o", str(tmp_path / "out"), "--config", str(config)).exception)
 

@@ -69,10 +69,16 @@ def test_parameters_of_the_nodes_alone_do_not_disturb_the_offline_run(tmp_path: 
         ("/**: {closure.min_overlap: 0.2}", "my.yaml: parameter 'closure.min_overlap' is fixed now: remove it"),
         (
             "sjsam: {smoothing.region.open: 9}",
-            "my.yaml: sjsam: parameter 'open' of RegionConfig is fixed now: remove it",
+            "my.yaml: sjsam: parameter 'smoothing.region.open' is fixed now: remove it",
         ),
-        ("ekf_slam: {submap: {max_distanc: 1}}", "my.yaml: ekf_slam: unknown parameter 'max_distanc'.*'max_distance'"),
-        ("ekf_slam: {submap: {max_distance: -1}}", "my.yaml: ekf_slam: parameter 'max_distance' must be at least"),
+        (
+            "ekf_slam: {submap: {max_distanc: 1}}",
+            "my.yaml: ekf_slam: unknown parameter 'submap.max_distanc'.*'submap.max_distance'",
+        ),
+        (
+            "ekf_slam: {submap: {max_distance: -1}}",
+            "my.yaml: ekf_slam: parameter 'submap.max_distance' must be at least",
+        ),
         ("ekf_slam: [1]", "my.yaml: the parameters of ekf_slam must be a mapping"),
         ("ekf_slam: {a: 1", "my.yaml is not YAML"),
         ("- 1", "my.yaml must hold one mapping per node"),

@@ -62,7 +62,7 @@ def test_one_line_goes_before_the_file(tmp_path: Path) -> None:
 
 def test_what_is_wrong_is_named() -> None:
     for values, message in (
-        ({"set": "ekf_slam.submap.max_distanc=2"}, "ekf_slam: unknown parameter 'max_distanc'"),
+        ({"set": "ekf_slam.submap.max_distanc=2"}, "ekf_slam: unknown parameter 'submap.max_distanc'"),
         ({"set": "stereo_driver.compresed=true"}, "stereo_driver: unknown parameter 'compresed'"),
         ({"topics": "lft=/a"}, "topic 'lft=/a' is not ROLE=TOPIC"),
         ({"agents": "one,two", "topics": "left=/a"}, "topics can be given for one rig"),
