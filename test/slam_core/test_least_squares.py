@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from slam_core.chi_square import chi_square_bound
 from slam_core.least_squares import (
     LevenbergMarquardtConfig,
-    chi_square_bound,
     levenberg_marquardt,
     whitening,
 )

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from dense_mapping.tsdf import TsdfVolume
 from dense_mapping.tsdf_kernels import BLOCK
-from slam_core.config import Config, parameter
+from slam_core.config import Config
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, ByteArray, Float32Array
 
@@ -42,7 +42,8 @@ class SurfaceConfig(Config):
 
     min_images: int = 2
     """A voxel counts from so many key frames on."""
-    max_sigma: float = parameter(0.06, "voxels whose distance is less certain are left out", unit="m", minimum=1e-3)
+    max_sigma: float = 0.06
+    """Voxels whose distance is less certain are left out, m."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dense_mapping.tsdf_kernels import BLOCK, DepthView, integrate
-from slam_core.camera import Camera
+from slam_core.camera import MIN_DEPTH, Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray, Float32Array
@@ -156,5 +156,5 @@ def _surface_samples(T: FloatArray, camera: Camera, depth: Float32Array, truncat
     v, u = np.nonzero(depth[::2, ::2] > 0.0)
     z = depth[::2, ::2][v, u].astype(np.float64)
     rays = np.column_stack([(2 * u - camera.cx) / camera.fx, (2 * v - camera.cy) / camera.fy, np.ones(len(u))])
-    points = [rays * np.maximum(z + shift, 0.05)[:, None] for shift in (-truncation, 0.0, truncation)]
+    points = [rays * np.maximum(z + shift, MIN_DEPTH)[:, None] for shift in (-truncation, 0.0, truncation)]
     return transform_points(T, np.concatenate(points))

@@ -9,14 +9,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from slam_core.camera import MIN_DEPTH
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 from slam_core.types import ByteArray, Float32Array
 
 BLOCK = 8
 """Voxels along the edge of a block."""
-NEAREST = 0.05
-"""Least depth (m) at which a voxel may lie before the camera."""
 
 
 class DepthView(NamedTuple):
@@ -93,7 +92,7 @@ def integrate(
                 column_z = T[2, 0] * x + T[2, 1] * y + T[2, 3]
             z = origins[b, 2] + (i % BLOCK + 0.5) * voxel_size
             pz = column_z + T[2, 2] * z
-            if pz < NEAREST:
+            if pz < MIN_DEPTH:
                 continue
             u, v = fx * ((column_x + T[0, 2] * z) / pz) + cx, fy * ((column_y + T[1, 2] * z) / pz) + cy
             measured = _look_up(u, v, view.depth, truncation)

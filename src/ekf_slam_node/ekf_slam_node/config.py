@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_core.calibration_error import CalibrationErrorConfig
+from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray
-from slam_core.least_squares import chi_square_bound
 
 NEAREST_ASSOCIATE = 0.15
 """Gate g_A of Algorithm 1."""
@@ -26,11 +26,8 @@ class MotionConfig(Config):
         2.0, "uncertainty of the speed of a rig never seen before", unit="m/s", minimum=0.0
     )
     sigma_initial_turn_rate: float = parameter(2.0, "the same for its turn rate", unit="rad/s", minimum=0.0)
-    standing_frames: int = parameter(
-        5,
-        "frames without motion after which the rig counts as standing: nothing is mapped until it moves; 0: never",
-        minimum=0,
-    )
+    standing_frames: int = 5
+    """Frames without motion after which the rig counts as standing: nothing is mapped until it moves; 0: never."""
     imu: str = parameter(
         "auto",
         "whether an IMU is used: where there is one, never, or always (a run without one is refused)",

@@ -25,11 +25,11 @@ import numpy as np
 
 from ekf_slam_node.config import InertialConfig, MotionConfig
 from ekf_slam_node.preintegration import ImuNoise, Preintegral
+from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxminus, make_transform, skew, so3_exp
+from slam_core.types import GRAVITY
 
-GRAVITY = 9.81
-_GATE = 16.27
-"""99.9 % of chi-square with 3 degrees of freedom."""
+_GATE = chi_square_bound(0.999, 3)
 _HAND_SHAKE = 2.0
 """By how much (m/s2) the first readings may differ from gravity, each axis."""
 _ACCELEROMETER_BIAS_WALK = 1e-3

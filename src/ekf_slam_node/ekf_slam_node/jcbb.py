@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_triangular
 
-from slam_core.chi_square import chi_square_quantiles
+from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray
 
 IndexArray = npt.NDArray[np.int64]
@@ -72,7 +72,7 @@ class _Search:
         for column in angles:
             wrapped = self._innovation[:, :, column]
             self._innovation[:, :, column] = (wrapped + np.pi) % (2.0 * np.pi) - np.pi
-        self._gates = chi_square_quantiles(confidence, self._dim * np.arange(1, self._count + 1))
+        self._gates = np.array([chi_square_bound(confidence, self._dim * k) for k in range(1, self._count + 1)])
         self._candidates = [self._compatible(i) for i in range(self._count)]
         # Few choices first: wrong branches end early.
         self._order = sorted(range(self._count), key=lambda i: (len(self._candidates[i]) or self._count + 1, i))

@@ -16,8 +16,9 @@ from numba import njit
 from ekf_slam_node.candidates import Candidates
 from ekf_slam_node.models import Frame, rig_points
 from ekf_slam_node.pair_kernels import PairErrors, gated, normal_equations, pair_errors
+from slam_core.camera import MIN_DEPTH
+from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxplus, invert_transform
-from slam_core.least_squares import chi_square_bound
 from slam_core.rigid_alignment import umeyama
 
 _SAMPLE_GATE = 4.0 * chi_square_bound(0.95, 3)
@@ -58,7 +59,7 @@ def _score(T, points, lateral, along, z, variance, fx, fy, cx, cy, gate):  # typ
             x = M[0, 0] * points[i, 0] + M[0, 1] * points[i, 1] + M[0, 2] * points[i, 2] + M[0, 3]
             y = M[1, 0] * points[i, 0] + M[1, 1] * points[i, 1] + M[1, 2] * points[i, 2] + M[1, 3]
             d = M[2, 0] * points[i, 0] + M[2, 1] * points[i, 1] + M[2, 2] * points[i, 2] + M[2, 3]
-            if d < 0.05:
+            if d < MIN_DEPTH:
                 total += gate
                 continue
             w = 1.0 / d

@@ -16,10 +16,8 @@ from slam_core.geometry import (
     skew,
     transform_points,
 )
-from slam_core.types import PoseEstimate
+from slam_core.types import ORIGIN_SIGMA, PoseEstimate
 
-_ORIGIN_SIGMA = 1e-6
-"""Standard deviation of the first pose (m, rad): it is the origin by definition, but no covariance may be singular."""
 _LEAST_SIGMA = np.radians(0.5)
 """Gravity counts from when it is known to this angle."""
 _SAME_ERROR_S = 20.0
@@ -51,7 +49,7 @@ class OdometryChain:
         self._levelled_ns = 0
         # Of the errors of pose (6) and up direction (3).
         self._covariance = np.zeros((9, 9))
-        self._covariance[:6, :6] = _ORIGIN_SIGMA**2 * np.eye(6)
+        self._covariance[:6, :6] = ORIGIN_SIGMA**2 * np.eye(6)
 
     def pose(self, stamp_ns: int, T: FloatArray, covariance: FloatArray) -> PoseEstimate:
         """T_odom_rig of a pose in the open submap."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from slam_core.camera import MIN_DEPTH
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 
@@ -99,7 +100,7 @@ def gated(error, S, depth, scale, gate):  # type: ignore[no-untyped-def]
         a = error[n, 0] / L[0, 0]
         b = (error[n, 1] - L[1, 0] * a) / L[1, 1]
         c = (error[n, 2] - L[2, 0] * a - L[2, 1] * b) / L[2, 2]
-        out[n] = a * a + b * b + c * c < gate and depth[n] > 0.05
+        out[n] = a * a + b * b + c * c < gate and depth[n] > MIN_DEPTH
     return out
 
 

@@ -16,7 +16,7 @@ from ekf_slam_node.ccda import ccda, distance_variances, equal_distances
 from ekf_slam_node.covariance import Covariance, whiten
 from ekf_slam_node.ekf import UpdateReport
 from ekf_slam_node.jcbb import UNPAIRED, IndexArray, JointPrediction, jcbb
-from slam_core.chi_square import chi_square_quantile
+from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 
@@ -202,7 +202,7 @@ class PlanarEkf:
         if self.config.method == "jcbb":
             return jcbb(measured, noise, JointPrediction(z, S), angles=(1,), confidence=self.config.confidence)
         distance, nis = self._distances(measured)
-        possible = nis < chi_square_quantile(self.config.confidence, 2)
+        possible = nis < chi_square_bound(self.config.confidence, 2)
         if self.config.method == "ccda":
             return self._combined(measured, possible, distance)
         return _one_to_one(np.where(possible, distance, np.inf))
@@ -218,7 +218,7 @@ class PlanarEkf:
         fits = equal_distances(
             (self.landmarks[rows], distance_variances(self.landmarks[rows], joint)),
             (points[columns], distance_variances(points[columns], own[columns])),
-            chi_square_quantile(self.config.confidence, 1),
+            chi_square_bound(self.config.confidence, 1),
         )
         return ccda(rows, columns, costs[columns, rows], fits, len(measured))
 
@@ -243,7 +243,7 @@ class PlanarEkf:
         if not len(self.landmarks) or not len(unpaired):
             return unpaired
         nis = self._distances(measured[unpaired])[1]
-        return np.asarray(unpaired[nis.min(axis=1) > chi_square_quantile(self.config.new_confidence, 2)])
+        return np.asarray(unpaired[nis.min(axis=1) > chi_square_bound(self.config.new_confidence, 2)])
 
 
 def _moved(points: FloatArray, shift: FloatArray, angle: float) -> FloatArray:

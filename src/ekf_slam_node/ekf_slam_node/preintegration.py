@@ -17,10 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_core.geometry import FloatArray, skew, so3_exp
-from slam_core.types import ImuSample
-
-_LONGEST_INTERVAL_S = 0.05
-"""Readings farther apart than this say nothing of what was between them."""
+from slam_core.types import LONGEST_IMU_STEP_S, ImuSample
 
 _LONGEST_S = 10.0
 """Nothing is integrated over longer times, and readings are kept for twice as long."""
@@ -97,7 +94,7 @@ class ImuReadings:
         readings = np.array([[*s.angular_velocity, *s.linear_acceleration] for s in self._samples])
         times = (stamps - start_ns).astype(np.float64)
         at_middle = np.column_stack([np.interp(middle, times, column) for column in readings.T])
-        silent = np.clip(np.diff(edges) * 1e-9 - _LONGEST_INTERVAL_S, 0.0, None) > 0.0
+        silent = np.clip(np.diff(edges) * 1e-9 - LONGEST_IMU_STEP_S, 0.0, None) > 0.0
         silent |= (middle < times[0]) | (middle > times[-1])
         return _integrated(at_middle, biases, np.diff(edges) * 1e-9, silent, noise)
 

@@ -19,8 +19,9 @@ from ekf_slam_node.candidates import Candidates
 from ekf_slam_node.models import Frame, back_project, project, rig_points, velocity_of_motion
 from ekf_slam_node.motion_guess import refine_motion
 from ekf_slam_node.pair_kernels import PairErrors, pair_errors
+from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray
-from slam_core.least_squares import MAD_TO_SIGMA, chi_square_bound
+from slam_core.least_squares import MAD_TO_SIGMA
 
 _APART = 3
 """Frames from one of a pair to the other, where the two share enough."""

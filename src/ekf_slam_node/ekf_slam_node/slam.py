@@ -26,8 +26,8 @@ from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.rolling_shutter import RollingShutter
 from ekf_slam_node.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submap_chain import SubmapChain
+from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
-from slam_core.least_squares import chi_square_bound
 from slam_core.types import Counters, Features, ImuSample, PoseEstimate, RelativeMotion, Submap
 
 _AID_GATE = chi_square_bound(0.999, 6)

@@ -12,7 +12,7 @@ from ekf_slam_node.landmarks import LandmarkBook
 from ekf_slam_node.models import CORE_DIM
 from slam_core.geometry import FloatArray, boxminus, boxplus
 from slam_core.linear_algebra import blas
-from slam_core.types import PoseEstimate, Submap
+from slam_core.types import ORIGIN_SIGMA, PoseEstimate, Submap
 
 _MIN_FRAMES = 5
 """A submap has at least so many frames."""
@@ -21,10 +21,6 @@ _MIN_SHARED = 15
 
 _LEAST_EIGENVALUE = 1e-12
 """Share of the largest eigenvalue that rounding may reach."""
-
-
-_START_SIGMA = 1e-6
-"""Standard deviation of a submap's first pose (m, rad), exact by definition: no covariance may be singular."""
 
 
 class SubmapBuilder:
@@ -42,7 +38,7 @@ class SubmapBuilder:
         self._start_stamp_ns = start_stamp_ns
         self._follows_previous = follows_previous
         self._session = session
-        self._path = [PoseEstimate(start_stamp_ns, np.eye(4), _START_SIGMA**2 * np.eye(6))]
+        self._path = [PoseEstimate(start_stamp_ns, np.eye(4), ORIGIN_SIGMA**2 * np.eye(6))]
         self._standing = 0
         self._bridged: list[PoseEstimate] = []
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from ndt_registration.search import SEPARATION, Candidate, pose_distance
+from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxminus
-from slam_core.least_squares import chi_square_bound
 
 _MARGIN = 0.03
 """Cost by which the answer must beat every rival."""

@@ -10,9 +10,7 @@ import numpy as np
 
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, so3_exp
-
-_MAX_GAP = 0.05
-"""Gap between samples above which they are not used."""
+from slam_core.types import LONGEST_IMU_STEP_S
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class Gyro:
         while R is not None and now < end_ns:
             stamp, rate = self._samples[0]
             until = min(self._samples[1][0] if len(self._samples) > 1 else end_ns, end_ns)
-            if 1e-9 * (until - stamp) > _MAX_GAP or stamp > now:
+            if 1e-9 * (until - stamp) > LONGEST_IMU_STEP_S or stamp > now:
                 return None
             R = R @ so3_exp(rate * 1e-9 * (until - now))
             now = until

@@ -26,10 +26,9 @@ from slam_core.geometry import (
     pose7_from_transform,
     transform_from_pose7,
 )
+from slam_core.types import ORIGIN_SIGMA
 
 BEFORE, NOW, VELOCITY = slice(0, 6), slice(6, 12), slice(12, 18)
-_START_SIGMA = 1e-6
-"""Standard deviation of the first pose (m, rad): it is the origin by definition, but no covariance may be singular."""
 _LOST_SIGMA = 100.0
 """Standard deviation (m, rad) of a pose of which nothing is known."""
 
@@ -61,7 +60,7 @@ class MotionFilter:
         self.T_before, self.T = T, T
         self._velocity = np.zeros(6)
         self._dt = 0.0
-        self._P = np.diag(np.r_[np.full(12, _START_SIGMA), self._speed] ** 2)
+        self._P = np.diag(np.r_[np.full(12, ORIGIN_SIGMA), self._speed] ** 2)
 
     @property
     def covariance(self) -> FloatArray:

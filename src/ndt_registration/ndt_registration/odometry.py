@@ -22,7 +22,7 @@ from ndt_registration.motion_filter import MotionFilter, MotionFilterConfig, rot
 from ndt_registration.pyramid import GridConfig
 from ndt_registration.registration import RegistrationConfig, RegistrationResult, for_dimension, register
 from ndt_registration.uncertainty import UncertaintyConfig
-from slam_core.config import Config, group, parameter
+from slam_core.config import Config, group
 from slam_core.geometry import FloatArray, boxminus, compose_jacobians, invert_transform
 from slam_core.types import RelativeMotion
 
@@ -57,10 +57,10 @@ that is not may be off follows from what it loses.
 class OdometryConfig(Config):
     """ScanPoints odometry."""
 
-    keyframes: int = parameter(10, "keyframes in the local map", minimum=1)
-    keyframe_distance: float = parameter(
-        0.3, "distance from the last keyframe above which a scan becomes one", unit="m", minimum=0.0
-    )
+    keyframes: int = 10
+    """Keyframes in the local map."""
+    keyframe_distance: float = 0.3
+    """Distance from the last keyframe above which a scan becomes one, m."""
     restart_after: int = 5
     """Failures after which the map starts anew."""
     motion: MotionFilterConfig = group(MotionFilterConfig)

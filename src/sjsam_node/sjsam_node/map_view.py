@@ -35,10 +35,7 @@ from slam_core.geometry import (
     skew,
 )  # fmt: skip
 from slam_core.linear_algebra.sparse_cholesky import IntArray
-from slam_core.types import Float32Array, PoseEstimate, Submap
-
-_ORIGIN_SIGMA = 1e-6
-"""Standard deviation of the map's first pose (m, rad): the origin by definition, but no covariance may be singular."""
+from slam_core.types import ORIGIN_SIGMA, Float32Array, PoseEstimate, Submap
 
 STILL = 0.003, 0.001
 """Movement (m, rad) that a path need not show."""
@@ -155,7 +152,7 @@ class MapView:
     def _widening(self, component: int) -> FloatArray:
         """Covariance (6, 6) that is added in a component whose frame nothing ties to the map's."""
         if component == self.graph.component(0):
-            return np.asarray(_ORIGIN_SIGMA**2 * np.eye(6))
+            return np.asarray(ORIGIN_SIGMA**2 * np.eye(6))
         return np.diag(np.square([*[self.unlinked_sigma] * 3, np.pi, np.pi, np.pi]))
 
 

@@ -3,18 +3,15 @@
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
+from functools import lru_cache
+
 from scipy.special import gammaincinv
 
-from slam_core.geometry import FloatArray
+ELLIPSE_PROBABILITY = 0.995
+"""Share of the probability inside every ellipse and ellipsoid that is shown, as in the thesis's figures."""
 
 
-def chi_square_quantile(probability: float, freedom: float) -> float:
-    """Value that a chi-square variable with ``freedom`` degrees of freedom stays below with this probability."""
-    return float(chi_square_quantiles(probability, freedom))
-
-
-def chi_square_quantiles(probability: float, freedom: npt.ArrayLike) -> FloatArray:
-    """The same for several numbers of degrees of freedom (n,)."""
-    return np.asarray(2.0 * gammaincinv(0.5 * np.asarray(freedom), probability))
+@lru_cache(maxsize=4096)
+def chi_square_bound(probability: float, freedom: int) -> float:
+    """Bound that a chi-square variable with ``freedom`` degrees of freedom stays below with this probability."""
+    return float(2.0 * gammaincinv(0.5 * freedom, probability))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_core.body_frame import body_offset
-from slam_core.chi_square import chi_square_quantile
+from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, both_halves, boxminus, invert_transform, skew, so3_log
 from slam_core.rigid_alignment import umeyama
 from slam_core.trajectory import Trajectory
@@ -173,7 +173,7 @@ def anees_bounds(dimension: int, samples: int, confidence: float = 0.95) -> tupl
         raise ValueError(f"dimension and samples must be positive, got {dimension} and {samples}")
     freedom = dimension * samples
     tail = (1.0 - confidence) / 2.0
-    return chi_square_quantile(tail, freedom) / freedom, chi_square_quantile(1.0 - tail, freedom) / freedom
+    return chi_square_bound(tail, freedom) / freedom, chi_square_bound(1.0 - tail, freedom) / freedom
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,11 @@ class InputConfig(Config):
         " counted; all: every frame is processed, however late",
         choices=POLICIES,
     )
-    waiting: int = parameter(2, "frames of an input that may wait with policy newest", unit="frames", minimum=1)
+    waiting: int = 2
+    """Frames of an input that may wait with policy newest."""
     depth: int = parameter(200, "messages kept per topic until received, and until paired", minimum=1)
-    overdue: float = parameter(
-        1.0, "with policy newest: longest wait of a frame for another sensor", unit="s", minimum=0.05
-    )
+    overdue: float = 1.0
+    """With policy newest: longest wait of a frame for another sensor, s."""
     pairing_tolerance_s: float = parameter(
         PAIRING_TOLERANCE_S, "largest difference of stamps that belong together", unit="s", minimum=0.0
     )

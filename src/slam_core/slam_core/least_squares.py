@@ -8,12 +8,10 @@ squared residuals, ``chi2 = sum r^T r`` (no factor one half), so that they compa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import scipy.linalg
-from scipy.special import gammaincinv
 
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
@@ -45,12 +43,6 @@ def whitening(covariance: FloatArray) -> FloatArray:
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a Gaussian over the median of its absolute deviations."""
-
-
-@lru_cache(maxsize=4096)
-def chi_square_bound(probability: float, dof: int) -> float:
-    """Bound that a chi-square variable of ``dof`` degrees of freedom stays below with this probability."""
-    return float(2.0 * gammaincinv(0.5 * dof, probability))
 
 
 @dataclass(frozen=True)

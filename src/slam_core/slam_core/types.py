@@ -21,6 +21,13 @@ Float32Array = npt.NDArray[np.float32]
 ByteArray = npt.NDArray[np.uint8]
 AnyArray = npt.NDArray[Any]
 
+ORIGIN_SIGMA = 1e-6
+"""Standard deviation (m, rad) of a pose that is the origin by definition: no covariance may be singular."""
+GRAVITY = 9.81
+"""Specific force of a rig at rest, m/s2."""
+LONGEST_IMU_STEP_S = 0.05
+"""IMU readings farther apart than this say nothing of what was between them."""
+
 
 class FeatureSource(IntEnum):
     """Source of a feature's depth; the values of the ``source`` field of the ``features`` topic."""

@@ -12,10 +12,9 @@ import numpy as np
 
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, so3_log
-from slam_core.types import ImuSample
+from slam_core.types import GRAVITY, ImuSample
 from slam_simulation.trajectory import Path
 
-GRAVITY = 9.81
 STEP = 1e-3
 
 

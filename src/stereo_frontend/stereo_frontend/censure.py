@@ -13,7 +13,7 @@ from numba import njit
 
 from slam_core.in_place import in_place
 from slam_core.types import ByteArray
-from stereo_frontend.keypoints import Keypoints, Selector
+from stereo_frontend.keypoints import MOST_KEYPOINTS, Keypoints, Selector
 from stereo_frontend.surf import SurfConfig, describe
 from stereo_frontend.surf_detector import MAX_PIXELS, vertex
 
@@ -27,7 +27,6 @@ _LINE = 10.0
 """Largest ratio of the squared trace of the response's scatter matrix to its determinant."""
 _LINE_REACH = 4
 """Half the edge of the window of that matrix, px, for the smallest size; it grows with the octagon."""
-_MOST_KEYPOINTS = 20000
 _SCALE_PER_SIZE = 1.2 / 9.0
 
 
@@ -36,7 +35,7 @@ class CensureDetector:
 
     def __init__(self, surf: SurfConfig | None = None) -> None:
         self._surf = surf or SurfConfig()
-        self._found = np.empty((_MOST_KEYPOINTS, 4), np.float32)
+        self._found = np.empty((MOST_KEYPOINTS, 4), np.float32)
 
     def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
         """Keypoints above ``threshold`` times the customary one, thinned out by ``select``.

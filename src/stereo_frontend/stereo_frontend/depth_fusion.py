@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.camera import Camera
+from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform
-from slam_core.least_squares import chi_square_bound
 from slam_core.types import DepthImage
 from stereo_frontend.depth_lookup import DepthSamples, sample_depth
 

@@ -12,6 +12,9 @@ import numpy.typing as npt
 
 from slam_core.types import AnyArray, ByteArray, Float32Array
 
+MOST_KEYPOINTS = 20000
+"""Keypoints of one image that a detector has room for."""
+
 Selector = Callable[[Float32Array, Float32Array, Float32Array], npt.NDArray[np.intp]]
 """Chooses keypoints: (uv (n, 2) px, size (n,) px, response (n,)) to the indices kept, in their final order."""
 

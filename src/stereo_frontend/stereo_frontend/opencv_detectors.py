@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 
 from slam_core.types import AnyArray, ByteArray, Float32Array
-from stereo_frontend.keypoints import Keypoints, Selector
+from stereo_frontend.keypoints import MOST_KEYPOINTS, Keypoints, Selector
 
 SIFT_CONTRAST = 0.04
 """Contrast threshold of Lowe 2004 as OpenCV scales it."""
 FAST_THRESHOLD = 20.0
-_MOST_KEYPOINTS = 20000
 
 
 class OpenCvDetector:
@@ -75,7 +74,7 @@ def _sift(threshold: float) -> Any:
 
 def _orb(threshold: float) -> Any:
     fast = int(np.clip(round(FAST_THRESHOLD * threshold), 2, 120))
-    return cv2.ORB.create(nfeatures=_MOST_KEYPOINTS, fastThreshold=fast)
+    return cv2.ORB.create(nfeatures=MOST_KEYPOINTS, fastThreshold=fast)
 
 
 _KINDS: dict[str, tuple[Callable[[float], Any], Callable[[AnyArray], Float32Array]]] = {

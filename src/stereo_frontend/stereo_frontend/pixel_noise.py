@@ -41,9 +41,8 @@ class PixelNoiseConfig(Config):
     floor: float = parameter(
         0.11, "standard deviation of the smallest keypoints", unit="px", minimum=0.01, maximum=10.0
     )
-    slope: float = parameter(
-        0.015, "growth of the standard deviation with the keypoint's diameter", minimum=0.0, maximum=1.0
-    )
+    slope: float = 0.015
+    """Growth of the standard deviation with the keypoint's diameter."""
     max_factor: float = 3.0
     """Greatest factor."""
 

@@ -23,7 +23,7 @@ import numpy as np
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import ByteArray, Float32Array
-from stereo_frontend.keypoints import Keypoints, Selector
+from stereo_frontend.keypoints import MOST_KEYPOINTS, Keypoints, Selector
 from stereo_frontend.surf_descriptor import (
     DIMENSION,
     describe_oriented,
@@ -38,7 +38,6 @@ _OCTAVES = 3
 _CUSTOMARY_THRESHOLD = 26.0
 """Determinant of the Hessian of a customary keypoint, grey values 0 to 255."""
 
-_MOST_KEYPOINTS = 20000
 _DIAMETER = 9.0 / 1.2
 """Size of a keypoint (px) per unit of its scale: that of the filter that found it."""
 
@@ -50,7 +49,8 @@ _WEIGHTS = region_weights()
 class SurfConfig(Config):
     """Parameters of SURF, named as in the paper."""
 
-    doubled: bool = parameter(True, "search the image enlarged twice: keypoints down to half the size")
+    doubled: bool = True
+    """Search the image enlarged twice: keypoints down to half the size."""
     upright: bool = parameter(False, "describe along the image axes (U-SURF) instead of the keypoint's orientation")
     extended: bool = parameter(True, "descriptors of 128 numbers (SURF-128) instead of 64: better told apart, slower")
 
@@ -60,7 +60,7 @@ class SurfDetector:
 
     def __init__(self, config: SurfConfig | None = None) -> None:
         self.config = config or SurfConfig()
-        self._found = np.empty((_MOST_KEYPOINTS, 4), np.float32)
+        self._found = np.empty((MOST_KEYPOINTS, 4), np.float32)
 
     def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
         """Keypoints above ``threshold`` times the configured one, thinned out by ``select`` before they are described.

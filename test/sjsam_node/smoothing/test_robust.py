@@ -24,8 +24,8 @@ from sjsam_node.smoothing.estimator import Estimator, EstimatorConfig
 from sjsam_node.smoothing.joining import JoiningProblem
 from sjsam_node.smoothing.problem import LocalMap, flatten
 from sjsam_node.smoothing.robust import LOSSES, RobustConfig, closing_rows, normalized_error, predicted, weight, widened
+from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import boxminus
-from slam_core.least_squares import chi_square_bound
 
 ROBUST = [loss for loss in LOSSES if loss != "none"]
 

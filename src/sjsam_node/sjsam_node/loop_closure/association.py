@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sjsam_node.graph.links import Prior
+from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxplus, skew, transform_points
-from slam_core.least_squares import chi_square_bound
 from slam_core.linear_algebra import blas
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
@@ -29,9 +29,8 @@ class AssociationConfig(Config):
     """Gates of the association between submaps."""
 
     method: str = parameter("joint", "how landmarks are matched", choices=METHODS)
-    descriptor_threshold: float = parameter(
-        0.6, "least scalar product of two descriptors (7.5)", minimum=-1.0, maximum=1.0
-    )
+    descriptor_threshold: float = 0.6
+    """Least scalar product of two descriptors (7.5)."""
     probability: float = 0.999
     """Share of true pairs inside a chi-square gate."""
     nearest_gate: float = parameter(0.3, "distance below which the nearest neighbour is taken", unit="m", minimum=0.0)

@@ -24,9 +24,9 @@ from sjsam_node.loop_closure.association import variance_factor
 from sjsam_node.loop_closure.verification import ClosureConfig
 from sjsam_node.smoothing.estimator import local_residual, observation_nis
 from sjsam_node.smoothing.smoother import Smoother, UpdateResult
+from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus
-from slam_core.least_squares import chi_square_bound
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 _RELIEF = 0.5
@@ -45,9 +45,8 @@ class ConsistencyConfig(Config):
     """Updates that a submap may cost beyond its first, to let closures go."""
     settling_rounds: int = 6
     """The same when the map settles."""
-    closure_probability: float = parameter(
-        0.9999, "share of true closures whose rise of chi2 is accepted", minimum=0.9, maximum=0.9999999
-    )
+    closure_probability: float = 0.9999
+    """Share of true closures whose rise of chi2 is accepted."""
     view_change: float = 2.0
     """Factor by which squared errors of matches from another view are larger than those in a whole map."""
     max_variance_factor: float = parameter(

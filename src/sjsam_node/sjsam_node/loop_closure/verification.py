@@ -22,9 +22,9 @@ from sjsam_node.loop_closure.association import (
     similarity,
 )  # fmt: skip
 from sjsam_node.loop_closure.place_recognition import PlaceRecognitionConfig
+from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, boxminus
-from slam_core.least_squares import chi_square_bound
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 from slam_core.rigid_alignment import ransac_rigid_transform
 
@@ -33,7 +33,8 @@ from slam_core.rigid_alignment import ransac_rigid_transform
 class ClosureConfig(Config):
     """Conditions on a link between submaps for it to be believed."""
 
-    window: int = parameter(3, "submaps back along the agent's path that a new one is linked to directly", minimum=1)
+    window: int = 3
+    """Submaps back along the agent's path that a new one is linked to directly."""
     proximity: float = parameter(
         3.0, "distance between the middles of submaps that are tried as near", unit="m", minimum=0.0
     )
@@ -57,7 +58,8 @@ class ClosureConfig(Config):
     """Largest distance of an inlier of the first alignment (m)."""
     min_near_inliers: int = 5
     """Least matches of a link to a near submap."""
-    min_inliers: int = parameter(10, "least matches of a link to a submap found by its looks", minimum=3)
+    min_inliers: int = 10
+    """Least matches of a link to a submap found by its looks."""
     min_spread: float = 0.25
     """Least second-largest standard deviation of the matched landmarks (m)."""
     min_overlap: float = 0.3

@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sjsam_node.smoothing.problem import JoiningState, LocalMap
+from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
-from slam_core.least_squares import chi_square_bound
 from slam_core.linear_algebra.block_pattern import IntArray
 
 LOSSES = ("none", "huber", "cauchy", "dcs")

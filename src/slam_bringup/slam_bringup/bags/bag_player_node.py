@@ -49,7 +49,8 @@ class PlayerConfig(Config):
     rename: tuple[str, ...] = parameter((), "'<topic of the bag>=<topic>': publish under this name")
     pace: tuple[str, ...] = parameter((), "'<node>=<topic>': do not run ahead of this node on this topic")
     window: int = parameter(4, "messages of a paced topic that may be unprocessed", minimum=1)
-    patience: float = parameter(120.0, "longest wait for a paced node that reports nothing", unit="s", minimum=1.0)
+    patience: float = 120.0
+    """Longest wait for a paced node that reports nothing, s."""
     wait_for_subscribers: float = parameter(3.0, "longest wait for subscribers at the start", unit="s", minimum=0.0)
     wait_for_start: bool = parameter(False, "begin when the service ~/start is called, not when subscribers are there")
     subscribers: tuple[str, ...] = parameter(

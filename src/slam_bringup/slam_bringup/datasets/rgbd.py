@@ -36,10 +36,10 @@ from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, invert_transform, m
 from slam_core.messages import rectified_info
 from slam_core.trajectory import read_trajectory
 from slam_core.types import AnyArray
+from tof_driver.depth import MILLIMETRES_INVALID
 
 _RATE = 30.0
 _NUMBERED_RATE = 10.0
-_MILLIMETRES_INVALID = 65535
 _PAIRING_NS = 20_000_000
 _KINECT_SEVEN_SCENES = (585.0, 585.0, 320.0, 240.0)
 _KINECT_SEVEN_SCENES_COLOUR = ColourCamera((530.0, 530.0, 320.0, 240.0), (0.0256, 0.0, 0.0))
@@ -135,7 +135,7 @@ def _level(T_world_camera: FloatArray) -> FloatArray:
 
 def _clean(depth: AnyArray, units_per_metre: float) -> AnyArray:
     """uint16 mm with 0 for no reading; float32 m where the unit is another."""
-    depth = np.where(depth == _MILLIMETRES_INVALID, 0, depth).astype(np.uint16)
+    depth = np.where(depth == MILLIMETRES_INVALID, 0, depth).astype(np.uint16)
     return depth if units_per_metre == 1000.0 else depth.astype(np.float32) / np.float32(units_per_metre)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from slam_bringup.doctor.evidence import Evidence
 from slam_bringup.doctor.finding import Finding
+from slam_core.types import GRAVITY
 
-_GRAVITY = 9.81
 _FEWEST = 50
 _FASTEST_RAD_S = 12.0
 _UPRIGHT = 0.5
@@ -29,7 +29,7 @@ def check_imu(evidence: Evidence) -> Iterator[Finding]:
             f"{topic} turns faster than {_FASTEST_RAD_S:.0f} rad/s much of the time",
             "angular velocity is in rad/s, not deg/s",
         )
-    if abs(size - _GRAVITY) > 3.0:
+    if abs(size - GRAVITY) > 3.0:
         unit = "in g?" if 0.7 < size < 1.3 else "without gravity?" if size < 0.7 else "in another unit?"
         yield Finding(
             "accelerometer unit",

@@ -20,9 +20,10 @@ from ekf_slam_node.planar_sam import PlanarGraph, PlanarMap, pose_covariances, s
 from sjsam_node.linear_slam.text_joining import join_text_maps
 from sjsam_node.linear_slam.text_maps import TextMap
 from slam_bringup.planar.log import PlanarLog, RobotLog
+from slam_core.chi_square import chi_square_bound
 from slam_core.evaluation import nees
 from slam_core.geometry import FloatArray
-from slam_core.least_squares import LevenbergMarquardtConfig, chi_square_bound
+from slam_core.least_squares import LevenbergMarquardtConfig
 from slam_core.rigid_alignment import umeyama
 
 METHODS = ("ekf", "sam", "submaps")

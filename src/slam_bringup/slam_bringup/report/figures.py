@@ -15,14 +15,13 @@ from dense_mapping.floor_plan import FREE, OCCUPIED, FloorPlan
 from dense_mapping.navigation import frontiers
 from slam_bringup.pipeline.results import AgentResult, RunResult
 from slam_bringup.report.canvas import blank, draw_to_scale
-from slam_core.chi_square import chi_square_quantile
+from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.evaluation import align, associate
 from slam_core.files import atomic_path
 from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
 
 matplotlib.use("Agg")
 
-ELLIPSE_CONFIDENCE = 0.995
 COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd")
 _TRUTH = "#222222"
 
@@ -70,7 +69,7 @@ def _draw_landmarks(axes: Axes, result: RunResult) -> None:
     if len(landmarks.positions) == 0:
         return
     values, vectors = np.linalg.eigh(landmarks.covariances[:, :2, :2])
-    axis_lengths = 2.0 * np.sqrt(np.maximum(values, 0.0) * chi_square_quantile(ELLIPSE_CONFIDENCE, 2))
+    axis_lengths = 2.0 * np.sqrt(np.maximum(values, 0.0) * chi_square_bound(ELLIPSE_PROBABILITY, 2))
     # An ellipse as large as a room says only that the landmark is far away.
     shown = axis_lengths[:, 1] < 2.0
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
@@ -172,7 +171,7 @@ def error_figure(agent: AgentResult) -> Figure | None:
     error[:, 3:] = np.degrees(error[:, 3:])
     sigma = np.sqrt(np.diagonal(matched.covariances, axis1=1, axis2=2)).copy()
     sigma[:, 3:] = np.degrees(sigma[:, 3:])
-    bound = float(np.sqrt(chi_square_quantile(ELLIPSE_CONFIDENCE, 1)))
+    bound = float(np.sqrt(chi_square_bound(ELLIPSE_PROBABILITY, 1)))
     figure, grid = blank(10, 5, 2, 3)
     for i, (axes, name) in enumerate(
         zip(grid.ravel(), ("x m", "y m", "z m", "rx deg", "ry deg", "rz deg"), strict=True)

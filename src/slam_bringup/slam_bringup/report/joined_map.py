@@ -11,8 +11,8 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from sjsam_node.linear_slam.text_joining import TextJoiningResult
-from slam_bringup.report.figures import COLOURS, ELLIPSE_CONFIDENCE, save_png
-from slam_core.chi_square import chi_square_quantile
+from slam_bringup.report.figures import COLOURS, save_png
+from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 
 _FEATURES = "#b36b00"
 
@@ -39,13 +39,13 @@ def _draw(axes: Axes, result: TextJoiningResult, a: int, b: int) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(color="0.92")
     axes.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]")
-    axes.set_title(f"chi2 {result.chi2:.6g}; ellipses hold {100 * ELLIPSE_CONFIDENCE:g} %", fontsize=10)
+    axes.set_title(f"chi2 {result.chi2:.6g}; ellipses hold {100 * ELLIPSE_PROBABILITY:g} %", fontsize=10)
     axes.legend(fontsize=8)
 
 
 def _ellipses(axes: Axes, centres: np.ndarray, covariances: np.ndarray, colour: str) -> None:
     values, vectors = np.linalg.eigh(covariances)
-    lengths = 2.0 * np.sqrt(np.maximum(values, 0.0) * chi_square_quantile(ELLIPSE_CONFIDENCE, 2))
+    lengths = 2.0 * np.sqrt(np.maximum(values, 0.0) * chi_square_bound(ELLIPSE_PROBABILITY, 2))
     angles = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     axes.add_collection(EllipseCollection(
         lengths[:, 1], lengths[:, 0], angles, units="xy", offsets=centres, offset_transform=axes.transData,

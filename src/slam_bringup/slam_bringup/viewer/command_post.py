@@ -10,11 +10,10 @@ import numpy as np
 
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.navigation import Frontier, Way, frontiers, walked, way
-from slam_core.chi_square import chi_square_quantile
+from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate
 
-_CONFIDENCE = 0.995
 _NOWHERE_M = 20.0
 """A stretch that nothing ties to the map yet has a standard deviation of a hundred metres."""
 
@@ -77,7 +76,7 @@ def ways_out(
 def position_radius(pose: PoseEstimate) -> float:
     """Radius (m) of the circle on the floor that holds the agent with 99.5 %, by the largest axis of its ellipse."""
     largest = max(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1], 0.0)
-    return float(np.sqrt(chi_square_quantile(_CONFIDENCE, 2) * largest))
+    return float(np.sqrt(chi_square_bound(ELLIPSE_PROBABILITY, 2) * largest))
 
 
 def radius_text(radius: float) -> str:

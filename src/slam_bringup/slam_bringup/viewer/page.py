@@ -22,7 +22,7 @@ from dense_mapping.decimation import at_most
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from slam_bringup.viewer.picture_of_plan import plan_picture
-from slam_core.chi_square import chi_square_quantile
+from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, quaternion_from_rotation
 from slam_core.types import ByteArray, Float32Array
 
@@ -30,7 +30,6 @@ COLOURS = ((214, 39, 40), (31, 119, 180), (44, 160, 44), (148, 103, 189), (255, 
 """One for each agent, in their order."""
 
 _STATE_COLOURS = {"OK": "#2a9d3a", "DEGRADED": "#d98e04", "LOST": "#d62728"}
-_ELLIPSOID_CONFIDENCE = 0.995
 _LARGEST_ELLIPSOID_M = 1.5
 """An ellipsoid as large as a room says only that the landmark is far away, and hides the room."""
 _MOST_ELLIPSOIDS = 4000
@@ -287,7 +286,7 @@ class ViewerPage:
         self, name: str, positions: FloatArray, covariances: FloatArray, colour: tuple[int, int, int]
     ) -> None:
         values, vectors = np.linalg.eigh(covariances)
-        radii = np.sqrt(np.maximum(values, 0.0) * chi_square_quantile(_ELLIPSOID_CONFIDENCE, 3))
+        radii = np.sqrt(np.maximum(values, 0.0) * chi_square_bound(ELLIPSE_PROBABILITY, 3))
         shown = np.flatnonzero(radii[:, 2] < _LARGEST_ELLIPSOID_M)[:_MOST_ELLIPSOIDS]
         vectors = vectors * np.where(np.linalg.det(vectors) < 0, -1.0, 1.0)[:, None, None]
         ball = trimesh.creation.icosphere(subdivisions=1)

@@ -47,7 +47,8 @@ class ViewerConfig(Config):
     port: int = parameter(8080, "port of the page; 0: any that is free", minimum=0, maximum=65535)
     host: str = parameter("127.0.0.1", "address the page listens on; 0.0.0.0 lets other machines see it")
     map_frame: str = parameter("map", "frame of the map")
-    post_period_s: float = parameter(2.0, "time from one look for ways out to the next", unit="s", minimum=0.2)
+    post_period_s: float = 2.0
+    """Time from one look for ways out to the next, s."""
 
 
 @dataclass

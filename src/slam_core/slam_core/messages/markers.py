@@ -6,15 +6,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from slam_core.chi_square import chi_square_quantile
+from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import FloatArray, make_transform
 from slam_core.messages.base import Message, MessageTypes
 from slam_core.messages.poses import pose_message
 
 Colour = tuple[float, float, float, float]
 
-PROBABILITY = 0.995
-"""Share of the probability inside an ellipsoid, as in the thesis's figures."""
 
 _ORANGE: Colour = (1.0, 0.55, 0.1, 0.35)
 _BLUE: Colour = (0.1, 0.4, 1.0, 1.0)
@@ -58,7 +56,7 @@ def _ellipsoids(covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rotations (n, 3, 3) whose columns are the axes, and full lengths (n, 3) m of the axes."""
     eigenvalues, axes = np.linalg.eigh(np.asarray(covariances).reshape(-1, 3, 3))
     axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]
-    factor = chi_square_quantile(PROBABILITY, 3)
+    factor = chi_square_bound(ELLIPSE_PROBABILITY, 3)
     return axes, 2.0 * np.sqrt(factor * np.maximum(eigenvalues, 0.0))
 
 
