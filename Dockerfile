@@ -6,6 +6,8 @@
 ARG BASE=debian:bookworm-slim
 FROM ${BASE}
 
+# No versions: the same lines serve Debian and Ubuntu.
+# hadolint ignore=DL3008
 RUN apt-get update \
     && DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends \
         python3 python3-venv python3-dev build-essential libgl1 libglib2.0-0 \

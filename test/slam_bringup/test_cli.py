@@ -70,6 +70,19 @@ def test_how_much_is_said_is_chosen_before_or_behind_the_command(before, after, 
     assert not [h for h in logging.getLogger().handlers if type(h) is logging.StreamHandler], "it ends with the command"
 
 
+@click.command()
+def endless() -> None:
+    raise KeyboardInterrupt
+
+
+def test_ctrl_c_ends_every_command_with_its_exit_code(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "slam_bringup.commands.endless", SimpleNamespace(command=endless))
+    monkeypatch.setitem(COMMANDS, "endless", "does not end")
+    result = CliRunner().invoke(slam, ["endless"])
+    assert result.exit_code == 130
+    assert result.output == "\nstopped\n"
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_its_help(name: str) -> None:
     result = CliRunner().invoke(slam, [name, "--help"])

@@ -7,6 +7,7 @@ import gc
 import importlib
 import os
 import sys
+from typing import Any
 
 import click
 
@@ -49,6 +50,15 @@ class _LazyGroup(click.Group):
             return None
         module = importlib.import_module(f"slam_bringup.commands.{cmd_name}")
         return with_verbosity(module.command)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:  # whatever was loading or at work; a run that can keep something does so before
+            from slam_bringup.processes.interrupt import INTERRUPTED
+
+            click.echo("\nstopped", err=True)
+            sys.exit(INTERRUPTED)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

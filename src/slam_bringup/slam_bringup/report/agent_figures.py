@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_bringup.pipeline.results import AgentResult, RunResult
 from slam_bringup.report.canvas import blank, draw_to_scale
+from slam_bringup.report.figures import COLOURS
 from slam_core.geometry import FloatArray
 
 _AXES = ("x", "y", "z")
@@ -30,8 +31,9 @@ def side_view(result: RunResult) -> Figure | None:
         axes.plot(points[:, along], points[:, 2], ".", color="#b36b00", markersize=2, label="landmarks")
         axes.set_xlim(min(low[along], path[:, along].min()) - 0.5, max(high[along], path[:, along].max()) + 0.5)
         axes.set_ylim(min(low[2], path[:, 2].min()) - 0.3, max(high[2], path[:, 2].max()) + 0.3)
-    for agent, positions in zip(result.agents, paths, strict=False):
-        axes.plot(positions[:, along], positions[:, 2], linewidth=1.4, label=agent.name or "trajectory")
+    for agent, colour in zip(result.agents, COLOURS * len(result.agents), strict=False):
+        positions = agent.trajectory.poses[:, :3, 3]
+        axes.plot(positions[:, along], positions[:, 2], color=colour, linewidth=1.4, label=agent.name or "trajectory")
     draw_to_scale(figure, axes)
     axes.set(xlabel=f"{_AXES[along]} [m]", ylabel="z [m]")
     axes.legend(fontsize=8, loc="upper right")

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
+
+from slam_bringup.processes.interrupt import STOPPED
 
 _SHOWN_EVENTS = 8
 
@@ -24,7 +27,7 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
         table.add_row("dropped", f"{count} x {reason}")
     table.add_row("path", f"{summary['path_length_m']:.2f} m")
     table.add_row("map", f"{summary['landmarks']} landmarks, {summary['submaps']} submaps")
-    if "features_from" in summary:
+    if "features_from" in summary and summary["mode"] == "tof":
         table.add_row("features from", f"{summary['features_from']} images")
     table.add_row("loop closures", str(summary["loop_closures"]))
     for name, part in summary.get("agents", {"": summary}).items():
@@ -33,15 +36,17 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
         table.add_row("scan odometry", _accuracy(summary["scan_odometry"]))
     table.add_row(
         "time",
-        f"mapping {summary['wall_s']:.1f} s for {summary['sensor_s']:.1f} s, {summary['real_time_factor']:.1f} x real "
-        f"time; from start to end {summary['total_s']:.1f} s, {summary['total_real_time_factor']:.1f} x",
+        f"{summary['sensor_s']:.1f} s of recording mapped in {summary['wall_s']:.1f} s "
+        f"({summary['real_time_factor']:.1f} x real time); {summary['total_s']:.1f} s from start to end",
     )
     stages = [f"{name} {s['median']:.1f}" for name, s in summary["stage_ms"].items() if s]
-    table.add_row("ms per call", ", ".join(stages))
+    table.add_row("ms per step", ", ".join(stages))
     if summary["events"]:
         more = len(summary["events"]) - _SHOWN_EVENTS
         table.add_row("events", "\n".join(summary["events"][:_SHOWN_EVENTS] + [f"and {more} more"] * (more > 0)))
     table.add_row("results", str(out))
+    report = "" if STOPPED in summary["events"] else "report.html in a browser, "
+    table.add_row("to look at", f"slam view {shlex.quote(str(out))}; {report}result.mcap in Foxglove")
     return table
 
 
@@ -58,7 +63,7 @@ def _lost(summary: dict[str, Any]) -> str:
 def _accuracy(part: dict[str, Any]) -> str:
     if "ate_rmse_m" not in part:
         return "no ground truth"
-    anees = f", ANEES {part['anees']:.1f}" if part.get("anees") is not None else ""
+    anees = f", ANEES {part['anees']:.1f} (honest: 1)" if part.get("anees") is not None else ""
     # Poses of an IMU or a marker, say: slam evaluate takes the difference off.
     other = "; truth is of another body frame: slam evaluate --align-body" if part.get("body_offset") else ""
     return (
