@@ -39,7 +39,7 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
         f"{summary['sensor_s']:.1f} s of recording mapped in {summary['wall_s']:.1f} s "
         f"({summary['real_time_factor']:.1f} x real time); {summary['total_s']:.1f} s from start to end",
     )
-    stages = [f"{name} {s['median']:.1f}" for name, s in summary["stage_ms"].items() if s]
+    stages = [f"{name} {s['median']:.1f}" for name, s in summary["stage_ms"].items() if s and s["median"] >= 0.05]
     table.add_row("ms per step", ", ".join(stages))
     if summary["events"]:
         more = len(summary["events"]) - _SHOWN_EVENTS
