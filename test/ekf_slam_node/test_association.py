@@ -60,13 +60,10 @@ def test_small_step_is_associated_rightly(world: PointWorld, rng: np.random.Gene
 def test_descriptors_are_needed_where_the_prediction_is_vague(world: PointWorld, rng: np.random.Generator) -> None:
     candidates, first, now, second = two_views(world, SMALL_STEP, rng)
     vague = np.diag(np.repeat([0.05, 0.03], 3) ** 2)
-    similarity = np.asarray(candidates.descriptors @ now.descriptors.T, dtype=np.float64)
     shares = []
     for threshold in (0.75, -1.0):
         config = FeatureAssociationConfig(descriptor_threshold=threshold, descriptor_weight=0.0)
-        rows, columns = association.associate_mahalanobis(
-            candidates, now, similarity, np.eye(4), vague, T_RIG_OPTICAL, config
-        )
+        rows, columns = association.associate_mahalanobis(candidates, now, np.eye(4), vague, T_RIG_OPTICAL, config)
         shares.append(np.mean(first[rows] == second[columns]))
     assert shares[0] > 0.99
     assert shares[1] < 0.8
@@ -77,11 +74,11 @@ def test_gated_costs_are_those_of_equation_4_8(world: PointWorld, rng: np.random
     prior = np.diag(np.repeat([0.02, 0.01], 3) ** 2)
     seen = predict(candidates, SMALL_STEP, T_RIG_OPTICAL, now)
     S = innovation_covariance(seen, candidates, prior)
-    similarity = candidates.descriptors @ now.descriptors.T
+    similarity = candidates.descriptors.astype(np.float64) @ now.descriptors.astype(np.float64).T
     costs = np.full(similarity.shape, np.inf)
     visible = seen.in_image(now.camera, margin_px=-50.0)
     rows, columns, values = association._gated_pairs(
-        now.z, now.variance, seen.z, S, visible, similarity, -1.0, 16.0, 3.0
+        now.z, now.variance, now.descriptors, seen.z, S, visible, candidates.descriptors, -1.0, 16.0, 3.0
     )
     assert len(rows) > 100
     assert np.array_equal(np.lexsort((columns, rows)), np.arange(len(rows)))
@@ -101,12 +98,12 @@ def test_there_is_room_for_every_pair(world: PointWorld, rng: np.random.Generato
     candidates, _, now, _ = two_views(world, SMALL_STEP, rng)
     seen = predict(candidates, SMALL_STEP, T_RIG_OPTICAL, now)
     S = np.tile(1e8 * np.eye(3), (len(candidates), 1, 1))
-    similarity, everywhere = np.ones((len(candidates), len(now)), np.float32), np.ones(len(candidates), bool)
+    pairs, everywhere = len(candidates) * len(now), np.ones(len(candidates), bool)
     rows, columns, values = association._gated_pairs(
-        now.z, now.variance, seen.z, S, everywhere, similarity, 0.5, 1e9, 0.0
+        now.z, now.variance, now.descriptors, seen.z, S, everywhere, candidates.descriptors, -2.0, 1e9, 0.0
     )
-    assert len(rows) == similarity.size > association._ROOM
-    np.testing.assert_array_equal(rows * len(now) + columns, np.arange(similarity.size))
+    assert len(rows) == pairs > association._ROOM
+    np.testing.assert_array_equal(rows * len(now) + columns, np.arange(pairs))
     assert np.isfinite(values).all()
 
 

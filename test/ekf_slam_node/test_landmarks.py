@@ -87,11 +87,10 @@ def test_every_algorithm_pairs_what_is_the_same(rng):
     views = [world.features(np.eye(4), k, rng, max_features=80) for k in (1, 2)]
     (before, first), (now, second) = [(frame_from_features(f, np.arange(len(f)), 0.01, 1e-5), i) for f, i in views]
     candidates = Candidates(*rig_points(before, T_RIG_OPTICAL), before.descriptors)
-    similarity = np.asarray(candidates.descriptors @ now.descriptors.T, dtype=np.float64)
     config, covariance = FeatureAssociationConfig(), 1e-4 * np.eye(6)
     common = len(np.intersect1d(first, second))
     for associate, share in ((associate_mahalanobis, 0.95), (associate_jcbb, 0.2), (associate_ccda, 0.2)):
-        rows, columns = associate(candidates, now, similarity, np.eye(4), covariance, T_RIG_OPTICAL, config)
+        rows, columns = associate(candidates, now, np.eye(4), covariance, T_RIG_OPTICAL, config)
         assert (first[rows] == second[columns]).mean() > 0.99
         assert len(rows) >= share * common
     rows, columns = associate_nearest(candidates, now, np.eye(4), T_RIG_OPTICAL, 0.15)

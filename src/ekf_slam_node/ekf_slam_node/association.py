@@ -20,6 +20,8 @@ from ekf_slam_node.models import Frame, Observation, rig_points
 from ekf_slam_node.pair_kernels import first_of_both
 from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, transform_points
+from slam_core.in_place import in_place
+from slam_core.least_squares import chi_square_bound
 
 _JOINT_FEATURES = 20
 """Features that the search for joint compatibility takes in."""
@@ -31,37 +33,72 @@ _JOINT_CONFIDENCE = 0.999
 
 
 @njit(cache=True, nogil=True)
-def _gated_pairs(z, variance, seen_z, S, visible, similarity, threshold, gate, weight):  # type: ignore[no-untyped-def]
-    """Rows, columns and costs (Eq. 4.8 plus the descriptors') of all pairs inside the gate, row by row."""
+def _gated_pairs(z, variance, looks, seen_z, S, visible, known_looks, threshold, gate, weight):  # type: ignore[no-untyped-def]
+    """Rows, columns and costs (Eq. 4.8 plus the descriptors') of all pairs inside the gate, row by row.
+
+    ``looks`` and ``known_looks`` are the features' and the candidates' descriptors, unit norm. Few pairs come as far as
+    to have theirs multiplied.
+    """
     rows, columns, costs = np.empty(_ROOM, np.int64), np.empty(_ROOM, np.int64), np.empty(_ROOM)
+    u, v, variance_u, variance_v = z[:, 0].copy(), z[:, 1].copy(), variance[:, 0].copy(), variance[:, 1].copy()
+    near = np.zeros(-(-len(z) // 8) * 8, np.uint8)
+    eights = near.view(np.uint64)
     used = 0
     for i in range(len(seen_z)):
         if not visible[i]:
             continue
         if used + len(z) > len(rows):
             rows, columns, costs = _doubled(rows, len(z)), _doubled(columns, len(z)), _doubled(costs, len(z))
-        reach_u = np.sqrt(gate * (S[i, 0, 0] + 4.0))
-        for j in range(len(z)):
-            du = z[j, 0] - seen_z[i, 0]
-            if similarity[i, j] < threshold or abs(du) > reach_u + 4.0 * np.sqrt(gate * variance[j, 0]):
+        _mark_near(u, v, variance_u, variance_v, seen_z[i], S[i], gate, near)
+        for eight in range(len(eights)):
+            if eights[eight] == 0:
                 continue
-            dv, dw = z[j, 1] - seen_z[i, 1], z[j, 2] - seen_z[i, 2]
-            # Cholesky factor of the 3x3 S + R, by hand: this runs for every pair.
-            a = np.sqrt(S[i, 0, 0] + variance[j, 0])
-            b = S[i, 1, 0] / a
-            c = np.sqrt(S[i, 1, 1] + variance[j, 1] - b * b)
-            d = S[i, 2, 0] / a
-            e = (S[i, 2, 1] - d * b) / c
-            f = np.sqrt(max(S[i, 2, 2] + variance[j, 2] - d * d - e * e, 1e-300))
-            y0 = du / a
-            y1 = (dv - b * y0) / c
-            y2 = (dw - d * y0 - e * y1) / f
-            nis = y0 * y0 + y1 * y1 + y2 * y2
-            if nis < gate:
-                cost = nis + 2.0 * np.log(a * c * f) + weight * (1.0 - np.float64(similarity[i, j]))
-                rows[used], columns[used], costs[used] = i, j, cost
+            for j in range(8 * eight, min(8 * eight + 8, len(z))):
+                if not near[j]:
+                    continue
+                nis, root = _distance(z[j], variance[j], seen_z[i], S[i])
+                if not nis < gate:
+                    continue
+                similarity = _dot(known_looks[i], looks[j])
+                if similarity < threshold:
+                    continue
+                rows[used], columns[used] = i, j
+                costs[used] = nis + 2.0 * np.log(root) + weight * (1.0 - similarity)
                 used += 1
     return rows[:used], columns[:used], costs[:used]
+
+
+@in_place()
+def _mark_near(u, v, variance_u, variance_v, seen, S, gate, near):  # type: ignore[no-untyped-def]
+    """Mark the features that either pixel coordinate alone does not put outside the gate."""
+    for j in range(len(u)):
+        du, dv = u[j] - seen[0], v[j] - seen[1]
+        near[j] = (du * du < gate * (S[0, 0] + variance_u[j])) & (dv * dv < gate * (S[1, 1] + variance_v[j]))
+
+
+@in_place()
+def _distance(z, variance, seen, S):  # type: ignore[no-untyped-def]
+    """Squared Mahalanobis distance of a pair, and the root of the determinant of S + R."""
+    du, dv, dw = z[0] - seen[0], z[1] - seen[1], z[2] - seen[2]
+    # Cholesky factor of the 3x3 S + R, by hand: this runs for every pair that is near.
+    a = np.sqrt(S[0, 0] + variance[0])
+    b = S[1, 0] / a
+    c = np.sqrt(S[1, 1] + variance[1] - b * b)
+    d = S[2, 0] / a
+    e = (S[2, 1] - d * b) / c
+    f = np.sqrt(max(S[2, 2] + variance[2] - d * d - e * e, 1e-300))
+    y0 = du / a
+    y1 = (dv - b * y0) / c
+    y2 = (dw - d * y0 - e * y1) / f
+    return y0 * y0 + y1 * y1 + y2 * y2, a * c * f
+
+
+@in_place(fastmath={"reassoc", "contract"})
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for k in range(len(a)):
+        total += np.float64(a[k]) * np.float64(b[k])
+    return total
 
 
 _ROOM = 4096
@@ -89,21 +126,18 @@ def pair_up(
 
 
 def associate_mahalanobis(
-    candidates: Candidates, frame: Frame, similarity: Similarity, T_previous_now: FloatArray,
-    motion_covariance: FloatArray, T_rig_optical: FloatArray, config: FeatureAssociationConfig,
+    candidates: Candidates, frame: Frame, T_previous_now: FloatArray, motion_covariance: FloatArray,
+    T_rig_optical: FloatArray, config: FeatureAssociationConfig,
 ) -> tuple[IndexArray, IndexArray]:  # fmt: skip
-    """Algorithm 2: indices of candidates and of features, paired by normalised distance and descriptors.
-
-    ``similarity`` (n, m), of any precision, are the cosines of the candidates' and the features' descriptors.
-    """
+    """Algorithm 2: indices of candidates and of features, paired by normalised distance and descriptors."""
     seen = predict(candidates, T_previous_now, T_rig_optical, frame)
     S = innovation_covariance(seen, candidates, motion_covariance)
     visible = seen.in_image(frame.camera, margin_px=-50.0)
     rows, columns, costs = _gated_pairs(
-        frame.z, frame.variance, seen.z, S, visible, similarity, config.descriptor_threshold, config.gate,
-        config.descriptor_weight,
+        frame.z, frame.variance, frame.descriptors, seen.z, S, visible, candidates.descriptors,
+        config.descriptor_threshold, config.gate, config.descriptor_weight,
     )  # fmt: skip
-    return pair_up(rows, columns, costs, similarity.shape)
+    return pair_up(rows, columns, costs, (len(candidates), len(frame)))
 
 
 def associate_nearest(
@@ -137,15 +171,15 @@ def match_descriptors(similarity: Similarity, threshold: float, ratio: float) ->
 
 
 def associate_jcbb(
-    candidates: Candidates, frame: Frame, similarity: Similarity, T_previous_now: FloatArray,
-    motion_covariance: FloatArray, T_rig_optical: FloatArray, config: FeatureAssociationConfig,
+    candidates: Candidates, frame: Frame, T_previous_now: FloatArray, motion_covariance: FloatArray,
+    T_rig_optical: FloatArray, config: FeatureAssociationConfig,
 ) -> tuple[IndexArray, IndexArray]:  # fmt: skip
     """Pairs that are jointly compatible: the features with the fewest candidates, as many as a search can handle.
 
     They fix the motion; the others follow by their gates around it (:class:`ekf_slam_node.linking.Linker`).
     """
     seen = predict(candidates, T_previous_now, T_rig_optical, frame)
-    pairs = _clearest_pairs(candidates, frame, similarity, seen, motion_covariance, config)
+    pairs = _clearest_pairs(candidates, frame, seen, motion_covariance, config)
     rows, columns = np.unique(pairs[0]), np.unique(pairs[1])
     J = seen.J_pose[rows].reshape(-1, 6)
     joint = J @ motion_covariance @ J.T
@@ -158,15 +192,15 @@ def associate_jcbb(
 
 
 def associate_ccda(
-    candidates: Candidates, frame: Frame, similarity: Similarity, T_previous_now: FloatArray,
-    motion_covariance: FloatArray, T_rig_optical: FloatArray, config: FeatureAssociationConfig,
+    candidates: Candidates, frame: Frame, T_previous_now: FloatArray, motion_covariance: FloatArray,
+    T_rig_optical: FloatArray, config: FeatureAssociationConfig,
 ) -> tuple[IndexArray, IndexArray]:  # fmt: skip
     """The most pairs whose points are two by two equally far apart (thesis 9.4.1), of the same features as JCBB's.
 
     The motion only says which pairs are possible at all; with a covariance without bounds their descriptors do.
     """
     seen = predict(candidates, T_previous_now, T_rig_optical, frame)
-    rows, columns, costs = _clearest_pairs(candidates, frame, similarity, seen, motion_covariance, config)
+    rows, columns, costs = _clearest_pairs(candidates, frame, seen, motion_covariance, config)
     before, now = candidates.points[rows], rig_points(frame.select(columns), T_rig_optical)
     fits = equal_distances(
         (before, distance_variances(before, candidates.covariances[rows])),
@@ -181,7 +215,6 @@ def associate_ccda(
 def _clearest_pairs(
     candidates: Candidates,
     frame: Frame,
-    similarity: Similarity,
     seen: Observation,
     motion_covariance: FloatArray,
     config: FeatureAssociationConfig,
@@ -189,8 +222,8 @@ def _clearest_pairs(
     """Rows, columns and costs of the gated pairs of the features with the fewest candidates."""
     S = innovation_covariance(seen, candidates, motion_covariance)
     rows, columns, costs = _gated_pairs(
-        frame.z, frame.variance, seen.z, S, seen.in_image(frame.camera), similarity, config.descriptor_threshold,
-        config.gate, 0.0,
+        frame.z, frame.variance, frame.descriptors, seen.z, S, seen.in_image(frame.camera), candidates.descriptors,
+        config.descriptor_threshold, config.gate, 0.0,
     )  # fmt: skip
     choices = np.bincount(columns, minlength=len(frame))
     clearest = np.argsort(np.where(choices > 0, choices, np.iinfo(np.int64).max), kind="stable")

@@ -90,15 +90,17 @@ class Covariance:
     def head(self, rows: int) -> FloatArray:
         """The first ``rows`` columns (n, rows): covariance of everything with the head of the state."""
         out = self._P[: self.size, :rows].copy()
-        square = out[:rows]
-        out[:rows] = np.tril(square) + np.tril(square, -1).T
+        for k in range(rows - 1):
+            out[k, k + 1 :] = out[k + 1 : rows, k]
         return out
 
     def blocks(self, first: IndexArray, width: int = 3) -> FloatArray:
         """Diagonal blocks (k, width, width) that start at rows ``first`` (k,)."""
         index = np.asarray(first)[:, None] + np.arange(width)
-        lower = np.tril(self._P[index[:, :, None], index[:, None, :]])
-        return np.asarray(lower + np.swapaxes(np.tril(lower, -1), 1, 2))
+        out = self._P[index[:, :, None], index[:, None, :]]
+        for k in range(width - 1):
+            out[:, k, k + 1 :] = out[:, k + 1 :, k]
+        return np.asarray(out)
 
     def set_head(self, columns: FloatArray) -> None:
         """Replace the first columns by (n, rows), as the time update does."""

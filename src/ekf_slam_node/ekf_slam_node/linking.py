@@ -12,7 +12,6 @@ import numpy as np
 
 from ekf_slam_node.association import (
     IndexArray,
-    Similarity,
     associate_ccda,
     associate_jcbb,
     associate_mahalanobis,
@@ -78,21 +77,20 @@ class Linker:
             return None
         # Seeded by the frame's own stamp: the result does not depend on what happened before.
         rng = np.random.default_rng((self._config.seed, frame.stamp_ns))
-        similarity = candidates.descriptors @ frame.descriptors.T
-        predicted = self._by_prediction(candidates, frame, similarity, prior, rng)
+        predicted = self._by_prediction(candidates, frame, prior, rng)
         if predicted is not None and len(predicted.rows) >= _CONVINCING * min(len(candidates), len(frame)):
             return predicted
         # A prediction that is wrong and sure of itself finds the few pairs that agree with it: looks alone decide.
-        guessed = self._by_guess(candidates, frame, similarity, rng)
+        guessed = self._by_guess(candidates, frame, rng)
         return max((link for link in (predicted, guessed) if link is not None), key=_number_of_pairs, default=None)
 
     def _by_prediction(
-        self, candidates: Candidates, frame: Frame, similarity: Similarity, prior: MotionPrior, rng: np.random.Generator
+        self, candidates: Candidates, frame: Frame, prior: MotionPrior, rng: np.random.Generator
     ) -> FrameLink | None:
         config = self._config
         if _image_spread(prior, frame) > _MAX_GATE_PX:
             return None
-        rows, columns = self._associate(candidates, frame, similarity, prior)
+        rows, columns = self._associate(candidates, frame, prior)
         guess = guess_motion(
             candidates.select(rows),
             frame.select(columns),
@@ -104,13 +102,12 @@ class Linker:
         )
         if guess is None or guess.inliers.sum() < max(config.min_inliers, 0.5 * len(rows)):
             return None
-        return self._settle(candidates, frame, similarity, guess, config.min_inliers)
+        return self._settle(candidates, frame, guess, config.min_inliers)
 
-    def _by_guess(
-        self, candidates: Candidates, frame: Frame, similarity: Similarity, rng: np.random.Generator
-    ) -> FrameLink | None:
+    def _by_guess(self, candidates: Candidates, frame: Frame, rng: np.random.Generator) -> FrameLink | None:
         """First with the descriptors that agree well, then with all that agree at all."""
         config = self._config
+        similarity = candidates.descriptors @ frame.descriptors.T
         strict = match_descriptors(similarity, config.descriptor_threshold, _GUESS_RATIO)
         loose = match_descriptors(similarity, _GUESS_DESCRIPTOR_THRESHOLD, 1.0)
         for rows, columns in (strict, loose):
@@ -125,24 +122,18 @@ class Linker:
             enough = max(config.min_inliers, _MIN_INLIER_RATIO * len(rows))
             if guess is None or guess.inliers.sum() < enough:
                 continue
-            link = self._settle(candidates, frame, similarity, guess, _GUESS_MIN_INLIERS)
+            link = self._settle(candidates, frame, guess, _GUESS_MIN_INLIERS)
             if link is not None:
                 return link
         return None
 
-    def _associate(
-        self, candidates: Candidates, frame: Frame, similarity: Similarity, prior: MotionPrior
-    ) -> tuple[IndexArray, IndexArray]:
+    def _associate(self, candidates: Candidates, frame: Frame, prior: MotionPrior) -> tuple[IndexArray, IndexArray]:
         config = self._config
         if config.method == "nearest":
             return associate_nearest(candidates, frame, prior.T, self._T_rig_optical, NEAREST_ASSOCIATE)
-        return _METHODS[config.method](
-            candidates, frame, similarity, prior.T, prior.covariance, self._T_rig_optical, config
-        )
+        return _METHODS[config.method](candidates, frame, prior.T, prior.covariance, self._T_rig_optical, config)
 
-    def _settle(
-        self, candidates: Candidates, frame: Frame, similarity: Similarity, guess: MotionGuess, least: int
-    ) -> FrameLink | None:
+    def _settle(self, candidates: Candidates, frame: Frame, guess: MotionGuess, least: int) -> FrameLink | None:
         """Associate once more around the motion found, where the gates are as small as they can be."""
         if self._config.method == "nearest":
             near = NEAREST_ASSOCIATE
@@ -150,7 +141,7 @@ class Linker:
         else:
             noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))
             rows, columns = associate_mahalanobis(
-                candidates, noisier, similarity, guess.T, guess.covariance, self._T_rig_optical, self._config
+                candidates, noisier, guess.T, guess.covariance, self._T_rig_optical, self._config
             )
         final = refine_motion(
             candidates.select(rows), frame.select(columns), self._T_rig_optical, guess.T, self._config.gate

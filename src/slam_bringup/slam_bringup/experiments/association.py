@@ -88,13 +88,13 @@ def _pairs(
     """Candidates of the first frame and features of the second that the method pairs."""
     before, now = _frame(first), _frame(second)
     candidates = Candidates(*rig_points(before, T_rig_optical), before.descriptors)
-    similarity = np.asarray(candidates.descriptors @ now.descriptors.T, dtype=np.float64)
     if config.method == "nearest":
         rows, columns = associate_nearest(candidates, now, prior.T, T_rig_optical, NEAREST_ASSOCIATE)
-        alike = similarity[rows, columns] >= config.descriptor_threshold
+        similarity = np.einsum("nd,nd->n", candidates.descriptors[rows], now.descriptors[columns])
+        alike = similarity >= config.descriptor_threshold
         return rows[alike], columns[alike]
     associate = _JOINT[config.method]
-    return associate(candidates, now, similarity, prior.T, prior.covariance, T_rig_optical, config)
+    return associate(candidates, now, prior.T, prior.covariance, T_rig_optical, config)
 
 
 def _frame(view: FeatureFrame) -> Frame:
