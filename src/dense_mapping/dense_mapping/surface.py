@@ -165,8 +165,11 @@ def _welded(
 ) -> tuple[Float32Array, npt.NDArray[np.int32], npt.NDArray[np.int64]]:
     """Points of neighbouring cubes that are one made one, and triangles without area dropped."""
     cells = np.rint(points.astype(np.float64) / (1e-3 * voxel_size)).astype(np.int64)
-    _, kept, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    faces = inverse.ravel()[faces].astype(np.int32)
+    order = np.lexsort(cells.T[::-1])
+    begins = np.concatenate([[True], (np.diff(cells[order], axis=0) != 0).any(axis=1)])
+    kept, inverse = order[begins], np.empty(len(order), dtype=np.int64)
+    inverse[order] = np.cumsum(begins) - 1
+    faces = inverse[faces].astype(np.int32)
     a, b, c = faces.T
     return points[kept], faces[(a != b) & (b != c) & (c != a)], kept
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dense_mapping.tsdf_kernels import BLOCK, DepthView, integrate
+from dense_mapping.tsdf_kernels import BLOCK, VOXELS, DepthView, integrate
 from slam_core.camera import MIN_DEPTH, Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, transform_points
@@ -21,7 +21,6 @@ from slam_core.types import ByteArray, Float32Array
 
 _TRUNCATION_VOXELS = 3.0
 """Distances are kept up to so many voxels."""
-VOXELS = BLOCK**3
 _KEY_RANGE = 1 << 20
 """Block coordinates lie within plus and minus half of this."""
 
@@ -124,8 +123,10 @@ class TsdfVolume:
     def _allocate(self, points: FloatArray) -> None:
         """Make the blocks that hold any of the points (n, 3)."""
         cells = np.floor(points / self.block_size).astype(np.int64)
-        keys, first = np.unique(_keys(cells), return_index=True)
-        new = [i for key, i in zip(keys.tolist(), first.tolist(), strict=True) if key not in self._rows]
+        keys = _keys(cells)
+        begins = np.flatnonzero(np.concatenate([np.ones(min(1, len(keys)), dtype=bool), keys[1:] != keys[:-1]]))
+        keys, first = np.unique(keys[begins], return_index=True)  # of the runs: neighbours mostly share a block
+        new = [i for key, i in zip(keys.tolist(), begins[first].tolist(), strict=True) if key not in self._rows]
         room = self.config.max_blocks - len(self)
         self.refused_blocks += max(0, len(new) - room)
         new = new[: max(0, room)]

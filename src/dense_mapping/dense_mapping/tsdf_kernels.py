@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from slam_core.camera import MIN_DEPTH
 from slam_core.geometry import FloatArray
@@ -16,6 +17,9 @@ from slam_core.types import ByteArray, Float32Array
 
 BLOCK = 8
 """Voxels along the edge of a block."""
+VOXELS = BLOCK**3
+_ONE = np.uintp(1)
+"""Unsigned indices cannot be negative, so that the kernels need not look whether they count from the end."""
 
 
 class DepthView(NamedTuple):
@@ -36,16 +40,16 @@ class DepthView(NamedTuple):
 def _look_up(u: float, v: float, depth: Float32Array, jump: float) -> float:  # pragma: no cover - compiled
     """Depth at a pixel, bilinear where the four neighbours belong to one surface, else of the nearest; 0: none."""
     height, width = depth.shape
-    column, row = math.floor(u), math.floor(v)
-    if column < 0 or row < 0 or column + 1 >= width or row + 1 >= height:
+    if not (u >= 0.0 and v >= 0.0 and u < width - 1 and v < height - 1):
         return 0.0
-    a, b = float(depth[row, column]), float(depth[row, column + 1])
-    c, d = float(depth[row + 1, column]), float(depth[row + 1, column + 1])
+    column, row = np.uintp(u), np.uintp(v)
+    upper, lower = depth[row], depth[row + _ONE]
+    a, b, c, d = upper[column], upper[column + _ONE], lower[column], lower[column + _ONE]
     lowest, highest = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
     fu, fv = u - column, v - row
     if lowest > 0.0 and highest - lowest < jump:
-        return (1.0 - fv) * ((1.0 - fu) * a + fu * b) + fv * ((1.0 - fu) * c + fu * d)
-    return float(depth[int(v + 0.5), int(u + 0.5)])
+        return float((1.0 - fv) * ((1.0 - fu) * a + fu * b) + fv * ((1.0 - fu) * c + fu * d))
+    return float(depth[np.uintp(v + 0.5), np.uintp(u + 0.5)])
 
 
 @in_place(error_model="numpy")
@@ -64,7 +68,7 @@ def _add_distance(
     return distance
 
 
-@in_place(error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def integrate(
     blocks: npt.NDArray[np.int64],
     origins: FloatArray,
@@ -80,31 +84,63 @@ def integrate(
     voxels: (n, 512, 4) sum of weighted distance, of weight, of weighted squared distance, and number of images.
     colours: (n, 512, 4) mean red, green, blue and of how many images. truncation: largest distance kept, m.
     """
-    T = view.T_camera_map
-    fx, fy, cx, cy = view.intrinsics[0], view.intrinsics[1], view.intrinsics[2], view.intrinsics[3]
+    column, row, away = np.empty(VOXELS), np.empty(VOXELS), np.empty(VOXELS)
     for b in blocks:
-        for i in range(BLOCK * BLOCK * BLOCK):
-            if i % BLOCK == 0:  # the next column of voxels along z
-                x = origins[b, 0] + (i // (BLOCK * BLOCK) + 0.5) * voxel_size
-                y = origins[b, 1] + ((i // BLOCK) % BLOCK + 0.5) * voxel_size
-                column_x = T[0, 0] * x + T[0, 1] * y + T[0, 3]
-                column_y = T[1, 0] * x + T[1, 1] * y + T[1, 3]
-                column_z = T[2, 0] * x + T[2, 1] * y + T[2, 3]
-            z = origins[b, 2] + (i % BLOCK + 0.5) * voxel_size
-            pz = column_z + T[2, 2] * z
-            if pz < MIN_DEPTH:
-                continue
-            u, v = fx * ((column_x + T[0, 2] * z) / pz) + cx, fy * ((column_y + T[1, 2] * z) / pz) + cy
-            measured = _look_up(u, v, view.depth, truncation)
-            if not measured > 0.0 or measured - pz < -truncation:
-                continue
-            row, column = int(v + 0.5), int(u + 0.5)
-            noise = view.sigma[row, column]
-            if not noise > 0.0:
-                continue
-            distance = _add_distance(voxels[b, i], measured - pz, noise, voxel_size, truncation, sign)
-            if view.picture.shape[0] > 0 and sign > 0.0 and abs(distance) < 1.5 * voxel_size:
-                _blend(colours[b, i], view.picture[row, column])
+        _project(origins[b], voxel_size, view.T_camera_map, view.intrinsics, (column, row, away))
+        _fill((column, row, away), voxels[b], colours[b], voxel_size, truncation, view, sign)
+
+
+_Places = tuple[FloatArray, FloatArray, FloatArray]
+"""Column and row (px) and distance along z (m) of the voxels of a block, (512,) each."""
+
+
+@in_place(error_model="numpy")
+def _project(
+    origin: FloatArray, voxel_size: float, T: FloatArray, intrinsics: FloatArray, out: _Places
+) -> None:  # pragma: no cover - compiled
+    """Places of the voxels of the block at ``origin``: no branch in the loop, so that it is vectorised."""
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    column, row, away = out
+    for line in range(BLOCK * BLOCK):
+        x = origin[0] + (line // BLOCK + 0.5) * voxel_size
+        y = origin[1] + (line % BLOCK + 0.5) * voxel_size
+        line_x = T[0, 0] * x + T[0, 1] * y + T[0, 3]
+        line_y = T[1, 0] * x + T[1, 1] * y + T[1, 3]
+        line_z = T[2, 0] * x + T[2, 1] * y + T[2, 3]
+        for k in range(BLOCK):
+            z = origin[2] + (k + 0.5) * voxel_size
+            pz = line_z + T[2, 2] * z
+            scale = 1.0 / pz
+            column[line * BLOCK + k] = fx * (line_x + T[0, 2] * z) * scale + cx
+            row[line * BLOCK + k] = fy * (line_y + T[1, 2] * z) * scale + cy
+            away[line * BLOCK + k] = pz
+
+
+@in_place(error_model="numpy")
+def _fill(
+    places: _Places,
+    voxels: Float32Array,
+    colours: ByteArray,
+    voxel_size: float,
+    truncation: float,
+    view: DepthView,
+    sign: float,
+) -> None:  # pragma: no cover - compiled
+    """Add an image to the voxels (512, 4) of one block at ``places``."""
+    columns, rows, away = places
+    for i in range(VOXELS):
+        if away[i] < MIN_DEPTH:
+            continue
+        measured = _look_up(columns[i], rows[i], view.depth, truncation)
+        if not measured > 0.0 or measured - away[i] < -truncation:
+            continue
+        row, column = np.uintp(rows[i] + 0.5), np.uintp(columns[i] + 0.5)
+        noise = view.sigma[row, column]
+        if not noise > 0.0:
+            continue
+        distance = _add_distance(voxels[i], measured - away[i], noise, voxel_size, truncation, sign)
+        if view.picture.shape[0] > 0 and sign > 0.0 and abs(distance) < 1.5 * voxel_size:
+            _blend(colours[i], view.picture[row, column])
 
 
 @in_place(error_model="numpy")

@@ -21,7 +21,6 @@ from ekf_slam_node.pair_kernels import first_of_both
 from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, transform_points
 from slam_core.in_place import in_place
-from slam_core.least_squares import chi_square_bound
 
 _JOINT_FEATURES = 20
 """Features that the search for joint compatibility takes in."""
