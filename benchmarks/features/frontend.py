@@ -2,8 +2,8 @@
 """Time of the whole stereo front end per pair and how it splits; simulated 640x480 pairs, EuRoC and KITTI.
 
 Disparities are refined half on each of two threads. The parts are processor time of one thread, the whole is time on
-the wall, so it only says something on an idle machine; "on two cores" is what the parts add up to: features, search, half
-of the disparities. "one core" is their sum. Not in either: every eighth right image has features of its own ("right").
+the wall, so it only says something on an idle machine; "on two cores" is what the parts add up to: features, search,
+half of the disparities. "one core" is their sum. In neither: every eighth right image has features too ("right").
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ _MIN_CORRELATION = 0.85
 _MAX_RATIO = 0.7
 """Most ratio of the best to the second-best distance, ``sqrt(2 - 2 correlation)``."""
 _ROUNDING = 1e-3
-"""What a perfect partner's correlation may lack of one."""
+"""Shortfall from one of a perfect partner's correlation, by rounding."""
 _LEAST_ENERGY = 1.0
 """Variance of grey values below which a patch shows nothing."""
 
