@@ -46,6 +46,16 @@ def test_what_lies_beyond_the_bounds_or_repeats_or_is_flat_has_no_partner(rng):
     assert np.isnan(search_rows(flat, flat, uv, level, BOUNDS)).all()
 
 
+def test_repeats_and_likeness_are_judged_in_noise_too(rng):
+    uv, level = keypoints(rng), np.zeros(60, np.float32)
+    stripes = np.tile(picture(rng, 20), (1, WIDTH // 20))
+    pair = [(stripes + rng.normal(0, 4, stripes.shape)).clip(0, 255).astype(np.uint8) for _ in range(2)]
+    assert np.isnan(search_rows(*pair, uv, level, BOUNDS)).mean() > 0.95
+    left = picture(rng)
+    spoilt = (moved(left, 20.0) + rng.normal(0, 13, left.shape)).clip(0, 255).astype(np.uint8)
+    assert np.isnan(search_rows(left.astype(np.uint8), spoilt, uv, level, BOUNDS)).mean() > 0.95
+
+
 def test_keypoints_at_the_edges_have_no_partner(rng):
     image = picture(rng).astype(np.uint8)
     corners = np.array([[1, 60], [WIDTH - 2, 60], [120, 1], [120, HEIGHT - 2], [9, 60]], np.float32)
