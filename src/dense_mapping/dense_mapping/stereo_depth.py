@@ -23,11 +23,11 @@ import numpy.typing as npt
 from slam_core.config import Config, parameter
 from slam_core.types import AnyArray, ByteArray, DepthImage, Float32Array, StereoImages
 
-_BLOCK_SIZE = 7
+_BLOCK_SIZE = 11
 """Window that is compared, odd, px."""
-_UNIQUENESS_PERCENT = 5
+_UNIQUENESS_PERCENT = 15
 """Share by which the best disparity must be better than the second best, %."""
-_MAX_LEFT_RIGHT = 1.0
+_MAX_LEFT_RIGHT = 0.5
 """Largest difference between the disparities left to right and right to left, px."""
 _SPECKLE_SIZE = 200
 """Islands of disparity up to this size are dropped, px."""
@@ -43,7 +43,7 @@ _SIGMA_SCALE = 2.0
 """Factor on the standard deviation from residual and gradient: neighbours share their errors."""
 _SIGMA_FLOOR = 0.12
 """Standard deviation of a perfect window's disparity, px."""
-_MATCHED_SIGMA = 0.7
+_MATCHED_SIGMA = 0.5
 """Standard deviation of what the matcher alone says, px."""
 _LARGEST_STEP = 0.6
 """Disparities that the step moves by more are dropped: matcher and picture contradict each other, px."""
