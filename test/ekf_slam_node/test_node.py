@@ -140,6 +140,7 @@ def test_loss_is_on_diagnostics(probe: FeatureProbe, filter_process: object) -> 
         features, _ = world.features(T, (k + 1) * STEP_NS, rng)
         probe.send_features(features if k < 6 else features.select(np.zeros(0, dtype=np.int64)))
     probe.wait(lambda: "LOST" in _diagnostics(probe), "loss was not reported")
+    assert "rolling_shutter none seen" in _diagnostics(probe)
 
 
 def _diagnostics(probe: FeatureProbe) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, room
 
-from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.config import EkfSlamConfig, MeasurementConfig
 from ekf_slam_node.models import Frame, frame_from_features
 from ekf_slam_node.rolling_shutter import RollingShutter, _robust_mean
 from ekf_slam_node.slam import EkfSlam
@@ -56,8 +56,10 @@ def motion(k: int) -> FloatArray:
     return invert_transform(pose((k - 1) / RATE)) @ pose(k / RATE)
 
 
-def learnt(readout_s: float, rng: np.random.Generator, frames: int = 60) -> tuple[RollingShutter, PointWorld]:
-    world, shutter = room(rng), RollingShutter(T_RIG_OPTICAL)
+def learnt(
+    readout_s: float, rng: np.random.Generator, frames: int = 60, known: tuple[float, float] = (0.0, 0.0)
+) -> tuple[RollingShutter, PointWorld]:
+    world, shutter = room(rng), RollingShutter(T_RIG_OPTICAL, known)
     for k in range(1, frames):
         frame, index = measured(world, k / RATE, readout_s, rng)
         shutter.learn(frame, index, np.arange(len(frame)), motion(k), 1.0 / RATE)
@@ -80,6 +82,27 @@ def test_features_are_moved_to_the_instant_of_the_middle_row(rng: np.random.Gene
     after = np.linalg.norm(shutter.corrected(exact, 1.0 / RATE, motion(60)).z[:, :2] - true[:, :2], axis=1)
     assert np.sqrt(np.mean(after**2)) < 0.35 * np.sqrt(np.mean(before**2))
     assert np.sqrt(np.mean(before**2)) > 1.0
+
+
+def test_what_is_known_beforehand_holds_from_the_first_frame_on(rng: np.random.Generator) -> None:
+    shutter, world = RollingShutter(T_RIG_OPTICAL, (READOUT_S, 0.001)), room(rng)
+    frame, _ = measured(world, 1 / RATE, READOUT_S, rng)
+    assert (shutter.readout_s, shutter.sigma_s) == (READOUT_S, 0.001)
+    assert np.abs(shutter.corrected(frame, 1.0 / RATE, motion(1)).z - frame.z)[:, :2].max() > 1.0
+
+
+def test_frames_outweigh_what_is_known_less_well(rng: np.random.Generator) -> None:
+    alone, _ = learnt(READOUT_S, rng)
+    vague, _ = learnt(READOUT_S, rng, known=(0.0, 0.01))
+    sure, _ = learnt(READOUT_S, rng, known=(0.01, 1e-4))
+    assert vague.readout_s == pytest.approx(READOUT_S, abs=0.004)
+    assert sure.readout_s == pytest.approx(0.01, abs=0.001)
+    assert sure.sigma_s < 1e-4 < vague.sigma_s < 1.5 * alone.sigma_s
+
+
+def test_a_readout_without_its_sigma_is_refused() -> None:
+    with pytest.raises(ValueError, match="'readout' is given without 'sigma_readout'"):
+        MeasurementConfig(readout=0.02)
 
 
 def test_rows_exposed_at_once_are_left_alone(rng: np.random.Generator) -> None:
@@ -108,5 +131,6 @@ def test_the_filter_is_nearer_to_the_truth_once_it_knows(rng: np.random.Generato
         last = slam.process(features(world, k / RATE, READOUT_S, rng)[0])
         errors.append(boxminus(invert_transform(pose(0.0)) @ pose(k / RATE), last.pose.T))
     steps = np.linalg.norm(np.diff(np.array(errors), axis=0)[:, 3:], axis=1)
-    assert slam.readout_s == pytest.approx(READOUT_S, abs=0.005)
+    assert slam.readout_s[0] == pytest.approx(READOUT_S, abs=0.005)
+    assert 1e-4 < slam.readout_s[1] < 0.005
     assert np.median(steps[40:]) < 0.6 * np.median(steps[:15])

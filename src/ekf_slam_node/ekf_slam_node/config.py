@@ -87,6 +87,19 @@ class MeasurementConfig(Config):
     )
     max_features: int = parameter(800, "the strongest features of a frame that are looked at", minimum=10)
     max_observations: int = parameter(120, "largest number of landmarks used in one update", minimum=6)
+    readout: float = parameter(
+        0.0, "time from a picture's first row to its last, where known beforehand; negative from the last to the first",
+        unit="s", minimum=-0.1, maximum=0.1,
+    )  # fmt: skip
+    sigma_readout: float = parameter(
+        0.0, "standard deviation of that time; 0: nothing is known, it is learnt alone", unit="s", minimum=0.0,
+        maximum=0.1,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.readout != 0.0 and self.sigma_readout == 0.0:
+            raise ValueError("parameter 'readout' is given without 'sigma_readout': say how well it is known")
 
 
 @dataclass(frozen=True)

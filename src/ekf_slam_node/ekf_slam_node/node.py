@@ -126,6 +126,7 @@ class EkfNode(StageNode[EkfNodeConfig]):
             self._publish_submaps(result.submaps)
             self.health.set(_STATES[result.state], result.reason)
             self.health.take(self.stage.counters.counts)
+            self.health.show("rolling_shutter", self.stage.finding or "none seen")
 
     def _publish_result(self, result: EkfResult) -> None:
         pose, types, twist = result.pose, self.types, (result.twist, result.twist_covariance)

@@ -77,19 +77,27 @@ class RollingShutter:
     ----------
     T_rig_optical
         Mounting of the camera, (4, 4).
+    known
+        Readout and its standard deviation, s, as known beforehand; nothing is where the latter is zero.
     """
 
-    def __init__(self, T_rig_optical: FloatArray) -> None:
+    def __init__(self, T_rig_optical: FloatArray, known: tuple[float, float] = (0.0, 0.0)) -> None:
         self._T_rig_optical = T_rig_optical
         self._moments: deque[_Moment] = deque(maxlen=_APART + 2)
         self._evidence: deque[tuple[float, float]] = deque(maxlen=_MEMORY)
-        self._readout_s = 0.0
+        self._known = known
+        self._readout_s, self._sigma_s = known
         self._frames = 0
 
     @property
     def readout_s(self) -> float:
         """Time from the first row to the last, s, negative from the last to the first; 0 where it may be chance."""
         return self._readout_s
+
+    @property
+    def sigma_s(self) -> float:
+        """Standard deviation of the readout, s; 0 while nothing is known."""
+        return self._sigma_s
 
     def corrected(self, frame: Frame, dt: float, T_previous_now: FloatArray | None = None) -> Frame:
         """The frame, dt (s) after the last, with its features where the middle row's instant has them.
@@ -129,10 +137,19 @@ class RollingShutter:
         """Take in the readout of one pair of frames and its standard deviation, s."""
         self._evidence.append((readout, np.hypot(sigma, _PAIR_SIGMA_S)))
         if len(self._evidence) >= _MIN_PAIRS:
-            mean, standard_error = _robust_mean(*np.array(self._evidence).T)
+            mean, standard_error = self._with_known(*_robust_mean(*np.array(self._evidence).T))
             # What was once beyond doubt is not given up for being a little less so: the map rests on it.
             least = _CERTAIN if self._readout_s == 0.0 else _DOUBTED
             self._readout_s = mean if abs(mean) > least * standard_error else 0.0
+            self._sigma_s = standard_error
+
+    def _with_known(self, mean: float, standard_error: float) -> tuple[float, float]:
+        """Mean and standard error of what the frames show and of what was known beforehand."""
+        known, sigma = self._known
+        if sigma == 0.0:
+            return mean, standard_error
+        weights = np.array([standard_error, sigma]) ** -2.0
+        return float(weights @ [mean, known] / weights.sum()), float(weights.sum() ** -0.5)
 
     # ---- one pair of frames
     def _of_pair(self, apart: int) -> tuple[float, float] | None:

@@ -61,7 +61,7 @@ class EkfSlam:
         self.config = config
         self._T_rig_optical = T_rig_optical
         self._linker = Linker(config.association, T_rig_optical)
-        self._shutter = RollingShutter(T_rig_optical)
+        self._shutter = RollingShutter(T_rig_optical, (config.measurement.readout, config.measurement.sigma_readout))
         self.counters = Counters()
         self.session = session
         self._forget()
@@ -139,9 +139,12 @@ class EkfSlam:
         return self._aids.inertial.complaint
 
     @property
-    def readout_s(self) -> float:
-        """Time from the picture's first row to its last, s; 0 where rows are exposed at once or nothing is known."""
-        return self._shutter.readout_s
+    def readout_s(self) -> tuple[float, float]:
+        """Time from the picture's first row to its last and its standard deviation, s; zeros where nothing is known.
+
+        The time is 0 where rows are exposed at once.
+        """
+        return self._shutter.readout_s, self._shutter.sigma_s
 
     def finish(self) -> tuple[Submap, ...]:
         """Close the open submap; the next frame begins a new one that does not follow it."""

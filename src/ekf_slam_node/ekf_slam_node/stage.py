@@ -115,11 +115,16 @@ class FilterStage:
             yield self._process(self._waiting.popleft())
 
     @property
+    def readout_s(self) -> tuple[float, float]:
+        """Time from a picture's first row to its last and its standard deviation, s; zeros where nothing is known."""
+        return (0.0, 0.0) if self._slam is None else self._slam.readout_s
+
+    @property
     def finding(self) -> str:
         """Finding about the camera that a user should know of, or ""."""
-        readout = 0.0 if self._slam is None else self._slam.readout_s
-        found = f"rolling shutter: {1e3 * abs(readout):.0f} ms from the first row to the last, corrected"
-        return found if readout else ""
+        readout, sigma = (1e3 * s for s in self.readout_s)
+        rows = "first row to the last" if readout > 0.0 else "last row to the first"
+        return f"rolling shutter: {abs(readout):.1f} +- {sigma:.1f} ms from the {rows}, corrected" if readout else ""
 
     def give_up(self) -> None:
         """Stop waiting for what a live node has not heard for long, until it is heard again."""

@@ -11,7 +11,10 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
+from slam_bringup.bags.rig_calibration import read_rig_calibration
+from slam_bringup.cli import slam
 from slam_bringup.commands.calibrate import command
+from slam_bringup.pipeline.configuration import load_system_config
 from slam_core.camera_info import read_camera_info
 from slam_core.geometry import make_transform, rotation_from_quaternion
 
@@ -87,3 +90,17 @@ def test_bad_input_is_refused_and_leaves_nothing(data_dir: Path, tmp_path: Path)
         with pytest.raises(ValueError, match=message):
             run(*arguments, "-o", str(out))
     assert not out.exists()
+
+
+@pytest.mark.data
+def test_refine_writes_a_readout_that_the_next_run_knows(data_dir: Path, tmp_path: Path) -> None:
+    bag, out = tmp_path / "office.mcap", tmp_path / "out"
+    slam(["convert", "rgbd", str(data_dir / "hololens_office_120"), "-o", str(bag)], standalone_mode=False)
+    known = tmp_path / "office.calibration.yaml"
+    known.write_text("/**:\n  ros__parameters:\n    calibration.sigma_scale: 0.004\n")
+    assert "read out within" in run("refine", str(bag), "-o", str(out))
+    filter_config = load_system_config(None, None, read_rig_calibration([out]).parameters).ekf_slam
+    assert filter_config.measurement.readout == pytest.approx(0.011, abs=0.003)
+    assert 0.0005 < filter_config.measurement.sigma_readout < 0.002
+    assert filter_config.calibration.sigma_scale == 0.004
+    assert read_camera_info(out / "tof.yaml").info.camera.width == 540

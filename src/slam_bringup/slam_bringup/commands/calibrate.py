@@ -72,7 +72,7 @@ def command(
 
     IMAGES are files, folders or quoted patterns; for two cameras one folder or pattern each, or all files of the first
     followed by those of the second. With refine IMAGES is a bag: its stereo calibration is corrected by what its own
-    pairs show.
+    pairs show, and the readout of a rolling shutter is learnt, for --calibration or beside the bag.
     """
     if kind == "refine":
         _refine(images, output, overwrite)
@@ -98,13 +98,11 @@ def _refine(bags: tuple[str, ...], output: Path, overwrite: bool) -> None:
         raise ValueError(f"calibrate refine takes one bag, got {len(bags)}")
     results = OutputFolder(output, "calibrate", f"refine {bags[0]}", overwrite=overwrite)
     with results:
-        infos, figures = refine(Path(bags[0]).expanduser())
+        bag = Path(bags[0]).expanduser()
+        found = refine(bag)
         with results.staged() as folder:
-            write_refined(folder, infos, figures)
-    click.echo(
-        f"rows were off by {figures['row_error_px']:.2f} px, disparities by {figures['disparity_error_px']:.2f} +- "
-        f"{figures['disparity_error_sigma_px']:.2f} px; left.yaml and right.yaml written to {output}"
-    )
+            write_refined(folder, bag, found)
+    click.echo(f"{found.told()}\nwritten to {output}")
 
 
 def _lenses(model: str, cameras: int) -> list[str]:

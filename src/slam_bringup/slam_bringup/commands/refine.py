@@ -1,51 +1,123 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``slam calibrate refine``: corrects a stereo calibration by what a recording shows of it, without a board."""
+"""``slam calibrate refine``: what a recording shows of its cameras without a board.
+
+A stereo pair that is not quite rectified is corrected; the readout of a rolling shutter is written down, so that the
+next run knows it from its first frame on.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
+
+from ekf_slam_node.stage import FilterStage
+from slam_bringup.bags.bag_calibration import FILE_NAME, calibration_file
 from slam_bringup.bags.readings import StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.commands.mapping_options import mode_for
+from slam_bringup.pipeline.configuration import choose, filter_config, load_system_config
+from slam_bringup.pipeline.overrides import read_overrides
+from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
+from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile
 from slam_core.files import atomic_text
+from slam_core.types import Features
 from stereo_frontend.corrected_info import corrected_right
 from stereo_frontend.frontend import Frontend
 from stereo_frontend.rectify import StereoRectifier
 
 
-def refine(bag: Path) -> tuple[tuple[CameraInfo, CameraInfo], dict[str, Any]]:
-    """Corrected infos (left, right) of the first agent with a stereo camera, and the figures of the correction.
+@dataclass(frozen=True)
+class Refined:
+    """Findings of a recording: its cameras' infos, corrected or as they were, the filter's parameters, figures."""
+
+    infos: Mapping[str, CameraInfo]
+    is_corrected: bool
+    parameters: Mapping[str, float]
+    figures: Mapping[str, Any]
+
+    def told(self) -> str:
+        """Findings as a line each."""
+        found, f = [], self.figures
+        if self.is_corrected:
+            found.append(
+                f"rows were off by {f['row_error_px']:.2f} px, disparities by {f['disparity_error_px']:.2f} +- "
+                f"{f['disparity_error_sigma_px']:.2f} px: corrected"
+            )
+        if self.parameters:
+            readout, sigma = (1e3 * value for value in self.parameters.values())
+            found.append(f"rows are read out within {readout:.1f} +- {sigma:.1f} ms: {FILE_NAME}")
+        return "\n".join(found)
+
+
+def refine(bag: Path) -> Refined:
+    """Findings of the first agent's images about its cameras.
 
     Raises
     ------
     ValueError
-        If the bag has no stereo camera, or shows nothing to correct.
+        If the bag has no camera infos, or shows nothing to correct.
     """
     with SensorBag(bag) as source:
-        agent = next((a for a in source.agents if {"left", "right"} <= source.sensors[a].topics.keys()), None)
-        if agent is None:
-            raise ValueError(f"{bag} has no stereo images")
-        left, right = source.sensors[agent].left, source.sensors[agent].right
-        if left is None or right is None:
-            raise ValueError(f"{bag} has stereo images without camera infos: calibrate with a board first")
-        rectifier, frontend = StereoRectifier(left, right), Frontend()
-        for reading in source.readings():
-            if isinstance(reading, StereoReading) and reading.agent == agent:
-                pair = reading.pair
-                frontend.process(rectifier(pair.stamp_ns, pair.left, pair.right))
+        agent, mode = source.agents[0], mode_for(source, None)
+        sensors = source.sensors[agent]
+        infos = {"left": sensors.left, "right": sensors.right} if mode == "stereo" else {"tof": sensors.tof}
+        known = {name: info for name, info in infos.items() if info is not None}
+        if len(known) < len(infos):
+            raise ValueError(f"{bag} has images without camera infos: calibrate with a board first")
+        right, figures = _corrected(source, agent, known["left"], known["right"]) if mode == "stereo" else (None, {})
+        parameters = _readout(source, agent, mode)
+    if right is None and not parameters:
+        raise ValueError(f"the images show no significant error to correct: {figures}")
+    corrected = {} if right is None else {"right": right}
+    return Refined(known | corrected, right is not None, parameters, figures | parameters)
+
+
+def _corrected(
+    source: SensorBag, agent: str, left: CameraInfo, right: CameraInfo
+) -> tuple[CameraInfo | None, dict[str, Any]]:
+    """The right camera's corrected info, None where nothing is to be corrected, and figures."""
+    rectifier, frontend = StereoRectifier(left, right), Frontend()
+    for reading in source.readings():
+        if isinstance(reading, StereoReading) and reading.agent == agent:
+            pair = reading.pair
+            frontend.process(rectifier(pair.stamp_ns, pair.left, pair.right))
     calibration = frontend.self_calibration
     if calibration.error is None or not calibration.corrects:
-        raise ValueError(f"the images show no significant error to correct: {calibration.figures()}")
+        return None, calibration.figures()
     corrected, left_over = corrected_right(right, calibration.error)
-    return (left, corrected), calibration.figures() | {"left_over_px": left_over}
+    return corrected, calibration.figures() | {"left_over_px": left_over}
 
 
-def write_refined(folder: Path, infos: tuple[CameraInfo, CameraInfo], figures: dict[str, Any]) -> None:
-    """``left.yaml``, ``right.yaml`` and ``summary.json``."""
-    for name, info in zip(("left", "right"), infos, strict=True):
+def _readout(source: SensorBag, agent: str, mode: str) -> dict[str, float]:
+    """Parameters of the rolling shutter as the filter learns them from the images alone; none where it sees none."""
+    sensors, system = source.sensors[agent], choose(load_system_config(None), mode, "ekf", "none", "off")
+    pipeline = SensorPipeline(system, sensors, False, StageTimes())
+    stage = FilterStage(filter_config(system.ekf_slam, sensors), sensors.frames, sensors.base_frame)
+    for reading in source.readings():
+        items = pipeline.add(reading) if reading.agent == agent else iter(())
+        for value in (pipeline.measure(item).value for item in items):
+            if isinstance(value, Features):
+                stage.add_features(value)
+            for _ in stage.ready():
+                pass
+    readout, sigma = stage.readout_s
+    return {"measurement.readout": readout, "measurement.sigma_readout": sigma} if readout else {}
+
+
+def write_refined(folder: Path, bag: Path, found: Refined) -> None:
+    """Write a calibration: the cameras, ``calibration.yaml`` with what the bag's own says, ``summary.json``."""
+    for name, info in found.infos.items():
         CameraInfoFile(info, name).write(folder / f"{name}.yaml")
-    atomic_text(folder / "summary.json", json.dumps(figures, indent=2) + "\n")
+    own = calibration_file(bag)
+    known = read_overrides(own).of_all if own.is_file() else {}
+    if parameters := known | dict(found.parameters):
+        document = {"/**": {"ros__parameters": parameters}}
+        atomic_text(folder / FILE_NAME, yaml.safe_dump(document, sort_keys=False))
+    atomic_text(folder / "summary.json", json.dumps(found.figures, indent=2) + "\n")
