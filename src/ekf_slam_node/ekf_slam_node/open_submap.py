@@ -10,6 +10,7 @@ import numpy as np
 from ekf_slam_node.candidates import Candidates, squared_distances
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.covariance import IndexArray
+from ekf_slam_node.drift import Drift
 from ekf_slam_node.ekf import Ekf, UpdateReport
 from ekf_slam_node.landmarks import LandmarkBook, Pending, spread_choice
 from ekf_slam_node.linking import FrameLink
@@ -54,6 +55,7 @@ class OpenSubmap:
         self.ekf = ekf
         self.book = book
         self.pending = pending
+        self._drift = Drift()
         self._config = config
         self._T_rig_optical = T_rig_optical
         self._frames = 0
@@ -123,6 +125,14 @@ class OpenSubmap:
         after = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
         self.book.noise.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
         return report, sight.select(good)
+
+    def drift_by(self, common: FloatArray) -> None:
+        """Take in what a frame's common error (6,) leaves behind, at the camera's present place."""
+        self._drift.add(common, (self.ekf.T @ self._T_rig_optical)[:3, 3])
+
+    def pose_covariance(self) -> FloatArray:
+        """Covariance (6, 6) of the rig's pose, drift included."""
+        return self.ekf.pose_covariance() + self._drift.covariance(self.ekf.T[:3, 3])
 
     def _noise_factors(self, sight: Sight) -> FloatArray:
         """Factors (k, 3) on the variances of u, v and inverse depth: a landmark's own share of the pixel noise."""

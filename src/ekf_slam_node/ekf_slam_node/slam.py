@@ -239,6 +239,7 @@ class EkfSlam:
         report, measured = local.measure(linked.frame, chosen, common)
         if not report.applied:
             self.counters.add("updates_failed")
+        local.drift_by(linked.common)
         self._arrive(linked.frame)
         ids, index = local.book.ids[measured.slots], linked.frame.index[measured.columns]
         self._shutter.learn(linked.measured, ids, measured.columns, linked.link.T, linked.dt)

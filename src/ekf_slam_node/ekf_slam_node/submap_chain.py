@@ -126,7 +126,8 @@ class SubmapChain:
         covariance = compose_covariance(ekf.T, ekf.pose_covariance(), motion.T, motion.covariance)
         pose = PoseEstimate(stamp_ns, ekf.T @ motion.T, covariance)
         self._builder.add_bridged_pose(pose)
-        return self._odometry.pose(stamp_ns, pose.T, covariance)
+        drifted = compose_covariance(ekf.T, self.local.pose_covariance(), motion.T, motion.covariance)
+        return self._odometry.pose(stamp_ns, pose.T, drifted)
 
     def is_complete(self, shared: int) -> bool:
         """True if the submap ends with this frame, in which the next one would share so many landmarks with it."""
@@ -153,12 +154,13 @@ class SubmapChain:
 
         Beyond it the rig is assumed to go on for a while and then to stop.
         """
-        ekf, motion = self.local.ekf, self._config.motion
+        ekf, covariance = self.local.ekf, self.local.pose_covariance()
         dt = seconds_between(self.stamp_ns, stamp_ns)
         if dt <= 0.0:
-            return self._odometry.pose(stamp_ns, ekf.T, ekf.pose_covariance())
+            return self._odometry.pose(stamp_ns, ekf.T, covariance)
         T = ekf.T @ relative_motion(ekf.velocity, min(dt, _COAST_TIME))
-        return self._odometry.pose(stamp_ns, T, ekf.time_update(dt, motion.sigma).head[:6, :6])
+        grown = ekf.time_update(dt, self._config.motion.sigma).head[:6, :6] - ekf.pose_covariance()
+        return self._odometry.pose(stamp_ns, T, covariance + grown)
 
     def last_sound_pose(self, stamp_ns: int) -> PoseEstimate:
         """The newest finite pose of the open submap's path as T_odom_rig, with another stamp."""
