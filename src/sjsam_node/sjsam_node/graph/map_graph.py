@@ -13,8 +13,9 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
@@ -23,9 +24,9 @@ import scipy.sparse.csgraph
 from sjsam_node.graph.fusion import BoolArray as BoolArray
 from sjsam_node.graph.fusion import Fusion
 from sjsam_node.graph.links import Link
-from sjsam_node.graph.selection import spread_order, variables
+from sjsam_node.graph.selection import Matches, spread_order, variables
 from slam_core.geometry import FloatArray, invert_transform
-from slam_core.linear_algebra.sparse_cholesky import IntArray
+from slam_core.linear_algebra.block_pattern import IntArray, pointers
 from slam_core.types import Submap
 
 _ALL = 1 << 30
@@ -45,7 +46,7 @@ class Record:
         """Agent, session and index: unique, and an order that does not depend on when a submap arrived."""
         return self.submap.agent, self.submap.session, self.submap.index
 
-    @property
+    @cached_property
     def observations(self) -> IntArray:
         """Numbers of its observations, (n,)."""
         return np.arange(self.first_observation, self.first_observation + len(self.submap.landmarks))
@@ -56,6 +57,7 @@ class Snapshot:
     """Links and estimate of a map graph at one time."""
 
     links: list[Link]
+    matches: Matches
     poses: FloatArray
     points: FloatArray
     fusion: Fusion
@@ -78,13 +80,15 @@ class MapGraph:
     _stretch: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _middles: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     starts: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    ends: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Nodes at which the records start and end, (records,)."""
     point_covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
     ties: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     redundant: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     doubt: FloatArray = field(default_factory=lambda: np.empty(0))
     """Variance factor that the matches of each record had when they were let go for contradicting each other, or 1."""
     is_complete: bool = False
-    _pairs: dict[Link, IntArray] = field(default_factory=dict)
+    _matches: Matches = field(default_factory=Matches)
     _rank: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _variable_of: IntArray | None = None
     _oldest: dict[int, Record] = field(default_factory=dict)
@@ -100,6 +104,11 @@ class MapGraph:
         return self._fusion.record_of
 
     @property
+    def linked(self) -> IntArray:
+        """The two records of every link, (links, 2)."""
+        return self._matches.ends
+
+    @property
     def variable_of(self) -> IntArray:
         """Variable of the estimate that each observation is of, (observations,).
 
@@ -107,12 +116,10 @@ class MapGraph:
         oldest of them, else its own.
         """
         if self._variable_of is None:
-            counts = np.array([len(k.pairs) for k in self.links], dtype=np.int64)
-            ends = np.array([k.ends for k in self.links], dtype=np.int64).reshape(-1, 2)
-            pairs = [np.empty((0, 2), dtype=np.int64), *(self._observed(k) for k in self.links)]
+            matches = self._matches
             self._variable_of = variables(
-                np.concatenate(pairs), np.append(0, np.cumsum(counts)),
-                counts if self.is_complete else self.ties[ends].min(axis=1, initial=_ALL),
+                matches.pairs, matches.ptr,
+                np.diff(matches.ptr) if self.is_complete else self.ties[matches.ends].min(axis=1, initial=_ALL),
                 self.landmark_of, self._rank,
             )  # fmt: skip
         return self._variable_of
@@ -142,7 +149,8 @@ class MapGraph:
         self._fusion.append(n, len(self.records))
         self._ending_at[end] = len(self.records)
         middle = np.median(submap.landmarks, axis=0) if len(submap.landmarks) else np.zeros(3)
-        self._middles, self.starts = np.concatenate([self._middles, middle[None]]), np.append(self.starts, start)
+        self._middles = np.concatenate([self._middles, middle[None]])
+        self.starts, self.ends = np.append(self.starts, start), np.append(self.ends, end)
         self.ties, self._rank = np.append(self.ties, ties), np.append(self._rank, spread_order(submap.landmarks))
         self.redundant, self.doubt = np.append(self.redundant, False), np.append(self.doubt, 1.0)
         self.use_all_ties(False)
@@ -206,15 +214,18 @@ class MapGraph:
             self._merge(link)
         self.links.append(link)
         self._variable_of = None
-        return self._fusion.unite(self._observed(link))
+        added = self._observed([link])
+        self._matches = self._matches.followed_by(added)
+        return self._fusion.unite(added.pairs)
 
-    def _observed(self, link: Link) -> IntArray:
-        """The observations that a link's pairs name, (k, 2)."""
-        known = self._pairs.get(link)
-        if known is None:
-            first = np.array([self.records[i].first_observation for i in link.ends])
-            known = self._pairs[link] = np.asarray(link.pairs + first)
-        return known
+    def _observed(self, links: Sequence[Link]) -> Matches:
+        """The observations that the pairs of links name."""
+        if not links:
+            return Matches()
+        counts, ends = [len(k.pairs) for k in links], np.array([k.ends for k in links], dtype=np.int64)
+        first = np.searchsorted(self.record_of, ends)
+        pairs = np.concatenate([k.pairs for k in links]) + np.repeat(first, counts, axis=0)
+        return Matches(pairs, pointers(counts), ends)
 
     def _merge(self, link: Link) -> None:
         first, second = self.component(link.first), self.component(link.second)
@@ -248,18 +259,16 @@ class MapGraph:
     def replace_links(self, links: Iterable[Link]) -> None:
         """Believe exactly these links (of those there were): landmarks are fused anew from them."""
         self.links = list(links)
-        self._pairs = {k: self._observed(k) for k in self.links}
-        self._variable_of = None
+        self._matches, self._variable_of = self._observed(self.links), None
         self._fusion.separate()
-        if self.links:
-            self._fusion.unite(np.concatenate([self._observed(link) for link in self.links]))
+        self._fusion.unite(self._matches.pairs)
         self._split_components()
 
     def _split_components(self) -> None:
         """Components anew from submaps and links; each is named after its first node."""
         count = len(self.poses)
-        a = [r.start for r in self.records] + [self.records[k.first].start for k in self.links]
-        b = [r.end for r in self.records] + [self.records[k.second].start for k in self.links]
+        linked = self.starts[self._matches.ends]
+        a, b = np.concatenate([self.starts, linked[:, 0]]), np.concatenate([self.ends, linked[:, 1]])
         graph = scipy.sparse.coo_matrix((np.ones(len(a)), (a, b)), (count, count))
         _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
         first = np.unique(label, return_index=True)[1]
@@ -269,12 +278,13 @@ class MapGraph:
     def snapshot(self) -> Snapshot:
         """The beliefs and the estimate, to come back to."""
         return Snapshot(
-            list(self.links), self.poses.copy(), self.points.copy(), self._fusion.copy(), self.component_of.copy()
+            list(self.links), self._matches, self.poses.copy(), self.points.copy(), self._fusion.copy(),
+            self.component_of.copy(),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
         """Back to a snapshot taken since the last submap was added."""
-        self.links = list(snapshot.links)
+        self.links, self._matches = list(snapshot.links), snapshot.matches
         self._variable_of = None
         self.poses, self.points = snapshot.poses.copy(), snapshot.points.copy()
         self._fusion, self.component_of = snapshot.fusion.copy(), snapshot.component_of.copy()

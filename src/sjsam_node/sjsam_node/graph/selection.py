@@ -9,8 +9,35 @@ and counts nothing twice), so that the estimate does not grow with all that is s
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 from numba import njit
+
+from slam_core.linear_algebra.block_pattern import IntArray
+
+
+def _none() -> IntArray:
+    return np.empty((0, 2), dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Matched observations of links, one link after the other.
+
+    pairs (k, 2) of observations, ptr (n + 1,) where those of each link start, ends (n, 2): the records it links.
+    """
+
+    pairs: IntArray = field(default_factory=_none)
+    ptr: IntArray = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
+    ends: IntArray = field(default_factory=_none)
+
+    def followed_by(self, later: Matches) -> Matches:
+        """These and others."""
+        return Matches(
+            np.concatenate([self.pairs, later.pairs]), np.append(self.ptr, self.ptr[-1] + later.ptr[1:]),
+            np.concatenate([self.ends, later.ends]),
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)

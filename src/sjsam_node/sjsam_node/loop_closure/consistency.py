@@ -22,7 +22,6 @@ from sjsam_node.graph.links import Link, Status
 from sjsam_node.graph.map_graph import BoolArray
 from sjsam_node.loop_closure.association import variance_factor
 from sjsam_node.loop_closure.verification import ClosureConfig
-from sjsam_node.smoothing.estimator import local_residual, observation_nis
 from sjsam_node.smoothing.smoother import Smoother, UpdateResult
 from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, parameter
@@ -184,9 +183,8 @@ class Consistency:
 
         What the map could judge, and found consistent, excludes nothing that it holds.
         """
-        held = self._closures()
         if not found:
-            return [], [k for k, is_off in zip(held, self._are_against_odometry(held), strict=True) if is_off]
+            return [], []
         consistent = [k for k in found if k.status is Status.CONSISTENT]
         if len(consistent) == len(found):
             return consistent, []
@@ -197,7 +195,7 @@ class Consistency:
         agreeing = [
             k for k, is_off in zip(offered, self._excluded(best, offered), strict=True) if k is best or not is_off
         ]
-        agreeing, rivals = self._with_rivals(agreeing, held, ends)
+        agreeing, rivals = self._with_rivals(agreeing, self._closures(), ends)
         group = agreeing if rivals or not sure else [k for k in agreeing if _is_in(k, sure)]
         support = self._support(group)
         enough = support >= self._support(rivals) if rivals else bool(sure) or len(group) > len(found)
@@ -326,10 +324,7 @@ class Consistency:
         """
         graph, assembled = self.smoother.graph, self.smoother.assembled(component)
         out = np.full(len(graph.points), np.nan)
-        for i, reduced in zip(assembled.records, assembled.reduced, strict=True):
-            if len(reduced.shared):
-                rows = graph.records[i].observations[reduced.shared]
-                out[rows] = observation_nis(local_residual(graph, graph.records[i], reduced), reduced.information)
+        out[assembled.observations] = assembled.nis()
         return out
 
     def _median_nis(self, link: Link, nis: FloatArray) -> float:
@@ -372,11 +367,13 @@ class Consistency:
 
     def _verdict(self, added: Sequence[Link], offered: Sequence[Link]) -> Verdict:
         """Verdict on the links there were, of which ``added`` are new."""
-        held = {(k.ends, k.is_closure): k for k in self.smoother.graph.links}
-        left = sum(len(k.pairs) for k in held.values())
-        accepted = tuple(k for k in added if (k.ends, True) in held)
-        removed = tuple(k for k in offered if k.is_closure and not _is_in(k, added) and (k.ends, True) not in held)
-        return Verdict(accepted, sum(len(k.pairs) for k in offered) - left, removed)
+        held, were = {id(k) for k in self.smoother.graph.links}, {id(k) for k in offered}
+        gone = [k for k in offered if id(k) not in held]
+        smaller = [k for k in self.smoother.graph.links if id(k) not in were]
+        lost = {k.ends for k in gone if k.is_closure} - {k.ends for k in smaller if k.is_closure}
+        removed = tuple(k for k in gone if k.is_closure and k.ends in lost and not _is_in(k, added))
+        dropped = sum(len(k.pairs) for k in gone) - sum(len(k.pairs) for k in smaller)
+        return Verdict(tuple(k for k in added if k.ends not in lost), dropped, removed)
 
 
 def _is_in(link: Link, links: Iterable[Link]) -> bool:

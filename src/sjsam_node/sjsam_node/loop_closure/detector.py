@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
@@ -107,8 +108,7 @@ class LoopDetector:
 
         Of ``most`` pairs, the nearest.
         """
-        due = self.near.due(self.graph, chain)
-        return self._verified(due[:most], self._novelty())
+        return self._verified(list(islice(self.near.due(self.graph, chain), most)), self._novelty())
 
     def around(self, middle: FloatArray, records: Iterable[int], excluded: set[int]) -> list[int]:
         """Those of ``records`` whose landmarks are around a point (3,) of the map, nearest first."""

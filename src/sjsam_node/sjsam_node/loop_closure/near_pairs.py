@@ -9,7 +9,7 @@ order in which submaps arrive.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -94,23 +94,23 @@ class NearPairs:
         if records:
             self.compared.forget(records)
 
-    def due(self, graph: MapGraph, chain: Chain) -> list[tuple[int, int]]:
+    def due(self, graph: MapGraph, chain: Chain) -> Iterator[tuple[int, int]]:
         """Pairs without a link, near in the map, that were not compared yet or lay elsewhere when they were.
 
         Nearest first.
         """
         near = self._near(graph)
-        linked = np.sort(np.array([(k.first, k.second) for k in graph.links], dtype=np.int64).reshape(-1, 2), axis=1)
-        near = near[~np.isin(_codes(near), _codes(linked))]
+        near = near[~np.isin(_codes(near), _codes(np.sort(graph.linked, axis=1)))]
         gap = _seen_from(graph, near[:, 0], near[:, 1]) - self.compared.where(near)
         due = near[np.linalg.norm(gap, axis=1) >= self.moved].tolist()
-        return [(first, second) for first, second in due if first not in chain(second)]
+        return ((first, second) for first, second in due if first not in chain(second))
 
     def _near(self, graph: MapGraph) -> IntArray:
         """Every record with its nearest ones of the same component, (k, 2), the nearest pair first."""
         pairs, distances = [np.empty((0, 2), dtype=np.int64)], [np.empty(0)]
         for component in np.unique(graph.component_of).tolist():
-            records = np.array([i for i in graph.records_of(component) if not graph.redundant[i]], dtype=np.int64)
+            records = np.array(graph.records_of(component), dtype=np.int64)
+            records = records[~graph.redundant[records]]
             middles = graph.middles(records)
             count = [*range(2, min(len(records), self.neighbours + 1) + 1)]  # the first is the record itself
             if not count:

@@ -15,9 +15,9 @@ import numpy as np
 
 from sjsam_node.graph.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.smoothing import kernels
-from sjsam_node.smoothing.joining import JoiningProblem, map_residual
+from sjsam_node.smoothing.joining import JoiningProblem, joint_errors, map_residual
 from sjsam_node.smoothing.parking import Parked
-from sjsam_node.smoothing.problem import JoiningState, LocalMap, block_rows, flatten
+from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten
 from sjsam_node.smoothing.regions import Region
 from sjsam_node.smoothing.robust import RobustConfig, RobustJoining, closing_rows, predicted
 from slam_core.config import Config, group, parameter
@@ -25,6 +25,9 @@ from slam_core.geometry import FloatArray, make_transform, so3_log
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
 from slam_core.linear_algebra import blas
 from slam_core.linear_algebra.sparse_cholesky import BACKENDS, IntArray
+
+_UNMOVED = 1e-4
+"""Squared change of a submap's residual, in sigmas, below which its own landmarks stay where they were in it."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +86,21 @@ def reduce_map(record: Record, is_shared: BoolArray, rows: str, *, recover: bool
 
 
 @dataclass(frozen=True, eq=False)
+class _Recovered:
+    """Private landmarks (p, 3) of a reduced submap in its frame, and the residual that they were recovered from."""
+
+    reduced: ReducedMap
+    residual: FloatArray
+    weighted: FloatArray
+    private: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Assembled:
     """One component as a joining problem: which nodes, landmarks, records and regions of records it is made of.
 
-    maps: the reduced submaps as they are joined, then the regions. dropped: scalar rows of each that a robust loss left
-    out.
+    maps: the reduced submaps, then the regions. observations: those of the reduced submaps' landmarks, (k,). dropped:
+    scalar rows of each map that a robust loss left out.
     """
 
     records: list[int]
@@ -95,7 +108,8 @@ class Assembled:
     nodes: IntArray
     landmarks: IntArray
     reduced: list[ReducedMap]
-    maps: list[LocalMap]
+    observations: IntArray
+    maps: FlatMaps
     problem: JoiningProblem
     state: JoiningState
     dropped: list[IntArray]
@@ -118,6 +132,13 @@ class Assembled:
                 return region.reference, *region.node(node)
         return self.parked.node(node)
 
+    def nis(self) -> FloatArray:
+        """Squared error (k,) of each of the ``observations`` as the rest of its submap predicts it.
+
+        3 degrees of freedom each.
+        """
+        return joint_errors(kernels.TANGENT, self.maps.first(len(self.records)), self.state)[2]
+
     def covariance(self, nodes: Sequence[int]) -> FloatArray:
         """Joint covariance (6k, 6k) of nodes that are not inside a region, from the last factor."""
         return self.problem.columns(self.state, np.searchsorted(self.nodes, nodes))
@@ -131,7 +152,9 @@ class Estimator:
     """
 
     config: EstimatorConfig = field(default_factory=EstimatorConfig)
-    _cache: dict[int, tuple[bytes, ReducedMap]] = field(default_factory=dict)
+    _cache: dict[int, ReducedMap] = field(default_factory=dict)
+    _was_tying: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    _recovered: dict[int, _Recovered] = field(default_factory=dict)
 
     def assemble(
         self,
@@ -145,45 +168,55 @@ class Estimator:
         ``regions`` stand for their records; ``parked`` ones are left out.
         """
         parked = parked or Parked()
-        inside = {i for region in regions for i in region.records.tolist()} | set(parked.records.tolist())
-        records = [i for i in graph.records_of(component) if i not in inside]
-        is_shared = graph.tying()
-        reduced = [self._reduced(graph, i, is_shared) for i in records]
-        own = [graph.records[i] for i in records]
+        is_inside = np.zeros(len(graph.records), dtype=bool)
+        for inside in [parked.records, *(region.records for region in regions)]:
+            is_inside[inside] = True
+        records = [i for i in graph.records_of(component) if not is_inside[i]]
+        reduced = self._reduced(graph, records)
         nodes = np.unique(
-            [n for r in own for n in (r.start, r.end)] + [n for r in regions for n in (r.reference, *r.separator)]
-        )
-        seen = [graph.variable_of[r.observations[m.shared]] for r, m in zip(own, reduced, strict=True)]
-        landmarks = np.unique(np.concatenate([*seen, *(graph.variable_of[r.landmarks] for r in regions)]))
-        maps = [
+            np.concatenate(
+                [graph.starts[records], graph.ends[records], *([r.reference, *r.separator] for r in regions)]
+            )
+        ).astype(np.int64)
+        observations = _observations(graph, records, [m.shared for m in reduced])
+        seen = graph.variable_of[observations]
+        landmarks = np.unique(np.concatenate([seen, *(graph.variable_of[r.landmarks] for r in regions)]))
+        maps = flatten([
             *_local_maps(graph, records, reduced, nodes, landmarks),
             *(region.local_map(graph, nodes, landmarks) for region in regions),
-        ]
+        ])  # fmt: skip
         poses = graph.poses[nodes]
         state = JoiningState(
             np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), graph.points[landmarks]
         )
         anchor = np.searchsorted(nodes, [graph.oldest(component).start])
         constant = sum(region.constant for region in regions)
-        problem = JoiningProblem(flatten(maps), state, anchor, kernels.TANGENT, self.config.solver, None, constant)
+        problem = JoiningProblem(maps, state, anchor, kernels.TANGENT, self.config.solver, None, constant)
         nothing = [np.empty(0, dtype=np.int64)] * len(records)
         return Assembled(
-            records, tuple(regions), nodes, landmarks, reduced, maps, problem, state, nothing, parked
+            records, tuple(regions), nodes, landmarks, reduced, observations, maps, problem, state, nothing, parked
         )  # fmt: skip
 
     def local_maps(self, graph: MapGraph, records: list[int], nodes: IntArray, landmarks: IntArray) -> list[LocalMap]:
         """Reduced records over sorted lists of nodes and landmarks."""
-        is_shared = graph.tying()
-        return _local_maps(graph, records, [self._reduced(graph, i, is_shared) for i in records], nodes, landmarks)
+        return _local_maps(graph, records, self._reduced(graph, records), nodes, landmarks)
 
-    def _reduced(self, graph: MapGraph, record: int, is_shared: BoolArray) -> ReducedMap:
-        mask = is_shared[graph.records[record].observations]
-        known = self._cache.get(record)
-        if known is None or known[0] != mask.tobytes():
-            recover = not graph.redundant[record]
-            known = (mask.tobytes(), reduce_map(graph.records[record], mask, self.config.rows, recover=recover))
-            self._cache[record] = known
-        return known[1]
+    def _reduced(self, graph: MapGraph, records: list[int]) -> list[ReducedMap]:
+        tying, before = graph.tying(), self._was_tying
+        changed = np.nonzero(tying[: len(before)] != before)[0]
+        for i in np.unique(graph.record_of[changed]).tolist():
+            self._cache.pop(i, None)
+        self._was_tying = tying
+        for i in records:
+            if i not in self._cache:
+                record, recover = graph.records[i], not graph.redundant[i]
+                self._cache[i] = reduce_map(record, tying[record.observations], self.config.rows, recover=recover)
+        return [self._cache[i] for i in records]
+
+    def forget(self) -> None:
+        """Keep nothing of former updates."""
+        self._cache.clear()
+        self._recovered.clear()
 
     def optimize(
         self,
@@ -201,6 +234,7 @@ class Estimator:
         assembled = self.assemble(graph, component, regions, parked)
         for i in set(graph.records_of(component)).difference(assembled.records):
             self._cache.pop(i, None)
+            self._recovered.pop(i, None)
         tolerance = self.config.live_tolerance if coarse else self.config.relative_tolerance
         most = min(self.config.iterations, self.config.live_iterations) if coarse else self.config.iterations
         optimizer = LevenbergMarquardtConfig(most, tolerance)
@@ -209,16 +243,16 @@ class Estimator:
             state, result, assembled = self._robust(assembled, state, optimizer)
         graph.poses[assembled.nodes] = make_transform(state.rotations, state.translations)
         graph.points[assembled.landmarks] = state.landmarks
-        for i, reduced, dropped in zip(assembled.records, assembled.reduced, assembled.dropped, strict=True):
-            self._recover(graph, graph.records[i], reduced, dropped)
+        assembled = replace(assembled, state=state)
+        self._recover(graph, assembled, 0.0 if not coarse else _UNMOVED)
         assembled.parked.carry(graph, assembled.nodes)
-        return replace(assembled, state=state), result
+        return assembled, result
 
     def _robust(
         self, assembled: Assembled, state: JoiningState, optimizer: LevenbergMarquardtConfig
     ) -> tuple[JoiningState, LeastSquaresResult, Assembled]:
         """Without the rows that the others contradict; the order of the variables stays."""
-        problem, maps = assembled.problem, assembled.maps
+        problem, maps = assembled.problem, assembled.maps.unflattened()
 
         def solve(weighted: list[LocalMap], start: JoiningState) -> JoiningState:
             problem.maps = flatten(weighted)
@@ -229,44 +263,42 @@ class Estimator:
         found = joining.run(state)
         problem.maps = flatten(found.maps)
         state, result = problem.optimize(found.state, optimizer)
-        return state, result, replace(assembled, maps=found.maps, dropped=found.dropped)
+        return state, result, replace(assembled, dropped=found.dropped)
 
-    @staticmethod
-    def _recover(graph: MapGraph, record: Record, reduced: ReducedMap, dropped: IntArray) -> None:
-        """Landmarks of a record given what was joined."""
-        T, rows = graph.poses[record.start], record.observations
-        graph.points[rows[reduced.shared]] = graph.points[graph.variable_of[rows[reduced.shared]]]
-        private = record.submap.landmarks[reduced.private]
-        if reduced.cross is not None:
-            residual = predicted(reduced.information, local_residual(graph, record, reduced), dropped)
-            private = private + (reduced.cross @ (reduced.information @ residual)).reshape(-1, 3)
-        graph.points[rows[reduced.private]] = private @ T[:3, :3].T + T[:3, 3]
+    def _recover(self, graph: MapGraph, assembled: Assembled, unmoved: float) -> None:
+        """Landmarks given what was joined; of a submap whose residual hardly changed they stay as they were in it."""
+        records, own = assembled.records, assembled.maps.first(len(assembled.records))
+        graph.points[assembled.observations] = graph.points[graph.variable_of[assembled.observations]]
+        residual, weighted, _ = joint_errors(kernels.TANGENT, own, assembled.state)
+        ends = own.mean_ptr[1:-1]
+        parts = zip(records, assembled.reduced, np.split(residual, ends), np.split(weighted, ends), strict=True)
+        for (i, reduced, r, w), dropped in zip(parts, assembled.dropped, strict=True):
+            known = self._recovered.get(i)
+            if known is None or known.reduced is not reduced or (r - known.residual) @ (w - known.weighted) > unmoved:
+                if len(dropped):
+                    w = reduced.information @ predicted(reduced.information, r, dropped)
+                private = graph.records[i].submap.landmarks[reduced.private]
+                if reduced.cross is not None:
+                    private = private + (reduced.cross @ w).reshape(-1, 3)
+                self._recovered[i] = _Recovered(reduced, r, w, private)
+        private = [self._recovered[i].private for i in records]
+        T = np.repeat(graph.poses[graph.starts[records]], [len(p) for p in private], axis=0)
+        rows = _observations(graph, records, [m.private for m in assembled.reduced])
+        graph.points[rows] = (T[:, :3, :3] @ np.concatenate([np.empty((0, 3)), *private])[..., None])[..., 0] + T[:, :3, 3]
+
+
+def _observations(graph: MapGraph, records: list[int], landmarks: list[IntArray]) -> IntArray:
+    """Those of some landmarks of each record, one record after the other."""
+    own = [graph.records[i].first_observation + index for i, index in zip(records, landmarks, strict=True)]
+    return np.concatenate([np.empty(0, dtype=np.int64), *own])
 
 
 def _local_maps(
     graph: MapGraph, records: list[int], reduced: list[ReducedMap], nodes: IntArray, landmarks: IntArray
 ) -> list[LocalMap]:
-    out = []
-    for i, m in zip(records, reduced, strict=True):
-        r = graph.records[i]
-        ids = np.searchsorted(landmarks, graph.variable_of[r.observations[m.shared]])
-        start, end = np.searchsorted(nodes, [r.start, r.end])
-        out.append(LocalMap(int(start), np.array([end]), ids, m.mean, m.information))
-    return out
-
-
-def local_residual(graph: MapGraph, record: Record, reduced: ReducedMap) -> FloatArray:
-    """Residual ``h [-] z`` (m,) of a record at the graph's estimate."""
-    poses = graph.poses[[record.start, record.end]]
-    points = graph.points[graph.variable_of[record.observations[reduced.shared]]]
-    state = JoiningState(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), points)
-    local = LocalMap(0, np.array([1]), np.arange(len(points)), reduced.mean, reduced.information)
-    return map_residual(kernels.TANGENT, local, state)
-
-
-def observation_nis(residual: FloatArray, information: FloatArray) -> FloatArray:
-    """Squared error of each landmark of a local map as all its other rows predict it; 3 degrees of freedom each."""
-    n = (len(residual) - 6) // 3
-    weighted = (information @ residual)[6:].reshape(n, 3)
-    blocks = information[6:, 6:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
-    return np.asarray(np.einsum("ni,ni->n", weighted, np.linalg.solve(blocks, weighted[..., None])[..., 0]))
+    seen = np.searchsorted(landmarks, graph.variable_of[_observations(graph, records, [m.shared for m in reduced])])
+    ids = np.split(seen, np.cumsum([len(m.shared) for m in reduced])[:-1])
+    starts = np.searchsorted(nodes, graph.starts[records]).tolist()
+    ends = np.searchsorted(nodes, graph.ends[records]).reshape(-1, 1)
+    parts = zip(starts, ends, ids, reduced, strict=True)
+    return [LocalMap(start, end, own, m.mean, m.information) for start, end, own, m in parts]

@@ -184,6 +184,16 @@ def map_residual(model: int, m: LocalMap, state: JoiningState) -> FloatArray:
     return residual
 
 
+def joint_errors(model: int, maps: FlatMaps, state: JoiningState) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals (m,) of local maps at a state, ``information @ residual`` (m,), and the NIS (l,) of each landmark.
+
+    The NIS is against what all other rows of the same map predict: as many degrees of freedom as a landmark has.
+    """
+    residual, nis = np.empty((2, int(maps.mean_ptr[-1]))), np.empty(int(maps.landmark_ptr[-1]))
+    kernels.joint_errors(model, maps, *_arrays(state), residual[0], residual[1], nis)
+    return residual[0], residual[1], nis
+
+
 def _arrays(state: JoiningState) -> tuple[FloatArray, FloatArray, FloatArray]:
     return state.rotations, state.translations, state.landmarks
 

@@ -81,6 +81,47 @@ def joint_cost(model, maps, R, t, points):
 
 
 @njit(cache=True, nogil=True)
+def joint_errors(model, maps, R, t, points, residual, weighted, nis):
+    """Residuals of all local maps, ``information @ residual``, and the NIS of each landmark given the map's other rows.
+
+    residual, weighted (m,) as the means lie; nis (l,) as the landmarks do, ``d`` degrees of freedom each.
+    """
+    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info, _ = maps
+    d = t.shape[1]
+    a = 1 if d == 2 else 3
+    block = np.empty((d, d))
+    for f in range(len(ref)):
+        first, m = z_ptr[f], z_ptr[f + 1] - z_ptr[f]
+        poses, landmarks = pose_idx[pose_ptr[f] : pose_ptr[f + 1]], lm_idx[lm_ptr[f] : lm_ptr[f + 1]]
+        r, w = residual[first : first + m], weighted[first : first + m]
+        B = np.empty((len(poses), a, a))
+        local_residual(model, R[ref[f]], t[ref[f]], poses, landmarks, z[first : first + m], R, t, points, r, B)
+        information = info[info_ptr[f] : info_ptr[f + 1]].reshape((m, m))
+        w[:] = np.dot(information, r)
+        for k in range(len(landmarks)):
+            row = (d + a) * len(poses) + d * k
+            block[:] = information[row : row + d, row : row + d]
+            nis[lm_ptr[f] + k] = _solved_square(block, w[row : row + d].copy())
+
+
+@njit(cache=True, nogil=True)
+def _solved_square(A, x):
+    """``x^T A^-1 x`` of a positive definite matrix, which becomes its triangle."""
+    total = 0.0
+    for i in range(len(x)):
+        for j in range(i):
+            for k in range(j):
+                A[i, j] -= A[i, k] * A[j, k]
+            A[i, j] /= A[j, j]
+            x[i] -= A[i, j] * x[j]
+            A[i, i] -= A[i, j] * A[i, j]
+        A[i, i] = np.sqrt(A[i, i])
+        x[i] /= A[i, i]
+        total += x[i] * x[i]
+    return total
+
+
+@njit(cache=True, nogil=True)
 def reference_jacobian(Ri, ti, poses, landmarks, t, points, B, J):
     """Columns of the reference pose, ``J`` (m, d + a): ``-R^T`` and ``R^T [l - t]x``, with ``-B R^T`` for angles."""
     d = len(ti)

@@ -67,6 +67,16 @@ class FlatMaps(NamedTuple):
             self.information, self.pull,
         )  # fmt: skip
 
+    def unflattened(self) -> list[LocalMap]:
+        """The local maps one by one."""
+        ptrs = self.pose_ptr, self.landmark_ptr, self.mean_ptr, self.information_ptr, self.mean_ptr
+        values = self.poses, self.landmarks, self.mean, self.information, self.pull
+        parts = [np.split(v[: p[-1]], p[1:-1]) for p, v in zip(ptrs, values, strict=True)]
+        return [
+            LocalMap(int(reference), poses, landmarks, mean, information.reshape(len(mean), -1), pull)
+            for reference, poses, landmarks, mean, information, pull in zip(self.reference, *parts, strict=True)
+        ]
+
 
 def flatten(maps: Sequence[LocalMap]) -> FlatMaps:
     """Local maps as :class:`FlatMaps`."""

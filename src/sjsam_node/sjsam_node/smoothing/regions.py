@@ -222,7 +222,7 @@ def _tied(graph: MapGraph, records: IntArray) -> IntArray:
     observations = np.concatenate([graph.records[i].observations for i in records])
     rows, seen = np.searchsorted(records, graph.record_of[observations]), graph.variable_of[observations]
     B = scipy.sparse.csr_matrix((np.ones(len(rows)), (rows, seen)), (len(records), len(graph.points)))
-    ends = np.array([[graph.records[i].start, graph.records[i].end] for i in records])
+    ends = np.stack([graph.starts[records], graph.ends[records]], axis=1)
     E = scipy.sparse.csr_matrix(
         (np.full(ends.size, 10.0 * _FIRM), (np.repeat(np.arange(len(records)), 2), ends.ravel())),
         (len(records), len(graph.poses)),
@@ -240,10 +240,9 @@ def _sightings(graph: MapGraph) -> IntArray:
 
 def _uses(graph: MapGraph) -> IntArray:
     """Number of submaps that start or end at each node; one more at the end of a way, that may come."""
-    ends = np.array([(r.start, r.end) for r in graph.records], dtype=np.int64).reshape(-1, 2)
-    uses = np.bincount(ends.ravel(), minlength=len(graph.poses))
+    uses = np.bincount(np.concatenate([graph.starts, graph.ends]), minlength=len(graph.poses))
     open_end = np.ones(len(uses), dtype=bool)
-    open_end[ends[:, 0]] = False
+    open_end[graph.starts] = False
     return np.asarray(uses + 2 * open_end)
 
 

@@ -161,6 +161,7 @@ class Smoother:
     def resume(self) -> None:
         """Keep nothing but the graph and its estimate, which is at its optimum: after loading as after saving."""
         self._choose_ties()
+        self.estimator.forget()
         self._solved.clear()
         self.parked = Parked()
         self.regions = Regions(self.estimator.local_maps, self.config.region)
