@@ -10,6 +10,7 @@ import numpy as np
 
 from sjsam_node.graph.map_graph import MapGraph, Record
 from slam_core.geometry import compose_covariance
+from slam_core.linear_algebra.block_pattern import IntArray
 from slam_core.types import PoseEstimate, Submap
 
 Key = tuple[str, int, int]
@@ -17,10 +18,14 @@ Key = tuple[str, int, int]
 
 @dataclass
 class Agents:
-    """Records of a graph by agent, session and index; ``window``: how long a chain of them is asked for."""
+    """Records of a graph by agent, session and index; ``window``: how long a chain of them is asked for.
+
+    chained (n, 2): each record with those of its chain, the earlier one first.
+    """
 
     graph: MapGraph
     window: int
+    chained: IntArray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
     _lookup: dict[Key, int] = field(default_factory=dict)
     _newest: dict[str, int] = field(default_factory=dict)
     _odometry: dict[str, PoseEstimate] = field(default_factory=dict)
@@ -64,6 +69,8 @@ class Agents:
         for s in chain:
             covariance = compose_covariance(known.T, known.covariance, s.end_pose, s.covariance[:6, :6])
             known = PoseEstimate(record.submap.end_stamp_ns, known.T @ s.end_pose, covariance)
+        earlier = np.array([[previous, new] for previous in self.chain(new)], dtype=np.int64).reshape(-1, 2)
+        self.chained = np.concatenate([self.chained, earlier])
         self._lookup[record.key], self._newest[agent], self._odometry[agent] = new, new, known
 
 

@@ -145,7 +145,7 @@ class GlobalMap:
         self.smoother.condense(new, chain)
         found = self.detector.closures(chain, new)
         if self._has_moved:
-            found += self.detector.missed(self.agents.chain, self.config.compared_at_once)
+            found += self.detector.missed(self.agents.chained, self.config.compared_at_once)
         self._judge_redundancy(new, found)
         result, verdict = self.consistency.update(found, new)
         self._account(verdict, len(found))
@@ -272,7 +272,9 @@ class GlobalMap:
             return
         newest = len(self.graph.records) - 1
         for _ in range(_PASSES):
-            missed = self.detector.missed(self.agents.chain, self.config.compared_at_settling * len(self.graph.records))
+            missed = self.detector.missed(
+                self.agents.chained, self.config.compared_at_settling * len(self.graph.records)
+            )
             for found in _grouped(missed, self.config.joined_at_once):
                 self._account(self.consistency.update(found, newest)[1], len(found))
             if not missed:

@@ -70,7 +70,7 @@ class _Stacked:
     def with_one(self, submap: Submap) -> _Stacked:
         kept = _moving(submap.path)
         poses = np.concatenate([self.poses, [p.T for p in kept]])
-        gains = np.concatenate([self.gains, [_smoothing(submap, p)[0] for p in kept]])
+        gains = np.concatenate([self.gains, _smoothing(submap, kept)[0]])
         return _Stacked([*self.count, len(kept)], [*self.inside, *kept], poses, gains)
 
 
@@ -118,7 +118,9 @@ class MapView:
             marginals, widening = self.smoother.marginals(component), self._widening(component)
             for i in (i for i in marginals.records if i >= since):
                 record = self.graph.records[i]
-                poses, covariances = _with_covariances(self.graph, marginals, i, *_gains(record.submap))
+                poses, covariances = _with_covariances(
+                    self.graph, marginals, i, *_smoothing(record.submap, record.submap.path)
+                )
                 covariances += np.array([covariance_of_calibration(T, self.calibration) for T in poses])
                 own = record.submap.path
                 out.setdefault(record.submap.agent, []).extend(
@@ -202,14 +204,12 @@ def _with_covariances(
     poses = _on_skeleton(graph, [record], np.zeros(len(inside), dtype=np.int64), inside, gains)
     J_inverse, J_end = compose_jacobians(T_inverse, T_end)
     D = np.concatenate([J_inverse @ inverse_jacobian(T_start), J_end], axis=1)
-    covariances = np.empty((len(poses), 6, 6))
-    for k, T in enumerate(poses):
-        J_start, J_pose = compose_jacobians(T_start, T_inverse @ T)
-        J = J_pose @ gains[k] @ D
-        J[:, :6] += J_start
-        # The map's first pose has no covariance of its own.
-        covariances[k] = _positive(J @ joint @ J.T + marginals.factor * J_pose @ remaining[k] @ J_pose.T)
-    return poses, covariances
+    J_start, J_pose = compose_jacobians(np.broadcast_to(T_start, poses.shape), T_inverse @ poses)
+    J = J_pose @ gains @ D
+    J[:, :, :6] += J_start
+    left = marginals.factor * J_pose @ remaining @ _transposed(J_pose)
+    # The map's first pose has no covariance of its own.
+    return poses, _positive(J @ joint @ _transposed(J) + left)
 
 
 def _moving(path: Sequence[PoseEstimate]) -> list[PoseEstimate]:
@@ -223,14 +223,8 @@ def _moving(path: Sequence[PoseEstimate]) -> list[PoseEstimate]:
     return [*kept, path[-1]]
 
 
-def _gains(submap: Submap) -> tuple[FloatArray, FloatArray]:
-    """Of each pose of a submap: how its end corrects it, and what covariance that leaves, (n, 6, 6) each."""
-    found = [_smoothing(submap, pose) for pose in submap.path]
-    return np.array([g for g, _ in found]), np.array([r for _, r in found])
-
-
-def _smoothing(submap: Submap, pose: PoseEstimate) -> tuple[FloatArray, FloatArray]:
-    """Gain (6, 6) by which a better end corrects a pose of the path, and the covariance (6, 6) of what it leaves.
+def _smoothing(submap: Submap, path: Sequence[PoseEstimate]) -> tuple[FloatArray, FloatArray]:
+    """Gain by which a better end corrects each pose of a path, and the covariance of what it leaves, (n, 6, 6).
 
     A pose errs by what it hands on to the end, and by the noise of its own frame's measurement, which the end does not
     share. The first pose after the start shows the size of the latter: its covariance is that of two frames.
@@ -239,28 +233,36 @@ def _smoothing(submap: Submap, pose: PoseEstimate) -> tuple[FloatArray, FloatArr
     of what a pose erred by was made good before the end, which shares no more than the whole of its own error.
     """
     end_covariance = submap.covariance[:6, :6]
-    if pose.stamp_ns == submap.end_stamp_ns:
-        return np.eye(6), np.zeros((6, 6))
-    if pose.stamp_ns == submap.start_stamp_ns:
-        return np.zeros((6, 6)), np.zeros((6, 6))
-    handed_on = _positive(pose.covariance - 0.5 * submap.path[1].covariance)
-    A = np.eye(6)  # the lever arm of what is left of the way
-    A[:3, 3:] = -skew(submap.end_pose[:3, 3] - pose.T[:3, 3])
-    shared = _capped(A @ handed_on @ A.T, end_covariance)
-    gain = np.linalg.solve(A, np.linalg.solve(end_covariance, shared).T)
-    return gain, _positive(pose.covariance - gain @ end_covariance @ gain.T)
+    stamps = np.array([pose.stamp_ns for pose in path])
+    gain, remaining = np.zeros((len(path), 6, 6)), np.zeros((len(path), 6, 6))
+    gain[stamps == submap.end_stamp_ns] = np.eye(6)
+    between = np.nonzero((stamps != submap.end_stamp_ns) & (stamps != submap.start_stamp_ns))[0]
+    if len(between):
+        own = np.array([path[k].covariance for k in between.tolist()])
+        handed_on = _positive(own - 0.5 * submap.path[1].covariance)
+        A: FloatArray = np.tile(np.eye(6), (len(between), 1, 1))  # the lever arm of what is left of the way
+        A[:, :3, 3:] = -skew(submap.end_pose[:3, 3] - np.array([path[k].T[:3, 3] for k in between.tolist()]))
+        shared = _capped(A @ handed_on @ _transposed(A), end_covariance)
+        gain[between] = np.linalg.solve(A, _transposed(np.asarray(np.linalg.solve(end_covariance, shared))))
+        left = gain[between] @ end_covariance @ _transposed(gain[between])
+        remaining[between] = _positive(own - left)
+    return gain, remaining
+
+
+def _transposed(A: FloatArray) -> FloatArray:
+    return np.swapaxes(A, -1, -2)
 
 
 def _capped(covariance: FloatArray, largest: FloatArray) -> FloatArray:
     """The covariance, in no direction larger than another one, which is positive definite."""
     root = np.linalg.cholesky(largest)
-    relative = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
-    values, vectors = np.linalg.eigh(0.5 * (relative + relative.T))
+    relative = np.linalg.solve(root, _transposed(np.linalg.solve(root, covariance)))
+    values, vectors = np.linalg.eigh(0.5 * (relative + _transposed(relative)))
     half = root @ vectors
-    return np.asarray((half * np.minimum(values, 1.0)) @ half.T)
+    return np.asarray((half * np.minimum(values, 1.0)[..., None, :]) @ _transposed(half))
 
 
 def _positive(covariance: FloatArray) -> FloatArray:
     """Nearest positive definite matrix: eigenvalues no smaller than nothing much."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    return np.asarray((vectors * np.maximum(values, 1e-12)) @ vectors.T)
+    values, vectors = np.linalg.eigh(0.5 * (covariance + _transposed(covariance)))
+    return np.asarray((vectors * np.maximum(values, 1e-12)[..., None, :]) @ _transposed(vectors))

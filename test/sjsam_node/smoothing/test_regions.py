@@ -12,13 +12,14 @@ from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.graph.links import Link
 from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.smoothing.estimator import EstimatorConfig
-from sjsam_node.smoothing.regions import Region, RegionConfig
+from sjsam_node.smoothing.regions import Active, Region, RegionConfig
 from sjsam_node.smoothing.regions import join as join_region
 from sjsam_node.smoothing.smoother import Smoother, SmootherConfig
 from slam_core.geometry import boxminus, boxplus, make_transform, so3_exp
 from slam_core.types import Submap
 
 ALWAYS_OPEN = RegionConfig(open=10_000)
+NONE = np.empty(0, dtype=np.int64)
 EAGER = RegionConfig(size=8, open=12, quiet=1)
 
 
@@ -50,7 +51,9 @@ def way() -> GlobalMap:
 
 
 def a_region(smoother: Smoother) -> Region:
-    region = join_region(smoother.graph, np.arange(3, 12), 0, smoother.estimator.local_maps)
+    region = join_region(
+        smoother.graph, np.arange(3, 12), 0, smoother.estimator.local_maps, Active.of(smoother.graph, NONE)
+    )
     assert region is not None
     return region
 
@@ -119,7 +122,7 @@ def test_a_region_holds_wherever_it_is_carried_but_not_bent(way: GlobalMap) -> N
 def holds(region: Region, graph: MapGraph) -> bool:
     smoother = Smoother(graph)
     smoother.regions.closed = [region]
-    return bool(smoother.regions.fitting(graph, 0))
+    return bool(smoother.regions.fitting(graph, 0, NONE))
 
 
 def test_what_links_the_inside_of_a_region_opens_it_and_what_links_its_separator_does_not(way: GlobalMap) -> None:

@@ -278,7 +278,11 @@ class MapGraph:
     def snapshot(self) -> Snapshot:
         """The beliefs and the estimate, to come back to."""
         return Snapshot(
-            list(self.links), self._matches, self.poses.copy(), self.points.copy(), self._fusion.copy(),
+            list(self.links),
+            self._matches,
+            self.poses.copy(),
+            self.points.copy(),
+            self._fusion.copy(),
             self.component_of.copy(),
         )
 

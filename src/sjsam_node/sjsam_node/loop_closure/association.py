@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from sjsam_node.graph.links import Prior
 from slam_core.chi_square import chi_square_bound
@@ -61,8 +62,8 @@ class PointSet:
 
     def variances(self) -> FloatArray:
         """Covariance (n, 3, 3) of each landmark."""
-        rows = np.arange(3 * len(self.points)).reshape(-1, 3)
-        return np.asarray(self.covariance[rows[:, :, None], rows[:, None, :]])
+        n, k = len(self.points), np.arange(len(self.points))
+        return np.asarray(self.covariance.reshape(n, 3, n, 3)[k, :, k, :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,23 +87,51 @@ def similarity(first: PointSet, second: PointSet) -> npt.NDArray[np.float32]:
 
 def candidate_pairs(first: PointSet, second: PointSet, prior: Prior, config: AssociationConfig) -> IntArray:
     """One-to-one pairs (k, 2) inside the gate around the prior, each the other's best."""
-    i, j = np.nonzero(similarity(first, second) >= config.descriptor_threshold)
-    error = first.points[i] - transform_points(prior.T, second.points)[j]
+    alike, seen = similarity(first, second) >= config.descriptor_threshold, transform_points(prior.T, second.points)
     if config.method == "nearest":
-        score = np.linalg.norm(error, axis=1)
-        inside = score < config.nearest_gate
-    else:
-        bound = chi_square_bound(config.probability, 3)
-        own, other = first.variances() + config.position_noise**2 * np.eye(3), _variances_seen(second, prior)
-        # No eigenvalue is larger than the trace: what this sends away is outside the gate.
-        largest = np.trace(own, axis1=1, axis2=2)[i] + np.trace(other, axis1=1, axis2=2)[j]
-        near = np.einsum("ni,ni->n", error, error) < bound * largest
-        i, j, error = i[near], j[near], error[near]
-        S = own[i] + other[j]
-        nis = np.einsum("ni,ni->n", error, np.linalg.solve(S, error[..., None])[..., 0])
-        score = nis + np.linalg.slogdet(S)[1]  # Eq. 4.8
-        inside = nis < bound
-    return mutual_best(i[inside], j[inside], score[inside])
+        i, j = np.nonzero(alike)
+        distance = np.linalg.norm(first.points[i] - seen[j], axis=1)
+        inside = distance < config.nearest_gate
+        return mutual_best(i[inside], j[inside], distance[inside])
+    own, other = first.variances() + config.position_noise**2 * np.eye(3), _variances_seen(second, prior)
+    return mutual_best(*_gated(alike, first.points, seen, own, other, chi_square_bound(config.probability, 3)))
+
+
+@njit(cache=True, nogil=True)
+def _gated(alike, first, second, own, other, bound):  # type: ignore[no-untyped-def]
+    """Pairs (i, j) of points inside the gate, and their scores ``NIS + log det`` (Eq. 4.8)."""
+    most = int(alike.sum())
+    i, j, score = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
+    count = 0
+    e, S = np.empty(3), np.empty((3, 3))
+    for a in range(len(first)):
+        for b in range(len(second)):
+            if not alike[a, b]:
+                continue
+            squared = trace = 0.0
+            for p in range(3):
+                e[p] = first[a, p] - second[b, p]
+                squared += e[p] * e[p]
+                trace += own[a, p, p] + other[b, p, p]
+            if squared >= bound * trace:  # no eigenvalue is larger than the trace: this is outside the gate
+                continue
+            S[:] = own[a] + other[b]
+            nis = determinant = 0.0
+            for p in range(3):
+                for q in range(p):
+                    for k in range(q):
+                        S[p, q] -= S[p, k] * S[q, k]
+                    S[p, q] /= S[q, q]
+                    S[p, p] -= S[p, q] * S[p, q]
+                    e[p] -= S[p, q] * e[q]
+                determinant += np.log(S[p, p])
+                S[p, p] = np.sqrt(S[p, p])
+                e[p] /= S[p, p]
+                nis += e[p] * e[p]
+            if nis < bound:
+                i[count], j[count], score[count] = a, b, nis + determinant
+                count += 1
+    return i[:count], j[:count], score[:count]
 
 
 def _variances_seen(points: PointSet, prior: Prior) -> FloatArray:

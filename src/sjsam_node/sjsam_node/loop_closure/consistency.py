@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from operator import is_
 
 import numpy as np
 
@@ -367,6 +368,8 @@ class Consistency:
 
     def _verdict(self, added: Sequence[Link], offered: Sequence[Link]) -> Verdict:
         """Verdict on the links there were, of which ``added`` are new."""
+        if len(offered) == len(self.smoother.graph.links) and all(map(is_, offered, self.smoother.graph.links)):
+            return Verdict(tuple(added))
         held, were = {id(k) for k in self.smoother.graph.links}, {id(k) for k in offered}
         gone = [k for k in offered if id(k) not in held]
         smaller = [k for k in self.smoother.graph.links if id(k) not in were]

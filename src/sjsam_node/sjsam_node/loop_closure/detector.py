@@ -10,20 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import islice
 
 import numpy as np
 
 from sjsam_node.graph.links import Link, Prior, Status
 from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.association import match
-from sjsam_node.loop_closure.near_pairs import Chain, NearPairs
+from sjsam_node.loop_closure.near_pairs import NearPairs
 from sjsam_node.loop_closure.novelty import Novelty
 from sjsam_node.loop_closure.place_recognition import PlaceIndex
 from sjsam_node.loop_closure.point_sets import at_end, at_start
 from sjsam_node.loop_closure.verification import ClosureConfig, Verifier, largest_sigma
 from sjsam_node.smoothing.smoother import Smoother
 from slam_core.geometry import FloatArray, boxminus, compose_covariance, invert_transform
+from slam_core.linear_algebra.block_pattern import IntArray
 
 
 @dataclass
@@ -103,12 +103,12 @@ class LoopDetector:
                 break
         return found
 
-    def missed(self, chain: Chain, most: int) -> list[Link]:
+    def missed(self, chained: IntArray, most: int) -> list[Link]:
         """Links between records that have come near each other since they were compared, if ever they were.
 
-        Of ``most`` pairs, the nearest.
+        Of ``most`` pairs, the nearest; none of those ``chained`` (n, 2) along the odometry.
         """
-        return self._verified(list(islice(self.near.due(self.graph, chain), most)), self._novelty())
+        return self._verified(self.near.due(self.graph, chained)[:most], self._novelty())
 
     def around(self, middle: FloatArray, records: Iterable[int], excluded: set[int]) -> list[int]:
         """Those of ``records`` whose landmarks are around a point (3,) of the map, nearest first."""

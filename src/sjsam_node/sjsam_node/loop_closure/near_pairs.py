@@ -9,7 +9,6 @@ order in which submaps arrive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,10 +17,6 @@ from scipy.spatial import cKDTree
 from sjsam_node.graph.map_graph import MapGraph
 from slam_core.geometry import FloatArray
 from slam_core.linear_algebra.sparse_cholesky import IntArray
-
-Chain = Callable[[int], list[int]]
-"""The records before one along its agent's odometry that it is linked to anyway."""
-
 
 _SHIFT = 32
 """A pair is one number, the first record shifted by so many bits and the second, so that many are found at once."""
@@ -94,16 +89,17 @@ class NearPairs:
         if records:
             self.compared.forget(records)
 
-    def due(self, graph: MapGraph, chain: Chain) -> Iterator[tuple[int, int]]:
+    def due(self, graph: MapGraph, chained: IntArray) -> list[tuple[int, int]]:
         """Pairs without a link, near in the map, that were not compared yet or lay elsewhere when they were.
 
-        Nearest first.
+        Nearest first; none of those ``chained`` (n, 2) along the odometry of an agent.
         """
         near = self._near(graph)
-        near = near[~np.isin(_codes(near), _codes(np.sort(graph.linked, axis=1)))]
+        tied = np.sort(np.concatenate([graph.linked, chained]), axis=1)
+        near = near[~np.isin(_codes(near), _codes(tied))]
         gap = _seen_from(graph, near[:, 0], near[:, 1]) - self.compared.where(near)
-        due = near[np.linalg.norm(gap, axis=1) >= self.moved].tolist()
-        return ((first, second) for first, second in due if first not in chain(second))
+        due = near[np.linalg.norm(gap, axis=1) >= self.moved]
+        return [(first, second) for first, second in due.tolist()]
 
     def _near(self, graph: MapGraph) -> IntArray:
         """Every record with its nearest ones of the same component, (k, 2), the nearest pair first."""

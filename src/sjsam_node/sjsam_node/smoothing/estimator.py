@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -17,14 +17,15 @@ from sjsam_node.graph.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.joining import JoiningProblem, joint_errors, map_residual
 from sjsam_node.smoothing.parking import Parked
-from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten
+from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten, split
 from sjsam_node.smoothing.regions import Region
 from sjsam_node.smoothing.robust import RobustConfig, RobustJoining, closing_rows, predicted
 from slam_core.config import Config, group, parameter
-from slam_core.geometry import FloatArray, make_transform, so3_log
+from slam_core.geometry import FloatArray, compose_covariance, make_transform, so3_log
 from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
 from slam_core.linear_algebra import blas
-from slam_core.linear_algebra.sparse_cholesky import BACKENDS, IntArray
+from slam_core.linear_algebra.block_pattern import IntArray, pointers
+from slam_core.linear_algebra.sparse_cholesky import BACKENDS
 
 _UNMOVED = 1e-4
 """Squared change of a submap's residual, in sigmas, below which its own landmarks stay where they were in it."""
@@ -127,10 +128,29 @@ class Assembled:
 
     def moving_with(self, node: int) -> tuple[int, FloatArray, FloatArray] | None:
         """The reference of a node that was not estimated by itself, T_reference_node and its covariance (6, 6)."""
-        for region in self.regions:
-            if node in region.inner:
-                return region.reference, *region.node(node)
-        return self.parked.node(node)
+        if (found := self._in_region(node)) is not None:
+            return found
+        parked = self.parked.node(node)
+        anchor = None if parked is None else self._in_region(parked[0])
+        if parked is None or anchor is None:
+            return parked
+        covariance = compose_covariance(anchor[1], anchor[2], parked[1], parked[2])
+        return anchor[0], anchor[1] @ parked[1], covariance
+
+    def _in_region(self, node: int) -> tuple[int, FloatArray, FloatArray] | None:
+        nodes, region_of = self._inner
+        at = int(np.searchsorted(nodes, node))
+        if at == len(nodes) or nodes[at] != node:
+            return None
+        region = self.regions[region_of[at]]
+        return region.reference, *region.node(node)
+
+    @cached_property
+    def _inner(self) -> tuple[IntArray, IntArray]:
+        """Nodes inside regions, ascending, and the region of each."""
+        nodes = np.concatenate([np.empty(0, dtype=np.int64), *(r.inner for r in self.regions)])
+        order = np.argsort(nodes)
+        return nodes[order], np.repeat(np.arange(len(self.regions)), [len(r.inner) for r in self.regions])[order]
 
     def nis(self) -> FloatArray:
         """Squared error (k,) of each of the ``observations`` as the rest of its submap predicts it.
@@ -245,7 +265,6 @@ class Estimator:
         graph.points[assembled.landmarks] = state.landmarks
         assembled = replace(assembled, state=state)
         self._recover(graph, assembled, 0.0 if not coarse else _UNMOVED)
-        assembled.parked.carry(graph, assembled.nodes)
         return assembled, result
 
     def _robust(
@@ -270,8 +289,8 @@ class Estimator:
         records, own = assembled.records, assembled.maps.first(len(assembled.records))
         graph.points[assembled.observations] = graph.points[graph.variable_of[assembled.observations]]
         residual, weighted, _ = joint_errors(kernels.TANGENT, own, assembled.state)
-        ends = own.mean_ptr[1:-1]
-        parts = zip(records, assembled.reduced, np.split(residual, ends), np.split(weighted, ends), strict=True)
+        each = split(residual, own.mean_ptr), split(weighted, own.mean_ptr)
+        parts = zip(records, assembled.reduced, *each, strict=True)
         for (i, reduced, r, w), dropped in zip(parts, assembled.dropped, strict=True):
             known = self._recovered.get(i)
             if known is None or known.reduced is not reduced or (r - known.residual) @ (w - known.weighted) > unmoved:
@@ -281,10 +300,12 @@ class Estimator:
                 if reduced.cross is not None:
                     private = private + (reduced.cross @ w).reshape(-1, 3)
                 self._recovered[i] = _Recovered(reduced, r, w, private)
-        private = [self._recovered[i].private for i in records]
-        T = np.repeat(graph.poses[graph.starts[records]], [len(p) for p in private], axis=0)
+        every = [self._recovered[i].private for i in records]
+        T = np.repeat(graph.poses[graph.starts[records]], [len(p) for p in every], axis=0)
         rows = _observations(graph, records, [m.private for m in assembled.reduced])
-        graph.points[rows] = (T[:, :3, :3] @ np.concatenate([np.empty((0, 3)), *private])[..., None])[..., 0] + T[:, :3, 3]
+        graph.points[rows] = (T[:, :3, :3] @ np.concatenate([np.empty((0, 3)), *every])[..., None])[..., 0] + T[
+            :, :3, 3
+        ]
 
 
 def _observations(graph: MapGraph, records: list[int], landmarks: list[IntArray]) -> IntArray:
@@ -297,7 +318,7 @@ def _local_maps(
     graph: MapGraph, records: list[int], reduced: list[ReducedMap], nodes: IntArray, landmarks: IntArray
 ) -> list[LocalMap]:
     seen = np.searchsorted(landmarks, graph.variable_of[_observations(graph, records, [m.shared for m in reduced])])
-    ids = np.split(seen, np.cumsum([len(m.shared) for m in reduced])[:-1])
+    ids = split(seen, pointers([len(m.shared) for m in reduced]))
     starts = np.searchsorted(nodes, graph.starts[records]).tolist()
     ends = np.searchsorted(nodes, graph.ends[records]).reshape(-1, 1)
     parts = zip(starts, ends, ids, reduced, strict=True)

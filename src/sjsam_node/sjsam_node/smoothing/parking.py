@@ -78,9 +78,10 @@ def is_tied(graph: MapGraph, record: int) -> bool:
     return int(np.count_nonzero((owner != record) & ~graph.redundant[owner])) >= _ENOUGH
 
 
-def anchor_of(graph: MapGraph, record: int) -> int | None:
-    """The nearest start node of a submap of the same component that is not redundant."""
-    own = np.nonzero((graph.component_of[graph.starts] == graph.component(record)) & ~graph.redundant)[0]
+def anchor_of(graph: MapGraph, record: int, nodes: IntArray) -> int | None:
+    """The nearest of some nodes at which a submap of the same component starts that is not redundant."""
+    fitting = (graph.component_of[graph.starts] == graph.component(record)) & ~graph.redundant
+    own = np.nonzero(fitting & np.isin(graph.starts, nodes))[0]
     if not len(own):
         return None
     gap = graph.poses[graph.starts[own], :3, 3] - graph.poses[graph.records[record].start, :3, 3]

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from sjsam_node.smoothing import kernels
 from slam_core.geometry import FloatArray
@@ -71,7 +73,7 @@ class FlatMaps(NamedTuple):
         """The local maps one by one."""
         ptrs = self.pose_ptr, self.landmark_ptr, self.mean_ptr, self.information_ptr, self.mean_ptr
         values = self.poses, self.landmarks, self.mean, self.information, self.pull
-        parts = [np.split(v[: p[-1]], p[1:-1]) for p, v in zip(ptrs, values, strict=True)]
+        parts = [split(v, p) for p, v in zip(ptrs, values, strict=True)]
         return [
             LocalMap(int(reference), poses, landmarks, mean, information.reshape(len(mean), -1), pull)
             for reference, poses, landmarks, mean, information, pull in zip(self.reference, *parts, strict=True)
@@ -96,6 +98,12 @@ def flatten(maps: Sequence[LocalMap]) -> FlatMaps:
 
 def _joined(parts: Sequence[Any], dtype: type) -> Any:
     return np.concatenate([np.asarray(p, dtype=dtype).ravel() for p in parts]) if parts else np.empty(0, dtype)
+
+
+def split(values: npt.NDArray[Any], ptr: IntArray) -> list[npt.NDArray[Any]]:
+    """Stretches of an array, as views; ``ptr`` (n + 1,) says where they start."""
+    ends = ptr.tolist()
+    return [values[a:b] for a, b in itertools.pairwise(ends)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,9 +3,11 @@
 
 A *region* is some submaps that lie together, joined to one Gaussian over what the rest of the map shares with them: its
 separator, nodes and landmarks. To the joining problem it is one more local map, in the frame of its reference node
-(submaps of submaps: Ni and Dellaert 2010). It holds wherever later closures move it as a whole. Once something inside
-it is linked to the outside, or its separator turns further than the relinearisation threshold, it is opened: its
-submaps take part in the joining again one by one, until it has been quiet there for a while.
+(submaps of submaps: Ni and Dellaert 2010). Regions far from the newest submap are joined to larger ones in turn, so
+that an update has few of them however large the map is. A region holds wherever later closures move it as a whole. Once
+something inside it is linked to the outside, or its separator turns further than the relinearisation threshold, it is
+opened: its parts take part in the joining again, down to single submaps where these are what was touched, until it
+has been quiet there for a while.
 """
 
 from __future__ import annotations
@@ -23,13 +25,17 @@ from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.joining import JoiningProblem
 from sjsam_node.smoothing.problem import JoiningState, LocalMap, flatten
 from slam_core.config import Config, parameter
-from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
+from slam_core.geometry import FloatArray, boxminus, compose_jacobians, invert_transform, transform_points
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 _FIRM = 4
 """Landmarks in common that tie two submaps together."""
 _WORTH = 0.4
-"""A region's normal equations must be smaller than this share of those of its submaps together."""
+"""A region's normal equations must be smaller than this share of those of its parts together."""
+_PARTS = 6
+"""Regions that are joined to a larger one, at most."""
+_MANY = 10
+"""Regions of a component from which on those far away are joined."""
 
 LocalMaps = Callable[[MapGraph, list[int], IntArray, IntArray], list[LocalMap]]
 """Local maps of records, over the nodes and landmarks of two sorted lists."""
@@ -39,7 +45,7 @@ LocalMaps = Callable[[MapGraph, list[int], IntArray, IntArray], list[LocalMap]]
 class RegionConfig(Config):
     """Parameters of condensing: which submaps are joined to larger ones until a closure needs them."""
 
-    size: int = parameter(96, "submaps that are joined to a larger one, at most", minimum=2)
+    size: int = parameter(32, "submaps that are joined to a larger one, at most", minimum=2)
     open: int = 64
     """Submaps of a component that take part in each update one by one, about."""
     quiet: int = 10
@@ -78,6 +84,8 @@ class Region:
         Covariance of reference, separator and inner nodes in the frame of the reference, (1 + k + i, 6, 6).
     redundancy
         Rows of the records beyond what is unknown inside and the rows of the local map.
+    parts
+        Regions that it was joined from, besides single submaps.
     """
 
     records: IntArray
@@ -100,13 +108,15 @@ class Region:
     uses: IntArray
     node_covariances: FloatArray
     redundancy: int
+    parts: tuple[Region, ...]
 
-    def holds(self, graph: MapGraph, sightings: IntArray, uses: IntArray, anchor: int) -> bool:
+    def holds(self, graph: MapGraph, active: Active, anchor: int) -> bool:
         """True if the rest of the map knows no more of it than when it was joined, and what it knows is still apart.
 
-        ``sightings`` of every observation's landmark, ``uses`` of every node, the ``anchor`` of the component.
+        ``anchor``: first node of the component.
         """
         nodes, variable_of = np.concatenate([[self.reference], self.separator, self.inner]), graph.variable_of
+        sightings, uses = active.sightings, active.uses
         known = variable_of[self.landmarks]
         return bool(
             np.all(graph.component_of[nodes] == graph.component_of[anchor])
@@ -158,55 +168,107 @@ class Region:
         return max(2.0 * float(np.arcsin(half)), float(sheared))
 
 
+@dataclass(frozen=True, eq=False)
+class Active:
+    """What the submaps that take part in the estimate know, without those ``parked`` (records).
+
+    sightings (observations,) of every observation's landmark; uses (nodes,): how many submaps start or end at each
+    node, one more at the end of a way, that may come.
+    """
+
+    sightings: IntArray
+    uses: IntArray
+
+    @classmethod
+    def of(cls, graph: MapGraph, parked: IntArray) -> Active:
+        """As the graph is now."""
+        takes_part = np.ones(len(graph.records), dtype=bool)
+        takes_part[parked] = False
+        seen = np.bincount(graph.variable_of[takes_part[graph.record_of]], minlength=len(graph.points))
+        ends = np.concatenate([graph.starts[takes_part], graph.ends[takes_part]])
+        open_end = np.ones(len(graph.poses), dtype=bool)
+        open_end[graph.starts] = False
+        uses = np.bincount(ends, minlength=len(graph.poses)) + 2 * open_end
+        return cls(np.asarray(seen[graph.variable_of]), np.asarray(uses))
+
+
 @dataclass
 class Regions:
-    """The regions of a map, and when each submap outside of them was needed last."""
+    """The regions of a map, and when each submap was needed last."""
 
     local_maps: LocalMaps
     config: RegionConfig = field(default_factory=RegionConfig)
     closed: list[Region] = field(default_factory=list)
     _needed: dict[int, int] = field(default_factory=dict)
 
-    def fitting(self, graph: MapGraph, component: int) -> list[Region]:
-        """Regions of a component; those that do not hold any more are opened."""
-        sightings, uses, anchor = _sightings(graph), _uses(graph), graph.oldest(component).start
-        own = [r for r in self.closed if graph.component_of[r.reference] == component]
-        kept = [r for r in own if r.holds(graph, sightings, uses, anchor)]
-        self.open([r for r in own if not any(r is k for k in kept)], len(graph.records))
-        return kept
+    def fitting(self, graph: MapGraph, component: int, parked: IntArray) -> list[Region]:
+        """Regions of a component; those that do not hold any more are opened, down to the parts that hold."""
+        active, anchor = Active.of(graph, parked), graph.oldest(component).start
+        while True:
+            own = [r for r in self.closed if graph.component_of[r.reference] == component]
+            kept = [r for r in own if r.holds(graph, active, anchor)]
+            if len(kept) == len(own):
+                return kept
+            self.open([r for r in own if not any(r is k for k in kept)], len(graph.records))
 
     def open(self, regions: Sequence[Region], now: int) -> None:
-        """Let the submaps of some regions take part again one by one."""
+        """Let the parts of some regions take part again."""
+        parts = [part for region in regions for part in region.parts]
+        self.closed = [*(r for r in self.closed if not any(r is other for other in regions)), *parts]
         for region in regions:
-            self._needed.update(dict.fromkeys(region.records.tolist(), now))
-        self.closed = [r for r in self.closed if not any(r is other for other in regions)]
+            inside = [i for part in region.parts for i in part.records.tolist()]
+            self._note(np.setdiff1d(region.records, inside), now)
 
-    def close(self, graph: MapGraph, component: int, busy: set[int]) -> None:
+    def clear(self, now: int) -> None:
+        """Let all submaps take part again one by one."""
+        while self.closed:
+            self.open(self.closed, now)
+
+    def _note(self, records: IntArray, now: int) -> None:
+        self._needed.update(dict.fromkeys(records.tolist(), now))
+
+    def close(self, graph: MapGraph, component: int, busy: Sequence[int], parked: IntArray) -> None:
         """Join the submaps that have been quiet for longest to one region, if more than enough are open.
 
-        ``busy`` ones stay. Small regions nearby become part of it.
+        ``busy`` ones stay. Of many regions those far from the newest submap are joined to one, too.
         """
-        now = len(graph.records)
-        inside = {i for r in self.closed for i in r.records.tolist()}
-        opened = [i for i in graph.records_of(component) if i not in inside]
-        if len(opened) <= self.config.open:
-            return
-        quiet = [i for i in opened if i not in busy and now - self._needed.get(i, i) > self.config.quiet]
+        active, now = Active.of(graph, parked), len(graph.records)
+        is_open = graph.component_of[graph.starts] == component
+        is_open[parked] = False
+        for region in self.closed:
+            is_open[region.records] = False
+        if np.count_nonzero(is_open) > self.config.open:
+            is_open[list(busy)] = False
+            self._close_records(
+                graph, component, [i for i in np.nonzero(is_open)[0].tolist() if self._quiet(i, now)], active
+            )
+        anchor = graph.oldest(component).start
+        own = [r for r in self.closed if graph.component_of[r.reference] == component]
+        if len(own) > _MANY:
+            self._close_regions(graph, component, [r for r in own if r.holds(graph, active, anchor)], active)
+
+    def _quiet(self, record: int, now: int) -> bool:
+        return now - self._needed.get(record, record) > self.config.quiet
+
+    def _close_records(self, graph: MapGraph, component: int, quiet: list[int], active: Active) -> None:
         if not quiet:
             return
         first = min(quiet, key=lambda i: (self._needed.get(i, i), i))
-        small = [
-            r
-            for r in self.closed
-            if len(r.records) < self.config.size // 2 and graph.component_of[r.reference] == component
-        ]
-        chosen = self._gathered(graph, np.concatenate([quiet, *(r.records for r in small)]), first)
-        region = join(graph, chosen, component, self.local_maps)
+        chosen = self._gathered(graph, np.array(quiet), first)
+        region = join(graph, chosen, component, self.local_maps, active)
         if region is None:
-            self._needed[first] = now
+            self._note(chosen, len(graph.records))
         else:
-            taken = [r for r in small if np.isin(r.records, chosen).any()]
-            self.closed = [*(r for r in self.closed if not any(r is t for t in taken)), region]
+            self.closed.append(region)
+
+    def _close_regions(self, graph: MapGraph, component: int, regions: list[Region], active: Active) -> None:
+        places = np.array([graph.poses[r.reference, :3, 3] for r in regions])
+        first = int(np.argmax(np.linalg.norm(places - graph.poses[graph.starts[-1], :3, 3], axis=1)))
+        nearest = np.argsort(np.linalg.norm(places - places[first], axis=1), kind="stable")[:_PARTS]
+        parts = [regions[k] for k in sorted(nearest.tolist())]
+        region = join(graph, np.empty(0, dtype=np.int64), component, self.local_maps, active, parts)
+        if region is not None:
+            self.closed = [*(r for r in self.closed if not any(r is part for part in parts)), region]
 
     def _gathered(self, graph: MapGraph, candidates: IntArray, first: int) -> IntArray:
         """Of the candidates nearest to one, those that hang together with it."""
@@ -233,41 +295,42 @@ def _tied(graph: MapGraph, records: IntArray) -> IntArray:
     return np.asarray(scipy.sparse.csgraph.connected_components(common, directed=False)[1])
 
 
-def _sightings(graph: MapGraph) -> IntArray:
-    """Number of observations of each observation's landmark."""
-    return np.asarray(np.bincount(graph.variable_of, minlength=len(graph.points))[graph.variable_of])
+def join(
+    graph: MapGraph,
+    records: IntArray,
+    component: int,
+    local_maps: LocalMaps,
+    active: Active,
+    parts: Sequence[Region] = (),
+) -> Region | None:
+    """Join records and regions to one region at the graph's estimate.
 
-
-def _uses(graph: MapGraph) -> IntArray:
-    """Number of submaps that start or end at each node; one more at the end of a way, that may come."""
-    uses = np.bincount(np.concatenate([graph.starts, graph.ends]), minlength=len(graph.poses))
-    open_end = np.ones(len(uses), dtype=bool)
-    open_end[graph.starts] = False
-    return np.asarray(uses + 2 * open_end)
-
-
-def join(graph: MapGraph, records: IntArray, component: int, local_maps: LocalMaps) -> Region | None:
-    """Join records to one region at the graph's estimate; None where that does not pay, or is not determined."""
-    sightings, uses = _sightings(graph), _uses(graph)
-    own = [graph.records[i] for i in records]
-    nodes, used = np.unique([(r.start, r.end) for r in own], return_counts=True)
-    is_separator = (used < uses[nodes]) | (nodes == graph.oldest(component).start)
-    reference, separator, inner = int(nodes[is_separator][0]), nodes[is_separator][1:], nodes[~is_separator]
-    observations = np.concatenate([r.observations for r in own])
+    None where that does not pay, or is not determined.
+    """
+    every = np.sort(np.concatenate([records, *(p.records for p in parts)]))
+    ends, used = np.unique(np.concatenate([graph.starts[every], graph.ends[every]]), return_counts=True)
+    nodes, shared = _outside(graph, records, parts)
+    is_separator = (used < active.uses[ends]) | (ends == graph.oldest(component).start)
+    if not is_separator.any():  # landmarks alone tie it to the rest
+        is_separator[np.searchsorted(ends, nodes[0])] = True
+    reference, separator, inner = int(ends[is_separator][0]), ends[is_separator][1:], ends[~is_separator]
+    observations = np.concatenate([graph.records[i].observations for i in every])
     seen = graph.variable_of[observations]
     landmarks, first, times = np.unique(seen, return_index=True, return_counts=True)
-    known = times < sightings[observations[first]]
-    shared = landmarks[sightings[observations[first]] > 1]
+    known = times < active.sightings[observations[first]]
     T_reference = invert_transform(graph.poses[reference])
-    poses, points = T_reference @ graph.poses[nodes], transform_points(T_reference, graph.points)
-    state = JoiningState(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), points[shared])
-    maps = local_maps(graph, records.tolist(), nodes, shared)
+    poses, points = T_reference @ graph.poses, transform_points(T_reference, graph.points)
+    state = JoiningState(
+        np.ascontiguousarray(poses[nodes, :3, :3]), np.ascontiguousarray(poses[nodes, :3, 3]), points[shared]
+    )
+    maps = [*local_maps(graph, records.tolist(), nodes, shared), *(p.local_map(graph, nodes, shared) for p in parts)]
     at_separator, kept = np.searchsorted(nodes, separator), np.searchsorted(shared, landmarks[known])
     rows = 6 * len(separator) + 3 * len(kept)
     if rows**2 > _WORTH * sum(len(m.mean) ** 2 for m in maps):
         return None
     fixed, last = np.searchsorted(nodes, [reference]), np.concatenate([at_separator, len(nodes) + kept])
-    problem = JoiningProblem(flatten(maps), state, fixed, kernels.TANGENT, last=last)
+    constant = sum(p.constant for p in parts)
+    problem = JoiningProblem(flatten(maps), state, fixed, kernels.TANGENT, last=last, constant=constant)
     scalars = problem.scalars(at_separator, kept)
     try:
         newton, least = problem.newton_step(state)
@@ -275,13 +338,31 @@ def join(graph: MapGraph, records: IntArray, component: int, local_maps: LocalMa
         marginals = problem.marginals(state)
     except ValueError:
         return None
-    ordered = np.searchsorted(nodes, np.concatenate([[reference], separator, inner]))
-    node_covariances = np.array([marginals.covariance([k]) for k in ordered.tolist()])
+    covariances = np.zeros((len(graph.poses), 6, 6))
+    covariances[nodes] = marginals.pose_blocks(np.arange(len(nodes)))
+    for p in parts:
+        J_reference, J_node = compose_jacobians(np.broadcast_to(poses[p.reference], p.inner_poses.shape), p.inner_poses)
+        own = p.node_covariances[1 + len(p.separator) :]
+        covariances[p.inner] = (
+            J_reference @ covariances[p.reference] @ np.swapaxes(J_reference, 1, 2)
+            + J_node @ own @ np.swapaxes(J_node, 1, 2)
+        )  # fmt: skip
     group = np.where(known, np.cumsum(known) - 1, -1)[np.searchsorted(landmarks, seen)]
     is_known, inside = group >= 0, observations[group < 0]
+    redundancy = problem.rows - problem.layout.pattern.n + sum(p.redundancy for p in parts)
     return Region(
-        records, reference, separator, inner, poses[at_separator], observations[first[known]], points[landmarks[known]],
+        every, reference, separator, inner, poses[separator], observations[first[known]], points[landmarks[known]],
         information, -information @ step, float(least + step @ information @ step), observations[is_known],
-        group[is_known], poses[np.searchsorted(nodes, inner)], inside, points[inside], graph.variable_of[inside],
-        sightings[inside], uses[inner], node_covariances, problem.rows - problem.layout.pattern.n,
+        group[is_known], poses[inner], inside, points[inside], graph.variable_of[inside],
+        active.sightings[inside], active.uses[inner], covariances[np.concatenate([[reference], separator, inner])],
+        redundancy, tuple(parts),
     )  # fmt: skip
+
+
+def _outside(graph: MapGraph, records: IntArray, parts: Sequence[Region]) -> tuple[IntArray, IntArray]:
+    """Nodes and landmarks that records and regions are over, ascending."""
+    nodes = [graph.starts[records], graph.ends[records], *(np.append(p.separator, p.reference) for p in parts)]
+    observations = np.concatenate([np.empty(0, dtype=np.int64), *(graph.records[i].observations for i in records)])
+    tying = observations[graph.tying()[observations]]
+    seen = graph.variable_of[np.concatenate([tying, *(p.landmarks for p in parts)])]
+    return np.unique(np.concatenate(nodes)), np.unique(seen)

@@ -125,22 +125,21 @@ class Smoother:
     def condense(self, new: int, busy: Sequence[int]) -> None:
         """Join old submaps that nothing touches to regions; ``busy`` records stay as they are."""
         if self.config.estimator.linearises:
-            past = np.nonzero(self.graph.redundant)[0]
-            for record in past[~np.isin(past, [*self.parked.records.tolist(), *busy, new])].tolist():
+            stay = [new, *busy, *self.parked.records, *(i for r in self.regions.closed for i in r.records)]
+            for record in np.setdiff1d(np.nonzero(self.graph.redundant)[0], stay).tolist():
                 self._park(record)
-            busy = [new, *busy, *self.parked.records.tolist()]
-            self.regions.close(self.graph, self.graph.component(new), set(busy))
+            self.regions.close(self.graph, self.graph.component(new), [new, *busy], self.parked.records)
 
     def _park(self, record: int) -> None:
         """Leave a redundant record out from here on, if the estimate does not need it."""
-        graph, r = self.graph, self.graph.records[record]
-        reference, solved = anchor_of(graph, record), self._solved.get(graph.component(record))
+        graph, r, solved = self.graph, self.graph.records[record], self._solved.get(self.graph.component(record))
         following = np.nonzero(graph.starts == r.end)[0].tolist()
-        if reference is None or solved is None or not all(is_tied(graph, i) for i in following):
+        if solved is None or not all(is_tied(graph, i) for i in following):
+            return
+        reference = anchor_of(graph, record, solved.assembled.nodes)
+        if reference is None or not np.isin([r.start, r.end], solved.assembled.nodes).all():
             return
         nodes = [reference, r.start, r.end]
-        if not np.isin(nodes, solved.assembled.nodes).all():
-            return
         joint, covariances = solved.assembled.covariance(nodes), np.empty((2, 6, 6))
         for k, node in enumerate(nodes[1:]):
             rows = np.append(np.arange(6), 6 * k + 6 + np.arange(6))
@@ -154,7 +153,7 @@ class Smoother:
         """
         self._choose_ties()
         self.parked = Parked()
-        self.regions.open(self.regions.closed, len(self.graph.records))
+        self.regions.clear(len(self.graph.records))
         for component in np.unique(self.graph.component_of).tolist():
             self._solve(component, coarse=coarse)
 
@@ -194,13 +193,14 @@ class Smoother:
     def _solve(self, component: int, *, coarse: bool = True) -> UpdateResult:
         """Optimise a component; regions that this bends are opened."""
         while True:
-            regions = self.regions.fitting(self.graph, component)
             parked = self._parked_in(component)
+            regions = self.regions.fitting(self.graph, component, self.parked.records)
             assembled, found = self.estimator.optimize(self.graph, component, regions, parked, coarse=coarse)
             bent = [r for r in regions if r.carry(self.graph) > self.config.region.relinearize]
             if not bent:
                 break
             self.regions.open(bent, len(self.graph.records))
+        parked.carry(self.graph, assembled.nodes)
         result = self._result_of(component, assembled, found.cost, found.iterations, found.converged)
         self._solved[component] = _Solved(assembled, result)
         return result
