@@ -56,7 +56,7 @@ FIXED = {
     "SurfaceConfig": "min_images sigma_floor correlation min_triangles",
     "FloorPlanConfig": "clear_below min_points min_rays ray_step storey_height max_cells",
     "GlobalMapConfig": "unlinked_sigma compared_at_once compared_at_settling joined_at_once redundant_matches",
-    "SmootherConfig": "settled_work",
+    "SmootherConfig": "settled_work settled_ties",
     "EstimatorConfig": "relative_tolerance live_tolerance live_iterations",
     "RobustConfig": "probability",
     "RegionConfig": "open quiet relinearize",

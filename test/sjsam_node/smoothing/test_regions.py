@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from submap_world import Agent, circle, ring_world
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.graph.links import Link
 from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.smoothing import regions
 from sjsam_node.smoothing.estimator import EstimatorConfig
 from sjsam_node.smoothing.regions import Active, Region, RegionConfig
 from sjsam_node.smoothing.regions import join as join_region
@@ -50,10 +52,10 @@ def way() -> GlobalMap:
     return join(walk(0.5), global_map(ALWAYS_OPEN))[0]
 
 
-def a_region(smoother: Smoother) -> Region:
-    region = join_region(
-        smoother.graph, np.arange(3, 12), 0, smoother.estimator.local_maps, Active.of(smoother.graph, NONE)
-    )
+def a_region(smoother: Smoother, first: int = 3, end: int = 12, parts: Sequence[Region] = ()) -> Region:
+    records = NONE if parts else np.arange(first, end)
+    active = Active.of(smoother.graph, NONE)
+    region = join_region(smoother.graph, records, 0, smoother.estimator.local_maps, active, parts)
     assert region is not None
     return region
 
@@ -138,6 +140,41 @@ def test_what_links_the_inside_of_a_region_opens_it_and_what_links_its_separator
         graph.add_link(Link(record, other, pairs, np.eye(4), np.eye(6), True))
         assert holds(region, graph) != is_open
         smoother.restore(before)
+
+
+@pytest.fixture
+def always_worth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two regions are joined even if that saves little."""
+    monkeypatch.setattr(regions, "_WORTH", np.inf)
+
+
+@pytest.mark.usefixtures("always_worth")
+def test_a_region_of_regions_says_what_its_submaps_say(way: GlobalMap) -> None:
+    way.settle()
+    smoother = way.smoother
+    whole, parts = a_region(smoother, 3, 21), [a_region(smoother, 3, 12), a_region(smoother, 12, 21)]
+    nested = a_region(smoother, parts=parts)
+    for name in ("records", "separator", "inner", "inner_observations", "landmarks", "redundancy", "uses"):
+        assert np.array_equal(getattr(nested, name), getattr(whole, name)), name
+    scale = np.abs(whole.information).max()
+    assert np.allclose(nested.information, whole.information, rtol=0.0, atol=1e-6 * scale)
+    assert np.allclose(np.linalg.solve(nested.information, nested.pull), np.linalg.solve(whole.information, whole.pull),
+                       rtol=0.0, atol=1e-7)  # fmt: skip
+    assert nested.constant == pytest.approx(whole.constant, rel=1e-6)
+    surer = np.linalg.eigvalsh(nested.node_covariances - whole.node_covariances)
+    assert surer.min() > -1e-9  # never, where it is inside a part
+
+
+@pytest.mark.usefixtures("always_worth")
+def test_a_link_to_the_inside_of_a_region_of_regions_leaves_the_other_parts_closed(way: GlobalMap) -> None:
+    smoother, graph = way.smoother, way.graph
+    parts = [a_region(smoother, 3, 12), a_region(smoother, 12, 21)]
+    smoother.regions.closed = [a_region(smoother, parts=parts)]
+    observation = int(parts[0].inner_observations[0])
+    record = next(i for i in parts[0].records if observation in graph.records[i].observations)
+    pairs = np.array([[observation - graph.records[record].first_observation, 0]])
+    graph.add_link(Link(record, len(graph.records) - 1, pairs, np.eye(4), np.eye(6), True))
+    assert smoother.regions.fitting(graph, 0, NONE) == [parts[1]]
 
 
 def test_a_landmark_of_the_separator_that_is_let_go_is_estimated_by_the_region_alone(way: GlobalMap) -> None:

@@ -29,7 +29,8 @@ from slam_core.geometry import FloatArray, invert_transform
 from slam_core.linear_algebra.block_pattern import IntArray, pointers
 from slam_core.types import Submap
 
-_ALL = 1 << 30
+ALL = 1 << 30
+"""Landmarks by which two submaps are tied together where all that they share are to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ class MapGraph:
     redundant: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     doubt: FloatArray = field(default_factory=lambda: np.empty(0))
     """Variance factor that the matches of each record had when they were let go for contradicting each other, or 1."""
-    is_complete: bool = False
+    _least_ties: int = 0
     _matches: Matches = field(default_factory=Matches)
     _rank: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _variable_of: IntArray | None = None
@@ -119,17 +120,17 @@ class MapGraph:
             matches = self._matches
             self._variable_of = variables(
                 matches.pairs, matches.ptr,
-                np.diff(matches.ptr) if self.is_complete else self.ties[matches.ends].min(axis=1, initial=_ALL),
+                np.maximum(self.ties[matches.ends].min(axis=1, initial=ALL), self._least_ties),
                 self.landmark_of, self._rank,
             )  # fmt: skip
         return self._variable_of
 
-    def use_all_ties(self, use: bool) -> None:
-        """Let all landmarks that submaps share tie them together, or a selection of them."""
-        if use != self.is_complete:
-            self.is_complete, self._variable_of = use, None
+    def tie_by(self, least: int) -> None:
+        """Let so many of the landmarks that two submaps share tie them together, or more where they were to anyway."""
+        if least != self._least_ties:
+            self._least_ties, self._variable_of = least, None
 
-    def append(self, submap: Submap, start: int | None, guess: FloatArray, ties: int = _ALL) -> Record:
+    def append(self, submap: Submap, start: int | None, guess: FloatArray, ties: int = ALL) -> Record:
         """Add a submap that starts at node ``start``, or at a new node at pose ``guess`` in a component of its own.
 
         ``ties`` landmarks, at most, tie it to each other one.
@@ -153,7 +154,7 @@ class MapGraph:
         self.starts, self.ends = np.append(self.starts, start), np.append(self.ends, end)
         self.ties, self._rank = np.append(self.ties, ties), np.append(self._rank, spread_order(submap.landmarks))
         self.redundant, self.doubt = np.append(self.redundant, False), np.append(self.doubt, 1.0)
-        self.use_all_ties(False)
+        self.tie_by(0)
         self._variable_of = None
         self.records.append(record)
         known = self._oldest.get(self.component(-1))

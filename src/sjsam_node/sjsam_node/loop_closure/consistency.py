@@ -93,20 +93,31 @@ class Consistency:
         self._wait(k for k in found if not _is_in(k, added))
         if not added and not removed:
             return self.smoother.update(newest), Verdict()
+        sure = [k for k in found if k.status is Status.CONSISTENT]
+        tried = self._tried(added, removed, newest)
+        if tried is None and 0 < len(sure) < len(added):  # one that the map was not sure of need not take others along
+            self._wait(k for k in added if not _is_in(k, sure))
+            tried = self._tried(sure, [], newest)
+        if tried is not None:
+            return tried
+        self._wait(added)
+        if len(added) > len(found):
+            self._refused_support = self._support(added)
+        return self.smoother.update(newest), Verdict()
+
+    def _tried(self, added: list[Link], removed: list[Link], newest: int) -> tuple[UpdateResult, Verdict] | None:
+        """Update the map with closures and without others; None, and all as it was, if it cannot live with that."""
         before, checkpoint = self.smoother.totals(), self.smoother.checkpoint()
         offered = [*self.smoother.graph.links, *added]
         result = self.smoother.update(newest, added, removed)
         result, outliers = self._evaluate(newest, result, self.config.rounds)
         verdict = self._verdict(added, offered)
-        if self._is_better(verdict, before, newest, outliers):
-            self.refused = [k for k in self.refused if not _is_in(k, added)]
-            self._refused_support = 0
-            return result, verdict
-        self.smoother.restore(checkpoint)
-        self._wait(added)
-        if len(added) > len(found):
-            self._refused_support = self._support(added)
-        return self.smoother.update(newest), Verdict()
+        if not self._is_better(verdict, before, newest, outliers):
+            self.smoother.restore(checkpoint)
+            return None
+        self.refused = [k for k in self.refused if not _is_in(k, added)]
+        self._refused_support = 0
+        return result, verdict
 
     def settle(self, newest: int) -> Verdict:
         """Let go what the settled map contradicts, until nothing is left or it has been evaluated often enough.
@@ -301,17 +312,17 @@ class Consistency:
 
         Also returns by how much chi2 will fall without these matches.
         """
-        for _ in range(rounds):
-            nis = self._nis(self.smoother.graph.component(newest))
+        graph = self.smoother.graph
+        while True:
+            nis = self._nis(graph.component(newest))
             gate = self._gate(nis)
             beyond = np.nonzero(np.nan_to_num(nis) > gate)[0]
-            suspects = set(self.smoother.graph.record_of[beyond].tolist())
-            closures = [k for k in self._closures() if not suspects.isdisjoint(k.ends)]
+            near = np.isin(graph.linked, graph.record_of[beyond]).any(axis=1)
+            closures = [k for i in np.nonzero(near)[0].tolist() if (k := graph.links[i]).is_closure]
             worst = max(closures, key=lambda k: self._median_nis(k, nis), default=None)
-            if worst is None or self._median_nis(worst, nis) <= gate:
+            if rounds == 0 or worst is None or self._median_nis(worst, nis) <= gate:
                 return result, self._drop_outliers(beyond, nis)
-            result = self.smoother.update(newest, removed=[worst])
-        return result, 0.0
+            result, rounds = self.smoother.update(newest, removed=[worst]), rounds - 1
 
     def _gate(self, nis: FloatArray) -> float:
         """Squared error beyond which a match is none, in units of the map's own variance factor."""

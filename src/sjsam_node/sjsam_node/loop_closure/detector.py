@@ -158,8 +158,8 @@ class LoopDetector:
             found, status = self.verifier.verify(first, second, prior, way, old, new)
         if found is None:
             return None
-        unsure = status is Status.UNINFORMATIVE and prior is not None
-        error = self.verifier.error_against(found, prior, 0.0) if unsure and prior is not None else 0.0
+        may_move = status is not Status.INCONSISTENT and prior is not None
+        error = self.verifier.error_against(found, prior, 0.0) if may_move and prior is not None else 0.0
         return Link(old, new, found.pairs, found.T, found.covariance, True, error, status)
 
     def _confirmed(self, link: Link) -> list[Link]:

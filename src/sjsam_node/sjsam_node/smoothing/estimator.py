@@ -252,8 +252,9 @@ class Estimator:
         ``coarse``: to where a step promises less than ``live_tolerance``.
         """
         assembled = self.assemble(graph, component, regions, parked)
-        for i in set(graph.records_of(component)).difference(assembled.records):
-            self._cache.pop(i, None)
+        held = set(assembled.records)
+        for i in [i for i in self._cache if i not in held and graph.component(i) == component]:
+            del self._cache[i]
             self._recovered.pop(i, None)
         tolerance = self.config.live_tolerance if coarse else self.config.relative_tolerance
         most = min(self.config.iterations, self.config.live_iterations) if coarse else self.config.iterations

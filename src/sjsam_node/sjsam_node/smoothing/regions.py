@@ -128,6 +128,10 @@ class Region:
             and len(np.unique(known)) == len(known)
         )
 
+    def shown(self, graph: MapGraph) -> set[int]:
+        """What the rest of the map knows of it: nodes, and landmarks as negative numbers."""
+        return {self.reference, *self.separator.tolist(), *(-1 - graph.variable_of[self.landmarks]).tolist()}
+
     def node(self, node: int) -> tuple[FloatArray, FloatArray]:
         """T_reference_node of a node of the region, and its covariance (6, 6)."""
         nodes = np.concatenate([[self.reference], self.separator, self.inner])
@@ -160,7 +164,8 @@ class Region:
         shifted = transform_points(T_reference, graph.points[graph.variable_of[self.landmarks]]) - self.points
         moved = T_reference @ graph.poses[self.separator]
         turned = moved[:, :3, :3] @ np.swapaxes(self.poses[:, :3, :3], 1, 2) - np.eye(3)
-        extent = max(float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self.points) else 0.0, 1.0)
+        places = np.concatenate([np.zeros((1, 3)), self.points, self.poses[:, :3, 3]])
+        extent = max(float(np.linalg.norm(np.ptp(places, axis=0))), 1.0)
         shifted = np.concatenate([moved[:, :3, 3] - self.poses[:, :3, 3], shifted])
         sheared = np.linalg.norm(shifted, axis=1).max(initial=0.0) / extent
         # The Frobenius norm of R - I is that of a rotation by an angle a: sqrt(8) sin(a / 2).
@@ -262,12 +267,24 @@ class Regions:
             self.closed.append(region)
 
     def _close_regions(self, graph: MapGraph, component: int, regions: list[Region], active: Active) -> None:
-        places = np.array([graph.poses[r.reference, :3, 3] for r in regions])
-        first = int(np.argmax(np.linalg.norm(places - graph.poses[graph.starts[-1], :3, 3], axis=1)))
-        nearest = np.argsort(np.linalg.norm(places - places[first], axis=1), kind="stable")[:_PARTS]
-        parts = [regions[k] for k in sorted(nearest.tolist())]
-        region = join(graph, np.empty(0, dtype=np.int64), component, self.local_maps, active, parts)
-        if region is not None:
+        now, here = len(graph.records), graph.poses[graph.starts[-1], :3, 3]
+        left = [r for r in regions if self._quiet(int(r.records[0]), now)]
+        if not left:
+            return
+        parts = [max(left, key=lambda r: float(np.linalg.norm(graph.poses[r.reference, :3, 3] - here)))]
+        known = parts[0].shown(graph)
+        while len(parts) < _PARTS:
+            left = [r for r in left if not any(r is part for part in parts)]
+            nearest = max(left, key=lambda r: len(known & r.shown(graph)), default=None)
+            if nearest is None or not known & nearest.shown(graph):
+                break
+            parts.append(nearest)
+            known |= nearest.shown(graph)
+        none = np.empty(0, dtype=np.int64)
+        region = join(graph, none, component, self.local_maps, active, parts) if len(parts) > 1 else None
+        if region is None:
+            self._note(parts[0].records[:1], now)
+        else:
             self.closed = [*(r for r in self.closed if not any(r is part for part in parts)), region]
 
     def _gathered(self, graph: MapGraph, candidates: IntArray, first: int) -> IntArray:

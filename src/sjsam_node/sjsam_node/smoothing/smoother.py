@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sjsam_node.graph.links import Link, Prior
-from sjsam_node.graph.map_graph import MapGraph, Snapshot
+from sjsam_node.graph.map_graph import ALL, MapGraph, Snapshot
 from sjsam_node.smoothing.estimator import Assembled, Estimator, EstimatorConfig
 from sjsam_node.smoothing.marginals import ComponentMarginals, prior_of_pair, relative_pose, seen_from
 from sjsam_node.smoothing.parking import Parked, anchor_of, is_tied
@@ -33,7 +33,9 @@ class SmootherConfig(Config):
     """Parameters of keeping the estimate."""
 
     settled_work: float = 3e7
-    """Entries of the submaps' information matrices up to which a map settles with all its landmarks."""
+    """Entries of the submaps' information matrices up to which a map settles with more than the selected landmarks."""
+    settled_ties: int = 24
+    """Landmarks by which two submaps are tied together then, at least, where all that they share are too many."""
     estimator: EstimatorConfig = group(EstimatorConfig)
     region: RegionConfig = group(RegionConfig)
 
@@ -125,7 +127,7 @@ class Smoother:
     def condense(self, new: int, busy: Sequence[int]) -> None:
         """Join old submaps that nothing touches to regions; ``busy`` records stay as they are."""
         if self.config.estimator.linearises:
-            stay = [new, *busy, *self.parked.records, *(i for r in self.regions.closed for i in r.records)]
+            stay = np.concatenate([[new, *busy], self.parked.records, *(r.records for r in self.regions.closed)])
             for record in np.setdiff1d(np.nonzero(self.graph.redundant)[0], stay).tolist():
                 self._park(record)
             self.regions.close(self.graph, self.graph.component(new), [new, *busy], self.parked.records)
@@ -181,9 +183,12 @@ class Smoother:
         self.parked = checkpoint.parked
 
     def _choose_ties(self) -> None:
-        self.graph.use_all_ties(True)
-        if self._work() > self.config.settled_work or (self.graph.doubt > 1.0).any():
-            self.graph.use_all_ties(False)
+        self.graph.tie_by(0)
+        for least in (ALL, self.config.settled_ties) if not (self.graph.doubt > 1.0).any() else ():
+            self.graph.tie_by(least)
+            if self._work() <= self.config.settled_work:
+                return
+            self.graph.tie_by(0)
 
     def _work(self) -> float:
         """Entries of the information matrices that the selected landmarks make."""
