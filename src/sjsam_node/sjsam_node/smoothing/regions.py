@@ -129,7 +129,7 @@ class Region:
         )
 
     def shown(self, graph: MapGraph) -> set[int]:
-        """What the rest of the map knows of it: nodes, and landmarks as negative numbers."""
+        """Nodes that the rest of the map knows of it, and landmarks, as negative numbers."""
         return {self.reference, *self.separator.tolist(), *(-1 - graph.variable_of[self.landmarks]).tolist()}
 
     def node(self, node: int) -> tuple[FloatArray, FloatArray]:
@@ -175,7 +175,7 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class Active:
-    """What the submaps that take part in the estimate know, without those ``parked`` (records).
+    """Knowledge of the submaps that take part in the estimate, without those ``parked`` (records).
 
     sightings (observations,) of every observation's landmark; uses (nodes,): how many submaps start or end at each
     node, one more at the end of a way, that may come.
