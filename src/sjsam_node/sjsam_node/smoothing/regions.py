@@ -51,7 +51,11 @@ class RegionConfig(Config):
     quiet: int = 10
     """Submaps that came since one was needed, before it may be joined to others."""
     relinearize: float = 0.002
-    """Turn of a region's separator since it was linearised beyond which it is opened (rad)."""
+    """Turn of a region's separator since it was linearised beyond which it is opened (rad), up to ``size`` submaps."""
+
+    def largest_turn(self, region: Region) -> float:
+        """The same for a region of any size (rad): along a way turns add up like steps of a random walk."""
+        return self.relinearize * float(np.sqrt(max(len(region.records) / self.size, 1.0)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -201,7 +201,7 @@ class Smoother:
             parked = self._parked_in(component)
             regions = self.regions.fitting(self.graph, component, self.parked.records)
             assembled, found = self.estimator.optimize(self.graph, component, regions, parked, coarse=coarse)
-            bent = [r for r in regions if r.carry(self.graph) > self.config.region.relinearize]
+            bent = [r for r in regions if r.carry(self.graph) > self.config.region.largest_turn(r)]
             if not bent:
                 break
             self.regions.open(bent, len(self.graph.records))
