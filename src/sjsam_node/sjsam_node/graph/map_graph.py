@@ -24,7 +24,7 @@ import scipy.sparse.csgraph
 from sjsam_node.graph.fusion import BoolArray as BoolArray
 from sjsam_node.graph.fusion import Fusion
 from sjsam_node.graph.links import Link
-from sjsam_node.graph.selection import Matches, spread_order, variables
+from sjsam_node.graph.selection import LinkedPairs, spread_order, variables
 from slam_core.geometry import FloatArray, invert_transform
 from slam_core.linear_algebra.block_pattern import IntArray, pointers
 from slam_core.types import Submap
@@ -58,7 +58,7 @@ class Snapshot:
     """Links and estimate of a map graph at one time."""
 
     links: list[Link]
-    matches: Matches
+    matches: LinkedPairs
     poses: FloatArray
     points: FloatArray
     fusion: Fusion
@@ -89,7 +89,7 @@ class MapGraph:
     doubt: FloatArray = field(default_factory=lambda: np.empty(0))
     """Variance factor that the matches of each record had when they were let go for contradicting each other, or 1."""
     _least_ties: int = 0
-    _matches: Matches = field(default_factory=Matches)
+    _matches: LinkedPairs = field(default_factory=LinkedPairs)
     _rank: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     _variable_of: IntArray | None = None
     _oldest: dict[int, Record] = field(default_factory=dict)
@@ -219,14 +219,14 @@ class MapGraph:
         self._matches = self._matches.followed_by(added)
         return self._fusion.unite(added.pairs)
 
-    def _observed(self, links: Sequence[Link]) -> Matches:
+    def _observed(self, links: Sequence[Link]) -> LinkedPairs:
         """The observations that the pairs of links name."""
         if not links:
-            return Matches()
+            return LinkedPairs()
         counts, ends = [len(k.pairs) for k in links], np.array([k.ends for k in links], dtype=np.int64)
         first = np.searchsorted(self.record_of, ends)
         pairs = np.concatenate([k.pairs for k in links]) + np.repeat(first, counts, axis=0)
-        return Matches(pairs, pointers(counts), ends)
+        return LinkedPairs(pairs, pointers(counts), ends)
 
     def _merge(self, link: Link) -> None:
         first, second = self.component(link.first), self.component(link.second)

@@ -22,7 +22,7 @@ def _none() -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class LinkedPairs:
     """Matched observations of links, one link after the other.
 
     pairs (k, 2) of observations, ptr (n + 1,) where those of each link start, ends (n, 2): the records it links.
@@ -32,9 +32,9 @@ class Matches:
     ptr: IntArray = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
     ends: IntArray = field(default_factory=_none)
 
-    def followed_by(self, later: Matches) -> Matches:
+    def followed_by(self, later: LinkedPairs) -> LinkedPairs:
         """These and others."""
-        return Matches(
+        return LinkedPairs(
             np.concatenate([self.pairs, later.pairs]), np.append(self.ptr, self.ptr[-1] + later.ptr[1:]),
             np.concatenate([self.ends, later.ends]),
         )  # fmt: skip
