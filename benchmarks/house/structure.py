@@ -62,6 +62,9 @@ def measure(trees: Trees) -> dict[str, str]:
         "public names": str(sum(len(list(public_names(tree))) for _, tree in trees.values())),
         "parameters of all configurations": str(sum(count_parameters(tree) for _, tree in trees.values())),
         "named and inline float constants": str(sum(count_constants(tree) for _, tree in trees.values())),
+        "of these outside the drawings of the simulator": str(
+            sum(count_constants(tree) for name, (_, tree) in trees.items() if "simulation" not in name)
+        ),
         "class names that stand twice": f"{len(twice)} ({', '.join(twice)})" if twice else "0",
         "import circles of modules": str(len(circles(module_imports(trees)))),
         "import circles of folders": str(len(circles(folder_imports(trees)))),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from ndt_registration.stage import Scan
@@ -130,6 +131,31 @@ class AgentSensors:
         return (self.tof if camera == "tof" else self.left) is not None
 
 
+def _imu_reading(sensors: AgentSensors, message: Message) -> Reading:
+    sample = imu_from_message(message)
+    sensors.frames.lookup(sensors.base_frame, sample.frame_id)  # unusable where that is not known
+    return ImuReading(sensors.agent, sample)
+
+
+def _laser_reading(sensors: AgentSensors, message: Message) -> Reading:
+    return LaserReading(sensors.agent, Scan(stamp_ns(message), points_from_scan(message), message.header.frame_id))
+
+
+def _colour_reading(sensors: AgentSensors, message: Message) -> Reading:
+    return ColourReading(sensors.agent, stamp_ns(message), colour_from_message(message))
+
+
+_UNPAIRED_ROLES: dict[str, Callable[[AgentSensors, Message], Reading]] = {
+    "imu": _imu_reading,
+    "scan": _laser_reading,
+    "color": _colour_reading,
+}
+"""Decoders of the roles whose every message is a reading by itself."""
+
+ROLES_READ = ("left", "right", "depth", "amplitude", "intensity", *_UNPAIRED_ROLES)
+"""Roles whose messages become readings."""
+
+
 class AgentPairing:
     """Pairs one agent's messages by stamp; what it drops is counted in ``left_out``."""
 
@@ -149,13 +175,8 @@ class AgentPairing:
     def add(self, role: str, message: Message) -> list[Reading]:
         """The readings that this message completes."""
         self._ready = []
-        if role == "imu":
-            self._on_imu(message)
-        elif role == "scan":
-            scan = Scan(stamp_ns(message), points_from_scan(message), message.header.frame_id)
-            self._hand_on(LaserReading(self._sensors.agent, scan))
-        elif role == "color":
-            self._hand_on(ColourReading(self._sensors.agent, stamp_ns(message), colour_from_message(message)))
+        if role in _UNPAIRED_ROLES:
+            self._hand_on(_UNPAIRED_ROLES[role](self._sensors, message))
         elif role in ("left", "right"):
             self._stereo.add(role, stamp_ns(message), message)
         else:
@@ -179,11 +200,6 @@ class AgentPairing:
             stamp, images["depth"], images.get("amplitude"), images.get("intensity"), self._sensors.tof_frame
         )
         self._hand_on(DepthReading(self._sensors.agent, raw))
-
-    def _on_imu(self, message: Message) -> None:
-        sample = imu_from_message(message)
-        self._sensors.frames.lookup(self._sensors.base_frame, sample.frame_id)  # unusable where that is not known
-        self._hand_on(ImuReading(self._sensors.agent, sample))
 
     def _hand_on(self, reading: Reading) -> None:
         """Only what is newer than all before: a message may have come twice, or time jumped back."""

@@ -30,6 +30,7 @@ import numpy as np
 
 from slam_bringup.bags.bag import BagReader
 from slam_bringup.bags.readings import (
+    ROLES_READ,
     AgentPairing,
     AgentSensors,
     ColourReading,
@@ -50,8 +51,6 @@ from slam_core.messages import (
     transform_from_message,
 )
 from slam_core.trajectory import Trajectory
-
-_READ = ("left", "right", "depth", "amplitude", "intensity", "imu", "scan")
 
 
 class SensorBag:
@@ -103,10 +102,9 @@ class SensorBag:
         """A pair comes when its last image does."""
         self.left_out.clear()
         pairing = {agent: AgentPairing(sensors, self.left_out) for agent, sensors in self.sensors.items()}
-        read = (*_READ, *("color",) * colours)
         route: dict[str, list[tuple[str, str]]] = {}
         for agent, sensors in self.sensors.items():
-            for role in (role for role in read if role in sensors.topics):
+            for role in (role for role in ROLES_READ if role in sensors.topics and (colours or role != "color")):
                 route.setdefault(sensors.topics[role], []).append((agent, role))
         types = {name: info.type_name for name, info in self.reader.topics.items()}
         for topic, _, data in self.reader.raw(route):

@@ -52,8 +52,7 @@ class SensorPipeline:
         self._agent = sensors.agent
         self._times = times
         self._uses_stereo = mode != "tof"
-        self._scanner = sensors.scanner if odometry else ""
-        self._uses_depth = mode != "stereo" or self._scanner == "depth"
+        self._uses_depth = mode != "stereo" or (odometry and sensors.scanner == "depth")
         self.log = FrameLog()
         """Pictures with their features, for people to look at."""
         self._require(mode, sensors, odometry)
@@ -72,7 +71,7 @@ class SensorPipeline:
             yield from self._on_pair(reading)
         elif isinstance(reading, DepthReading) and self._uses_depth:
             yield from self._on_depth(reading)
-        elif isinstance(reading, LaserReading) and self._odometry is not None and self._scanner == "scan":
+        elif isinstance(reading, LaserReading) and self._odometry is not None:
             self._odometry.add_scan(reading.scan)
             yield from self._scans()
 
