@@ -12,7 +12,7 @@ from imu_world import ACCELEROMETER_BIAS, GYRO_BIAS, PLACE, carried, imu_place, 
 
 from ekf_slam_node.aids import MotionAids
 from ekf_slam_node.config import EkfSlamConfig, InertialConfig, MotionConfig
-from ekf_slam_node.odometry import OdometryChain, Upwards
+from ekf_slam_node.odometry import OdometryChain, UpDirection
 from ekf_slam_node.preintegration import ImuNoise, ImuReadings, Preintegral
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.slam import EkfSlam
@@ -223,7 +223,7 @@ def test_gravity_holds_roll_and_pitch_of_a_long_chain() -> None:
         seen = boxplus(step, drift * rng.standard_normal(6))
         up = truth[:3, :3].T @ tilted @ Z
         read = so3_exp(spread * rng.standard_normal(3)) @ up
-        levelled = Upwards(read, spread**2 * (np.eye(3) - np.outer(read, read)))
+        levelled = UpDirection(read, spread**2 * (np.eye(3) - np.outer(read, read)))
         for chain, gravity in zip(chains, (levelled, None), strict=True):
             stamp = 20 * k * 10**9
             chain.advance(chain.pose(stamp, seen, np.diag(drift**2)), gravity)

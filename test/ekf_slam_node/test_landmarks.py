@@ -10,34 +10,34 @@ from ekf_slam_node.association import associate_ccda, associate_jcbb, associate_
 from ekf_slam_node.candidates import Candidates
 from ekf_slam_node.config import EkfSlamConfig, FeatureAssociationConfig, LandmarkConfig, SubmapConfig
 from ekf_slam_node.ekf import Ekf
-from ekf_slam_node.landmarks import LandmarkBook
+from ekf_slam_node.landmarks import LandmarkTable
 from ekf_slam_node.models import CORE_DIM, frame_from_features, rig_points
 from ekf_slam_node.slam import EkfSlam
 from ekf_slam_node.submap_builder import conditional_start
 from slam_core.geometry import make_transform, rotation_from_euler
 
 
-def book_of(sightings: list[int]) -> LandmarkBook:
-    book = LandmarkBook(4)
+def book_of(sightings: list[int]) -> LandmarkTable:
+    table = LandmarkTable(4)
     n = len(sightings)
-    book.add(np.arange(n), np.array(sightings), np.eye(4, dtype=np.float32)[np.arange(n) % 4], frame=10)
-    return book
+    table.add(np.arange(n), np.array(sightings), np.eye(4, dtype=np.float32)[np.arange(n) % 4], frame=10)
+    return table
 
 
 def test_landmarks_with_too_few_sightings_leave_after_their_probation():
     config = LandmarkConfig(min_sightings=3, probation_frames=6)
-    book = book_of([1, 2, 3, 7])
-    assert book.unreliable(15, config).tolist() == []
-    assert book.unreliable(16, config).tolist() == [1, 0]
+    table = book_of([1, 2, 3, 7])
+    assert table.unreliable(15, config).tolist() == []
+    assert table.unreliable(16, config).tolist() == [1, 0]
 
 
 def test_landmarks_that_are_missed_where_they_should_be_seen_leave():
     config = LandmarkConfig(min_hit_ratio=0.25, min_expected=12)
-    book = book_of([9, 9])
+    table = book_of([9, 9])
     for k in range(12):
         seen = np.array([0]) if k % 3 == 0 else np.array([], dtype=np.int64)
-        book.count(seen, np.zeros((len(seen), 4), np.float32), expected=np.array([True, True]))
-    assert book.unreliable(11, config).tolist() == [1]
+        table.count(seen, np.zeros((len(seen), 4), np.float32), expected=np.array([True, True]))
+    assert table.unreliable(11, config).tolist() == [1]
 
 
 def test_points_that_exist_only_for_a_moment_do_not_stay_in_the_map(rng):

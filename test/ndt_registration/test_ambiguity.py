@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ndt_registration.ambiguity import reason_of_doubt
+from ndt_registration.ambiguity import ambiguity_reason
 from ndt_registration.registration import register
 from ndt_registration.search import Candidate
 from slam_core.geometry import FloatArray, boxminus, make_transform
@@ -29,13 +29,13 @@ def at_x(x: float, cost: float) -> Candidate:
     ],
 )
 def test_only_a_close_rival_elsewhere_makes_a_doubt(other: Candidate, doubted: bool) -> None:
-    reason = reason_of_doubt(at_x(0.0, -0.12), [other], CERTAIN, 2.0)
+    reason = ambiguity_reason(at_x(0.0, -0.12), [other], CERTAIN, 2.0)
     assert reason.startswith("ambiguous: a pose 1.00 m and 0.0 deg away") if doubted else reason == ""
 
 
 def test_a_rival_that_the_covariance_covers_is_none() -> None:
     corridor = np.diag([4.0, *np.full(5, 1e-6)])
-    assert reason_of_doubt(at_x(0.0, -0.12), [at_x(1.0, -0.12)], corridor, 2.0) == ""
+    assert ambiguity_reason(at_x(0.0, -0.12), [at_x(1.0, -0.12)], corridor, 2.0) == ""
 
 
 @pytest.mark.parametrize("step", [0.3, -0.3])

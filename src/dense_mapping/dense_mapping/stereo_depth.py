@@ -118,10 +118,17 @@ def _match(image: ByteArray, other: ByteArray, steps: int) -> Float32Array:
     # Columns left of the first disparity cannot be matched: widened images keep the left edge of the picture.
     padded = [cv2.copyMakeBorder(i, 0, 0, steps, 0, cv2.BORDER_REPLICATE) for i in (image, other)]
     matcher = cv2.StereoSGBM.create(
-        minDisparity=0, numDisparities=steps, blockSize=_BLOCK_SIZE, P1=8 * area, P2=64 * area, preFilterCap=31,
-        uniquenessRatio=_UNIQUENESS_PERCENT, speckleWindowSize=_SPECKLE_SIZE, speckleRange=1,
+        minDisparity=0,
+        numDisparities=steps,
+        blockSize=_BLOCK_SIZE,
+        P1=8 * area,
+        P2=64 * area,
+        preFilterCap=31,
+        uniquenessRatio=_UNIQUENESS_PERCENT,
+        speckleWindowSize=_SPECKLE_SIZE,
+        speckleRange=1,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    )  # fmt: skip
+    )
     disparity = matcher.compute(*padded)[:, steps:].astype(np.float32) / np.float32(_SUBPIXELS)
     disparity[disparity <= 0.0] = np.nan
     return disparity

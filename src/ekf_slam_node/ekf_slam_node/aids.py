@@ -9,7 +9,7 @@ import numpy as np
 
 from ekf_slam_node.config import InertialConfig, MotionConfig
 from ekf_slam_node.inertial import InertialFilter, at_place
-from ekf_slam_node.odometry import Upwards
+from ekf_slam_node.odometry import UpDirection
 from ekf_slam_node.preintegration import ImuReadings, Preintegral
 from slam_core.geometry import (
     FloatArray,
@@ -117,9 +117,9 @@ class MotionAids:
         return -1 if self._readings.newest is None else self._readings.newest.stamp_ns
 
     @property
-    def up(self) -> Upwards | None:
+    def up(self) -> UpDirection | None:
         """The direction against gravity at the newest linked frame, where an IMU knows it."""
-        return Upwards(self.inertial.up, self.inertial.tilt_covariance) if self.inertial.can_bridge else None
+        return UpDirection(self.inertial.up, self.inertial.tilt_covariance) if self.inertial.can_bridge else None
 
     def velocity(self) -> tuple[FloatArray, FloatArray]:
         """Velocities (6,) of the rig as the IMU has them, with standard deviations (6,)."""

@@ -19,9 +19,14 @@ _LEAST_DISTANCE = 1e-9
 
 
 def ccda(
-    rows: IndexArray, columns: IndexArray, costs: FloatArray, fits: npt.NDArray[np.bool_], measurements: int,
-    *, max_nodes: int = 20_000,
-) -> IndexArray:  # fmt: skip
+    rows: IndexArray,
+    columns: IndexArray,
+    costs: FloatArray,
+    fits: npt.NDArray[np.bool_],
+    measurements: int,
+    *,
+    max_nodes: int = 20_000,
+) -> IndexArray:
     """Landmark (m,) of each of the ``measurements``, or -1.
 
     Parameters

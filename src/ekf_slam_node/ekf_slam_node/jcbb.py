@@ -32,9 +32,14 @@ class JointPrediction:
 
 
 def jcbb(
-    measured: FloatArray, noise: FloatArray, predicted: JointPrediction, *, angles: tuple[int, ...] = (),
-    confidence: float = 0.99, max_nodes: int = 20_000,
-) -> IndexArray:  # fmt: skip
+    measured: FloatArray,
+    noise: FloatArray,
+    predicted: JointPrediction,
+    *,
+    angles: tuple[int, ...] = (),
+    confidence: float = 0.99,
+    max_nodes: int = 20_000,
+) -> IndexArray:
     """Landmark of each measurement, or -1.
 
     Parameters
@@ -61,9 +66,14 @@ class _Search:
     """Depth-first search; a node is the pairs so far with the Cholesky factor of their joint covariance."""
 
     def __init__(
-        self, measured: FloatArray, noise: FloatArray, predicted: JointPrediction, angles: tuple[int, ...],
-        confidence: float, max_nodes: int,
-    ) -> None:  # fmt: skip
+        self,
+        measured: FloatArray,
+        noise: FloatArray,
+        predicted: JointPrediction,
+        angles: tuple[int, ...],
+        confidence: float,
+        max_nodes: int,
+    ) -> None:
         self._count, self._dim = measured.shape
         self._noise = noise
         self._covariance = predicted.covariance

@@ -40,7 +40,7 @@ class Pending:
         return self.select(np.flatnonzero(keep))
 
 
-class LandmarkBook:
+class LandmarkTable:
     """One row per landmark, in the order of the filter's slots."""
 
     def __init__(self, descriptor_size: int) -> None:
@@ -65,11 +65,11 @@ class LandmarkBook:
         self._expected = np.concatenate([self._expected, np.zeros(len(ids), dtype=np.int64)])
         self._hits = np.concatenate([self._hits, np.zeros(len(ids), dtype=np.int64)])
 
-    def select(self, slots: IndexArray) -> LandmarkBook:
-        """A book of the landmarks ``slots`` alone, their record of hits and misses starting anew."""
-        book = LandmarkBook(self.descriptors.shape[1])
-        book.add(self.ids[slots], self.sightings[slots], self.descriptors[slots], 0)
-        return book
+    def select(self, slots: IndexArray) -> LandmarkTable:
+        """A table of the landmarks ``slots`` alone, their record of hits and misses starting anew."""
+        table = LandmarkTable(self.descriptors.shape[1])
+        table.add(self.ids[slots], self.sightings[slots], self.descriptors[slots], 0)
+        return table
 
     def count(self, seen: IndexArray, descriptors: Float32Array, expected: np.ndarray) -> None:
         """Count the sightings of slots ``seen`` with their new descriptors.

@@ -73,9 +73,14 @@ def _score(T, points, lateral, along, z, variance, fx, fy, cx, cy, gate):  # typ
 
 
 def guess_motion(
-    candidates: Candidates, frame: Frame, T_rig_optical: FloatArray, rng: np.random.Generator, hypotheses: int, gate:
-    float, initial: FloatArray | None = None,
-) -> MotionGuess | None:  # fmt: skip
+    candidates: Candidates,
+    frame: Frame,
+    T_rig_optical: FloatArray,
+    rng: np.random.Generator,
+    hypotheses: int,
+    gate: float,
+    initial: FloatArray | None = None,
+) -> MotionGuess | None:
     """Motion of paired candidates and features (same length, row by row); None where too few pairs agree.
 
     ``initial`` competes with the samples.

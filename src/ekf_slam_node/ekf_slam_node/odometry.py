@@ -25,7 +25,7 @@ _SAME_ERROR_S = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class Upwards:
+class UpDirection:
     """Unit vector (3,) upwards along the rig's axes, with its covariance (3, 3), singular along it."""
 
     direction: FloatArray
@@ -55,7 +55,7 @@ class OdometryChain:
         """T_odom_rig of a pose in the open submap."""
         return PoseEstimate(stamp_ns, self._T @ T, compose_covariance(self._T, self._covariance[:6, :6], T, covariance))
 
-    def advance(self, end: PoseEstimate, up: Upwards | None = None) -> None:
+    def advance(self, end: PoseEstimate, up: UpDirection | None = None) -> None:
         """The open submap is finished, the next one starts at this pose T_odom_rig, where gravity may be known."""
         J, _ = compose_jacobians(self._T, invert_transform(self._T) @ end.T)
         cross = J @ self._covariance[:6, 6:]
@@ -73,7 +73,7 @@ class OdometryChain:
         R = self._T[:3, :3]
         return transform_points(self._T, points), R @ covariances @ R.T
 
-    def _level(self, up: Upwards, stamp_ns: int) -> None:
+    def _level(self, up: UpDirection, stamp_ns: int) -> None:
         R = self._T[:3, :3]
         measured, noise = R @ up.direction, R @ up.covariance @ R.T
         H = np.zeros((3, 9))

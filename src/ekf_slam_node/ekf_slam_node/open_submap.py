@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map under construction: filter, landmarks' book and the last frame's other features, kept in step."""
+"""The map under construction: filter, table of landmarks and the last frame's other features, kept in step."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.covariance import IndexArray
 from ekf_slam_node.drift import Drift
 from ekf_slam_node.ekf import Ekf, UpdateReport
-from ekf_slam_node.landmarks import LandmarkBook, Pending, spread_choice
+from ekf_slam_node.landmarks import LandmarkTable, Pending, spread_choice
 from ekf_slam_node.linking import FrameLink
 from ekf_slam_node.models import Frame, observe, rig_points
 from slam_core.camera import MIN_DEPTH
@@ -43,17 +43,17 @@ class OpenSubmap:
 
     Parameters
     ----------
-    ekf, book
+    ekf, table
         The same landmarks in the same order.
     pending
         Features of the frame at which the map begins.
     """
 
     def __init__(
-        self, config: EkfSlamConfig, T_rig_optical: FloatArray, ekf: Ekf, book: LandmarkBook, pending: Pending
+        self, config: EkfSlamConfig, T_rig_optical: FloatArray, ekf: Ekf, table: LandmarkTable, pending: Pending
     ) -> None:
         self.ekf = ekf
-        self.book = book
+        self.table = table
         self.pending = pending
         self._drift = Drift()
         self._config = config
@@ -63,7 +63,7 @@ class OpenSubmap:
     @property
     def descriptor_size(self) -> int:
         """Columns of the descriptors, 0 while none is known."""
-        known = len(self.book) or len(self.pending.ids)
+        known = len(self.table) or len(self.pending.ids)
         return int(self.pending.candidates.descriptors.shape[1]) if known else 0
 
     def candidates(self) -> Candidates:
@@ -73,7 +73,7 @@ class OpenSubmap:
         return Candidates(
             np.concatenate([points, pending.points]),
             np.concatenate([covariances, pending.covariances]),
-            np.concatenate([self.book.descriptors, pending.descriptors]),
+            np.concatenate([self.table.descriptors, pending.descriptors]),
         )
 
     # ---------------------------------------------------------------------------------------------- one frame, in order
@@ -83,20 +83,20 @@ class OpenSubmap:
         The rig must still be at the previous frame: a new landmark's place comes from that frame's measurement.
         Features that belong to a landmark of the submap before (``ids``) come first.
         """
-        known = np.flatnonzero(link.rows < len(self.book))
-        fresh = np.flatnonzero(link.rows >= len(self.book))
-        fresh = fresh[self.pending.free[link.rows[fresh] - len(self.book)]]
+        known = np.flatnonzero(link.rows < len(self.table))
+        fresh = np.flatnonzero(link.rows >= len(self.table))
+        fresh = fresh[self.pending.free[link.rows[fresh] - len(self.table)]]
         pixels = frame.z[link.columns, :2]
         size = (frame.camera.width, frame.camera.height)
         known = known[spread_choice(pixels[known], pixels[:0], self._config.measurement.max_observations, size)]
-        which = link.rows[fresh] - len(self.book)
+        which = link.rows[fresh] - len(self.table)
         inherited = self.pending.ids[which] >= 0
         first = fresh[inherited]
         others = fresh[~inherited]
         room = max(wanted - len(known) - len(first), 0)
         others = others[spread_choice(pixels[others], pixels[np.concatenate([known, first])], room, size)]
         chosen = np.concatenate([first, others])
-        slots = self._add(link.rows[chosen] - len(self.book), new_ids)
+        slots = self._add(link.rows[chosen] - len(self.table), new_ids)
         return Sight(
             np.concatenate([link.rows[known], slots]), np.concatenate([link.columns[known], link.columns[chosen]])
         )
@@ -106,7 +106,7 @@ class OpenSubmap:
         candidates = pending.candidates.select(which)
         slots = self.ekf.augment(candidates.points, candidates.covariances)
         ids = np.where(pending.ids[which] >= 0, pending.ids[which], new_ids[: len(which)])
-        self.book.add(ids, pending.sightings[which], candidates.descriptors, self._frames)
+        self.table.add(ids, pending.sightings[which], candidates.descriptors, self._frames)
         return slots
 
     def measure(self, frame: Frame, sight: Sight, common: FloatArray) -> tuple[UpdateReport, Sight]:
@@ -123,7 +123,7 @@ class OpenSubmap:
         good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > MIN_DEPTH))
         report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good], common)
         after = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
-        self.book.noise.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
+        self.table.noise.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
         return report, sight.select(good)
 
     def drift_by(self, common: FloatArray) -> None:
@@ -136,7 +136,7 @@ class OpenSubmap:
 
     def _noise_factors(self, sight: Sight) -> FloatArray:
         """Factors (k, 3) on the variances of u, v and inverse depth: a landmark's own share of the pixel noise."""
-        own = self.book.noise.factors(sight.slots)
+        own = self.table.noise.factors(sight.slots)
         return np.column_stack([own, own, np.ones(len(own))])
 
     def remember(self, frame: Frame, sight: Sight, link: FrameLink, landmarks_before: int) -> None:
@@ -151,11 +151,11 @@ class OpenSubmap:
     def tidy(self, frame: Frame, sight: Sight) -> None:
         """Count who was seen and who should have been, and remove landmarks that cannot be relied on."""
         view = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks, frame.camera)
-        self.book.count(sight.slots, frame.descriptors[sight.columns], view.in_image(frame.camera, margin_px=10.0))
+        self.table.count(sight.slots, frame.descriptors[sight.columns], view.in_image(frame.camera, margin_px=10.0))
         self._frames += 1
-        for slot in self.book.unreliable(self._frames, self._config.landmark):
+        for slot in self.table.unreliable(self._frames, self._config.landmark):
             self.ekf.remove(slot)
-            self.book.remove(slot)
+            self.table.remove(slot)
 
 
 def pending_of(frame: Frame, T_rig_optical: FloatArray) -> Pending:
@@ -170,7 +170,7 @@ def pending_of(frame: Frame, T_rig_optical: FloatArray) -> Pending:
     )
 
 
-def inheriting(frame: Frame, T_rig_optical: FloatArray, sight: Sight, used: Sight, book: LandmarkBook) -> Pending:
+def inheriting(frame: Frame, T_rig_optical: FloatArray, sight: Sight, used: Sight, table: LandmarkTable) -> Pending:
     """All features of a frame, those in ``sight`` with their landmarks' names: what an independent submap starts from.
 
     Names and descriptors are inherited, no places: these come from this frame's measurements except the ``used`` ones,
@@ -178,9 +178,9 @@ def inheriting(frame: Frame, T_rig_optical: FloatArray, sight: Sight, used: Sigh
     """
     pending = pending_of(frame, T_rig_optical)
     descriptors = pending.candidates.descriptors.copy()
-    descriptors[sight.columns] = book.descriptors[sight.slots]
-    pending.ids[sight.columns] = book.ids[sight.slots]
-    pending.sightings[sight.columns] = book.sightings[sight.slots] + 1
+    descriptors[sight.columns] = table.descriptors[sight.slots]
+    pending.ids[sight.columns] = table.ids[sight.slots]
+    pending.sightings[sight.columns] = table.sightings[sight.slots] + 1
     pending.free[used.columns] = False
     candidates = replace(pending.candidates, descriptors=descriptors)
     return replace(pending, candidates=candidates)

@@ -117,9 +117,15 @@ def _integrated(
     v = np.cumsum(force * step, axis=0)
     p = np.cumsum((v - force * step) * step + 0.5 * force * step**2, axis=0)
     return Preintegral(
-        float(dt.sum()), R, v[-1], p[-1], _bias_jacobian(middle, force, dt),
-        _noise_covariance(v, p, dt, until, silent, noise), v[-1] / dt.sum(), size,
-    )  # fmt: skip
+        float(dt.sum()),
+        R,
+        v[-1],
+        p[-1],
+        _bias_jacobian(middle, force, dt),
+        _noise_covariance(v, p, dt, until, silent, noise),
+        v[-1] / dt.sum(),
+        size,
+    )
 
 
 def _bias_jacobian(middle: FloatArray, force: FloatArray, dt: FloatArray) -> FloatArray:

@@ -192,7 +192,7 @@ class EkfSlam:
         surprising = is_surprising(link, expected, self.config.association.gate)
         common = self._common.sigma(frame)
         aid = None if aid is None else widened(aid, common)
-        return LinkedFrame(frame, measured, dt, link, aid, common, surprising, len(local.book))
+        return LinkedFrame(frame, measured, dt, link, aid, common, surprising, len(local.table))
 
     def _augment(self, linked: LinkedFrame) -> Sight:
         """Add the landmarks that the frame confirms, at the previous pose; returns all landmarks that it sees."""
@@ -241,7 +241,7 @@ class EkfSlam:
             self.counters.add("updates_failed")
         local.drift_by(linked.common)
         self._arrive(linked.frame)
-        ids, index = local.book.ids[measured.slots], linked.frame.index[measured.columns]
+        ids, index = local.table.ids[measured.slots], linked.frame.index[measured.columns]
         self._shutter.learn(linked.measured, ids, measured.columns, linked.link.T, linked.dt)
         return UpdatedFrame(report, measured, closes, ids, index)
 

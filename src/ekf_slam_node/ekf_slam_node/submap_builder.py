@@ -8,7 +8,7 @@ import numpy as np
 from ekf_slam_node.config import SubmapConfig
 from ekf_slam_node.covariance import IndexArray
 from ekf_slam_node.ekf import Ekf
-from ekf_slam_node.landmarks import LandmarkBook
+from ekf_slam_node.landmarks import LandmarkTable
 from ekf_slam_node.models import CORE_DIM
 from slam_core.geometry import FloatArray, boxminus, boxplus
 from slam_core.linear_algebra import blas
@@ -87,15 +87,15 @@ class SubmapBuilder:
         sound = (p for p in reversed(self._path) if np.isfinite(p.T).all() and np.isfinite(p.covariance).all())
         return next(sound)
 
-    def close(self, ekf: Ekf, book: LandmarkBook) -> Submap:
+    def close(self, ekf: Ekf, table: LandmarkTable) -> Submap:
         """The submap as it is now: its end pose is the last pose added."""
         keep = np.concatenate([np.arange(6), np.arange(CORE_DIM, ekf.covariance.size)])
         covariance = _positive_definite(ekf.covariance.dense()[np.ix_(keep, keep)])
         end = self._path[-1]
         return Submap(
             agent=self._agent, index=self.index, start_stamp_ns=self._start_stamp_ns, end_stamp_ns=end.stamp_ns,
-            end_pose=end.T, landmarks=ekf.landmarks.copy(), covariance=covariance, landmark_ids=book.ids.copy(),
-            sightings=book.sightings.copy(), descriptors=book.descriptors.copy(), path=tuple(self._path),
+            end_pose=end.T, landmarks=ekf.landmarks.copy(), covariance=covariance, landmark_ids=table.ids.copy(),
+            sightings=table.sightings.copy(), descriptors=table.descriptors.copy(), path=tuple(self._path),
             follows_previous=self._follows_previous, session=self._session,
         )  # fmt: skip
 

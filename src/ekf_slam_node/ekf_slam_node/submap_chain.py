@@ -10,9 +10,9 @@ import numpy as np
 from ekf_slam_node.aids import Aid
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import Ekf
-from ekf_slam_node.landmarks import LandmarkBook, Pending
+from ekf_slam_node.landmarks import LandmarkTable, Pending
 from ekf_slam_node.models import CORE_DIM, Frame, relative_motion, seconds_between
-from ekf_slam_node.odometry import OdometryChain, Upwards
+from ekf_slam_node.odometry import OdometryChain, UpDirection
 from ekf_slam_node.open_submap import OpenSubmap, Sight, inheriting, pending_of
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.steps import UpdatedFrame
@@ -69,7 +69,7 @@ class SubmapChain:
         return self._local
 
     # ------------------------------------------------------------------------------------------------------- opening
-    def start(self, frame: Frame, pose: PoseEstimate | None = None, up: Upwards | None = None) -> OpenSubmap:
+    def start(self, frame: Frame, pose: PoseEstimate | None = None, up: UpDirection | None = None) -> OpenSubmap:
         """Open a submap at a frame of which nothing is known before: position zero, velocity unknown.
 
         ``pose``: T_odom_rig at the frame, or None to start where the chain has ended. ``up``: gravity there, if known.
@@ -82,25 +82,25 @@ class SubmapChain:
         local = self._empty_map(frame, np.zeros(6), self._config.motion.initial_variance, pending)
         return self._open(local, frame, follows=False)
 
-    def follow(self, frame: Frame, seen: Sight, measured: Sight, up: Upwards | None = None) -> OpenSubmap:
+    def follow(self, frame: Frame, seen: Sight, measured: Sight, up: UpDirection | None = None) -> OpenSubmap:
         """Open the submap that follows the one just closed, at the rig's pose in this frame, and gravity if known."""
         local = self.local
         self._odometry.advance(self.pose(frame.stamp_ns), up)
         if self._config.submap.start == "independent":
-            pending = inheriting(frame, self._T_rig_optical, seen, measured, local.book)
+            pending = inheriting(frame, self._T_rig_optical, seen, measured, local.table)
             # The velocity is a starting point with a variance so wide that it carries no information over.
             wide = np.repeat([_RESTART_SIGMA_VELOCITY, _RESTART_SIGMA_TURN_RATE], 3) ** 2
             return self._open(self._empty_map(frame, local.ekf.velocity, wide, pending), frame, follows=True)
         ekf = conditional_start(local.ekf, measured.slots, self._config.error == "invariant")
         pending = pending_of(frame, self._T_rig_optical).without(measured.columns)
-        book = local.book.select(measured.slots)
-        return self._open(OpenSubmap(self._config, self._T_rig_optical, ekf, book, pending), frame, follows=True)
+        table = local.table.select(measured.slots)
+        return self._open(OpenSubmap(self._config, self._T_rig_optical, ekf, table, pending), frame, follows=True)
 
     def _empty_map(self, frame: Frame, velocity: FloatArray, variance: FloatArray, pending: Pending) -> OpenSubmap:
         covariance = np.zeros((CORE_DIM, CORE_DIM))
         covariance[6:, 6:] = np.diag(variance)
         ekf = Ekf(velocity, covariance, self._config.error == "invariant")
-        return OpenSubmap(self._config, self._T_rig_optical, ekf, LandmarkBook(frame.descriptors.shape[1]), pending)
+        return OpenSubmap(self._config, self._T_rig_optical, ekf, LandmarkTable(frame.descriptors.shape[1]), pending)
 
     def _open(self, local: OpenSubmap, frame: Frame, follows: bool) -> OpenSubmap:
         self._local = local
@@ -139,7 +139,7 @@ class SubmapChain:
         if self._local is None or self._builder.is_empty:
             return ()
         self._next_index += 1
-        return (self._builder.close(self._local.ekf, self._local.book),)
+        return (self._builder.close(self._local.ekf, self._local.table),)
 
     def finish(self) -> tuple[Submap, ...]:
         """Close the open submap; the next one does not follow it."""
@@ -168,9 +168,14 @@ class SubmapChain:
         return self._odometry.pose(stamp_ns, last.T, last.covariance)
 
     def result(
-        self, stamp_ns: int, state: TrackingState, reason: str, submaps: tuple[Submap, ...] = (),
-        updated: UpdatedFrame | None = None, pose: PoseEstimate | None = None,
-    ) -> EkfResult:  # fmt: skip
+        self,
+        stamp_ns: int,
+        state: TrackingState,
+        reason: str,
+        submaps: tuple[Submap, ...] = (),
+        updated: UpdatedFrame | None = None,
+        pose: PoseEstimate | None = None,
+    ) -> EkfResult:
         """The estimate at a stamp, with the submaps that the frame finished and its measurement update, if any.
 
         ``pose``: T_odom_rig where it is known otherwise than by :meth:`pose`.
@@ -189,7 +194,7 @@ class SubmapChain:
         )
 
     def _landmark_view(self) -> LandmarkView:
-        ekf, book = self.local.ekf, self.local.book
+        ekf, table = self.local.ekf, self.local.table
         blocks = ekf.covariance.blocks(CORE_DIM + 3 * np.arange(len(ekf.landmarks)))
         positions, covariances = self._odometry.points(ekf.landmarks, blocks)
-        return LandmarkView(book.ids.copy(), positions, covariances, book.sightings.copy(), book.descriptors.copy())
+        return LandmarkView(table.ids.copy(), positions, covariances, table.sightings.copy(), table.descriptors.copy())

@@ -19,7 +19,7 @@ _GATE = chi_square_bound(0.999, 6)
 """Squared Mahalanobis distance within which a pose is no rival: the covariance covers it."""
 
 
-def reason_of_doubt(
+def ambiguity_reason(
     best: Candidate,
     others: list[Candidate],
     covariance: FloatArray,

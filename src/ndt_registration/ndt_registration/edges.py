@@ -98,9 +98,15 @@ def _rims(points: FloatArray, size: int, reach: float, step: float) -> FloatArra
 
 @in_place()
 def _find_rims(
-    size: int, reach: float, step: float, d: FloatArray, r: FloatArray, bins: Int32Array, first: Int32Array,
+    size: int,
+    reach: float,
+    step: float,
+    d: FloatArray,
+    r: FloatArray,
+    bins: Int32Array,
+    first: Int32Array,
     out: FloatArray,
-) -> int:  # fmt: skip
+) -> int:
     """Write the rims to ``out``; returns their number."""
     used = 0
     for i in range(len(r)):

@@ -79,9 +79,16 @@ class IcpTarget:
 
 
 def icp_align(
-    source: FloatArray, target: IcpTarget, T: FloatArray, scale: float, config: IcpConfig, *, coarse_points: int,
-    plane: bool, planar: bool,
-) -> IcpOutcome:  # fmt: skip
+    source: FloatArray,
+    target: IcpTarget,
+    T: FloatArray,
+    scale: float,
+    config: IcpConfig,
+    *,
+    coarse_points: int,
+    plane: bool,
+    planar: bool,
+) -> IcpOutcome:
     """Move ``source`` (n, 3), in random order, onto ``target`` from the pose ``T``.
 
     All its points are used with the last rejection limit, ``coarse_points`` of them before. ``planar`` allows x, y and

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from ndt_registration.visibility import Prices, RangeImage, direction_bin
+from ndt_registration.visibility import RangeImage, VisibilityCosts, direction_bin
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 
@@ -54,7 +54,7 @@ def pose_cost(
     t: FloatArray,
     image: RangeImage,
     tolerance: float,
-    prices: Prices,
+    point_costs: VisibilityCosts,
     field: NearField,
     gain: float,
 ) -> float:
@@ -66,13 +66,13 @@ def pose_cost(
         k = direction_bin(x, y, z, image.size)
         far = image.far[k]
         if far == 0.0:
-            cost += prices.unseen
+            cost += point_costs.unseen
         else:
             r = np.sqrt(x * x + y * y + z * z)
             if r > far + tolerance:
-                cost += prices.hidden * min((r - far) / tolerance - 1.0, 1.0)
+                cost += point_costs.hidden * min((r - far) / tolerance - 1.0, 1.0)
             elif r < image.near[k] - tolerance:
-                cost += prices.free * min((image.near[k] - r) / tolerance - 1.0, 1.0)
+                cost += point_costs.free * min((image.near[k] - r) / tolerance - 1.0, 1.0)
         a = int(np.floor((x + field.reach) / field.edge)) + 1
         b = int(np.floor((y + field.reach) / field.edge)) + 1
         c = int(np.floor((z + field.reach) / field.edge)) + 1
@@ -88,7 +88,7 @@ def lattice_costs(
     translations: FloatArray,
     image: RangeImage,
     tolerance: float,
-    prices: Prices,
+    point_costs: VisibilityCosts,
     field: NearField,
     gain: float,
 ) -> FloatArray:
@@ -97,5 +97,5 @@ def lattice_costs(
     for a in range(rotations.shape[0]):
         turned = points @ rotations[a].T
         for b in range(translations.shape[0]):
-            costs[a, b] = pose_cost(turned, translations[b], image, tolerance, prices, field, gain)
+            costs[a, b] = pose_cost(turned, translations[b], image, tolerance, point_costs, field, gain)
     return costs

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from ndt_registration.ambiguity import reason_of_doubt
+from ndt_registration.ambiguity import ambiguity_reason
 from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare, viewpoint
 from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
 from ndt_registration.matching import block_gradients, fit_to_grid
@@ -226,17 +226,17 @@ def _register(
     conflict = judge(views, optimum).conflict
     result = _result(source, target, optimum, iterations, conflict, config)
     if candidates and result.converged:
-        return _doubted(result, candidates[0], candidates[1:], target)
+        return _without_ambiguity(result, candidates[0], candidates[1:], target)
     return result
 
 
-def _doubted(
+def _without_ambiguity(
     result: RegistrationResult, best: Candidate, others: list[Candidate], target: Target
 ) -> RegistrationResult:
     """The result of a search, as a failure where it is not the only answer."""
     scale = max(target.cloud.scale, 1e-6)
     centred = _shifted_covariance(result.covariance, -best.T[:3, :3] @ target.centre)
-    reason = reason_of_doubt(best, others, centred, scale)
+    reason = ambiguity_reason(best, others, centred, scale)
     if not reason and result.degenerate:
         return replace(result, converged=False, reason=f"without a guess {result.reason}")
     if not reason:
@@ -258,9 +258,15 @@ def _aligned(
         return _descend(source, target, T, start, scale, config)
     plane = config.method == "icp_plane"
     outcome = icp_align(
-        source.points, target.icp(), T, scale, config.icp, coarse_points=_COARSE_POINTS, plane=plane,
+        source.points,
+        target.icp(),
+        T,
+        scale,
+        config.icp,
+        coarse_points=_COARSE_POINTS,
+        plane=plane,
         planar=source.planar,
-    )  # fmt: skip
+    )
     R, t = np.ascontiguousarray(outcome.T[:3, :3]), outcome.T[:3, 3].copy()
     layers = target.pyramid.layers(source, 0, len(source), config.rim_share)
     there = ndt_align(layers, R, t, planar_constraint(source.planar), scale, 0, 0.0)

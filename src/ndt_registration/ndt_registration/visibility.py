@@ -28,7 +28,7 @@ class RangeImage(NamedTuple):
     far: FloatArray
 
 
-class Prices(NamedTuple):
+class VisibilityCosts(NamedTuple):
     """Cost of a point that lies outside the view, behind the surface, and in front of it, in free space."""
 
     unseen: float
@@ -70,7 +70,9 @@ def range_image(points: FloatArray, size: int) -> RangeImage:
 
 
 @in_place()
-def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolerance: float, prices: Prices) -> float:
+def visibility_cost(
+    points: FloatArray, t: FloatArray, image: RangeImage, tolerance: float, costs: VisibilityCosts
+) -> float:
     """Mean cost of points (n, 3), moved by ``t`` (3,).
 
     Deviations grow from 0 to the full price between 1 and 2 tolerances.
@@ -85,13 +87,13 @@ def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolera
         k = direction_bin(x, y, z, image.size)
         far = image.far[k]
         if far == 0.0:
-            cost += prices.unseen
+            cost += costs.unseen
             continue
         r = np.sqrt(x * x + y * y + z * z)
         if r > far + tolerance:
-            cost += prices.hidden * min((r - far) / tolerance - 1.0, 1.0)
+            cost += costs.hidden * min((r - far) / tolerance - 1.0, 1.0)
         elif r < image.near[k] - tolerance:
-            cost += prices.free * min((image.near[k] - r) / tolerance - 1.0, 1.0)
+            cost += costs.free * min((image.near[k] - r) / tolerance - 1.0, 1.0)
         else:
             matches += 1
     share = matches / points.shape[0]

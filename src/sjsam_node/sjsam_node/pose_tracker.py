@@ -55,8 +55,8 @@ class PoseTracker:
 
         None while the agent's place is not known or the stamp is odd; several where it was taken for odd.
         """
-        ruling = self._stamps.add("odom", pose.stamp_ns, pose)
-        found = [self._move_to(released) for _, released in ruling.released]
+        decision = self._stamps.add("odom", pose.stamp_ns, pose)
+        found = [self._move_to(released) for _, released in decision.released]
         return [in_map for in_map in found if in_map is not None]
 
     @property

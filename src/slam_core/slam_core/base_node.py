@@ -235,15 +235,15 @@ class SlamNode(TransformNode, Generic[C]):
             entry.handler(stamp, message)
             return
         starts = entry.policy is StampPolicy.FRAMES
-        ruling = self._stamps.add(entry.topic, stamp, message, starts_sessions=starts)
-        if ruling.rejected:
-            self._reject(f"{entry.topic}: message rejected: {ruling.reason}", len(ruling.rejected))
-        if ruling.new_session:
+        decision = self._stamps.add(entry.topic, stamp, message, starts_sessions=starts)
+        if decision.rejected:
+            self._reject(f"{entry.topic}: message rejected: {decision.reason}", len(decision.rejected))
+        if decision.new_session:
             self._flush()
-            why = f"{ruling.reason} on {entry.topic}"
+            why = f"{decision.reason} on {entry.topic}"
             self._jobs.add(QueuedCall("session", lambda: self.start_session(why)))
-        self._held_back = len(ruling.released) > 1
-        for released_ns, released in ruling.released:
+        self._held_back = len(decision.released) > 1
+        for released_ns, released in decision.released:
             if starts:
                 entry.gaps.add(released_ns)
             entry.handler(released_ns, released)

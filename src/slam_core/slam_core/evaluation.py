@@ -68,9 +68,14 @@ class ErrorStatistics:
         if len(errors) == 0:
             raise ValueError("no errors to summarise: estimate and ground truth share no stamps")
         return cls(
-            float(np.sqrt(np.mean(np.square(errors)))), float(np.mean(errors)), float(np.median(errors)),
-            float(np.std(errors)), float(np.min(errors)), float(np.max(errors)), len(errors),
-        )  # fmt: skip
+            float(np.sqrt(np.mean(np.square(errors)))),
+            float(np.mean(errors)),
+            float(np.median(errors)),
+            float(np.std(errors)),
+            float(np.min(errors)),
+            float(np.max(errors)),
+            len(errors),
+        )
 
 
 def associate(

@@ -45,7 +45,7 @@ class StampPolicy(Enum):
 
 
 @dataclass(frozen=True)
-class Ruling(Generic[T]):
+class StampDecision(Generic[T]):
     """Decision about messages: those ``released`` as (stamp_ns, item) in order, stamps ``rejected`` and why.
 
     new_session: what was released is the first of a new session.
@@ -109,7 +109,7 @@ class StampGuard(Generic[T]):
         self.session = 0
         self._streams: dict[str, _Stream[T]] = {}
 
-    def add(self, name: str, stamp_ns: int, item: T, *, starts_sessions: bool = True) -> Ruling[T]:
+    def add(self, name: str, stamp_ns: int, item: T, *, starts_sessions: bool = True) -> StampDecision[T]:
         """Judge one message of stream ``name``."""
         stream = self._streams.setdefault(name, _Stream())
         if stream.last_ns is None and self._is_near(stamp_ns):
@@ -117,7 +117,7 @@ class StampGuard(Generic[T]):
         if stream.goes_on(stamp_ns):
             return self._release(stream, [(stamp_ns, item)], outliers=stream.held)
         if stream.is_late(stamp_ns):
-            return Ruling(
+            return StampDecision(
                 rejected=(stamp_ns,), reason=f"{_seconds(stream.last_ns, stamp_ns)} older than the one before"
             )
         return self._hold(stream, stamp_ns, item, starts_sessions)
@@ -133,7 +133,7 @@ class StampGuard(Generic[T]):
         ahead = NEAR_NS if self.session == 0 else LATE_NS
         return not known or any(-NEAR_NS <= stamp_ns - last <= ahead for last in known)
 
-    def _join(self, stream: _Stream[T], stamp_ns: int, item: T) -> Ruling[T]:
+    def _join(self, stream: _Stream[T], stamp_ns: int, item: T) -> StampDecision[T]:
         """A stream's first message in a session, with those of it that were held as a jump."""
         first = 0
         for i, (held_ns, _) in enumerate(stream.held):
@@ -141,15 +141,17 @@ class StampGuard(Generic[T]):
                 first = i + 1
         return self._release(stream, [*stream.held[first:], (stamp_ns, item)], outliers=stream.held[:first])
 
-    def _release(self, stream: _Stream[T], items: list[tuple[int, T]], outliers: list[tuple[int, T]]) -> Ruling[T]:
+    def _release(
+        self, stream: _Stream[T], items: list[tuple[int, T]], outliers: list[tuple[int, T]]
+    ) -> StampDecision[T]:
         rejected = tuple(stamp for stamp, _ in outliers)
         reason = _off(stream.last_ns, rejected[0]) if rejected else ""
         stream.accept(items)
         for other in self._streams.values():
             other.contradicted |= other is not stream and bool(other.held)
-        return Ruling(tuple(items), rejected, reason)
+        return StampDecision(tuple(items), rejected, reason)
 
-    def _hold(self, stream: _Stream[T], stamp_ns: int, item: T, starts_sessions: bool) -> Ruling[T]:
+    def _hold(self, stream: _Stream[T], stamp_ns: int, item: T, starts_sessions: bool) -> StampDecision[T]:
         refuted: list[tuple[int, T]] = []
         if not stream.agrees_with_held(stamp_ns):
             refuted, stream.held, stream.contradicted = stream.held, [], False
@@ -161,7 +163,7 @@ class StampGuard(Generic[T]):
                 return self._begin_session(stream)
             refuted.append(stream.held.pop(0))
         rejected = tuple(stamp for stamp, _ in refuted)
-        return Ruling(rejected=rejected, reason=_off(self._reference(stream), rejected[0]) if rejected else "")
+        return StampDecision(rejected=rejected, reason=_off(self._reference(stream), rejected[0]) if rejected else "")
 
     def _is_gap(self, stream: _Stream[T]) -> bool:
         """True if what is held lies ahead in the stream's own time, or in that of the session where it has none."""
@@ -171,13 +173,15 @@ class StampGuard(Generic[T]):
             0 <= stream.held[0][0] - s.last_ns <= NEAR_NS for s in self._streams.values() if s.last_ns is not None
         )
 
-    def _begin_session(self, stream: _Stream[T]) -> Ruling[T]:
+    def _begin_session(self, stream: _Stream[T]) -> StampDecision[T]:
         items, before = stream.held, self._reference(stream)
         self.session += 1
         for other in self._streams.values():
             other.last_ns = other.floor_ns = None
         stream.accept(items)
-        return Ruling(tuple(items), reason=f"time jumped back by {_seconds(before, items[0][0])}", new_session=True)
+        return StampDecision(
+            tuple(items), reason=f"time jumped back by {_seconds(before, items[0][0])}", new_session=True
+        )
 
     def _reference(self, stream: _Stream[T]) -> int | None:
         """The stamp that a stream's next one is compared with."""

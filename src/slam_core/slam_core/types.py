@@ -103,10 +103,18 @@ class Features:
     def select(self, index: AnyArray) -> Features:
         """The features at ``index`` (mask or indices)."""
         return Features(
-            self.stamp_ns, self.xyz[index], self.uv[index], self.depth[index], self.sigma_uv[index],
-            self.sigma_depth[index], self.response[index], self.source[index], self.descriptors[index],
-            self.camera, self.frame_id,
-        )  # fmt: skip
+            self.stamp_ns,
+            self.xyz[index],
+            self.uv[index],
+            self.depth[index],
+            self.sigma_uv[index],
+            self.sigma_depth[index],
+            self.response[index],
+            self.source[index],
+            self.descriptors[index],
+            self.camera,
+            self.frame_id,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ EDGE_RAYS = 4
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def meet(
+def place_on_surface(
     planes: FloatArray, shifts: FloatArray, q: int, x: float, y: float
 ) -> tuple[float, float, float]:  # pragma: no cover - compiled
     """Depth, and (u, v) within the surface, where the ray (x, y, 1) meets row ``q`` of the view."""

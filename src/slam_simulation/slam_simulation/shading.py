@@ -15,7 +15,7 @@ from numba import njit
 
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray, Float32Array
-from slam_simulation.pixel_surfaces import EDGE_RAYS, meet, surfaces_of_pixel
+from slam_simulation.pixel_surfaces import EDGE_RAYS, place_on_surface, surfaces_of_pixel
 from slam_simulation.raycaster import TILE, Hits, Rays, View, for_tile_rows
 from slam_simulation.surface_table import Look, SurfaceTable
 from slam_simulation.texture_sampling import interpolate, sample_texture, trilinear
@@ -132,7 +132,7 @@ def _radiance(
 ) -> float:  # pragma: no cover - compiled
     """Radiance of surface ``w`` (row ``q`` of the view) along the ray (x, y, 1), over the footprint of pixel (i, j)."""
     p = planes
-    z, u, v = meet(planes, shifts, q, x, y)
+    z, u, v = place_on_surface(planes, shifts, q, x, y)
     xu, yu, xv, yv = rays[i, j, 2], rays[i, j, 3], rays[i, j, 4], rays[i, j, 5]
     # u = z (e . r) - shift and z = 1 / (n . r), so du = z e . dr - z^2 (n . dr) (e . r).
     e1, e2 = p[q, 3] * x + p[q, 4] * y + p[q, 5], p[q, 6] * x + p[q, 7] * y + p[q, 8]

@@ -40,9 +40,14 @@ def sample_surfaces(world: World, spacing: float) -> tuple[FloatArray, FloatArra
 
 
 def count_sightings(
-    world: SurfaceTable, points: FloatArray, normals: FloatArray, camera: Camera, poses: FloatArray, max_depth: float,
+    world: SurfaceTable,
+    points: FloatArray,
+    normals: FloatArray,
+    camera: Camera,
+    poses: FloatArray,
+    max_depth: float,
     max_incidence_deg: float = 75.0,
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Number of the cameras at ``poses`` T_world_camera (m, 4, 4) that see each point (n, 3), near and not hidden."""
     rays = camera_rays(camera)
     seen = np.zeros(len(points))

@@ -20,7 +20,7 @@ from slam_core.camera import Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, make_transform, so3_exp
 from slam_core.types import ByteArray, Float32Array
-from slam_simulation.pixel_surfaces import EDGE_RAYS, meet, surfaces_of_pixel
+from slam_simulation.pixel_surfaces import EDGE_RAYS, place_on_surface, surfaces_of_pixel
 from slam_simulation.profiles import RealismConfig
 from slam_simulation.raycaster import TILE, Hits, Rays, View, camera_rays, for_tile_rows, make_view, trace
 from slam_simulation.shading import reflectance, surface_light
@@ -155,7 +155,7 @@ def _echo(
     The ray is (x, y, 1), the row ``q``, the place (u, v).
     """
     p = planes
-    z, u, v = meet(planes, shifts, q, x, y)
+    z, u, v = place_on_surface(planes, shifts, q, x, y)
     ray_length = np.sqrt(x * x + y * y + 1.0)
     distance = z * ray_length
     # planes[:3] is normal / (normal . p), its product with the ray is 1/z.

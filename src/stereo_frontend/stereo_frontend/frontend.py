@@ -173,9 +173,14 @@ class Frontend:
         if self.config.mode != "stereo":
             estimate = self._with_tof(images, left, estimate, depth, T_left_tof)
         return make_features(
-            images.stamp_ns, left, estimate, self._noise.sigma(left.size), images.stereo.camera,
-            "stereo_left_optical_frame", _MAX_RELATIVE_SIGMA,
-        )  # fmt: skip
+            images.stamp_ns,
+            left,
+            estimate,
+            self._noise.sigma(left.size),
+            images.stereo.camera,
+            "stereo_left_optical_frame",
+            _MAX_RELATIVE_SIGMA,
+        )
 
     def reset(self) -> None:
         """Forget thresholds, noise and counts."""

@@ -155,9 +155,14 @@ def _first_motion(first: StereoView, second: StereoView, known: RectificationErr
     disparity = np.maximum(first.disparity + known.columns(first.uv_right), _LEAST_DISPARITY)
     depth = first.stereo.depth_from_disparity(disparity)
     ok, rotation, translation, inliers = cv2.solvePnPRansac(
-        camera.unproject(first.uv, depth), second.uv, camera.K, None, reprojectionError=_RANSAC_PX,
-        iterationsCount=200, flags=cv2.SOLVEPNP_P3P,
-    )  # fmt: skip
+        camera.unproject(first.uv, depth),
+        second.uv,
+        camera.K,
+        None,
+        reprojectionError=_RANSAC_PX,
+        iterationsCount=200,
+        flags=cv2.SOLVEPNP_P3P,
+    )
     if not ok or inliers is None or len(inliers) < _LEAST_INLIERS:
         return None
     turn, shift = (np.asarray(v, np.float64).ravel() for v in (rotation, translation))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slam_bringup.bags.bag_types import BagTypes, typestore
-from slam_bringup.bags.pacing import Audience, Connections, FlowControl, ReplayClock, header_stamp_ns
+from slam_bringup.bags.pacing import Connections, FlowControl, ReplayClock, RequiredSubscribers, header_stamp_ns
 from slam_core.messages import header_message, image_message
 
 STAMP = 1_403_715_273_262_142_976
@@ -80,7 +80,7 @@ def test_rate_zero_never_delays_and_a_rate_scales_time() -> None:
 
 
 def test_an_audience_is_missing_until_every_topic_has_its_subscribers() -> None:
-    audience = Audience(("/left=2", "/tof/info=1", "/imu=0", "/not_played=1"))
+    audience = RequiredSubscribers(("/left=2", "/tof/info=1", "/imu=0", "/not_played=1"))
     matched = {"/left": 1, "/tof/info": 1, "/imu": 0}
     audience.forget_all_but(matched)
     assert audience.missing(matched.__getitem__) == ["/left"]
@@ -91,7 +91,7 @@ def test_an_audience_is_missing_until_every_topic_has_its_subscribers() -> None:
 @pytest.mark.parametrize("pair", ["/left", "/left=many", "=2", "/left=-1"])
 def test_an_audience_of_another_form_is_refused(pair: str) -> None:
     with pytest.raises(ValueError, match="topic>=<number"):
-        Audience((pair,))
+        RequiredSubscribers((pair,))
 
 
 def test_nodes_are_an_obstacle_until_they_report_all_inputs_connected() -> None:

@@ -78,9 +78,16 @@ def offered_qos(latched: bool = False, depth: int = 1000, *, best_effort: bool =
     reliability = QosReliability.BEST_EFFORT if best_effort else QosReliability.RELIABLE
     durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
     return Qos(
-        QosHistory.KEEP_LAST, depth, reliability, durability, _FOREVER, _FOREVER, QosLiveliness.AUTOMATIC,
-        _FOREVER, False,
-    )  # fmt: skip
+        QosHistory.KEEP_LAST,
+        depth,
+        reliability,
+        durability,
+        _FOREVER,
+        _FOREVER,
+        QosLiveliness.AUTOMATIC,
+        _FOREVER,
+        False,
+    )
 
 
 class BagWriter:
@@ -104,8 +111,15 @@ class BagWriter:
         If there is something at ``path`` that must not be replaced.
     """
 
-    def __init__(self, path: Path, storage: str = "mcap", *, overwrite: bool = True, compression: str = "zstd",
-                 calibration: str = "") -> None:  # fmt: skip
+    def __init__(
+        self,
+        path: Path,
+        storage: str = "mcap",
+        *,
+        overwrite: bool = True,
+        compression: str = "zstd",
+        calibration: str = "",
+    ) -> None:
         if storage not in ("mcap", "sqlite3"):
             raise ValueError(f"bag storage must be mcap or sqlite3, got '{storage}'")
         if compression not in COMPRESSIONS:

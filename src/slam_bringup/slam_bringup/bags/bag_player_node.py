@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 
 from slam_bringup.bags.bag import BagReader, RawMessage
 from slam_bringup.bags.extrinsics import StaticTransform
-from slam_bringup.bags.pacing import Audience, Connections, FlowControl, ReplayClock, header_stamp_ns
+from slam_bringup.bags.pacing import Connections, FlowControl, ReplayClock, RequiredSubscribers, header_stamp_ns
 from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.config import Config, parameter
 from slam_core.messages import (
@@ -74,7 +74,7 @@ class BagPlayerNode(Node):
             raise ValueError("parameter 'bag' must name the bag to play")
         self._types = RosTypes()
         self._flow = FlowControl(self.config.pace, self.config.window, self.config.patience)
-        self._audience = Audience(self.config.subscribers)
+        self._audience = RequiredSubscribers(self.config.subscribers)
         self._connections = Connections()
         self._transforms = [StaticTransform.parse(text) for text in self.config.transforms]
         self._names = dict(pair.split("=", 1) for pair in self.config.rename)
@@ -122,7 +122,7 @@ class BagPlayerNode(Node):
             else:
                 self._wait_for_subscribers()
             self._wait_until(lambda: self._connections.obstacles(self.config.nodes))
-            self._wait_for_audience()
+            self._wait_for_required_subscribers()
             self._static_output.wait_for_all_acked(Duration(seconds=5))
             self._play_once()
             while self.config.loop and not self._stop.is_set():
@@ -208,7 +208,7 @@ class BagPlayerNode(Node):
             if any(counts) and time.monotonic() - stable_since > _SETTLE_S:
                 break
 
-    def _wait_for_audience(self) -> None:
+    def _wait_for_required_subscribers(self) -> None:
         """Until this end knows of everybody who is to hear: discovery takes both ends their own time."""
         outputs = {self._names.get(topic, topic): publisher for topic, publisher in self._outputs.items()}
         self._audience.forget_all_but(outputs)

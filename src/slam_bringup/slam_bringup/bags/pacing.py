@@ -103,7 +103,7 @@ def _forget_up_to(stamps: deque[int], stamp_ns: int) -> None:
         stamps.popleft()
 
 
-class Audience:
+class RequiredSubscribers:
     """Numbers of subscribers that each topic must have before its first message is sent.
 
     Parameters

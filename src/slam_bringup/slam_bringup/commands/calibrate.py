@@ -65,9 +65,14 @@ FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_fr
 @click.option("-o", "--output", required=True, type=UserPath(file_okay=False), help="folder to write")
 @overwrite_option("results of other images, or results that were changed since")
 def command(
-    kind: str, images: tuple[str, ...], board_text: str | None, model: str, left_info: Path | None, output: Path,
+    kind: str,
+    images: tuple[str, ...],
+    board_text: str | None,
+    model: str,
+    left_info: Path | None,
+    output: Path,
     overwrite: bool,
-) -> None:  # fmt: skip
+) -> None:
     """Calibrate one camera (mono), a stereo pair, or a stereo camera's left eye with a ToF camera (stereo-tof).
 
     IMAGES are files, folders or quoted patterns; for two cameras one folder or pattern each, or all files of the first

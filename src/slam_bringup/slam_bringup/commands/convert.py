@@ -49,9 +49,16 @@ def convert(
 )
 @overwrite_option("a bag that slam wrote")
 def command(
-    kind: str, source: Path, output: Path, calibration: Path | None, ground_truth: Path | None, rate: float | None,
-    storage: str, compression: str, overwrite: bool,
-) -> None:  # fmt: skip
+    kind: str,
+    source: Path,
+    output: Path,
+    calibration: Path | None,
+    ground_truth: Path | None,
+    rate: float | None,
+    storage: str,
+    compression: str,
+    overwrite: bool,
+) -> None:
     """Convert a public data set to a bag, and say what of it is left out and what is assumed.
 
     KIND is euroc (folders with mav0, or key frames), kitti (odometry) or rgbd (7-Scenes, TUM RGB-D, plain folders of

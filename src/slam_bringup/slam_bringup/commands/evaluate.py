@@ -36,17 +36,30 @@ from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajector
     help="covariances of the estimate; found by itself beside a trajectory.tum",
 )
 @click.option(
-    "--truth-sigma", nargs=2, type=click.FloatRange(0.0), default=(0.0, 0.0), show_default=True, metavar="M DEG",
+    "--truth-sigma",
+    nargs=2,
+    type=click.FloatRange(0.0),
+    default=(0.0, 0.0),
+    show_default=True,
+    metavar="M DEG",
     help="standard deviations of ground truth, position [m] and orientation [deg] per axis, for the NEES",
-)  # fmt: skip
+)
 @click.option("--align-body", is_flag=True, help="take a constant difference of the two body frames off the truth")
 @click.option("-o", "--output", type=UserPath(dir_okay=False), help="write the figures as JSON")
 @overwrite_option("figures of other trajectories")
 def command(
-    estimate: Path, ground_truth: Path, alignment: str, delta: int, max_difference: float, interpolate: bool,
-    covariance: Path | None, truth_sigma: tuple[float, float], align_body: bool, output: Path | None,
+    estimate: Path,
+    ground_truth: Path,
+    alignment: str,
+    delta: int,
+    max_difference: float,
+    interpolate: bool,
+    covariance: Path | None,
+    truth_sigma: tuple[float, float],
+    align_body: bool,
+    output: Path | None,
     overwrite: bool,
-) -> None:  # fmt: skip
+) -> None:
     """ATE, RPE and NEES of the trajectory ESTIMATE against GROUND_TRUTH (TUM, KITTI or EuRoC files)."""
     trajectories = f"{estimate.resolve()} {ground_truth.resolve()}"
     file = OutputFile(output, "evaluate", trajectories, overwrite=overwrite) if output is not None else None

@@ -25,13 +25,23 @@ from slam_core.output_folder import OutputFolder
 @click.command("join")
 @click.argument("folder", metavar="DIR", type=UserPath(exists=True, file_okay=False))
 @click.option("-o", "--output", metavar="OUT", required=True, type=UserPath(file_okay=False))
-@click.option("--rows", type=click.Choice(ROWS), default=TextJoiningConfig().rows, show_default=True,
-              help="joint: each submap's full information; block: each landmark alone (Algorithm 4)")  # fmt: skip
+@click.option(
+    "--rows",
+    type=click.Choice(ROWS),
+    default=TextJoiningConfig().rows,
+    show_default=True,
+    help="joint: each submap's full information; block: each landmark alone (Algorithm 4)",
+)
 @click.option(
     "--robust", type=click.Choice(LOSSES), help="loss of what closes a loop: what the rest contradicts is left out"
 )
-@click.option("--config", "config_file", metavar="FILE", type=UserPath(exists=True, dir_okay=False),
-              help="YAML with parameters of the joining")  # fmt: skip
+@click.option(
+    "--config",
+    "config_file",
+    metavar="FILE",
+    type=UserPath(exists=True, dir_okay=False),
+    help="YAML with parameters of the joining",
+)
 @overwrite_option("results of other submaps, or results that were changed since")
 def command(
     folder: Path, output: Path, rows: str, robust: str | None, config_file: Path | None, overwrite: bool

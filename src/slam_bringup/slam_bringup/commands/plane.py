@@ -23,10 +23,20 @@ from slam_core.output_folder import OutputFolder
 @click.command("plane")
 @click.argument("log", type=UserPath(exists=True))
 @click.option("-o", "--output", metavar="OUT", required=True, type=UserPath(file_okay=False))
-@click.option("--method", type=click.Choice(METHODS), default="sam", show_default=True,
-              help="one filter, everything smoothed at once, or submaps joined")  # fmt: skip
-@click.option("--association", type=click.Choice(ASSOCIATIONS), default="known", show_default=True,
-              help="known: by the log's own names of the landmarks; else searched")  # fmt: skip
+@click.option(
+    "--method",
+    type=click.Choice(METHODS),
+    default="sam",
+    show_default=True,
+    help="one filter, everything smoothed at once, or submaps joined",
+)
+@click.option(
+    "--association",
+    type=click.Choice(ASSOCIATIONS),
+    default="known",
+    show_default=True,
+    help="known: by the log's own names of the landmarks; else searched",
+)
 @click.option("--robot", metavar="NAME", help="one robot of a log of several")
 @overwrite_option("results of another log, or results that were changed since")
 def command(log: Path, output: Path, method: str, association: str, robot: str | None, overwrite: bool) -> None:

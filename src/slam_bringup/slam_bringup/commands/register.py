@@ -50,9 +50,15 @@ UNIT_RATIO = 20.0
 @click.option("--json", "as_json", is_flag=True, help="print JSON on a terminal as well")
 @overwrite_option("results of other clouds, or results that were changed since")
 def command(
-    source: Path, target: Path, method: str, initial_guess: str | None, config_file: Path | None, output: Path | None,
-    as_json: bool, overwrite: bool,
-) -> None:  # fmt: skip
+    source: Path,
+    target: Path,
+    method: str,
+    initial_guess: str | None,
+    config_file: Path | None,
+    output: Path | None,
+    as_json: bool,
+    overwrite: bool,
+) -> None:
     """Align SOURCE to TARGET (pcd, ply, vtk; lines of numbers in csv, txt, xyz; a LaserScan's yaml).
 
     Clouds without z, or of one height only, are aligned in the plane: x, y and yaw.

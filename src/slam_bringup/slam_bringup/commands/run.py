@@ -72,9 +72,15 @@ def command(
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"mapping {bag.name}", total=2 * readings)
             result, growth = run_bag(
-                bag, system, mapper=mapper, odometry=odometry, names=names, growth=growth,
-                on_reading=lambda: progress.advance(task), stopped=lambda: interrupt.asked,
-            )  # fmt: skip
+                bag,
+                system,
+                mapper=mapper,
+                odometry=odometry,
+                names=names,
+                growth=growth,
+                on_reading=lambda: progress.advance(task),
+                stopped=lambda: interrupt.asked,
+            )
         require_map(result)
         if interrupt.asked:
             result = replace(result, events=(STOPPED, *result.events))

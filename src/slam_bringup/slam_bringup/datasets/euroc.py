@@ -131,9 +131,16 @@ def rectify(left: _Mount, right: _Mount) -> tuple[tuple[CameraInfo, CameraInfo],
     size = (left.camera.width, left.camera.height)
     distortions = [np.array(m.camera.distortion) for m in (left, right)]
     rectification = cv2.stereoRectify(
-        left.camera.K, distortions[0], right.camera.K, distortions[1], size, T_right_left[:3, :3], T_right_left[:3, 3:],
-        flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
-    )  # fmt: skip
+        left.camera.K,
+        distortions[0],
+        right.camera.K,
+        distortions[1],
+        size,
+        T_right_left[:3, :3],
+        T_right_left[:3, 3:],
+        flags=cv2.CALIB_ZERO_DISPARITY,
+        alpha=0,
+    )
     R_left, R_right, P_left, P_right = (np.asarray(m, dtype=np.float64) for m in rectification[:4])
     infos = CameraInfo(left.camera, R_left, P_left), CameraInfo(right.camera, R_right, P_right)
     return infos, make_transform(R_left, np.zeros(3))

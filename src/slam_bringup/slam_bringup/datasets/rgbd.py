@@ -167,9 +167,14 @@ def _seven_scenes(folder: Path, clock: Clock) -> _Layout:
             poses.append((stamp, _read_matrix(pose)))
     stated = _stated(folder / "camera-intrinsics.txt")
     return _Layout(
-        pairs, 1000.0, stated or _KINECT_SEVEN_SCENES, poses, _KINECT_SEVEN_SCENES_COLOUR, assumed=clock.assumed,
+        pairs,
+        1000.0,
+        stated or _KINECT_SEVEN_SCENES,
+        poses,
+        _KINECT_SEVEN_SCENES_COLOUR,
+        assumed=clock.assumed,
         usual="" if stated else _usual(_KINECT_SEVEN_SCENES, "7-Scenes"),
-    )  # fmt: skip
+    )
 
 
 def _tum(folder: Path) -> _Layout:

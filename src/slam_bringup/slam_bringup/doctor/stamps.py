@@ -96,7 +96,7 @@ def _clocks(evidence: Evidence) -> Iterator[Finding]:
 def _pairing(evidence: Evidence) -> Iterator[Finding]:
     streams = evidence.streams
     if {"left", "right"} <= streams.keys():
-        yield from _eyes(streams["left"], streams["right"])
+        yield from _stereo_pairs(streams["left"], streams["right"])
     depth = evidence.depth_role
     if "left" in streams and depth:
         apart = _apart_s(streams["left"].stamps, streams[depth].stamps)
@@ -108,7 +108,7 @@ def _pairing(evidence: Evidence) -> Iterator[Finding]:
             )
 
 
-def _eyes(left: Stream, right: Stream) -> Iterator[Finding]:
+def _stereo_pairs(left: Stream, right: Stream) -> Iterator[Finding]:
     apart = _apart_s(left.stamps, right.stamps)
     if not len(apart):
         return

@@ -115,10 +115,16 @@ def _experiment() -> Experiment:
 
     def report(results: Mapping[str, JobResult]) -> Findings:
         rows = [
-            [method, *(f"{results[f'{method}, {rate} Hz'].values[key]:.3f}" for rate in _RATES
-                       for key in ("precision", "recall"))]
+            [
+                method,
+                *(
+                    f"{results[f'{method}, {rate} Hz'].values[key]:.3f}"
+                    for rate in _RATES
+                    for key in ("precision", "recall")
+                ),
+            ]
             for method in METHODS
-        ]  # fmt: skip
+        ]
         f = {
             name: 2 * v["precision"] * v["recall"] / max(v["precision"] + v["recall"], 1e-9)
             for name, v in ((name, r.values) for name, r in results.items())

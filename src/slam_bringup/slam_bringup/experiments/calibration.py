@@ -63,9 +63,14 @@ def _experiment() -> Experiment:
             inside = float(np.mean(np.abs(normalised) < 3.0))
             spread = float(np.std(normalised))
             comparisons.append(
-                Comparison(f"{rig}: errors within 3 sigma", "all values close to the specification",
-                           f"{100 * inside:.1f} %", ">= 99 %", inside >= 0.99)
-            )  # fmt: skip
+                Comparison(
+                    f"{rig}: errors within 3 sigma",
+                    "all values close to the specification",
+                    f"{100 * inside:.1f} %",
+                    ">= 99 %",
+                    inside >= 0.99,
+                )
+            )
             rows.append([rig, str(result.arrays["normalised"].shape[1]), f"{spread:.2f}", f"{100 * inside:.1f}"])
         table = Table(
             f"{_VIEWS} views, corner noise {_CORNER_SIGMA_PX} px: errors over their claimed sigma",

@@ -23,9 +23,14 @@ MODULE = "slam_bringup.experiments.chain"
 
 
 def mapped(
-    scenario: str, mode: str = "stereo", *, mapper: str = "sjsam", odometry: str = "none", every: int = 1,
+    scenario: str,
+    mode: str = "stereo",
+    *,
+    mapper: str = "sjsam",
+    odometry: str = "none",
+    every: int = 1,
     frames: int | None = None,
-) -> Job:  # fmt: skip
+) -> Job:
     """The whole chain on a scenario."""
     arguments = {"mode": mode, "mapper": mapper, "odometry": odometry}
     return Job(f"{MODULE}:map_bag", arguments, EVERYTHING, (rendered(scenario, every, frames),))

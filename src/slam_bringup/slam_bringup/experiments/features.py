@@ -163,10 +163,16 @@ def _detectors() -> Experiment:
         times = {name: v["times"] for name, v in values.items()}
         ratio = times["surf"][1][0] / times["sift"][1][0]
         rows = [
-            [name, *(f"{ms:.1f} ms, {count}" for ms, count in v["times"]), f"{v['repeatability']:.2f}",
-             f"{v['right']:.0f}", f"{v['precision']:.3f}", f"{v['spread_px']:.2f}"]
+            [
+                name,
+                *(f"{ms:.1f} ms, {count}" for ms, count in v["times"]),
+                f"{v['repeatability']:.2f}",
+                f"{v['right']:.0f}",
+                f"{v['precision']:.3f}",
+                f"{v['spread_px']:.2f}",
+            ]
             for name, v in values.items()
-        ]  # fmt: skip
+        ]
         header = ("detector", *(f"{w} x {h}" for w, h in _SIZES), "repeatability", "right matches", "precision",
                   "spread px")  # fmt: skip
         return Findings(
@@ -211,12 +217,19 @@ def _tof_features() -> Experiment:
             axes.set_title(kind, fontsize=9)
             axes.set_axis_off()
         return Findings(
-            [Comparison(f"repeatability on {kind}", verdict[kind], f"{values[kind]['repeatability']:.2f}")
-             for kind in _KINDS],
-            [Table("Features with a depth below them, three frames later",
-                   ("picture", "features", "repeatability", "right matches", "precision"), rows)],
+            [
+                Comparison(f"repeatability on {kind}", verdict[kind], f"{values[kind]['repeatability']:.2f}")
+                for kind in _KINDS
+            ],
+            [
+                Table(
+                    "Features with a depth below them, three frames later",
+                    ("picture", "features", "repeatability", "right matches", "precision"),
+                    rows,
+                )
+            ],
             [Picture(figure, "3.4", "Features in the pictures of the laser camera.")],
-        )  # fmt: skip
+        )
 
     return Experiment("tof_features", "3.3", "Features on the laser camera's pictures", jobs, report)
 

@@ -138,8 +138,13 @@ def _sweep() -> Experiment:
         angle, rate = plots.angles(run.arrays)
         return Findings(
             comparisons=[
-                Comparison("angle swept", "about 90 deg", f"{turned[0]:.2f} of {turned[1]:.2f} deg", "within 0.5 deg",
-                           bool(error <= 0.5)),
+                Comparison(
+                    "angle swept",
+                    "about 90 deg",
+                    f"{turned[0]:.2f} of {turned[1]:.2f} deg",
+                    "within 0.5 deg",
+                    bool(error <= 0.5),
+                ),
                 bounds_comparison("sweep", run),
             ],
             tables=[Table("Accuracy", ACCURACY_HEADER, [accuracy_row("sweep", run)])],
@@ -148,7 +153,7 @@ def _sweep() -> Experiment:
                 Picture(angle, "9.13", "Angles."),
                 Picture(rate, "9.14", "Angular velocities."),
             ],
-        )  # fmt: skip
+        )
 
     return Experiment("sweep", "9.1.4", "A sweep of 90 degrees checks the angles", jobs, report)
 

@@ -91,9 +91,14 @@ def _firemen() -> Experiment:
                 )  # fmt: skip
             worst = max(agent["joined_ate_m"] for agent in agents)
             comparisons.append(
-                Comparison(f"{len(agents)} firemen in one map, largest ATE", "only imagined", f"{1e3 * worst:.1f} mm",
-                           "<= 60 mm, as of one agent", worst <= 0.06)
-            )  # fmt: skip
+                Comparison(
+                    f"{len(agents)} firemen in one map, largest ATE",
+                    "only imagined",
+                    f"{1e3 * worst:.1f} mm",
+                    "<= 60 mm, as of one agent",
+                    worst <= 0.06,
+                )
+            )
             comparisons.append(bounds_comparison(name, results[name]))
         return Findings(
             comparisons,

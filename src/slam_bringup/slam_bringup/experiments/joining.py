@@ -100,9 +100,14 @@ def _comparisons(name: str, run: JobResult, thesis: Mapping[str, str], mark_m: f
     else:
         closed = summary["loop_closures"] > 0 and agent["joined_end_m"] < 0.01 * agent["path_m"]
         comparisons.append(
-            Comparison("loop", thesis["end"], f"{summary['loop_closures']} closures, end error "
-                       f"{1e3 * agent['joined_end_m']:.1f} mm", "closed, end error < 1 % of the way", closed)
-        )  # fmt: skip
+            Comparison(
+                "loop",
+                thesis["end"],
+                f"{summary['loop_closures']} closures, end error {1e3 * agent['joined_end_m']:.1f} mm",
+                "closed, end error < 1 % of the way",
+                closed,
+            )
+        )
     comparisons.append(bounds_comparison(name, run))
     drift = np.ptp(run.arrays["0 filter poses"][:, 2, 3])
     comparisons.append(Comparison("range of height before joining", thesis["height"], f"{drift:.2f} m"))

@@ -137,20 +137,37 @@ def _report(results: Mapping[str, JobResult]) -> Findings:
     for name, arrays in known.items():
         mean = float(arrays["nees"].mean())
         comparisons.append(
-            Comparison(f"NEES of the last pose, {name}", "not measured", f"{mean:.2f}",
-                       f"{low:.2f} to {high:.2f}", low <= mean <= high)
-        )  # fmt: skip
+            Comparison(
+                f"NEES of the last pose, {name}",
+                "not measured",
+                f"{mean:.2f}",
+                f"{low:.2f} to {high:.2f}",
+                low <= mean <= high,
+            )
+        )
     below = all(np.all(r.arrays["smoother cost"] <= r.arrays["filter cost"] + 1e-9) for r in results.values())
     comparisons.append(
-        Comparison("SAM's cost below the filter's", "SAM smooths the whole path",
-                   "in every run" if below else "not in every run", "in every run", below)
-    )  # fmt: skip
+        Comparison(
+            "SAM's cost below the filter's",
+            "SAM smooths the whole path",
+            "in every run" if below else "not in every run",
+            "in every run",
+            below,
+        )
+    )
     rows = [
-        [name, f"{1e3 * a['filter rmse'].mean():.0f}", f"{1e3 * a['smoother rmse'].mean():.0f}",
-         f"{a['nees'].mean():.2f}", f"{a['filter cost'].mean():.0f}", f"{a['smoother cost'].mean():.0f}",
-         f"{100 * a['wrong'].mean():.2f}", f"{a['landmarks'].mean():.1f}"]
+        [
+            name,
+            f"{1e3 * a['filter rmse'].mean():.0f}",
+            f"{1e3 * a['smoother rmse'].mean():.0f}",
+            f"{a['nees'].mean():.2f}",
+            f"{a['filter cost'].mean():.0f}",
+            f"{a['smoother cost'].mean():.0f}",
+            f"{100 * a['wrong'].mean():.2f}",
+            f"{a['landmarks'].mean():.1f}",
+        ]
         for name, a in ((name, r.arrays) for name, r in results.items())
-    ]  # fmt: skip
+    ]
     header = ("association, bearing noise", "EKF RMSE mm", "SAM RMSE mm", "EKF NEES", "EKF cost", "SAM cost",
               "wrong pairs %", "landmarks (40)")  # fmt: skip
     arrays = results[f"unknown, {_BEARINGS[0]:g} rad"].arrays

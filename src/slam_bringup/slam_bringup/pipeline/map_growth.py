@@ -87,9 +87,14 @@ class Joining:
         """Join one submap."""
         report = self.global_map.add(submap)
         _LOG.info(
-            "submap %d of %s: %s, %d landmarks known, %d new, closures %s", submap.index, submap.agent or "the rig",
-            report.reason or "joined", report.matched, report.new_landmarks, list(report.closures),
-        )  # fmt: skip
+            "submap %d of %s: %s, %d landmarks known, %d new, closures %s",
+            submap.index,
+            submap.agent or "the rig",
+            report.reason or "joined",
+            report.matched,
+            report.new_landmarks,
+            list(report.closures),
+        )
         self.closures += len(report.closures)
         self.solver = report.solver or self.solver
 

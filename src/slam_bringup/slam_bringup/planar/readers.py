@@ -69,9 +69,14 @@ def _mrclam_robot(folder: Path, name: str, subject_of: dict[int, int], landmarks
     z, ids = measured[kept, 2:4], subject[kept]
     of_step = [np.flatnonzero(step == k) for k in range(len(stamps))]
     return RobotLog(
-        name, stamps, motions, covariances, tuple(z[rows] for rows in of_step),
-        tuple(ids[rows].astype(np.int64) for rows in of_step), _interpolated(truth, stamps),
-    )  # fmt: skip
+        name,
+        stamps,
+        motions,
+        covariances,
+        tuple(z[rows] for rows in of_step),
+        tuple(ids[rows].astype(np.int64) for rows in of_step),
+        _interpolated(truth, stamps),
+    )
 
 
 def _integrated(odometry: FloatArray, stamps: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -126,9 +131,14 @@ def read_lost_in_the_woods(path: Path) -> PlanarLog:
     seen = [np.flatnonzero(row > 0.0).astype(np.int64) for row in data["r"]]
     observations = tuple(np.column_stack([data["r"][k, ids], data["b"][k, ids]]) for k, ids in enumerate(seen))
     robot = RobotLog(
-        "robot", dt * np.arange(float(len(truth))), motions, np.broadcast_to(Q, (len(motions), 3, 3)), observations,
-        tuple(seen), truth,
-    )  # fmt: skip
+        "robot",
+        dt * np.arange(float(len(truth))),
+        motions,
+        np.broadcast_to(Q, (len(motions), 3, 3)),
+        observations,
+        tuple(seen),
+        truth,
+    )
     sigma_range, sigma_bearing = 2.0 * np.sqrt(variances[2:])
     landmarks = {k: np.asarray(point) for k, point in enumerate(data["l"])}
     return PlanarLog(path.stem, (robot,), float(sigma_range), float(sigma_bearing), landmarks)

@@ -22,12 +22,19 @@ def blank(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple
     across = (width - _LEFT - _RIGHT - (columns - 1) * _BETWEEN[0]) / columns
     along = (height - _BOTTOM - _TOP - (rows - 1) * _BETWEEN[1]) / rows
     axes = figure.subplots(
-        rows, columns, sharex=True, squeeze=False,
+        rows,
+        columns,
+        sharex=True,
+        squeeze=False,
         gridspec_kw={
-            "left": _LEFT / width, "right": 1.0 - _RIGHT / width, "bottom": _BOTTOM / height,
-            "top": 1.0 - _TOP / height, "wspace": _BETWEEN[0] / across, "hspace": _BETWEEN[1] / along,
+            "left": _LEFT / width,
+            "right": 1.0 - _RIGHT / width,
+            "bottom": _BOTTOM / height,
+            "top": 1.0 - _TOP / height,
+            "wspace": _BETWEEN[0] / across,
+            "hspace": _BETWEEN[1] / along,
         },
-    )  # fmt: skip
+    )
     return figure, axes
 
 

@@ -86,10 +86,16 @@ def _image(topic: str, topics: Collection[str]) -> dict[str, Any]:
 def _plot(title: str, agents: list[str], topics: Collection[str]) -> dict[str, Any]:
     """Standard deviations of x and y, from the diagonal of the covariance of ``pose``."""
     paths = [
-        {"value": f"{agent}/pose.pose.covariance[{index}].@sqrt", "label": f"{agent.strip('/')} {axis}".strip(),
-         "enabled": True, "timestampMethod": "receiveTime"}
-        for agent in agents if f"{agent}/pose" in topics for axis, index in (("x", 0), ("y", 7))
-    ]  # fmt: skip
+        {
+            "value": f"{agent}/pose.pose.covariance[{index}].@sqrt",
+            "label": f"{agent.strip('/')} {axis}".strip(),
+            "enabled": True,
+            "timestampMethod": "receiveTime",
+        }
+        for agent in agents
+        if f"{agent}/pose" in topics
+        for axis, index in (("x", 0), ("y", 7))
+    ]
     return {"foxglovePanelTitle": title, "paths": paths, "showLegend": True, "isSynced": True, "xAxisVal": "timestamp"}
 
 

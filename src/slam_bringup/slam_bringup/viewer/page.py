@@ -151,9 +151,16 @@ class ViewerPage:
         centre = T[:3, :3] @ [width / 2, height / 2, -0.08] + T[:3, 3]
         turned = T[:3, :3] @ np.diag([1.0, -1.0, -1.0])  # viser's image lies with its rows downwards
         self.server.scene.add_image(
-            f"/floor plan/{number}", plan_picture(plan), width, height, format="png", cast_shadow=False,
-            receive_shadow=False, wxyz=_wxyz(turned), position=centre,
-        )  # fmt: skip
+            f"/floor plan/{number}",
+            plan_picture(plan),
+            width,
+            height,
+            format="png",
+            cast_shadow=False,
+            receive_shadow=False,
+            wxyz=_wxyz(turned),
+            position=centre,
+        )
 
     def show_trajectory(self, agent: str, index: int, poses: FloatArray, layer: str = "trajectories") -> None:
         """The way of an agent, poses (n, 4, 4)."""
@@ -291,10 +298,17 @@ class ViewerPage:
         vectors = vectors * np.where(np.linalg.det(vectors) < 0, -1.0, 1.0)[:, None, None]
         ball = trimesh.creation.icosphere(subdivisions=1)
         self.server.scene.add_batched_meshes_simple(
-            name, np.asarray(ball.vertices, dtype=np.float32), np.asarray(ball.faces), _wxyz(vectors[shown]),
-            positions[shown], batched_scales=np.maximum(radii[shown], 1e-4), batched_colors=colour, opacity=0.35,
-            cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+            name,
+            np.asarray(ball.vertices, dtype=np.float32),
+            np.asarray(ball.faces),
+            _wxyz(vectors[shown]),
+            positions[shown],
+            batched_scales=np.maximum(radii[shown], 1e-4),
+            batched_colors=colour,
+            opacity=0.35,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
 
 
 def _wxyz(rotation: FloatArray) -> FloatArray:

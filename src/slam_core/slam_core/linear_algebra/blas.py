@@ -60,9 +60,17 @@ def subtract_square(C: FloatArray, A: FloatArray) -> None:
     n, k = A.shape
     alpha, beta = c_double(-1.0), c_double(1.0)
     _dsyrk(
-        byref(_LOWER), byref(_PLAIN), byref(c_int(n)), byref(c_int(k)), byref(alpha), _pointer(A), _stride(A),
-        byref(beta), _pointer(C), _stride(C),
-    )  # fmt: skip
+        byref(_LOWER),
+        byref(_PLAIN),
+        byref(c_int(n)),
+        byref(c_int(k)),
+        byref(alpha),
+        _pointer(A),
+        _stride(A),
+        byref(beta),
+        _pointer(C),
+        _stride(C),
+    )
 
 
 def add_product(C: FloatArray, A: FloatArray, B: FloatArray) -> None:

@@ -89,6 +89,14 @@ def _solve(L, B, sizes):
 def _multiply(A, C, sizes):
     k, n = sizes.ctypes.data, sizes[1:].ctypes.data
     _dsyrk(
-        _LETTERS[_UPPER:].ctypes.data, _LETTERS[_TRANSPOSED:].ctypes.data, n, k, _FACTORS[1:].ctypes.data,
-        A.ctypes.data, k, _FACTORS.ctypes.data, C.ctypes.data, n,
-    )  # fmt: skip
+        _LETTERS[_UPPER:].ctypes.data,
+        _LETTERS[_TRANSPOSED:].ctypes.data,
+        n,
+        k,
+        _FACTORS[1:].ctypes.data,
+        A.ctypes.data,
+        k,
+        _FACTORS.ctypes.data,
+        C.ctypes.data,
+        n,
+    )

@@ -32,9 +32,16 @@ def cloud_message(types: MessageTypes, header: Message, cloud: AnyArray) -> Mess
     height, width = cloud.shape if cloud.ndim == 2 else (1, len(cloud))
     step = cloud.dtype.itemsize
     return types.PointCloud2(
-        header=header, height=height, width=width, fields=_fields(types, cloud.dtype), is_bigendian=False,
-        point_step=step, row_step=width * step, data=types.octets(cloud), is_dense=bool(_is_dense(cloud)),
-    )  # fmt: skip
+        header=header,
+        height=height,
+        width=width,
+        fields=_fields(types, cloud.dtype),
+        is_bigendian=False,
+        point_step=step,
+        row_step=width * step,
+        data=types.octets(cloud),
+        is_dense=bool(_is_dense(cloud)),
+    )
 
 
 def cloud_from_message(message: Message) -> AnyArray:

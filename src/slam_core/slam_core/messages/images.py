@@ -52,9 +52,14 @@ def image_message(types: MessageTypes, header: Message, image: AnyArray, encodin
         raise ValueError(f"encoding {encoding} does not fit an array of {image.dtype} and shape {image.shape}")
     height, width = image.shape[:2]
     return types.Image(
-        header=header, height=height, width=width, encoding=encoding, is_bigendian=0,
-        step=width * channels * image.itemsize, data=types.octets(image),
-    )  # fmt: skip
+        header=header,
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=width * channels * image.itemsize,
+        data=types.octets(image),
+    )
 
 
 def image_from_message(message: Message) -> AnyArray:

@@ -33,11 +33,18 @@ def ellipsoid_markers(
     shapes = _ellipsoids(covariances)
     spheres = [
         _marker(
-            types, header, namespace, index, type=2, color=_colour(types, colour), scale=_vector(types, axes),
-            pose=pose_message(types, make_transform(rotation, position)), text=str(int(landmark_id)),
+            types,
+            header,
+            namespace,
+            index,
+            type=2,
+            color=_colour(types, colour),
+            scale=_vector(types, axes),
+            pose=pose_message(types, make_transform(rotation, position)),
+            text=str(int(landmark_id)),
         )
         for index, (landmark_id, position, rotation, axes) in enumerate(zip(ids, positions, *shapes, strict=True))
-    ]  # fmt: skip
+    ]
     return types.MarkerArray(markers=[clear, *spheres])
 
 
@@ -47,9 +54,16 @@ def path_marker(
     """A line strip through points (n, 3) m."""
     corners = [types.Point(x=float(x), y=float(y), z=float(z)) for x, y, z in points]
     return _marker(
-        types, header, namespace, 0, type=4, points=corners, color=_colour(types, colour),
-        scale=_vector(types, np.array([0.02, 0.0, 0.0])), pose=pose_message(types, np.eye(4)),
-    )  # fmt: skip
+        types,
+        header,
+        namespace,
+        0,
+        type=4,
+        points=corners,
+        color=_colour(types, colour),
+        scale=_vector(types, np.array([0.02, 0.0, 0.0])),
+        pose=pose_message(types, np.eye(4)),
+    )
 
 
 def _ellipsoids(covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
