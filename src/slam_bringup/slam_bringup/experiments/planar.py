@@ -155,6 +155,19 @@ def _report(results: Mapping[str, JobResult]) -> Findings:
             below,
         )
     )
+    arrays = results[f"unknown, {_BEARINGS[0]:g} rad"].arrays
+    return Findings(
+        comparisons,
+        [_table(runs, results)],
+        [
+            Picture(_drawn(arrays, "open"), "6.5", "SAM before the loop closes."),
+            Picture(_drawn(arrays, "smoothed"), "6.6", "SAM after the loop closed."),
+            Picture(_drawn(arrays, "filter"), "6.1", "The filter on the same drive."),
+        ],
+    )
+
+
+def _table(runs: int, results: Mapping[str, JobResult]) -> Table:
     rows = [
         [
             name,
@@ -170,16 +183,7 @@ def _report(results: Mapping[str, JobResult]) -> Findings:
     ]
     header = ("association, bearing noise", "EKF RMSE mm", "SAM RMSE mm", "EKF NEES", "EKF cost", "SAM cost",
               "wrong pairs %", "landmarks (40)")  # fmt: skip
-    arrays = results[f"unknown, {_BEARINGS[0]:g} rad"].arrays
-    return Findings(
-        comparisons,
-        [Table(f"50 samples, {runs} worlds", header, rows)],
-        [
-            Picture(_drawn(arrays, "open"), "6.5", "SAM before the loop closes."),
-            Picture(_drawn(arrays, "smoothed"), "6.6", "SAM after the loop closed."),
-            Picture(_drawn(arrays, "filter"), "6.1", "The filter on the same drive."),
-        ],
-    )
+    return Table(f"50 samples, {runs} worlds", header, rows)
 
 
 def _drawn(arrays: Mapping[str, FloatArray], kind: str) -> Figure:

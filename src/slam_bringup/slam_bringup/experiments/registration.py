@@ -114,15 +114,8 @@ def _registration() -> Experiment:
             for method, name in _METHODS.items()
         ]
         seconds = float(np.median(results["ndt 0.2"].arrays["seconds"]))
-        comparisons.append(
-            Comparison(
-                "time of one NDT registration, 20 % of the points",
-                "about 2 s",
-                f"{seconds:.3f} s",
-                "<= 0.1 s",
-                seconds <= 0.1,
-            )
-        )
+        what = "time of one NDT registration, 20 % of the points"
+        comparisons.append(Comparison(what, "about 2 s", f"{seconds:.3f} s", "<= 0.1 s", seconds <= 0.1))
         return Findings(
             comparisons, [_success_table(success), _grid_table(results), _time_table(results)], _scan_pictures(results)
         )
