@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from ndt_registration.visibility import RangeImage, VisibilityCosts, direction_bin
+from ndt_registration.visibility import Prices, RangeImage, point_cost
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 
@@ -54,7 +54,7 @@ def pose_cost(
     t: FloatArray,
     image: RangeImage,
     tolerance: float,
-    point_costs: VisibilityCosts,
+    point_costs: Prices,
     field: NearField,
     gain: float,
 ) -> float:
@@ -63,16 +63,7 @@ def pose_cost(
     cost, near = 0.0, 0
     for i in range(points.shape[0]):
         x, y, z = points[i, 0] + t[0], points[i, 1] + t[1], points[i, 2] + t[2]
-        k = direction_bin(x, y, z, image.size)
-        far = image.far[k]
-        if far == 0.0:
-            cost += point_costs.unseen
-        else:
-            r = np.sqrt(x * x + y * y + z * z)
-            if r > far + tolerance:
-                cost += point_costs.hidden * min((r - far) / tolerance - 1.0, 1.0)
-            elif r < image.near[k] - tolerance:
-                cost += point_costs.free * min((image.near[k] - r) / tolerance - 1.0, 1.0)
+        cost += point_cost(x, y, z, image, tolerance, point_costs)[0]
         a = int(np.floor((x + field.reach) / field.edge)) + 1
         b = int(np.floor((y + field.reach) / field.edge)) + 1
         c = int(np.floor((z + field.reach) / field.edge)) + 1
@@ -88,7 +79,7 @@ def lattice_costs(
     translations: FloatArray,
     image: RangeImage,
     tolerance: float,
-    point_costs: VisibilityCosts,
+    point_costs: Prices,
     field: NearField,
     gain: float,
 ) -> FloatArray:

@@ -20,7 +20,7 @@ from ndt_registration.ndt import NdtOptimum, ndt_align
 from ndt_registration.near_field import lattice_costs, near_field
 from ndt_registration.orientation import ball_lattice, best_rotations, facing_normals, rotation_lattice
 from ndt_registration.pyramid import Pyramid
-from ndt_registration.visibility import RangeImage, VisibilityCosts, visibility_cost
+from ndt_registration.visibility import Prices, RangeImage, visibility_cost
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform
 
@@ -59,7 +59,7 @@ class SearchConfig(Config):
     """Distinct refined poses that are handed on."""
 
 
-PRICES = VisibilityCosts(unseen=0.15, hidden=0.5, free=2.0)
+PRICES = Prices(unseen=0.15, hidden=0.5, free=2.0)
 """Nothing is lost where a scan ends, little where things hide each other, but space that was seen free stays free."""
 SEPARATION = 0.05
 """Poses nearer than this (rad, and translation over the scale) are the same candidate."""

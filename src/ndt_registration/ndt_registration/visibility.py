@@ -28,7 +28,7 @@ class RangeImage(NamedTuple):
     far: FloatArray
 
 
-class VisibilityCosts(NamedTuple):
+class Prices(NamedTuple):
     """Cost of a point that lies outside the view, behind the surface, and in front of it, in free space."""
 
     unseen: float
@@ -70,12 +70,23 @@ def range_image(points: FloatArray, size: int) -> RangeImage:
 
 
 @in_place()
-def visibility_cost(
-    points: FloatArray, t: FloatArray, image: RangeImage, tolerance: float, costs: VisibilityCosts
-) -> float:
-    """Mean cost of points (n, 3), moved by ``t`` (3,).
+def point_cost(x: float, y: float, z: float, image: RangeImage, tolerance: float, costs: Prices) -> tuple[float, bool]:
+    """Cost of a point, from 0 to the full one between 1 and 2 tolerances, and True if it matches a surface."""
+    k = direction_bin(x, y, z, image.size)
+    far = image.far[k]
+    if far == 0.0:
+        return costs.unseen, False
+    r = np.sqrt(x * x + y * y + z * z)
+    if r > far + tolerance:
+        return costs.hidden * min((r - far) / tolerance - 1.0, 1.0), False
+    if r < image.near[k] - tolerance:
+        return costs.free * min((image.near[k] - r) / tolerance - 1.0, 1.0), False
+    return 0.0, True
 
-    Deviations grow from 0 to the full price between 1 and 2 tolerances.
+
+@in_place()
+def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolerance: float, costs: Prices) -> float:
+    """Mean :func:`point_cost` of points (n, 3), moved by ``t`` (3,).
 
     Where hardly anything matches nothing can be said: below a share ``LEAST_MATCH`` of matches the cost rises towards
     1.
@@ -84,18 +95,9 @@ def visibility_cost(
     matches = 0
     for i in range(points.shape[0]):
         x, y, z = points[i, 0] + t[0], points[i, 1] + t[1], points[i, 2] + t[2]
-        k = direction_bin(x, y, z, image.size)
-        far = image.far[k]
-        if far == 0.0:
-            cost += costs.unseen
-            continue
-        r = np.sqrt(x * x + y * y + z * z)
-        if r > far + tolerance:
-            cost += costs.hidden * min((r - far) / tolerance - 1.0, 1.0)
-        elif r < image.near[k] - tolerance:
-            cost += costs.free * min((image.near[k] - r) / tolerance - 1.0, 1.0)
-        else:
-            matches += 1
+        added, matched = point_cost(x, y, z, image, tolerance, costs)
+        cost += added
+        matches += matched
     share = matches / points.shape[0]
     return float(cost / points.shape[0] + max(1.0 - share / LEAST_MATCH, 0.0))
 

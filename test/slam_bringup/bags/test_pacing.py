@@ -79,17 +79,17 @@ def test_rate_zero_never_delays_and_a_rate_scales_time() -> None:
         ReplayClock(-1.0)
 
 
-def test_an_audience_is_missing_until_every_topic_has_its_subscribers() -> None:
-    audience = RequiredSubscribers(("/left=2", "/tof/info=1", "/imu=0", "/not_played=1"))
+def test_subscribers_are_missing_until_every_topic_has_them() -> None:
+    required = RequiredSubscribers(("/left=2", "/tof/info=1", "/imu=0", "/not_played=1"))
     matched = {"/left": 1, "/tof/info": 1, "/imu": 0}
-    audience.forget_all_but(matched)
-    assert audience.missing(matched.__getitem__) == ["/left"]
+    required.forget_all_but(matched)
+    assert required.missing(matched.__getitem__) == ["/left"]
     matched["/left"] = 3
-    assert audience.missing(matched.__getitem__) == []
+    assert required.missing(matched.__getitem__) == []
 
 
 @pytest.mark.parametrize("pair", ["/left", "/left=many", "=2", "/left=-1"])
-def test_an_audience_of_another_form_is_refused(pair: str) -> None:
+def test_required_subscribers_of_another_form_are_refused(pair: str) -> None:
     with pytest.raises(ValueError, match="topic>=<number"):
         RequiredSubscribers((pair,))
 

@@ -74,7 +74,7 @@ class BagPlayerNode(Node):
             raise ValueError("parameter 'bag' must name the bag to play")
         self._types = RosTypes()
         self._flow = FlowControl(self.config.pace, self.config.window, self.config.patience)
-        self._audience = RequiredSubscribers(self.config.subscribers)
+        self._required_subscribers = RequiredSubscribers(self.config.subscribers)
         self._connections = Connections()
         self._transforms = [StaticTransform.parse(text) for text in self.config.transforms]
         self._names = dict(pair.split("=", 1) for pair in self.config.rename)
@@ -211,8 +211,8 @@ class BagPlayerNode(Node):
     def _wait_for_required_subscribers(self) -> None:
         """Until this end knows of everybody who is to hear: discovery takes both ends their own time."""
         outputs = {self._names.get(topic, topic): publisher for topic, publisher in self._outputs.items()}
-        self._audience.forget_all_but(outputs)
-        missing = self._audience.missing
+        self._required_subscribers.forget_all_but(outputs)
+        missing = self._required_subscribers.missing
         self._wait_until(
             lambda: [
                 f"{topic} has not all its subscribers"
