@@ -52,14 +52,8 @@ from slam_core.transform_node import TransformNode
 
 C = TypeVar("C", bound=Config)
 
-
-_POLICIES = {
-    "CameraInfo": StampPolicy.ANY,
-    "PointStamped": StampPolicy.ANY,
-    "Imu": StampPolicy.FOLLOWS,
-    "PoseWithCovarianceStamped": StampPolicy.FOLLOWS,
-    "Odometry": StampPolicy.FOLLOWS,
-}
+_POLICIES = dict.fromkeys(("CameraInfo", "PointStamped"), StampPolicy.ANY)
+_POLICIES |= dict.fromkeys(("Imu", "PoseWithCovarianceStamped", "Odometry"), StampPolicy.FOLLOWS)
 """Types whose messages accompany frames: having processed one says nothing of the frame of its stamp."""
 
 PROGRESS_TOPIC = "/progress"
