@@ -27,8 +27,8 @@ from stereo_frontend.patch_alignment import align_patches
 
 _INNER_RADIUS = 5
 """Half width of the smaller patch that must agree, px."""
-MAX_SHIFT = 3.0
-"""Most correction of the disparity that is handed in, px."""
+_MAX_SHIFT = 3.0
+"""Most correction of the keypoints' disparity, px."""
 _MIN_CORRELATION = 0.8
 """Least normalised cross-correlation of the aligned patches."""
 _MAX_DISAGREEMENT = 2.0
@@ -125,7 +125,7 @@ def _align(
     slope = 1.0 / _SLOPE_SIGMA**2
     information = np.array([0.0, 1.0 / config.row_sigma**2, slope, slope])
     out = np.full((len(uv), 5), np.nan, np.float32)
-    align_patches(template, image, uv, u_start, row_offset, radius, MAX_SHIFT, information, out)
+    align_patches(template, image, uv, u_start, row_offset, radius, _MAX_SHIFT, information, out)
     out[~(out[:, 2] >= _MIN_CORRELATION)] = np.nan
     disparity, variance, correlation, row_shift, row_variance = out.T
     sigma = np.sqrt(_SIGMA_SCALE**2 * variance + config.sigma_floor**2).astype(np.float32)

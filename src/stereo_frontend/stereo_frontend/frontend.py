@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The front end: a stereo pair, a depth image or both become features with depth and honest standard deviations.
 
-``stereo``: features of the left image, their partners searched along the rows of the right one, disparity refined,
-``d = f b / (u_left - u_right)`` (Eqs. 4.3-4.4). Now and then features of the right image are matched to them, which
-tells how exact keypoints are, and how the rows of the pair lie.
+``stereo``: features of both images, matched, disparity refined, ``d = f b / (u_left - u_right)`` (Eqs. 4.3-4.4).
 ``tof``: features and depth of the ToF camera alone. ``replace``: stereo features, depth from the ToF camera where it
 sees them (11.2). ``fuse``: both depths weighted by their variances (11.4).
 """
@@ -17,16 +15,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slam_core.camera import Camera
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import Counters, DepthImage, Features, FeatureSource, Float32Array, StereoImages
 from stereo_frontend.assembly import DepthEstimate, make_features
 from stereo_frontend.depth_fusion import FusionConfig, MappedDepth, fuse_depth, map_depth
-from stereo_frontend.disparity import MAX_SHIFT, DisparityConfig, RefinedDisparity, refine_disparity
+from stereo_frontend.disparity import DisparityConfig, RefinedDisparity, refine_disparity
 from stereo_frontend.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.matching import (
+    Matches,
     MatchingConfig,
     disparity_bounds,
     has_candidate,
@@ -36,15 +34,12 @@ from stereo_frontend.matching import (
 )
 from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
 from stereo_frontend.rectification_error import RectificationError
-from stereo_frontend.row_search import search_rows
 from stereo_frontend.self_calibration import SelfCalibrationConfig, StereoSelfCalibration
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
 from stereo_frontend.two_view_consistency import StereoView
 
 _MAX_RELATIVE_SIGMA = 0.35
 """Features whose depth sigma exceeds this share of their depth are dropped."""
-_CHECK_EVERY = 8
-"""Pairs from one whose right image has keypoints of its own to the next."""
 RIGHT_SURPLUS = 1.6
 """Features wanted in the right image per feature of the left, so that few partners are missing."""
 _NEIGHBOURS = 16
@@ -107,8 +102,6 @@ class Frontend:
         self._wide = self.self_calibration.widened(self.config.matching)
         self._tof = TofFeatures(self.config.tof, self.config.features, self.config.noise)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="second_core")
-        self._extracted = 0
-        self._camera: Camera | None = None
 
     def process(
         self, images: StereoImages | None, depth: DepthImage | None = None, T_left_tof: FloatArray | None = None
@@ -116,20 +109,16 @@ class Frontend:
         """Features of one instant: :meth:`extract`, then :meth:`measure`, of the same arguments."""
         return self.measure(self.extract(images), images, depth, T_left_tof)
 
-    def extract(self, images: StereoImages | None) -> tuple[Keypoints, Keypoints | None] | None:
-        """Keypoints of the left image, and of some right images those that a left one could match.
+    def extract(self, images: StereoImages | None) -> tuple[Keypoints, Keypoints] | None:
+        """Keypoints of the left image, and of the right image those that a left one could match.
 
-        None in mode ``tof``, whose keypoints need the depth image. A caller may extract from one frame while
-        :meth:`measure` is at the one before.
+        Both images have a thread each. None in mode ``tof``, whose keypoints need the depth image. A caller may extract
+        from one frame while :meth:`measure` is at the one before.
         """
         if self.config.mode == "tof":
             return None
         if images is None:
             raise ValueError(f"mode '{self.config.mode}' needs a stereo pair, got none")
-        is_check = self._extracted % _CHECK_EVERY == 0 or images.stereo.camera != self._camera
-        self._extracted, self._camera = 1 if is_check else self._extracted + 1, images.stereo.camera
-        if not is_check:
-            return self._left(images.left), None
         bounds = disparity_bounds(self.config.matching, images.stereo.camera.fx * images.stereo.baseline)
         left = self._pool.submit(self._left, images.left)
         right = self._right(images.right, lambda uv, size: has_candidate(left.result(), uv, size, self._wide, bounds))
@@ -137,7 +126,7 @@ class Frontend:
 
     def measure(
         self,
-        keypoints: tuple[Keypoints, Keypoints | None] | None,
+        keypoints: tuple[Keypoints, Keypoints] | None,
         images: StereoImages | None,
         depth: DepthImage | None = None,
         T_left_tof: FloatArray | None = None,
@@ -186,7 +175,7 @@ class Frontend:
         """Forget thresholds, noise and counts."""
         for part in (self._left, self._right, self._noise, self.self_calibration, self._tof):
             part.reset()
-        self.counters, self._extracted = Counters(), 0
+        self.counters = Counters()
 
     def report(self) -> FrontendReport:
         """Findings about the images so far."""
@@ -197,25 +186,19 @@ class Frontend:
             self.self_calibration.figures(), tuple(text for text in advice if text), picture, correction
         )
 
-    def _stereo_depth(self, images: StereoImages, left: Keypoints, right: Keypoints | None) -> DepthEstimate:
+    def _stereo_depth(self, images: StereoImages, left: Keypoints, right: Keypoints) -> DepthEstimate:
         stereo, calibration = images.stereo, self.self_calibration
         focal_baseline = stereo.camera.fx * stereo.baseline
         bounds = disparity_bounds(self.config.matching, focal_baseline)
-        if right is not None and not calibration.knows(stereo.camera):
-            self._acquire(images, left, right, bounds)
-        rows = calibration.rows(left.uv, np.zeros(len(left)))
-        u_right = search_rows(images.left, images.right, left.uv, rows, bounds)
-        found = np.flatnonzero(np.isfinite(u_right))
-        uv, partner = left.uv[found], np.column_stack([u_right, left.uv[:, 1] + rows])[found]
+        matches = self._match(images, left, right, bounds)
+        uv, partner = left.uv[matches.left], right.uv[matches.right]
         row_error = calibration.rows(partner, uv[:, 0] - partner[:, 0])
         refined = self._refine(images, uv, partner[:, 0], row_error)
         trusted = refined.valid
-        if right is not None:
-            if trusted.sum() < _FEW_TRUSTED * len(left):
-                self._reject_swapped(left, right, bounds)
-            whole = np.full(len(left), np.nan, np.float32)
-            whole[found] = refined.disparity
-            self._learn_noise(left, right, whole, bounds)
+        if trusted.sum() < _FEW_TRUSTED * len(left):
+            self._reject_swapped(left, right, bounds)
+        size = left.size[matches.left]
+        self._noise.learn((uv - partner)[trusted, 1] + row_error[trusted], size[trusted])
         self._noise.learn_rectification((refined.row_shift - row_error)[trusted], refined.row_sigma[trusted])
         correction, correction_sigma = calibration.columns(partner)
         disparity = refined.disparity + correction
@@ -223,29 +206,22 @@ class Frontend:
         disparity[~has_consistent_neighbour(uv, disparity, _NEIGHBOURS)] = np.nan
         sigma = np.sqrt(refined.sigma**2 + self._noise.rectification_sigma**2 + correction_sigma**2)
         estimate = DepthEstimate.unknown(len(left))
-        estimate.depth[found] = stereo.depth_from_disparity(disparity)
-        estimate.sigma[found] = focal_baseline / disparity**2 * sigma
-        self._count(left, right, len(found), int(np.isfinite(disparity).sum()))
+        estimate.depth[matches.left] = stereo.depth_from_disparity(disparity)
+        estimate.sigma[matches.left] = focal_baseline / disparity**2 * sigma
+        self._count(left, right, len(matches), int(np.isfinite(disparity).sum()))
         kept = np.flatnonzero(np.isfinite(disparity))
-        calibration.learn(self._view(images, left.select(found[kept]), refined.select(kept)))
+        calibration.learn(self._view(images, left.select(matches.left[kept]), refined.select(kept)))
         return estimate
 
-    def _acquire(self, images: StereoImages, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> None:
-        """Find out how the rows of a first pair lie, from matches in a wider band."""
-        wide = match_stereo(left, right, self._wide, bounds)
-        view = self._view_of_keypoints(images, left.select(wide.left), right.select(wide.right))
-        self.self_calibration.acquire(view)
-
-    def _learn_noise(
-        self, left: Keypoints, right: Keypoints, disparity: Float32Array, bounds: tuple[float, float]
-    ) -> None:
-        """Take in the row differences of keypoints found in both images, where patches give the same ``disparity``."""
-        error = self.self_calibration.rows(right.uv, np.zeros(len(right)))
+    def _match(self, images: StereoImages, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> Matches:
+        """Matches along the rows as they are; those of a first pair are found out with a wider band."""
+        calibration = self.self_calibration
+        if not calibration.knows(images.stereo.camera):
+            wide = match_stereo(left, right, self._wide, bounds)
+            calibration.acquire(self._view_of_keypoints(images, left.select(wide.left), right.select(wide.right)))
+        error = calibration.rows(right.uv, np.zeros(len(right)))
         aligned = dataclasses.replace(right, uv=right.uv - np.column_stack([np.zeros_like(error), error]))
-        matches = match_stereo(left, aligned, self.config.matching, bounds)
-        difference = left.uv[matches.left] - aligned.uv[matches.right]
-        agrees = np.abs(difference[:, 0] - disparity[matches.left]) < MAX_SHIFT
-        self._noise.learn(difference[agrees, 1], left.size[matches.left][agrees])
+        return match_stereo(left, aligned, self.config.matching, bounds)
 
     def _view(self, images: StereoImages, left: Keypoints, refined: RefinedDisparity) -> StereoView:
         """View that self-calibration learns from."""
@@ -328,9 +304,9 @@ class Frontend:
                 f"left and right images are swapped: {share:.0%} of {matches} matches have a negative disparity"
             )
 
-    def _count(self, left: Keypoints, right: Keypoints | None, matched: int, refined: int) -> None:
+    def _count(self, left: Keypoints, right: Keypoints, matched: int, refined: int) -> None:
         self.counters.add("frames")
         self.counters.add("keypoints_left", len(left))
-        self.counters.add("keypoints_right", 0 if right is None else len(right))
+        self.counters.add("keypoints_right", len(right))
         self.counters.add("matched", matched)
         self.counters.add("disparity_rejected", matched - refined)

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stereo matching of described keypoints: the normalised scalar product (Eq. 3.1) within the epipolar band.
 
-Disparities are searched without it (:mod:`stereo_frontend.row_search`): it tells how exact keypoints are and how the
-rows of a pair lie.
-
 ``argmax_j  delta_i . delta_j >= alpha`` for unit-norm descriptors; a match must be the best of both sides, lie in the
 band of rows around its partner, and have a disparity between the bounds that the depth range sets.
 """
@@ -30,7 +27,7 @@ IndexArray = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class MatchingConfig(Config):
-    """Depths that are looked for, and limits of a match of keypoints of both images."""
+    """Limits of a stereo match."""
 
     min_similarity: float = parameter(
         0.7, "least scalar product of two descriptors (alpha of Eq. 3.1)", minimum=-1.0, maximum=1.0

@@ -12,7 +12,7 @@ UNKNOWNS = 4
 REORDER = {"reassoc", "contract"}
 """Licence that a sum needs to be vectorised; the rest of fastmath would forget that NaN exists."""
 _MOST_ITERATIONS = 20
-_CONVERGED = 0.03
+_CONVERGED = 0.01
 _LEAST_ENERGY = 1.0
 _ROUNDING_VARIANCE = 0.1
 """Variance of grey values rounded to integers, both images."""

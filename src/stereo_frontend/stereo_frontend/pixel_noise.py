@@ -23,10 +23,8 @@ ROW_FLOOR = 0.06
 """Standard deviation of the row of the smallest keypoints in one clean image, px."""
 ROW_SLOPE = 0.003
 """Growth of that with the keypoint's diameter."""
-_FACTOR_MEMORY = 0.5
-"""Weight of the past in the running factor, which is learnt from every eighth pair; 1 keeps it constant."""
 _MEMORY = 0.9
-"""Weight of the past in what is learnt from every pair."""
+"""Weight of the past in the running factor; 1 keeps it constant."""
 _MIN_MATCHES = 30
 """Matches needed in a frame to learn from it."""
 _MIN_FACTOR = 0.7
@@ -75,7 +73,7 @@ class PixelNoise:
         clean = np.sqrt(2.0) * np.hypot(ROW_FLOOR, ROW_SLOPE * size)
         normalised = (row_difference - np.median(row_difference)) / clean
         measured = float(np.clip(MAD_TO_SIGMA * np.median(np.abs(normalised)), _MIN_FACTOR, c.max_factor))
-        self.factor = _FACTOR_MEMORY * self.factor + (1.0 - _FACTOR_MEMORY) * measured
+        self.factor = _MEMORY * self.factor + (1.0 - _MEMORY) * measured
 
     def learn_rectification(self, row_shift: Float32Array, row_sigma: Float32Array) -> None:
         """Take in the row shifts (n,) px of aligned patches and their standard deviations (n,) px."""

@@ -80,7 +80,7 @@ class ExtractedFrame:
 
     images: StereoImages | None
     depth: DepthImage | None
-    keypoints: tuple[Keypoints, Keypoints | None] | None
+    keypoints: tuple[Keypoints, Keypoints] | None
 
 
 class FeatureStage:
