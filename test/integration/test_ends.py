@@ -35,6 +35,7 @@ class Run:
             stderr=subprocess.STDOUT,
             text=True,
             start_new_session=True,
+            preexec_fn=hear_the_terminal,
         )
 
     def nodes(self) -> list[int]:
@@ -48,6 +49,11 @@ class Run:
         except OSError:
             return False
         return f"SLAM_PARENT_PID={self.process.pid}".encode() in environment and state != "Z"
+
+
+def hear_the_terminal() -> None:
+    """Whoever runs the tests under nohup has SIGHUP ignored, which programs inherit."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = 120.0) -> bool:
