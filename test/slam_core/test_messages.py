@@ -119,9 +119,9 @@ def test_a_camera_in_colour_gives_grey_and_colours_a_grey_one_grey_alone(rng: np
     colour = rng.integers(0, 256, (4, 6, 3), dtype=np.uint8)
     for encoding, image in (("rgb8", colour), ("bgr8", colour[..., ::-1])):
         grey, kept = m.grey_and_colour_from_message(m.image_message(TYPES, header(), image, encoding))
-        np.testing.assert_array_equal(kept, colour)
+        np.testing.assert_array_equal(kept(), colour)
         np.testing.assert_array_equal(grey, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY))
-    assert m.grey_and_colour_from_message(m.image_message(TYPES, header(), colour[..., 0]))[1] is None
+    assert m.grey_and_colour_from_message(m.image_message(TYPES, header(), colour[..., 0]))[1]() is None
 
 
 def test_pictures_beside_depth_keep_their_values_and_colours_become_grey(rng: np.random.Generator) -> None:

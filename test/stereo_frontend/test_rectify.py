@@ -57,9 +57,9 @@ def test_colours_lie_on_the_rectified_left_image(rng):
     colour = rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)
     for channel in range(3):
         pair = StereoRectifier(left, right)(
-            7, np.ascontiguousarray(colour[..., channel]), colour[..., 0].copy(), colour
+            7, np.ascontiguousarray(colour[..., channel]), colour[..., 0].copy(), lambda: colour
         )
-        np.testing.assert_array_equal(pair.colour[..., channel], pair.left)
+        np.testing.assert_array_equal(pair.colour()[..., channel], pair.left)
 
 
 def spot(pixel: np.ndarray) -> np.ndarray:

@@ -56,7 +56,7 @@ def test_a_side_by_side_frame_is_cut_in_the_middle():
     assert pair.left.max() == 0
     assert pair.right.min() == 200
     frame[:, :20] = (20, 130, 240)
-    np.testing.assert_array_equal(split_side_by_side(5, frame).colour, np.full((10, 20, 3), (240, 130, 20), np.uint8))
+    np.testing.assert_array_equal(split_side_by_side(5, frame).colour(), np.full((10, 20, 3), (240, 130, 20), np.uint8))
     with pytest.raises(ValueError, match="even width"):
         split_side_by_side(0, frame[:, :39])
 

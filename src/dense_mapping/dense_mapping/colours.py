@@ -21,9 +21,8 @@ def stereo_picture(images: StereoImages, has_other_colours: bool) -> ByteArray:
 
     Shape (height, width, 3) or (height, width) uint8.
     """
-    if images.colour is not None:
-        return images.colour
-    return NO_PICTURE if has_other_colours else images.left
+    picture = images.picture()
+    return NO_PICTURE if picture is images.left and has_other_colours else picture
 
 
 class RecentColours:

@@ -33,15 +33,13 @@ from sjsam_node.storage import StoredMap
 from slam_core.calibration_error import CalibrationErrorConfig
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
+from slam_core.messages.poses import FARTHEST_M
 from slam_core.types import Counters, PoseEstimate, Submap
 
 ALREADY_JOINED = "already joined"
 
 _PASSES = 2
 """Times that settling looks for closures, and lets go what the map contradicts: one finding lets another follow."""
-
-FARTHEST_M = 1e6
-"""Landmarks beyond are none of a building."""
 
 SMALLEST_VARIANCE = 1e-15
 """Of a landmark (m2) or an end pose (m2, rad2); no camera is that sure of anything."""

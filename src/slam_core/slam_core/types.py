@@ -7,6 +7,7 @@ integer nanoseconds, the only time an estimator knows.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
@@ -37,11 +38,19 @@ class FeatureSource(IntEnum):
     FUSED = 2
 
 
+MakeColour = Callable[[], ByteArray | None]
+"""Makes an image in colour once it is wanted, uint8 (height, width, 3), red first; None of a grey camera."""
+
+
+def no_colour() -> None:
+    """The :data:`MakeColour` of a grey camera."""
+
+
 @dataclass(frozen=True, eq=False)
 class StereoImages:
     """A rectified pair: ``left`` and ``right`` uint8, shape (height, width), of ``stereo``, left in ``frame_id``.
 
-    ``colour``: the left image (height, width, 3), red first, or None of a grey camera.
+    ``colour`` makes the left image in colour: few frames are shown, all are searched for features.
     """
 
     stamp_ns: int
@@ -49,7 +58,12 @@ class StereoImages:
     right: ByteArray
     stereo: StereoCamera
     frame_id: str = "stereo_left_optical_frame"
-    colour: ByteArray | None = None
+    colour: MakeColour = no_colour
+
+    def picture(self) -> ByteArray:
+        """The left image in colour, or grey of a grey camera."""
+        colour = self.colour()
+        return self.left if colour is None else colour
 
 
 @dataclass(frozen=True, eq=False)

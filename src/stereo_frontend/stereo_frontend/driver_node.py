@@ -149,8 +149,7 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
 
     def _publish_pair(self, pair: RawPair) -> None:
         frames = self.config.left_frame, self.config.right_frame
-        left = pair.left if pair.colour is None else pair.colour
-        for side, frame, image in zip(SIDES, frames, (left, pair.right), strict=True):
+        for side, frame, image in zip(SIDES, frames, (pair.picture(), pair.right), strict=True):
             header = header_message(self.types, pair.stamp_ns, frame)
             encoding = "mono8" if image.ndim == 2 else "rgb8"
             self.publish(f"stereo/{side}/image_raw", image_message(self.types, header, image, encoding))
@@ -170,9 +169,10 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
                 if self.files[side]:
                     self.publish(_INFO_TOPIC.format(side), camera_info_message(self.types, header, info))
                 self.publish(f"stereo/{side}/image_rect", image_message(self.types, header, image))
-            if images.colour is not None:
+            colour = images.colour() if self.has_listeners(_COLOUR_TOPIC) else None
+            if colour is not None:
                 header = header_message(self.types, images.stamp_ns, images.frame_id)
-                self.publish(_COLOUR_TOPIC, image_message(self.types, header, images.colour, "rgb8"))
+                self.publish(_COLOUR_TOPIC, image_message(self.types, header, colour, "rgb8"))
         self.health.take(self.stage.counters)
 
     # -- calibration ---------------------------------------------------------------------------------------------------

@@ -119,7 +119,7 @@ class FeatureNode(StageNode[FrontendConfig]):
 
     def _picture(self, frame: ExtractedFrame) -> ByteArray:
         if frame.images is not None:
-            return frame.images.left if frame.images.colour is None else frame.images.colour
+            return frame.images.picture()
         assert frame.depth is not None
         depth = frame.depth
         grey = next((picture for picture in (depth.amplitude, depth.intensity) if picture is not None), None)

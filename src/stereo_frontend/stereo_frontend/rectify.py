@@ -14,7 +14,7 @@ import numpy as np
 
 from slam_core.camera import Camera, CameraInfo, StereoCamera
 from slam_core.geometry import FloatArray
-from slam_core.types import AnyArray, ByteArray, StereoImages
+from slam_core.types import AnyArray, ByteArray, MakeColour, StereoImages, no_colour
 
 _OUTSIDE = -10.0
 _MINIMUM_BASELINE = 1e-4
@@ -102,10 +102,14 @@ class StereoRectifier:
         self._right = Rectifier(right, self.stereo.camera)
 
     def __call__(
-        self, stamp_ns: int, left: ByteArray, right: ByteArray, colour: ByteArray | None = None
+        self, stamp_ns: int, left: ByteArray, right: ByteArray, colour: MakeColour = no_colour
     ) -> StereoImages:
         """Rectify one pair of raw images, uint8 (height, width) each, of one stamp; ``colour``: the left one's."""
-        rectified_colour = None if colour is None else self._left.colour(colour)
+
+        def rectified_colour() -> ByteArray | None:
+            raw = colour()
+            return None if raw is None else self._left.colour(raw)
+
         return StereoImages(stamp_ns, self._left(left), self._right(right), self.stereo, colour=rectified_colour)
 
 

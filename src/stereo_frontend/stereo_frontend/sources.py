@@ -10,12 +10,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from slam_core.types import AnyArray, ByteArray
+from slam_core.types import AnyArray, ByteArray, MakeColour, no_colour
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 _SUBFOLDERS = (
@@ -32,14 +33,19 @@ _NAME_ENDS = (("_left", "_right"), ("_l", "_r"), ("_0", "_1"), ("left", "right")
 class RawPair:
     """One unrectified pair: left and right uint8 (height, width), the left one in ``frame_id``.
 
-    ``colour``: the left image (height, width, 3), red first, or None of a grey camera.
+    ``colour`` makes the left image in colour.
     """
 
     stamp_ns: int
     left: ByteArray
     right: ByteArray
     frame_id: str = "stereo_left_optical_frame"
-    colour: ByteArray | None = None
+    colour: MakeColour = no_colour
+
+    def picture(self) -> ByteArray:
+        """The left image in colour, or grey of a grey camera."""
+        colour = self.colour()
+        return self.left if colour is None else colour
 
 
 class SideBySideSource:
@@ -121,7 +127,7 @@ class FolderSource:
         stamp = _stamp_in_name(left)
         stamp = round(self._next / self.rate * 1e9) if stamp is None else stamp
         self._next += 1
-        return RawPair(stamp, read_grey(left), read_grey(right), colour=_read_colour(left))
+        return RawPair(stamp, read_grey(left), read_grey(right), colour=partial(_read_colour, left))
 
     def close(self) -> None:
         """Nothing to let go of."""
@@ -139,7 +145,7 @@ def split_side_by_side(stamp_ns: int, frame: AnyArray) -> RawPair:
         raise ValueError(f"a side-by-side frame must have an even width, got {frame.shape[1]} px")
     grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
     half = grey.shape[1] // 2
-    colour = None if frame.ndim == 2 else np.asarray(cv2.cvtColor(frame[:, :half], cv2.COLOR_BGR2RGB), np.uint8)
+    colour = no_colour if frame.ndim == 2 else partial(_red_first, frame[:, :half])
     return RawPair(stamp_ns, np.ascontiguousarray(grey[:, :half]), np.ascontiguousarray(grey[:, half:]), colour=colour)
 
 
@@ -178,7 +184,11 @@ def read_grey(path: Path) -> ByteArray:
 def _read_colour(path: Path) -> ByteArray | None:
     """Colours of an image file, red first; None if it is grey."""
     image = cv2.imread(str(path), cv2.IMREAD_ANYCOLOR)
-    return None if image is None or image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+    return None if image is None or image.ndim == 2 else _red_first(image)
+
+
+def _red_first(image: AnyArray) -> ByteArray:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _images(folder: Path) -> list[Path]:

@@ -195,6 +195,12 @@ def test_a_landmark_of_the_separator_that_is_let_go_is_estimated_by_the_region_a
     assert np.abs(found - graph.points[alone]).max() < 1e-3
 
 
+def test_a_large_region_may_turn_further_before_it_is_opened(way: GlobalMap) -> None:
+    config, region = RegionConfig(size=8, relinearize=0.002), a_region(way.smoother)
+    assert config.largest_turn(replace(region, records=np.arange(4))) == pytest.approx(0.002)
+    assert config.largest_turn(replace(region, records=np.arange(32))) == pytest.approx(0.004)
+
+
 def test_a_closure_touches_only_the_regions_that_it_affects() -> None:
     joined = global_map(RegionConfig(size=8, open=16, quiet=1))
     untouched = []

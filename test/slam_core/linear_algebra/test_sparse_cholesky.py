@@ -130,7 +130,7 @@ def test_what_is_not_positive_definite_is_said_so(backend: str) -> None:
 
 
 def test_entries_outside_the_pattern_raise(backend: str) -> None:
-    alone = BlockPattern.of_scalars(3, np.array([0, 1, 2, 3]), np.array([0, 1, 2]))
+    alone = BlockPattern(np.ones(3, dtype=np.int64), np.array([0, 1, 2, 3]), np.array([0, 1, 2]))
     factor = SparseCholesky(alone, backend)
     factor.factorize(np.array([1.0, 2.0, 4.0]))
     with pytest.raises(KeyError):

@@ -20,6 +20,7 @@ from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxplus, skew, transform_points
 from slam_core.linear_algebra import blas
+from slam_core.linear_algebra.small_kernels import solved_square
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 METHODS = ("nearest", "mahalanobis", "joint")
@@ -116,20 +117,9 @@ def _gated(alike, first, second, own, other, bound):  # type: ignore[no-untyped-
             if squared >= bound * trace:  # no eigenvalue is larger than the trace: this is outside the gate
                 continue
             S[:] = own[a] + other[b]
-            nis = determinant = 0.0
-            for p in range(3):
-                for q in range(p):
-                    for k in range(q):
-                        S[p, q] -= S[p, k] * S[q, k]
-                    S[p, q] /= S[q, q]
-                    S[p, p] -= S[p, q] * S[p, q]
-                    e[p] -= S[p, q] * e[q]
-                determinant += np.log(S[p, p])
-                S[p, p] = np.sqrt(S[p, p])
-                e[p] /= S[p, p]
-                nis += e[p] * e[p]
+            nis, log_det = solved_square(S, e)
             if nis < bound:
-                i[count], j[count], score[count] = a, b, nis + determinant
+                i[count], j[count], score[count] = a, b, nis + log_det
                 count += 1
     return i[:count], j[:count], score[:count]
 

@@ -68,10 +68,6 @@ class Verdict:
     dropped: int = 0
     removed: tuple[Link, ...] = ()
 
-    def followed_by(self, later: Verdict) -> Verdict:
-        """Both verdicts as one."""
-        return Verdict(self.accepted + later.accepted, self.dropped + later.dropped, self.removed + later.removed)
-
 
 @dataclass
 class Consistency:

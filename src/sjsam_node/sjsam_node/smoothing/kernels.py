@@ -20,6 +20,7 @@ from numba import njit
 
 from sjsam_node.smoothing import angle_kernels
 from sjsam_node.smoothing.angle_kernels import angle_error, exp_rotation
+from slam_core.linear_algebra.small_kernels import solved_square
 
 PLANAR, TANGENT, EULER = angle_kernels.PLANAR, angle_kernels.TANGENT, angle_kernels.EULER
 
@@ -101,24 +102,7 @@ def joint_errors(model, maps, R, t, points, residual, weighted, nis):
         for k in range(len(landmarks)):
             row = (d + a) * len(poses) + d * k
             block[:] = information[row : row + d, row : row + d]
-            nis[lm_ptr[f] + k] = _solved_square(block, w[row : row + d].copy())
-
-
-@njit(cache=True, nogil=True)
-def _solved_square(A, x):
-    """``x^T A^-1 x`` of a positive definite matrix, which becomes its triangle."""
-    total = 0.0
-    for i in range(len(x)):
-        for j in range(i):
-            for k in range(j):
-                A[i, j] -= A[i, k] * A[j, k]
-            A[i, j] /= A[j, j]
-            x[i] -= A[i, j] * x[j]
-            A[i, i] -= A[i, j] * A[i, j]
-        A[i, i] = np.sqrt(A[i, i])
-        x[i] /= A[i, i]
-        total += x[i] * x[i]
-    return total
+            nis[lm_ptr[f] + k], _ = solved_square(block, w[row : row + d].copy())
 
 
 @njit(cache=True, nogil=True)

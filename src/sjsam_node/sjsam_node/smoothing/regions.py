@@ -218,12 +218,12 @@ class Regions:
             kept = [r for r in own if r.holds(graph, active, anchor)]
             if len(kept) == len(own):
                 return kept
-            self.open([r for r in own if not any(r is k for k in kept)], len(graph.records))
+            self.open([r for r in own if r not in kept], len(graph.records))
 
     def open(self, regions: Sequence[Region], now: int) -> None:
         """Let the parts of some regions take part again."""
         parts = [part for region in regions for part in region.parts]
-        self.closed = [*(r for r in self.closed if not any(r is other for other in regions)), *parts]
+        self.closed = [*(r for r in self.closed if r not in regions), *parts]
         for region in regions:
             inside = [i for part in region.parts for i in part.records.tolist()]
             self._note(np.setdiff1d(region.records, inside), now)
@@ -278,7 +278,7 @@ class Regions:
         parts = [max(left, key=lambda r: float(np.linalg.norm(graph.poses[r.reference, :3, 3] - here)))]
         known = parts[0].shown(graph)
         while len(parts) < _PARTS:
-            left = [r for r in left if not any(r is part for part in parts)]
+            left = [r for r in left if r not in parts]
             nearest = max(left, key=lambda r: len(known & r.shown(graph)), default=None)
             if nearest is None or not known & nearest.shown(graph):
                 break
@@ -289,7 +289,7 @@ class Regions:
         if region is None:
             self._note(parts[0].records[:1], now)
         else:
-            self.closed = [*(r for r in self.closed if not any(r is part for part in parts)), region]
+            self.closed = [*(r for r in self.closed if r not in parts), region]
 
     def _gathered(self, graph: MapGraph, candidates: IntArray, first: int) -> IntArray:
         """Of the candidates nearest to one, those that hang together with it."""

@@ -183,12 +183,12 @@ class Smoother:
         self.parked = checkpoint.parked
 
     def _choose_ties(self) -> None:
-        self.graph.tie_by(0)
-        for least in (ALL, self.config.settled_ties) if not (self.graph.doubt > 1.0).any() else ():
+        """As many landmarks as the work allows; those selected alone where submaps contradicted each other."""
+        contradicted = bool((self.graph.doubt > 1.0).any())
+        for least in (0,) if contradicted else (ALL, self.config.settled_ties, 0):
             self.graph.tie_by(least)
             if self._work() <= self.config.settled_work:
-                return
-            self.graph.tie_by(0)
+                break
 
     def _work(self) -> float:
         """Entries of the information matrices that the selected landmarks make."""

@@ -17,7 +17,6 @@ import yaml
 
 from ekf_slam_node.stage import FilterStage
 from slam_bringup.bags.bag_calibration import FILE_NAME, calibration_file
-from slam_bringup.bags.readings import StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.commands.mapping_options import mode_for
 from slam_bringup.pipeline.configuration import choose, filter_config, load_system_config
@@ -29,8 +28,7 @@ from slam_core.camera_info import CameraInfoFile
 from slam_core.files import atomic_text
 from slam_core.types import Features
 from stereo_frontend.corrected_info import corrected_right
-from stereo_frontend.frontend import Frontend
-from stereo_frontend.rectify import StereoRectifier
+from stereo_frontend.frontend import FrontendReport
 
 
 @dataclass(frozen=True)
@@ -71,32 +69,20 @@ def refine(bag: Path) -> Refined:
         known = {name: info for name, info in infos.items() if info is not None}
         if len(known) < len(infos):
             raise ValueError(f"{bag} has images without camera infos: calibrate with a board first")
-        right, figures = _corrected(source, agent, known["left"], known["right"]) if mode == "stereo" else (None, {})
-        parameters = _readout(source, agent, mode)
-    if right is None and not parameters:
+        report, parameters = _learnt(source, agent, mode)
+    figures = {**report.rectification, **parameters}
+    if report.correction is None and not parameters:
         raise ValueError(f"the images show no significant error to correct: {figures}")
-    corrected = {} if right is None else {"right": right}
-    return Refined(known | corrected, right is not None, parameters, figures | parameters)
+    if report.correction is not None:
+        known["right"], figures["left_over_px"] = corrected_right(known["right"], report.correction)
+    return Refined(known, report.correction is not None, parameters, figures)
 
 
-def _corrected(
-    source: SensorBag, agent: str, left: CameraInfo, right: CameraInfo
-) -> tuple[CameraInfo | None, dict[str, Any]]:
-    """The right camera's corrected info, None where nothing is to be corrected, and figures."""
-    rectifier, frontend = StereoRectifier(left, right), Frontend()
-    for reading in source.readings():
-        if isinstance(reading, StereoReading) and reading.agent == agent:
-            pair = reading.pair
-            frontend.process(rectifier(pair.stamp_ns, pair.left, pair.right))
-    calibration = frontend.self_calibration
-    if calibration.error is None or not calibration.corrects:
-        return None, calibration.figures()
-    corrected, left_over = corrected_right(right, calibration.error)
-    return corrected, calibration.figures() | {"left_over_px": left_over}
+def _learnt(source: SensorBag, agent: str, mode: str) -> tuple[FrontendReport, dict[str, float]]:
+    """Findings of the front end, and parameters of the rolling shutter as the filter learns them from the images alone.
 
-
-def _readout(source: SensorBag, agent: str, mode: str) -> dict[str, float]:
-    """Parameters of the rolling shutter as the filter learns them from the images alone; none where it sees none."""
+    There are none of these where it sees none.
+    """
     sensors, system = source.sensors[agent], choose(load_system_config(None), mode, "ekf", "none", "off")
     pipeline = SensorPipeline(system, sensors, False, StageTimes())
     stage = FilterStage(filter_config(system.ekf_slam, sensors), sensors.frames, sensors.base_frame)
@@ -108,7 +94,8 @@ def _readout(source: SensorBag, agent: str, mode: str) -> dict[str, float]:
             for _ in stage.ready():
                 pass
     readout, sigma = stage.readout_s
-    return {"measurement.readout": readout, "measurement.sigma_readout": sigma} if readout else {}
+    parameters = {"measurement.readout": readout, "measurement.sigma_readout": sigma} if readout else {}
+    return pipeline.front_end(), parameters
 
 
 def write_refined(folder: Path, bag: Path, found: Refined) -> None:

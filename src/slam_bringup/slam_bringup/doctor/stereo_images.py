@@ -57,7 +57,7 @@ def match_pairs(evidence: Evidence) -> PixelMatches | None:
     try:
         rectifier = StereoRectifier(left, right)
         chosen = evidence.pairs()[:: BURST // _PAIRS_PER_BURST]
-        images = [rectifier(stamp, *pair) for stamp, *pair in chosen]
+        images = [rectifier(stamp, first, second) for stamp, first, second in chosen]
     except ValueError:
         return None
     found = [_match(pair.left, pair.right) for pair in images]

@@ -68,7 +68,7 @@ def _logged(frame: ExtractedFrame, features: Features) -> LoggedFrame:
 def _picture(frame: ExtractedFrame) -> ByteArray:
     """The left image in its colours, or what a depth camera gives beside depth, or depth itself."""
     if frame.images is not None:
-        return frame.images.left if frame.images.colour is None else frame.images.colour
+        return frame.images.picture()
     assert frame.depth is not None, "a frame has one or the other"
     depth = frame.depth
     picture = next((p for p in (depth.amplitude, depth.intensity) if p is not None), depth.depth)

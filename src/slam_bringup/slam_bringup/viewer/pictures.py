@@ -136,8 +136,7 @@ def _image_of(
 ) -> tuple[ByteArray | None, Camera | None, str]:
     """The image of a reading, grey or red first, its raw camera, and the name of its mount."""
     if isinstance(reading, StereoReading):
-        pair = reading.pair
-        return pair.left if pair.colour is None else pair.colour, sensors.left.camera if sensors.left else None, "left"
+        return reading.pair.picture(), sensors.left.camera if sensors.left else None, "left"
     amplitude = reading.raw.amplitude
     grey = None if amplitude is None else np.clip(amplitude, 0, 255).astype(np.uint8)
     return grey, sensors.tof.camera if sensors.tof else None, "tof"

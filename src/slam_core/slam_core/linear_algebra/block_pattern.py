@@ -35,11 +35,6 @@ class BlockPattern:
     column_ptr: IntArray
     rows: IntArray
 
-    @classmethod
-    def of_scalars(cls, n: int, indptr: IntArray, indices: IntArray) -> BlockPattern:
-        """The pattern of a lower triangle in compressed columns, every unknown a block of its own."""
-        return cls(np.ones(n, dtype=np.int64), indptr, indices)
-
     @cached_property
     def start(self) -> IntArray:
         """First unknown of every block, and their number at the end, (N + 1,)."""

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import struct
+from functools import partial
 
 import cv2
 import numpy as np
 
 from slam_core.messages.base import Message, MessageTypes
-from slam_core.types import AnyArray, ByteArray, Float32Array
+from slam_core.types import AnyArray, ByteArray, Float32Array, MakeColour, no_colour
 
 ENCODINGS = {
     "mono8": ("u1", 1), "8UC1": ("u1", 1), "8UC3": ("u1", 3), "bgr8": ("u1", 3), "rgb8": ("u1", 3), "bgra8": ("u1", 4),
@@ -99,8 +100,8 @@ def grey_from_message(message: Message) -> ByteArray:
     return _grey(*_decoded(message))
 
 
-def grey_and_colour_from_message(message: Message) -> tuple[ByteArray, ByteArray | None]:
-    """The grey image of :func:`grey_from_message` and, of a colour camera, its colours (height, width, 3), red first.
+def grey_and_colour_from_message(message: Message) -> tuple[ByteArray, MakeColour]:
+    """The grey image of :func:`grey_from_message`, and what makes it in colour.
 
     Raises
     ------
@@ -108,7 +109,8 @@ def grey_and_colour_from_message(message: Message) -> tuple[ByteArray, ByteArray
         For floating-point images, whose scale is not known here.
     """
     image, encoding = _decoded(message)
-    return _grey(image, encoding), _colours(image, encoding) if encoding in _TO_GREY else None
+    is_colour = encoding in _TO_GREY and image.dtype == np.uint8
+    return _grey(image, encoding), partial(_colours, image, encoding) if is_colour else no_colour
 
 
 def picture_from_message(message: Message) -> AnyArray:
