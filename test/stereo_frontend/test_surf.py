@@ -9,15 +9,8 @@ import pytest
 
 from stereo_frontend.surf import SurfConfig, SurfDetector
 from stereo_frontend.surf_descriptor import describe_oriented, describe_upright, orientation, region_weights
-from stereo_frontend.surf_detector import (
-    FILTER_SIZES,
-    find_keypoints,
-    find_maxima,
-    fitting_octaves,
-    halved,
-    hessian_row,
-    integral_image,
-)
+from stereo_frontend.surf_detector import find_keypoints, find_maxima, fitting_octaves, halved, integral_image
+from stereo_frontend.surf_hessian import FILTER_SIZES, determinant_at, row_filter, wrapped_integral
 
 
 @pytest.fixture(scope="module")
@@ -27,13 +20,35 @@ def image() -> np.ndarray:
     return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
+@pytest.fixture(scope="module")
+def squares() -> np.ndarray:
+    """Black and white squares of 5 to 9 px and blobs: sums over lobes come as near to 2^16 as they can."""
+    picture = np.zeros((130, 170), np.uint8)
+    for top, side in ((0, 5), (30, 7), (65, 9)):
+        white = np.random.default_rng(side).random((30 // side, 170 // side + 1)) < 0.5
+        tiles = np.kron(255 * white, np.ones((side, side)))[:, :170]
+        picture[top : top + len(tiles)] = tiles
+    picture[95:130], picture[104:122, 40:58] = 255, 0
+    picture[96:128, 100:140], picture[105:119, 113:127] = 0, 255
+    return picture
+
+
 def hessian(image: np.ndarray, size: int) -> np.ndarray:
-    """Determinants of a whole layer, zero where the filter does not fit."""
-    height, width = image.shape
-    out = np.zeros((height, width), np.float32)
-    sums = np.empty((6, width + 1), np.int32)
-    for y in range(size // 2, height - size // 2):
-        hessian_row(integral_image(image), size, y, sums, out[y])
+    """Determinants of a whole layer by single pixels, zero where the filter does not fit."""
+    integral, half = wrapped_integral(image), size // 2
+    out = np.zeros(image.shape, np.float32)
+    for y in range(half, image.shape[0] - half):
+        for x in range(half, image.shape[1] - half):
+            out[y, x] = determinant_at(integral, x, y, size)
+    return out
+
+
+def hessian_by_rows(image: np.ndarray, size: int) -> np.ndarray:
+    """The same by whole rows."""
+    out = np.zeros(image.shape, np.float32)
+    fill, sums = row_filter(size), np.empty((4, image.shape[1] + 1), np.uint16)
+    for y in range(size // 2, image.shape[0] - size // 2):
+        fill(wrapped_integral(image), y, sums, out[y])
     return out
 
 
@@ -98,15 +113,30 @@ def twin_wavelet(image: np.ndarray, x: float, y: float, half: float) -> tuple[fl
 
 def test_the_integral_image_is_opencvs(image):
     np.testing.assert_array_equal(integral_image(image), cv2.integral(image))
+    np.testing.assert_array_equal(wrapped_integral(image), cv2.integral(image) % 2**16)
 
 
 @pytest.mark.parametrize("size", FILTER_SIZES)
-def test_hessian_equals_its_twin(image, size):
+@pytest.mark.parametrize("picture", ["image", "squares"])
+def test_hessian_equals_its_twin(request, picture, size):
+    image = request.getfixturevalue(picture)
     out, half = hessian(image, size), size // 2
     inside = np.zeros_like(out, bool)
     inside[half:-half, half:-half] = True
     np.testing.assert_allclose(out[inside], twin_hessian(image, size)[inside], rtol=1e-4, atol=1e-2)
     assert not out[~inside].any()
+
+
+@pytest.mark.parametrize("size", FILTER_SIZES[1:3])
+@pytest.mark.parametrize("picture", ["image", "squares"])
+def test_hessian_by_rows_is_that_of_the_pixels_to_the_last_bit(request, picture, size):
+    image = request.getfixturevalue(picture)
+    np.testing.assert_array_equal(hessian_by_rows(image, size), hessian(image, size))
+
+
+def test_rows_are_not_filtered_where_sums_would_wrap_around():
+    with pytest.raises(ValueError, match="27 px"):
+        row_filter(FILTER_SIZES[3])
 
 
 def test_octaves_are_those_that_fit_the_image():
@@ -123,16 +153,16 @@ def test_the_next_octave_is_the_mean_of_four_pixels(image):
 def test_octaves_meet_at_the_place_they_have_in_the_first(image):
     found, alone = np.empty((5000, 4), np.float32), np.empty((5000, 4), np.float32)
     first, both = (find_keypoints(image, halved(image), n, np.float32(5.0), found) for n in (1, 2))
-    n = find_maxima(integral_image(halved(image)), np.float32(5.0), alone)
+    n = find_maxima(wrapped_integral(halved(image)), np.float32(5.0), alone)
     assert both == first + n
     np.testing.assert_allclose(found[first:both, :2], 2.0 * alone[:n, :2] + 0.5)  # centres of pixels twice as large
     np.testing.assert_allclose(found[first:both, 2:], alone[:n, 2:] * [2.0, 1.0])
 
 
 def test_maxima_are_those_of_an_exhaustive_search(image):
-    integral, threshold = integral_image(image), np.float32(5.0)
+    threshold = np.float32(5.0)
     found = np.empty((5000, 4), np.float32)
-    n = find_maxima(integral, threshold, found)
+    n = find_maxima(wrapped_integral(image), threshold, found)
     height, width = image.shape
     layers = np.stack([hessian(image, size) for size in FILTER_SIZES])
     expected, border = set(), FILTER_SIZES[3] // 2 + 4

@@ -5,9 +5,8 @@ A filter of size S stands for a Gaussian of scale ``1.2 S / 9``. An octave is an
 before, searched with four filters. Those of the next octave are then twice as large, 18, 30, 42, 54, where the paper
 enlarges the filters instead: 15, 27, 39, 51. So octaves adjoin instead of overlapping, no keypoint is found twice, and
 each costs a quarter of the one before. Keypoints are maxima of the two middle sizes: these are filtered everywhere, the
-outer two only around candidates, which saves half of the work. The sums that the boxes of one row share are built once
-per row, which leaves 23 loads per pixel and layer instead of 32, all along the row, so that the compiler vectorises
-them.
+outer two only around candidates, which saves half of the work. The filters are those of
+:mod:`stereo_frontend.surf_hessian`.
 """
 
 from __future__ import annotations
@@ -18,9 +17,8 @@ from numba import njit
 
 from slam_core.in_place import in_place
 from slam_core.types import ByteArray
+from stereo_frontend.surf_hessian import FILTER_SIZES, determinant_at, row_filter, wrapped_integral
 
-FILTER_SIZES = (9, 15, 21, 27)
-"""Edges (px) of the box filters of an octave."""
 MAX_PIXELS = 2**31 // 255
 """A larger image would overflow the 32-bit integral image."""
 
@@ -31,6 +29,7 @@ _BORDERS = (14, 17)
 it is compared with, and one around it, and one for the vertex."""
 _KEPT_ROWS = 4
 """Rows of determinants that are kept; a maximum needs three."""
+_fill_smaller, _fill_larger = row_filter(FILTER_SIZES[1]), row_filter(FILTER_SIZES[2])
 
 IntegralImage = npt.NDArray[np.int32]
 
@@ -49,7 +48,7 @@ def find_keypoints(first, second, octaves, threshold, found):  # type: ignore[no
     """
     count, pixel = 0, np.float32(1.0)
     for _ in range(octaves):
-        number = find_maxima(integral_image(first), threshold, found[count:])
+        number = find_maxima(wrapped_integral(first), threshold, found[count:])
         for k in range(count, count + number):
             for axis in range(2):
                 found[k, axis] = (found[k, axis] + np.float32(0.5)) * pixel - np.float32(0.5)
@@ -86,83 +85,6 @@ def integral_image(image: ByteArray) -> IntegralImage:
     return out
 
 
-@in_place()
-def hessian_row(integral, size, y, sums, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` with ``Dxx Dyy - (0.9 Dxy)^2`` of a row, normalised by the filter's area; its ends stay as they are.
-
-    ``sums`` (6, width + 1) is room.
-    """
-    width = integral.shape[1] - 1
-    lobe, half = size // 3, size // 2
-    middle = lobe // 2
-    n = width - 2 * half
-    band, stack, cross, xx, yy, xy = sums[0], sums[1], sums[2], sums[3][:n], sums[4][:n], sums[5][:n]
-    # Column sums of Dxx's band, of Dyy's weighted stack, of Dxy's upper minus lower boxes.
-    _difference(integral[y + lobe], integral[y - lobe + 1], band)
-    _outer_less_inner(integral[y + half + 1], integral[y - half], integral[y + middle + 1], integral[y - middle], stack)
-    _crossed(integral[y], integral[y - lobe], integral[y + lobe + 1], integral[y + 1], cross)
-    _outer_less_inner(band[2 * half + 1 :], band, band[half + middle + 1 :], band[half - middle :], xx)
-    _difference(stack[half + lobe :], stack[half - lobe + 1 :], yy)
-    _crossed(cross[half + 1 :], cross[half - lobe :], cross[half + lobe + 1 :], cross[half:], xy)
-    _determinants(xx, yy, xy, np.float32(1.0 / (size * size)), out[half : half + n])
-
-
-# Each of these loops has one array to write and few to read: with more of them the compiler gives up proving that they
-# do not overlap, and vectorises nothing.
-@in_place()
-def _difference(plus, minus, out):  # type: ignore[no-untyped-def]
-    for x in range(len(out)):
-        out[x] = plus[x] - minus[x]
-
-
-@in_place()
-def _outer_less_inner(plus, minus, inner_plus, inner_minus, out):  # type: ignore[no-untyped-def]
-    """Sums of a box less three times those of its middle third."""
-    for x in range(len(out)):
-        out[x] = plus[x] - minus[x] - 3 * (inner_plus[x] - inner_minus[x])
-
-
-@in_place()
-def _crossed(first, second, third, fourth, out):  # type: ignore[no-untyped-def]
-    for x in range(len(out)):
-        out[x] = first[x] - second[x] - third[x] + fourth[x]
-
-
-@in_place()
-def _determinants(xx, yy, xy, scale, out):  # type: ignore[no-untyped-def]
-    for x in range(len(out)):
-        dxx, dyy, dxy = np.float32(xx[x]) * scale, np.float32(yy[x]) * scale, np.float32(xy[x]) * scale
-        out[x] = dxx * dyy - np.float32(0.81) * dxy * dxy
-
-
-@in_place()
-def _determinant_at(integral, x, y, size):  # type: ignore[no-untyped-def]
-    """The same as :func:`hessian_row` at one pixel."""
-    lobe, half = size // 3, size // 2
-    middle = lobe // 2
-    scale = np.float32(1.0 / (size * size))
-    wide, tall = (half, lobe - 1), (lobe - 1, half)
-    xx = _box(integral, x, y, wide) - 3 * _box(integral, x, y, (middle, lobe - 1))
-    yy = _box(integral, x, y, tall) - 3 * _box(integral, x, y, (lobe - 1, middle))
-    xy = np.int32(0)
-    for sy in (-1, 1):
-        for sx in (-1, 1):
-            # Box of size ``lobe``, one pixel off the axes.
-            left, top = (x + 1 if sx > 0 else x - lobe), (y + 1 if sy > 0 else y - lobe)
-            upper, lower = integral[top], integral[top + lobe]
-            xy += sx * sy * (lower[left + lobe] - lower[left] - upper[left + lobe] + upper[left])
-    dxx, dyy, dxy = np.float32(xx) * scale, np.float32(yy) * scale, np.float32(xy) * scale
-    return dxx * dyy - np.float32(0.81) * dxy * dxy
-
-
-@in_place()
-def _box(integral, x, y, reach):  # type: ignore[no-untyped-def]
-    """Sum over the pixels at most ``reach`` (columns, rows) away."""
-    upper, lower = integral[y - reach[1]], integral[y + reach[1] + 1]
-    left, right = x - reach[0], x + reach[0] + 1
-    return lower[right] - lower[left] - upper[right] + upper[left]
-
-
 @njit(cache=True, nogil=True)
 def find_maxima(integral, threshold, found):  # type: ignore[no-untyped-def]
     """Write maxima of 3x3x3 neighbourhoods above ``threshold`` to ``found`` rows u, v, scale, response.
@@ -172,7 +94,7 @@ def find_maxima(integral, threshold, found):  # type: ignore[no-untyped-def]
     Both middle layers are filtered row by row and searched right behind, while their last rows are in the cache.
     """
     width = integral.shape[1] - 1
-    sums = np.empty((6, width + 1), np.int32)
+    sums = np.empty((4, width + 1), np.uint16)
     layers = np.zeros((2, _KEPT_ROWS, width), np.float32)
     marks, cube = np.zeros(-(-width // 8) * 8, np.uint8), np.empty((3, 3, 3), np.float32)
     return _find_in_rows(integral, threshold, sums, layers, marks, cube, np.empty(3), found)
@@ -184,10 +106,10 @@ def _find_in_rows(integral, threshold, sums, layers, marks, cube, offset, found)
     height = integral.shape[0] - 1
     count = 0
     for y in range(height):
-        for place in range(2):
-            size = FILTER_SIZES[place + 1]
-            if size // 2 <= y < height - size // 2:
-                hessian_row(integral, size, y, sums, layers[place, y % _KEPT_ROWS])
+        if FILTER_SIZES[1] // 2 <= y < height - FILTER_SIZES[1] // 2:
+            _fill_smaller(integral, y, sums, layers[0, y % _KEPT_ROWS])
+        if FILTER_SIZES[2] // 2 <= y < height - FILTER_SIZES[2] // 2:
+            _fill_larger(integral, y, sums, layers[1, y % _KEPT_ROWS])
         for place in range(2):
             if _BORDERS[place] <= y - 1 < height - _BORDERS[place]:
                 count += _find_in_row(integral, layers, place, y - 1, threshold, marks, cube, offset, found[count:])
@@ -251,12 +173,15 @@ def _is_higher(row, x, value):  # type: ignore[no-untyped-def]
 
 @in_place()
 def _fill_outer(integral, x, y, size, value, out):  # type: ignore[no-untyped-def]
-    """Determinants (3, 3) of a layer that is not filtered everywhere; False as soon as one is not below ``value``."""
-    for j in range(3):
-        for i in range(3):
-            out[j, i] = _determinant_at(integral, x + i - 1, y + j - 1, size)
-            if out[j, i] >= value:
-                return False
+    """Determinants (3, 3) of a layer that is not filtered everywhere; False as soon as one is not below ``value``.
+
+    The one in the middle, which is the largest most often, comes first.
+    """
+    for k in range(9):
+        j, i = (k + 4) % 9 // 3, (k + 4) % 3
+        out[j, i] = determinant_at(integral, x + i - 1, y + j - 1, size)
+        if out[j, i] >= value:
+            return False
     return True
 
 

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled kernels of the box-filter Hessian (Bay et al. 2008, section 3.2), in whole numbers of 16 bits.
+
+The integral image is kept modulo 2^16: the sum over a box is a difference of its corners and comes out exact as long as
+it is below 2^16 itself, however often the corners have wrapped around. So each lobe of a filter is summed by itself,
+and only what may leave that range, Dxx and Dyy, is put together in 32 bits. Half the bytes, twice the numbers per
+vector register: half the time of a 32-bit integral image, with the same determinants to the last bit.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from slam_core.in_place import in_place
+from slam_core.types import ByteArray
+
+FILTER_SIZES = (9, 15, 21, 27)
+"""Edges (px) of the box filters of an octave."""
+_LARGEST_IN_ROWS = 21
+"""Edge (px) of the largest filter whose two outer lobes together stay below 2^16."""
+
+WrappedIntegral = npt.NDArray[np.uint16]
+_Index = np.uintp
+"""Unsigned indices cannot be negative, so that the kernels need not look whether they count from the end."""
+
+
+@njit(cache=True, nogil=True)
+def wrapped_integral(image: ByteArray) -> WrappedIntegral:
+    """Sums over all pixels above and to the left modulo 2^16, uint16 (height + 1, width + 1)."""
+    height, width = image.shape
+    out = np.empty((height + 1, width + 1), np.uint16)
+    out[0] = np.uint16(0)
+    for y in range(height):
+        out[y + 1, 0] = np.uint16(0)
+        _running_sum(image[y], out[y + 1, 1:])
+        _add(out[y], out[y + 1])
+    return out
+
+
+@in_place()
+def _running_sum(values, out):  # type: ignore[no-untyped-def]
+    total = np.uint16(0)
+    for x in range(len(values)):
+        total = np.uint16(total + values[x])
+        out[x] = total
+
+
+@in_place()
+def _add(values, out):  # type: ignore[no-untyped-def]
+    for x in range(len(values)):
+        out[x] = np.uint16(out[x] + values[x])
+
+
+def row_filter(size: int) -> Any:
+    """A kernel ``(integral, y, sums, out)`` for the filter of an edge of ``size`` px.
+
+    It fills ``out`` with ``Dxx Dyy - (0.9 Dxy)^2`` of row y, normalised by the filter's area; the row's ends stay as
+    they are. ``sums``, uint16 (4, width + 1), is room. The size is known to the compiler, which only so finds out that
+    the shifted reads of one array do not overlap with what is written.
+    """
+    if size > _LARGEST_IN_ROWS:
+        raise ValueError(f"lobes of a filter of {size} px do not stay below 2^16")
+    lobe, half = size // 3, size // 2
+    middle = lobe // 2
+    determinants = _determinants_of(size)
+
+    @in_place()
+    def fill_row(integral, y, sums, out):  # type: ignore[no-untyped-def]
+        column, inner, outer, cross = sums[0], sums[1], sums[2], sums[3]
+        _difference(integral[y + lobe], integral[y - lobe + 1], column)
+        _difference(integral[y + middle + 1], integral[y - middle], inner)
+        _difference(integral[y + half + 1], integral[y - half], outer)
+        _subtract(inner, outer)
+        _crossed(integral[y], integral[y - lobe], integral[y + lobe + 1], integral[y + 1], cross)
+        determinants(column, inner, outer, cross, out[half : integral.shape[1] - 1 - half])
+
+    return fill_row
+
+
+# Each of these loops has one array to write and few to read: with more of them the compiler gives up proving that they
+# do not overlap, and vectorises nothing.
+@in_place()
+def _difference(plus, minus, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        out[x] = np.uint16(plus[x] - minus[x])
+
+
+@in_place()
+def _subtract(values, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        out[x] = np.uint16(out[x] - values[x])
+
+
+@in_place()
+def _crossed(first, second, third, fourth, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        out[x] = np.uint16(first[x] - second[x] - third[x] + fourth[x])
+
+
+def _determinants_of(size: int) -> Any:
+    """A kernel that makes determinants from the column sums of a row.
+
+    column: of Dxx's band; inner, outer: of Dyy's middle lobe and of its other two; cross: of Dxy's upper less its lower
+    boxes. All are summed up along the row.
+    """
+    lobe, half = size // 3, size // 2
+    middle = lobe // 2
+    far, right, left = _Index(2 * half + 1), _Index(half + middle + 1), _Index(half - middle)
+    end, begin = _Index(half + lobe), _Index(half - lobe + 1)
+    before, own, after, last = _Index(half - lobe), _Index(half), _Index(half + 1), _Index(half + lobe + 1)
+    scale = np.float32(1.0 / (size * size))
+
+    @in_place()
+    def determinants(column, inner, outer, cross, out):  # type: ignore[no-untyped-def]
+        for i in range(len(out)):
+            x = _Index(i)
+            within = np.uint16(column[x + right] - column[x + left])
+            beside = np.uint16(column[x + far] - column[x] - within)
+            above = np.uint16(outer[x + end] - outer[x + begin])
+            between = np.uint16(inner[x + end] - inner[x + begin])
+            xx, yy = np.int32(beside) - 2 * np.int32(within), np.int32(above) - 2 * np.int32(between)
+            xy = np.int16(cross[x + own] - cross[x + before] - cross[x + last] + cross[x + after])
+            dxx, dyy, dxy = np.float32(np.int32(xx)) * scale, np.float32(np.int32(yy)) * scale, np.float32(xy) * scale
+            out[x] = dxx * dyy - np.float32(0.81) * dxy * dxy
+
+    return determinants
+
+
+@in_place()
+def determinant_at(integral, x, y, size):  # type: ignore[no-untyped-def]
+    """The same at one pixel, for a filter of any of the sizes."""
+    lobe, half = size // 3, size // 2
+    middle = lobe // 2
+    top, bottom = integral[y - lobe + 1], integral[y + lobe]
+    xx = _box(top, bottom, x - half, x - middle) - 2 * _box(top, bottom, x - middle, x + middle + 1)
+    xx += _box(top, bottom, x + middle + 1, x + half + 1)
+    left, right = x - lobe + 1, x + lobe
+    first, second, third, fourth = (
+        integral[y - half],
+        integral[y - middle],
+        integral[y + middle + 1],
+        integral[y + half + 1],
+    )
+    yy = _box(first, second, left, right) - 2 * _box(second, third, left, right) + _box(third, fourth, left, right)
+    upper, above, below, lower = integral[y - lobe], integral[y], integral[y + 1], integral[y + lobe + 1]
+    xy = _box(upper, above, x - lobe, x) - _box(upper, above, x + 1, x + lobe + 1)
+    xy += _box(below, lower, x + 1, x + lobe + 1) - _box(below, lower, x - lobe, x)
+    scale = np.float32(1.0 / (size * size))
+    dxx, dyy, dxy = np.float32(xx) * scale, np.float32(yy) * scale, np.float32(xy) * scale
+    return dxx * dyy - np.float32(0.81) * dxy * dxy
+
+
+@in_place()
+def _box(upper, lower, left, right):  # type: ignore[no-untyped-def]
+    """Sum over the pixels between two rows and two columns of corners, below 2^16."""
+    return np.int64(np.uint16(lower[right] - lower[left] - upper[right] + upper[left]))
