@@ -13,6 +13,10 @@ from typing import Any
 
 from numba import njit
 
+from slam_core.kernel_cache import load_machine_code_alone
+
+load_machine_code_alone()
+
 
 def in_place(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """``njit`` with cache, without the interpreter's lock and without counting references; ``options`` go to it."""

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels from Numba's cache take their machine code alone: half the memory, and half the time, of loading them.
+
+A cached kernel comes with its LLVM code too, for kernels that are yet to be compiled and call it. Numba parses that of
+every kernel that it loads and keeps it, 0.4 MB each. Here it stays packed until somebody asks, which nobody does once
+all kernels are compiled (``slam warmup``). Which functions a kernel defines is read from its machine code instead.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from functools import cache
+from typing import Any
+
+import numpy as np
+from llvmlite import binding as llvm
+from numba.core.codegen import CPUCodeLibrary
+
+_FASTEST = 1
+"""Level of compression."""
+_ELF = b"\x7fELF\x02\x01"
+"""First bytes of an object file of Linux, 64 bits, little endian."""
+_SECTION = np.dtype([("name", "<u4"), ("kind", "<u4"), ("flags", "<u8"), ("address", "<u8"), ("offset", "<u8"),
+                     ("size", "<u8"), ("link", "<u4"), ("rest", "V20")])  # fmt: skip
+_SYMBOL = np.dtype(
+    [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("at", "<u8"), ("size", "<u8")]
+)
+_SYMBOL_TABLE = 2
+
+
+def load_machine_code_alone() -> None:
+    """Have kernels loaded so from now on, in this process; a second call changes nothing."""
+    CPUCodeLibrary._unserialize = classmethod(_unserialize)  # type: ignore[method-assign,assignment]
+
+
+_load_all = CPUCodeLibrary._unserialize.__func__  # type: ignore[attr-defined]
+
+
+def _unserialize(cls: Any, codegen: Any, state: tuple[str, str, Any]) -> Any:
+    """In place of Numba's: a compiled library from what the cache holds."""
+    name, kind, data = state
+    if kind != "object" or not data[0].startswith(_ELF):
+        return _load_all(cls, codegen, state)
+    machine_code, llvm_code = data
+    library = _load_all(cls, codegen, (name, kind, (machine_code, _nothing())))
+    codegen._engine._defined_symbols |= defined_symbols(machine_code)
+    packed = zlib.compress(llvm_code, _FASTEST)
+
+    @cache
+    def module_for_linking() -> Any:
+        return llvm.parse_bitcode(zlib.decompress(packed))
+
+    library._get_module_for_linking = module_for_linking
+    return library
+
+
+@cache
+def _nothing() -> bytes:
+    """LLVM code of an empty module."""
+    return bytes(llvm.parse_assembly("").as_bitcode())
+
+
+def defined_symbols(elf: bytes) -> set[str]:
+    """Names of the functions and variables that an object file (ELF, 64 bits) defines for others."""
+    (first,) = struct.unpack_from("<Q", elf, 0x28)
+    (count,) = struct.unpack_from("<H", elf, 0x3C)
+    sections = np.frombuffer(elf, _SECTION, count, first)
+    names: set[str] = set()
+    for table in sections[sections["kind"] == _SYMBOL_TABLE]:
+        symbols = np.frombuffer(elf, _SYMBOL, int(table["size"]) // _SYMBOL.itemsize, int(table["offset"]))
+        text = int(sections[int(table["link"])]["offset"])
+        for at in symbols["name"][(symbols["section"] != 0) & (symbols["info"] >> 4 != 0)].tolist():
+            names.add(elf[text + at : elf.index(b"\0", text + at)].decode())
+    return names
