@@ -36,6 +36,8 @@ def test_a_newer_transform_replaces_the_old_one() -> None:
     moved = np.eye(4)
     moved[0, 3] = 1.0
     tree.add("a", "b", np.eye(4))
+    tree.lookup("a", "b")[0, 3] = 7.0
+    np.testing.assert_array_equal(tree.lookup("a", "b"), np.eye(4))
     tree.add("a", "b", moved)
     np.testing.assert_array_equal(tree.lookup("a", "b"), moved)
     assert "b" in tree

@@ -16,11 +16,13 @@ class FrameTree:
     def __init__(self) -> None:
         self._neighbours: dict[str, dict[str, FloatArray]] = {}
         self._parents: dict[str, str] = {}
+        self._found: dict[tuple[str, str], FloatArray] = {}
 
     def add(self, parent: str, child: str, T_parent_child: FloatArray) -> None:
         """Set or replace one transform (4, 4); a frame has one parent, so that an earlier one is forgotten."""
         if not is_rigid_transform(T_parent_child):
             raise ValueError(f"transform {parent} <- {child} is not rigid: {T_parent_child.tolist()}")
+        self._found.clear()
         earlier = self._parents.get(child, parent)
         if earlier != parent:
             del self._neighbours[earlier][child], self._neighbours[child][earlier]
@@ -61,6 +63,11 @@ class FrameTree:
         ValueError
             If no chain of transforms joins the two frames.
         """
+        if (target, source) not in self._found:
+            self._found[target, source] = self._looked_up(target, source)
+        return self._found[target, source].copy()
+
+    def _looked_up(self, target: str, source: str) -> FloatArray:
         if target == source:
             return np.eye(4)
         reached: dict[str, FloatArray] = {target: np.eye(4)}

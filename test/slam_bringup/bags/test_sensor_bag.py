@@ -65,6 +65,20 @@ def test_readings_are_paired_and_of_one_stamp_depth_comes_before_stereo(tmp_path
     assert not opened.left_out
 
 
+def test_true_poses_are_read_along_with_the_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        write_agent(bag)
+    with SensorBag(tmp_path / "bag") as opened:
+        first = opened.ground_truth("")
+        assert list(opened.readings())
+        monkeypatch.setattr(opened.reader, "raw", None)
+        second = opened.ground_truth("")
+    assert first is not None
+    assert second is not None
+    np.testing.assert_array_equal(first.poses, second.poses)
+    np.testing.assert_array_equal(first.stamps_ns, second.stamps_ns)
+
+
 def test_imu_readings_keep_the_axes_of_the_imu(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as bag:
         write_agent(bag)

@@ -75,6 +75,7 @@ class SensorBag:
         """Messages that the last :meth:`readings` left out, by reason."""
         self._warnings: list[str] = []
         self._names = names or BagNames()
+        self._true_poses: dict[str, list[bytes]] = {}
 
     def __enter__(self) -> Self:
         self.reader.__enter__()
@@ -107,13 +108,18 @@ class SensorBag:
             for role in (role for role in ROLES_READ if role in sensors.topics and (colours or role != "color")):
                 route.setdefault(sensors.topics[role], []).append((agent, role))
         types = {name: info.type_name for name, info in self.reader.topics.items()}
-        for topic, _, data in self.reader.raw(route):
+        true_poses: dict[str, list[bytes]] = {topic: [] for topic in self._truth_topics()}
+        for topic, _, data in self.reader.raw({*route, *true_poses}):
+            if topic in true_poses:
+                true_poses[topic].append(data)
+                continue
             try:
                 message = self.reader.decode(types[topic], data)
                 for agent, role in route[topic]:
                     yield from pairing[agent].add(role, message)
             except ValueError as error:
                 self._count_unusable(topic, error)
+        self._true_poses = true_poses
         for p in pairing.values():
             p.finish()
 
@@ -123,6 +129,10 @@ class SensorBag:
         text = f"{topic}: {error}"
         if self.left_out[reason] == 1 and text not in self._warnings:
             self._warnings.append(text)
+
+    def _truth_topics(self) -> set[str]:
+        """Topics of true poses: read along with the rest, for another pass would unpack the whole bag."""
+        return {s.topics["ground_truth"] for s in self.sensors.values() if "ground_truth" in s.topics}
 
     @property
     def calibration(self) -> RigCalibration:
@@ -144,7 +154,11 @@ class SensorBag:
         topic = self.sensors[agent].topics.get("ground_truth")
         if topic is None:
             return None
-        poses = {stamp_ns(m): pose_from_message(m.pose) for _, _, m in self.reader.messages([topic])}
+        if topic not in self._true_poses:  # the bag has not been read to its end
+            self._true_poses[topic] = [data for _, _, data in self.reader.raw([topic])]
+        type_name = self.reader.topics[topic].type_name
+        messages = (self.reader.decode(type_name, data) for data in self._true_poses[topic])
+        poses = {stamp_ns(m): pose_from_message(m.pose) for m in messages}
         stamps = sorted(poses)
         return Trajectory(np.array(stamps, dtype=np.int64), np.stack([poses[s] for s in stamps])) if stamps else None
 

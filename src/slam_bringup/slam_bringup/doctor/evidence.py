@@ -146,7 +146,7 @@ def _gather_agent(bag: BagReader, agent: str, frames: FrameTree, names: BagNames
     usual = [f for f in (f"{agent}/base_link", "base_link") if f in frames]
     base = names.base_frame or (usual[0] if usual else "")
     evidence = Evidence(agent, topics, streams, calibrations, frames, base)
-    _decode_sample(bag, evidence)
+    _decode_sample(bag, evidence, messages)
     return evidence
 
 
@@ -183,7 +183,7 @@ def _read_frames(bag: BagReader) -> FrameTree:
     return tree
 
 
-def _decode_sample(bag: BagReader, evidence: Evidence) -> None:
+def _decode_sample(bag: BagReader, evidence: Evidence, messages: int | None) -> None:
     """Bursts of the left camera, or of the depth camera without one, and all that is nearest to them in time."""
     leader = "left" if "left" in evidence.streams else evidence.depth_role
     wanted = _bursts(evidence.streams[leader].stamps)
@@ -196,7 +196,9 @@ def _decode_sample(bag: BagReader, evidence: Evidence) -> None:
     samples: list[FloatArray] = []
     imu = [evidence.topics["imu"]] if "imu" in evidence.streams else []
     last = max(max(stamps, default=0) for stamps in chosen.values())
-    for topic, _, data in bag.raw([*chosen, *imu]):
+    for count, (topic, _, data) in enumerate(bag.raw([*chosen, *imu])):
+        if messages is not None and count >= messages:
+            break
         stamp = header_stamp_ns(data)
         if topic not in imu and stamp not in chosen[topic]:
             continue
