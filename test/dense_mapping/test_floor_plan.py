@@ -146,6 +146,17 @@ def test_levelling_turns_up_into_z(rng):
     np.testing.assert_allclose(level_transform(np.array([0, 0, -1.0]))[:3, :3] @ [0, 0, -1], [0, 0, 1], atol=1e-12)
 
 
+def test_a_model_of_final_poses_keeps_little_and_has_the_same_plan(both_rooms):
+    fixed = DenseModel(both_rooms.config, fixed=True)
+    for placed in both_rooms.keyframes:
+        fixed.add_keyframe(placed.camera, placed.T_map_camera, placed.keyframe)
+    surface = fixed.surface()
+    (plan,), (other,) = (model.floor_plans(surface) for model in (both_rooms, fixed))
+    np.testing.assert_array_equal(plan.cells, other.cells)
+    pixels = [sum(k.keyframe.depth_units.size for k in model.keyframes) for model in (both_rooms, fixed)]
+    assert pixels[1] == pixels[0] / 16
+
+
 def test_a_plan_that_would_fill_the_memory_is_refused_with_what_to_do(both_rooms):
     drifted = boxplus(both_rooms.keyframes[-1].T_map_camera, np.array([5000.0, 0, 0, 0, 0, 0]))
     model = flat_model([(1.5, 1.5)])

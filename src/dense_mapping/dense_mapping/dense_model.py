@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dense_mapping.floor_plan import FloorPlan, FloorPlanConfig, floor_plans
-from dense_mapping.keyframes import Keyframe, KeyframeConfig, KeyframeSelector, PlacedKeyframe, make_keyframe
+from dense_mapping.floor_plan import RAY_STEP, FloorPlan, FloorPlanConfig, floor_plans
+from dense_mapping.keyframes import Keyframe, KeyframeConfig, KeyframeSelector, PlacedKeyframe, make_keyframe, thinned
 from dense_mapping.stereo_depth import StereoDepthConfig
 from dense_mapping.surface import Surface, SurfaceConfig, extract_surface
 from dense_mapping.tsdf import TsdfConfig, TsdfVolume
@@ -56,14 +56,20 @@ class DenseConfig(Config):
 class DenseModel:
     """Collects key frames of any number of cameras.
 
+    Parameters
+    ----------
+    fixed
+        Poses are final: nothing will be moved, and of the key frames only what floor plans need is kept.
+
     Attributes
     ----------
     moved
         How often a key frame was moved since the start.
     """
 
-    def __init__(self, config: DenseConfig | None = None) -> None:
+    def __init__(self, config: DenseConfig | None = None, *, fixed: bool = False) -> None:
         self.config = config or DenseConfig()
+        self._fixed = fixed
         self.moved = 0
         self.reset()
 
@@ -92,6 +98,8 @@ class DenseModel:
         """Put a key frame that is made already into the field."""
         placed = PlacedKeyframe(camera, keyframe, T_map_camera)
         self._put(placed)
+        if self._fixed:
+            placed.keyframe = thinned(keyframe, RAY_STEP)
         self._placed.append(placed)
         del self._placed[: -self.config.max_keyframes]
 

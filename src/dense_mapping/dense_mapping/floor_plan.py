@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dense_mapping.keyframes import PlacedKeyframe
+from dense_mapping.keyframes import PlacedKeyframe, thinned
 from dense_mapping.levelling import floor_heights, level_transform, storey_of, up_direction
 from dense_mapping.surface import Surface
 from slam_core.camera import MIN_DEPTH
@@ -28,7 +28,7 @@ _MIN_COVER = 0.3
 """Surface above a cell, as a share of its own area, that makes it occupied."""
 _MIN_RAYS = 2
 """Rays through a cell that make it free."""
-_RAY_STEP = 4
+RAY_STEP = 4
 """Every so many pixels a ray is drawn, px."""
 _STOREY_HEIGHT = 2.0
 """Least height from one floor to the next."""
@@ -127,7 +127,7 @@ def floor_plans(
     for i, floor in enumerate(floors):
         own = np.flatnonzero(storeys == i).tolist()
         band = (middles[:, 2] > floor + config.lowest) & (middles[:, 2] < floor + config.highest)
-        rays = [_rays(keyframes[k], poses[k], _RAY_STEP) for k in own]
+        rays = [_rays(keyframes[k], poses[k]) for k in own]
         if own:
             obstacles = Obstacles(middles[band], areas[band])
             plans.append(_plan(obstacles, rays, float(floor), config, T_level_map))
@@ -140,15 +140,13 @@ def _triangles(points: FloatArray, faces: npt.NDArray[np.int32]) -> tuple[FloatA
     return (a + b + c) / 3.0, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def _rays(placed: PlacedKeyframe, T_level_camera: FloatArray, step: int) -> FloatArray:
+def _rays(placed: PlacedKeyframe, T_level_camera: FloatArray) -> FloatArray:
     """Starts and ends (n, 6) of the rays of a key frame; the end is two sigma before what was measured."""
-    k, camera = placed.keyframe, placed.keyframe.camera
-    depth, sigma = k.depth[::step, ::step], k.sigma[::step, ::step]
+    k = thinned(placed.keyframe, RAY_STEP)
+    depth, sigma, camera = k.depth, k.sigma, k.camera
     v, u = np.nonzero(depth > 0.0)
     z = np.maximum(depth[v, u] - 2.0 * sigma[v, u], MIN_DEPTH).astype(np.float64)
-    directions = np.column_stack(
-        [(step * u - camera.cx) / camera.fx, (step * v - camera.cy) / camera.fy, np.ones(len(u))]
-    )
+    directions = np.column_stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))])
     ends = transform_points(T_level_camera, directions * z[:, None])
     return np.concatenate([np.tile(T_level_camera[:3, 3], (len(ends), 1)), ends], axis=1)
 

@@ -58,7 +58,7 @@ class KeyframeSelector:
 class Keyframe:
     """A depth image as small as it may be kept: depth in quarters, sigma in halves of a millimetre; 0: no reading.
 
-    ``picture``: (height, width, 3) uint8, or of no size.
+    ``picture``: (height, width, 3) uint8, or of no size. ``spacing``: pixels from one that is kept to the next.
     """
 
     stamp_ns: int
@@ -66,6 +66,7 @@ class Keyframe:
     depth_units: npt.NDArray[np.uint16]
     sigma_units: ByteArray
     picture: ByteArray
+    spacing: int = 1
 
     @property
     def depth(self) -> Float32Array:
@@ -111,6 +112,16 @@ def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray 
         np.where(depth > 0.0, np.clip(np.rint(sigma / _SIGMA_UNIT), 1, 255), 0).astype(np.uint8),
         NO_PICTURE if picture is None else np.ascontiguousarray(picture),
     )
+
+
+def thinned(keyframe: Keyframe, spacing: int) -> Keyframe:
+    """One pixel of ``spacing`` in rows and columns, without picture; at least as far apart as they are already."""
+    step = max(1, spacing // keyframe.spacing)
+    depth = np.ascontiguousarray(keyframe.depth_units[::step, ::step])
+    sigma = np.ascontiguousarray(keyframe.sigma_units[::step, ::step])
+    c, (height, width) = keyframe.camera, depth.shape
+    camera = Camera(width, height, c.fx / step, c.fy / step, c.cx / step, c.cy / step)
+    return Keyframe(keyframe.stamp_ns, camera, depth, sigma, NO_PICTURE, step * keyframe.spacing)
 
 
 def with_picture(keyframe: Keyframe, picture: ByteArray) -> Keyframe:

@@ -191,6 +191,7 @@ class GlobalMap:
             small = replace(submap, covariance=put(submap.covariance), descriptors=put(submap.descriptors), path=path)
             self.graph.records[old] = replace(self.graph.records[old], submap=small)
             self.detector.index.move(old, small.descriptors)
+            self._offload.forget()
 
     @property
     def components(self) -> int:
@@ -285,6 +286,7 @@ class GlobalMap:
                 break
         self.smoother.settle()
         self._account(self.consistency.relieve(), 0)
+        self._offload.forget()
         self._has_moved, self._is_settled = False, True
 
     @property

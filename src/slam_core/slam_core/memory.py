@@ -10,14 +10,18 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import mmap
 import sys
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 """Parameters of ``mallopt`` (malloc.h)."""
+_LLVM = "libllvmlite.so"
 _KEPT_BYTES = 64 << 20
 _LARGE_BYTES = 8 << 20
+_FEW_BYTES = 1 << 20
 _NEW_OBJECTS = 10_000
 """Objects made, less those freed, that begin a search for garbage; Python has 700."""
 
@@ -38,6 +42,14 @@ def share_one_heap() -> None:
         library.mallopt(parameter, value)
 
 
+def keep_little() -> None:
+    """From here on give back what is freed, as soon as it is a megabyte: for what is done once, not in every frame."""
+    library = _glibc()
+    if library is not None:
+        for parameter in (_MMAP_THRESHOLD, _TRIM_THRESHOLD):
+            library.mallopt(parameter, _FEW_BYTES)
+
+
 def search_less_garbage() -> None:
     """Leave all that is loaded so far out of the search for garbage, and search less often: 3 % of a run's time."""
     gc.freeze()
@@ -46,7 +58,15 @@ def search_less_garbage() -> None:
 
 
 def give_back() -> None:
-    """Return freed memory to the system, between two parts of a run that need it for different things."""
+    """Return freed memory to the system, between two parts of a run that need it for different things.
+
+    So is the code of LLVM, 50 MB, which loads kernels and then does nothing; whoever needs it again reads it again.
+    """
     library = _glibc()
-    if library is not None:
-        library.malloc_trim(0)
+    if library is None:
+        return
+    library.malloc_trim(0)
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        if line.endswith(_LLVM) and " r-xp " in line:
+            first, end = (int(address, 16) for address in line.split()[0].split("-"))
+            library.madvise(ctypes.c_void_p(first), ctypes.c_size_t(end - first), mmap.MADV_DONTNEED)

@@ -31,3 +31,20 @@ def test_many_arrays_open_few_files(rng: np.random.Generator) -> None:
     assert len(list(OPEN.iterdir())) - before < 5
     assert all((a == k).all() and a.shape == (k + 1, 3) for k, a in enumerate(stored))
     assert np.array_equal(on_disk, large)
+
+
+@pytest.mark.skipif(not OPEN.exists(), reason="counts resident pages as Linux does")
+def test_what_was_read_is_left_to_the_system_and_read_again(rng: np.random.Generator) -> None:
+    disk, large = Offload(), rng.integers(0, 255, (40, 1 << 20), np.uint8)
+    on_disk = disk.put(large)
+    assert np.array_equal(on_disk, large)
+    read = _mapped_mib()
+    disk.forget()
+    assert _mapped_mib() < read - 30
+    assert np.array_equal(on_disk, large)
+
+
+def _mapped_mib() -> float:
+    """Resident memory of this process that files hold, MiB."""
+    (line,) = (row for row in Path("/proc/self/status").read_text().splitlines() if row.startswith("RssFile"))
+    return int(line.split()[1]) / 1024

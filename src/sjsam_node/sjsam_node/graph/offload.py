@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Large arrays of old submaps on disk, in one file that nobody else sees and that ends with the process."""
+"""Large arrays of old submaps on disk, in one file that nobody else sees and that ends with the process.
+
+What is read stays in the process until the next submap comes: then the operating system alone decides what it keeps.
+"""
 
 from __future__ import annotations
 
+import mmap
 import tempfile
 from dataclasses import dataclass, field
 from typing import IO, Any
@@ -22,8 +26,14 @@ class Offload:
 
     _file: IO[Any] = field(default_factory=tempfile.TemporaryFile)
     _segment: AnyArray = field(default_factory=lambda: np.empty(0, np.uint8))
+    _mapped: list[mmap.mmap] = field(default_factory=list)
     _first: int = 0
     _end: int = 0
+
+    def forget(self) -> None:
+        """Leave what was read to the operating system; it is read again where it is used."""
+        for segment in self._mapped:
+            segment.madvise(mmap.MADV_DONTNEED)
 
     def put(self, array: AnyArray) -> AnyArray:
         """The same array, on disk and read only."""
@@ -33,7 +43,8 @@ class Offload:
             self._first += len(self._segment)
             self._end, size = self._first, max(_SEGMENT, -(-array.nbytes // _SEGMENT) * _SEGMENT)
             self._file.truncate(self._first + size)
-            self._segment = np.asarray(np.memmap(self._file, np.uint8, "r", self._first, (size,)))
+            self._mapped.append(mmap.mmap(self._file.fileno(), size, prot=mmap.PROT_READ, offset=self._first))
+            self._segment = np.frombuffer(self._mapped[-1], np.uint8)
         self._file.seek(self._end)
         self._file.write(np.ascontiguousarray(array).data)
         self._file.flush()

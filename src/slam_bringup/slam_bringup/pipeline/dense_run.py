@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
 
@@ -14,6 +17,7 @@ from dense_mapping.keyframes import grey_levels
 from dense_mapping.stereo_depth import stereo_depth
 from slam_bringup.bags.readings import AgentSensors, ColourReading, DepthReading, ImuReading, Reading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
 from slam_core.geometry import FloatArray
@@ -37,25 +41,68 @@ def dense_model(
 
     ``corrections``: by agent, what the rectification of its right images is wrong by, where that is sure.
     """
-    model = DenseModel(config.dense_mapper)
+    model = DenseModel(config.dense_mapper, fixed=True)
+    with FieldThread(model) as field, closing(ahead(bag.readings(colours=True), _is_an_image)) as readings:
+        _add_all(readings, bag, config, trajectories, field, on_reading, stopped, corrections or {})
+    return model
+
+
+def _add_all(
+    readings: Iterator[Reading],
+    bag: SensorBag,
+    config: SystemConfig,
+    trajectories: Mapping[str, Trajectory],
+    field: FieldThread,
+    on_reading: Callable[[], None],
+    stopped: Callable[[], bool],
+    corrections: Mapping[str, RectificationError | None],
+) -> None:
     cameras = {
-        agent: AgentDepth(bag.sensors[agent], config, trajectory, (corrections or {}).get(agent))
+        agent: AgentDepth(bag.sensors[agent], config, trajectory, corrections.get(agent))
         for agent, trajectory in trajectories.items()
         if len(trajectory)
     }
     last_ns = max((int(t.stamps_ns[-1]) for t in trajectories.values() if len(t)), default=0)
-    for reading in bag.readings(colours=True):
+    for reading in readings:
         if isinstance(reading, StereoReading | DepthReading) and reading.stamp_ns > last_ns:
             break
         if stopped():
             break
         if reading.agent in cameras:
-            cameras[reading.agent].add(reading, model)
+            cameras[reading.agent].add(reading, field)
         if not isinstance(reading, ColourReading):
             on_reading()
     for camera in cameras.values():
-        camera.finish(model)
-    return model
+        camera.finish(field)
+
+
+def _is_an_image(reading: Reading) -> bool:
+    return not isinstance(reading, ImuReading)
+
+
+class FieldThread:
+    """The model, whose key frames are put into its field by a thread: the depth of the next is measured meanwhile."""
+
+    def __init__(self, model: DenseModel) -> None:
+        self.model = model
+        self._pool = ThreadPoolExecutor(1, "field")
+        self._last: Future[None] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._pool:
+            self._wait()
+
+    def add(self, camera: str, T_map_camera: FloatArray, image: DepthImage, picture: ByteArray | None) -> None:
+        """Put a key frame into the model when the one before is there."""
+        self._wait()
+        self._last = self._pool.submit(self.model.add, camera, T_map_camera, image, picture)
+
+    def _wait(self) -> None:
+        if self._last is not None:
+            self._last.result()
 
 
 class AgentDepth:
@@ -85,58 +132,58 @@ class AgentDepth:
             self._stereo = stereo_stage(sensors)
             self._T_base_left = sensors.transform("base", "left")
 
-    def add(self, reading: Reading, model: DenseModel) -> None:
+    def add(self, reading: Reading, field: FieldThread) -> None:
         """Put the reading into the model if it is an image of a key frame."""
         if isinstance(reading, DepthReading) and self._depth is not None:
-            for camera, T in self._wanted(model, "tof", reading.stamp_ns, self._T_base_tof):
+            for camera, T in self._wanted(field, "tof", reading.stamp_ns, self._T_base_tof):
                 self._depth.add(reading.raw)
                 for image in self._depth.ready():
-                    self._add_depth(model, camera, T, image)
+                    self._add_depth(field, camera, T, image)
         elif isinstance(reading, ColourReading) and self._depth is not None:
             if (picture := self._depth.colour(reading.image)) is not None:
                 self._colours.add(reading.stamp_ns, picture)
-            self._put_coloured(model, reading.stamp_ns)
+            self._put_coloured(field, reading.stamp_ns)
         elif isinstance(reading, ImuReading):
             R_base_imu = self._sensors.frames.lookup(self._sensors.base_frame, reading.sample.frame_id)[:3, :3]
             self._forces.append((reading.sample.stamp_ns, R_base_imu @ reading.sample.linear_acceleration))
         elif isinstance(reading, StereoReading) and self._stereo is not None:
-            for camera, T in self._wanted(model, "stereo", reading.stamp_ns, self._T_base_left):
+            for camera, T in self._wanted(field, "stereo", reading.stamp_ns, self._T_base_left):
                 self._stereo.add(reading.pair)
                 for images in self._stereo.ready():
                     depth = stereo_depth(images, self._config.stereo)
-                    model.add(camera, T, depth, stereo_picture(images, self._has_colours))
+                    field.add(camera, T, depth, stereo_picture(images, self._has_colours))
 
-    def _add_depth(self, model: DenseModel, camera: str, T: FloatArray, image: DepthImage) -> None:
+    def _add_depth(self, field: FieldThread, camera: str, T: FloatArray, image: DepthImage) -> None:
         """Put a depth image into the model, or keep it until its colours have come."""
         if self._has_colours:
             self._uncoloured.append((camera, T, image))
         else:
-            model.add(camera, T, image, self._picture(image))
+            field.add(camera, T, image, self._picture(image))
 
-    def _put_coloured(self, model: DenseModel, until_ns: int | None = None) -> None:
+    def _put_coloured(self, field: FieldThread, until_ns: int | None = None) -> None:
         """Put those depth images into the model whose colours have come if they ever do: a later picture is here."""
         while self._uncoloured and (until_ns is None or self._uncoloured[0][2].stamp_ns <= until_ns):
             camera, T, image = self._uncoloured.pop(0)
             picture = self._colours.near(image.stamp_ns)
-            model.add(camera, T, image, NO_PICTURE if picture is None else picture)
+            field.add(camera, T, image, NO_PICTURE if picture is None else picture)
 
-    def finish(self, model: DenseModel) -> None:
+    def finish(self, field: FieldThread) -> None:
         """Give the model what waits, and what the accelerometer read along the trajectory: poses cost one by one."""
-        self._put_coloured(model)
+        self._put_coloured(field)
         stamps = self._trajectory.stamps_ns
         inside = [(stamp, force) for stamp, force in self._forces if stamps[0] <= stamp <= stamps[-1]]
         if inside:
             poses = self._trajectory.interpolate(np.array([stamp for stamp, _ in inside]))
             forces = np.array([force for _, force in inside])
-            model.add_specific_force(np.einsum("nij,nj->i", poses[:, :3, :3], forces))
+            field.model.add_specific_force(np.einsum("nij,nj->i", poses[:, :3, :3], forces))
 
     def _wanted(
-        self, model: DenseModel, sensor: str, stamp_ns: int, T_base_camera: FloatArray
+        self, field: FieldThread, sensor: str, stamp_ns: int, T_base_camera: FloatArray
     ) -> Iterator[tuple[str, FloatArray]]:
         """Name and pose T_map_camera if the stamp lies within the trajectory and its pose makes a key frame."""
         T_map_base = self._pose(stamp_ns)
         camera = f"{self._agent}/{sensor}"
-        if T_map_base is not None and model.wants(camera, T_map_base @ T_base_camera):
+        if T_map_base is not None and field.model.wants(camera, T_map_base @ T_base_camera):
             yield camera, T_map_base @ T_base_camera
 
     def _pose(self, stamp_ns: int) -> FloatArray | None:

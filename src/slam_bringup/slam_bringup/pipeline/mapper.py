@@ -22,6 +22,7 @@ from slam_bringup.pipeline.map_growth import MapGrowth
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges
 from slam_bringup.pipeline.sensor_pipeline import AgentItem
 from slam_bringup.pipeline.stage_times import StageTimes
+from slam_core.memory import give_back
 from slam_core.messages import rounded
 from slam_core.types import Features, ImuSample, PoseEstimate, Submap
 
@@ -76,6 +77,7 @@ class Mapper:
             self._take_results(agent)
             last += stage.finish()
             self._events += [stage.finding] if stage.finding else []
+        give_back()
         self._join(in_order(last))
         for join in self._joins:
             error = join.exception()

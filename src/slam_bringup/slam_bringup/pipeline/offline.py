@@ -11,19 +11,17 @@ does not depend on that.
 from __future__ import annotations
 
 import logging
-import queue
-import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
-from typing import TypeAlias, TypeVar
 
 import cv2
 
 from slam_bringup.bags.readings import ImuReading, Reading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
+from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.map_growth import MapGrowth, map_growth
 from slam_bringup.pipeline.mapper import Mapper
@@ -31,14 +29,10 @@ from slam_bringup.pipeline.results import RunResult
 from slam_bringup.pipeline.run_record import run_result, told
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_core.memory import give_back
+from slam_core.memory import give_back, keep_little
 from slam_core.types import ImuSample
 
 _LOG = logging.getLogger(__name__)
-T = TypeVar("T")
-Batches: TypeAlias = queue.Queue[tuple[list[T] | None, BaseException | None]]
-_AHEAD = 8
-"""Items that may wait between two stages."""
 
 
 def run_bag(
@@ -92,6 +86,7 @@ def run_bag(
             {agent: pipeline.log.frames for agent, pipeline in pipelines.items()},
         )
         _LOG.info("mapped %d submaps in %.1f s; the dense model is next", record.submaps, record.wall_s)
+        keep_little()
         give_back()
         with times.measure("dense model"):
             result = run_result(
@@ -105,7 +100,7 @@ def _map(mapping: Mapper, items: Generator[AgentItem, None, None]) -> str:
     failure = ""
     try:
         try:
-            for item in _ahead(items, _is_of_an_image):
+            for item in ahead(items, _is_of_an_image):
                 mapping.process(item)
         except Exception as error:
             if not mapping.has_frames:
@@ -121,7 +116,7 @@ def _measured(
     bag: SensorBag, pipelines: dict[str, SensorPipeline], on_reading: Callable[[], None], stopped: Callable[[], bool]
 ) -> Generator[AgentItem, None, None]:
     """Reading, finding features and measuring their depth, each on a thread of its own."""
-    with closing(_ahead(_extracted(bag, pipelines, on_reading, stopped), _is_of_an_image)) as items:
+    with closing(ahead(_extracted(bag, pipelines, on_reading, stopped), _is_of_an_image)) as items:
         for item in items:
             yield pipelines[item.agent].measure(item)
 
@@ -129,7 +124,7 @@ def _measured(
 def _extracted(
     bag: SensorBag, pipelines: dict[str, SensorPipeline], on_reading: Callable[[], None], stopped: Callable[[], bool]
 ) -> Generator[AgentItem, None, None]:
-    with closing(_ahead(bag.readings(), _is_of_an_image)) as readings:
+    with closing(ahead(bag.readings(), _is_of_an_image)) as readings:
         for reading in readings:
             yield from pipelines[reading.agent].add(reading)
             on_reading()
@@ -141,49 +136,3 @@ def _extracted(
 
 def _is_of_an_image(item: Reading | AgentItem) -> bool:
     return not isinstance(item.value if isinstance(item, AgentItem) else item, ImuReading | ImuSample)
-
-
-def _fill(
-    made: Batches[T], items: Generator[T, None, None], ends_batch: Callable[[T], bool], stopped: threading.Event
-) -> None:
-    """Put the items into the queue by batches, then None, with the error that has ended them if one has."""
-    error: BaseException | None = None
-    batch: list[T] = []
-    with closing(items):
-        try:
-            for item in items:
-                batch.append(item)
-                if not ends_batch(item):
-                    continue
-                made.put((batch, None))
-                batch = []
-                if stopped.is_set():
-                    return
-        except BaseException as caught:  # handed to the consumer, who raises it
-            error = caught
-    made.put((batch, None))
-    made.put((None, error))
-
-
-def _ahead(items: Generator[T, None, None], ends_batch: Callable[[T], bool]) -> Generator[T, None, None]:
-    """The same items, made by another thread a few batches ahead of their use.
-
-    Handing over wakes threads: IMU samples, ten to a frame, go together with the image that they come before.
-    """
-    made: Batches[T] = queue.Queue(_AHEAD)
-    stopped = threading.Event()
-    thread = threading.Thread(target=_fill, args=(made, items, ends_batch, stopped), name="images", daemon=True)
-    thread.start()
-    try:
-        while True:
-            ready, error = made.get()
-            if error is not None:
-                raise error
-            if ready is None:
-                return
-            yield from ready
-    finally:
-        stopped.set()
-        while thread.is_alive():  # it may wait for room; the bag must not be closed under it
-            with suppress(queue.Empty):
-                made.get(timeout=0.05)
