@@ -70,14 +70,16 @@ def test_fused_depth_is_better_than_both_and_its_sigma_true(rng):
     n, truth = 20000, 2.0
     sigma_stereo, sigma_tof = rng.uniform(0.01, 0.05, (2, n))
     stereo, tof = truth + sigma_stereo * rng.normal(size=n), truth + sigma_tof * rng.normal(size=n)
-    depth, sigma, fused = fuse_depth(stereo, sigma_stereo, MappedDepth(tof, sigma_tof, np.zeros((n, 2))), 9.0)
+    depth, sigma, fused = fuse_depth(
+        stereo, sigma_stereo, MappedDepth(tof, sigma_tof, np.zeros((n, 2)), np.ones(n)), 9.0
+    )
     assert fused.mean() == pytest.approx(0.9973, abs=0.002)
     assert np.std(depth - truth) < 0.9 * min(np.std(stereo - truth), np.std(tof - truth))
     assert 0.97 < np.std((depth - truth)[fused] / sigma[fused]) < 1.03
 
 
 def test_a_tof_depth_that_disagrees_is_left_out():
-    tof = MappedDepth(np.array([2.5, np.nan, 2.01]), np.array([0.01, np.nan, 0.01]), np.zeros((3, 2)))
+    tof = MappedDepth(np.array([2.5, np.nan, 2.01]), np.array([0.01, np.nan, 0.01]), np.zeros((3, 2)), np.ones(3))
     depth, sigma, fused = fuse_depth(np.array([2.0, 2.0, np.nan]), np.array([0.02, 0.02, np.nan]), tof, 9.0)
     assert not fused.any()
     np.testing.assert_array_equal(depth, [2.0, 2.0, np.nan])

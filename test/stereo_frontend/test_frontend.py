@@ -105,6 +105,21 @@ def test_a_tof_depth_that_disagrees_does_not_spoil_stereo(stereo_pair):
     np.testing.assert_allclose(features.depth[shared], stereo.depth)
 
 
+def test_a_tof_camera_that_errs_by_an_offset_is_corrected_to_agree_with_stereo(stereo_pair):
+    found = {}
+    for mode in ("auto", "off"):
+        front = frontend("fuse", **{"range_calibration.mode": mode})
+        for disparity in np.arange(8.0, 14.0, 0.5):
+            pair, depth = stereo_pair(disparity=disparity), 200.0 * 0.12 / disparity
+            features = front.process(pair, tof_image(pair, depth=depth + 0.05), IDENTITY)
+        fused = features.source != FeatureSource.STEREO
+        found[mode] = np.abs(np.median(features.depth[fused]) - depth), np.median(features.sigma_depth[fused])
+        assert front.report().ranges.get("corrected") == {"auto": "yes", "off": None}[mode]
+    assert found["auto"][0] < 0.01
+    assert found["auto"][0] < 0.25 * found["off"][0]
+    assert found["auto"][1] > found["off"][1]
+
+
 @pytest.mark.parametrize(("stamp_ns", "count"), [(2_000_000_000, "tof_too_old"), (None, "tof_missing")])
 def test_without_a_fresh_depth_image_stereo_stands_alone(stereo_pair, stamp_ns, count):
     pair = stereo_pair()

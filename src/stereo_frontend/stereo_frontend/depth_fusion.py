@@ -55,12 +55,13 @@ class MappedDepth:
     """Depth from the ToF camera for left pixels.
 
     depth, sigma: (n,) m along the left camera's z, NaN where the ToF camera sees no single surface. uv: (n, 2) px in
-    the ToF image.
+    the ToF image. ray_length: (n,) range over depth.
     """
 
     depth: FloatArray
     sigma: FloatArray
     uv: FloatArray
+    ray_length: FloatArray
 
 
 def map_depth(
@@ -102,7 +103,7 @@ def map_depth(
     depth = np.where(np.isfinite(update), update, depth)
     sigma = _mapped_sigma(samples, image.camera, age) / np.abs(rays_tof[:, 2])
     blank = np.where(settled & (depth > 0.0), 0.0, np.nan)
-    return MappedDepth(update + blank, sigma + blank, pixels)
+    return MappedDepth(update + blank, sigma + blank, pixels, np.linalg.norm(rays_tof, axis=1))
 
 
 def fuse_depth(

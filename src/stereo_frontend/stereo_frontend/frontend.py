@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from slam_core.camera import StereoCamera
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import Counters, DepthImage, Features, FeatureSource, Float32Array, StereoImages
@@ -33,6 +34,7 @@ from stereo_frontend.matching import (
     swapped_share,
 )
 from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
+from stereo_frontend.range_self_calibration import RangeDifferences, RangeSelfCalibration, RangeSelfCalibrationConfig
 from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.self_calibration import SelfCalibrationConfig, StereoSelfCalibration
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
@@ -63,6 +65,7 @@ class FrontendConfig(Config):
     noise: PixelNoiseConfig = group(PixelNoiseConfig)
     self_calibration: SelfCalibrationConfig = group(SelfCalibrationConfig)
     fusion: FusionConfig = group(FusionConfig)
+    range_calibration: RangeSelfCalibrationConfig = group(RangeSelfCalibrationConfig)
     tof: TofFeatureConfig = group(TofFeatureConfig)
 
 
@@ -70,15 +73,16 @@ class FrontendConfig(Config):
 class FrontendReport:
     """Findings of the front end about its images.
 
-    rectification: figures of the stereo pair; advice: to the user, a sentence each; picture: what features are searched
-    in: "stereo", "amplitude", "intensity", "range" or "" before the first image; correction: what the right image's
-    rectification is wrong by, where disparities are corrected for it.
+    rectification: figures of the stereo pair; ranges: of the depth camera beside it; advice: to the user, a sentence
+    each; picture: what features are searched in: "stereo", "amplitude", "intensity", "range" or "" before the first
+    image; correction: what the right image's rectification is wrong by, where disparities are corrected for it.
     """
 
     rectification: Mapping[str, float | str] = field(default_factory=dict)
     advice: tuple[str, ...] = ()
     picture: str = ""
     correction: RectificationError | None = None
+    ranges: Mapping[str, float | str] = field(default_factory=dict)
 
 
 def _more(config: FeatureConfig, factor: float) -> FeatureConfig:
@@ -99,6 +103,7 @@ class Frontend:
         self._right = FeatureExtractor(_more(self.config.features, RIGHT_SURPLUS))
         self._noise = PixelNoise(self.config.noise)
         self.self_calibration = StereoSelfCalibration(self.config.self_calibration)
+        self.range_calibration = RangeSelfCalibration(self.config.range_calibration)
         self._wide = self.self_calibration.widened(self.config.matching)
         self._tof = TofFeatures(self.config.tof, self.config.features, self.config.noise)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="second_core")
@@ -173,17 +178,21 @@ class Frontend:
 
     def reset(self) -> None:
         """Forget thresholds, noise and counts."""
-        for part in (self._left, self._right, self._noise, self.self_calibration, self._tof):
+        for part in (self._left, self._right, self._noise, self.self_calibration, self.range_calibration, self._tof):
             part.reset()
         self.counters = Counters()
 
     def report(self) -> FrontendReport:
         """Findings about the images so far."""
-        advice = (self.self_calibration.advice(), self._tof.advice())
+        advice = (self.self_calibration.advice(), self.range_calibration.advice(), self._tof.advice())
         picture = "+".join(self._tof.used) if self.config.mode == "tof" else "stereo"
         correction = self.self_calibration.error if self.self_calibration.corrects else None
         return FrontendReport(
-            self.self_calibration.figures(), tuple(text for text in advice if text), picture, correction
+            self.self_calibration.figures(),
+            tuple(text for text in advice if text),
+            picture,
+            correction,
+            self.range_calibration.figures(),
         )
 
     def _stereo_depth(self, images: StereoImages, left: Keypoints, right: Keypoints) -> DepthEstimate:
@@ -294,7 +303,25 @@ class Frontend:
         if age > self.config.fusion.max_age:
             self.counters.add("tof_too_old")
             return None
-        return map_depth(left.uv, stereo.depth, images.stereo.camera, depth, T, age)
+        return self._map_corrected(left.uv, stereo, images.stereo, depth, T, age)
+
+    def _map_corrected(
+        self, uv: Float32Array, stereo: DepthEstimate, pair: StereoCamera, depth: DepthImage, T: FloatArray, age: float
+    ) -> MappedDepth:
+        """Depth of left pixels with what is known of the range camera's errors, which what both see tells."""
+        calibration = self.range_calibration
+        fields = calibration.look(depth)
+        mapped = map_depth(uv, stereo.depth, pair.camera, calibration.corrected(depth, fields), T, age)
+        seen = np.flatnonzero(np.isfinite(mapped.depth))
+        sigma = mapped.sigma.copy()
+        sigma[seen] = np.hypot(sigma[seen], calibration.sigma(fields, mapped.uv[seen]) / mapped.ray_length[seen])
+        both = seen[np.isfinite(stereo.depth[seen])]
+        depths, sigmas = (
+            np.column_stack([getattr(e, name)[both] for e in (mapped, stereo)]) for name in ("depth", "sigma")
+        )
+        differences = RangeDifferences.between(mapped.uv[both], depths, sigmas, mapped.ray_length[both])
+        calibration.learn(depth, fields, differences)
+        return dataclasses.replace(mapped, sigma=sigma)
 
     def _reject_swapped(self, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> None:
         share, matches = swapped_share(left, right, self.config.matching, bounds)

@@ -77,10 +77,14 @@ class FeatureNode(StageNode[FrontendConfig]):
         self.listen_together(topics, self._on_depth)
 
     def _tof_picture(self) -> str:
-        """Image that is needed beside depth, or ""; a node cannot know what there will be, so auto means amplitude."""
-        if self.config.mode != "tof" or self.config.tof.images == "range":
-            return ""
-        return "intensity" if self.config.tof.images == "intensity" else "amplitude"
+        """Image that is needed beside depth, or ""; a node cannot know what there will be, so auto means amplitude.
+
+        In modes ``replace`` and ``fuse`` the amplitude tells of errors of the range.
+        """
+        images = self.config.tof.images
+        if images in ("intensity", "range"):
+            return "intensity" if images == "intensity" and self.config.mode == "tof" else ""
+        return "amplitude"
 
     def _on_info(self, side: str, message: Message) -> None:
         self.pairs.set_info(side, camera_info_from_message(message))
@@ -132,6 +136,8 @@ class FeatureNode(StageNode[FrontendConfig]):
         report = self.stage.report()
         for name, value in report.rectification.items():
             self.health.show(f"rectification_{name}", value)
+        for name, value in report.ranges.items():
+            self.health.show(f"ranges_{name}", value)
         self.health.show("picture", report.picture)
         self.health.show("advice", "; ".join(report.advice))
         few = f"only {number} features" if number < FEW_FEATURES else ""

@@ -3,11 +3,7 @@
 
 Row differences of matches give the field across the rows; pairs of moments the field along them
 (:mod:`stereo_frontend.two_view_consistency`). Both are evidence on the same ten numbers
-(:mod:`stereo_frontend.rectification_error`) and add up as normal equations.
-
-Errors within a frame, and of a landmark over frames, are not independent. So the covariance is not that of the normal
-equations alone, but the sandwich estimate over groups of moments (White 1980; Liang and Zeger 1986), drawn towards the
-former while there are few groups.
+(:mod:`stereo_frontend.rectification_error`) and add up as normal equations (:mod:`stereo_frontend.normal_equations`).
 
 The rows are followed from the first frame on. Disparities are corrected only when the evidence is beyond doubt: a
 correction without need harms.
@@ -25,9 +21,9 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, Float32Array
 from stereo_frontend.matching import MatchingConfig
+from stereo_frontend.normal_equations import NormalEquations, sandwich_estimate
 from stereo_frontend.rectification_error import PRIOR_SIGMA, RectificationError
 from stereo_frontend.two_view_consistency import (
-    NormalEquations,
     StereoView,
     consistency_equations,
     match_views,
@@ -57,8 +53,6 @@ _FEW = 30
 """Fewer matches say nothing."""
 _HYSTERESIS = 0.5
 """A correction stays until what asks for it falls below this share of what it took to begin."""
-_PRIOR_GROUPS = 5.0
-"""Weight of the normal equations' own covariance, in groups."""
 
 
 @dataclass(frozen=True)
@@ -180,15 +174,4 @@ def _estimate(evidence: list[NormalEquations], camera: Camera) -> RectificationE
     """The solution of all normal equations, with the sandwich covariance."""
     if not evidence:
         return RectificationError.unknown(camera)
-    information = np.array([e.information for e in evidence])
-    vectors = np.array([e.vector for e in evidence])
-    total = np.diag(1.0 / PRIOR_SIGMA**2) + information.sum(axis=0)
-    theta = np.linalg.solve(total, vectors.sum(axis=0))
-    scores = np.add.reduceat(vectors - information @ theta, np.arange(0, len(evidence), _GROUP), axis=0)
-    lower = np.linalg.cholesky(total)
-    whitened = np.linalg.solve(lower, scores.T)
-    ratio, axes = np.linalg.eigh(whitened @ whitened.T)
-    share = len(scores) / (len(scores) + _PRIOR_GROUPS)
-    # What scatters more than the equations claim is believed; what by chance scatters less is not.
-    half = np.linalg.solve(lower.T, axes) * np.sqrt(1.0 + share * np.maximum(ratio - 1.0, 0.0))
-    return RectificationError(camera, theta, half @ half.T)
+    return RectificationError(camera, *sandwich_estimate(evidence, np.diag(1.0 / PRIOR_SIGMA**2), _GROUP))

@@ -18,16 +18,15 @@ import numpy.typing as npt
 from slam_core.camera import StereoCamera
 from slam_core.geometry import FloatArray, make_transform, skew, so3_exp
 from slam_core.types import Float32Array
+from stereo_frontend.normal_equations import MEDIAN_CHI_SQUARE_1, NormalEquations, robust_weights
 from stereo_frontend.rectification_error import RectificationError, column_basis, row_basis
 
 _ITERATIONS = 6
-_ROBUST_SCALE = 9.0
-"""Squared residual, in its variance, at which a match has half its weight (Cauchy)."""
 _RANSAC_PX = 3.0
 _LEAST_INLIERS = 15
 _LEAST_DISPARITY = 0.1
-_MEDIAN_CHI_SQUARE_1, _MEDIAN_CHI_SQUARE_3 = 0.455, 2.366
-"""Of one and of three degrees of freedom."""
+_MEDIAN_CHI_SQUARE_3 = 2.366
+"""Median of chi-square of three degrees of freedom."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +58,6 @@ class StereoView:
         """The matches at ``index``."""
         names = ("uv", "disparity", "sigma", "row_shift", "row_sigma", "sigma_uv", "descriptors")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
-
-
-@dataclass(frozen=True, eq=False)
-class NormalEquations:
-    """``information @ parameters = vector`` of one piece of evidence, (10, 10) and (10,)."""
-
-    information: FloatArray
-    vector: FloatArray
-
-    def __add__(self, other: NormalEquations) -> NormalEquations:
-        return NormalEquations(self.information + other.information, self.vector + other.vector)
 
 
 def match_views(
@@ -105,7 +93,7 @@ def consistency_equations(first: StereoView, second: StereoView, known: Rectific
         weight = np.linalg.inv(covariance)
         squares = np.einsum("ni,nij,nj->n", residual, weight, residual)
         noise = max(1.0, float(np.median(squares)) / _MEDIAN_CHI_SQUARE_3)
-        robust = 1.0 / noise / (1.0 + squares / noise / _ROBUST_SCALE)
+        robust = robust_weights(squares, noise)
         J = np.concatenate([J_motion, J_theta], axis=2)
         H, g = _normal(J, np.asarray(robust[:, None, None] * weight), residual)
         H_mm, H_mt, H_tt, g_m, g_t = H[:6, :6], H[:6, 6:], H[6:, 6:], g[:6], g[6:]
@@ -135,8 +123,8 @@ def row_equations(view: StereoView, known: RectificationError, floor_px: float) 
     theta: FloatArray = known.parameters
     for _ in range(_ITERATIONS):
         squares = (view.row_shift - basis @ theta) ** 2 / variance
-        noise = max(1.0, float(np.median(squares)) / _MEDIAN_CHI_SQUARE_1)
-        weighted = basis * (1.0 / (noise * variance) / (1.0 + squares / noise / _ROBUST_SCALE))[:, None]
+        noise = max(1.0, float(np.median(squares)) / MEDIAN_CHI_SQUARE_1)
+        weighted = basis * robust_weights(squares, noise, variance)[:, None]
         evidence = NormalEquations(basis.T @ weighted, weighted.T @ view.row_shift)
         theta = np.asarray(np.linalg.solve(evidence.information + prior, evidence.vector + prior @ known.parameters))
     return evidence

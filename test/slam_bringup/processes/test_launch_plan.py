@@ -40,6 +40,7 @@ def test_a_rig_may_name_its_topics_frames_and_files() -> None:
     found = {spec.executable: spec.parameters for spec in plan.nodes}
     assert found["stereo_driver"]["compressed"] is True
     assert (found["tof_driver"]["pictures"], found["tof_driver"]["measurement"]) == ("none", "depth")
+    assert found["feature_extractor"]["tof.images"] == "range"
     assert found["ekf_slam"]["base_frame"] == "rig"
     assert found["ekf_slam"]["submap.max_distance"] == 2.0
     assert (found["sjsam"]["map_path"], found["sjsam"]["localize_only"]) == ("/maps/a", True)

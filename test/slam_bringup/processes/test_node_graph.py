@@ -58,8 +58,9 @@ def test_parameters_follow_from_the_choice_and_the_bag() -> None:
     assert "/one/tof/camera_info" in graph.played.values()
 
 
-def test_nodes_search_the_image_that_the_bag_has() -> None:
-    config = choose(load_system_config(None), "tof", "sjsam", "none")
+@pytest.mark.parametrize("mode", ["tof", "fuse"])
+def test_nodes_take_the_image_that_the_bag_has(mode: str) -> None:
+    config = choose(load_system_config(None), mode, "sjsam", "none")
     for roles, driver, features in (
         (("amplitude", "intensity"), "both", "amplitude"),
         (("intensity",), "intensity", "intensity"),

@@ -152,6 +152,8 @@ def _only_some_have(result: RunResult, first: AgentResult) -> dict[str, Any]:
         summary["features_from"] = first.front_end.picture
     if first.front_end.rectification:
         summary["rectification"] = dict(first.front_end.rectification)
+    if first.front_end.ranges:
+        summary["ranges"] = dict(first.front_end.ranges)
     if len(first.filtered):
         summary["filtered"] = _accuracy(first, first.filtered)
     if len(result.agents) > 1:

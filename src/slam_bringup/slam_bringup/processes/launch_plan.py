@@ -112,6 +112,9 @@ def _for_rig(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
     drivers = names.calibration.driver_parameters()
     compressed = {"compressed": True} if values["compressed"] == "true" else {}
     chosen = {k: values[k] for k in ("pictures", "measurement") if values[k] != AUTO}
+    pictures = values["pictures"] if values["pictures"] != AUTO else {"depth": "none"}.get(values["measurement"], "")
+    images = {"none": "range", "intensity": "intensity"}.get(pictures, "")
+    chooses = images != "" and config.feature_extractor.tof.images == "auto"
     specs = live_nodes(
         config,
         agents,
@@ -119,6 +122,7 @@ def _for_rig(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
         rectified=values["rectified"] == "true",
         extra={
             "tof_driver": drivers["tof_driver"] | chosen,
+            "feature_extractor": {"tof.images": images} if chooses else {},
             "stereo_driver": drivers["stereo_driver"] | compressed,
         },
         base_frames=dict.fromkeys(agents, names.base_frame) if names.base_frame else None,

@@ -164,7 +164,7 @@ def _bag_parameters(
     chosen = {0: "none", 2: "both"}.get(len(pictures)) or pictures[0]
     if chosen == "amplitude" and sensor.topics.get("color") == sensor.topics["amplitude"]:
         chosen = "color"
-    chooses = config.feature_extractor.mode == "tof" and config.feature_extractor.tof.images == "auto"
+    chooses = config.feature_extractor.mode != "stereo" and config.feature_extractor.tof.images == "auto"
     compressed = sensor.topics.get("left", "").endswith("/compressed")
     drivers = calibration.driver_parameters()
     return {

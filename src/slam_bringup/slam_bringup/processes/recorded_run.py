@@ -20,7 +20,7 @@ from slam_core.messages import estimate_from_message
 from slam_core.types import PoseEstimate
 from stereo_frontend.frontend import FrontendReport
 
-_FIGURES = "rectification_"
+_FIGURES = ("rectification_", "ranges_")
 _LOSSES = ("lost_by_transport", "rejected", "skipped", "unpaired")
 
 
@@ -90,9 +90,12 @@ def collect(
 def _front_end(agent: str, diagnostics: dict[str, dict[str, str]]) -> FrontendReport:
     """Findings about an agent's images in the last diagnostics of its ``feature_extractor``."""
     values = diagnostics.get(_topic(agent, "feature_extractor"), {})
-    figures = {key.removeprefix(_FIGURES): text for key, text in values.items() if key.startswith(_FIGURES)}
+    rectification, ranges = (
+        {key.removeprefix(prefix): _number(text) for key, text in values.items() if key.startswith(prefix)}
+        for prefix in _FIGURES
+    )
     advice = tuple(text for text in values.get("advice", "").split("; ") if text)
-    return FrontendReport({key: _number(text) for key, text in figures.items()}, advice, values.get("picture", ""))
+    return FrontendReport(rectification, advice, values.get("picture", ""), ranges=ranges)
 
 
 def _number(text: str) -> float | str:
