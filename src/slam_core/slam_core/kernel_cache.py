@@ -13,10 +13,13 @@ import zlib
 from functools import cache
 from typing import Any
 
+import numba
 import numpy as np
 from llvmlite import binding as llvm
 from numba.core.codegen import CPUCodeLibrary
 
+_KNOWN = tuple(f"0.{minor}." for minor in range(61, 69))
+"""Releases of Numba whose cache is laid out so; another one loads its kernels as it always does."""
 _FASTEST = 1
 """Level of compression."""
 _ELF = b"\x7fELF\x02\x01"
@@ -30,8 +33,9 @@ _SYMBOL_TABLE = 2
 
 
 def load_machine_code_alone() -> None:
-    """Have kernels loaded so from now on, in this process; a second call changes nothing."""
-    CPUCodeLibrary._unserialize = classmethod(_unserialize)  # type: ignore[method-assign,assignment]
+    """Have kernels loaded so from now on, in this process; a second call, or another Numba, changes nothing."""
+    if numba.__version__.startswith(_KNOWN):
+        CPUCodeLibrary._unserialize = classmethod(_unserialize)  # type: ignore[method-assign,assignment]
 
 
 _load_all = CPUCodeLibrary._unserialize.__func__  # type: ignore[attr-defined]
