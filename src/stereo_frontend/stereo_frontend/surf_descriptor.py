@@ -13,7 +13,7 @@ from numba import njit
 
 from slam_core.in_place import in_place
 from slam_core.types import Float32Array
-from stereo_frontend.surf_lattice import STRIDE, haar_wavelets, lattice_room, read_lattice, row_room
+from stereo_frontend.surf_lattice import ONE, STRIDE, haar_wavelets, lattice_room, read_lattice, row_room
 
 SAMPLES = 20
 UPRIGHT_CORNERS = SAMPLES + 2
@@ -85,7 +85,7 @@ def describe_upright(integral, keypoints, weights, out):  # type: ignore[no-unty
         row_room(integral.shape[1], UPRIGHT_CORNERS),
     )
     dx, dy = np.empty(SAMPLES * STRIDE, np.float32), np.empty(SAMPLES * STRIDE, np.float32)
-    split, total = np.empty((SAMPLES, _ROW), np.float32), np.empty(_ROW, np.float32)
+    split, total = np.empty((SAMPLES, _ROW), np.float32), np.empty((2, _ROW), np.float32)
     for k in range(keypoints.shape[0]):
         inside = read_lattice(integral, keypoints[k], UPRIGHT_CORNERS, lattice, room)
         haar_wavelets(lattice, UPRIGHT_CORNERS, inside, 1, 0, line, dx, dy)
@@ -105,8 +105,8 @@ def describe_oriented(integral, keypoints, weights, out):  # type: ignore[no-unt
         row_room(integral.shape[1], TURNED_CORNERS),
     )
     dx, dy = np.empty(_NODES * STRIDE, np.float32), np.empty(_NODES * STRIDE, np.float32)
-    nodes, samples = np.empty(2 * _NODES * STRIDE, np.float32), np.empty(2 * SAMPLES, np.float32)
-    split, total = np.empty((SAMPLES, _ROW), np.float32), np.empty(_ROW, np.float32)
+    nodes, samples = np.empty(2 * _NODES * STRIDE, np.float32), _sample_room()
+    split, total = np.empty((SAMPLES, _ROW), np.float32), np.empty((2, _ROW), np.float32)
     for k in range(keypoints.shape[0]):
         inside = read_lattice(integral, keypoints[k], TURNED_CORNERS, lattice, room)
         angle = _dominant_direction(lattice, inside, line)
@@ -170,72 +170,106 @@ def _directions(x, y):  # type: ignore[no-untyped-def]
 
 
 @in_place()
-def _turned_samples(dx, dy, cosine, sine, nodes, samples, split):  # type: ignore[no-untyped-def]
+def _turned_samples(dx, dy, cosine, sine, nodes, room, split):  # type: ignore[no-untyped-def]
     """Wavelets at the samples of a turned square, bilinear between nodes, along the square's axes and split by sign.
 
-    ``nodes`` and ``samples`` are room for (dx, dy) pairs of all nodes and of one row of samples.
+    ``nodes`` is room for (dx, dy) pairs of all nodes, ``room`` that of :func:`_sample_room`.
     """
+    at, shares, x, y = room
     for k in range(len(dx)):
         nodes[2 * k], nodes[2 * k + 1] = dx[k], dy[k]
     middle = np.float32(0.5 * (_NODES - 1))
     for j in range(SAMPLES):
         across = _FIRST_SAMPLE + np.float32(j)
-        _between_nodes(nodes, middle - sine * across, middle + cosine * across, cosine, sine, samples)
+        _places(middle - sine * across, middle + cosine * across, cosine, sine, at, shares)
+        _between_nodes(nodes, at, shares[0], shares[1], x, y)
         for i in range(SAMPLES):
-            a, b = samples[2 * i], samples[2 * i + 1]
-            _split(cosine * a + sine * b, cosine * b - sine * a, split[j], _TERMS * i)
+            x[i], y[i] = cosine * x[i] + sine * y[i], cosine * y[i] - sine * x[i]
+        _split(x, y, split[j])
+
+
+@njit(cache=True, nogil=True)
+def _sample_room():  # type: ignore[no-untyped-def]
+    """Room for a line of samples: the node before each, its shares of the next ones, its wavelets."""
+    return (
+        np.empty(SAMPLES, np.int32),
+        np.empty((2, SAMPLES), np.float32),
+        np.empty(SAMPLES, np.float32),
+        np.empty(SAMPLES, np.float32),
+    )
 
 
 @in_place()
-def _between_nodes(nodes, start_x, start_y, step_x, step_y, out):  # type: ignore[no-untyped-def]
-    """Pairs (dx, dy) along a line of samples through the middle (start_x, start_y), one step apart."""
+def _places(start_x, start_y, step_x, step_y, at, shares):  # type: ignore[no-untyped-def]
+    """Where samples along a line through (start_x, start_y), one step apart, lie between the nodes."""
     for i in range(SAMPLES):
         along = _FIRST_SAMPLE + np.float32(i)
         x, y = start_x + step_x * along, start_y + step_y * along
-        x0, y0 = int(x), int(y)
-        fx, fy = x - np.float32(x0), y - np.float32(y0)
-        at = 2 * (y0 * STRIDE + x0)
-        above, below = nodes[at : at + 4], nodes[at + 2 * STRIDE : at + 2 * STRIDE + 4]
-        for c in range(2):
-            upper = above[c] + fx * (above[c + 2] - above[c])
-            lower = below[c] + fx * (below[c + 2] - below[c])
-            out[2 * i + c] = upper + fy * (lower - upper)
+        x0, y0 = np.int32(x), np.int32(y)
+        shares[0, i], shares[1, i] = x - np.float32(x0), y - np.float32(y0)
+        at[i] = 2 * (y0 * STRIDE + x0)
+
+
+@in_place()
+def _between_nodes(nodes, at, share_x, share_y, out_x, out_y):  # type: ignore[no-untyped-def]
+    """Wavelets dx and dy of each sample of a line from those of the four nodes around it."""
+    for i in range(SAMPLES):
+        a = np.uintp(at[i])
+        c, below = a + ONE + ONE, a + np.uintp(2 * STRIDE)
+        d = below + ONE + ONE
+        upper_x, lower_x = _lerp(nodes[a], nodes[c], share_x[i]), _lerp(nodes[below], nodes[d], share_x[i])
+        upper_y = _lerp(nodes[a + ONE], nodes[c + ONE], share_x[i])
+        lower_y = _lerp(nodes[below + ONE], nodes[d + ONE], share_x[i])
+        out_x[i], out_y[i] = _lerp(upper_x, lower_x, share_y[i]), _lerp(upper_y, lower_y, share_y[i])
+
+
+@in_place()
+def _lerp(first, second, share):  # type: ignore[no-untyped-def]
+    return first + share * (second - first)
 
 
 @in_place()
 def _split_samples(dx, dy, split):  # type: ignore[no-untyped-def]
     """The terms of all samples of a square along the axes of the image."""
     for j in range(SAMPLES):
-        for i in range(SAMPLES):
-            _split(dx[j * STRIDE + i], dy[j * STRIDE + i], split[j], _TERMS * i)
+        _split(dx[j * STRIDE : j * STRIDE + SAMPLES], dy[j * STRIDE : j * STRIDE + SAMPLES], split[j])
 
 
 @in_place()
-def _split(x, y, out, at):  # type: ignore[no-untyped-def]
-    """Write the eight terms of one sample: x and |x| where y is not negative, where it is, then y by the sign of x."""
+def _split(dx, dy, out):  # type: ignore[no-untyped-def]
+    """Write the eight terms of a row of samples (20,), term after term (8 * 20,).
+
+    x and |x| where y is not negative, where it is, then y by the sign of x.
+    """
     zero = np.float32(0.0)
-    positive_x = x if y >= zero else zero
-    positive_y = y if x >= zero else zero
-    out[at], out[at + 1] = positive_x, abs(positive_x)
-    out[at + 2], out[at + 3] = x - positive_x, abs(x - positive_x)
-    out[at + 4], out[at + 5] = positive_y, abs(positive_y)
-    out[at + 6], out[at + 7] = y - positive_y, abs(y - positive_y)
+    for i in range(SAMPLES):
+        x, y = dx[i], dy[i]
+        positive_x = x if y >= zero else zero
+        positive_y = y if x >= zero else zero
+        out[i], out[SAMPLES + i] = positive_x, abs(positive_x)
+        out[2 * SAMPLES + i], out[3 * SAMPLES + i] = x - positive_x, abs(x - positive_x)
+        out[4 * SAMPLES + i], out[5 * SAMPLES + i] = positive_y, abs(positive_y)
+        out[6 * SAMPLES + i], out[7 * SAMPLES + i] = y - positive_y, abs(y - positive_y)
 
 
 @in_place()
 def _sum_regions(split, weights, row, out):  # type: ignore[no-untyped-def]
-    """Weighted sums (128,) of the samples' terms (20, 20 * 8) over 4 x 4 subregions, scaled to unit length.
+    """Weighted sums (128,) of the samples' terms (20, 8 * 20) over 4 x 4 subregions, scaled to unit length.
 
-    ``row`` is room for one row of terms.
+    ``row`` (2, 160) is room for one row of terms, term after term and sample after sample.
     """
+    planes, samples = row[0], row[1]
     for region in range(4):
-        row[:] = np.float32(0.0)
+        planes[:] = np.float32(0.0)
         for j in range(SAMPLES):
             if weights[region, j] > 0.0:
-                _add_row(split[j], weights[region, j], row)
+                _add_row(split[j], weights[region, j], planes)
+        for i in range(SAMPLES):
+            for term in range(_TERMS):
+                samples[_TERMS * i + term] = planes[SAMPLES * term + i]
         for column in range(4):
             at = (4 * region + column) * _TERMS
-            _sum_samples(row, weights[column], out[at : at + _TERMS])
+            _sum_samples(samples, weights[column], out[at : at + _TERMS])
     square = np.float32(0.0)
     for i in range(DIMENSION):
         square += out[i] * out[i]

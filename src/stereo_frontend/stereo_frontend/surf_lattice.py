@@ -15,6 +15,8 @@ from slam_core.in_place import in_place
 
 STRIDE = 32
 """Numbers from one row of a lattice to the next; at least the corners along a side."""
+ONE = np.uintp(1)
+"""Unsigned indices cannot be negative, so that the kernels need not look whether they count from the end."""
 
 
 @njit(cache=True, nogil=True)
@@ -26,7 +28,7 @@ def lattice_room(corners):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def row_room(width, corners):  # type: ignore[no-untyped-def]
     """Room for a row of an image, and for the column beside each corner and the corner's share of the next one."""
-    return np.empty(width), np.empty(corners, np.int64), np.empty(corners)
+    return np.empty(width), np.empty(corners, np.uintp), np.empty(corners)
 
 
 @in_place()
@@ -68,7 +70,7 @@ def _blend(above, below, share, out):  # type: ignore[no-untyped-def]
 def _between(row, places, shares, out):  # type: ignore[no-untyped-def]
     for i in range(len(places)):
         value = row[places[i]]
-        out[i] = value + shares[i] * (row[places[i] + 1] - value)
+        out[i] = value + shares[i] * (row[places[i] + ONE] - value)
 
 
 @in_place()
