@@ -43,6 +43,17 @@ def test_the_grid_takes_the_best_of_each_cell_first(rng):
     assert alone <= set(kept.tolist())
 
 
+@pytest.mark.parametrize("digits", [7, 1])
+def test_the_grid_takes_strength_in_turn_equals_by_place(rng, digits):
+    uv = rng.uniform([0, 0], [100, 80], (400, 2)).astype(np.float32)
+    response = np.round(rng.uniform(1, 2, 400), digits).astype(np.float32)
+    cell = (uv[:, 1] // 10).astype(int) * 10 + (uv[:, 0] // 10).astype(int)
+    order = np.lexsort((uv[:, 0], uv[:, 1], -response, cell))
+    rank = np.array([np.sum(cell[order[:k]] == cell[order[k]]) for k in range(400)])
+    expected = order[np.lexsort((-response[order], rank))][:150]
+    np.testing.assert_array_equal(spread_over_grid(uv, response, (80, 100), (8, 10), 150), expected)
+
+
 def test_the_threshold_settles_so_that_one_pass_suffices(stereo_pair):
     extractor = FeatureExtractor(FeatureConfig(target=150))
     thresholds = []

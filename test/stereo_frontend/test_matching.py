@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.matching import (
@@ -129,6 +130,20 @@ def test_a_match_that_slipped_by_a_repeat_stands_alone(rng):
     alone = ~has_consistent_neighbour(uv, disparity, 16)
     assert set(np.flatnonzero(alone)) == {3, 5, 70}
     assert set(np.flatnonzero(~has_consistent_neighbour(uv, disparity, 0))) == {5}
+
+
+def test_neighbours_are_those_of_a_search_tree(rng):
+    uv = rng.uniform(0, 300, (250, 2)).astype(np.float32)
+    disparity = rng.uniform(5, 60, 250)
+    disparity[rng.random(250) < 0.2] = np.nan
+    known = np.flatnonzero(np.isfinite(disparity))
+    d = disparity[known]
+    _, nearest = cKDTree(uv[known]).query(uv[known], k=7)
+    like = np.abs(d[nearest[:, 1:]] - d[:, None]) <= np.maximum(2.0, 0.2 * d)[:, None]
+    expected = np.zeros(250, bool)
+    expected[known] = like.any(axis=1)
+    assert 0.3 < expected[known].mean() < 0.9
+    np.testing.assert_array_equal(has_consistent_neighbour(uv, disparity, 6), expected)
 
 
 def test_an_object_with_several_matches_is_consistent(rng):

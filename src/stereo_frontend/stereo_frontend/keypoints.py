@@ -70,11 +70,15 @@ def spread_over_grid(
         Number of keypoints kept at most.
     """
     rows, columns = grid
-    row = np.clip((uv[:, 1] * (rows / shape[0])).astype(np.intp), 0, rows - 1)
-    column = np.clip((uv[:, 0] * (columns / shape[1])).astype(np.intp), 0, columns - 1)
+    row = np.clip((uv[:, 1] * (rows / shape[0])).astype(np.int16), 0, rows - 1)
+    column = np.clip((uv[:, 0] * (columns / shape[1])).astype(np.int16), 0, columns - 1)
     cell = row * columns + column
-    order = np.lexsort((uv[:, 0], uv[:, 1], -response, cell))
-    sorted_cell = cell[order]
-    first_of_cell = np.searchsorted(sorted_cell, sorted_cell)
-    rank = np.arange(len(order)) - first_of_cell
-    return order[np.lexsort((-response[order], rank))][:target]
+    strongest = np.argsort(-response)
+    sorted_response = response[strongest]
+    if np.any(sorted_response[1:] == sorted_response[:-1]):
+        strongest = np.lexsort((uv[:, 0], uv[:, 1], cell, -response))
+    by_cell = np.argsort(cell[strongest], kind="stable")
+    sorted_cell = cell[strongest][by_cell]
+    rank = np.empty(len(by_cell), np.int16)
+    rank[by_cell] = np.arange(len(by_cell)) - np.searchsorted(sorted_cell, sorted_cell)
+    return strongest[np.argsort(rank, kind="stable")[:target]]

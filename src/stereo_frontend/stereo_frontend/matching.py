@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from numba import njit
-from scipy.spatial import cKDTree
 
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
@@ -162,11 +161,31 @@ def has_consistent_neighbour(uv: Float32Array, disparity: FloatArray, neighbours
     if neighbours == 0 or len(known) <= neighbours:
         consistent[known] = True
         return consistent
-    d = disparity[known]
-    _, nearest = cKDTree(uv[known]).query(uv[known], k=neighbours + 1)
-    difference = np.abs(d[nearest[:, 1:]] - d[:, None])
-    consistent[known] = np.any(difference <= np.maximum(2.0, 0.2 * d)[:, None], axis=1)
+    u, v = np.asarray(uv[known].T, np.float64, order="C")
+    consistent[known] = _nearest_is_among(u, v, np.asarray(disparity[known], np.float64), neighbours)
     return consistent
+
+
+@njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})
+def _nearest_is_among(u, v, disparity, neighbours):  # type: ignore[no-untyped-def]
+    """Whether the nearest position of a like disparity is among so many nearest ones, (n,).
+
+    All are compared: for some hundred positions a quarter of the time of a search tree.
+    """
+    n = len(u)
+    out, squares = np.zeros(n, np.bool_), np.empty(n)
+    for i in range(n):
+        own, limit = disparity[i], max(2.0, 0.2 * disparity[i])
+        for j in range(n):
+            squares[j] = (u[j] - u[i]) ** 2 + (v[j] - v[i]) ** 2
+        squares[i] = np.inf
+        nearest, nearer = np.inf, 0
+        for j in range(n):
+            nearest = min(nearest, squares[j] if abs(disparity[j] - own) <= limit else np.inf)
+        for j in range(n):
+            nearer += squares[j] < nearest
+        out[i] = nearest < np.inf and nearer < neighbours
+    return out
 
 
 def _matches(left: npt.ArrayLike, right: npt.ArrayLike, similarity: npt.ArrayLike) -> Matches:
