@@ -66,17 +66,32 @@ def row_filter(size: int) -> Any:
         raise ValueError(f"lobes of a filter of {size} px do not stay below 2^16")
     lobe, half = size // 3, size // 2
     middle = lobe // 2
-    determinants = _determinants_of(size)
+    far, right, left = _Index(2 * half + 1), _Index(half + middle + 1), _Index(half - middle)
+    end, begin = _Index(half + lobe), _Index(half - lobe + 1)
+    before, own, after, last = _Index(half - lobe), _Index(half), _Index(half + 1), _Index(half + lobe + 1)
+    scale = np.float32(1.0 / (size * size))
 
+    # No kernel among what this one encloses: the cache would take it for another one in every process.
     @in_place()
     def fill_row(integral, y, sums, out):  # type: ignore[no-untyped-def]
         column, inner, outer, cross = sums[0], sums[1], sums[2], sums[3]
+        determinants = out[half : integral.shape[1] - 1 - half]
+        # Column sums of Dxx's band, of Dyy's middle lobe and its other two, of Dxy's upper less its lower boxes.
         _difference(integral[y + lobe], integral[y - lobe + 1], column)
         _difference(integral[y + middle + 1], integral[y - middle], inner)
         _difference(integral[y + half + 1], integral[y - half], outer)
         _subtract(inner, outer)
         _crossed(integral[y], integral[y - lobe], integral[y + lobe + 1], integral[y + 1], cross)
-        determinants(column, inner, outer, cross, out[half : integral.shape[1] - 1 - half])
+        for i in range(len(determinants)):
+            x = _Index(i)
+            within = np.uint16(column[x + right] - column[x + left])
+            beside = np.uint16(column[x + far] - column[x] - within)
+            above = np.uint16(outer[x + end] - outer[x + begin])
+            between = np.uint16(inner[x + end] - inner[x + begin])
+            xx, yy = np.int32(beside) - 2 * np.int32(within), np.int32(above) - 2 * np.int32(between)
+            xy = np.int16(cross[x + own] - cross[x + before] - cross[x + last] + cross[x + after])
+            dxx, dyy, dxy = np.float32(np.int32(xx)) * scale, np.float32(np.int32(yy)) * scale, np.float32(xy) * scale
+            determinants[x] = dxx * dyy - np.float32(0.81) * dxy * dxy
 
     return fill_row
 
@@ -99,35 +114,6 @@ def _subtract(values, out):  # type: ignore[no-untyped-def]
 def _crossed(first, second, third, fourth, out):  # type: ignore[no-untyped-def]
     for x in range(len(out)):
         out[x] = np.uint16(first[x] - second[x] - third[x] + fourth[x])
-
-
-def _determinants_of(size: int) -> Any:
-    """A kernel that makes determinants from the column sums of a row.
-
-    column: of Dxx's band; inner, outer: of Dyy's middle lobe and of its other two; cross: of Dxy's upper less its lower
-    boxes. All are summed up along the row.
-    """
-    lobe, half = size // 3, size // 2
-    middle = lobe // 2
-    far, right, left = _Index(2 * half + 1), _Index(half + middle + 1), _Index(half - middle)
-    end, begin = _Index(half + lobe), _Index(half - lobe + 1)
-    before, own, after, last = _Index(half - lobe), _Index(half), _Index(half + 1), _Index(half + lobe + 1)
-    scale = np.float32(1.0 / (size * size))
-
-    @in_place()
-    def determinants(column, inner, outer, cross, out):  # type: ignore[no-untyped-def]
-        for i in range(len(out)):
-            x = _Index(i)
-            within = np.uint16(column[x + right] - column[x + left])
-            beside = np.uint16(column[x + far] - column[x] - within)
-            above = np.uint16(outer[x + end] - outer[x + begin])
-            between = np.uint16(inner[x + end] - inner[x + begin])
-            xx, yy = np.int32(beside) - 2 * np.int32(within), np.int32(above) - 2 * np.int32(between)
-            xy = np.int16(cross[x + own] - cross[x + before] - cross[x + last] + cross[x + after])
-            dxx, dyy, dxy = np.float32(np.int32(xx)) * scale, np.float32(np.int32(yy)) * scale, np.float32(xy) * scale
-            out[x] = dxx * dyy - np.float32(0.81) * dxy * dxy
-
-    return determinants
 
 
 @in_place()
