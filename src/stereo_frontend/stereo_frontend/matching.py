@@ -168,7 +168,7 @@ def has_consistent_neighbour(uv: Float32Array, disparity: FloatArray, neighbours
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})
 def _nearest_is_among(u, v, disparity, neighbours):  # type: ignore[no-untyped-def]
-    """Whether the nearest position of a like disparity is among so many nearest ones, (n,).
+    """Mask (n,) of the positions whose nearest one of a like disparity is among so many nearest ones.
 
     All are compared: for some hundred positions a quarter of the time of a search tree.
     """

@@ -201,7 +201,7 @@ def _sample_room():  # type: ignore[no-untyped-def]
 
 @in_place()
 def _places(start_x, start_y, step_x, step_y, at, shares):  # type: ignore[no-untyped-def]
-    """Where samples along a line through (start_x, start_y), one step apart, lie between the nodes."""
+    """Fill ``at`` and ``shares`` for samples along a line through (start_x, start_y), one step apart."""
     for i in range(SAMPLES):
         along = _FIRST_SAMPLE + np.float32(i)
         x, y = start_x + step_x * along, start_y + step_y * along
