@@ -152,8 +152,8 @@ class RangeSelfCalibration:
 
     # ---- what tells of it
     def look(self, image: DepthImage) -> RangeFields | None:
-        """Quantities that the error of each pixel depends on; None if nothing is to be learnt."""
-        if self.config.mode == "off":
+        """Quantities that the error of each pixel depends on; None if they serve nothing."""
+        if self.config.mode == "off" or not (self.corrects or self._has_changed(image)):
             return None
         if image.amplitude is not None and self._mean_amplitude == 0.0:
             lit = image.amplitude[np.isfinite(image.depth)]
@@ -163,8 +163,9 @@ class RangeSelfCalibration:
 
     def learn(self, image: DepthImage, fields: RangeFields | None, seen: RangeDifferences) -> None:
         """Take in one view; ``seen`` is measured on the image as :meth:`corrected` gave it."""
-        if fields is None or len(seen.uv) < _FEW or not self._is_new(image):
+        if fields is None or len(seen.uv) < _FEW or not self._has_changed(image):
             return
+        self._reference = _grid(image)
         size = dimension(fields.weakness is not None)
         if len(self._theta) != size:
             self._begin(size)
@@ -182,16 +183,14 @@ class RangeSelfCalibration:
         self._theta, self._covariance = np.zeros(size), prior_covariance(size)
         self._prior = np.asarray(np.linalg.inv(self._covariance))
 
-    def _is_new(self, image: DepthImage) -> bool:
-        """True if the view has changed since the last one that was taken in."""
-        grid = image.depth[::_GRID, ::_GRID].astype(np.float64)
-        if self._reference.shape == grid.shape:
-            change = np.abs(grid / self._reference - 1.0)
-            change = change[np.isfinite(change)]
-            if len(change) and np.median(change) < _MIN_CHANGE:
-                return False
-        self._reference = grid
-        return True
+    def _has_changed(self, image: DepthImage) -> bool:
+        """True if the view is another one than the last that was taken in."""
+        grid = _grid(image)
+        if self._reference.shape != grid.shape:
+            return True
+        change = np.abs(grid / self._reference - 1.0)
+        change = change[np.isfinite(change)]
+        return len(change) == 0 or bool(np.median(change) >= _MIN_CHANGE)
 
     def _equations(self, rows: FloatArray, value: FloatArray, variance: FloatArray) -> NormalEquations:
         """Evidence of one view, robust."""
@@ -226,6 +225,10 @@ class RangeSelfCalibration:
         total, weight = _shared_by_neighbours(seen.uv, inside, scale, 1.0 / seen.sigma, _NEIGHBOURS * width)
         self._shared = _FORGETTING * self._shared + total
         self._weight = _FORGETTING * self._weight + weight
+
+
+def _grid(image: DepthImage) -> FloatArray:
+    return image.depth[::_GRID, ::_GRID].astype(np.float64)
 
 
 @in_place()
