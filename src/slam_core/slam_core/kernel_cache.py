@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels from Numba's cache take their machine code alone: half the memory, and half the time, of loading them.
+"""Kernels from Numba's cache take their machine code alone: half the memory, two thirds of the time to load.
 
 A cached kernel comes with its LLVM code too, for kernels that are yet to be compiled and call it. Numba parses that of
 every kernel that it loads and keeps it, 0.4 MB each. Here it stays packed until somebody asks, which nobody does once
