@@ -12,10 +12,11 @@ from submap_world import Agent, circle, ring_world
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.graph.links import Link
 from sjsam_node.graph.map_graph import MapGraph
-from sjsam_node.smoothing import regions
+from sjsam_node.smoothing import region as region_module
 from sjsam_node.smoothing.estimator import EstimatorConfig
-from sjsam_node.smoothing.regions import Active, Region, RegionConfig
-from sjsam_node.smoothing.regions import join as join_region
+from sjsam_node.smoothing.region import Active, Region
+from sjsam_node.smoothing.region import join as join_region
+from sjsam_node.smoothing.regions import RegionConfig
 from sjsam_node.smoothing.smoother import Smoother, SmootherConfig
 from slam_core.geometry import boxminus, boxplus, make_transform, so3_exp
 from slam_core.types import Submap
@@ -145,7 +146,7 @@ def test_what_links_the_inside_of_a_region_opens_it_and_what_links_its_separator
 @pytest.fixture
 def always_worth(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two regions are joined even if that saves little."""
-    monkeypatch.setattr(regions, "_WORTH", np.inf)
+    monkeypatch.setattr(region_module, "_WORTH", np.inf)
 
 
 @pytest.mark.usefixtures("always_worth")
@@ -199,6 +200,17 @@ def test_a_large_region_may_turn_further_before_it_is_opened(way: GlobalMap) -> 
     config, region = RegionConfig(size=8, relinearize=0.002), a_region(way.smoother)
     assert config.largest_turn(replace(region, records=np.arange(4))) == pytest.approx(0.002)
     assert config.largest_turn(replace(region, records=np.arange(32))) == pytest.approx(0.004)
+
+
+def test_a_region_behind_an_open_way_is_kept_in_the_frame_of_its_open_end(way: GlobalMap) -> None:
+    graph, region = way.graph, a_region(way.smoother, 0, 12)
+    assert (region.root, region.reference) == (graph.records[0].start, graph.records[11].end)
+    root, T, covariance = region.node(int(region.inner[0]))
+    assert root == region.root
+    assert np.abs(T - graph.poses[region.inner[0]]).max() < 1e-12  # the map's own frame is that of its first node
+    way.settle()
+    exact = way.smoother.marginals(0).ends(0)[6:, 6:]
+    assert np.abs(covariance - exact).max() < 0.3 * np.abs(exact).max()
 
 
 def test_a_closure_touches_only_the_regions_that_it_affects() -> None:

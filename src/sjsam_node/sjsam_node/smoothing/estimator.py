@@ -18,7 +18,7 @@ from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.joining import JoiningProblem, joint_errors, map_residual
 from sjsam_node.smoothing.parking import Parked
 from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten, split
-from sjsam_node.smoothing.regions import Region
+from sjsam_node.smoothing.region import Region
 from sjsam_node.smoothing.robust import RobustConfig, RobustJoining, closing_rows, predicted
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, compose_covariance, make_transform, so3_log
@@ -142,8 +142,8 @@ class Assembled:
         at = int(np.searchsorted(nodes, node))
         if at == len(nodes) or nodes[at] != node:
             return None
-        region = self.regions[region_of[at]]
-        return region.reference, *region.node(node)
+        region: Region = self.regions[region_of[at]]
+        return region.node(node)
 
     @cached_property
     def _inner(self) -> tuple[IntArray, IntArray]:

@@ -23,7 +23,8 @@ from sjsam_node.graph.map_graph import ALL, MapGraph, Snapshot
 from sjsam_node.smoothing.estimator import Assembled, Estimator, EstimatorConfig
 from sjsam_node.smoothing.marginals import ComponentMarginals, prior_of_pair, relative_pose, seen_from
 from sjsam_node.smoothing.parking import Parked, anchor_of, is_tied
-from sjsam_node.smoothing.regions import Region, RegionConfig, Regions
+from sjsam_node.smoothing.region import Region
+from sjsam_node.smoothing.regions import RegionConfig, Regions
 from slam_core.config import Config, group
 from slam_core.geometry import FloatArray, compose_covariance
 
