@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from slam_calibration.board import Chessboard
 from slam_calibration.bundle import LensState, Rig, adjust
-from slam_calibration.length_error import DISTANCE, length_error, parameter_file
+from slam_calibration.length_error import DISTANCE, PairError, pair_error, parameter_file
 from slam_calibration.simulated import beside, covering_view, example_camera, simulate_views
 from slam_core.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, transform_points
@@ -32,7 +32,7 @@ def triangulated(states: tuple[LensState, ...], pixels: list[FloatArray]) -> Flo
     return 0.5 * (rays[0] * along[:, :1] + right * along[:, 1:] - R.T @ t)
 
 
-def test_scale_and_direction_err_as_the_calibration_claims() -> None:
+def test_lengths_directions_and_disparities_err_as_the_calibration_claims() -> None:
     true_points = DISTANCE * np.column_stack([GRID, np.ones(len(GRID))])
     pixels = [s.camera.project(transform_points(s.T, true_points)) for s in PAIR]
     np.testing.assert_allclose(triangulated(PAIR, pixels), true_points, atol=1e-6)
@@ -42,18 +42,30 @@ def test_scale_and_direction_err_as_the_calibration_claims() -> None:
         poses = tuple(covering_view(rng, PAIR[0]) for _ in range(12))
         views = simulate_views(rng, BOARD, PAIR, poses, 0.15)
         found = adjust(BOARD - BOARD.mean(axis=0), views, Rig(PAIR, poses))
-        claimed = length_error(found.rig.cameras, found.covariance)
+        claimed = pair_error(found.rig.cameras, found.covariance)
         points = triangulated(found.rig.cameras, pixels)
         scale = np.sum(points * true_points) / np.sum(true_points**2) - 1.0
         angle = Rotation.align_vectors(points, true_points)[0].as_rotvec()
-        ratios.append([scale**2 / claimed.sigma_scale**2, np.mean(angle**2) / claimed.sigma_mounting**2])
-        sigmas.append(claimed.sigma_scale)
+        disparity = PAIR[0].parameters[0] * np.linalg.norm(PAIR[1].T[:3, 3]) * (1.0 / points[:, 2] - 1.0 / DISTANCE)
+        ratios.append(
+            [
+                scale**2 / claimed.lengths.sigma_scale**2,
+                np.mean(angle**2) / claimed.lengths.sigma_mounting**2,
+                np.mean(disparity**2) / claimed.sigma_disparity**2,
+            ]
+        )
+        sigmas.append(claimed.lengths.sigma_scale)
     assert 5e-4 < np.mean(sigmas) < 4e-3
-    scale_nees, direction_nees = np.mean(ratios, axis=0)
-    assert 0.4 < scale_nees < 2.0
-    assert 0.4 < direction_nees < 2.0
+    for nees in np.mean(ratios, axis=0):
+        assert 0.4 < nees < 2.0
 
 
 def test_the_file_sets_the_parameters_of_every_node_that_has_them() -> None:
-    values = yaml.safe_load(parameter_file(CalibrationErrorConfig(0.002, 0.0003)))["/**"]["ros__parameters"]
-    assert values == {"calibration.sigma_scale": 0.002, "calibration.sigma_mounting": 0.0003}
+    values = yaml.safe_load(parameter_file(PairError(CalibrationErrorConfig(0.002, 0.0003), 0.04)))["/**"][
+        "ros__parameters"
+    ]
+    assert values == {
+        "calibration.sigma_scale": 0.002,
+        "calibration.sigma_mounting": 0.0003,
+        "self_calibration.sigma_disparity": 0.04,
+    }

@@ -183,6 +183,6 @@ def test_a_calibration_from_pictures_errs_by_hundredths_of_a_pixel_and_says_so()
         wrong = disparity_error(pair, infos)
         errors.append(wrong)
         disparity = -infos[1].P[0, 3] / 3.0
-        nees.append((np.mean(wrong) / disparity / pair.error.sigma_scale) ** 2)
+        nees.append((np.mean(wrong) / disparity / pair.error.lengths.sigma_scale) ** 2)
     assert 0.01 < np.sqrt(np.mean(np.square(errors))) < 0.1
     assert 0.1 < np.mean(nees) < 2.5

@@ -111,6 +111,24 @@ def test_a_perfect_pair_is_left_alone():
         assert not np.any(calibration.rows(pixels, np.zeros(3)))
 
 
+def test_a_calibration_that_says_how_it_errs_is_corrected_by_as_much_as_the_views_say():
+    """Turns too small for the evidence to be beyond doubt, drawn as large as the calibration claims."""
+    pixels = np.random.default_rng(1).uniform([20, 20], [620, 460], (200, 2))
+    before, after, claimed = [], [], []
+    for seed in range(8):
+        turn = 2e-4 * np.random.default_rng(seed).standard_normal(3)
+        truth = RectificationError(STEREO.camera, linear_error(turn), np.eye(len(NAMES)))
+        calibration = learnt(turn, seed, sigma_disparity=0.14)
+        assert calibration.corrects
+        assert "along them" not in calibration.advice()
+        field, sigma = calibration.columns(pixels)
+        before.append(np.mean(truth.columns(pixels) ** 2))
+        after.append(np.mean((field - truth.columns(pixels)) ** 2))
+        claimed.append(np.mean(sigma**2))
+    assert np.mean(after) < 0.5 * np.mean(before)
+    assert 0.3 < np.mean(after) / np.mean(claimed) < 2.0
+
+
 def test_the_evidence_of_a_camera_that_stands_still_counts_once():
     calibration = StereoSelfCalibration()
     view = Walk(TURN, 0).views(1)[0]

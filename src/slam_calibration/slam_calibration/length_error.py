@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""By how much a calibrated pair errs in lengths and directions: what SLAM wants to know of a calibration.
+"""By how much a calibrated pair errs in lengths, directions and disparities: what SLAM wants to know of a calibration.
 
 The parameters of a joint calibration are strongly correlated, so their single standard deviations say little: those of
 a principal point or of a turn of the right camera are some tenths of a pixel, their common effect on a disparity is
@@ -10,6 +10,7 @@ points that they show move with the parameters (implicit function theorem on the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import yaml
@@ -25,8 +26,21 @@ _RAYS = np.linspace(-0.4, 0.4, 5)
 """Grid over the middle of the picture, in widths and heights."""
 
 
-def length_error(states: Sequence[LensState], covariance: FloatArray) -> CalibrationErrorConfig:
-    """Standard deviations of a pair's scale (at :data:`DISTANCE`) and of its direction.
+@dataclass(frozen=True)
+class PairError:
+    """Standard deviations of a pair's lengths and direction, and of its disparities (px, root mean square)."""
+
+    lengths: CalibrationErrorConfig = CalibrationErrorConfig()
+    sigma_disparity: float = 0.0
+
+    @property
+    def is_exact(self) -> bool:
+        """True if all errors are zero."""
+        return self.lengths.is_exact and self.sigma_disparity == 0.0
+
+
+def pair_error(states: Sequence[LensState], covariance: FloatArray) -> PairError:
+    """What a pair's calibration makes of points at :data:`DISTANCE`.
 
     Parameters
     ----------
@@ -40,12 +54,20 @@ def length_error(states: Sequence[LensState], covariance: FloatArray) -> Calibra
     columns = np.concatenate([points[:, :, None], -skew(points)], axis=2).reshape(-1, 4)
     effect = np.linalg.lstsq(columns, moved.reshape(len(columns), -1), rcond=None)[0]
     variances = np.diag(effect @ covariance @ effect.T)
-    return CalibrationErrorConfig(float(np.sqrt(variances[0])), float(np.sqrt(variances[1:].mean())))
+    lengths = CalibrationErrorConfig(float(np.sqrt(variances[0])), float(np.sqrt(variances[1:].mean())))
+    # A disparity d = f b / z that is off by e moves its point by -z e / d.
+    disparity = states[0].parameters[0] * np.linalg.norm(states[1].T[:3, 3]) / DISTANCE
+    off = moved[:, 2] * disparity / DISTANCE
+    return PairError(lengths, float(np.sqrt(np.einsum("nk,kl,nl->n", off, covariance, off).mean())))
 
 
-def parameter_file(error: CalibrationErrorConfig) -> str:
-    """YAML that ``--config`` and nodes take: the deviations for the filter and for the joined map."""
-    values = {"calibration.sigma_scale": error.sigma_scale, "calibration.sigma_mounting": error.sigma_mounting}
+def parameter_file(error: PairError) -> str:
+    """YAML that ``--config`` and nodes take: the deviations for the filter, the joined map and the stereo front end."""
+    values = {
+        "calibration.sigma_scale": error.lengths.sigma_scale,
+        "calibration.sigma_mounting": error.lengths.sigma_mounting,
+        "self_calibration.sigma_disparity": error.sigma_disparity,
+    }
     return str(yaml.safe_dump({"/**": {"ros__parameters": values}}, sort_keys=False))
 
 

@@ -14,9 +14,8 @@ import numpy as np
 
 from slam_calibration.board import Chessboard
 from slam_calibration.bundle import LensState, Rig, adjust
-from slam_calibration.length_error import length_error
+from slam_calibration.length_error import PairError, pair_error
 from slam_calibration.simulated import covering_view, simulate_views
-from slam_core.calibration_error import CalibrationErrorConfig
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, make_transform
 
@@ -29,7 +28,7 @@ class CalibratedPair:
 
     cameras: tuple[Camera, ...]
     T_rectified_raw: tuple[FloatArray, ...]
-    error: CalibrationErrorConfig
+    error: PairError
 
 
 def calibrated_pair(
@@ -43,7 +42,7 @@ def calibrated_pair(
         make_transform(info.R, np.array([x, 0.0, 0.0])) for info, x in zip(infos, (0.0, baseline), strict=True)
     )
     if pictures == 0:
-        return CalibratedPair(tuple(i.camera for i in infos), T_rectified_raw, CalibrationErrorConfig())
+        return CalibratedPair(tuple(i.camera for i in infos), T_rectified_raw, PairError())
     T_right_left = invert_transform(T_rectified_raw[1]) @ T_rectified_raw[0]
     states = [_state(info.camera, T) for info, T in zip(infos, (np.eye(4), T_right_left), strict=True)]
     poses = [covering_view(rng, states[0]) for _ in range(pictures)]
@@ -54,7 +53,7 @@ def calibrated_pair(
     return CalibratedPair(
         (_moved(infos[0].camera, left), _moved(infos[1].camera, right)),
         (T_rectified_raw[0], T_rectified_raw[0] @ invert_transform(T_true)),
-        length_error(states, found.covariance),
+        pair_error(states, found.covariance),
     )
 
 

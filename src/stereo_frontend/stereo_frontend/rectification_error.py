@@ -91,6 +91,11 @@ class RectificationError:
         """Root mean square (px) of :meth:`columns` over the image."""
         return _rms(self.columns(self._grid()))
 
+    def column_moment(self) -> FloatArray:
+        """M (10, 10): the mean square (px2) of :meth:`columns` over the image is ``parameters^T M parameters``."""
+        J = self.camera.fx * column_basis(self._rays(self._grid()))
+        return np.asarray(J.T @ J / len(J))
+
     def column_sigma_rms(self) -> float:
         """Standard deviation (px) of the same."""
         return _rms(self.column_sigma(self._grid()))

@@ -6,7 +6,8 @@ Row differences of matches give the field across the rows; pairs of moments the 
 (:mod:`stereo_frontend.rectification_error`) and add up as normal equations (:mod:`stereo_frontend.normal_equations`).
 
 The rows are followed from the first frame on. Disparities are corrected only when the evidence is beyond doubt: a
-correction without need harms.
+correction without need harms. Where the calibration itself says by how much it errs (``slam calibrate`` does), no doubt
+is left to judge: that is the prior of the field, and what the recording adds to it is used from the first moments on.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ _FEW = 30
 """Fewer matches say nothing."""
 _HYSTERESIS = 0.5
 """A correction stays until what asks for it falls below this share of what it took to begin."""
+_FREE = 3.0
+"""Directions of the field's nine in which a calibration errs about freely: in the others its errors compensate."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,13 @@ class SelfCalibrationConfig(Config):
     """Limits of learning and of what is believed."""
 
     mode: str = parameter("auto", "correct where the evidence asks for it, or never", choices=("auto", "off"))
+    sigma_disparity: float = parameter(
+        0.0,
+        "standard deviation of disparities by errors of the calibration, as slam calibrate writes it; 0: not known",
+        unit="px",
+        minimum=0.0,
+        maximum=10.0,
+    )
     row_floor: float = 0.1
     """Standard deviation of a perfect match's row difference, px."""
 
@@ -74,7 +84,7 @@ class StereoSelfCalibration:
     def reset(self) -> None:
         """Forget everything."""
         self.error: RectificationError | None = None
-        self.corrects_rows = self.corrects = False
+        self.corrects_rows = self.corrects = self._is_significant = False
         self._reference: StereoView | None = None
         self._evidence: deque[NormalEquations] = deque(maxlen=_MEMORY)
         self._moments = 0
@@ -114,10 +124,10 @@ class StereoSelfCalibration:
 
     def advice(self) -> str:
         """Advice to the user, or ""."""
-        if self.error is None or not (self.corrects_rows or self.corrects):
+        if self.error is None or not (self.corrects_rows or self._is_significant):
             return ""
         text = f"rectification off by {self.error.row_rms():.1f} px across the rows"
-        if self.corrects:
+        if self._is_significant:
             sigma = self.error.column_sigma_rms()
             text += f" and {self.error.column_rms():.2f} +- {sigma:.2f} px along them, corrected"
         return f"{text}: recalibrate, or slam calibrate refine"
@@ -130,7 +140,7 @@ class StereoSelfCalibration:
             return
         unknown = RectificationError.unknown(view.stereo.camera)
         rows = [row_equations(view, unknown, self.config.row_floor)] if len(view) >= _FEW else []
-        self._settle(_estimate(rows, unknown.camera))
+        self._settle(self._estimate(rows, unknown.camera))
 
     def learn(self, view: StereoView) -> None:
         """Take in the matches of one pair; disparities and rows as measured, without any correction."""
@@ -154,24 +164,28 @@ class StereoSelfCalibration:
     def _take(self, view: StereoView, evidence: NormalEquations) -> None:
         self._reference = view
         self._evidence.append(evidence)
-        self._settle(_estimate(list(self._evidence), view.stereo.camera))
+        self._settle(self._estimate(list(self._evidence), view.stereo.camera))
+
+    def _estimate(self, evidence: list[NormalEquations], camera: Camera) -> RectificationError:
+        """The solution of all normal equations, with the sandwich covariance."""
+        unknown = RectificationError.unknown(camera)
+        if not evidence:
+            return unknown
+        prior = np.diag(1.0 / PRIOR_SIGMA**2)
+        if self.config.sigma_disparity > 0.0:
+            prior += _FREE / self.config.sigma_disparity**2 * unknown.column_moment()
+        return RectificationError(camera, *sandwich_estimate(evidence, prior, _GROUP))
 
     def _settle(self, error: RectificationError) -> None:
         self.error = error
         slack = _HYSTERESIS if self.corrects_rows else 1.0
         rows = error.row_rms()
         self.corrects_rows = rows > slack * _MIN_ROW_ERROR and rows > slack * self._significant(error.row_sigma_rms())
-        slack = _HYSTERESIS if self.corrects else 1.0
+        slack = _HYSTERESIS if self._is_significant else 1.0
         enough = self._moments >= _MIN_MOMENTS
-        self.corrects = enough and error.column_rms() > slack * self._significant(error.column_sigma_rms())
+        self._is_significant = enough and error.column_rms() > slack * self._significant(error.column_sigma_rms())
+        self.corrects = self._is_significant or (enough and self.config.sigma_disparity > 0.0)
 
     def _significant(self, sigma: float) -> float:
         """Limit that an error of standard deviation ``sigma`` must exceed to be believed."""
         return float(np.sqrt(_MIN_CHI_SQUARE)) * sigma
-
-
-def _estimate(evidence: list[NormalEquations], camera: Camera) -> RectificationError:
-    """The solution of all normal equations, with the sandwich covariance."""
-    if not evidence:
-        return RectificationError.unknown(camera)
-    return RectificationError(camera, *sandwich_estimate(evidence, np.diag(1.0 / PRIOR_SIGMA**2), _GROUP))

@@ -18,7 +18,7 @@ from slam_bringup.commands.refine import refine, write_refined
 from slam_bringup.report.figures import save_png
 from slam_calibration.board import Board, parse_board
 from slam_calibration.bundle import BundleResult
-from slam_calibration.length_error import length_error, parameter_file
+from slam_calibration.length_error import pair_error, parameter_file
 from slam_calibration.lens import DISTORTION_PARAMETERS, parameter_names
 from slam_calibration.pictures import BoardViews, find_views, pair_pictures
 from slam_calibration.rectification import stereo_infos
@@ -138,7 +138,7 @@ def _write(
         atomic_text(output / EXTRINSICS, extrinsics_text(*frames, T, covariance))
         atomic_text(output / URDF, extrinsics_urdf(*frames, T))
     if kind == "stereo":
-        error = length_error(result.rig.cameras, result.covariance)
+        error = pair_error(result.rig.cameras, result.covariance)
         atomic_text(output / FILE_NAME, parameter_file(error))
     save_png(output / "residuals.png", residual_figure(result, names))
     save_png(output / "board_poses.png", board_poses_figure(result, board.points, names))
