@@ -40,7 +40,7 @@ class PairError:
 
 
 def pair_error(states: Sequence[LensState], covariance: FloatArray) -> PairError:
-    """What a pair's calibration makes of points at :data:`DISTANCE`.
+    """Standard deviations of what a pair's calibration makes of points at :data:`DISTANCE`.
 
     Parameters
     ----------
