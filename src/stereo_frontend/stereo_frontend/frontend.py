@@ -312,6 +312,8 @@ class Frontend:
         calibration = self.range_calibration
         fields = calibration.look(depth)
         mapped = map_depth(uv, stereo.depth, pair.camera, calibration.corrected(depth, fields), T, age)
+        if fields is None:
+            return mapped
         seen = np.flatnonzero(np.isfinite(mapped.depth))
         sigma = mapped.sigma.copy()
         sigma[seen] = np.hypot(sigma[seen], calibration.sigma(fields, mapped.uv[seen]) / mapped.ray_length[seen])

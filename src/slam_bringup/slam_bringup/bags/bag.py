@@ -11,6 +11,7 @@ import shutil
 import struct
 import tempfile
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import groupby
@@ -28,7 +29,7 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, ReaderError, StoragePlugin, Writer, storage_mcap
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, ReaderError, StoragePlugin, Writer
 
 from slam_bringup.bags.bag_calibration import FILE_NAME, calibration_file
 from slam_bringup.bags.bag_owner import OWNER, require_free
@@ -47,8 +48,12 @@ COMPRESSIONS = ("zstd", "none")
 _FOREVER = QosTime(2147483647, 4294967295)
 _STORAGE_SUFFIXES = (".mcap", ".db3")
 
-# The profile of every topic is YAML of its own: parsing all of them anew takes half the time to open a bag.
-storage_mcap.parse_qos = cache(storage_mcap.parse_qos)  # type: ignore[attr-defined,assignment]
+# The profile of every topic is YAML of its own: parsing all of them anew takes half the time to open a bag. Another
+# release of rosbags, as it may be beside a sourced ROS 2, may parse them elsewhere, and then does so as ever.
+with suppress(ImportError, AttributeError):
+    from rosbags.rosbag2 import storage_mcap
+
+    storage_mcap.parse_qos = cache(storage_mcap.parse_qos)  # type: ignore[attr-defined,assignment]
 
 
 class BagMessage(NamedTuple):
