@@ -4,44 +4,61 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
+from dense_mapping.row_keys import row_keys
 from dense_mapping.surface import Surface
+from slam_core.types import AnyArray
 
 _FIRST_CELL_M = 0.045
 
 
+class _Cells(NamedTuple):
+    """Cell of every vertex (n,), faces (k, 3) of cells, some more than once, and how many there are without these."""
+
+    cell: npt.NDArray[np.int64]
+    faces: npt.NDArray[np.int64]
+    face_count: int
+
+
 def at_most(surface: Surface, faces: int) -> Surface:
     """The surface itself, or the finest coarser one that has no more than so many faces."""
-    size, coarse = _FIRST_CELL_M, surface
-    while len(coarse.faces) > faces:
-        coarse = coarser(surface, size)
+    if len(surface.faces) <= faces:
+        return surface
+    size, cells = _FIRST_CELL_M, _cells(surface, _FIRST_CELL_M)
+    while cells.face_count > faces:
         size *= 1.25
-    return coarse
+        cells = _cells(surface, size)
+    return _coarser(surface, cells)
 
 
-def coarser(surface: Surface, size: float) -> Surface:
-    """The surface with one vertex in each cell of ``size`` m, in the middle of those that were there."""
-    _, first, cell, count = np.unique(
-        np.floor(surface.points / size).astype(np.int64),
-        axis=0,
-        return_index=True,
-        return_inverse=True,
-        return_counts=True,
-    )
-    cell = cell.ravel()
+def _cells(surface: Surface, size: float) -> _Cells:
+    """The vertices by cells of ``size`` m, in the order of their places; a face within two cells is none."""
+    keys = row_keys(np.floor(surface.points / size).astype(np.int64))
+    cell = np.searchsorted(np.unique(keys), keys)
+    faces = cell[surface.faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    return _Cells(cell, faces, len(np.unique(row_keys(faces))))
 
-    def mean(values: np.ndarray) -> np.ndarray:
+
+def _coarser(surface: Surface, cells: _Cells) -> Surface:
+    """One vertex in each cell, in the middle of those that were there."""
+    cell, count = cells.cell, np.bincount(cells.cell)
+    first = np.empty(len(count), dtype=np.int64)
+    first[cell[::-1]] = np.arange(len(cell))[::-1]
+
+    def mean(values: AnyArray) -> AnyArray:
         return np.stack([np.bincount(cell, column) for column in values.T], axis=1) / count[:, None]
 
-    faces = cell[surface.faces].astype(np.int32)
-    a, b, c = faces.T
     return replace(
         surface,
         points=mean(surface.points).astype(np.float32),
         normals=surface.normals[first],
         colours=np.rint(mean(surface.colours)).astype(np.uint8),
         sigma=surface.sigma[first],
-        faces=np.unique(faces[(a != b) & (b != c) & (c != a)], axis=0),
+        faces=cells.faces[np.unique(row_keys(cells.faces), return_index=True)[1]].astype(np.int32),
     )

@@ -1,25 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """The surface of a TSDF as a triangle mesh whose vertices know their normal, colour and standard deviation.
 
-Marching cubes (Lorensen and Cline 1987; PyMCubes) runs over cubes of blocks. A voxel that was not seen well enough is
-NaN: every triangle that it would shape is dropped, so the mesh ends where the knowledge ends.
+Marching cubes (Lorensen and Cline 1987) runs over cubes of blocks. A voxel that was not seen well enough is NaN: every
+triangle that it would shape is dropped, so the mesh ends where the knowledge ends.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import mcubes
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
+from dense_mapping.row_keys import row_keys
+from dense_mapping.surface_kernels import add_normals, fill_means, march, pieces, triangle_table
 from dense_mapping.tsdf import TsdfVolume
 from dense_mapping.tsdf_kernels import BLOCK
 from slam_core.config import Config
 from slam_core.geometry import FloatArray
-from slam_core.types import AnyArray, ByteArray, Float32Array
+from slam_core.types import ByteArray, Float32Array
 
 _SIGMA_FLOOR = 0.002
 """Standard deviation that no number of images improves: calibration, grid."""
@@ -27,8 +26,6 @@ _CORRELATION = 0.15
 """Share of the variance that the key frames of one place have in common."""
 _MIN_TRIANGLES = 60
 """Connected pieces with fewer triangles are left out."""
-_FACES_AT_ONCE = 50_000
-"""Triangles whose normals are computed at once, for the sake of memory."""
 
 _CHUNK = 6
 """Blocks along the edge of a cube that marching cubes runs over at once."""
@@ -78,7 +75,7 @@ def extract_surface(volume: TsdfVolume, config: SurfaceConfig) -> Surface:
         return Surface.empty()
     offsets = np.cumsum([0, *(len(points) for points, *_ in pieces)])
     points, colours, sigma = (np.concatenate([piece[k] for piece in pieces]) for k in (0, 2, 3))
-    faces = np.concatenate([piece[1] + offset for piece, offset in zip(pieces, offsets, strict=False)])
+    faces = np.concatenate([piece[1] + offset for piece, offset in zip(pieces, offsets.astype(np.int32), strict=False)])
     points, faces, kept = _welded(points, faces, volume.config.voxel_size)
     faces = _without_islands(faces, len(points), _MIN_TRIANGLES)
     used, faces = _renumbered(faces, len(points))
@@ -115,37 +112,23 @@ def _chunk_surface(
 ) -> tuple[Float32Array, npt.NDArray[np.int32], ByteArray, Float32Array]:
     """Points, faces, colours and sigma of one cube of blocks, one voxel of overlap with the next cubes."""
     corner = chunk * _CHUNK
-    size = (_CHUNK + 1) * BLOCK
-    distance = np.full((size, size, size), np.nan, dtype=np.float32)
-    sigma = np.full((size, size, size), np.nan, dtype=np.float32)
-    colours = np.zeros((size, size, size, 3), dtype=np.uint8)
     inside = np.flatnonzero(((volume.coordinates >= corner) & (volume.coordinates <= corner + _CHUNK)).all(axis=1))
-    means, sigmas = voxel_statistics(volume.voxels[inside], config)
-    shown = volume.colours[inside]
-    for values, target in (
-        (means, distance),
-        (sigmas, sigma),
-        (np.where(shown[..., 3:] > 0, shown[..., :3], _UNSEEN), colours),
-    ):
-        _put_blocks(values, volume.coordinates[inside] - corner, target)
+    rows = np.zeros((_CHUNK + 1,) * 3, dtype=np.int64)
+    rows[tuple((volume.coordinates[inside] - corner).T)] = inside
     edge = _CHUNK * BLOCK + 1
-    distance = distance[:edge, :edge, :edge]
-    if not (distance < 0.0).any() or not (distance > 0.0).any():
+    distance = np.full(((_CHUNK + 1) * BLOCK,) * 3, np.nan, dtype=np.float32)
+    limits, noise = (config.min_images, config.max_sigma), (_CORRELATION, _SIGMA_FLOOR)
+    fill_means(volume.voxels, inside, (volume.coordinates[inside] - corner) * BLOCK, limits, noise, distance)
+    vertices, voxels, faces = march(distance[:edge, :edge, :edge], triangle_table())
+    if not len(faces):
         return _nothing()
-    vertices, triangles = mcubes.marching_cubes(distance, 0.0)
-    triangles = triangles[np.isfinite(vertices).all(axis=1)[triangles].all(axis=1)].astype(np.int64)
-    used, faces = _renumbered(triangles, len(vertices))
-    vertices = vertices[used]
-    nearest = tuple(np.rint(vertices).astype(np.int64).T)
-    points = (corner * volume.block_size + (vertices + 0.5) * volume.config.voxel_size).astype(np.float32)
-    return points, faces[:, ::-1].astype(np.int32), colours[nearest], sigma[nearest]
-
-
-def _put_blocks(values: AnyArray, places: npt.NDArray[np.int64], target: AnyArray) -> None:
-    """Write the voxels (n, 512, ...) of blocks at places (n, 3), counted in blocks, into a cube of voxels."""
-    blocks, rest = len(target) // BLOCK, target.shape[3:]
-    x, y, z = places.T
-    target.reshape(*(blocks, BLOCK) * 3, *rest)[x, :, y, :, z] = values.reshape(-1, BLOCK, BLOCK, BLOCK, *rest)
+    used, faces = _renumbered(faces, len(vertices))
+    points = (corner * volume.block_size + (vertices[used] + 0.5) * volume.config.voxel_size).astype(np.float32)
+    block, (x, y, z) = rows[tuple((voxels[used] // BLOCK).T)], (voxels[used] % BLOCK).T
+    voxel = (x * BLOCK + y) * BLOCK + z
+    shown = volume.colours[block, voxel]
+    colours = np.where(shown[:, 3:] > 0, shown[:, :3], np.uint8(_UNSEEN))
+    return points, faces, colours, voxel_statistics(volume.voxels[block, voxel], config)[1]
 
 
 def _nothing() -> tuple[Float32Array, npt.NDArray[np.int32], ByteArray, Float32Array]:
@@ -165,10 +148,7 @@ def _welded(
 ) -> tuple[Float32Array, npt.NDArray[np.int32], npt.NDArray[np.int64]]:
     """Points of neighbouring cubes that are one made one, and triangles without area dropped."""
     cells = np.rint(points.astype(np.float64) / (1e-3 * voxel_size)).astype(np.int64)
-    order = np.lexsort(cells.T[::-1])
-    begins = np.concatenate([[True], (np.diff(cells[order], axis=0) != 0).any(axis=1)])
-    kept, inverse = order[begins], np.empty(len(order), dtype=np.int64)
-    inverse[order] = np.cumsum(begins) - 1
+    _, kept, inverse = np.unique(row_keys(cells), return_index=True, return_inverse=True)
     faces = inverse[faces].astype(np.int32)
     a, b, c = faces.T
     return points[kept], faces[(a != b) & (b != c) & (c != a)], kept
@@ -176,21 +156,13 @@ def _welded(
 
 def _without_islands(faces: npt.NDArray[np.int32], count: int, least: int) -> npt.NDArray[np.int32]:
     """Faces of connected pieces with at least ``least`` triangles."""
-    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_matrix((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    piece = connected_components(graph, directed=False)[1][faces[:, 0]]
-    return np.asarray(faces[np.bincount(piece)[piece] >= least])
+    piece = pieces(faces, count)[faces[:, 0]]
+    return np.asarray(faces[np.bincount(piece)[piece] >= least]) if len(faces) else faces
 
 
 def _normals(points: Float32Array, faces: npt.NDArray[np.int32]) -> Float32Array:
     """Unit normals of the vertices, from the triangles around each, by area."""
-    total = np.zeros((3, len(points)))
-    for first in range(0, len(faces), _FACES_AT_ONCE):
-        some = faces[first : first + _FACES_AT_ONCE]
-        a, b, c = (points[some[:, k]].astype(np.float64) for k in range(3))
-        across = np.cross(b - a, c - a)
-        for k in range(3):
-            np.add.at(total[k], some.ravel(), np.repeat(across[:, k], 3))
-    total = total.T
+    total = np.zeros((len(points), 3))
+    add_normals(points, faces, total)
     length: FloatArray = np.linalg.norm(total, axis=1, keepdims=True)
     return (total / np.maximum(length, 1e-12)).astype(np.float32)
