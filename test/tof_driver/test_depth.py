@@ -51,6 +51,22 @@ def test_range_through_a_lens_becomes_depth_with_honest_sigma(rng: np.random.Gen
     assert abs(np.mean(normalised)) < 0.02
 
 
+def test_depth_camera_sigma_grows_with_depth_and_reasons_are_counted(rng: np.random.Generator) -> None:
+    processor = DepthProcessor(DEPTH_CAMERA, PLAIN)
+    raw = rng.uniform(2000, 2005, (PLAIN.height, PLAIN.width)).astype(np.uint16)
+    raw[40:60, 50:70] = 0
+    image = processor.process(0, raw)
+    known = np.isfinite(image.depth)
+    np.testing.assert_allclose(image.depth[known], 1e-3 * raw[known], rtol=1e-6)
+    expected = range_sigma(replace(NoiseConfig(), model="quadratic"), image.depth[known], None)
+    np.testing.assert_allclose(image.sigma[known], expected, rtol=1e-6)
+    assert np.isnan(image.sigma[~known]).all()
+    counts = processor.counters.counts
+    assert counts["no_reading"] == 400
+    assert counts["valid"] == counts["output_pixels"] == known.sum() == raw.size - 400 - counts.get("flying", 0)
+    assert processor.share_with_depth == pytest.approx(known.mean())
+
+
 def test_a_camera_without_distortion_is_not_resampled() -> None:
     distance, truth = wall(PLAIN)
     image = DepthProcessor(DepthConfig(), PLAIN).process(0, distance.astype(np.float32), 600.0 / distance**2)

@@ -51,6 +51,28 @@ def test_without_amplitude_only_the_range_is_judged() -> None:
     assert judge_pixels(CONFIG, distance, None).ravel().tolist() == expected
 
 
+def judging_twin(c: MaskConfig, distance: NDArray[np.float32], amplitude: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """The rules of ``judge_pixels``, test by test."""
+    reason = np.zeros(distance.shape, dtype=np.uint8)
+    with np.errstate(invalid="ignore", over="ignore"):
+        reflectivity = amplitude * np.square(distance) / np.float32(c.white_amplitude)
+    reason[reflectivity < c.minimum_reflectivity] = Reason.WRAPPED
+    reason[(amplitude < c.minimum_amplitude) | ~np.isfinite(amplitude)] = Reason.TOO_DARK
+    reason[(distance < c.minimum_range) | (distance > c.maximum_range)] = Reason.OUT_OF_RANGE
+    reason[~(np.isfinite(distance) & (distance > 0.0))] = Reason.NO_READING
+    reason[amplitude >= c.saturated_amplitude] = Reason.SATURATED
+    return reason
+
+
+def test_judging_against_its_twin(rng: np.random.Generator) -> None:
+    distance = rng.uniform(-1.0, 9.0, (40, 50)).astype(np.float32)
+    amplitude = rng.choice([3.0, 20.0, 100.0, 1000.0, 2300.0, np.nan, np.inf], distance.shape).astype(np.float32)
+    distance[rng.random(distance.shape) < 0.1] = np.nan
+    expected = judging_twin(CONFIG, distance, amplitude)
+    np.testing.assert_array_equal(judge_pixels(CONFIG, distance, amplitude), expected)
+    assert set(expected.ravel()) == set(Reason) - {Reason.FLYING}
+
+
 def flying_twin(
     distance: NDArray[np.float32], sigma: NDArray[np.float32], read: NDArray[np.bool_], slope: float
 ) -> NDArray[np.bool_]:

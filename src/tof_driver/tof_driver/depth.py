@@ -12,13 +12,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from slam_core.camera import Camera
 from slam_core.config import Config, group, parameter
+from slam_core.in_place import in_place
 from slam_core.types import AnyArray, ByteArray, Counters, DepthImage, Float32Array
 from tof_driver.mask import (
     MAXIMUM_INCIDENCE_DEG,
     NOISE_MULTIPLE,
+    VALID,
     MaskConfig,
     Reason,
     judge_pixels,
@@ -62,6 +65,8 @@ class DepthProcessor:
         Camera of the depth images that :meth:`process` returns.
     counters
         ``images``, raw pixels by :class:`Reason` and ``output_pixels`` (rectified pixels with depth) since the start.
+    share_with_depth
+        Share of the newest image's pixels that have depth.
     """
 
     def __init__(self, config: DepthConfig, camera: Camera, rectified: Camera | None = None) -> None:
@@ -69,6 +74,7 @@ class DepthProcessor:
         self.camera = camera
         self.output_camera = rectified or replace(camera, distortion_model="none", distortion=())
         self.counters = Counters()
+        self.share_with_depth = 0.0
         self._noise = _with_model(config.noise, config.measurement)
         same = camera.is_rectified and np.allclose(self.output_camera.K, camera.K, atol=1e-6)
         self._rectification = None if same else RectificationMap.between(camera, self.output_camera)
@@ -100,9 +106,11 @@ class DepthProcessor:
         intensity = self._picture("intensity", intensity)
         distance = measured * self._ray_length if self.config.measurement == "depth" else measured
         reason, sigma = self._believable(distance, amplitude)
-        depth, sigma = self._along_z(distance, sigma, reason)
-        depth, sigma = self._rectified(depth, sigma, reason)
-        self._count(reason, depth)
+        depth = np.empty_like(distance)
+        counts = np.zeros(len(Reason), np.int64)
+        _along_z(distance, reason, self._ray_length, depth, sigma, counts)
+        depth, sigma = self._rectified(depth, sigma)
+        self._count(counts, depth)
         return DepthImage(
             stamp_ns,
             depth,
@@ -146,25 +154,15 @@ class DepthProcessor:
             amplitude = None  # a picture, not the strength of the camera's own light: it judges nothing
         reason = judge_pixels(mask, distance, amplitude)
         if noise.model == "quadratic":
-            sigma = range_sigma(noise, distance / self._ray_length, None) * self._ray_length
+            sigma = np.empty_like(distance)
+            _quadratic_sigma(distance, self._ray_length, np.float32(noise.constant), np.float32(noise.quadratic), sigma)
         else:
             sigma = range_sigma(noise, distance, amplitude)
         if mask.flying_pixels:
             reject_flying_pixels(distance, sigma, reason, self._pixel_angle)
         return reason, sigma
 
-    def _along_z(
-        self, distance: Float32Array, sigma: Float32Array, reason: ByteArray
-    ) -> tuple[Float32Array, Float32Array]:
-        masked = reason != Reason.VALID
-        depth, sigma = distance / self._ray_length, sigma / self._ray_length
-        depth[masked] = np.nan
-        sigma[masked] = np.nan
-        return depth, sigma
-
-    def _rectified(
-        self, depth: Float32Array, sigma: Float32Array, reason: ByteArray
-    ) -> tuple[Float32Array, Float32Array]:
+    def _rectified(self, depth: Float32Array, sigma: Float32Array) -> tuple[Float32Array, Float32Array]:
         if self._rectification is None:
             return depth, sigma
         slope = self._pixel_angle * np.tan(np.radians(MAXIMUM_INCIDENCE_DEG))
@@ -173,12 +171,38 @@ class DepthProcessor:
     def _rectified_picture(self, image: Float32Array | None) -> Float32Array | None:
         return image if image is None or self._rectification is None else self._rectification.image(image)
 
-    def _count(self, reason: ByteArray, depth: Float32Array) -> None:
+    def _count(self, counts: npt.NDArray[np.int64], depth: Float32Array) -> None:
+        seen = int(np.isfinite(depth).sum()) if self._rectification is not None else int(counts[Reason.VALID])
+        self.share_with_depth = seen / depth.size
         self.counters.add("images")
-        self.counters.add("output_pixels", int(np.isfinite(depth).sum()))
-        for value, amount in enumerate(np.bincount(reason.ravel(), minlength=len(Reason))):
+        self.counters.add("output_pixels", seen)
+        for value, amount in enumerate(counts):
             if amount:
                 self.counters.add(Reason(value).name.lower(), int(amount))
+
+
+@in_place(error_model="numpy")
+def _quadratic_sigma(distance, ray_length, constant, quadratic, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with the standard deviation along the ray of a camera whose noise grows with depth squared."""
+    for v in range(distance.shape[0]):
+        for u in range(distance.shape[1]):
+            z = distance[v, u] / ray_length[v, u]
+            out[v, u] = (constant + quadratic * z * z) * ray_length[v, u]
+
+
+@in_place(error_model="numpy")
+def _along_z(distance, reason, ray_length, depth, sigma, counts):  # type: ignore[no-untyped-def]
+    """Fill ``depth``, and turn ``sigma`` into that of depth; NaN where a pixel is not valid. Counts the reasons."""
+    for v in range(distance.shape[0]):
+        for u in range(distance.shape[1]):
+            valid = reason[v, u] == VALID
+            depth[v, u] = distance[v, u] / ray_length[v, u] if valid else np.float32(np.nan)
+            sigma[v, u] = sigma[v, u] / ray_length[v, u] if valid else np.float32(np.nan)
+    for v in range(reason.shape[0]):
+        for u in range(reason.shape[1]):
+            if reason[v, u] != VALID:
+                counts[reason[v, u]] += 1
+    counts[VALID] = reason.size - counts.sum()
 
 
 def normalise(intensity: Float32Array | None) -> Float32Array | None:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 
 from slam_core.config import Config, parameter
+from slam_core.in_place import in_place
 from slam_core.types import ByteArray, Float32Array
 
 MAXIMUM_INCIDENCE_DEG = 75.0
@@ -34,6 +34,9 @@ class Reason(IntEnum):
     SATURATED = 4
     WRAPPED = 5
     FLYING = 6
+
+
+VALID, NO_READING, OUT_OF_RANGE, TOO_DARK, SATURATED, WRAPPED, FLYING = (int(reason) for reason in Reason)
 
 
 @dataclass(frozen=True)
@@ -71,17 +74,35 @@ def judge_pixels(config: MaskConfig, distance: Float32Array, amplitude: Float32A
     amplitude
         Same shape, digits, or None.
     """
-    reason = np.zeros(distance.shape, dtype=np.uint8)
-    if amplitude is not None:
-        with np.errstate(invalid="ignore", over="ignore"):
-            reflectivity = amplitude * np.square(distance) / np.float32(config.white_amplitude)
-        reason[reflectivity < config.minimum_reflectivity] = Reason.WRAPPED
-        reason[(amplitude < config.minimum_amplitude) | ~np.isfinite(amplitude)] = Reason.TOO_DARK
-    reason[(distance < config.minimum_range) | (distance > config.maximum_range)] = Reason.OUT_OF_RANGE
-    reason[~(np.isfinite(distance) & (distance > 0.0))] = Reason.NO_READING
-    if amplitude is not None and config.saturated_amplitude > 0.0:
-        reason[amplitude >= config.saturated_amplitude] = Reason.SATURATED
+    c = config
+    limits = (c.minimum_range, c.maximum_range, c.minimum_amplitude, c.minimum_reflectivity, c.white_amplitude)
+    saturated = c.saturated_amplitude if c.saturated_amplitude > 0.0 else np.inf
+    reason = np.empty(distance.shape, np.uint8)
+    light = np.zeros(0, np.float32) if amplitude is None else amplitude.ravel()
+    _judge(distance.ravel(), light, np.array([*limits, saturated], np.float32), reason.reshape(-1))
     return reason
+
+
+@in_place(error_model="numpy")
+def _judge(distance, amplitude, limits, reason):  # type: ignore[no-untyped-def]
+    """Later tests outdo earlier ones, so that what hides all others is named: no reading, and before it saturation."""
+    nearest, farthest, darkest, least_reflectivity, white, saturated = limits
+    lit = len(amplitude) > 0
+    for i in range(len(distance)):
+        r, found = distance[i], np.uint8(VALID)
+        if lit:
+            light = amplitude[i]
+            if light * (r * r) / white < least_reflectivity:
+                found = np.uint8(WRAPPED)
+            if light < darkest or not np.isfinite(light):
+                found = np.uint8(TOO_DARK)
+        if r < nearest or r > farthest:
+            found = np.uint8(OUT_OF_RANGE)
+        if not (np.isfinite(r) and r > np.float32(0.0)):
+            found = np.uint8(NO_READING)
+        if lit and amplitude[i] >= saturated:
+            found = np.uint8(SATURATED)
+        reason[i] = found
 
 
 def reject_flying_pixels(distance: Float32Array, sigma: Float32Array, reason: ByteArray, pixel_angle: float) -> None:
@@ -99,30 +120,54 @@ def reject_flying_pixels(distance: Float32Array, sigma: Float32Array, reason: By
     pixel_angle
         Angle between the rays of neighbouring pixels, rad.
     """
-    read = (reason != Reason.NO_READING) & (reason != Reason.SATURATED)
-    # A frame of NaN spares the kernel all tests for borders and missing neighbours: no comparison with NaN holds.
-    surrounded = np.pad(np.where(read, distance, np.float32(np.nan)), 1, constant_values=np.nan)
+    height, width = distance.shape
     # Half of the noise of a difference: sqrt(a^2 + b^2) is taken as (a + b) / sqrt(2).
-    noise = np.pad(sigma * np.float32(NOISE_MULTIPLE / np.sqrt(2.0)), 1)
+    half = np.float32(NOISE_MULTIPLE / np.sqrt(2.0))
     slope = np.float32(pixel_angle * np.tan(np.radians(MAXIMUM_INCIDENCE_DEG)))
-    flying = _flying(surrounded, noise, slope, MINIMUM_NEIGHBOURS)
-    reason[flying & (reason == Reason.VALID)] = Reason.FLYING
+    surrounded, noise = np.empty((2, height + 2, width + 2), np.float32)
+    _surround(distance, sigma, reason, half, surrounded, noise)
+    jumps, same_surface = np.empty((2, width), np.float32)
+    _mark_flying(surrounded, noise, slope, MINIMUM_NEIGHBOURS, jumps, same_surface, reason)
 
 
-@njit(cache=True, nogil=True)
-def _flying(distance, noise, slope, minimum_neighbours):  # type: ignore[no-untyped-def]
-    height, width = distance.shape[0] - 2, distance.shape[1] - 2
-    flying = np.empty((height, width), dtype=np.bool_)
+@in_place()
+def _surround(distance, sigma, reason, factor, surrounded, noise):  # type: ignore[no-untyped-def]
+    """Readings in a frame of NaN, and their noise: no comparison with NaN holds, so no border has to be tested for."""
+    height, width = distance.shape
+    surrounded[:] = np.float32(np.nan)
+    noise[:] = np.float32(0.0)
     for v in range(height):
         for u in range(width):
-            r, half = distance[v + 1, u + 1], noise[v + 1, u + 1]
-            jumps, same_surface = 0, -1  # the pixel itself is among the nine
-            for dv in range(3):
-                for du in range(3):
-                    other = distance[v + dv, u + du]
-                    steps = np.float32(1.4142) if dv != 1 and du != 1 else np.float32(1.0)
-                    limit = steps * slope * min(r, other) + half + noise[v + dv, u + du]
-                    jumps += abs(other - r) > limit
-                    same_surface += abs(other - r) <= limit
-            flying[v, u] = jumps > 0 or same_surface < minimum_neighbours
-    return flying
+            noise[v + 1, u + 1] = sigma[v, u] * factor
+            if reason[v, u] != NO_READING and reason[v, u] != SATURATED:
+                surrounded[v + 1, u + 1] = distance[v, u]
+
+
+@in_place()
+def _mark_flying(distance, noise, slope, minimum_neighbours, jumps, same_surface, reason):  # type: ignore[no-untyped-def]
+    """``jumps`` and ``same_surface`` (width,) are room to count the neighbours of a row's pixels."""
+    height, width = reason.shape
+    for v in range(height):
+        jumps[:] = np.float32(0.0)
+        same_surface[:] = np.float32(0.0)
+        row, half = distance[v + 1, 1 : width + 1], noise[v + 1, 1 : width + 1]
+        for dv in range(3):
+            for du in range(3):
+                if dv == 1 and du == 1:
+                    continue
+                steps = np.float32(1.4142) if dv != 1 and du != 1 else np.float32(1.0)
+                others, noises = distance[v + dv, du : du + width], noise[v + dv, du : du + width]
+                _compare(row, half, others, noises, steps * slope, jumps, same_surface)
+        for u in range(width):
+            if jumps[u] > 0 or same_surface[u] < minimum_neighbours:
+                reason[v, u] = FLYING if reason[v, u] == VALID else reason[v, u]
+
+
+@in_place()
+def _compare(row, half, others, noises, slope, jumps, same_surface):  # type: ignore[no-untyped-def]
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for u in range(len(row)):
+        difference = abs(others[u] - row[u])
+        limit = slope * min(row[u], others[u]) + half[u] + noises[u]
+        jumps[u] += one if difference > limit else zero
+        same_surface[u] += one if difference <= limit else zero

@@ -76,7 +76,7 @@ class DepthStage:
         while self._processor is not None and self._waiting:
             raw = self._waiting.popleft()
             depth = self._processor.process(raw.stamp_ns, raw.image, raw.amplitude, raw.intensity)
-            share = float(np.isfinite(depth.depth).mean())
+            share = self._processor.share_with_depth
             self.complaint = f"{100.0 * share:.1f} % of the pixels have depth" if share < FEW_PIXELS else ""
             yield replace(depth, frame_id=raw.frame_id)
 
