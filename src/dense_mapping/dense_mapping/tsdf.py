@@ -13,14 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dense_mapping.tsdf_kernels import BLOCK, VOXELS, DepthView, integrate
-from slam_core.camera import MIN_DEPTH, Camera
+from dense_mapping.tsdf_kernels import BLOCK, VOXELS, DepthView, integrate, surface_blocks
+from slam_core.camera import Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray, Float32Array
 
 _TRUNCATION_VOXELS = 3.0
 """Distances are kept up to so many voxels."""
+_RECENT = 1 << 12
+"""Blocks that a look through a depth image remembers, a power of two."""
 _KEY_RANGE = 1 << 20
 """Block coordinates lie within plus and minus half of this."""
 
@@ -85,7 +87,7 @@ class TsdfVolume:
         self, T_map_camera: FloatArray, camera: Camera, depth: Float32Array, sigma: Float32Array, picture: ByteArray
     ) -> None:
         """Add a depth image: depth and sigma (h, w) m, 0 where there is none; picture (h, w, 3), or (0, 0, 3)."""
-        self._allocate(_surface_samples(T_map_camera, camera, depth, self.truncation))
+        self._allocate(self._surface_cells(T_map_camera, camera, depth))
         self._integrate(T_map_camera, camera, depth, sigma, picture, 1.0)
 
     def remove(self, T_map_camera: FloatArray, camera: Camera, depth: Float32Array, sigma: Float32Array) -> None:
@@ -97,8 +99,7 @@ class TsdfVolume:
     ) -> None:
         T_camera_map = invert_transform(T)
         blocks = self._visible(T_camera_map, camera, float(depth.max(initial=0.0)))
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        view = DepthView(T_camera_map, intrinsics, depth, sigma, picture)
+        view = DepthView(T_camera_map, _intrinsics(camera), depth, sigma, picture)
         size = self.config.voxel_size
         integrate(blocks, self._origins(), self._voxels, self._colours, size, self.truncation, view, sign)
 
@@ -120,20 +121,24 @@ class TsdfVolume:
                 seen &= side * (along - slope * z) / np.hypot(1.0, slope) > -radius
         return np.flatnonzero(seen)
 
-    def _allocate(self, points: FloatArray) -> None:
-        """Make the blocks that hold any of the points (n, 3)."""
-        cells = np.floor(points / self.block_size).astype(np.int64)
-        keys = _keys(cells)
-        begins = np.flatnonzero(np.concatenate([np.ones(min(1, len(keys)), dtype=bool), keys[1:] != keys[:-1]]))
-        keys, first = np.unique(keys[begins], return_index=True)  # of the runs: neighbours mostly share a block
-        new = [i for key, i in zip(keys.tolist(), begins[first].tolist(), strict=True) if key not in self._rows]
+    def _surface_cells(self, T: FloatArray, camera: Camera, depth: Float32Array) -> npt.NDArray[np.int64]:
+        """Places (m, 3) of the blocks near the surfaces that a depth image shows."""
+        cells = np.empty((3 * (depth.size // 4 + sum(depth.shape) + 1), 3), dtype=np.int64)
+        recent = np.full((_RECENT, 3), _KEY_RANGE, dtype=np.int64)
+        count = surface_blocks(T, _intrinsics(camera), depth, self.truncation, self.block_size, recent, cells)
+        return cells[:count]
+
+    def _allocate(self, cells: npt.NDArray[np.int64]) -> None:
+        """Make the blocks at places (n, 3)."""
+        keys, first = np.unique(_keys(cells), return_index=True)
+        new = [(key, i) for key, i in zip(keys.tolist(), first.tolist(), strict=True) if key not in self._rows]
         room = self.config.max_blocks - len(self)
         self.refused_blocks += max(0, len(new) - room)
         new = new[: max(0, room)]
         self._make_room()
-        for i in new:
+        for key, i in new:
             self._coordinates[len(self)] = cells[i]
-            self._rows[int(_keys(cells[i : i + 1])[0])] = len(self)
+            self._rows[key] = len(self)
 
     def _make_room(self) -> None:
         """Room for all blocks that there may be: the system gives memory to those alone that are written to."""
@@ -152,10 +157,5 @@ def _keys(cells: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     return np.asarray((shifted[:, 0] * _KEY_RANGE + shifted[:, 1]) * _KEY_RANGE + shifted[:, 2])
 
 
-def _surface_samples(T: FloatArray, camera: Camera, depth: Float32Array, truncation: float) -> FloatArray:
-    """Points (m, 3) of the map on every other pixel's ray, before, at and behind its depth."""
-    v, u = np.nonzero(depth[::2, ::2] > 0.0)
-    z = depth[::2, ::2][v, u].astype(np.float64)
-    rays = np.column_stack([(2 * u - camera.cx) / camera.fx, (2 * v - camera.cy) / camera.fy, np.ones(len(u))])
-    points = [rays * np.maximum(z + shift, MIN_DEPTH)[:, None] for shift in (-truncation, 0.0, truncation)]
-    return transform_points(T, np.concatenate(points))
+def _intrinsics(camera: Camera) -> FloatArray:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])

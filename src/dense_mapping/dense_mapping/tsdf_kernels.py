@@ -37,6 +37,40 @@ class DepthView(NamedTuple):
 
 
 @in_place(error_model="numpy")
+def surface_blocks(
+    T_map_camera: FloatArray,
+    intrinsics: FloatArray,
+    depth: Float32Array,
+    truncation: float,
+    block_size: float,
+    recent: npt.NDArray[np.int64],
+    cells: npt.NDArray[np.int64],
+) -> int:  # pragma: no cover - compiled
+    """Blocks (m, 3) that rays go through before, at and behind their depth, some more than once, to ``cells``; m.
+
+    Rays are those of every other pixel. ``recent`` (k, 3), k a power of two: room for blocks found not long ago, at
+    first out of reach.
+    """
+    T, count = T_map_camera, 0
+    for side in (-1.0, 0.0, 1.0):
+        for v in range(0, depth.shape[0], 2):
+            for u in range(0, depth.shape[1], 2):
+                if not depth[v, u] > 0.0:
+                    continue
+                z = max(depth[v, u] + side * truncation, MIN_DEPTH)
+                x, y = (u - intrinsics[2]) / intrinsics[0] * z, (v - intrinsics[3]) / intrinsics[1] * z
+                for k in range(3):
+                    place = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z + T[k, 3]
+                    cells[count, k] = math.floor(place / block_size)
+                a, b, c = cells[count]
+                slot = (a * 73856093 ^ b * 19349663 ^ c * 83492791) & (recent.shape[0] - 1)
+                if recent[slot, 0] != a or recent[slot, 1] != b or recent[slot, 2] != c:
+                    recent[slot, 0], recent[slot, 1], recent[slot, 2] = a, b, c
+                    count += 1
+    return count
+
+
+@in_place(error_model="numpy")
 def _look_up(u: float, v: float, depth: Float32Array, jump: float) -> float:  # pragma: no cover - compiled
     """Depth at a pixel, bilinear where the four neighbours belong to one surface, else of the nearest; 0: none."""
     height, width = depth.shape
