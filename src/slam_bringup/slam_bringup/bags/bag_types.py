@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -40,38 +40,58 @@ class BagTypes(MessageTypes):
         return np.ascontiguousarray(array, dtype=np.int8).reshape(-1)
 
 
+class _Field(NamedTuple):
+    """A field of a message: its element type if it is a numeric sequence, and a function that makes its default."""
+
+    name: str
+    dtype: np.dtype[Any] | None
+    default: Callable[[], Any]
+
+
 def _make(type_name: str, **given: Any) -> Any:
     fields = {}
-    for name, kind in typestore().fielddefs[type_name][1]:
-        fields[name] = _as_field(kind, given.pop(name)) if name in given else _default(type_name, name, kind)
+    for name, dtype, default in _fields(type_name):
+        if name not in given:
+            fields[name] = default()
+        else:
+            value = given.pop(name)
+            fields[name] = value if dtype is None else np.asarray(value, dtype=dtype)
     if given:
         raise TypeError(f"{type_name} has no field {', '.join(given)}")
     return typestore().types[type_name](**fields)
 
 
-def _as_field(kind: Any, value: Any) -> Any:
-    """Numeric sequences become numpy arrays of the field's element type; everything else stays."""
+@cache
+def _fields(type_name: str) -> tuple[_Field, ...]:
+    """The fields of a type, looked up once: a marker alone has forty."""
+    fields = typestore().fielddefs[type_name][1]
+    return tuple(_Field(name, _element_type(kind), _default(type_name, name, kind)) for name, kind in fields)
+
+
+def _element_type(kind: Any) -> np.dtype[Any] | None:
     node, detail = kind
-    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE) and _is_numeric(detail[0]):
-        return np.asarray(value, dtype=_dtype(detail[0]))
-    return value
+    is_sequence = node in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+    return _dtype(detail[0]) if is_sequence and _is_numeric(detail[0]) else None
 
 
-def _default(type_name: str, name: str, kind: Any) -> Any:
+def _default(type_name: str, name: str, kind: Any) -> Callable[[], Any]:
+    """A function that returns the default of a field, a new one each time where it could be changed."""
     node, detail = kind
     if node == Nodetype.NAME:
-        return _make(detail)
+        return partial(_make, detail)
     if node == Nodetype.BASE:
-        if (type_name, name) == ("geometry_msgs/msg/Quaternion", "w"):
-            return 1.0
-        return "" if detail[0] in _TEXT else np.dtype(detail[0].replace("octet", "uint8")).type(0).item()
+        value = 1.0 if (type_name, name) == ("geometry_msgs/msg/Quaternion", "w") else _zero(detail[0])
+        return lambda: value
     element, count = detail
     length = count if node == Nodetype.ARRAY else 0
-    return (
-        np.zeros(length, dtype=_dtype(element))
-        if _is_numeric(element)
-        else [_default("", "", element) for _ in range(length)]
-    )
+    if _is_numeric(element):
+        return partial(np.zeros, length, dtype=_dtype(element))
+    make = _default("", "", element)
+    return lambda: [make() for _ in range(length)]
+
+
+def _zero(base: str) -> Any:
+    return "" if base in _TEXT else np.dtype(base.replace("octet", "uint8")).type(0).item()
 
 
 def _is_numeric(element: Any) -> bool:

@@ -16,15 +16,17 @@ _BETWEEN = (0.65, 0.3)
 """Room (inches) between columns and between rows of axes."""
 
 
-def blank(width: float, height: float, rows: int = 1, columns: int = 1) -> tuple[Figure, npt.NDArray[np.object_]]:
-    """A figure (inches) and its axes (rows, columns), which share their x axis."""
+def blank(
+    width: float, height: float, rows: int = 1, columns: int = 1, *, sharex: bool = True
+) -> tuple[Figure, npt.NDArray[np.object_]]:
+    """A figure (inches) and its axes (rows, columns), which share their x axis unless not wanted."""
     figure = Figure(figsize=(width, height))
     across = (width - _LEFT - _RIGHT - (columns - 1) * _BETWEEN[0]) / columns
     along = (height - _BOTTOM - _TOP - (rows - 1) * _BETWEEN[1]) / rows
     axes = figure.subplots(
         rows,
         columns,
-        sharex=True,
+        sharex=sharex,
         squeeze=False,
         gridspec_kw={
             "left": _LEFT / width,

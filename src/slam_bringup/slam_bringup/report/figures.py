@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import matplotlib
@@ -27,9 +28,19 @@ _TRUTH = "#222222"
 
 
 def save_png(path: Path, figure: Figure, dpi: int = 130) -> None:
-    """Write a figure; without a date in the file, so that equal figures are equal bytes."""
+    """Write a figure."""
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=dpi, metadata={"Software": None})
+        temporary.write_bytes(png(figure, dpi))
+
+
+def png(figure: Figure, dpi: int) -> bytes:
+    """A figure as PNG, without a date, so that equal figures are equal bytes.
+
+    Packed quickly: a tenth larger than packed well, which takes a quarter of the time for drawing.
+    """
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs={"compress_level": 1})
+    return buffer.getvalue()
 
 
 def map_figure(result: RunResult) -> Figure:

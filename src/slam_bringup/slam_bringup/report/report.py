@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -17,7 +16,7 @@ from matplotlib.figure import Figure
 from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_bringup.pipeline.results import AgentResult, RunResult
 from slam_bringup.report.agent_figures import motion_figure, side_view, sigma_figure
-from slam_bringup.report.figures import error_figure, features_figure, floor_plan_figure, timing_figure
+from slam_bringup.report.figures import error_figure, features_figure, floor_plan_figure, png, timing_figure
 from slam_bringup.report.scene3d import scene_page
 from slam_bringup.report.structure_figures import sparsity_figure, submaps_figure
 from slam_core.evaluation import Evaluation
@@ -90,9 +89,7 @@ def verdict(evaluation: Evaluation | None) -> str:
 def _embedded(figure: Figure | None) -> str | None:
     if figure is None:
         return None
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return _as_url(buffer.getvalue())
+    return _as_url(png(figure, 110))
 
 
 def _as_url(image: bytes, kind: str = "png") -> str:

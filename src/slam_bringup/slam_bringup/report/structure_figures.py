@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sjsam_node.graph.map_graph import MapGraph
+from slam_bringup.report.canvas import blank
 from slam_bringup.report.figures import COLOURS
 from slam_core.geometry import FloatArray, transform_points
 
@@ -18,8 +19,7 @@ def submaps_figure(graph: MapGraph) -> Figure | None:
     """Submaps and their landmarks from above, chained by odometry alone and joined, with the closures (Fig. 9.3)."""
     if len(graph.records) < 2:
         return None
-    figure = Figure(figsize=(10, 4.6), layout="constrained")
-    before, after = figure.subplots(1, 2)
+    figure, ((before, after),) = blank(10, 4.6, 1, 2, sharex=False)
     joined = np.stack([graph.poses[r.start] for r in graph.records])
     for axes, starts, title in (
         (before, _chained(graph), "before: by odometry alone"),
@@ -67,8 +67,7 @@ def sparsity_figure(graph: MapGraph) -> Figure | None:
         return None
     rows, columns = _entries(graph)
     unknowns = len(graph.poses) + len(np.unique(columns[columns >= len(graph.poses)]))
-    figure = Figure(figsize=(10, 4.2), layout="constrained")
-    axes = figure.add_subplot()
+    figure, ((axes,),) = blank(10, 4.2)
     shown = slice(None, None, 1 + len(rows) // _MOST_ENTRIES)
     axes.plot(columns[shown], rows[shown], ".", color=COLOURS[1], markersize=1.2, rasterized=True)
     axes.axvline(len(graph.poses) - 0.5, color="0.6", linewidth=0.8)
