@@ -29,6 +29,38 @@ def slanted(normal=NORMAL, distance=2.0) -> np.ndarray:
     return plane_depth(np.column_stack([u.ravel(), v.ravel()]), normal, distance).reshape(204, 204)
 
 
+def plane_twin(image: DepthImage, u: float, v: float) -> tuple[float, float, float] | None:
+    """Depth and gradient of the plane of inverse depth, by least squares; None where there is no single surface."""
+    u0, v0 = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+    if not (1 <= u0 < CAMERA.width - 1 and 1 <= v0 < CAMERA.height - 1):
+        return None
+    part = (slice(v0 - 1, v0 + 2), slice(u0 - 1, u0 + 2))
+    depth, sigma = (np.asarray(values[part], np.float64).ravel() for values in (image.depth, image.sigma))
+    if not (np.isfinite(depth).all() and np.isfinite(sigma).all()):
+        return None
+    dv, du = (g.ravel() for g in np.mgrid[-1:2, -1:2])
+    plane, *_ = np.linalg.lstsq(np.column_stack([np.ones(9), du, dv]), 1.0 / depth, rcond=None)
+    z = 1.0 / (plane @ [1.0, u - u0, v - v0])
+    gradient = -plane[1:] * z**2
+    step = np.abs(1.0 / depth - plane @ [np.ones(9), du, dv]) * z**2
+    fits = (step <= np.maximum(4.0 * sigma, 0.005 * z)).all() and (np.abs(gradient) <= 0.06 * z).all()
+    return (z, *gradient) if fits and 0.9 * depth.min() <= z <= 1.1 * depth.max() else None
+
+
+def test_the_kernel_against_its_twin(rng):
+    depth = slanted() + rng.normal(0, 0.02, (204, 204)) + 0.5 * (np.arange(204) > 100)
+    depth[rng.random(depth.shape) < 0.01] = np.nan
+    image = depth_image(depth, sigma=0.01)
+    uv = rng.uniform(-2, 206, (600, 2))
+    samples = sample_depth(image, uv)
+    expected = [plane_twin(image, *position) for position in uv]
+    known = np.array([plane is not None for plane in expected])
+    np.testing.assert_array_equal(np.isfinite(samples.depth), known)
+    assert 200 < known.sum() < 590
+    found = np.column_stack([samples.depth, samples.gradient])[known]
+    np.testing.assert_allclose(found, [plane for plane in expected if plane], rtol=1e-9, atol=1e-12)
+
+
 def test_a_slanted_plane_is_exact_between_pixels(rng):
     uv = rng.uniform(2, 200, (300, 2))
     samples = sample_depth(depth_image(slanted()), uv)

@@ -17,8 +17,9 @@ from slam_core.camera import Camera
 from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform
+from slam_core.in_place import in_place
 from slam_core.types import DepthImage
-from stereo_frontend.depth_lookup import DepthSamples, sample_depth
+from stereo_frontend.depth_lookup import DepthSamples, fit_plane, sample_depth
 
 _MOTION_SPEED = 0.3
 """Speed of the rig assumed when the stamps differ: depth sigma grows by speed times age, m/s."""
@@ -89,13 +90,8 @@ def map_depth(
     T_tof_left = invert_transform(T_left_tof)
     rays_tof, origin = rays @ T_tof_left[:3, :3].T, T_tof_left[:3, 3]
     depth = np.where(np.isfinite(initial_depth), initial_depth, _median_depth(image))
-    moving = np.arange(len(depth))
-    for _ in range(_ITERATIONS - 1):
-        samples = sample_depth(image, image.camera.project(rays_tof[moving] * depth[moving, None] + origin))
-        update = (samples.depth - origin[2]) / rays_tof[moving, 2]
-        moved = np.abs(update - depth[moving])
-        depth[moving] = np.where(np.isfinite(update), update, depth[moving])
-        moving = moving[moved > _STANDS_STILL]
+    c = image.camera
+    _settle(image.depth, image.sigma, rays_tof, origin, (c.fx, c.fy, c.cx, c.cy), depth)
     pixels = image.camera.project(rays_tof * depth[:, None] + origin)
     samples = sample_depth(image, pixels)
     update = (samples.depth - origin[2]) / rays_tof[:, 2]
@@ -104,6 +100,24 @@ def map_depth(
     sigma = _mapped_sigma(samples, image.camera, age) / np.abs(rays_tof[:, 2])
     blank = np.where(settled & (depth > 0.0), 0.0, np.nan)
     return MappedDepth(update + blank, sigma + blank, pixels, np.linalg.norm(rays_tof, axis=1))
+
+
+@in_place(error_model="numpy")
+def _settle(image, sigma, rays, origin, intrinsics, depth):  # type: ignore[no-untyped-def]
+    """Move ``depth`` (n,) m along rays (n, 3) in the frame of a depth image to where the image has the same depth."""
+    fx, fy, cx, cy = intrinsics
+    for i in range(len(depth)):
+        for _ in range(_ITERATIONS - 1):
+            d = depth[i]
+            x, y, z = rays[i, 0] * d + origin[0], rays[i, 1] * d + origin[1], rays[i, 2] * d + origin[2]
+            found = fit_plane(image, sigma, x / z * fx + cx, y / z * fy + cy)[0] if z > 0.0 else 0.0
+            if found == 0.0:
+                break
+            update = (found - origin[2]) / rays[i, 2]
+            moved = abs(update - d)
+            depth[i] = update if np.isfinite(update) else d
+            if not moved > _STANDS_STILL:
+                break
 
 
 def fuse_depth(

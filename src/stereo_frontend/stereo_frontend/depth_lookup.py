@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 from slam_core.types import DepthImage
 
 _MAX_MISFIT = 4.0
@@ -23,7 +24,6 @@ _MIN_STEP = 0.005
 _MAX_SLOPE = 0.06
 """Greatest change of depth per pixel, as a share of depth."""
 
-_DU, _DV = (g.ravel() for g in np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]))
 _FREEDOM = 6
 """Nine pixels less the three numbers of the plane."""
 _MEDIAN_CHI_SQUARE, _HIGH_CHI_SQUARE = 0.891, 2.099
@@ -41,47 +41,62 @@ class DepthSamples:
 
 def sample_depth(image: DepthImage, uv: npt.ArrayLike) -> DepthSamples:
     """Depth of positions (n, 2) px; positions outside the image or beside missing pixels are NaN."""
-    uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
-    centre, inside = _nearest_inner_pixels(uv, image.depth.shape)
-    u = centre[:, 0, None] + _DU.astype(np.intp)
-    v = centre[:, 1, None] + _DV.astype(np.intp)
-    depth = image.depth[v, u].astype(np.float64)
-    sigma = image.sigma[v, u].astype(np.float64)
-    usable = inside & np.all(np.isfinite(depth) & (depth > 0.0) & np.isfinite(sigma), axis=1)
-    depth[~usable], sigma[~usable] = 1.0, 1.0
-    return _fit_plane(depth, sigma, uv - centre, usable)
+    uv = np.ascontiguousarray(uv, dtype=np.float64).reshape(-1, 2)
+    planes = np.full((len(uv), 6), np.nan)
+    _fit_planes(image.depth, image.sigma, uv, planes)
+    depth, gradient, (pixel_variance, misfit, offset_squared) = planes[:, 0], planes[:, 1:3], planes[:, 3:].T
+    variance = _variance_of_fit(pixel_variance, misfit, offset_squared, np.isfinite(depth))
+    return DepthSamples(depth, np.sqrt(variance), gradient)
 
 
-def _nearest_inner_pixels(uv: FloatArray, shape: tuple[int, ...]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
-    limit = np.array([shape[1] - 2, shape[0] - 2])
-    finite = np.where(np.isfinite(uv), uv, -1.0)
-    rounded = np.floor(np.clip(finite, -1e6, 1e6) + 0.5).astype(np.intp)
-    inside = np.all((rounded >= 1) & (rounded <= limit), axis=1)
-    return np.clip(rounded, 1, np.maximum(limit, 1)), inside
+@in_place(error_model="numpy")
+def _fit_planes(depth, sigma, uv, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (n, 6) where there is one surface: depth, its gradient (2,), and what the variance is made of.
+
+    Those are the pixels' mean variance, the misfit per freedom, both m2, and the squared distance to the middle pixel.
+    """
+    for i in range(len(uv)):
+        plane = fit_plane(depth, sigma, uv[i, 0], uv[i, 1])
+        if plane[0] > 0.0:
+            for j in range(6):
+                out[i, j] = plane[j]
 
 
-def _fit_plane(
-    depth: FloatArray,
-    sigma: FloatArray,
-    offset: FloatArray,
-    usable: npt.NDArray[np.bool_],
-) -> DepthSamples:
-    inverse = 1.0 / depth
-    mean, slope_u, slope_v = inverse.mean(axis=1), inverse @ _DU / 6.0, inverse @ _DV / 6.0
-    fitted = mean[:, None] + slope_u[:, None] * _DU + slope_v[:, None] * _DV
-    value = mean + slope_u * offset[:, 0] + slope_v * offset[:, 1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        z = 1.0 / value
-        step = np.abs(inverse - fitted) * z[:, None] ** 2
-        gradient = -np.column_stack([slope_u, slope_v]) * z[:, None] ** 2
-    limit = np.maximum(_MAX_MISFIT * sigma, _MIN_STEP * z[:, None])
-    smooth = np.all(step <= limit, axis=1) & np.all(np.abs(gradient) <= _MAX_SLOPE * z[:, None], axis=1)
-    ok = usable & smooth & (value > 0.0) & (depth.min(axis=1) * 0.9 <= z) & (z <= depth.max(axis=1) * 1.1)
-    pixel_variance = (sigma**2).mean(axis=1)
-    misfit = (step**2).sum(axis=1) / _FREEDOM
-    variance = _variance_of_fit(pixel_variance, misfit, (offset**2).sum(axis=1), ok)
-    blank = np.where(ok, 0.0, np.nan)
-    return DepthSamples(z + blank, np.sqrt(variance) + blank, gradient + blank[:, None])
+@in_place(error_model="numpy")
+def fit_plane(depth, sigma, u, v):  # type: ignore[no-untyped-def]
+    """The six numbers of :func:`_fit_planes` at a position, px; all 0 where there is no single surface."""
+    nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    height, width = depth.shape
+    if not (0.5 <= u < width - 1.5 and 0.5 <= v < height - 1.5):
+        return nothing
+    u0, v0 = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+    mean, slope_u, slope_v, nearest, farthest = 0.0, 0.0, 0.0, np.inf, 0.0
+    for j in range(-1, 2):
+        for i in range(-1, 2):
+            z = np.float64(depth[v0 + j, u0 + i])
+            if not (0.0 < z < np.inf and np.isfinite(sigma[v0 + j, u0 + i])):
+                return nothing
+            mean, slope_u, slope_v = mean + 1.0 / z, slope_u + i / z, slope_v + j / z
+            nearest, farthest = min(nearest, z), max(farthest, z)
+    mean, slope_u, slope_v = mean / 9.0, slope_u / 6.0, slope_v / 6.0
+    du, dv = u - u0, v - v0
+    value = mean + slope_u * du + slope_v * dv
+    z = 1.0 / value
+    gradient_u, gradient_v = -slope_u * z * z, -slope_v * z * z
+    if not (value > 0.0 and nearest * 0.9 <= z <= farthest * 1.1):
+        return nothing
+    if not (abs(gradient_u) <= _MAX_SLOPE * z and abs(gradient_v) <= _MAX_SLOPE * z):
+        return nothing
+    variance, misfit = 0.0, 0.0
+    for j in range(-1, 2):
+        for i in range(-1, 2):
+            noise = np.float64(sigma[v0 + j, u0 + i])
+            fitted = mean + slope_u * i + slope_v * j
+            step = abs(1.0 / np.float64(depth[v0 + j, u0 + i]) - fitted) * z * z
+            if not step <= max(_MAX_MISFIT * noise, _MIN_STEP * z):
+                return nothing
+            variance, misfit = variance + noise * noise, misfit + step * step
+    return z, gradient_u, gradient_v, variance / 9.0, misfit / _FREEDOM, du * du + dv * dv
 
 
 def _variance_of_fit(

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_core.config import Config, parameter
+from slam_core.in_place import in_place
 from slam_core.types import ByteArray, DepthImage, Features, FeatureSource, Float32Array
 from stereo_frontend.assembly import DepthEstimate, make_features
 from stereo_frontend.depth_lookup import sample_depth
@@ -105,14 +106,33 @@ def _shows_something(values: Float32Array | None) -> bool:
 
 def normalised_picture(values: Float32Array, clip: float, gamma: float) -> ByteArray:
     """An 8-bit picture of an image (Eq. 3.3); missing values are white, an image without contrast black."""
-    finite = values[np.isfinite(values)]
+    known = np.isfinite(values)
+    finite = values.ravel() if known.all() else values[known]
     if finite.size == 0:
         return np.zeros(values.shape, np.uint8)
     low, high = np.quantile(finite[:: max(1, finite.size // 20000)], [clip, 1.0 - clip])
     if not high > low:
         return np.zeros(values.shape, np.uint8)
-    unit = np.clip((values - np.float32(low)) / np.float32(high - low), 0.0, 1.0)
-    return np.asarray(255.0 * np.nan_to_num(unit, nan=1.0) ** np.float32(gamma) + 0.5).astype(np.uint8)
+    unit = np.empty(values.size, np.float32)
+    _normalise(np.asarray(values, np.float32).ravel(), np.float32(low), np.float32(high - low), unit)
+    lifted = np.sqrt(unit, out=unit) if gamma == 0.5 else unit ** np.float32(gamma)
+    picture = np.empty(values.shape, np.uint8)
+    _to_grey(lifted, picture.reshape(-1))
+    return picture
+
+
+@in_place(error_model="numpy")
+def _normalise(values, low, span, out):  # type: ignore[no-untyped-def]
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for i in range(len(values)):
+        share = (values[i] - low) / span
+        out[i] = max(share, zero) if share < one else one  # a missing value is no less than one
+
+
+@in_place()
+def _to_grey(unit, out):  # type: ignore[no-untyped-def]
+    for i in range(len(unit)):
+        out[i] = np.uint8(np.int32(np.float32(255.0) * unit[i] + np.float32(0.5)))
 
 
 def _joined(parts: list[Keypoints]) -> Keypoints:
