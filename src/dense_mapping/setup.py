@@ -22,7 +22,6 @@ setup(
         "numpy",
         "opencv-python-headless",
         "plyfile",
-        "PyMCubes",
         "PyYAML",
         "scipy",
         "trimesh",

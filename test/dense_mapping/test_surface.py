@@ -11,6 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from dense_mapping import surface_kernels as kernels
+from dense_mapping.cube_triangles import triangle_table
 from dense_mapping.row_keys import row_keys
 from dense_mapping.surface import SurfaceConfig, voxel_statistics
 
@@ -21,7 +22,7 @@ def test_marching_cubes_cuts_as_pymcubes_does_and_leaves_out_what_is_not_known(r
     distance[rng.random(distance.shape) < unknown * (np.arange(20) > 9)] = np.nan
     vertices, triangles = mcubes.marching_cubes(distance, 0.0)
     whole = triangles[np.isfinite(vertices).all(axis=1)[triangles].all(axis=1)].astype(int)
-    found, voxels, faces = kernels.march(distance, kernels.triangle_table())
+    found, voxels, faces = kernels.march(distance, triangle_table())
     assert len(faces) == len(whole) > 100
     np.testing.assert_allclose(found[faces], vertices[whole][:, ::-1], atol=1e-12)
     assert np.abs(found[faces] - voxels[faces]).max() <= 0.5

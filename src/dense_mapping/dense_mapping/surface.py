@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from dense_mapping.cube_triangles import triangle_table
 from dense_mapping.row_keys import row_keys
-from dense_mapping.surface_kernels import add_normals, fill_means, march, pieces, triangle_table
+from dense_mapping.surface_kernels import add_normals, fill_means, march, pieces
 from dense_mapping.tsdf import TsdfVolume
 from dense_mapping.tsdf_kernels import BLOCK
 from slam_core.config import Config

@@ -1,43 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compiled parts of the surface: marching cubes over known voxels, connected pieces, normals.
 
-PyMCubes' own loop takes 47 ns per voxel and knows nothing of voxels that were not seen. Its table of triangles is used
-here, asked of it once, so both cut a cube in the same way.
+PyMCubes' own loop takes 47 ns per voxel and knows nothing of voxels that were not seen; both cut in the same way.
 """
 
 from __future__ import annotations
 
-from functools import cache
-
-import mcubes
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from dense_mapping.cube_triangles import Triangles
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 from slam_core.types import Float32Array
 
-_MOST_TRIANGLES = 5
-"""Triangles in one cube."""
-Triangles = npt.NDArray[np.int8]
 Faces = npt.NDArray[np.int32]
-
-
-@cache
-def triangle_table() -> Triangles:
-    """Triangles (256, 5, 3) of a cube whose corners are inside (bit 4x + 2y + z set) or outside, -1: no more.
-
-    A triangle's corners are edges of the cube: 8 times their axis plus the bits of their lower end.
-    """
-    table = np.full((256, _MOST_TRIANGLES, 3), -1, dtype=np.int8)
-    for code in range(256):
-        inside = np.array([code >> bit & 1 for bit in range(8)])
-        vertices, triangles = mcubes.marching_cubes((1.0 - 2.0 * inside).reshape(2, 2, 2), 0.0)
-        axes = np.argmax(vertices == 0.5, axis=1) if len(vertices) else np.empty(0, dtype=np.int64)
-        lower = np.floor(vertices).astype(np.int64) @ np.array([4, 2, 1])
-        table[code, : len(triangles)] = (8 * axes + lower)[triangles.astype(np.int64)]
-    return table
 
 
 @in_place()

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from slam_core.camera import CameraInfo
 from slam_core.geometry import FloatArray, so3_exp, so3_log
@@ -21,6 +20,8 @@ def corrected_right(info: CameraInfo, error: RectificationError) -> tuple[Camera
 
     P stays, so the left info goes with it as it is. ``error`` is that of images rectified with ``info``.
     """
+    from scipy.optimize import least_squares  # 10 MB that only a run with such an error needs
+
     target = error.camera
     u, v = np.meshgrid(np.linspace(0, target.width - 1, _GRID), np.linspace(0, target.height - 1, _GRID))
     ideal = np.column_stack([u.ravel(), v.ravel()])
