@@ -15,13 +15,18 @@ f and g are piecewise linear, smooth by their prior. A camera without amplitude 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from types import EllipsisType
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from slam_core.camera import Camera
 from slam_core.geometry import FloatArray
 from slam_core.types import DepthImage, Float32Array
+
+Pixels = tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]] | EllipsisType
 
 KNOTS: FloatArray = np.arange(0.0, 10.5, 0.5)
 """Ranges between which f and g are linear, m."""
@@ -61,53 +66,65 @@ def prior_covariance(size: int) -> FloatArray:
 class RangeFields:
     """Quantities that the error of each pixel depends on.
 
-    range: (h, w) m along the ray, NaN where there is none. weakness: (h, w), or None without amplitude. share, ahead:
-    (k, h, w), A_k / A and (r_k - r) A_k / A.
+    range: (h, w) m along the ray, NaN where there is none. amplitude: (h, w), or None; mean_amplitude is the camera's.
+    amplitudes, ranges: A_k and r_k, (h, w) each.
     """
 
     range: FloatArray
-    weakness: FloatArray | None
-    share: FloatArray
-    ahead: FloatArray
+    amplitude: Float32Array | None
+    mean_amplitude: float
+    amplitudes: list[Float32Array]
+    ranges: list[Float32Array]
 
     @classmethod
     def of(cls, image: DepthImage, mean_amplitude: float) -> RangeFields:
         """Fields of a depth image; ``mean_amplitude`` belongs to the camera, and stays the same."""
         distance = image.depth * ray_length(image.camera)
-        if image.amplitude is None:
-            none = np.zeros((0, *distance.shape), np.float32)
-            return cls(distance, None, none, none)
-        own = np.maximum(image.amplitude, np.float32(mean_amplitude / _WEAKEST))
-        amplitude, around = _surroundings(image.amplitude, distance)
-        share = amplitude / own
-        return cls(distance, np.float32(mean_amplitude) / own, share, share * (around - distance))
+        around = ([], []) if image.amplitude is None else _surroundings(image.amplitude, distance)
+        return cls(distance, image.amplitude, mean_amplitude, *around)
+
+    @property
+    def has_amplitude(self) -> bool:
+        """True if the error has all its terms."""
+        return self.amplitude is not None
+
+    def terms(self, at: Pixels = ...) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Weakness (...), shares ``A_k / A`` and ``(r_k - r) A_k / A`` (k, ...) of pixels, by default of all."""
+        assert self.amplitude is not None
+        own = np.maximum(self.amplitude[at], np.float32(self.mean_amplitude / _WEAKEST))
+        share = np.stack([amplitude[at] for amplitude in self.amplitudes]) / own
+        ahead = share * (np.stack([around[at] for around in self.ranges]) - self.range[at])
+        return np.asarray(np.float32(self.mean_amplitude) / own), share, ahead
 
     def rows(self, uv: FloatArray) -> FloatArray:
         """Derivatives (n, parameters) of the error at pixels (n, 2), which must have depth."""
         u, v = np.rint(uv).astype(np.intp).T
         hat = _hats(self.range[v, u])
-        if self.weakness is None:
+        if self.amplitude is None:
             return hat
-        return np.column_stack([hat, hat * self.weakness[v, u][:, None], self.share[:, v, u].T, self.ahead[:, v, u].T])
+        weakness, share, ahead = self.terms((v, u))
+        return np.column_stack([hat, hat * weakness[:, None], share.T, ahead.T])
 
     def weakness_at(self, uv: FloatArray) -> FloatArray:
         """Weakness (n,) at pixels (n, 2); ones without amplitude."""
-        if self.weakness is None:
+        if self.amplitude is None:
             return np.ones(len(uv))
         u, v = np.rint(uv).astype(np.intp).T
-        return np.asarray(self.weakness[v, u], np.float64)
+        return np.asarray(self.terms((v, u))[0], np.float64)
 
     def error(self, theta: FloatArray) -> FloatArray:
         """Error (h, w) m of all pixels by parameters; NaN where there is no depth."""
-        n, k = len(KNOTS), len(self.share)
+        n, k = len(KNOTS), len(self.amplitudes)
         out = np.interp(self.range, KNOTS, theta[:n])
-        if self.weakness is not None:
-            out += self.weakness * np.interp(self.range, KNOTS, theta[n : 2 * n])
-            out += np.tensordot(theta[2 * n : 2 * n + k], self.share, 1)
-            out += np.tensordot(theta[2 * n + k :], self.ahead, 1)
+        if self.amplitude is not None:
+            weakness, share, ahead = self.terms()
+            out += weakness * np.interp(self.range, KNOTS, theta[n : 2 * n])
+            out += np.tensordot(theta[2 * n : 2 * n + k], share, 1)
+            out += np.tensordot(theta[2 * n + k :], ahead, 1)
         return np.asarray(out)
 
 
+@lru_cache(maxsize=4)
 def ray_length(camera: Camera) -> FloatArray:
     """Range over depth of each pixel of a camera without distortion, (h, w)."""
     x = (np.arange(camera.width) - camera.cx) / camera.fx
@@ -121,8 +138,8 @@ def _hats(distance: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(0.0, 1.0 - np.abs(inside[:, None] - KNOTS) / (KNOTS[1] - KNOTS[0])))
 
 
-def _surroundings(amplitude: Float32Array, distance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Amplitude and range (k, h, w) around each pixel, the range weighted by the light."""
+def _surroundings(amplitude: Float32Array, distance: FloatArray) -> tuple[list[Float32Array], list[Float32Array]]:
+    """Amplitudes and ranges (h, w) around each pixel at the widths, the range weighted by the light."""
     height, width = distance.shape
     size = (_SMALL, max(1, round(_SMALL * height / width)))
     light = np.where(np.isfinite(distance), amplitude, 0.0).astype(np.float32)
@@ -133,6 +150,6 @@ def _surroundings(amplitude: Float32Array, distance: FloatArray) -> tuple[FloatA
         blurred = [cv2.GaussianBlur(image, (0, 0), share * _SMALL) for image in small]
         mean = blurred[1] / np.maximum(blurred[0], np.float32(1e-6))
         full = [cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR) for image in (blurred[0], mean)]
-        amplitudes.append(full[0])
-        ranges.append(full[1])
-    return np.stack(amplitudes), np.stack(ranges)
+        amplitudes.append(np.asarray(full[0], np.float32))
+        ranges.append(np.asarray(full[1], np.float32))
+    return amplitudes, ranges

@@ -166,7 +166,7 @@ class RangeSelfCalibration:
         if fields is None or len(seen.uv) < _FEW or not self._has_changed(image):
             return
         self._reference = _grid(image)
-        size = dimension(fields.weakness is not None)
+        size = dimension(fields.has_amplitude)
         if len(self._theta) != size:
             self._begin(size)
         rows = fields.rows(seen.uv)
