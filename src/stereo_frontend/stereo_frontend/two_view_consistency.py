@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.camera import StereoCamera
-from slam_core.geometry import FloatArray, make_transform, skew, so3_exp
+from slam_core.geometry import FloatArray, make_transform, so3_exp
+from slam_core.in_place import in_place
 from slam_core.types import Float32Array
 from stereo_frontend.normal_equations import MEDIAN_CHI_SQUARE_1, NormalEquations, robust_weights
 from stereo_frontend.rectification_error import RectificationError, column_basis, row_basis
@@ -89,12 +90,9 @@ def consistency_equations(first: StereoView, second: StereoView, known: Rectific
     noise = 1.0
     bases = _column_jacobian(first), _column_jacobian(second)
     for _ in range(_ITERATIONS):
-        residual, J_motion, J_theta, covariance = _linearised(first, second, bases, T, theta)
-        weight = np.linalg.inv(covariance)
-        squares = np.einsum("ni,nij,nj->n", residual, weight, residual)
+        residual, J, weight, squares = _linearised(first, second, bases, T, theta)
         noise = max(1.0, float(np.median(squares)) / _MEDIAN_CHI_SQUARE_3)
         robust = robust_weights(squares, noise)
-        J = np.concatenate([J_motion, J_theta], axis=2)
         H, g = _normal(J, np.asarray(robust[:, None, None] * weight), residual)
         H_mm, H_mt, H_tt, g_m, g_t = H[:6, :6], H[:6, 6:], H[6:, 6:], g[:6], g[6:]
         if np.linalg.cond(H_mm) > 1e12:
@@ -165,31 +163,58 @@ def _column_jacobian(view: StereoView) -> FloatArray:
 def _linearised(
     first: StereoView, second: StereoView, bases: tuple[FloatArray, FloatArray], T: FloatArray, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Residuals (n, 3) px of (u, v, disparity), with Jacobians and covariance.
+    """Residuals (n, 3) px of (u, v, disparity), with their Jacobians, information and squares.
 
-    Jacobians by motion (n, 3, 6) and calibration (n, 3, 10); covariance (n, 3, 3). ``bases``: what
-    :func:`_column_jacobian` has of both views.
+    Jacobians (n, 3, 16) by motion (6) and calibration (10); information (n, 3, 3); squares (n,) of the whitened
+    residuals. ``bases``: what :func:`_column_jacobian` has of both views.
     """
-    c, fb = first.stereo.camera, first.stereo.camera.fx * first.stereo.baseline
-    basis1, basis2 = bases
-    d1 = np.maximum(first.disparity + basis1 @ theta, _LEAST_DISPARITY)
-    d2 = second.disparity + basis2 @ theta
-    points = c.unproject(first.uv, fb / d1) @ T[:3, :3].T
-    moved = points + T[:3, 3]
-    w = 1.0 / np.maximum(moved[:, 2], 1e-3)
-    predicted = np.column_stack([c.fx * moved[:, 0] * w + c.cx, c.fy * moved[:, 1] * w + c.cy, fb * w])
-    J = np.zeros((len(first), 3, 3))
-    J[:, 0, 0], J[:, 0, 2] = c.fx * w, -c.fx * moved[:, 0] * w * w
-    J[:, 1, 1], J[:, 1, 2] = c.fy * w, -c.fy * moved[:, 1] * w * w
-    J[:, 2, 2] = -fb * w * w
-    J_motion = np.concatenate([-J, J @ skew(points)], axis=2)
-    along = np.einsum("nij,nj->ni", J, points) * (-1.0 / d1)[:, None]
-    J_theta = -along[:, :, None] * basis1[:, None, :]
-    J_theta[:, 2] += basis2
-    covariance = along[:, :, None] * along[:, None, :] * np.square(first.sigma)[:, None, None]
-    pixel = first.sigma_uv**2 + second.sigma_uv**2
-    covariance[:, 0, 0] += pixel
-    covariance[:, 1, 1] += pixel
-    covariance[:, 2, 2] += second.sigma**2
-    residual = np.column_stack([second.uv, d2]) - predicted
-    return residual, J_motion, J_theta, covariance
+    n, c = len(first), first.stereo.camera
+    residual, J, weight, squares = np.empty((n, 3)), np.empty((n, 3, 16)), np.empty((n, 3, 3)), np.empty(n)
+    d1 = np.maximum(first.disparity + bases[0] @ theta, _LEAST_DISPARITY)
+    d2 = second.disparity + bases[1] @ theta
+    camera = (c.fx, c.fy, c.cx, c.cy, c.fx * first.stereo.baseline)
+    measured = (first.uv, d1, first.sigma, first.sigma_uv), (second.uv, d2, second.sigma, second.sigma_uv)
+    _linearise(*measured, *bases, T, camera, residual, J, weight, squares)
+    return residual, J, weight, squares
+
+
+@in_place(error_model="numpy")
+def _linearise(first, second, basis1, basis2, T, camera, residual, J, weight, squares):  # type: ignore[no-untyped-def]
+    """Fill the arrays that :func:`_linearised` returns; ``first`` and ``second`` are (uv, disparity, sigma, sigma_uv).
+
+    ``D`` is the derivative of the prediction by the point in the second camera, ``e`` that by the first disparity.
+    """
+    fx, fy, cx, cy, fb = camera
+    for k in range(len(squares)):
+        uv1, d1, uv2, d2 = first[0][k], first[1][k], second[0][k], second[1][k]
+        z1 = fb / d1
+        x1, y1 = (uv1[0] - cx) / fx * z1, (uv1[1] - cy) / fy * z1
+        x = T[0, 0] * x1 + T[0, 1] * y1 + T[0, 2] * z1
+        y = T[1, 0] * x1 + T[1, 1] * y1 + T[1, 2] * z1
+        z = T[2, 0] * x1 + T[2, 1] * y1 + T[2, 2] * z1
+        moved_x, moved_y, w = x + T[0, 3], y + T[1, 3], 1.0 / max(z + T[2, 3], 1e-3)
+        r = (uv2[0] - fx * moved_x * w - cx, uv2[1] - fy * moved_y * w - cy, d2 - fb * w)
+        D = ((fx * w, 0.0, -fx * moved_x * w * w), (0.0, fy * w, -fy * moved_y * w * w), (0.0, 0.0, -fb * w * w))
+        pixel = first[3][k] ** 2 + second[3][k] ** 2
+        noise = (pixel, pixel, second[2][k] ** 2)
+        e = (
+            -(D[0][0] * x + D[0][2] * z) / d1,
+            -(D[1][1] * y + D[1][2] * z) / d1,
+            -D[2][2] * z / d1,
+        )
+        for i in range(3):
+            a, b, c = D[i]
+            J[k, i, 0], J[k, i, 1], J[k, i, 2] = -a, -b, -c
+            J[k, i, 3], J[k, i, 4], J[k, i, 5] = b * z - c * y, c * x - a * z, a * y - b * x
+            for j in range(basis1.shape[1]):
+                J[k, i, 6 + j] = -e[i] * basis1[k, j] + (basis2[k, j] if i == 2 else 0.0)
+            residual[k, i] = r[i]
+        # Inverse of diag(noise) + s e e^T (Sherman and Morrison 1950).
+        share = first[2][k] ** 2
+        total = 1.0 + share * (e[0] ** 2 / noise[0] + e[1] ** 2 / noise[1] + e[2] ** 2 / noise[2])
+        squares[k] = 0.0
+        for i in range(3):
+            for j in range(3):
+                own = 1.0 / noise[i] if i == j else 0.0
+                weight[k, i, j] = own - share * e[i] * e[j] / (noise[i] * noise[j] * total)
+                squares[k] += r[i] * weight[k, i, j] * r[j]
