@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ import pytest
 from stereo_frontend.surf import SurfConfig, SurfDetector
 from stereo_frontend.surf_descriptor import describe_oriented, describe_upright, orientation, region_weights
 from stereo_frontend.surf_detector import find_keypoints, find_maxima, fitting_octaves, halved, integral_image
-from stereo_frontend.surf_hessian import FILTER_SIZES, determinant_at, row_filter, wrapped_integral
+from stereo_frontend.surf_hessian import FILTER_SIZES, determinant_at, row_filter
+from stereo_frontend.surf_integral import KEPT_ROWS, integral_room, next_integral_row
 
 
 @pytest.fixture(scope="module")
@@ -33,22 +36,32 @@ def squares() -> np.ndarray:
     return picture
 
 
+def integral_rows(image: np.ndarray, reach: int, doubled: bool = False) -> Iterator[tuple[int, np.ndarray]]:
+    """Every row at least ``reach`` from the edges, with the kept rows of the integral image as far as that below it."""
+    height, width = np.array(image.shape) * (2 if doubled else 1)
+    room = integral_room(width)
+    for newest in range(height):
+        next_integral_row(image, doubled, newest, room)
+        if newest >= 2 * reach:
+            yield newest - reach, room[0]
+
+
 def hessian(image: np.ndarray, size: int) -> np.ndarray:
     """Determinants of a whole layer by single pixels, zero where the filter does not fit."""
-    integral, half = wrapped_integral(image), size // 2
     out = np.zeros(image.shape, np.float32)
-    for y in range(half, image.shape[0] - half):
-        for x in range(half, image.shape[1] - half):
+    for y, integral in integral_rows(image, size // 2):
+        for x in range(size // 2, image.shape[1] - size // 2):
             out[y, x] = determinant_at(integral, x, y, size)
     return out
 
 
 def hessian_by_rows(image: np.ndarray, size: int) -> np.ndarray:
     """The same by whole rows."""
-    out = np.zeros(image.shape, np.float32)
-    fill, sums = row_filter(size), np.empty((4, image.shape[1] + 1), np.uint16)
-    for y in range(size // 2, image.shape[0] - size // 2):
-        fill(wrapped_integral(image), y, sums, out[y])
+    out, fill = np.zeros(image.shape, np.float32), row_filter(size)
+    for y, integral in integral_rows(image, size // 2):
+        row = np.zeros(integral.shape[1], np.float32)
+        fill(integral, y, np.empty((4, len(row)), np.uint16), row)
+        out[y, size // 2 : -(size // 2)] = row[size // 2 : image.shape[1] - size // 2]
     return out
 
 
@@ -113,7 +126,16 @@ def twin_wavelet(image: np.ndarray, x: float, y: float, half: float) -> tuple[fl
 
 def test_the_integral_image_is_opencvs(image):
     np.testing.assert_array_equal(integral_image(image), cv2.integral(image))
-    np.testing.assert_array_equal(wrapped_integral(image), cv2.integral(image) % 2**16)
+
+
+@pytest.mark.parametrize("shape", [(130, 170), (37, 64), (3, 1), (1, 5)])
+@pytest.mark.parametrize("doubled", [False, True])
+def test_rows_of_the_integral_image_are_opencvs_of_the_image_or_of_it_enlarged(rng, shape, doubled):
+    image = rng.integers(0, 256, shape, dtype=np.uint8)
+    large = cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_LINEAR) if doubled else image
+    expected = cv2.integral(large) % 2**16
+    rows = [rows[(y + 1) % KEPT_ROWS].copy() for y, rows in integral_rows(image, 0, doubled)]
+    np.testing.assert_array_equal(np.stack(rows)[:, : expected.shape[1]], expected[1:])
 
 
 @pytest.mark.parametrize("size", FILTER_SIZES)
@@ -152,17 +174,29 @@ def test_the_next_octave_is_the_mean_of_four_pixels(image):
 
 def test_octaves_meet_at_the_place_they_have_in_the_first(image):
     found, alone = np.empty((5000, 4), np.float32), np.empty((5000, 4), np.float32)
-    first, both = (find_keypoints(image, halved(image), n, np.float32(5.0), found) for n in (1, 2))
-    n = find_maxima(wrapped_integral(halved(image)), np.float32(5.0), alone)
+    first, both = (find_keypoints(image, False, n, np.float32(5.0), found) for n in (1, 2))
+    n = find_maxima(halved(image), False, np.float32(5.0), alone)
     assert both == first + n
     np.testing.assert_allclose(found[first:both, :2], 2.0 * alone[:n, :2] + 0.5)  # centres of pixels twice as large
     np.testing.assert_allclose(found[first:both, 2:], alone[:n, 2:] * [2.0, 1.0])
 
 
+def test_an_image_is_searched_enlarged_and_then_as_it_is(image):
+    found, alone = np.empty((5000, 4), np.float32), np.empty((5000, 4), np.float32)
+    large = cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_LINEAR)
+    both = find_keypoints(image, True, 2, np.float32(5.0), found)
+    first = find_maxima(large, False, np.float32(5.0), alone)
+    second = find_maxima(image, False, np.float32(5.0), alone[first:])
+    assert min(first, second) > 5
+    assert both == first + second
+    np.testing.assert_allclose(found[:first], alone[:first], rtol=1e-6)
+    np.testing.assert_array_equal(found[first:both, 3], alone[first:both, 3])
+
+
 def test_maxima_are_those_of_an_exhaustive_search(image):
     threshold = np.float32(5.0)
     found = np.empty((5000, 4), np.float32)
-    n = find_maxima(wrapped_integral(image), threshold, found)
+    n = find_maxima(image, False, threshold, found)
     height, width = image.shape
     layers = np.stack([hessian(image, size) for size in FILTER_SIZES])
     expected, border = set(), FILTER_SIZES[3] // 2 + 4

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from slam_core.config import Config, parameter
@@ -31,7 +30,7 @@ from stereo_frontend.surf_descriptor import (
     merged_signs,
     region_weights,
 )
-from stereo_frontend.surf_detector import MAX_PIXELS, find_keypoints, fitting_octaves, halved, integral_image
+from stereo_frontend.surf_detector import MAX_PIXELS, find_keypoints, fitting_octaves, integral_image
 
 _OCTAVES = 3
 """Octaves of four filter sizes."""
@@ -81,13 +80,10 @@ class SurfDetector:
 
     def _find_all(self, image: ByteArray, threshold: float) -> Float32Array:
         """Rows of u, v, scale, response, in pixels of ``image``."""
-        if self.config.doubled:
-            large = np.asarray(cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_LINEAR), np.uint8)
-            first, second, pixel = large, image, 0.5
-        else:
-            first, second, pixel = image, halved(image), 1.0
-        octaves = fitting_octaves(first.shape[0], first.shape[1], _OCTAVES)
-        number = find_keypoints(first, second, octaves, np.float32(threshold), self._found)
+        pixel = 0.5 if self.config.doubled else 1.0
+        height, width = (int(side / pixel) for side in image.shape)
+        octaves = fitting_octaves(height, width, _OCTAVES)
+        number = find_keypoints(image, self.config.doubled, octaves, np.float32(threshold), self._found)
         found = self._found[:number].copy()
         found[:, :2] = (found[:, :2] + 0.5) * pixel - 0.5
         found[:, 2] *= pixel

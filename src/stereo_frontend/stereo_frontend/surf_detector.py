@@ -17,7 +17,8 @@ from numba import njit
 
 from slam_core.in_place import in_place
 from slam_core.types import ByteArray
-from stereo_frontend.surf_hessian import FILTER_SIZES, determinant_at, row_filter, wrapped_integral
+from stereo_frontend.surf_hessian import FILTER_SIZES, determinant_at, row_filter
+from stereo_frontend.surf_integral import integral_room, next_integral_row
 
 MAX_PIXELS = 2**31 // 255
 """A larger image would overflow the 32-bit integral image."""
@@ -29,6 +30,8 @@ _BORDERS = (14, 17)
 it is compared with, and one around it, and one for the vertex."""
 _KEPT_ROWS = 4
 """Rows of determinants that are kept; a maximum needs three."""
+_AHEAD = FILTER_SIZES[3] // 2
+"""Rows by which the integral image precedes the layers: as far as the largest filter around a maximum reaches."""
 _fill_smaller, _fill_larger = row_filter(FILTER_SIZES[1]), row_filter(FILTER_SIZES[2])
 
 IntegralImage = npt.NDArray[np.int32]
@@ -40,21 +43,22 @@ def fitting_octaves(height: int, width: int, octaves: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def find_keypoints(first, second, octaves, threshold, found):  # type: ignore[no-untyped-def]
+def find_keypoints(image, doubled, octaves, threshold, found):  # type: ignore[no-untyped-def]
     """Write keypoints above ``threshold`` to ``found`` rows u, v, scale, response; return their number.
 
-    ``first`` and ``second`` are the images of the first two octaves; u, v and scale are in pixels of ``first``. All in
-    one call, so that no step waits for the interpreter.
+    The first octave is that of the image, or where ``doubled`` of the image enlarged twice; u, v and scale are in its
+    pixels. All in one call, so that no step waits for the interpreter.
     """
     count, pixel = 0, np.float32(1.0)
-    for _ in range(octaves):
-        number = find_maxima(wrapped_integral(first), threshold, found[count:])
+    for octave in range(octaves):
+        enlarge = doubled and octave == 0
+        number = find_maxima(image, enlarge, threshold, found[count:])
         for k in range(count, count + number):
             for axis in range(2):
                 found[k, axis] = (found[k, axis] + np.float32(0.5)) * pixel - np.float32(0.5)
             found[k, 2] *= pixel
         count += number
-        first, second, pixel = second, halved(second), np.float32(2.0) * pixel
+        image, pixel = image if enlarge else halved(image), np.float32(2.0) * pixel
     return count
 
 
@@ -86,38 +90,46 @@ def integral_image(image: ByteArray) -> IntegralImage:
 
 
 @njit(cache=True, nogil=True)
-def find_maxima(integral, threshold, found):  # type: ignore[no-untyped-def]
+def find_maxima(image, doubled, threshold, found):  # type: ignore[no-untyped-def]
     """Write maxima of 3x3x3 neighbourhoods above ``threshold`` to ``found`` rows u, v, scale, response.
 
-    Return their number.
+    Return their number. Where ``doubled`` the image is searched enlarged twice, and u, v and scale are in its pixels.
 
-    Both middle layers are filtered row by row and searched right behind, while their last rows are in the cache.
+    Integral image, both middle layers and their maxima follow each other row by row, while the last rows are in the
+    cache.
     """
-    width = integral.shape[1] - 1
-    sums = np.empty((4, width + 1), np.uint16)
-    layers = np.zeros((2, _KEPT_ROWS, width), np.float32)
-    marks, cube = np.zeros(-(-width // 8) * 8, np.uint8), np.empty((3, 3, 3), np.float32)
-    return _find_in_rows(integral, threshold, sums, layers, marks, cube, np.empty(3), found)
+    size = (2 * image.shape[0], 2 * image.shape[1]) if doubled else image.shape
+    rows = integral_room(size[1])
+    columns = rows[0].shape[1]
+    sums = np.empty((4, columns), np.uint16)
+    layers = np.zeros((2, _KEPT_ROWS, columns), np.float32)
+    marks, cube = np.zeros(columns, np.uint8), np.empty((3, 3, 3), np.float32)
+    return _find_in_rows(image, doubled, size, rows, threshold, sums, layers, marks, cube, np.empty(3), found)
 
 
 @in_place()
-def _find_in_rows(integral, threshold, sums, layers, marks, cube, offset, found):  # type: ignore[no-untyped-def]
-    """The same; what comes before ``found`` is room."""
-    height = integral.shape[0] - 1
+def _find_in_rows(image, doubled, size, rows, threshold, sums, layers, marks, cube, offset, found):  # type: ignore[no-untyped-def]
+    """The same; what comes between ``size`` and ``found``, but for ``threshold``, is room."""
+    (height, width), integral = size, rows[0]
     count = 0
-    for y in range(height):
+    for newest in range(height + _AHEAD):
+        if newest < height:
+            next_integral_row(image, doubled, newest, rows)
+        y = newest - _AHEAD
         if FILTER_SIZES[1] // 2 <= y < height - FILTER_SIZES[1] // 2:
             _fill_smaller(integral, y, sums, layers[0, y % _KEPT_ROWS])
         if FILTER_SIZES[2] // 2 <= y < height - FILTER_SIZES[2] // 2:
             _fill_larger(integral, y, sums, layers[1, y % _KEPT_ROWS])
         for place in range(2):
             if _BORDERS[place] <= y - 1 < height - _BORDERS[place]:
-                count += _find_in_row(integral, layers, place, y - 1, threshold, marks, cube, offset, found[count:])
+                count += _find_in_row(
+                    integral, width, layers, place, y - 1, threshold, marks, cube, offset, found[count:]
+                )
     return count
 
 
 @in_place()
-def _find_in_row(integral, layers, place, y, threshold, marks, cube, offset, found):  # type: ignore[no-untyped-def]
+def _find_in_row(integral, width, layers, place, y, threshold, marks, cube, offset, found):  # type: ignore[no-untyped-def]
     """Maxima of one row of one layer.
 
     Their position and scale are those of the vertex of the parabola through the neighbourhood (Brown and Lowe 2002).
@@ -127,7 +139,7 @@ def _find_in_row(integral, layers, place, y, threshold, marks, cube, offset, fou
     own, other = layers[place], layers[1 - place]
     above, here, below = own[rows[0]], own[rows[1]], own[rows[2]]
     other_above, other_here, other_below = other[rows[0]], other[rows[1]], other[rows[2]]
-    count, end = 0, layers.shape[2] - border
+    count, end = 0, width - border
     _mark_peaks(above, here, below, threshold, marks)
     eights = marks.view(np.uint64)
     for eight in range(border // 8, (end + 7) // 8):

@@ -12,55 +12,27 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from numba import njit
 
 from slam_core.in_place import in_place
-from slam_core.types import ByteArray
+from stereo_frontend.surf_integral import KEPT_ROWS
 
 FILTER_SIZES = (9, 15, 21, 27)
 """Edges (px) of the box filters of an octave."""
 _LARGEST_IN_ROWS = 21
 """Edge (px) of the largest filter whose two outer lobes together stay below 2^16."""
 
-WrappedIntegral = npt.NDArray[np.uint16]
 _Index = np.uintp
 """Unsigned indices cannot be negative, so that the kernels need not look whether they count from the end."""
-
-
-@njit(cache=True, nogil=True)
-def wrapped_integral(image: ByteArray) -> WrappedIntegral:
-    """Sums over all pixels above and to the left modulo 2^16, uint16 (height + 1, width + 1)."""
-    height, width = image.shape
-    out = np.empty((height + 1, width + 1), np.uint16)
-    out[0] = np.uint16(0)
-    for y in range(height):
-        out[y + 1, 0] = np.uint16(0)
-        _running_sum(image[y], out[y + 1, 1:])
-        _add(out[y], out[y + 1])
-    return out
-
-
-@in_place()
-def _running_sum(values, out):  # type: ignore[no-untyped-def]
-    total = np.uint16(0)
-    for x in range(len(values)):
-        total = np.uint16(total + values[x])
-        out[x] = total
-
-
-@in_place()
-def _add(values, out):  # type: ignore[no-untyped-def]
-    for x in range(len(values)):
-        out[x] = np.uint16(out[x] + values[x])
+_ONE = _Index(1)
 
 
 def row_filter(size: int) -> Any:
     """A kernel ``(integral, y, sums, out)`` for the filter of an edge of ``size`` px.
 
     It fills ``out`` with ``Dxx Dyy - (0.9 Dxy)^2`` of row y, normalised by the filter's area; the row's ends stay as
-    they are. ``sums``, uint16 (4, width + 1), is room. The size is known to the compiler, which only so finds out that
-    the shifted reads of one array do not overlap with what is written.
+    they are. ``integral`` has the rows of :mod:`stereo_frontend.surf_integral`; ``sums``, uint16 (4, columns), is room.
+    The size is known to the compiler, which only so finds out that the shifted reads of one array do not overlap with
+    what is written.
     """
     if size > _LARGEST_IN_ROWS:
         raise ValueError(f"lobes of a filter of {size} px do not stay below 2^16")
@@ -77,11 +49,10 @@ def row_filter(size: int) -> Any:
         column, inner, outer, cross = sums[0], sums[1], sums[2], sums[3]
         determinants = out[half : integral.shape[1] - 1 - half]
         # Column sums of Dxx's band, of Dyy's middle lobe and its other two, of Dxy's upper less its lower boxes.
-        _difference(integral[y + lobe], integral[y - lobe + 1], column)
-        _difference(integral[y + middle + 1], integral[y - middle], inner)
-        _difference(integral[y + half + 1], integral[y - half], outer)
-        _subtract(inner, outer)
-        _crossed(integral[y], integral[y - lobe], integral[y + lobe + 1], integral[y + 1], cross)
+        _difference(integral[_at(y + lobe)], integral[_at(y - lobe + 1)], column)
+        _difference(integral[_at(y + middle + 1)], integral[_at(y - middle)], inner)
+        _remainder(integral[_at(y + half + 1)], integral[_at(y - half)], inner, outer)
+        _crossed(integral[_at(y)], integral[_at(y - lobe)], integral[_at(y + lobe + 1)], integral[_at(y + 1)], cross)
         for i in range(len(determinants)):
             x = _Index(i)
             within = np.uint16(column[x + right] - column[x + left])
@@ -96,6 +67,12 @@ def row_filter(size: int) -> Any:
     return fill_row
 
 
+@in_place()
+def _at(y):  # type: ignore[no-untyped-def]
+    """Index of row y of the integral image among those kept."""
+    return _Index(y) % _Index(KEPT_ROWS)
+
+
 # Each of these loops has one array to write and few to read: with more of them the compiler gives up proving that they
 # do not overlap, and vectorises nothing.
 @in_place()
@@ -105,9 +82,9 @@ def _difference(plus, minus, out):  # type: ignore[no-untyped-def]
 
 
 @in_place()
-def _subtract(values, out):  # type: ignore[no-untyped-def]
+def _remainder(plus, minus, part, out):  # type: ignore[no-untyped-def]
     for x in range(len(out)):
-        out[x] = np.uint16(out[x] - values[x])
+        out[x] = np.uint16(plus[x] - minus[x] - part[x])
 
 
 @in_place()
@@ -119,22 +96,23 @@ def _crossed(first, second, third, fourth, out):  # type: ignore[no-untyped-def]
 @in_place()
 def determinant_at(integral, x, y, size):  # type: ignore[no-untyped-def]
     """The same at one pixel, for a filter of any of the sizes."""
-    lobe, half = size // 3, size // 2
-    middle = lobe // 2
-    top, bottom = integral[y - lobe + 1], integral[y + lobe]
-    xx = _box(top, bottom, x - half, x - middle) - 2 * _box(top, bottom, x - middle, x + middle + 1)
-    xx += _box(top, bottom, x + middle + 1, x + half + 1)
-    left, right = x - lobe + 1, x + lobe
+    x, y, lobe, half = _Index(x), _Index(y), _Index(size // 3), _Index(size // 2)
+    middle = lobe // _Index(2)
+    top, bottom = integral[_at(y - lobe + _ONE)], integral[_at(y + lobe)]
+    xx = _box(top, bottom, x - half, x - middle) - 2 * _box(top, bottom, x - middle, x + middle + _ONE)
+    xx += _box(top, bottom, x + middle + _ONE, x + half + _ONE)
+    left, right = x - lobe + _ONE, x + lobe
     first, second, third, fourth = (
-        integral[y - half],
-        integral[y - middle],
-        integral[y + middle + 1],
-        integral[y + half + 1],
+        integral[_at(y - half)],
+        integral[_at(y - middle)],
+        integral[_at(y + middle + _ONE)],
+        integral[_at(y + half + _ONE)],
     )
     yy = _box(first, second, left, right) - 2 * _box(second, third, left, right) + _box(third, fourth, left, right)
-    upper, above, below, lower = integral[y - lobe], integral[y], integral[y + 1], integral[y + lobe + 1]
-    xy = _box(upper, above, x - lobe, x) - _box(upper, above, x + 1, x + lobe + 1)
-    xy += _box(below, lower, x + 1, x + lobe + 1) - _box(below, lower, x - lobe, x)
+    upper, above = integral[_at(y - lobe)], integral[_at(y)]
+    below, lower = integral[_at(y + _ONE)], integral[_at(y + lobe + _ONE)]
+    xy = _box(upper, above, x - lobe, x) - _box(upper, above, x + _ONE, x + lobe + _ONE)
+    xy += _box(below, lower, x + _ONE, x + lobe + _ONE) - _box(below, lower, x - lobe, x)
     scale = np.float32(1.0 / (size * size))
     dxx, dyy, dxy = np.float32(xx) * scale, np.float32(yy) * scale, np.float32(xy) * scale
     return dxx * dyy - np.float32(0.81) * dxy * dxy
