@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from dense_mapping.stereo_depth import StereoDepthConfig, stereo_depth
+from dense_mapping.stereo_kernels import StepNoise, refine
 from slam_core.camera import Camera, StereoCamera
 from slam_core.types import StereoImages
 from slam_simulation.scenario import Scenario
@@ -66,12 +68,59 @@ def test_errors_are_those_that_sigma_claims():
     for frame in simulator.run(frames=60, every=20):
         images = StereoImages(frame.stamp_ns, frame.left, frame.right, simulator.stereo.stereo)
         image = stereo_depth(images, StereoDepthConfig())
-        near = np.isfinite(image.depth) & (image.depth < 3.0) & (frame.truth.depth > 0)
-        errors.append((image.depth - frame.truth.depth)[near])
+        true_depth = frame.truth.depth[::2, ::2]
+        near = np.isfinite(image.depth) & (image.depth < 3.0) & (true_depth > 0)
+        errors.append((image.depth - true_depth)[near])
         sigmas.append(image.sigma[near])
     error, sigma = np.concatenate(errors), np.concatenate(sigmas)
-    assert len(error) > 50_000
+    assert len(error) > 12_500
     assert np.median(np.abs(error)) < 0.03
     assert np.median(np.abs(error)) / 0.6745 < 1.3 * np.median(sigma), "sigma must not be too small"
     assert np.median(np.abs(error)) / 0.6745 > 0.4 * np.median(sigma), "nor too large"
     assert np.mean(np.abs(error) > 5.0 * sigma) < 0.025
+
+
+NOISE = StepNoise(image=2.0, matched=0.5, scale=2.0, floor=0.05, largest_step=0.6, least_known=0.9)
+
+
+def refined_by_numpy(left: np.ndarray, right: np.ndarray, disparity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    known = np.isfinite(disparity)
+    place = np.clip(np.arange(disparity.shape[1]) - np.where(known, disparity, 0.0), 0, disparity.shape[1] - 1)
+    warped = np.array([np.interp(u, np.arange(len(row)), row) for u, row in zip(place, right, strict=True)])
+    slope = np.array([[-0.25, 0.0, 0.25]])
+    g, r = cv2.filter2D(left + warped, cv2.CV_64F, slope), warped - left
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return cv2.boxFilter(values * known, cv2.CV_64F, (15, 15), normalize=False, borderType=cv2.BORDER_REPLICATE)
+
+    count = np.maximum(total(np.ones_like(g)), 1.0)
+    offset, mean = total(r) / count, total(g) / count
+    energy = np.maximum(total(g * g) - count * (mean**2 + 1.0), 1e-3)
+    spread = 4.0 * np.maximum(total(r * r) / count - offset**2, 8.0)
+    information = energy + spread / 0.25
+    step = (total(g * r) - count * mean * offset) / information
+    kept = known & (count >= 0.9 * 225) & (np.abs(step) < 0.6) & (disparity + step > 0.5)
+    sigma = np.hypot(np.sqrt(spread / information), 0.05)
+    return np.where(kept, disparity + step, np.nan), np.where(kept, sigma, np.nan)
+
+
+@pytest.mark.parametrize("spacing", [1, 2])
+def test_the_compiled_step_is_that_of_numpy(rng, spacing):
+    pair = shifted_texture(rng, 9.37)
+    disparity = (9.37 + rng.normal(0, 0.2, pair.left.shape)).astype(np.float32)
+    disparity[50:60, 100:130] = np.nan
+    expected = refined_by_numpy(pair.left.astype(float), pair.right.astype(float), disparity)
+    found = refine(pair.left, pair.right, disparity, 15, spacing, NOISE)
+    for values, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(values, wanted[::spacing, ::spacing], atol=2e-4)
+    assert 0.5 < np.isfinite(found[0]).mean() < 0.99
+
+
+def test_a_surface_nearer_than_all_else_is_searched_for(rng):
+    """The range of disparities is that of the picture, up to the smallest depth."""
+    far, near = (shifted_texture(rng, disparity) for disparity in (6.0, 37.0))
+    left, right = far.left.copy(), far.right.copy()
+    left[60:180, 160:260], right[60:180, 123:223] = near.left[60:180, 160:260], near.right[60:180, 123:223]
+    image = stereo_depth(StereoImages(0, left, right, STEREO), StereoDepthConfig(min_depth=0.5))
+    assert abs(np.nanmedian(image.depth[90:150, 190:230]) - 20.0 / 37.0) < 0.01
+    assert np.isfinite(image.depth[90:150, 190:230]).mean() > 0.9

@@ -100,11 +100,12 @@ def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray 
     with np.errstate(invalid="ignore"):
         good = (depth >= config.min_depth) & (depth <= config.max_depth) & (sigma <= config.max_sigma)
     depth, sigma = np.where(good, depth, 0.0).astype(np.float32), np.where(good, sigma, 0.0).astype(np.float32)
-    while depth.size > _MAX_PIXELS:
-        # Every other pixel, not a mean: a mean over an edge would be a point in the air.
-        depth, sigma = depth[::2, ::2], sigma[::2, ::2]
-        picture = None if picture is None else _halved(picture)
-        camera = Camera(depth.shape[1], depth.shape[0], camera.fx / 2, camera.fy / 2, camera.cx / 2, camera.cy / 2)
+    # Every other pixel, not a mean: a mean over an edge would be a point in the air.
+    spacing = thinning(depth.shape)
+    depth, sigma = depth[::spacing, ::spacing], sigma[::spacing, ::spacing]
+    camera = thinned_camera(camera, spacing, depth.shape)
+    while picture is not None and picture.shape[0] > depth.shape[0]:
+        picture = _halved(picture)
     return Keyframe(
         image.stamp_ns,
         camera,
@@ -114,13 +115,27 @@ def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray 
     )
 
 
+def thinning(shape: tuple[int, ...]) -> int:
+    """One pixel of so many in rows and columns is kept of a depth image (height, width)."""
+    spacing = 1
+    while -(-shape[0] // spacing) * -(-shape[1] // spacing) > _MAX_PIXELS:
+        spacing *= 2
+    return spacing
+
+
+def thinned_camera(camera: Camera, spacing: int, shape: tuple[int, ...]) -> Camera:
+    """The camera of an image (height, width) of one pixel of ``spacing`` in rows and columns."""
+    return Camera(
+        shape[1], shape[0], camera.fx / spacing, camera.fy / spacing, camera.cx / spacing, camera.cy / spacing
+    )
+
+
 def thinned(keyframe: Keyframe, spacing: int) -> Keyframe:
     """One pixel of ``spacing`` in rows and columns, without picture; at least as far apart as they are already."""
     step = max(1, spacing // keyframe.spacing)
     depth = np.ascontiguousarray(keyframe.depth_units[::step, ::step])
     sigma = np.ascontiguousarray(keyframe.sigma_units[::step, ::step])
-    c, (height, width) = keyframe.camera, depth.shape
-    camera = Camera(width, height, c.fx / step, c.fy / step, c.cx / step, c.cy / step)
+    camera = thinned_camera(keyframe.camera, step, depth.shape)
     return Keyframe(keyframe.stamp_ns, camera, depth, sigma, NO_PICTURE, step * keyframe.spacing)
 
 
