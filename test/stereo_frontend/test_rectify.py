@@ -3,12 +3,19 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import so3_exp
-from stereo_frontend.rectify import Rectifier, StereoRectifier, rectification_map, stereo_camera_from_infos
+from stereo_frontend.rectify import (
+    FixedPointMap,
+    Rectifier,
+    StereoRectifier,
+    rectification_map,
+    stereo_camera_from_infos,
+)
 
 P_LEFT = np.array([[200.0, 0, 160, 0], [0, 200.0, 120, 0], [0, 0, 1, 0]])
 P_RIGHT = P_LEFT + np.array([[0, 0, 0, -200.0 * 0.12], [0, 0, 0, 0], [0, 0, 0, 0]])
@@ -114,3 +121,14 @@ def test_images_of_the_wrong_kind_are_refused(image):
     rectifier = Rectifier(CameraInfo(raw_camera("plumb_bob"), P=P_LEFT))
     with pytest.raises(ValueError, match="image"):
         rectifier(image)
+
+
+def test_grey_images_are_to_the_byte_what_opencv_makes_of_them(rng):
+    image = rng.integers(0, 256, (60, 80), dtype=np.uint8)
+    pixels = rng.uniform([-3.0, -3.0], [83.0, 63.0], (50, 70, 2)).astype(np.float32)
+    pixels[:5] = np.rint(pixels[:5])
+    pixels[5, :4] = [[0.0, 0.0], [79.0, 59.0], [78.99, 58.99], [-10.0, -10.0]]
+    mapped = FixedPointMap.of(pixels, 80, 60).grey(image)
+    maps = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
+    np.testing.assert_array_equal(mapped, cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+    assert 0.01 < (mapped == 0).mean() < 0.3

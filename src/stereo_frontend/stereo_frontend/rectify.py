@@ -9,12 +9,16 @@ After it, both images have one camera model without distortion, corresponding po
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from slam_core.camera import Camera, CameraInfo, StereoCamera
 from slam_core.geometry import FloatArray
-from slam_core.types import AnyArray, ByteArray, MakeColour, StereoImages, no_colour
+from slam_core.in_place import in_place
+from slam_core.types import ByteArray, Float32Array, MakeColour, StereoImages, no_colour
 
 _OUTSIDE = -10.0
 _MINIMUM_BASELINE = 1e-4
@@ -59,7 +63,7 @@ class Rectifier:
         self.source = info.camera
         self.camera = target or info.rectified
         passes = info.is_rectified and np.allclose(self.camera.K, info.camera.K, atol=1e-6)
-        self._maps = None if passes else _fixed_point_maps(info, self.camera)
+        self._map = None if passes else FixedPointMap.between(info, self.camera)
 
     def __call__(self, image: ByteArray) -> ByteArray:
         """Rectified image, uint8 (height, width).
@@ -71,18 +75,88 @@ class Rectifier:
         """
         if image.ndim != 2:
             raise ValueError(f"a camera image must be grey (height, width), got {image.shape}")
-        return self._mapped(image)
+        _check_image(image, self.source)
+        # Not the image itself: a message's is read-only, for which every kernel would be compiled once more.
+        return image.copy() if self._map is None else self._map.grey(image)
 
     def colour(self, image: ByteArray) -> ByteArray:
         """Rectified image in colour, uint8 (height, width, 3); ValueError as for a grey one."""
-        return self._mapped(image)
-
-    def _mapped(self, image: ByteArray) -> ByteArray:
         _check_image(image, self.source)
-        if self._maps is None:
-            # Not the image itself: a message's is read-only, for which every kernel would be compiled once more.
-            return image.copy()
-        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+        return image.copy() if self._map is None else self._map.colour(image)
+
+
+@dataclass(frozen=True, eq=False)
+class FixedPointMap:
+    """Place of each rectified pixel in the raw image, to 1/32 px.
+
+    corner: (h, w, 2) int16, column and row of the upper left of the four pixels around it. fraction: (h, w) uint16, 32
+    times the row's fraction plus the column's, in 1/32. offset: (h, w) int32 of that corner in the raw image, -1 where
+    not all four lie inside.
+    """
+
+    corner: npt.NDArray[np.int16]
+    fraction: npt.NDArray[np.uint16]
+    offset: npt.NDArray[np.int32]
+
+    @classmethod
+    def between(cls, info: CameraInfo, target: Camera) -> FixedPointMap:
+        """Map from the raw images of ``info`` to those of ``target``."""
+        pixels = np.nan_to_num(rectification_map(info, target), nan=_OUTSIDE).astype(np.float32)
+        return cls.of(pixels, info.camera.width, info.camera.height)
+
+    @classmethod
+    def of(cls, pixels: Float32Array, width: int, height: int) -> FixedPointMap:
+        """Map by raw pixels (h, w, 2) of images of that size."""
+        corner, fraction = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
+        u, v = corner[..., 0].astype(np.int32), corner[..., 1].astype(np.int32)
+        inside = (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
+        return cls(
+            np.asarray(corner, np.int16),
+            np.asarray(fraction, np.uint16),
+            np.where(inside, v * width + u, -1).astype(np.int32),
+        )
+
+    def grey(self, image: ByteArray) -> ByteArray:
+        """A grey image, bilinear, to the byte what OpenCV makes of it."""
+        raw, out = np.ascontiguousarray(image).view(), np.empty(self.offset.shape, np.uint8)
+        raw.flags.writeable = False
+        _remap(
+            raw,
+            raw.reshape(-1),
+            self.corner.reshape(-1, 2),
+            self.fraction.ravel(),
+            self.offset.ravel(),
+            out.reshape(-1),
+        )
+        return out
+
+    def colour(self, image: ByteArray) -> ByteArray:
+        """The same of a picture in colour."""
+        mapped = cv2.remap(image, self.corner, self.fraction, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return np.asarray(mapped, np.uint8)
+
+
+@in_place()
+def _remap(image, pixels, corner, fraction, offset, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (n,) from ``image`` (h, w), which ``pixels`` holds row after row; black outside."""
+    one, below, scale = np.uintp(1), np.uintp(image.shape[1]), np.int32(32)
+    for i in range(len(out)):
+        across, down = np.int32(fraction[i] & 31), np.int32(fraction[i] >> 5)
+        if offset[i] >= 0:
+            at = np.uintp(offset[i])
+            a, b = np.int32(pixels[at]), np.int32(pixels[at + one])
+            c, d = np.int32(pixels[at + below]), np.int32(pixels[at + below + one])
+        else:
+            u, v = corner[i, 0], corner[i, 1]
+            a, b, c, d = _grey(image, u, v), _grey(image, u + 1, v), _grey(image, u, v + 1), _grey(image, u + 1, v + 1)
+        upper, lower = scale * a + across * (b - a), scale * c + across * (d - c)
+        out[i] = np.uint8((scale * upper + down * (lower - upper) + np.int32(512)) >> np.int32(10))
+
+
+@in_place()
+def _grey(image, u, v):  # type: ignore[no-untyped-def]
+    inside = 0 <= u < image.shape[1] and 0 <= v < image.shape[0]
+    return np.int32(image[v, u]) if inside else np.int32(0)
 
 
 class StereoRectifier:
@@ -121,12 +195,6 @@ def rectification_map(info: CameraInfo, target: Camera) -> FloatArray:
     u, v = np.meshgrid(np.arange(target.width, dtype=np.float64), np.arange(target.height, dtype=np.float64))
     rays = target.unproject(np.column_stack([u.ravel(), v.ravel()]), np.ones(u.size)) @ info.R
     return info.camera.project(rays).reshape(target.height, target.width, 2)
-
-
-def _fixed_point_maps(info: CameraInfo, target: Camera) -> tuple[AnyArray, AnyArray]:
-    pixels = np.nan_to_num(rectification_map(info, target), nan=_OUTSIDE).astype(np.float32)
-    fixed, fraction = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
-    return fixed, fraction
 
 
 def _check_image(image: ByteArray, camera: Camera) -> None:
