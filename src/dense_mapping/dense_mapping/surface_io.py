@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A surface as files: PLY with normals, colours and sigma (plyfile), GLB for every viewer."""
+"""A surface as files: PLY with normals, colours and sigma (plyfile), GLB for every viewer (trimesh)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import plyfile
+import trimesh
 
-from dense_mapping.gltf import surface_glb
+from dense_mapping.gltf import matt_glb
 from dense_mapping.surface import Surface
 from slam_core.files import atomic_path
 
@@ -34,8 +35,13 @@ def write_mesh(path: Path, surface: Surface) -> None:
 
 def write_glb(path: Path, surface: Surface) -> None:
     """Write a binary glTF, whose Y axis is up (the map's Z), with normals and colours."""
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    normals = surface.normals @ turn.T if len(surface) else None
+    mesh = trimesh.Trimesh(
+        surface.points @ turn.T, surface.faces, vertex_normals=normals, vertex_colors=surface.colours, process=False
+    )
     with atomic_path(path) as temporary:
-        temporary.write_bytes(surface_glb(surface))
+        temporary.write_bytes(matt_glb(trimesh.Scene(mesh)))
 
 
 def read_mesh(path: Path) -> Surface:

@@ -10,7 +10,7 @@ import trimesh
 from trimesh.viewer.notebook import scene_to_html
 
 from dense_mapping.decimation import at_most
-from dense_mapping.gltf import unlit_glb
+from dense_mapping.gltf import matt_glb
 from dense_mapping.surface import Surface
 from slam_bringup.pipeline.results import RunResult
 from slam_bringup.report.figures import COLOURS
@@ -47,7 +47,7 @@ def _page(scene: trimesh.Scene) -> str:
     data = other.export(file_type="glb")  # type: ignore[no-untyped-call]
     before, found, after = page.partition(base64.b64encode(data).decode("ascii"))
     assert found, "the page holds the scene as base64"
-    return before + base64.b64encode(unlit_glb(scene)).decode("ascii") + after
+    return before + base64.b64encode(matt_glb(scene, lit=False)).decode("ascii") + after
 
 
 def _shaded(surface: Surface) -> ByteArray:
