@@ -8,6 +8,7 @@ former while there are few groups.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -34,23 +35,51 @@ class NormalEquations:
         return NormalEquations(self.information + other.information, self.vector + other.vector)
 
 
+class EvidenceWindow:
+    """The newest pieces of evidence, as sums of ``group`` consecutive ones, which are not independent.
+
+    At most ``pieces`` are remembered; the oldest group goes as a whole.
+    """
+
+    def __init__(self, group: int, pieces: int) -> None:
+        self._group = group
+        self._last = group
+        self.sums: deque[NormalEquations] = deque(maxlen=pieces // group)
+
+    def __len__(self) -> int:
+        """Number of pieces."""
+        return (len(self.sums) - 1) * self._group + self._last if self.sums else 0
+
+    def add(self, piece: NormalEquations) -> None:
+        """Take one piece."""
+        if self._last == self._group:
+            self.sums.append(piece)
+            self._last = 1
+        else:
+            self.sums[-1] = self.sums[-1] + piece
+            self._last += 1
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.sums.clear()
+        self._last = self._group
+
+
 def robust_weights(squares: FloatArray, noise: float, variance: FloatArray | float = 1.0) -> FloatArray:
     """Weights (n,) of measurements by their squared residuals (n,) in ``variance``, which is too small by ``noise``."""
     return np.asarray(1.0 / (noise * variance) / (1.0 + squares / noise / _ROBUST_SCALE))
 
 
-def sandwich_estimate(
-    evidence: Collection[NormalEquations], prior: FloatArray, group: int
-) -> tuple[FloatArray, FloatArray]:
-    """Solution (k,) of all the evidence and a prior information (k, k) about zero, with its covariance (k, k).
+def sandwich_estimate(groups: Collection[NormalEquations], prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Solution (k,) of all groups of evidence and a prior information (k, k) about zero, with its covariance (k, k).
 
-    ``group``: consecutive pieces that are not independent.
+    What is in one group is not independent, the groups are.
     """
-    information = np.array([e.information for e in evidence])
-    vectors = np.array([e.vector for e in evidence])
+    information = np.array([e.information for e in groups])
+    vectors = np.array([e.vector for e in groups])
     total = prior + information.sum(axis=0)
     theta = np.linalg.solve(total, vectors.sum(axis=0))
-    scores = np.add.reduceat(vectors - information @ theta, np.arange(0, len(evidence), group), axis=0)
+    scores = vectors - information @ theta
     lower = np.linalg.cholesky(total)
     whitened = np.linalg.solve(lower, scores.T)
     ratio, axes = np.linalg.eigh(whitened @ whitened.T)

@@ -13,7 +13,6 @@ which noise never does. Both stay with a place in the room: a landmark's sightin
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +23,7 @@ from slam_core.in_place import in_place
 from slam_core.types import DepthImage
 from stereo_frontend.normal_equations import (
     MEDIAN_CHI_SQUARE_1,
+    EvidenceWindow,
     NormalEquations,
     robust_weights,
     sandwich_estimate,
@@ -106,8 +106,9 @@ class RangeSelfCalibration:
         self._covariance: FloatArray = np.zeros((0, 0))
         self._prior: FloatArray = np.zeros((0, 0))
         self._mean_amplitude = 0.0
-        self._evidence: deque[NormalEquations] = deque(maxlen=_MEMORY)
-        self._squares: deque[tuple[int, FloatArray]] = deque(maxlen=_MEMORY)
+        self._evidence = EvidenceWindow(_GROUP, _MEMORY)
+        self._squares = EvidenceWindow(_GROUP, _MEMORY)
+        """Squares of the rows in place of their information, with how many they are."""
         self._reference: FloatArray = np.zeros((0, 0))
         self._shared = self._weight = 0.0
 
@@ -171,8 +172,8 @@ class RangeSelfCalibration:
             self._begin(size)
         rows = fields.rows(seen.uv)
         value = seen.value + (rows @ self._theta if self.corrects else 0.0)
-        self._evidence.append(self._equations(rows, value, seen.sigma**2))
-        self._squares.append((len(rows), rows.T @ rows))
+        self._evidence.add(self._equations(rows, value, seen.sigma**2))
+        self._squares.add(NormalEquations(rows.T @ rows, np.array([len(rows)])))
         self._settle()
         self._learn_unexplained(seen, value - rows @ self._theta, fields.weakness_at(seen.uv), image.camera.width)
 
@@ -206,9 +207,9 @@ class RangeSelfCalibration:
 
     def _settle(self) -> None:
         """Estimate from all evidence, and judge it."""
-        self._theta, self._covariance = sandwich_estimate(self._evidence, self._prior, _GROUP)
-        features = sum(n for n, _ in self._squares)
-        moment = np.sum([square for _, square in self._squares], axis=0) / features
+        self._theta, self._covariance = sandwich_estimate(self._evidence.sums, self._prior)
+        features = sum(float(s.vector[0]) for s in self._squares.sums)
+        moment = np.sum([s.information for s in self._squares.sums], axis=0) / features
         self.error_m = float(np.sqrt(self._theta @ moment @ self._theta))
         self.sigma_m = float(np.sqrt(np.sum(moment * self._covariance)))
         slack = _HYSTERESIS if self.corrects else 1.0

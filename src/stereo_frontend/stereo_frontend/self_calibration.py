@@ -12,7 +12,6 @@ is left to judge: that is the prior of the field, and what the recording adds to
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +21,7 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, Float32Array
 from stereo_frontend.matching import MatchingConfig
-from stereo_frontend.normal_equations import NormalEquations, sandwich_estimate
+from stereo_frontend.normal_equations import EvidenceWindow, NormalEquations, sandwich_estimate
 from stereo_frontend.rectification_error import PRIOR_SIGMA, RectificationError
 from stereo_frontend.two_view_consistency import (
     StereoView,
@@ -86,7 +85,7 @@ class StereoSelfCalibration:
         self.error: RectificationError | None = None
         self.corrects_rows = self.corrects = self._is_significant = False
         self._reference: StereoView | None = None
-        self._evidence: deque[NormalEquations] = deque(maxlen=_MEMORY)
+        self._evidence = EvidenceWindow(_GROUP, _MEMORY)
         self._moments = 0
 
     # ---- what is known
@@ -163,18 +162,18 @@ class StereoSelfCalibration:
 
     def _take(self, view: StereoView, evidence: NormalEquations) -> None:
         self._reference = view
-        self._evidence.append(evidence)
-        self._settle(self._estimate(list(self._evidence), view.stereo.camera))
+        self._evidence.add(evidence)
+        self._settle(self._estimate(list(self._evidence.sums), view.stereo.camera))
 
     def _estimate(self, evidence: list[NormalEquations], camera: Camera) -> RectificationError:
-        """The solution of all normal equations, with the sandwich covariance."""
+        """The solution of all groups of evidence, with the sandwich covariance."""
         unknown = RectificationError.unknown(camera)
         if not evidence:
             return unknown
         prior = np.diag(1.0 / PRIOR_SIGMA**2)
         if self.config.sigma_disparity > 0.0:
             prior += _FREE / self.config.sigma_disparity**2 * unknown.column_moment()
-        return RectificationError(camera, *sandwich_estimate(evidence, prior, _GROUP))
+        return RectificationError(camera, *sandwich_estimate(evidence, prior))
 
     def _settle(self, error: RectificationError) -> None:
         self.error = error
