@@ -64,4 +64,6 @@ def range_sigma(config: NoiseConfig, distance: Float32Array, amplitude: Float32A
         relative = np.square(distance / np.float32(config.reference_range))
     else:
         relative = np.float32(config.reference_amplitude) / np.maximum(amplitude, np.float32(1e-6))
-    return np.asarray(np.hypot(config.floor, config.reference_sigma * relative), dtype=np.float32)
+    # The same as hypot, which guards against overflow at twice the time.
+    squared = np.square(config.reference_sigma * relative, dtype=np.float64)
+    return np.asarray(np.sqrt(np.float64(np.float32(config.floor)) ** 2 + squared), dtype=np.float32)
