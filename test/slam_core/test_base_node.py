@@ -19,6 +19,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from slam_core.base_node import SlamNode  # noqa: E402
 from slam_core.config import Config, parameter  # noqa: E402
+from slam_core.exchange import Exchange  # noqa: E402
 from slam_core.messages import header_message, stamp_ns  # noqa: E402
 
 START = 1_700_000_000 * 10**9
@@ -131,6 +132,35 @@ def test_a_live_node_leaves_out_what_comes_too_fast_and_says_so(node: EarNode) -
     assert {v.key: v.value for v in status.values}["skipped"] == "8"
     assert "8 frames left out" in status.message
     assert "left out" not in node._diagnostic_message("").status[0].message
+
+
+class RelayNode(SlamNode[EarConfig]):
+    """Hands frames of one topic on to another one."""
+
+    def __init__(self, source: str, sink: str) -> None:
+        super().__init__(f"relay_{sink}", EarConfig)
+        self.advertise(sink, "PointCloud2")
+        self.listen(source, "PointCloud2", lambda m: self.publish(sink, m))
+
+
+def test_a_frame_that_nobody_can_go_on_with_is_left_out_by_the_first_node(node: EarNode) -> None:
+    exchange = Exchange()
+    with exchange.node([]):
+        first, slow = RelayNode("raw", "half"), RelayNode("half", "done")
+    for k in range(10):
+        first._receive(
+            first._inputs["raw"], node._ros_types.PointCloud2(header=header_message(node.types, START + k * MS, ""))
+        )
+        while first.work():
+            pass
+    assert first._jobs.skipped == {"raw": 7}  # one waits at the second node, two at the first
+    assert not first.has_work
+    slow.receive()
+    assert slow.work()
+    assert first.has_work
+    assert not slow._jobs.skipped
+    for relay in (first, slow):
+        relay.destroy_node()
 
 
 def test_a_node_reports_at_once_that_its_inputs_are_connected(node: EarNode, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,13 +52,28 @@ def test_a_shared_message_becomes_the_message_that_would_have_been_made(rng) -> 
 
 def test_only_listeners_of_a_topic_hear_it() -> None:
     exchange, heard = Exchange(), []
-    exchange.advertise("/a")
+    exchange.advertise("/a", lambda: None)
     assert exchange.has_publisher("/a")
     assert not exchange.has_listeners("/a")
     exchange.listen("/a", heard.append)
     exchange.publish("/a", 1)
     exchange.publish("/b", 2)
     assert heard == [1]
+
+
+def test_there_is_room_where_any_listener_would_begin_a_frame_at_once() -> None:
+    exchange, full, told = Exchange(), {"a": False, "b": False}, []
+    exchange.advertise("/depth", lambda: told.append("maker"))
+    assert exchange.has_room(["/depth"], ahead=False)
+    exchange.listen("/depth", lambda _: None)
+    assert exchange.has_room(["/depth"], ahead=False)
+    for name in full:
+        exchange.listen("/depth", lambda _: None, lambda ahead, n=name: full[n] and not ahead)
+    for full["a"], full["b"], room in ((False, True, True), (True, False, True), (True, True, False)):
+        assert exchange.has_room(["/depth", "/unheard"], ahead=False) == room
+        assert exchange.has_room(["/depth", "/unheard"], ahead=True)
+    exchange.tell_of_room("/depth")
+    assert told == ["maker"]
 
 
 def test_a_node_joins_only_while_it_is_made() -> None:

@@ -16,7 +16,7 @@ def fill(queue: JobQueue, count: int = 5) -> tuple[list[str], list[str]]:
         name = f"a{k}"
         queue.add(QueuedCall("a", lambda n=name: done.append(n), lambda n=name: left_out.append(n)))  # type: ignore[misc]
         queue.add(QueuedCall("imu", lambda n=name: done.append(f"imu after {n}")))  # type: ignore[misc]
-    while queue.run_one():
+    while queue.run_some():
         pass
     return done, left_out
 
@@ -40,7 +40,7 @@ def test_sources_do_not_push_each_other_out() -> None:
     queue, done = JobQueue("newest", waiting=1), []
     for name in ("a0", "b0", "a1"):
         queue.add(QueuedCall(name[0], lambda n=name: done.append(n), lambda: None))
-    while queue.run_one():
+    while queue.run_some():
         pass
     assert done == ["b0", "a1"]
 

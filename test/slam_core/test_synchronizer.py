@@ -90,3 +90,17 @@ def test_sets_of_a_clock_that_has_jumped_back_are_not_taken_for_leftovers() -> N
     for stamp in (1000, 10):
         pairs.add("b", stamp, "b")
     assert (sets, pairs.unpaired) == ([1000, 10], 0)
+
+
+def test_an_info_without_its_image_is_no_loss() -> None:
+    sets: list[int] = []
+    pairs = StampSynchronizer[str](["image", "info"], lambda stamp, _: sets.append(stamp), companions=["info"])
+    for stamp in (1, 2, 3):
+        pairs.add("info", stamp, "info")
+    pairs.add("image", 3, "image")
+    assert sets == [3]
+    assert pairs.unpaired == 0
+    pairs.add("image", 4, "image")
+    pairs.add("image", 5, "image")
+    pairs.add("info", 5, "info")
+    assert pairs.unpaired == 1

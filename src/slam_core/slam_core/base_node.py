@@ -118,7 +118,7 @@ class SlamNode(TransformNode, Generic[C]):
         def handle(stamp: int, message: Message) -> None:
             self._enqueue(topic, stamp, callback, message, announce=announce, keep=latched)
 
-        self._add_input(topic, type_name, handle, latched, required, policy)
+        self._add_input(topic, topic, type_name, handle, latched, required, policy)
 
     def listen_together(
         self,
@@ -130,17 +130,19 @@ class SlamNode(TransformNode, Generic[C]):
         stamps: StampPolicy = StampPolicy.FRAMES,
     ) -> None:
         """Subscribe to several topics (topic: type); ``callback`` gets the messages of one stamp in that order."""
-        names = list(topics)
+        names, source = list(topics), " + ".join(topics)
 
         def on_set(stamp: int, messages: tuple[Message, ...]) -> None:
-            self._enqueue(" + ".join(names), stamp, callback, *messages, keep=latched)
+            self._enqueue(source, stamp, callback, *messages, keep=latched)
 
         tolerance_ns = round(self.input_config.pairing_tolerance_s * 1e9)
-        pairs = StampSynchronizer[Message](names, on_set, tolerance_ns=tolerance_ns, depth=self.input_config.depth)
+        infos = [topic for topic, kind in topics.items() if kind == "CameraInfo"]
+        depth = self.input_config.depth
+        pairs = StampSynchronizer[Message](names, on_set, tolerance_ns=tolerance_ns, depth=depth, companions=infos)
         self._synchronizers.append(pairs)
         for topic, type_name in topics.items():
             self._add_input(
-                topic, type_name, lambda stamp, m, t=topic: pairs.add(t, stamp, m), latched, required, stamps
+                source, topic, type_name, lambda stamp, m, t=topic: pairs.add(t, stamp, m), latched, required, stamps
             )
 
     def advertise(
@@ -155,8 +157,7 @@ class SlamNode(TransformNode, Generic[C]):
         self._outputs[topic] = self.create_publisher(kind, topic, sensor_qos(depth, latched))
         self._latched |= {topic} if latched else set()
         self._alone |= {topic} if alone else set()
-        if self._exchange is not None:
-            self._exchange.advertise(self.resolve_topic_name(topic))
+        self._offer(self.resolve_topic_name(topic))
 
     def publish(self, topic: str, message: Message) -> None:
         """Send on an advertised topic: in a composed process by reference, and outside where anybody listens."""
@@ -206,6 +207,7 @@ class SlamNode(TransformNode, Generic[C]):
 
     def _add_input(
         self,
+        source: str,
         topic: str,
         type_name: str,
         handler: Callable[[int, Message], None],
@@ -214,10 +216,7 @@ class SlamNode(TransformNode, Generic[C]):
         policy: StampPolicy,
     ) -> None:
         kind = getattr(self._ros_types, type_name)
-        entry = Input(self.resolve_topic_name(topic), kind, handler, latched, required, policy)
-        entry.best_effort = self.input_config.reliability == "best_effort"
-        self._inputs[topic] = entry
-        self._connect(entry)
+        self._add_entry(topic, Input(self.resolve_topic_name(topic), kind, handler, latched, required, policy, source))
 
     def _receive(self, entry: Input, message: Message) -> None:
         entry.seen_at_s = time.monotonic()
@@ -263,6 +262,8 @@ class SlamNode(TransformNode, Generic[C]):
         self, source: str, stamp: int, callback: Callable[..., None], *messages: Message, announce: bool = True
     ) -> None:
         started = time.perf_counter()
+        if announce:
+            self._tell_of_room(source)
         try:
             callback(*messages)
             self.health.processed(time.perf_counter() - started, is_frame=announce)

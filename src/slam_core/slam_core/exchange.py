@@ -3,19 +3,29 @@
 
 A node publishes as ever; its message, which refers to the arrays it was made of, goes to the nodes of the process that
 listen, and is made a message of ROS only if somebody outside listens as well.
+
+A live node begins a frame only when somebody can go on with it: what is left out is left out by the first node, before
+anything was done for it.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from slam_core.messages.base import Message, MessageTypes
 from slam_core.types import AnyArray
+
+
+class Listener(NamedTuple):
+    """Takes a topic's messages; ``is_full`` tells if another frame has to wait, None where they are no frames."""
+
+    callback: Callable[[Message], None]
+    is_full: Callable[[bool], bool] | None
 
 
 class Exchange:
@@ -27,8 +37,8 @@ class Exchange:
     def __init__(self) -> None:
         self.node_options: dict[str, Any] = {}
         """Arguments that the node that is being made hands to rclpy's."""
-        self._publishers: set[str] = set()
-        self._listeners: dict[str, list[Callable[[Message], None]]] = defaultdict(list)
+        self._publishers: dict[str, list[Callable[[], None]]] = defaultdict(list)
+        self._listeners: dict[str, list[Listener]] = defaultdict(list)
 
     @contextmanager
     def node(self, arguments: Sequence[str]) -> Iterator[None]:
@@ -40,17 +50,36 @@ class Exchange:
         finally:
             Exchange.current = None
 
-    def advertise(self, topic: str) -> None:
-        """A node publishes a topic (full name)."""
-        self._publishers.add(topic)
+    def advertise(self, topic: str, on_room: Callable[[], None]) -> None:
+        """A node publishes a topic (full name); ``on_room`` is called when a listener may have room for a frame."""
+        self._publishers[topic].append(on_room)
 
     def has_publisher(self, topic: str) -> bool:
         """True if a node of this process publishes the topic."""
         return topic in self._publishers
 
-    def listen(self, topic: str, callback: Callable[[Message], None]) -> None:
-        """Call back with every message of the topic, in the thread of its publisher."""
-        self._listeners[topic].append(callback)
+    def listen(
+        self, topic: str, callback: Callable[[Message], None], is_full: Callable[[bool], bool] | None = None
+    ) -> None:
+        """Call back with every message of the topic, in the thread of its publisher.
+
+        ``is_full``, of a topic of frames, says whether another one has to wait, given whether it is made ahead.
+        """
+        self._listeners[topic].append(Listener(callback, is_full))
+
+    def has_room(self, topics: Iterable[str], ahead: bool) -> bool:
+        """True if somebody can use a frame on these topics, or nobody of this process listens to frames there.
+
+        ``ahead``: it may wait for a listener that is busy, as the next one.
+        """
+        asked = [listener.is_full for topic in topics for listener in self._listeners.get(topic, ())]
+        frames = [is_full for is_full in asked if is_full is not None]
+        return not frames or not all(is_full(ahead) for is_full in frames)
+
+    def tell_of_room(self, topic: str) -> None:
+        """A listener has begun or finished a frame: whoever publishes the topic may make the next one."""
+        for on_room in self._publishers.get(topic, ()):
+            on_room()
 
     def has_listeners(self, topic: str) -> bool:
         """True if a node of this process listens."""
@@ -58,8 +87,8 @@ class Exchange:
 
     def publish(self, topic: str, message: Message) -> None:
         """Hand a message to the listeners of this process."""
-        for callback in self._listeners.get(topic, ()):
-            callback(message)
+        for listener in self._listeners.get(topic, ()):
+            listener.callback(message)
 
 
 class SharedMessage:

@@ -10,7 +10,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+from typing import Any, ClassVar
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
@@ -20,7 +21,7 @@ from slam_core.guarded_node import GuardedNode
 from slam_core.input_config import InputConfig
 from slam_core.job_queue import JobQueue, QueuedCall
 from slam_core.messages.base import Message
-from slam_core.ros import declare_config, incompatibility, sensor_qos
+from slam_core.ros import declare_config, incompatibility, ros_type_name, sensor_qos
 from slam_core.stamp_gaps import StampGaps
 from slam_core.stamp_guard import StampPolicy
 
@@ -33,7 +34,10 @@ LATCHED_DEPTH = 1000
 
 @dataclass
 class Input:
-    """One subscription and what is known of its traffic; ``handler`` takes (stamp_ns, message)."""
+    """One subscription and what is known of its traffic; ``handler`` takes (stamp_ns, message).
+
+    ``source`` is that of the jobs made of it.
+    """
 
     topic: str
     message_class: Any
@@ -41,6 +45,7 @@ class Input:
     latched: bool
     required: bool
     policy: StampPolicy = StampPolicy.FRAMES
+    source: str = ""
     subscription: Any = None
     best_effort: bool = False
     volatile: bool = False
@@ -56,6 +61,9 @@ class Input:
 class ListeningNode(GuardedNode):
     """Keeps the subscriptions; what arrives goes to :meth:`_receive`, which makes jobs for :meth:`work` of it."""
 
+    MAKES_AHEAD: ClassVar[bool] = True
+    """True if a frame may be made for a node of the same process that is busy; not worth it where that is quick."""
+
     def __init__(self, name: str) -> None:
         self._exchange = Exchange.current
         options = {} if self._exchange is None else self._exchange.node_options
@@ -64,6 +72,8 @@ class ListeningNode(GuardedNode):
         self._inputs: dict[str, Input] = {}
         self._jobs = JobQueue(self.input_config.policy, self.input_config.waiting)
         self._inbox: deque[tuple[Input, Message]] = deque()
+        self._topics_out: list[str] = []
+        self._at_work = False
         self._wake = self.create_guard_condition(self._guarded("inbox", self._empty_inbox))
         self._started_at_s = time.monotonic()
 
@@ -72,34 +82,92 @@ class ListeningNode(GuardedNode):
 
     @property
     def has_work(self) -> bool:
-        """True if a job waits."""
-        return len(self._jobs) > 0
+        """True if a job can be done, or a message of this process waits."""
+        return len(self._inbox) > 0 or self._jobs.has_ready(frames=self._may_begin())
+
+    def receive(self) -> None:
+        """Take all messages that have come, so that the queue knows what waits and what to leave out."""
+        self._empty_inbox()
+        for entry in self._inputs.values():
+            if entry.subscription is not None:
+                self._drain(entry.subscription)
+
+    def _drain(self, subscription: Any) -> None:
+        """Take messages past the executor, which for each of them would set up anew what it waits for, 0.3 ms."""
+        with subscription.handle:
+            for _ in range(self.input_config.depth):
+                if (taken := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is None:
+                    break
+                subscription.callback(taken[0])
 
     def work(self) -> bool:
-        """Do the next job that waits; False if there is none."""
-        return self._jobs.run_one()
+        """Do what waits up to the next frame; False if nothing does."""
+        self._at_work = True
+        done = self._jobs.run_some(frames=self._may_begin())
+        self._at_work = False
+        if done:
+            self._tell_of_room()
+        return done
 
     def finish_work(self) -> None:
         """Do all jobs that wait."""
-        while self.work():
+        while self._jobs.run_some():
             pass
+
+    def _may_begin(self) -> bool:
+        """True if what is made of the next frame would be used: a live node leaves others out before it begins them."""
+        if self._exchange is None or self.input_config.policy == "all":
+            return True
+        return self._exchange.has_room(self._topics_out, self.MAKES_AHEAD)
+
+    def _tell_of_room(self, source: str = "") -> None:
+        """A frame of a source is begun, or all is done: whoever makes frames for this node may have been waiting."""
+        for entry in self._inputs.values():
+            if self._exchange is not None and entry.subscription is None and source in ("", entry.source):
+                self._exchange.tell_of_room(entry.topic)
 
     def do_later(self, source: str, run: Callable[[], None]) -> None:
         """Have something done in the node's own thread, in its turn; may be called from any thread."""
         self._jobs.add(QueuedCall(source, self._guarded(source, run)))
-        self._wake.trigger()
+        self._awaken()
+
+    def _offer(self, topic: str) -> None:
+        """Publish a topic (full name) in this process too."""
+        if self._exchange is not None:
+            self._topics_out.append(topic)
+            self._exchange.advertise(topic, self._awaken)
+
+    def _add_entry(self, topic: str, entry: Input) -> None:
+        entry.best_effort = self.input_config.reliability == "best_effort"
+        self._inputs[topic] = entry
+        self._connect(entry)
 
     def _connect(self, entry: Input) -> None:
         """Listen to a node of this process where one publishes the topic, else to the network."""
         if self._exchange is None or not self._exchange.has_publisher(entry.topic):
             self._subscribe(entry)
             return
-        self._exchange.listen(entry.topic, lambda message: self._put_in_inbox(entry, message))
+        self._jobs.limit(entry.source, 1)  # others wait where they cost less, at the node that makes them
+        is_full = partial(self._is_full, entry) if entry.policy is StampPolicy.FRAMES and not entry.latched else None
+        self._exchange.listen(entry.topic, lambda message: self._put_in_inbox(entry, message), is_full)
+
+    def _is_full(self, entry: Input, ahead: bool) -> bool:
+        """True if a frame of an input waits, or, unless one is made ``ahead``, if the node has something else to do.
+
+        Asked by the thread of the node that makes them.
+        """
+        waits = any(waiting is entry for waiting, _ in list(self._inbox)) or self._jobs.has_frames_of(entry.source)
+        return waits or (self._at_work and not ahead)
 
     def _put_in_inbox(self, entry: Input, message: Message) -> None:
         """Take a message from the thread of the node that made it."""
         self._inbox.append((entry, message))
-        self._wake.trigger()
+        self._awaken()
+
+    def _awaken(self) -> None:
+        """Have the node's thread look for work, if it waits for messages; it looks itself before it does."""
+        if self.sleeps:
+            self._wake.trigger()
 
     def _empty_inbox(self) -> None:
         while self._inbox:
@@ -112,7 +180,7 @@ class ListeningNode(GuardedNode):
         profile = sensor_qos(depth, entry.latched and not entry.volatile, best_effort=entry.best_effort)
         events = SubscriptionEventCallbacks(
             message_lost=lambda event: self.health.count("lost_by_transport", event.total_count_change),
-            incompatible_qos=lambda event: None,
+            use_default_callbacks=False,
         )
         entry.subscription = self.create_subscription(
             entry.message_class, entry.topic, lambda m: self._receive(entry, m), profile, event_callbacks=events
@@ -147,10 +215,11 @@ class ListeningNode(GuardedNode):
         publishers = self.get_publishers_info_by_topic(entry.topic)
         if not publishers:
             return "it has no publisher"
-        wanted = entry.subscription.qos_profile
+        wanted, type_name = entry.subscription.qos_profile, ros_type_name(entry.message_class)
         texts = []
         for info in publishers:
             why = incompatibility(info.qos_profile, wanted)
+            why = why or ("" if info.topic_type == type_name else f"a {info.topic_type}, a {type_name} is asked for")
             texts.append(
                 f"{info.node_namespace.rstrip('/')}/{info.node_name}" + (f", incompatible: {why}" if why else "")
             )

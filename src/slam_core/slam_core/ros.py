@@ -15,6 +15,7 @@ import importlib.util
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -42,6 +43,8 @@ C = TypeVar("C", bound=Config)
 _PROFILE_VARIABLES = {"FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"}
 _SIGNAL_PERIOD_S = 0.1
 """Longest time that a node without traffic takes to notice a signal."""
+_SERVICE_PERIOD_S = 0.02
+"""Period in which a node that always has work to do looks after timers and services."""
 
 
 class RosTypes(MessageTypes):
@@ -157,6 +160,11 @@ def message_class(type_name: str) -> Any:
         return None
 
 
+def ros_type_name(kind: Any) -> str:
+    """``package/msg/Name`` of a message class."""
+    return f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
+
+
 def use_fast_dds_profile(*, small_packets: bool = False) -> None:
     """Let Fast DDS carry large messages through shared memory, unless the environment says what it shall do.
 
@@ -187,15 +195,33 @@ def spin(node: RunnableNode, executor: SingleThreadedExecutor, stopped: threadin
     All that has come is received before the next job is done, so that the node itself knows what waits and what to
     leave out, not the transport.
     """
+    served_s = 0.0
     while rclpy.ok(context=executor.context) and not stopped.is_set():
         if not isinstance(node, GuardedNode):
             executor.spin_once(timeout_sec=_SIGNAL_PERIOD_S)
             continue
-        calls = -1
-        while calls != node.calls and not stopped.is_set():
-            calls = node.calls
-            executor.spin_once(timeout_sec=0.0 if node.has_work else _SIGNAL_PERIOD_S)
+        if not node.has_work:
+            _wait(node, executor)
+        elif time.monotonic() > served_s + _SERVICE_PERIOD_S:
+            _serve(node, executor)
+            served_s = time.monotonic()
+        node.receive()
         node.work()
+
+
+def _wait(node: GuardedNode, executor: SingleThreadedExecutor) -> None:
+    """Until something comes, from the network or from another thread."""
+    node.sleeps = True
+    executor.spin_once(timeout_sec=0.0 if node.has_work else _SIGNAL_PERIOD_S)
+    node.sleeps = False
+
+
+def _serve(node: GuardedNode, executor: SingleThreadedExecutor) -> None:
+    """Call back all that is ready: timers and services too, of which a node that has work to do hears only here."""
+    calls = -1
+    while calls != node.calls:
+        calls = node.calls
+        executor.spin_once(timeout_sec=0.0)
 
 
 def run_node(

@@ -7,7 +7,7 @@ Used by the nodes on messages and by the offline pipeline on a bag: both see the
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -35,6 +35,9 @@ class StampSynchronizer(Generic[T]):
         Largest difference of an item's stamp from its neighbours' in the set; 0 pairs equal stamps only.
     depth
         Items kept per topic while waiting for the others.
+    companions
+        Topics that say something of the others' items and are nothing alone, such as camera infos: what is left over of
+        these is dropped without being counted.
     """
 
     def __init__(
@@ -44,6 +47,7 @@ class StampSynchronizer(Generic[T]):
         *,
         tolerance_ns: int = 0,
         depth: int = 64,
+        companions: Collection[str] = (),
     ) -> None:
         if tolerance_ns < 0 or depth < 1:
             raise ValueError(f"pairing needs tolerance >= 0 ns and depth >= 1, got {tolerance_ns} ns and {depth}")
@@ -51,6 +55,7 @@ class StampSynchronizer(Generic[T]):
         self._on_set = on_set
         self._tolerance_ns = tolerance_ns
         self._depth = depth
+        self._companions = frozenset(companions)
         self.unpaired = 0
         """Items dropped because their partners never came."""
 
@@ -58,19 +63,19 @@ class StampSynchronizer(Generic[T]):
         """Take one item; calls ``on_set`` before it returns if the item completes a set."""
         queue = self._queues[topic]
         if queue.pop(stamp_ns, None) is not None:
-            self.unpaired += 1
+            self._count(topic)
         queue[stamp_ns] = item
         if len(queue) > self._depth:
             queue.popitem(last=False)
-            self.unpaired += 1
+            self._count(topic)
         stamps = self._partners(stamp_ns)
         if stamps is not None:
             self._emit(stamps)
 
     def clear(self) -> None:
         """Forget everything that waits; what waited counts as unpaired."""
-        for queue in self._queues.values():
-            self.unpaired += len(queue)
+        for topic, queue in self._queues.items():
+            self._count(topic, len(queue))
             queue.clear()
 
     @property
@@ -92,9 +97,13 @@ class StampSynchronizer(Generic[T]):
 
     def _emit(self, stamps: list[int]) -> None:
         items = []
-        for queue, stamp in zip(self._queues.values(), stamps, strict=True):
+        for (topic, queue), stamp in zip(self._queues.items(), stamps, strict=True):
             while (first := next(iter(queue))) != stamp:
                 del queue[first]
-                self.unpaired += 1
+                self._count(topic)
             items.append(queue.pop(stamp))
         self._on_set(stamps[0], tuple(items))
+
+    def _count(self, topic: str, number: int = 1) -> None:
+        if topic not in self._companions:
+            self.unpaired += number

@@ -63,6 +63,8 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
     ``image_rect`` is grey; of a colour camera there is ``stereo/left/image_rect_color`` beside it.
     """
 
+    MAKES_AHEAD = False
+
     def __init__(self) -> None:
         super().__init__("stereo_driver", StereoDriverConfig)
         self.stage = StereoStage()

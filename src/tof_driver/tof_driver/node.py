@@ -64,6 +64,8 @@ _COLOUR = "tof/color/image"
 class TofDriverNode(SlamNode[TofDriverConfig]):
     """Publishes the topics of :data:`slam_core.messages.DEPTH_TOPICS`."""
 
+    MAKES_AHEAD = False
+
     def __init__(self) -> None:
         super().__init__("tof_driver", TofDriverConfig)
         self.stage = DepthStage(depth_config(self.config))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag through the real nodes: start them, play the bag no faster than they follow, record, stop, collect.
 
-private domain -> nodes ready and connected -> recorder -> player -> input has ended -> map saved -> nodes stopped
+private domain -> nodes and recorder ready and connected -> player -> input has ended -> map saved -> nodes stopped
 """
 
 from __future__ import annotations
@@ -155,11 +155,11 @@ class _Choreography:
         self._stopped = stopped
 
     def start_nodes(self, *, composed: bool) -> None:
-        """All nodes, then the recorder; returns when every topic has reached whoever listens to it."""
-        for command in (self._composed(),) if composed else self._graph.commands:
+        """All nodes and the recorder at once; returns when every topic has reached whoever listens to it."""
+        for command in (*((self._composed(),) if composed else self._graph.commands), self._recorder()):
             self._group.start(command)
         self._wait_until_ready(from_outside=(*self._graph.played.values(), STATIC_TRANSFORMS_TOPIC))
-        self._start_recorder()
+        self._wait_for_recorder()
 
     def _composed(self) -> NodeCommand:
         """The process that is all nodes, which it finds in a file."""
@@ -181,9 +181,11 @@ class _Choreography:
         if self._stopped():
             raise KeyboardInterrupt
 
-    def _start_recorder(self) -> None:
+    def _recorder(self) -> NodeCommand:
         parameters = {"bag": str(self._recording), "topics": self._graph.recorded_topics, "header_stamps": True}
-        self._group.start(NodeCommand("slam_bringup", "recorder", tuple(ros_arguments(parameters))))
+        return NodeCommand("slam_bringup", "recorder", tuple(ros_arguments(parameters)))
+
+    def _wait_for_recorder(self) -> None:
         topics = [t for t in self._graph.recorded_topics if self._supervisor.publishes(t)]
         recorded = self._supervisor.subscribers
         self._supervisor.wait(
