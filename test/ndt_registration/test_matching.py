@@ -7,7 +7,7 @@ import numpy as np
 
 from ndt_registration.matching import block_gradients, fit_to_grid
 from ndt_registration.ndt import Layer, ndt_align
-from ndt_registration.voxel_grid import block_moments, normal_grid
+from ndt_registration.voxel_grid import block_moments, normal_grid, note_spurious_information
 from slam_core.geometry import FloatArray
 
 
@@ -26,6 +26,7 @@ def noisy_layer(rng: np.random.Generator) -> Layer:
         variance_floor=2.5e-7,
         slack=10.0,
     )
+    note_spurious_information(grid)
     return Layer(noisy_plane(rng), grid, 1.0)
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ndt_registration.ndt import Layer, Neighbours, cost_and_derivatives, ndt_align, no_neighbours
-from ndt_registration.voxel_grid import block_moments, find_block, normal_grid
+from ndt_registration.block_table import find_block
+from ndt_registration.lanes import Neighbours, groups_of, no_neighbours
+from ndt_registration.ndt import Layer, cost_and_derivatives, ndt_align
+from ndt_registration.voxel_grid import block_moments, normal_grid
 from slam_core.geometry import FloatArray, boxminus, boxplus, make_transform, transform_points
 
 STATES = [np.zeros(6), np.array([0.03, -0.02, 0.01, 0.02, -0.05, 0.03]), np.array([-0.1, 0.05, 0.02, -0.3, 0.2, 0.6])]
@@ -41,7 +43,7 @@ def evaluate(
     layer: Layer, T: FloatArray, neighbours: Neighbours | None = None
 ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
     g, H, M = np.empty(6), np.empty((6, 6)), np.empty((6, 6))
-    neighbours = neighbours or no_neighbours(len(layer.points))
+    neighbours = neighbours or no_neighbours(groups_of(len(layer.points)))
     cost = cost_and_derivatives((layer,), np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), neighbours, g, H, M)
     return cost, g, H, M
 
@@ -53,7 +55,7 @@ def test_cost_agrees_with_numpy(layer: Layer, state: FloatArray) -> None:
 
 
 def test_neighbours_of_the_step_before_change_nothing(layer: Layer) -> None:
-    kept = no_neighbours(len(layer.points))
+    kept = no_neighbours(groups_of(len(layer.points)))
     for state in STATES * 2:
         T = boxplus(np.eye(4), state)
         for again, anew in zip(evaluate(layer, T, kept), evaluate(layer, T), strict=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ndt_registration.block_table import find_block
 from ndt_registration.eigen import cholesky_solve6, symmetric_eigen3
 from ndt_registration.voxel_grid import (
     NormalGrid,
@@ -11,7 +12,6 @@ from ndt_registration.voxel_grid import (
     block_counts,
     block_moments,
     coarser,
-    find_block,
     normal_grid,
 )
 from slam_core.geometry import FloatArray
@@ -139,3 +139,12 @@ def test_cells_at_a_step_keep_their_own_normal(rng: np.random.Generator) -> None
 def test_counts_are_those_of_the_moments(rng: np.random.Generator) -> None:
     points = rng.normal(0.0, 1.0, (500, 3))
     np.testing.assert_array_equal(block_counts(points, 0.4), block_moments(points, 0.4).counts)
+
+
+def test_the_table_grows_where_cells_share_no_blocks(rng: np.random.Generator) -> None:
+    points = np.repeat(rng.uniform(-50.0, 50.0, (300, 3)), 3, axis=0) + 1e-3 * rng.normal(size=(900, 3))
+    grid = normal_grid(block_moments(points, 0.5), 0.5, min_points=3, relative_floor=1e-3, variance_floor=1e-6, slack=0)
+    corners = np.floor(points / 0.5).astype(int)[:, None] - np.indices((2, 2, 2)).reshape(3, 8).T
+    _, counts = np.unique(corners.reshape(-1, 3), axis=0, return_counts=True)
+    assert np.sort(grid.counts).tolist() == np.sort(counts[counts >= 3]).tolist()
+    assert all(find_block(grid.keys, grid.rows, *np.floor(p / 0.5).astype(int).tolist()) >= 0 for p in points[::30])

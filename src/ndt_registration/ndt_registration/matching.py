@@ -8,13 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from ndt_registration.lanes import FAR, LANES, bell, exponent_in_cell, gather, groups_of, no_neighbours, sum_over_cells
 from ndt_registration.ndt import Layer
-from ndt_registration.voxel_grid import NormalGrid, find_block
+from ndt_registration.voxel_grid import SPURIOUS, NormalGrid
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 
-_MATCHED = 4.5
+_MATCHED = np.float32(4.5)
 """A point with an exponent below this (three standard deviations) lies on a surface of the target."""
+_FIT_ROWS = 5
+_ZERO, _EIGHTH, _ONE, _TWO = np.float32(0.0), np.float32(0.125), np.float32(1.0), np.float32(2.0)
 
 
 class Fit(NamedTuple):
@@ -37,22 +40,6 @@ class Fit(NamedTuple):
     spurious_majorant: FloatArray
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _add_moments(px, py, pz, weight, sums):  # type: ignore[no-untyped-def]
-    """Add a point's weight and its weighted first and second moments to ``sums`` (10,)."""
-    x, y, z = weight * px, weight * py, weight * pz
-    sums[0] += weight
-    sums[1] += x
-    sums[2] += y
-    sums[3] += z
-    sums[4] += x * px
-    sums[5] += x * py
-    sums[6] += x * pz
-    sums[7] += y * py
-    sums[8] += y * pz
-    sums[9] += z * pz
-
-
 @njit(cache=True, nogil=True)
 def _hessian_of_weights(sums: FloatArray) -> FloatArray:
     """Sum of ``weight J' J`` with ``J = [I, -[p]x]`` from the weighted moments of the points."""
@@ -70,17 +57,6 @@ def _hessian_of_weights(sums: FloatArray) -> FloatArray:
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _offset(grid, cell, x, y, z):  # type: ignore[no-untyped-def]
-    """Offset q of a point from a cell's mean, and the cell's information times q."""
-    qx, qy, qz = x - grid.mean[cell, 0], y - grid.mean[cell, 1], z - grid.mean[cell, 2]
-    b = grid.information[cell]
-    ux = b[0] * qx + b[1] * qy + b[2] * qz
-    uy = b[1] * qx + b[3] * qy + b[4] * qz
-    uz = b[2] * qx + b[4] * qy + b[5] * qz
-    return qx, qy, qz, ux, uy, uz
-
-
 @njit(cache=True, nogil=True)
 def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGrid, max_distance: float) -> Fit:
     """Fit of points (n, 3) at a pose.
@@ -88,8 +64,9 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
     A point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m of its plane.
     """
     hessian_moments, majorant_moments = np.zeros(10), np.zeros(10)
+    room = np.empty((8 + _FIT_ROWS) * LANES, np.float32)
     inliers, squares, cx, cy, cz, second = _sums_of_fit(
-        points, R, t, grid, max_distance, hessian_moments, majorant_moments
+        points, R, t, grid, max_distance, no_neighbours(1), room, hessian_moments, majorant_moments
     )
     centre = np.array([cx, cy, cz]) / max(inliers, 1)
     radius = np.sqrt(max(second / max(inliers, 1) - (centre * centre).sum(), 1e-12))
@@ -103,34 +80,60 @@ def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGr
     )
 
 
-@in_place()
-def _fit_of_cells(grid, row, mx, my, mz):  # type: ignore[no-untyped-def]
-    """Weight of a point in cost, majorant and Hessian; least exponent of its cells and the distance there."""
-    weight = majorant_weight = hessian_weight = 0.0
-    best, distance = _MATCHED, 0.0
+@in_place(fastmath={"reassoc"})
+def _fit_of_cells(cells, place, room):  # type: ignore[no-untyped-def]
+    """Fit of each lane: rows of ``room`` from 8 on, whose first eight hold the cells' spurious information.
+
+    Weight in the cost, in the majorant and in the Hessian; least exponent of its cells, and which of them that is.
+    """
+    for j in range(LANES):
+        room[8 * LANES + j] = room[9 * LANES + j] = room[10 * LANES + j] = room[12 * LANES + j] = _ZERO
+        room[11 * LANES + j] = _MATCHED
     for k in range(8):
-        cell = grid.cells[row, k]
-        if cell < 0:
-            continue
-        qx, qy, qz, ux, uy, uz = _offset(grid, cell, mx, my, mz)
-        exponent = 0.5 * (qx * ux + qy * uy + qz * uz)
-        e = 0.125 * np.exp(-min(exponent, 30.0))
-        weight += e
-        # In the plane the least variance is that of z, which is zero, and the second is across the wall.
-        flat = grid.variance[cell, 0] <= 1e-9 * grid.variance[cell, 2]
-        spread = grid.variance[cell, 2] if flat else grid.variance[cell, 1]
-        b = grid.information[cell]
-        information = e * min(1.0 / max(grid.counts[cell] * spread, 1e-300), b[0] + b[3] + b[5])
-        majorant_weight += information
-        hessian_weight += information * (1.0 - 2.0 * min(exponent, 30.0))
-        if exponent < best:
-            best = exponent
-            distance = abs(qx * grid.normal[cell, 0] + qy * grid.normal[cell, 1] + qz * grid.normal[cell, 2])
-    return weight, majorant_weight, hessian_weight, best, distance
+        number = np.float32(k)
+        for j in range(LANES):
+            exponent = exponent_in_cell(cells, k, place, j)
+            e = _EIGHTH * bell(exponent)
+            room[8 * LANES + j] += e
+            information = e * room[k * LANES + j]
+            room[9 * LANES + j] += information
+            room[10 * LANES + j] += information * (_ONE - _TWO * min(exponent, FAR))
+            best = room[11 * LANES + j]
+            room[12 * LANES + j] = number if exponent < best else room[12 * LANES + j]
+            room[11 * LANES + j] = exponent if exponent < best else best
+
+
+@in_place(fastmath={"reassoc"})
+def _add_moments(p, weights, row, moments):  # type: ignore[no-untyped-def]
+    """Add the lanes' weights, which are a row of an array, and their first and second moments to ``moments`` (10,)."""
+    s = x = y = z = xx = xy = xz = yy = yz = zz = _ZERO
+    for j in range(LANES):
+        w, px, py, pz = weights[row * LANES + j], p[j], p[LANES + j], p[2 * LANES + j]
+        wx, wy, wz = w * px, w * py, w * pz
+        s += w
+        x += wx
+        y += wy
+        z += wz
+        xx += wx * px
+        xy += wx * py
+        xz += wx * pz
+        yy += wy * py
+        yz += wy * pz
+        zz += wz * pz
+    moments[0] += s
+    moments[1] += x
+    moments[2] += y
+    moments[3] += z
+    moments[4] += xx
+    moments[5] += xy
+    moments[6] += xz
+    moments[7] += yy
+    moments[8] += yz
+    moments[9] += zz
 
 
 @in_place()
-def _sums_of_fit(points, R, t, grid, max_distance, hessian_moments, majorant_moments):  # type: ignore[no-untyped-def]
+def _sums_of_fit(points, R, t, grid, max_distance, at, room, hessian_moments, majorant_moments):  # type: ignore[no-untyped-def]
     """Number of inliers, the sum of their squared distances, of their coordinates (three) and of these squared.
 
     Adds to the moments (10,) of both weights.
@@ -138,28 +141,36 @@ def _sums_of_fit(points, R, t, grid, max_distance, hessian_moments, majorant_mom
     inliers = 0
     squares = 0.0
     cx = cy = cz = second = 0.0
-    for i in range(points.shape[0]):
-        px = R[0, 0] * points[i, 0] + R[0, 1] * points[i, 1] + R[0, 2] * points[i, 2]
-        py = R[1, 0] * points[i, 0] + R[1, 1] * points[i, 1] + R[1, 2] * points[i, 2]
-        pz = R[2, 0] * points[i, 0] + R[2, 1] * points[i, 1] + R[2, 2] * points[i, 2]
-        mx, my, mz = px + t[0], py + t[1], pz + t[2]
-        s = 1.0 / grid.block_size
-        row = find_block(grid.keys, grid.rows, int(np.floor(mx * s)), int(np.floor(my * s)), int(np.floor(mz * s)))
-        if row < 0:
-            continue
-        weight, majorant_weight, hessian_weight, best, distance = _fit_of_cells(grid, row, mx, my, mz)
-        if best < _MATCHED and distance < max_distance:
-            inliers += 1
-            squares += distance * distance
-            cx += px
-            cy += py
-            cz += pz
-            second += px * px + py * py + pz * pz
-        if weight == 0.0:
-            continue
-        _add_moments(px, py, pz, majorant_weight, majorant_moments)
-        _add_moments(px, py, pz, hessian_weight, hessian_moments)
+    for group in range(groups_of(points.shape[0])):
+        count = gather(points, group, grid, R, t, at, -group)
+        for j in range(LANES):
+            row = at.block[j, 3]
+            for k in range(8):
+                cell = grid.cells[row, k] if row >= 0 else -1
+                room[k * LANES + j] = grid.records[cell, SPURIOUS] if cell >= 0 else _ZERO
+        _fit_of_cells(at.cells[0], at.place, room)
+        _add_moments(at.turned, room, 9, majorant_moments)
+        _add_moments(at.turned, room, 10, hessian_moments)
+        for j in range(count):
+            if not room[11 * LANES + j] < _MATCHED:
+                continue
+            px, py, pz = at.turned[j], at.turned[LANES + j], at.turned[2 * LANES + j]
+            distance = _distance(grid, grid.cells[at.block[j, 3], int(room[12 * LANES + j])], px, py, pz, t)
+            if distance < max_distance:
+                inliers += 1
+                squares += distance * distance
+                cx += px
+                cy += py
+                cz += pz
+                second += px * px + py * py + pz * pz
     return inliers, squares, cx, cy, cz, second
+
+
+@in_place()
+def _distance(grid, cell, px, py, pz, t):  # type: ignore[no-untyped-def]
+    """Distance of a turned point from the plane of a cell."""
+    qx, qy, qz = px + t[0] - grid.mean[cell, 0], py + t[1] - grid.mean[cell, 1], pz + t[2] - grid.mean[cell, 2]
+    return abs(qx * grid.normal[cell, 0] + qy * grid.normal[cell, 1] + qz * grid.normal[cell, 2])
 
 
 @njit(cache=True, nogil=True)
@@ -167,38 +178,27 @@ def block_gradients(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
     """Gradient (b, 6) of the cost of one layer at a pose, summed over each of the grid's blocks, half a cell's edge."""
     blocks = layer.grid.cells.shape[0]
     gradients, touched = np.zeros((blocks, 6)), np.zeros(blocks, np.bool_)
-    _add_gradients(layer, R, t, gradients, touched)
+    _add_gradients(layer, R, t, no_neighbours(1), gradients, touched)
     return gradients[touched]
 
 
 @in_place()
-def _add_gradients(layer, R, t, gradients, touched):  # type: ignore[no-untyped-def]
+def _add_gradients(layer, R, t, at, gradients, touched):  # type: ignore[no-untyped-def]
     """Add to the gradients (b, 6) of all blocks, and mark those that hold points."""
-    grid = layer.grid
-    s = 1.0 / grid.block_size
-    for i in range(layer.points.shape[0]):
-        x, y, z = layer.points[i, 0], layer.points[i, 1], layer.points[i, 2]
-        px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
-        py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
-        pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
-        mx, my, mz = px + t[0], py + t[1], pz + t[2]
-        row = find_block(grid.keys, grid.rows, int(np.floor(mx * s)), int(np.floor(my * s)), int(np.floor(mz * s)))
-        if row < 0:
-            continue
-        vx = vy = vz = 0.0
-        for k in range(8):
-            cell = grid.cells[row, k]
-            if cell < 0:
+    factor, sums = 0.125 * layer.factor, at.sums
+    for group in range(groups_of(layer.points.shape[0])):
+        count = gather(layer.points, group, layer.grid, R, t, at, -group)
+        sum_over_cells(at.cells[0], at.place, sums)
+        for j in range(count):
+            row = at.block[j, 3]
+            if row < 0:
                 continue
-            qx, qy, qz, ux, uy, uz = _offset(grid, cell, mx, my, mz)
-            e = 0.125 * layer.factor * np.exp(-min(0.5 * (qx * ux + qy * uy + qz * uz), 30.0))
-            vx += e * ux
-            vy += e * uy
-            vz += e * uz
-        touched[row] = True
-        gradients[row, 0] += vx
-        gradients[row, 1] += vy
-        gradients[row, 2] += vz
-        gradients[row, 3] += py * vz - pz * vy
-        gradients[row, 4] += pz * vx - px * vz
-        gradients[row, 5] += px * vy - py * vx
+            px, py, pz = at.turned[j], at.turned[LANES + j], at.turned[2 * LANES + j]
+            vx, vy, vz = factor * sums[LANES + j], factor * sums[2 * LANES + j], factor * sums[3 * LANES + j]
+            touched[row] = True
+            gradients[row, 0] += vx
+            gradients[row, 1] += vy
+            gradients[row, 2] += vz
+            gradients[row, 3] += py * vz - pz * vy
+            gradients[row, 4] += pz * vx - px * vz
+            gradients[row, 5] += px * vy - py * vx

@@ -7,7 +7,15 @@ from dataclasses import dataclass
 
 from ndt_registration.cloud import Cloud
 from ndt_registration.ndt import Layer
-from ndt_registration.voxel_grid import Moments, NormalGrid, adopt_planes, block_moments, coarser, normal_grid
+from ndt_registration.voxel_grid import (
+    Moments,
+    NormalGrid,
+    adopt_planes,
+    block_moments,
+    coarser,
+    normal_grid,
+    note_spurious_information,
+)
 from slam_core.config import Config, parameter
 
 _BLOCK_POINTS = 1.2
@@ -74,6 +82,7 @@ class Pyramid:
                 slack = _SLACK if level < _SURFACE_LEVELS else -1.0
                 floor = (_SURFACE_SMOOTHING * edge * 2**level) ** 2
                 adopt_planes(surface_grids[level], surface_grids[level + 1], config.flatness, _AGREEMENT, floor, slack)
+        note_spurious_information(surface_grids[0])
         return Pyramid(tuple(surface_grids), tuple(rim_grids))
 
     def layers(self, source: Cloud, level: int, count: int, rim_share: float) -> tuple[Layer, Layer]:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ndt_registration.ambiguity import ambiguity_reason
-from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare, viewpoint
+from ndt_registration.cloud import Cloud, finite_points, is_planar, largest_extent, prepare, viewpoint
 from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
 from ndt_registration.matching import block_gradients, fit_to_grid
 from ndt_registration.ndt import NdtOptimum, ndt_align
@@ -26,6 +26,7 @@ from ndt_registration.uncertainty import (
     Curvature,
     Extent,
     UncertaintyConfig,
+    clear_loss,
     direction_names,
     gradient_scatter,
     sandwich,
@@ -193,7 +194,7 @@ def check_cloud(points: FloatArray, name: str, config: RegistrationConfig) -> No
         raise DegenerateCloudError(
             f"the {name} has {len(points)} finite points, at least {config.min_points} are needed"
         )
-    extent = max(float(np.ptp(column)) for column in points.T)
+    extent = largest_extent(points)
     if extent < _LEAST_EXTENT:
         raise DegenerateCloudError(f"all points of the {name} coincide")
     if not extent < _LARGEST_EXTENT:
@@ -308,7 +309,11 @@ def _result(
         Curvature(optimum.hessian, optimum.majorant, fit.spurious_hessian, fit.spurious_majorant),
         gradient_scatter(gradients, len(source) / len(target.cloud)),
         Extent(fit.centre, max(fit.radius, _LEAST_RADIUS * scale)),
-        ScoreLoss(target.pyramid.layers(source, 0, _COARSE_POINTS, config.rim_share), _pose(optimum)).loss,
+        ScoreLoss(
+            target.pyramid.layers(source, 0, _COARSE_POINTS, config.rim_share),
+            _pose(optimum),
+            clear_loss(config.uncertainty),
+        ).loss,
         scale,
         planar_constraint(source.planar) > 0.0,
         config.uncertainty,

@@ -11,66 +11,94 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from ndt_registration.lanes import LANES, NOWHERE, Neighbours, gather, groups_of, mean_over_cells, no_neighbours
 from ndt_registration.ndt import Layer
-from ndt_registration.voxel_grid import find_block
 from slam_core.geometry import FloatArray, boxplus
 from slam_core.in_place import in_place
 
+_FEW = 4
+"""One in so many points tells at once where a pose is held without doubt."""
+
 
 class ScoreLoss:
-    """The fit at a pose T_target_source (4, 4), to be compared with the fit near it; surfaces and rims as layers."""
+    """The fit at a pose T_target_source (4, 4), to be compared with the fit near it; surfaces and rims as layers.
 
-    def __init__(self, layers: tuple[Layer, Layer], T: FloatArray) -> None:
-        self._layers, self._T = layers, T
-        self._fits = self._at(T)
+    clear: a share of that size, lost by a quarter of the points, needs no look at the others.
+    """
+
+    def __init__(self, layers: tuple[Layer, Layer], T: FloatArray, clear: float = 1.0) -> None:
+        self._layers, self._T, self._clear = layers, T, clear
+        R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+        self._fits = point_fits(layers[0], R, t), point_fits(layers[1], R, t)
 
     def loss(self, step: FloatArray) -> float:
-        """Share of the fit that is lost when the pose is moved by a vector (6,)."""
-        surfaces, rims = self._fits
-        moved_surfaces, moved_rims = self._at(boxplus(self._T, step))
-        both = (surfaces >= 0.0) & (moved_surfaces >= 0.0)
-        # Rims mark where a surface ends: one that leaves them is lost indeed.
-        weight = self._layers[1].factor
-        before = surfaces[both].sum() + weight * np.maximum(rims, 0.0).sum()
-        after = moved_surfaces[both].sum() + weight * np.maximum(moved_rims, 0.0).sum()
-        return 1.0 - float(after) / max(float(before), 1e-300)
+        """Share of the fit that is lost when the pose is moved by a vector (6,), or back by it: the lesser of both."""
+        moved = [boxplus(self._T, step), boxplus(self._T, -step)]
+        R, t = np.stack([T[:3, :3] for T in moved]), np.stack([T[:3, 3] for T in moved])
+        few = self._lost(_FEW, R, t)
+        return few if few > self._clear else self._lost(1, R, t)
 
-    def _at(self, T: FloatArray) -> tuple[FloatArray, FloatArray]:
-        R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+    def _lost(self, share: int, R: FloatArray, t: FloatArray) -> float:
         surfaces, rims = self._layers
-        return point_fits(surfaces, R, t), point_fits(rims, R, t)
+        return float(
+            least_loss(
+                surfaces._replace(points=surfaces.points[: len(surfaces.points) // share]),
+                rims._replace(points=rims.points[: len(rims.points) // share]),
+                *self._fits,
+                R,
+                t,
+            )
+        )
+
+
+@njit(cache=True, nogil=True)
+def least_loss(
+    surfaces: Layer, rims: Layer, fits: FloatArray, rim_fits: FloatArray, R: FloatArray, t: FloatArray
+) -> float:
+    """Least share of the fits before (n,) and (m,) that is lost at any of the poses (k, 3, 3), (k, 3)."""
+    at, least = no_neighbours(1), 1.0
+    for k in range(R.shape[0]):
+        before, after = _sums_of_both(surfaces, fits, True, R[k], t[k], at)
+        at.block[:] = NOWHERE  # what follows has another grid
+        rims_before, rims_after = _sums_of_both(rims, rim_fits, False, R[k], t[k], at)
+        at.block[:] = NOWHERE
+        before, after = before + rims.factor * rims_before, after + rims.factor * rims_after
+        least = min(least, 1.0 - after / max(before, 1e-300))
+    return least
+
+
+@in_place()
+def _sums_of_both(
+    layer: Layer, fits: FloatArray, on_the_map: bool, R: FloatArray, t: FloatArray, at: Neighbours
+) -> tuple[float, float]:
+    """Sums of the fits before and at a pose; of points that lie on the map both times, if so asked.
+
+    Rims mark where a surface ends: one that leaves them is lost indeed.
+    """
+    before = after = 0.0
+    for group in range(groups_of(layer.points.shape[0])):
+        count = gather(layer.points, group, layer.grid, R, t, at, -group)
+        mean_over_cells(at.cells[0], at.place, at.sums)
+        for j in range(count):
+            fit, moved = fits[group * LANES + j], at.sums[j]
+            if not on_the_map or (fit >= 0.0 and moved >= 0.0):
+                before += max(fit, 0.0)
+                after += max(moved, 0.0)
+    return before, after
 
 
 @njit(cache=True, nogil=True)
 def point_fits(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
     """Mean of ``exp(-1/2 q' B q)`` (Eq. 8.5) over the cells that cover each point, -1 where none does, shape (n,)."""
-    out = np.full(layer.points.shape[0], -1.0)
-    _fill_fits(layer, R, t, out)
+    out = np.empty(layer.points.shape[0])
+    _fill_fits(layer, R, t, no_neighbours(1), out)
     return out
 
 
 @in_place()
-def _fill_fits(layer: Layer, R: FloatArray, t: FloatArray, out: FloatArray) -> None:
-    grid = layer.grid
-    s = 1.0 / grid.block_size
-    for i in range(layer.points.shape[0]):
-        x, y, z = layer.points[i, 0], layer.points[i, 1], layer.points[i, 2]
-        mx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
-        my = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
-        mz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
-        row = find_block(grid.keys, grid.rows, int(np.floor(mx * s)), int(np.floor(my * s)), int(np.floor(mz * s)))
-        if row < 0:
-            continue
-        total, cells = 0.0, 0
-        for k in range(8):
-            cell = grid.cells[row, k]
-            if cell < 0:
-                continue
-            qx, qy, qz = mx - grid.mean[cell, 0], my - grid.mean[cell, 1], mz - grid.mean[cell, 2]
-            b = grid.information[cell]
-            ux = b[0] * qx + b[1] * qy + b[2] * qz
-            uy = b[1] * qx + b[3] * qy + b[4] * qz
-            uz = b[2] * qx + b[4] * qy + b[5] * qz
-            total += np.exp(-min(0.5 * (qx * ux + qy * uy + qz * uz), 30.0))
-            cells += 1
-        out[i] = total / cells
+def _fill_fits(layer: Layer, R: FloatArray, t: FloatArray, at: Neighbours, out: FloatArray) -> None:
+    for group in range(groups_of(layer.points.shape[0])):
+        count = gather(layer.points, group, layer.grid, R, t, at, -group)
+        mean_over_cells(at.cells[0], at.place, at.sums)
+        for j in range(count):
+            out[group * LANES + j] = at.sums[j]

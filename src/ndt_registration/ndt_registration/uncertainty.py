@@ -83,8 +83,8 @@ def sandwich(
     of translations and rotations be compared (Zhang and Singh 2016 on degeneracy).
 
     scatter: covariance (6, 6) of the cost's gradient, see :func:`gradient_scatter`. loss: share of the score that is
-    lost when the pose is moved by a vector (6,). scale: m, free directions get ``_FREE_SIGMA`` times this. fixed: (6,)
-    components of the pose error that were constrained; their variance is that of the floor.
+    lost when the pose is moved by a vector (6,) or back. scale: m, free directions get ``_FREE_SIGMA`` times this.
+    fixed: (6,) components of the pose error that were constrained; their variance is that of the floor.
     """
     to_pose = _about(extent)
     H, M, F, spurious, C = (to_pose.T @ A @ to_pose for A in (*curvature, scatter))
@@ -96,7 +96,7 @@ def sandwich(
     for k in np.flatnonzero(~constrained):
         v = vectors[:, k]
         step = _PROBE * scale * (to_pose @ v)
-        lost = min(loss(step), loss(-step))
+        lost = loss(step)
         free[k] = _is_free(v @ H @ v, v @ M @ v, v @ spurious @ v, lost, config)
         sigma[k] = scale * min(_FREE_SIGMA, _PROBE * config.loss_noise / max(lost, 1e-9))
         if not free[k] and lost > _WELL_DETERMINED * config.least_loss:
@@ -125,6 +125,11 @@ def _is_free(hessian: float, majorant: float, spurious: float, lost: float, conf
     return bool(majorant <= spurious or lost < least)
 
 
+def clear_loss(config: UncertaintyConfig) -> float:
+    """Loss among a few hundred points that shows a direction to be determined, whatever the others say."""
+    return _SPURIOUS_FACTOR * config.least_loss + _LOSS_OF_FEW
+
+
 def gradient_scatter(block_gradients: Iterable[FloatArray], density_ratio: float) -> FloatArray:
     """Covariance (6, 6) of the cost's gradient from those (b, 6) of the small blocks of each layer.
 
@@ -147,16 +152,20 @@ def _inverse(hessian: FloatArray, majorant: FloatArray) -> FloatArray:
 
     In directions where it is (nearly) none or less, that of a share of the majorant.
     """
-    root = np.linalg.cholesky(majorant + 1e-9 * np.trace(majorant) * np.eye(len(majorant)))
+    root = np.linalg.cholesky(majorant + _SUMS_ROUNDING * np.trace(majorant) * np.eye(len(majorant)))
     whitened = np.linalg.solve(root, np.linalg.solve(root, hessian).T)
     values, vectors = np.linalg.eigh(0.5 * (whitened + whitened.T))
     back = np.linalg.solve(root.T, vectors)
     return np.asarray(back / np.maximum(values, _LEAST_RELATIVE_CURVATURE) @ back.T)
 
 
+_SUMS_ROUNDING = 1e-6
+"""Error of a curvature over its trace: what is summed in one group of points is float32."""
 _LEAST_RELATIVE_CURVATURE = 0.05
 _WELL_DETERMINED = 10.0
 """So many times the least loss: directions of more curvature than one that loses this need not be tried."""
+_LOSS_OF_FEW = 0.08
+"""Nearly four standard deviations of the loss among 500 points."""
 _SPURIOUS_FACTOR = 2.0
 """So many times the loss is asked for where the curvature is no more than what errors of the normals make."""
 

@@ -56,6 +56,19 @@ def direction_bin(x: float, y: float, z: float, size: int) -> int:
     return i * size + j
 
 
+@njit(cache=True, nogil=True, inline="always")
+def direction_bin_without_branches(x, y, z, size):  # type: ignore[no-untyped-def]
+    """:func:`direction_bin` for loops over many points; ``size`` and the bin are int32."""
+    s = abs(x) + abs(y) + abs(z)
+    s = s if s > 0.0 else 1.0
+    u, v = x / s, y / s
+    folded_u = (1.0 - abs(v)) * (1.0 if u >= 0.0 else -1.0)
+    folded_v = (1.0 - abs(u)) * (1.0 if v >= 0.0 else -1.0)
+    u, v = (folded_u if z < 0.0 else u), (folded_v if z < 0.0 else v)
+    i, j = np.int32((u + 1.0) * 0.5 * size), np.int32((v + 1.0) * 0.5 * size)
+    return min(i, size - np.int32(1)) * size + min(j, size - np.int32(1))
+
+
 @njit(cache=True, nogil=True)
 def range_image(points: FloatArray, size: int) -> RangeImage:
     """Range image of points (n, 3) seen from the origin."""

@@ -15,16 +15,26 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from ndt_registration.block_table import (
+    MAX_CELLS_PER_AXIS,
+    Int32Array,
+    IntArray,
+    doubled,
+    find_block,
+    hash_table,
+    pack_key,
+    slot_of,
+)
 from ndt_registration.eigen import symmetric_eigen3
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 
-IntArray = npt.NDArray[np.int64]
-Int32Array = npt.NDArray[np.int32]
+Float32Array = npt.NDArray[np.float32]
 
-_OFFSET = 1 << 20
-MAX_CELLS_PER_AXIS = _OFFSET - 4
-"""Largest absolute block coordinate that the packed 63-bit key can hold."""
+_SHARED = 2
+"""So many corners for each entry are made room for at first: surfaces need two to three for each."""
+SPURIOUS = 9
+"""Column of a cell's record that holds the information along its plane that errors of its normal make."""
 
 
 class Moments(NamedTuple):
@@ -44,7 +54,9 @@ class NormalGrid(NamedTuple):
 
     ``keys`` and ``rows`` are the hash table of blocks; ``cells`` (m, 8) holds the cells that cover a block, -1 where
     there is none; ``mean`` (k, 3), ``information`` (k, 6) upper triangle of the inverse covariance, ``normal`` (k, 3)
-    direction of least variance, ``variance`` (k, 3) raw ascending eigenvalues, ``counts`` (k,) points.
+    direction of least variance, ``variance`` (k, 3) raw ascending eigenvalues, ``counts`` (k,) points. ``records``
+    (k, 16): mean from the cell's own corner (3) and information (6) once more, one cell in one line of the cache, and
+    what :func:`note_spurious_information` writes.
     """
 
     block_size: float
@@ -56,55 +68,23 @@ class NormalGrid(NamedTuple):
     normal: FloatArray
     variance: FloatArray
     counts: FloatArray
-
-
-@njit(cache=True, nogil=True, inline="always")
-def pack_key(ix: int, iy: int, iz: int) -> int:
-    """Key of a block; the table's empty slots hold -1, which no key is."""
-    return ((ix + _OFFSET) << 42) | ((iy + _OFFSET) << 21) | (iz + _OFFSET)
-
-
-@in_place()
-def slot_of(keys: IntArray, key: int) -> int:
-    """Place of ``key`` in the table, or of the empty slot where it belongs (linear probing, Fibonacci hashing)."""
-    mask = keys.shape[0] - 1
-    mixed = key * np.int64(-7046029254386353131)
-    slot = ((mixed >> 32) ^ mixed) & mask
-    while keys[slot] != -1 and keys[slot] != key:
-        slot = (slot + 1) & mask
-    return int(slot)
-
-
-@in_place()
-def find_block(keys: IntArray, rows: Int32Array, ix: int, iy: int, iz: int) -> int:
-    """Row of the block at integer coordinates, -1 where there is none."""
-    slot = slot_of(keys, pack_key(ix, iy, iz))
-    return int(rows[slot]) if keys[slot] != -1 else -1
+    records: Float32Array
 
 
 @njit(cache=True, nogil=True)
-def hash_table(entries: int) -> IntArray:
-    """Empty table, at most half full with so many entries."""
-    size = 16
-    while size < 2 * entries:
-        size *= 2
-    return np.full(size, -1, np.int64)
+def _numbered_corners(corner: IntArray, children: int) -> tuple[Int32Array, IntArray]:
+    """Number (n * children,) of each entry's corners, in order of first appearance, and those corners (m, 3).
 
-
-@njit(cache=True, nogil=True)
-def _accumulate(
-    corner: IntArray, count: FloatArray, first: FloatArray, outer: FloatArray, children: int
-) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Sum entries with equal corners; with ``children`` = 8 each entry goes to the eight corners below it as well."""
+    The table starts with the room that surfaces take, where children share most corners, and grows where that fails.
+    """
     n = corner.shape[0]
-    keys = hash_table(n * children)
+    keys = hash_table(n * _SHARED if children > 1 else n)
     rows = np.empty(keys.shape[0], np.int32)
-    out_corner = np.empty((n * children, 3), np.int64)
-    out_count = np.zeros(n * children)
-    out_sum = np.zeros((n * children, 3))
-    out_outer = np.zeros((n * children, 6))
+    number, out = np.empty(n * children, np.int32), np.empty((n * children, 3), np.int64)
     used = 0
     for i in range(n):
+        if 2 * (used + children) > keys.shape[0]:
+            keys, rows = doubled(keys, rows)
         for child in range(children):
             ix = corner[i, 0] - (child & 1)
             iy = corner[i, 1] - ((child >> 1) & 1)
@@ -112,17 +92,30 @@ def _accumulate(
             key = pack_key(ix, iy, iz)
             slot = slot_of(keys, key)
             if keys[slot] == -1:
-                keys[slot] = key
-                rows[slot] = used
-                out_corner[used, 0], out_corner[used, 1], out_corner[used, 2] = ix, iy, iz
+                keys[slot], rows[slot] = key, used
+                out[used, 0], out[used, 1], out[used, 2] = ix, iy, iz
                 used += 1
-            row = rows[slot]
+            number[i * children + child] = rows[slot]
+    return number, out[:used].copy()
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(
+    corner: IntArray, count: FloatArray, first: FloatArray, outer: FloatArray, children: int
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Sum entries with equal corners; with ``children`` = 8 each entry goes to the eight corners below it as well."""
+    number, out_corner = _numbered_corners(corner, children)
+    used = out_corner.shape[0]
+    out_count, out_sum, out_outer = np.zeros(used), np.zeros((used, 3)), np.zeros((used, 6))
+    for i in range(corner.shape[0]):
+        for child in range(children):
+            row = number[i * children + child]
             out_count[row] += count[i]
             for k in range(3):
                 out_sum[row, k] += first[i, k]
             for k in range(6):
                 out_outer[row, k] += outer[i, k]
-    return out_corner[:used], out_count[:used], out_sum[:used], out_outer[:used]
+    return out_corner, out_count, out_sum, out_outer
 
 
 @njit(cache=True, nogil=True)
@@ -135,18 +128,19 @@ def _point_moments(points: FloatArray, block_size: float) -> tuple[IntArray, Flo
     count = np.zeros(n)
     first = np.zeros((n, 3))
     outer = np.zeros((n, 6))
-    used = 0
+    used, last, row = 0, -1, 0
     for i in range(n):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         ix, iy, iz = int(np.floor(x / block_size)), int(np.floor(y / block_size)), int(np.floor(z / block_size))
         key = pack_key(ix, iy, iz)
-        slot = slot_of(keys, key)
-        if keys[slot] == -1:
-            keys[slot] = key
-            rows[slot] = used
-            corner[used, 0], corner[used, 1], corner[used, 2] = ix, iy, iz
-            used += 1
-        row = rows[slot]
+        if key != last:  # neighbours in the list often share a block
+            slot = slot_of(keys, key)
+            if keys[slot] == -1:
+                keys[slot] = key
+                rows[slot] = used
+                corner[used, 0], corner[used, 1], corner[used, 2] = ix, iy, iz
+                used += 1
+            last, row = key, int(rows[slot])
         count[row] += 1.0
         first[row, 0] += x
         first[row, 1] += y
@@ -207,17 +201,19 @@ def _distributions(
 def _cover(corner: IntArray) -> tuple[IntArray, Int32Array, Int32Array]:
     """Hash table from a block to the eight cells that cover it, in a fixed order of offsets."""
     n = corner.shape[0]
-    keys = hash_table(8 * n)
+    keys = hash_table(_SHARED * n)
     rows = np.empty(keys.shape[0], np.int32)
-    cells = np.full((8 * n, 8), -1, np.int32)
+    cells = np.empty((8 * n, 8), np.int32)
     used = 0
     for i in range(n):
+        if 2 * (used + 8) > keys.shape[0]:
+            keys, rows = doubled(keys, rows)
         for child in range(8):
             key = pack_key(corner[i, 0] + (child & 1), corner[i, 1] + ((child >> 1) & 1), corner[i, 2] + (child >> 2))
             slot = slot_of(keys, key)
             if keys[slot] == -1:
-                keys[slot] = key
-                rows[slot] = used
+                keys[slot], rows[slot] = key, used
+                cells[used] = -1
                 used += 1
             cells[rows[slot], child] = i
     return keys, rows, cells[:used].copy()
@@ -235,16 +231,18 @@ def _point_counts(points: FloatArray, block_size: float) -> FloatArray:
 @in_place()
 def _count_points(points: FloatArray, block_size: float, keys: IntArray, rows: Int32Array, count: FloatArray) -> int:
     """Fill an empty table, and ``count`` row by row; returns the number of blocks."""
-    used = 0
+    used, last, row = 0, -1, 0
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         key = pack_key(int(np.floor(x / block_size)), int(np.floor(y / block_size)), int(np.floor(z / block_size)))
-        slot = slot_of(keys, key)
-        if keys[slot] == -1:
-            keys[slot] = key
-            rows[slot] = used
-            used += 1
-        count[rows[slot]] += 1.0
+        if key != last:  # neighbours in a picture often share a block
+            slot = slot_of(keys, key)
+            if keys[slot] == -1:
+                keys[slot] = key
+                rows[slot] = used
+                used += 1
+            last, row = key, int(rows[slot])
+        count[row] += 1.0
     return used
 
 
@@ -291,8 +289,11 @@ def normal_grid(
     mean, information, normal, variance = _distributions(
         count, first[keep], outer[keep], relative_floor, variance_floor, slack
     )
-    keys, rows, cells = _cover(corner[keep])
-    return NormalGrid(block_size, keys, rows, cells, mean, information, normal, variance, count)
+    corner = corner[keep]
+    keys, rows, cells = _cover(corner)
+    records = np.zeros((len(mean), 16), np.float32)
+    records[:, :3], records[:, 3:9] = mean - block_size * corner, information
+    return NormalGrid(block_size, keys, rows, cells, mean, information, normal, variance, count, records)
 
 
 def plane_fits(moments: Moments, min_points: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -326,6 +327,7 @@ def _set_plane_information(grid: NormalGrid, i: int, n: FloatArray, floor: float
     for r in range(3):
         for c in range(r, 3):
             grid.information[i, m] = information * n[r] * n[c]
+            grid.records[i, 3 + m] = grid.information[i, m]
             m += 1
 
 
@@ -366,3 +368,14 @@ def adopt_planes(
         grid.counts[i] = wider.counts[cell]
         if slack >= 0.0:
             _set_plane_information(grid, i, n, floor, slack)
+
+
+@in_place()
+def note_spurious_information(grid: NormalGrid) -> None:
+    """Write what a normal from ``n`` points, off by ``sqrt(variance / (n spread))``, seems to hold along the plane."""
+    for i in range(grid.mean.shape[0]):
+        # In the plane the least variance is that of z, which is zero, and the second is across the wall.
+        flat = grid.variance[i, 0] <= 1e-9 * grid.variance[i, 2]
+        spread = grid.variance[i, 2] if flat else grid.variance[i, 1]
+        b = grid.information[i]
+        grid.records[i, SPURIOUS] = min(1.0 / max(grid.counts[i] * spread, 1e-300), b[0] + b[3] + b[5])
