@@ -29,6 +29,9 @@ _SMALL_ANGLE = 1e-7
 def skew(v: FloatArray) -> FloatArray:
     """Cross-product matrix ``[v]x``: ``skew(a) @ b == cross(a, b)``; shape (..., 3) to (..., 3, 3)."""
     v = np.asarray(v, dtype=np.float64)
+    if v.ndim == 1:
+        x, y, z = v.tolist()
+        return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
@@ -59,6 +62,11 @@ def _exp_of_one(x: float, y: float, z: float) -> FloatArray:
         a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
     else:
         a = b = math.nan
+    return _turn(a, b, x, y, z)
+
+
+def _turn(a: float, b: float, x: float, y: float, z: float) -> FloatArray:
+    """``I + a [v]x + b [v]x^2`` of v = (x, y, z)."""
     return np.array(
         [
             [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
@@ -71,6 +79,8 @@ def _exp_of_one(x: float, y: float, z: float) -> FloatArray:
 def so3_log(rotation: FloatArray) -> FloatArray:
     """Rotation vector of a rotation, angle in [0, pi]; shape (..., 3, 3) to (..., 3) rad. Exact up to and at pi."""
     q = quaternion_from_rotation(rotation)
+    if q.ndim == 1:
+        return _log_of_one(*q.tolist())
     norm = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(norm, q[..., 3:])
     small = norm < _SMALL_ANGLE
@@ -78,9 +88,18 @@ def so3_log(rotation: FloatArray) -> FloatArray:
     return np.asarray(scale * q[..., :3])
 
 
+def _log_of_one(x: float, y: float, z: float, w: float) -> FloatArray:
+    """Rotation vector of a quaternion, a tenth of the time of arrays of one."""
+    norm = math.hypot(x, y, z)
+    scale = 2.0 if norm < _SMALL_ANGLE else 2.0 * math.atan2(norm, w) / norm
+    return np.array([scale * x, scale * y, scale * z])
+
+
 def so3_left_jacobian(phi: FloatArray) -> FloatArray:
     """``J`` with ``Exp(phi + d) ~ Exp(J d) Exp(phi)``; shape (..., 3) to (..., 3, 3)."""
     phi = np.asarray(phi, dtype=np.float64)
+    if phi.ndim == 1:
+        return _left_jacobian_of_one(*phi.tolist())
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     small = angle < 1e-4
     safe = np.where(small, 1.0, angle)
@@ -88,6 +107,19 @@ def so3_left_jacobian(phi: FloatArray) -> FloatArray:
     b = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
     K = skew(phi)
     return np.asarray(np.eye(3) + a * K + b * (K @ K))
+
+
+def _left_jacobian_of_one(x: float, y: float, z: float) -> FloatArray:
+    """:func:`so3_left_jacobian` of one vector, a tenth of the time of arrays of one."""
+    square = x * x + y * y + z * z
+    angle = math.sqrt(square)
+    if angle < 1e-4:
+        a, b = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    elif math.isfinite(angle):
+        a, b = (1.0 - math.cos(angle)) / square, (angle - math.sin(angle)) / (angle * square)
+    else:
+        a = b = math.nan
+    return _turn(a, b, x, y, z)
 
 
 def so3_left_jacobian_inverse(phi: FloatArray) -> FloatArray:
