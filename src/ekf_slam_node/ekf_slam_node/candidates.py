@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ekf_slam_node.measurement_kernels import add_of_points, add_of_pose, squared_lengths
 from ekf_slam_node.models import Frame, Observation, increment_jacobian, observe, relative_motion
 from slam_core.geometry import FloatArray
 from slam_core.types import Float32Array
@@ -33,6 +34,10 @@ class Candidates:
     def select(self, index: np.ndarray) -> Candidates:
         """The candidates at ``index``."""
         return Candidates(self.points[index], self.covariances[index], self.descriptors[index])
+
+    def places(self, index: np.ndarray) -> Candidates:
+        """The candidates at ``index`` without their descriptors, which are the larger part."""
+        return Candidates(self.points[index], self.covariances[index], self.descriptors[:0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +64,15 @@ def innovation_covariance(
     seen: Observation, candidates: Candidates, motion_covariance: FloatArray | None
 ) -> FloatArray:
     """S (n, 3, 3) without the feature's own noise: of the motion (None: a motion held fixed) and of the candidates."""
-    S = seen.J_point @ candidates.covariances @ np.swapaxes(seen.J_point, 1, 2)
+    S = np.zeros((len(candidates), 3, 3))
+    add_of_points(seen.J_point, candidates.covariances, S)
     if motion_covariance is not None:
-        S = S + seen.J_pose @ motion_covariance @ np.swapaxes(seen.J_pose, 1, 2)
-    return np.asarray(S)
+        add_of_pose(seen.J_pose, motion_covariance, S)
+    return S
 
 
 def squared_distances(innovation: FloatArray, S: FloatArray) -> FloatArray:
     """NIS (n,) of innovations (n, 3) with covariances S (n, 3, 3)."""
-    return np.asarray(np.einsum("ni,ni->n", innovation, np.linalg.solve(S, innovation[:, :, None])[:, :, 0]))
+    out = np.empty(len(S))
+    squared_lengths(innovation, S, out)
+    return out

@@ -20,7 +20,7 @@ import numpy as np
 from ekf_slam_node.models import Frame
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
-from slam_core.least_squares import MAD_TO_SIGMA
+from slam_core.least_squares import MAD_TO_SIGMA, median
 
 _NEIGHBOURS = 0.1
 """Features nearer than this share of the image's width are neighbours."""
@@ -58,9 +58,11 @@ class CommonError:
         """Take in the residuals (n, 2) px of a frame's features at pixels (n, 2), image ``width`` px wide."""
         if self._factor == 0.0 or len(pixels) < 2:
             return
-        spread = MAD_TO_SIGMA * np.median(np.abs(residuals), axis=0)
+        sizes = np.abs(residuals)
+        spread = MAD_TO_SIGMA * np.array([median(sizes[:, 0]), median(sizes[:, 1])])
         r = np.clip(residuals, -_OUTLIER * spread, _OUTLIER * spread)
-        total, pairs = _shared_by_neighbours(pixels, r, _NEIGHBOURS * width)
+        order = np.argsort(pixels[:, 0])
+        total, pairs = _shared_by_neighbours(pixels[order], r[order], _NEIGHBOURS * width)
         self._sum = _FORGETTING * self._sum + total
         # One frame's pairs share features and the frame's own error: each frame's sum counts as one draw.
         self._square_sum = _FORGETTING**2 * self._square_sum + total**2
@@ -72,17 +74,22 @@ class CommonError:
         Turns and shifts that move the image of a point at the median distance by as much.
         """
         angle = self._factor * self.shared_px / frame.camera.fx
-        distance = float(1.0 / np.median(frame.z[:, 2])) if len(frame) else 0.0
+        distance = 1.0 / median(frame.z[:, 2]) if len(frame) else 0.0
         return np.repeat([angle * distance, angle], 3)
 
 
 @in_place()
 def _shared_by_neighbours(pixels, residuals, reach):  # type: ignore[no-untyped-def]
-    """Sum, over all pairs of pixels (n, 2) nearer than ``reach``, of the residuals' mean product; number of pairs."""
+    """Sum, over all pairs of pixels (n, 2) nearer than ``reach``, of the residuals' mean product; number of pairs.
+
+    Pixels come in the order of their first coordinate.
+    """
     total, pairs = 0.0, 0
     for i in range(len(pixels)):
         for j in range(i + 1, len(pixels)):
             du, dv = pixels[j, 0] - pixels[i, 0], pixels[j, 1] - pixels[i, 1]
+            if du >= reach:
+                break
             if du * du + dv * dv < reach * reach:
                 total += 0.5 * (residuals[i, 0] * residuals[j, 0] + residuals[i, 1] * residuals[j, 1])
                 pairs += 1

@@ -32,6 +32,42 @@ def _gather_columns(P, index, size, out):  # type: ignore[no-untyped-def]
             out[i, k] = P[i, j]
 
 
+@in_place()
+def _gather_blocks(P, first, out):  # type: ignore[no-untyped-def]
+    """Fill out (k, w, w) with the diagonal blocks of the symmetric P that start at rows ``first`` (k,)."""
+    for k in range(len(first)):
+        for i in range(out.shape[1]):
+            for j in range(i + 1):
+                out[k, i, j] = out[k, j, i] = P[first[k] + i, first[k] + j]
+
+
+@in_place()
+def _gather_all(P, kept, out):  # type: ignore[no-untyped-def]
+    """``out[i, j] = P[kept[i], kept[j]]`` for rising rows ``kept`` (k,) of the symmetric P."""
+    for j in range(len(kept)):
+        for i in range(j, len(kept)):
+            out[i, j] = out[j, i] = P[kept[i], kept[j]]
+
+
+@in_place()
+def _append_points(P, size, head, arms, covariances):  # type: ignore[no-untyped-def]
+    """Add the rows of points at ``arms`` (k, 3) from the pose, whose errors are its own, turn times arm, and their own.
+
+    ``head`` (size, 6): covariance of everything with the pose; ``covariances`` (k, 3, 3): of the own errors.
+    """
+    for column in range(size + 3 * len(arms)):
+        h = head[column] if column < size else P[column, :6]
+        for k in range(max(column - size, 0) // 3, len(arms)):
+            row, x, y, z = size + 3 * k, arms[k, 0], arms[k, 1], arms[k, 2]
+            P[row, column] = h[0] - y * h[5] + z * h[4]
+            P[row + 1, column] = h[1] - z * h[3] + x * h[5]
+            P[row + 2, column] = h[2] - x * h[4] + y * h[3]
+    for k in range(len(arms)):
+        for i in range(3):
+            for j in range(3):
+                P[size + 3 * k + i, size + 3 * k + j] += covariances[k, i, j]
+
+
 @njit(cache=True, nogil=True)
 def _cross_covariance(P, size, core, J_pose, J_point, rows, out):  # type: ignore[no-untyped-def]
     """``out = P H'`` for observations that touch the pose (first six) and three entries from rows[k] each."""
@@ -76,10 +112,12 @@ class Covariance:
         """The part of the buffer that is in use."""
         return self._P[: self.size, : self.size]
 
-    def dense(self) -> FloatArray:
-        """A full symmetric copy (n, n)."""
-        lower = np.tril(self._state)
-        return np.asarray(lower + np.tril(lower, -1).T)
+    def dense(self, kept: IndexArray | None = None) -> FloatArray:
+        """A full symmetric copy (n, n); only rows and columns ``kept`` (k,), in rising order, where these are given."""
+        rows = np.arange(self.size) if kept is None else kept
+        out = np.empty((len(rows), len(rows)))
+        _gather_all(self._P, rows, out)
+        return out
 
     def columns(self, index: IndexArray) -> FloatArray:
         """Columns ``index`` (k,) as an array (n, k)."""
@@ -96,11 +134,9 @@ class Covariance:
 
     def blocks(self, first: IndexArray, width: int = 3) -> FloatArray:
         """Diagonal blocks (k, width, width) that start at rows ``first`` (k,)."""
-        index = np.asarray(first)[:, None] + np.arange(width)
-        out = self._P[index[:, :, None], index[:, None, :]]
-        for k in range(width - 1):
-            out[:, k, k + 1 :] = out[:, k + 1 :, k]
-        return np.asarray(out)
+        out = np.empty((len(first), width, width))
+        _gather_blocks(self._P, np.asarray(first), out)
+        return out
 
     def set_head(self, columns: FloatArray) -> None:
         """Replace the first columns by (n, rows), as the time update does."""
@@ -132,6 +168,12 @@ class Covariance:
         self._P[n : n + k, n : n + k] = block
         self.size = n + k
 
+    def append_points(self, arms: FloatArray, covariances: FloatArray) -> None:
+        """Add points at ``arms`` (k, 3) from the pose with errors of their own (k, 3, 3) (Eq. 6.23)."""
+        self._reserve(self.size + 3 * len(arms))
+        _append_points(self._P, self.size, self.head(6), arms, covariances)
+        self.size += 3 * len(arms)
+
     def remove(self, first: int, width: int) -> None:
         """Drop rows ``first .. first + width`` (marginalise).
 
@@ -160,7 +202,7 @@ def whiten(S: FloatArray, cross: FloatArray, innovation: FloatArray) -> tuple[Fl
     Parameters
     ----------
     S
-        Innovation covariance (k, k), lower triangle used.
+        Innovation covariance (k, k), lower triangle used; in Fortran order it is overwritten.
     cross
         ``P H'`` (n, k), overwritten.
     innovation
@@ -171,7 +213,7 @@ def whiten(S: FloatArray, cross: FloatArray, innovation: FloatArray) -> tuple[Fl
     W = P H' L^-T and y = L^-1 innovation with S = L L'; the gain is applied as ``x += W y``, ``P -= W W'`` and y'y is
     the NIS. None if S is not positive definite.
     """
-    L = np.array(S, order="F")
+    L = np.asfortranarray(S)
     if not blas.cholesky(L):
         return None
     y, _ = lapack.dtrtrs(L, innovation, lower=1)

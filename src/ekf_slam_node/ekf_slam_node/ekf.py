@@ -18,6 +18,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekf_slam_node.covariance import Covariance, IndexArray, whiten
+from ekf_slam_node.measurement_kernels import (
+    add_of_points,
+    add_of_pose,
+    crossed,
+    lower_innovation,
+    mixed_terms,
+    moved_points,
+    seen_from_rig,
+)
 from ekf_slam_node.models import (
     CORE_DIM,
     Observation,
@@ -27,7 +36,7 @@ from ekf_slam_node.models import (
     relative_motion,
     velocity_of_motion,
 )
-from slam_core.geometry import FloatArray, make_transform, skew, so3_exp, so3_left_jacobian
+from slam_core.geometry import FloatArray, make_transform, so3_exp, so3_left_jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,14 +171,13 @@ class Ekf:
         """
         rows = CORE_DIM + 3 * np.asarray(slots)
         head = self.covariance.head(6)
-        cross = np.swapaxes(head[rows[:, None] + np.arange(3)], 1, 2)
-        J_pose, J_point = seen.J_pose, seen.J_point
-        mixed = J_pose @ cross @ np.swapaxes(J_point, 1, 2)
         pose = head[:6] if common is None else head[:6] + np.diag(common**2)
-        S = J_pose @ pose @ np.swapaxes(J_pose, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
-        S += J_point @ self.covariance.blocks(rows) @ np.swapaxes(J_point, 1, 2)
+        S = np.zeros((len(rows), 3, 3))
+        add_of_pose(seen.J_pose, pose, S)
+        add_of_points(seen.J_point, self.covariance.blocks(rows), S)
+        mixed_terms(seen.J_pose, seen.J_point, head, rows, S)
         S[:, np.arange(3), np.arange(3)] += variance
-        return np.asarray(S)
+        return S
 
     def innovation(self, z: FloatArray, seen: Observation, slots: IndexArray) -> FloatArray:
         """``z - h(x)`` (m, 3) at the predicted mean, also when the prediction was linearised elsewhere."""
@@ -196,14 +204,10 @@ class Ekf:
             return UpdateReport(0.0, 0, False)
         rows = CORE_DIM + 3 * np.asarray(slots, dtype=np.int64)
         cross = self.covariance.cross_covariance(seen.J_pose, seen.J_point, rows)
-        points = cross[rows[:, None] + np.arange(3)]
-        k = 3 * len(rows)
-        S = (seen.J_pose @ cross[:6] + seen.J_point @ points).reshape(k, k)
-        S[np.arange(k), np.arange(k)] += variance.ravel()
-        if common is not None:
-            B = (seen.J_pose * common).reshape(k, 6)
-            S += B @ B.T
-        return self._update(np.asfortranarray(0.5 * (S + S.T)), cross, self.innovation(z, seen, slots).ravel())
+        S = np.empty((3 * len(rows),) * 2, order="F")
+        shared = np.zeros(6) if common is None else common**2
+        lower_innovation(seen.J_pose, seen.J_point, cross, rows, variance, shared, S)
+        return self._update(S, cross, self.innovation(z, seen, slots).ravel())
 
     def _update(self, S: FloatArray, cross: FloatArray, innovation: FloatArray, stay: bool = False) -> UpdateReport:
         whitened = whiten(S, cross, innovation)
@@ -226,17 +230,20 @@ class Ekf:
         self.velocity = self.velocity + delta[6:12]
         old = np.vstack([self.T[:3, 3], self.landmarks])
         shift = np.vstack([delta[:3], delta[CORE_DIM:].reshape(-1, 3)])
-        new = _moved_points(old, shift, delta[3:6]) if self._invariant else old + shift
-        self.T = make_transform(so3_exp(delta[3:6]) @ self.T[:3, :3], new[0])
-        self.landmarks = new[1:]
+        turn, moved = so3_exp(delta[3:6]), shift
         if self._invariant:
-            self._change_coordinates(new - old)
+            moved = np.empty_like(shift)
+            moved_points(old, shift, delta[3:6], turn - np.eye(3), so3_left_jacobian(delta[3:6]), moved)
+        self.T = make_transform(turn @ self.T[:3, :3], old[0] + moved[0])
+        self.landmarks = old[1:] + moved[1:]
+        if self._invariant:
+            self._change_coordinates(moved)
 
     def _change_coordinates(self, moved: FloatArray) -> None:
+        """Of points that an update has moved by (1 + m, 3), the rig's place first; see the module."""
         A = np.zeros((self.covariance.size, 3), order="F")
-        turned = -skew(moved)
-        A[:3] = turned[0]
-        A[CORE_DIM:] = turned[1:].reshape(-1, 3)
+        crossed(moved[:1], A[:3])
+        crossed(moved[1:], A[CORE_DIM:])
         B = self.covariance.columns(np.array([3, 4, 5]))
         self.covariance.add_product(A, B + 0.5 * A @ B[3:6])
 
@@ -247,16 +254,10 @@ class Ekf:
         Returns their slots (Eqs. 6.22-6.24).
         """
         k, R = len(points), self.T[:3, :3]
-        arm = points @ R.T
-        J = np.concatenate([np.broadcast_to(np.eye(3), (k, 3, 3)), -skew(arm)], axis=2).reshape(3 * k, 6)
-        head = self.covariance.head(6)
-        block = J @ head[:6] @ J.T
-        own = R @ covariances @ R.T
-        for i in range(k):
-            block[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += own[i]
-        self.covariance.append(J @ head.T, block)
+        arms = points @ R.T
+        self.covariance.append_points(arms, R @ covariances @ R.T)
         self._offset = np.zeros(self.covariance.size)
-        self.landmarks = np.vstack([self.landmarks, arm + self.T[:3, 3]])
+        self.landmarks = np.vstack([self.landmarks, arms + self.T[:3, 3]])
         return np.arange(len(self.landmarks) - k, len(self.landmarks))
 
     def remove(self, slot: int) -> None:
@@ -279,17 +280,8 @@ class Ekf:
 
     def landmarks_in_rig(self) -> tuple[FloatArray, FloatArray]:
         """Landmarks as the rig has them around itself: positions (m, 3) in the rig frame and covariances (m, 3, 3)."""
-        R, arm = self.T[:3, :3], self.landmarks - self.T[:3, 3]
-        m = len(arm)
-        rows = CORE_DIM + 3 * np.arange(m)
-        head = self.covariance.head(6)
-        J = np.concatenate([np.broadcast_to(-np.eye(3), (m, 3, 3)), skew(arm)], axis=2)
-        mixed = J @ np.swapaxes(head[CORE_DIM:].reshape(m, 3, 6), 1, 2)
-        C = J @ head[:6] @ np.swapaxes(J, 1, 2) + mixed + np.swapaxes(mixed, 1, 2) + self.covariance.blocks(rows)
-        return arm @ R, R.T @ C @ R
-
-
-def _moved_points(points: FloatArray, shift: FloatArray, turn: FloatArray) -> FloatArray:
-    """Apply a right-invariant error, given in plain coordinates: ``shift`` (n, 3) of the points, ``turn`` (3,)."""
-    own = shift - np.cross(turn, points)
-    return np.asarray(points @ so3_exp(turn).T + own @ so3_left_jacobian(turn).T)
+        m = len(self.landmarks)
+        points, covariances = np.empty((m, 3)), np.empty((m, 3, 3))
+        blocks = self.covariance.blocks(CORE_DIM + 3 * np.arange(m))
+        seen_from_rig(self.landmarks, blocks, self.T, self.covariance.head(6), CORE_DIM, points, covariances)
+        return points, covariances

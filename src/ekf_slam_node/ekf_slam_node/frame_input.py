@@ -7,6 +7,7 @@ import numpy as np
 
 from ekf_slam_node.models import Frame, frame_from_features
 from slam_core.camera import MIN_DEPTH
+from slam_core.in_place import in_place
 from slam_core.types import Features
 
 _MAX_RELATIVE_DEPTH_SIGMA = 0.3
@@ -24,18 +25,24 @@ _FARTHEST_M, _LARGEST_PX, _SMALLEST_SIGMA = 1e5, 1e6, 1e-6
 
 def usable_features(features: Features) -> np.ndarray:
     """Mask (n,) of the features that are finite, within sensible limits and of a depth known well enough."""
-    sigma = np.column_stack([features.sigma_uv, features.sigma_depth])
-    with np.errstate(invalid="ignore"):
-        usable = np.isfinite(features.uv).all(axis=1) & np.isfinite(features.depth) & np.isfinite(sigma).all(axis=1)
-        usable &= (features.depth > MIN_DEPTH) & (features.depth < _FARTHEST_M) & (sigma > _SMALLEST_SIGMA).all(axis=1)
-        usable &= np.abs(features.uv).max(axis=1, initial=0.0) < _LARGEST_PX
-        usable &= features.sigma_depth < _MAX_RELATIVE_DEPTH_SIGMA * features.depth
-        usable &= np.isfinite(features.descriptors).all(axis=1)
+    usable = np.asarray(np.isfinite(features.descriptors).all(axis=1))
+    _keep_possible(features.uv, features.depth, features.sigma_uv, features.sigma_depth, usable)
     return usable
+
+
+@in_place()
+def _keep_possible(uv, depth, sigma_uv, sigma_depth, usable):  # type: ignore[no-untyped-def]
+    """Clear the marks of features that cannot be measurements; NaN passes no comparison."""
+    for n in range(len(usable)):
+        usable[n] &= depth[n] > MIN_DEPTH and depth[n] < _FARTHEST_M
+        usable[n] &= abs(uv[n, 0]) < _LARGEST_PX and abs(uv[n, 1]) < _LARGEST_PX
+        usable[n] &= _SMALLEST_SIGMA < sigma_uv[n, 0] < np.inf and _SMALLEST_SIGMA < sigma_uv[n, 1] < np.inf
+        usable[n] &= _SMALLEST_SIGMA < sigma_depth[n] < _MAX_RELATIVE_DEPTH_SIGMA * depth[n]
 
 
 def frame_of_strongest(features: Features, usable: np.ndarray, most: int) -> Frame:
     """At ``most`` so many of the usable features as a frame: the strongest, in their own order."""
     index = np.flatnonzero(usable)
-    strongest = np.argsort(-features.response[index], kind="stable")[:most]
-    return frame_from_features(features, np.sort(index[strongest]), _MIN_SIGMA_PX, _MIN_SIGMA_DEPTH)
+    if len(index) > most:
+        index = np.sort(index[np.argsort(-features.response[index], kind="stable")[:most]])
+    return frame_from_features(features, index, _MIN_SIGMA_PX, _MIN_SIGMA_DEPTH)

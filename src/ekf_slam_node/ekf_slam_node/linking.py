@@ -23,6 +23,7 @@ from ekf_slam_node.config import NEAREST_ASSOCIATE, FeatureAssociationConfig
 from ekf_slam_node.models import Frame
 from ekf_slam_node.motion_guess import MotionGuess, guess_motion, refine_motion
 from slam_core.geometry import FloatArray
+from slam_core.least_squares import median
 
 _MIN_INLIER_RATIO = 0.2
 """Inliers among the descriptor matches below which a motion guess is not trusted."""
@@ -92,8 +93,8 @@ class Linker:
             return None
         rows, columns = self._associate(candidates, frame, prior)
         guess = guess_motion(
-            candidates.select(rows),
-            frame.select(columns),
+            candidates.places(rows),
+            frame.places(columns),
             self._T_rig_optical,
             rng,
             _HYPOTHESES,
@@ -112,8 +113,8 @@ class Linker:
         loose = match_descriptors(similarity, _GUESS_DESCRIPTOR_THRESHOLD, 1.0)
         for rows, columns in (strict, loose):
             guess = guess_motion(
-                candidates.select(rows),
-                frame.select(columns),
+                candidates.places(rows),
+                frame.places(columns),
                 self._T_rig_optical,
                 rng,
                 2 * _HYPOTHESES,
@@ -144,7 +145,7 @@ class Linker:
                 candidates, noisier, guess.T, guess.covariance, self._T_rig_optical, self._config
             )
         final = refine_motion(
-            candidates.select(rows), frame.select(columns), self._T_rig_optical, guess.T, self._config.gate
+            candidates.places(rows), frame.places(columns), self._T_rig_optical, guess.T, self._config.gate
         )
         if final is None or final.inliers.sum() < least or not _is_usable(final):
             return None
@@ -166,8 +167,6 @@ def _number_of_pairs(link: FrameLink) -> int:
 
 def _image_spread(prior: MotionPrior, frame: Frame) -> float:
     """One sigma (px) by which the prior's motion moves the image of a point at the frame's median distance."""
-    rotation, translation = (
-        np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1],
-        np.linalg.eigvalsh(prior.covariance[:3, :3])[-1],
-    )
-    return float(frame.camera.fx * np.sqrt(rotation + translation * np.median(frame.z[:, 2]) ** 2))
+    halves = np.stack([prior.covariance[:3, :3], prior.covariance[3:, 3:]])
+    translation, rotation = np.linalg.eigvalsh(halves)[:, -1]
+    return float(frame.camera.fx * np.sqrt(rotation + translation * median(frame.z[:, 2]) ** 2))

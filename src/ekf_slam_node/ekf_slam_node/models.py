@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ekf_slam_node.measurement_kernels import observed, placed
 from slam_core.camera import MIN_DEPTH, Camera
 from slam_core.geometry import FloatArray, make_transform, skew, so3_exp, so3_left_jacobian, so3_log
 from slam_core.types import Features
@@ -94,6 +95,11 @@ class Frame:
             self.stamp_ns, self.z[index], self.variance[index], self.descriptors[index], self.camera, self.index[index]
         )
 
+    def places(self, index: np.ndarray) -> Frame:
+        """The measurements at ``index`` without their descriptors, which are the larger part."""
+        z, variance, own = self.z[index], self.variance[index], self.index[index]
+        return Frame(self.stamp_ns, z, variance, self.descriptors[:0], self.camera, own)
+
 
 def frame_from_features(features: Features, usable: np.ndarray, min_sigma_px: float, min_sigma_depth: float) -> Frame:
     """Measurements of the features at ``usable`` (indices), with floors on their noise."""
@@ -147,19 +153,18 @@ def back_project_jacobian(z: FloatArray, camera: Camera) -> FloatArray:
 
 def rig_points(frame: Frame, T_rig_optical: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Positions (n, 3) of a frame's features in the rig frame and their covariances (n, 3, 3)."""
-    R = T_rig_optical[:3, :3]
-    J = R @ back_project_jacobian(frame.z, frame.camera)
-    points = back_project(frame.z, frame.camera) @ R.T + T_rig_optical[:3, 3]
-    return points, np.einsum("nij,nj,nkj->nik", J, frame.variance, J)
+    points, covariances = np.empty((len(frame), 3)), np.empty((len(frame), 3, 3))
+    placed(frame.z, frame.variance, T_rig_optical, frame.camera.lens, points, covariances)
+    return points, covariances
 
 
 def observe(T_parent_rig: FloatArray, T_rig_optical: FloatArray, points: FloatArray, camera: Camera) -> Observation:
     """Predicted measurements, by a rig at ``T_parent_rig``, of points (n, 3) in the parent frame."""
-    T = T_parent_rig @ T_rig_optical
-    optical = (points - T[:3, 3]) @ T[:3, :3]
-    J_point = project_jacobian(optical, camera) @ T[:3, :3].T
-    J_rotation = J_point @ skew(points - T_parent_rig[:3, 3])
-    return Observation(project(optical, camera), optical[:, 2], np.concatenate([-J_point, J_rotation], axis=2), J_point)
+    n = len(points)
+    seen = Observation(np.empty((n, 3)), np.empty(n), np.empty((n, 3, 6)), np.empty((n, 3, 3)))
+    T, centre = T_parent_rig @ T_rig_optical, T_parent_rig[:3, 3]
+    observed(points, T, centre, camera.lens, seen.z, seen.depth, seen.J_pose, seen.J_point)
+    return seen
 
 
 @dataclass(frozen=True, eq=False)

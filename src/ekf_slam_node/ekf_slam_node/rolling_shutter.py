@@ -159,7 +159,7 @@ class RollingShutter:
         _, a, b = np.intersect1d(first.ids, second.ids, return_indices=True)
         if len(a) < _MIN_SHARED:
             return None
-        before, now = first.frame.select(first.columns[a]), second.frame.select(second.columns[b])
+        before, now = first.frame.places(first.columns[a]), second.frame.places(second.columns[b])
         T = np.eye(4)
         for moment in moments[1:-1]:
             T = T @ moment.T_previous_now

@@ -90,7 +90,7 @@ class SubmapBuilder:
     def close(self, ekf: Ekf, table: LandmarkTable) -> Submap:
         """The submap as it is now: its end pose is the last pose added."""
         keep = np.concatenate([np.arange(6), np.arange(CORE_DIM, ekf.covariance.size)])
-        covariance = _positive_definite(ekf.covariance.dense()[np.ix_(keep, keep)])
+        covariance = _positive_definite(ekf.covariance.dense(keep))
         end = self._path[-1]
         return Submap(
             agent=self._agent, index=self.index, start_stamp_ns=self._start_stamp_ns, end_stamp_ns=end.stamp_ns,
@@ -118,7 +118,7 @@ def smoothed(start_ns: int, bridged: list[PoseEstimate], end: PoseEstimate) -> l
 
 def _positive_definite(P: FloatArray) -> FloatArray:
     """A covariance whose smallest eigenvalues rounding has made negative, with these raised; others as they are."""
-    if blas.cholesky(np.array(P, order="F")):
+    if blas.cholesky(np.array(P.T, order="F")):
         return P
     values, vectors = np.linalg.eigh(P)
     return np.asarray((vectors * np.maximum(values, _LEAST_EIGENVALUE * values[-1])) @ vectors.T)

@@ -55,6 +55,11 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
+    def lens(self) -> FloatArray:
+        """fx, fy, cx, cy (4,), px."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
+
+    @property
     def is_rectified(self) -> bool:
         """True if straight lines stay straight: no distortion left."""
         if self.distortion_model == "equidistant":

@@ -26,6 +26,13 @@ _DOUBT = 4.0
 """Factor by which a step may promise more than the linear model was wrong by at the one before."""
 
 
+def median(values: FloatArray) -> float:
+    """``np.median`` of finite numbers (n,), at least one, without its tests and copies: a fifth of its time."""
+    ordered = np.sort(values)
+    n = len(ordered)
+    return float(0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]))
+
+
 def whitening(covariance: FloatArray) -> FloatArray:
     """``W`` with ``W covariance W^T = I`` (lower triangular), so that ``W e`` is a residual of unit variance.
 
