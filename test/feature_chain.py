@@ -89,7 +89,12 @@ class Chain(Probe):
                 *(["autosave_period_s:=0.5"] if self.small_submaps else []),
                 *([f"agents:={list(self.agents)}"] if any(self.agents) else []),
             ),
-            "ekf_slam": (*(["submap.max_frames:=8"] if self.small_submaps else []), f"agent:='{agent}'"),
+            # Frames are sent in bursts: a live filter would rightly leave out all but the newest of each.
+            "ekf_slam": (
+                "input.policy:=all",
+                *(["submap.max_frames:=8"] if self.small_submaps else []),
+                f"agent:='{agent}'",
+            ),
         }[executable]
         arguments = [word for parameter in own for word in ("-p", parameter)]
         namespace = ["-r", f"__ns:=/{agent}"] if agent else []
