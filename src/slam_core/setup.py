@@ -23,6 +23,7 @@ setup(
         "plyfile",
         "PyYAML",
         "scipy",
+        "threadpoolctl",
     ],
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",

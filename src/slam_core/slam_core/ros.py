@@ -29,6 +29,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
+from slam_core.blas_threads import use_one_blas_thread
 from slam_core.config import Config, ParameterInfo, changed, from_mapping, iterate_parameters
 from slam_core.guarded_node import GuardedNode
 from slam_core.memory import search_less_garbage, share_one_heap
@@ -235,6 +236,7 @@ def run_node(
     """
     share_one_heap()
     search_less_garbage()
+    use_one_blas_thread()
     use_fast_dds_profile(small_packets=small_packets)
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()

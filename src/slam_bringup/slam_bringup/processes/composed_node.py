@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import os
 import sys
 import threading
 from collections.abc import Sequence
@@ -29,6 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from slam_bringup.pipeline.configuration import ODOMETRIES, choose, load_system_config
 from slam_bringup.processes.node_graph import live_nodes
 from slam_bringup.processes.processes import NodeCommand
+from slam_core.blas_threads import use_one_blas_thread
 from slam_core.exchange import Exchange
 from slam_core.memory import search_less_garbage, share_one_heap
 from slam_core.process_life import end_with_parent, on_request_to_end
@@ -57,6 +57,7 @@ def run_composed(commands: Sequence[NodeCommand], ros_arguments: Sequence[str] =
         If a node refuses its parameters.
     """
     share_one_heap()
+    use_one_blas_thread()
     use_fast_dds_profile(small_packets=True)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()
@@ -129,8 +130,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"cannot start: {error}", file=sys.stderr)
         sys.exit(2)
 
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # every node has a thread; more of them fight for the cores
 
 if __name__ == "__main__":
     main()
