@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="needs ROS")
@@ -20,7 +21,8 @@ from std_srvs.srv import Trigger  # noqa: E402
 from slam_core.base_node import SlamNode  # noqa: E402
 from slam_core.config import Config, parameter  # noqa: E402
 from slam_core.exchange import Exchange  # noqa: E402
-from slam_core.messages import header_message, stamp_ns  # noqa: E402
+from slam_core.messages import STATIC_TRANSFORMS_TOPIC, header_message, stamp_ns, transform_message  # noqa: E402
+from slam_core.ros import sensor_qos  # noqa: E402
 
 START = 1_700_000_000 * 10**9
 MS = 10**6
@@ -103,6 +105,24 @@ def test_an_operators_stamp_means_nothing(node: EarNode) -> None:
     send(node, "frames", START + 200 * MS)
     assert len(node.heard) == 10
     assert (node.sessions, node.resets, node.health.counters["rejected"]) == (0, 0, 0)
+
+
+def test_transforms_are_received_before_the_frames_that_need_them(node: EarNode) -> None:
+    profile = sensor_qos(10, latched=True)
+    transforms = node.create_publisher(node.types.TransformStamped, STATIC_TRANSFORMS_TOPIC, profile)
+    frames = node.create_publisher(node.types.PointCloud2, "frames", sensor_qos(10))
+    deadline = time.monotonic() + 20.0
+    while {"frames", STATIC_TRANSFORMS_TOPIC} & set(node._unconnected()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    known: list[bool] = []
+    entry = node._inputs["frames"]
+    entry.subscription.callback = lambda message: known.append(len(node.lookup("rig", "lens")) == 4)
+    transforms.publish(transform_message(node.types, START, "rig", "lens", np.eye(4)))
+    frames.publish(node.types.PointCloud2(header=header_message(node.types, START, "lens")))
+    assert transforms.wait_for_all_acked()
+    assert frames.wait_for_all_acked()
+    node.receive()
+    assert known == [True]
 
 
 def test_a_fault_in_a_service_or_timer_is_answered_and_counted(node: EarNode) -> None:

@@ -28,6 +28,12 @@ class TransformNode(ListeningNode):
         self._listen_to_static_transforms()
         self._tf = self._advertise_tf()
 
+    def receive(self) -> None:
+        """Transforms first: what else has come needs them."""
+        for subscription in self._static_inputs:
+            self._drain(subscription)
+        super().receive()
+
     def lookup(self, target: str, source: str) -> FloatArray:
         """T_target_source (4, 4) from the static transforms; ValueError, so a counted rejection, if unknown."""
         return self.frames.lookup(target, source)

@@ -211,6 +211,7 @@ class BagPlayerNode(Node):
     def _wait_for_required_subscribers(self) -> None:
         """Until this end knows of everybody who is to hear: discovery takes both ends their own time."""
         outputs = {self._names.get(topic, topic): publisher for topic, publisher in self._outputs.items()}
+        outputs[STATIC_TRANSFORMS_TOPIC] = self._static_output
         self._required_subscribers.forget_all_but(outputs)
         missing = self._required_subscribers.missing
         self._wait_until(

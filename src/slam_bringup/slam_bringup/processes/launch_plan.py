@@ -21,6 +21,7 @@ from slam_bringup.bags.sensor_topics import BagNames, nodes_name, parse_topics
 from slam_bringup.pipeline.configuration import ODOMETRIES, choose, overrides_for, system_config, with_files
 from slam_bringup.pipeline.overrides import Overrides, overrides_of, parse_assignments, read_overrides
 from slam_bringup.processes.node_graph import NodeGraph, NodeSpec, live_nodes, plan_nodes
+from slam_core.messages import STATIC_TRANSFORMS_TOPIC
 from stereo_frontend.frontend import MODES
 
 AUTO = "auto"
@@ -170,7 +171,7 @@ def _player(path: Path, graph: NodeGraph, values: Mapping[str, str]) -> NodeSpec
         "rename": tuple(f"{topic}={name}" for topic, name in graph.played.items() if name != topic),
         "wait_for_subscribers": 0.0,
         "nodes": tuple(command.full_name for command in graph.commands),
-        "subscribers": tuple(f"{name}=1" for name in graph.played.values()),
+        "subscribers": tuple(f"{name}=1" for name in (*graph.played.values(), STATIC_TRANSFORMS_TOPIC)),
         "transforms": graph.transforms,
     }
     parameters = {name: value for name, value in parameters.items() if value != ()}

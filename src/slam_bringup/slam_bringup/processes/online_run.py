@@ -194,6 +194,7 @@ class _Choreography:
 
     def play(self, bag: Path, rate: float, on_progress: Callable[[int], None]) -> None:
         """Play the bag to its end; the player ends when the paced nodes have processed everything."""
+        heard_topics = (*self._graph.played.values(), STATIC_TRANSFORMS_TOPIC)
         parameters = {
             "bag": str(bag),
             "rate": rate,
@@ -203,7 +204,7 @@ class _Choreography:
             "window": _WINDOW,
             "wait_for_start": True,
             "transforms": self._graph.transforms,
-            "subscribers": tuple(f"{t}={len(self._supervisor.subscribers(t))}" for t in self._graph.played.values()),
+            "subscribers": tuple(f"{t}={len(self._supervisor.subscribers(t))}" for t in heard_topics),
         }
         player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
         self._supervisor.count_submaps(f"{name.rpartition('/')[0]}/submap/info" for name in self._graph.filters)
