@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in slam_bringup.cli: the same bytes, and no spinning
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded, as slam_core.blas_threads
 
 import numpy as np
 import pytest

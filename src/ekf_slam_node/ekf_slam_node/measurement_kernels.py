@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from slam_core.in_place import in_place
 
-_LEAST_DEPTH = 1e-3
+LEAST_DEPTH = 1e-3
 """Depths are kept away from zero, m."""
 
 
@@ -23,7 +23,7 @@ def observed(points, T, centre, lens, z, depth, J_pose, J_point):  # type: ignor
         x = T[0, 0] * dx + T[1, 0] * dy + T[2, 0] * dz
         y = T[0, 1] * dx + T[1, 1] * dy + T[2, 1] * dz
         depth[n] = T[0, 2] * dx + T[1, 2] * dy + T[2, 2] * dz
-        w = 1.0 / (depth[n] if depth[n] > _LEAST_DEPTH else _LEAST_DEPTH)
+        w = 1.0 / (depth[n] if depth[n] > LEAST_DEPTH else LEAST_DEPTH)
         z[n, 0], z[n, 1], z[n, 2] = lens[0] * x * w + lens[2], lens[1] * y * w + lens[3], w
         ax, ay, az = points[n, 0] - centre[0], points[n, 1] - centre[1], points[n, 2] - centre[2]
         for i in range(3):

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekf_slam_node.measurement_kernels import observed, placed
+from ekf_slam_node.measurement_kernels import LEAST_DEPTH, observed, placed
 from slam_core.camera import MIN_DEPTH, Camera
 from slam_core.geometry import FloatArray, make_transform, skew, so3_exp, so3_left_jacobian, so3_log
 from slam_core.types import Features
@@ -132,7 +132,7 @@ def project_jacobian(points: FloatArray, camera: Camera) -> FloatArray:
 
 
 def _safe_depth(depth: FloatArray) -> FloatArray:
-    return np.where(depth > 1e-3, depth, 1e-3)
+    return np.maximum(depth, LEAST_DEPTH)
 
 
 def back_project(z: FloatArray, camera: Camera) -> FloatArray:
@@ -142,17 +142,8 @@ def back_project(z: FloatArray, camera: Camera) -> FloatArray:
     return np.column_stack([x * depth, y * depth, depth])
 
 
-def back_project_jacobian(z: FloatArray, camera: Camera) -> FloatArray:
-    """Derivative (n, 3, 3) of :func:`back_project` (Eq. 6.24)."""
-    depth = 1.0 / z[:, 2]
-    J = np.zeros((len(z), 3, 3))
-    J[:, 0, 0], J[:, 1, 1] = depth / camera.fx, depth / camera.fy
-    J[:, :, 2] = -back_project(z, camera) * depth[:, None]
-    return J
-
-
 def rig_points(frame: Frame, T_rig_optical: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Positions (n, 3) of a frame's features in the rig frame and their covariances (n, 3, 3)."""
+    """Positions (n, 3) of a frame's features in the rig frame and their covariances (n, 3, 3) (Eqs. 6.22, 6.24)."""
     points, covariances = np.empty((len(frame), 3)), np.empty((len(frame), 3, 3))
     placed(frame.z, frame.variance, T_rig_optical, frame.camera.lens, points, covariances)
     return points, covariances

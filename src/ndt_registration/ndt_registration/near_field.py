@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from ndt_registration.visibility import Prices, RangeImage, direction_bin_without_branches
+from ndt_registration.visibility import Prices, RangeImage, direction_bin
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 
@@ -69,7 +69,7 @@ def pose_cost(
     cost, near = 0.0, np.int32(0)
     for i in range(points.shape[1]):
         x, y, z = xs[i] + t[0], ys[i] + t[1], zs[i] + t[2]
-        k = direction_bin_without_branches(x, y, z, size)
+        k = direction_bin(x, y, z, size)
         r = np.sqrt(x * x + y * y + z * z)
         behind = hidden * min((r - far[k]) * inverse_tolerance - 1.0, 1.0)
         before = free * min((nearest[k] - r) * inverse_tolerance - 1.0, 1.0)

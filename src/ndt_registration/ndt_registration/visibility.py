@@ -43,30 +43,20 @@ MEAN_BIN = 3.545
 
 
 @njit(cache=True, nogil=True, inline="always")
-def direction_bin(x: float, y: float, z: float, size: int) -> int:
-    """Bin of a direction."""
-    s = abs(x) + abs(y) + abs(z)
-    if s == 0.0:
-        return 0
-    u, v = x / s, y / s
-    if z < 0.0:
-        u, v = (1.0 - abs(v)) * (1.0 if u >= 0.0 else -1.0), (1.0 - abs(u)) * (1.0 if v >= 0.0 else -1.0)
-    i = min(int((u + 1.0) * 0.5 * size), size - 1)
-    j = min(int((v + 1.0) * 0.5 * size), size - 1)
-    return i * size + j
+def direction_bin(x, y, z, size):  # type: ignore[no-untyped-def]
+    """Bin of a direction, 0 without one; without branches, so that loops over many points vectorise.
 
-
-@njit(cache=True, nogil=True, inline="always")
-def direction_bin_without_branches(x, y, z, size):  # type: ignore[no-untyped-def]
-    """:func:`direction_bin` for loops over many points; ``size`` and the bin are int32."""
-    s = abs(x) + abs(y) + abs(z)
-    s = s if s > 0.0 else 1.0
+    With ``size`` an int32 the bin is one too, of which a vector register holds twice as many.
+    """
+    total = abs(x) + abs(y) + abs(z)
+    s = total if total > 0.0 else 1.0
     u, v = x / s, y / s
     folded_u = (1.0 - abs(v)) * (1.0 if u >= 0.0 else -1.0)
     folded_v = (1.0 - abs(u)) * (1.0 if v >= 0.0 else -1.0)
     u, v = (folded_u if z < 0.0 else u), (folded_v if z < 0.0 else v)
     i, j = np.int32((u + 1.0) * 0.5 * size), np.int32((v + 1.0) * 0.5 * size)
-    return min(i, size - np.int32(1)) * size + min(j, size - np.int32(1))
+    place = min(i, size - np.int32(1)) * size + min(j, size - np.int32(1))
+    return place if total > 0.0 else np.int32(0)
 
 
 @njit(cache=True, nogil=True)

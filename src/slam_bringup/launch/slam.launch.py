@@ -14,7 +14,7 @@ description or a static_transform_publisher. Without ROS's launch, ``slam nodes`
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
@@ -31,8 +31,7 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(a.name, default_value=a.default, description=a.description, choices=a.choices or None)
         for a in ARGUMENTS
     ]
-    threads = SetEnvironmentVariable("OPENBLAS_NUM_THREADS", "1")  # every node has its core; more fight for it
-    return LaunchDescription([*arguments, RVIZ, threads, OpaqueFunction(function=_nodes)])
+    return LaunchDescription([*arguments, RVIZ, OpaqueFunction(function=_nodes)])
 
 
 def _nodes(context: LaunchContext) -> list[Node]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import gc
 import importlib
-import os
 import sys
 from typing import Any
 
@@ -14,12 +13,11 @@ import click
 import slam_core.process_life  # noqa: F401  # its clock starts with the program
 from slam_bringup.commands.console import log_to_terminal, with_verbosity
 from slam_bringup.version import VERSION
+from slam_core.blas_threads import use_one_blas_thread
 from slam_core.memory import search_less_garbage, share_one_heap
 
-# The stages of a run have threads of their own: BLAS threads beside them only wait for each other, spinning. NumPy and
-# SciPy read this when they are loaded, here and in the nodes that are started from here. One number of threads also
-# means one order of summation, hence the same bytes.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Before NumPy and SciPy are loaded, and for the programs that are started from here.
+use_one_blas_thread()
 
 COMMANDS = {
     "run": "offline pipeline: a bag to a map and a trajectory",

@@ -53,9 +53,6 @@ class JobQueue:
         self.skipped: Counter[str] = Counter()
         """Jobs left out, by source."""
 
-    def __len__(self) -> int:
-        return len(self._jobs)
-
     def limit(self, source: str, waiting: int) -> None:
         """Let so many jobs of a source wait."""
         self._limits[source] = waiting
