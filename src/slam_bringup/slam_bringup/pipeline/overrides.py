@@ -103,8 +103,9 @@ def require_known_nodes(overrides: Overrides, known: set[str]) -> None:
 
 def require_known_parameters(overrides: Overrides, node: str) -> None:
     """Refuse rules for a node with a name that it does not have, where its names can be known (ROS is installed)."""
-    known = _parameters_of(node)
-    for name in overrides.of(f"/{node}") if known else ():
+    wanted = overrides.of(f"/{node}")
+    known = _parameters_of(node) if wanted else frozenset()  # ROS takes a quarter of a second to load
+    for name in wanted if known else ():
         if not is_parameter_of(node, name):
             near = difflib.get_close_matches(name, known, 1)
             hint = f"; did you mean '{near[0]}'?" if near else ""
