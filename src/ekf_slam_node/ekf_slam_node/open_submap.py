@@ -26,6 +26,11 @@ class Sight:
     slots: IndexArray
     columns: IndexArray
 
+    @classmethod
+    def of_nothing(cls) -> Sight:
+        """No landmark."""
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
     def __len__(self) -> int:
         return len(self.slots)
 

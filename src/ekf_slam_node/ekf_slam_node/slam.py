@@ -308,8 +308,7 @@ class EkfSlam:
         """No link: nothing is mapped.
 
         The filter stays at the last linked frame, so that the old map can be found again. The IMU tells meanwhile where
-        the rig is, as long as it knows. Two missed frames that link to each other go on in the old map from there, or
-        begin a new one.
+        the rig is, as long as it knows. Two missed frames that link to each other begin a new submap.
         """
         is_bridged = bridge is not None and is_known(bridge)
         missed = self._missed.add(frame)
@@ -325,15 +324,22 @@ class EkfSlam:
         return self._chain.result(frame.stamp_ns, TrackingState.LOST, reason)
 
     def _cross(self, missed: Frame, frame: Frame) -> EkfResult:
-        """Go on in the old map from a missed frame, to which the IMU has carried the rig."""
+        """Begin a new submap at a missed frame, to which the IMU has carried the rig: the old one ends there.
+
+        The old landmarks are no longer known well from there, and all wrong by the same: a gate that holds this error
+        lets a few features of other places through, and these would decide where the rig is.
+        """
         start_ns = self._chain.stamp_ns
         bridge = self._aids.bridge(start_ns, missed.stamp_ns)
         if bridge is None:
             return self._restart(missed, frame)
         self.counters.add("gaps_bridged")
         self._go_with(missed, seconds_between(start_ns, missed.stamp_ns), bridge)
+        submaps = self._chain.close()
+        self._chain.follow(missed, Sight.of_nothing(), Sight.of_nothing(), self._aids.up)
         self._chain.local.ekf.restart(*self._aids.velocity())
-        return self._advance(frame)
+        result = self._advance(frame)
+        return replace(result, submaps=submaps + result.submaps)
 
     def _restart(self, missed: Frame, frame: Frame) -> EkfResult:
         """The old map is not found again, but two missed frames agree: a new submap begins at the first of them."""
