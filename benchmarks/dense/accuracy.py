@@ -66,6 +66,7 @@ def row(path: Path, camera: str, frames: int, run: Path | None) -> list[str]:
     with SensorBag(path) as bag:
         trajectories = {agent: poses_of(bag, agent, frames, run) for agent in bag.agents}
         model = dense_model(bag, system, trajectories)
+    megabytes = (model.volume.voxels.nbytes + model.volume.colours.nbytes) / 2**20
     between = time.process_time()
     surface = model.surface()
     ended = time.process_time()
@@ -74,7 +75,6 @@ def row(path: Path, camera: str, frames: int, run: Path | None) -> list[str]:
     distance = distance_to_surfaces(world, points[near])
     nees = float(np.mean(np.square(distance / surface.sigma[near]))) if near.any() else np.nan
     quantiles = np.percentile(1000 * distance, [50, 95]) if near.any() else (np.nan, np.nan)
-    megabytes = (model.volume.voxels.nbytes + model.volume.colours.nbytes) / 2**20
     return [
         path.name, camera, str(len(model.keyframes)), str(int(near.sum())),
         f"{quantiles[0]:.1f}", f"{quantiles[1]:.1f}",

@@ -116,12 +116,8 @@ class DenseModel:
         return len(chosen)
 
     def surface(self) -> Surface:
-        """The mesh of all key frames."""
-        return extract_surface(self.volume, self.config.surface)
-
-    def release_field(self) -> None:
-        """Forget the field, by far the largest part; floor plans need only a surface that was made before."""
-        self.volume = TsdfVolume(self.config.tsdf)
+        """The mesh of all key frames. Of poses that are final it is made once: its field is forgotten."""
+        return extract_surface(self.volume, self.config.surface, release=self._fixed)
 
     def add_specific_force(self, force: FloatArray) -> None:
         """Take an accelerometer's reading (3,) m/s2, turned into the map frame: on the whole it points up."""

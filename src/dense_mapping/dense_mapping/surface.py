@@ -68,16 +68,20 @@ class Surface:
         return len(self.points)
 
 
-def extract_surface(volume: TsdfVolume, config: SurfaceConfig) -> Surface:
-    """The zero level of the field, with everything known of it."""
+def extract_surface(volume: TsdfVolume, config: SurfaceConfig, *, release: bool = False) -> Surface:
+    """The zero level of the field, with everything known of it; ``release``: the field is emptied on the way."""
+    voxel_size = volume.config.voxel_size
     pieces = [_chunk_surface(volume, chunk, config) for chunk in _chunks(volume)]
     pieces = [piece for piece in pieces if len(piece[1])]
+    if release:  # by far the largest part, and what follows needs room
+        volume.clear()
     if not pieces:
         return Surface.empty()
     offsets = np.cumsum([0, *(len(points) for points, *_ in pieces)])
     points, colours, sigma = (np.concatenate([piece[k] for piece in pieces]) for k in (0, 2, 3))
     faces = np.concatenate([piece[1] + offset for piece, offset in zip(pieces, offsets.astype(np.int32), strict=False)])
-    points, faces, kept = _welded(points, faces, volume.config.voxel_size)
+    del pieces
+    points, faces, kept = _welded(points, faces, voxel_size)
     faces = _without_islands(faces, len(points), _MIN_TRIANGLES)
     used, faces = _renumbered(faces, len(points))
     points = points[used]

@@ -56,6 +56,10 @@ class TsdfVolume:
         self.truncation = _TRUNCATION_VOXELS * config.voxel_size
         self.block_size = BLOCK * config.voxel_size
         self.refused_blocks = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all blocks."""
         self._rows: dict[int, int] = {}
         self._coordinates = np.empty((0, 3), dtype=np.int64)
         self._voxels = np.empty((0, VOXELS, 4), dtype=np.float32)

@@ -343,11 +343,18 @@ class GlobalMap:
             return None
         return PoseEstimate(r.submap.end_stamp_ns, self.graph.poses[r.end], self.view.node(r.end))
 
-    def save(self, path: Path | str) -> None:
-        """Write the map to a folder (see :mod:`sjsam_node.storage`), and go on from it as a map that is loaded does."""
+    def save(self, path: Path | str, *, is_last: bool = False) -> None:
+        """Write the map to a folder (see :mod:`sjsam_node.storage`), and go on from it as a map that is loaded does.
+
+        ``is_last``: nobody adds to the map or asks for covariances any more, so that only its graph is kept.
+        """
         self.settle()
         storage.write(Path(path), self.stored())
-        self.smoother.resume()
+        if is_last:
+            self.smoother.forget()
+            self._offload.forget()
+        else:
+            self.smoother.resume()
 
     def stored(self) -> StoredMap:
         """The map as it is, to be written; nothing is settled."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ import pytest
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult
+from slam_bringup.report.early_output import EarlyOutput
 from slam_bringup.report.output import write_results
+from slam_bringup.report.result_bag import write_result_bag
 from slam_core.geometry import boxplus
 from slam_core.trajectory import Trajectory, read_trajectory
 
@@ -95,3 +98,59 @@ def test_a_run_without_anything_still_has_its_files(tmp_path):
     summary = write_results(tmp_path, empty)
     assert summary["end_error_m"] is None
     assert (tmp_path / "report.html").exists()
+
+
+@pytest.fixture
+def mapped(result):
+    return replace(result, dense=Surface.empty(), floor_plans=(), events=())
+
+
+def save_map(folder):
+    folder.mkdir()
+    (folder / "graph").write_text("a map")
+
+
+def test_outputs_are_the_same_whether_begun_early_or_not(result, mapped, tmp_path):
+    early_folder, late_folder = tmp_path / "early", tmp_path / "late"
+    with EarlyOutput(early_folder, save_map) as early:
+        early.start(mapped)
+        early.write_rest(result, pictures=True)
+    late_folder.mkdir()
+    write_result_bag(late_folder / "result.mcap", result)
+    write_results(late_folder, result, save_map)
+    names = {p.relative_to(late_folder) for p in late_folder.rglob("*") if p.is_file()}
+    assert names == {p.relative_to(early_folder) for p in early_folder.rglob("*") if p.is_file()}
+    for name in names - {p for p in names if p.name in ("summary.json", "report.html")}:  # they state time and memory
+        assert (early_folder / name).read_bytes() == (late_folder / name).read_bytes(), name
+
+
+def test_the_map_is_there_as_soon_as_the_block_is_left(mapped, tmp_path):
+    def give_up():
+        with EarlyOutput(tmp_path / "out", save_map) as early:
+            early.start(mapped)
+            early._mapped.result(timeout=60)  # the user gives up while the dense model is made
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        give_up()
+    assert (tmp_path / "out" / "map" / "graph").read_text() == "a map"
+    assert not (tmp_path / "out" / "summary.json").exists()
+
+
+def test_nothing_is_drawn_for_a_run_that_was_stopped(result, mapped, tmp_path):
+    with EarlyOutput(tmp_path / "out", save_map) as early:
+        early.start(mapped)
+        summary = early.write_rest(result, pictures=False)
+    assert summary["frames"] == result.frames
+    assert {"map", "trajectory.tum", "result.mcap"} <= {p.name for p in (tmp_path / "out").iterdir()}
+    assert not (tmp_path / "out" / "report.html").exists()
+
+
+def test_an_error_in_the_thread_is_told(result, mapped, tmp_path):
+    def fail(folder):
+        raise OSError("no space left")
+
+    with EarlyOutput(tmp_path / "out", fail) as early:
+        early.start(mapped)
+        with pytest.raises(OSError, match="no space left"):
+            early.write_rest(result, pictures=True)

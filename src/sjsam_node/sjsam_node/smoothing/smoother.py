@@ -163,14 +163,18 @@ class Smoother:
     def resume(self) -> None:
         """Keep nothing but the graph and its estimate, which is at its optimum: after loading as after saving."""
         self._choose_ties()
-        self.estimator.forget()
-        self._solved.clear()
+        self.forget()
         self.parked = Parked()
         self.regions = Regions(self.estimator.local_maps, self.config.region)
         for component in np.unique(self.graph.component_of).tolist():
             assembled = self.estimator.assemble(self.graph, component)
             cost = assembled.problem.cost(assembled.state)
             self._solved[component] = _Solved(assembled, self._result_of(component, assembled, cost, 0, True))
+
+    def forget(self) -> None:
+        """Keep nothing of what was solved; the graph has its estimate."""
+        self.estimator.forget()
+        self._solved.clear()
 
     def checkpoint(self) -> Checkpoint:
         """Everything that an update changes, to come back to."""

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import click
 from rich.console import Console
@@ -27,8 +26,8 @@ from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.map_growth import MapGrowth, map_growth
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.pipeline.results import RunResult
 from slam_bringup.processes.interrupt import INTERRUPTED, MAP, STOPPED, Interrupt, giving_up
+from slam_bringup.report.early_output import EarlyOutput
 from slam_bringup.report.summary_table import summary_table
 from slam_bringup.version import VERSION
 from slam_core.output_folder import LOGS, OutputFolder
@@ -68,7 +67,10 @@ def command(
         require_stereo(bag, names)
     results, transcript = OutputFolder(output, "run", bag, overwrite=overwrite), Transcript(VERSION)
     staged = results.staged(rescue=MAP)
-    with results, transcript, giving_up(results), staged as folder, _saved_if_given_up(growth, folder / MAP):
+    with (
+        results, transcript, giving_up(results), staged as folder, _saved_if_given_up(growth, folder / MAP),
+        EarlyOutput(folder, growth.save) as early,
+    ):  # fmt: skip
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"mapping {bag.name}", total=2 * readings)
             result, growth = run_bag(
@@ -80,12 +82,13 @@ def command(
                 growth=growth,
                 on_reading=lambda: progress.advance(task),
                 stopped=lambda: interrupt.asked,
+                on_mapped=early.start,
             )
         require_map(result)
         if interrupt.asked:
             result = replace(result, events=(STOPPED, *result.events))
         with Console(stderr=True, quiet=is_quiet()).status(f"writing {output}"):
-            summary = _write(folder, result, growth, pictures=not interrupt.asked)
+            summary = early.write_rest(result, pictures=not interrupt.asked)
             transcript.write(folder / LOGS / LOG_NAME, summary_table(summary, output))
     show(summary_table(summary, output))
     if result.failure:
@@ -93,15 +96,6 @@ def command(
         sys.exit(FAILED)
     if interrupt.asked:
         sys.exit(INTERRUPTED)
-
-
-def _write(folder: Path, result: RunResult, growth: MapGrowth, *, pictures: bool) -> dict[str, Any]:
-    # What draws and writes is loaded when there is something to write: mapping needs the memory.
-    from slam_bringup.report.output import write_results
-    from slam_bringup.report.result_bag import write_result_bag
-
-    write_result_bag(folder / "result.mcap", result)
-    return write_results(folder, result, growth.save, pictures=pictures)
 
 
 @contextmanager

@@ -48,7 +48,7 @@ class MapGrowth(Protocol):
         """Poses T_map_base of this run by agent, with covariances, map frame."""
 
     def save(self, folder: Path) -> None:
-        """Write the map to a folder."""
+        """Write the map to a folder; nothing is added to it, and no covariance asked for, after that."""
 
 
 def map_growth(config: GlobalMapConfig, old: Path | None = None, *, localize_only: bool = False) -> MapGrowth:
@@ -126,7 +126,7 @@ class Joining:
 
     def save(self, folder: Path) -> None:
         """Write the map, the old one and what is new."""
-        self.global_map.save(folder)
+        self.global_map.save(folder, is_last=True)
 
 
 class Locating:

@@ -45,6 +45,7 @@ def run_bag(
     growth: MapGrowth | None = None,
     on_reading: Callable[[], None] = lambda: None,
     stopped: Callable[[], bool] = lambda: False,
+    on_mapped: Callable[[RunResult], None] = lambda result: None,
 ) -> tuple[RunResult, MapGrowth]:
     """The result of mapping a bag, offline and as fast as it goes, and the map.
 
@@ -64,6 +65,8 @@ def run_bag(
         Called after every reading of the bag, and again when the dense model has seen it, for a progress bar.
     stopped
         Asked after every reading: whether to end here, with what is mapped so far and without a dense model.
+    on_mapped
+        Called with the result without a dense model, before that is made.
 
     Raises
     ------
@@ -86,13 +89,22 @@ def run_bag(
             {agent: pipeline.log.frames for agent, pipeline in pipelines.items()},
         )
         _LOG.info("mapped %d submaps in %.1f s; the dense model is next", record.submaps, record.wall_s)
+        grown = mapping.growth
+        del pipelines, mapping  # with their images and filters
         keep_little()
         give_back()
         with times.measure("dense model"):
             result = run_result(
-                bag, config, record, mapper=mapper, odometry=odometry, on_reading=on_reading, stopped=stopped
+                bag,
+                config,
+                record,
+                mapper=mapper,
+                odometry=odometry,
+                on_reading=on_reading,
+                stopped=stopped,
+                on_mapped=on_mapped,
             )
-    return result, mapping.growth
+    return result, grown
 
 
 def _map(mapping: Mapper, items: Generator[AgentItem, None, None]) -> str:

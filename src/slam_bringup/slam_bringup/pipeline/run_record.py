@@ -20,6 +20,7 @@ from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_bringup.pipeline.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
 from slam_core.config import iterate_parameters
 from slam_core.geometry import FloatArray
+from slam_core.memory import give_back
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
 from stereo_frontend.frontend import FrontendReport
@@ -123,21 +124,20 @@ def run_result(
     odometry: str,
     on_reading: Callable[[], None] = lambda: None,
     stopped: Callable[[], bool] = lambda: False,
+    on_mapped: Callable[[RunResult], None] = lambda result: None,
 ) -> RunResult:
     """The result of a run over a bag, with the dense model on its trajectories.
 
-    ``on_reading`` is called after every reading that the dense model has seen, for a progress bar; then ``stopped`` is
-    asked: whoever wants the end now does not want to wait for the dense model.
+    ``on_mapped`` is called with the result without a dense model; ``on_reading`` after every reading that this has
+    seen, for a progress bar; then ``stopped`` is asked: whoever wants the end now does not want to wait for it.
     """
     agents = tuple(
         _agent_result(bag, config, agent, odometry, record.trajectories.get(agent, []), of_agent)
         for agent, of_agent in record.agents.items()
     )
-    surface, plans, failure = _dense(bag, config, record, agents, on_reading, stopped)
     landmarks = record.global_map.landmarks()
     stamps = [agent.filtered.stamps_ns for agent in agents if len(agent.filtered)]
-    events = _logged((*(failure,) * bool(failure), *bag.warnings, *record.events, *_events(record.agents)))
-    return RunResult(
+    mapped = RunResult(
         bag=bag.reader.path.name,
         mode=config.feature_extractor.mode,
         mapper=mapper,
@@ -145,8 +145,8 @@ def run_result(
         agents=agents,
         global_map=record.global_map,
         landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings),
-        dense=surface,
-        floor_plans=plans,
+        dense=Surface.empty(),
+        floor_plans=(),
         submaps=record.submaps,
         loop_closures=record.loop_closures,
         frames=sum(len(s) for s in stamps),
@@ -155,12 +155,14 @@ def run_result(
         sensor_s=max((s[-1] - s[0]) / 1e9 for s in stamps) if stamps else 0.0,
         wall_s=record.wall_s,
         stage_ms=record.stage_ms,
-        events=events,
         solver=record.solver,
-        failure=failure,
         backlog=record.backlog,
         changed=_changed(config),
     )
+    on_mapped(mapped)
+    surface, plans, failure = _dense(bag, config, record, agents, on_reading, stopped)
+    events = _logged((*(failure,) * bool(failure), *bag.warnings, *record.events, *_events(record.agents)))
+    return replace(mapped, dense=surface, floor_plans=plans, events=events, failure=failure)
 
 
 def told(error: Exception, consequence: str) -> str:
@@ -190,8 +192,8 @@ def _dense(
         corrections = {agent: known.front_end.correction for agent, known in record.agents.items()}
         model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading, stopped, corrections)
         if not stopped():
+            give_back()
             surface = model.surface()
-            model.release_field()
             plans = model.floor_plans(surface)
     except Exception as error:  # what was mapped is worth more than its picture
         failure = failure or told(error, "no dense model was made")

@@ -211,8 +211,10 @@ def timing_figure(result: RunResult) -> Figure:
     return figure
 
 
-def features_figure(agent: AgentResult) -> Figure:
-    """Number of features with depth in each frame."""
+def features_figure(agent: AgentResult) -> Figure | None:
+    """Number of features with depth in each frame; None without frames."""
+    if not len(agent.feature_counts):
+        return None
     figure, ((axes,),) = blank(10, 2.4)
     axes.plot(agent.feature_counts, color=COLOURS[1], linewidth=1.0)
     axes.set_ylim(bottom=0)

@@ -25,29 +25,45 @@ from dense_mapping.surface_io import write_glb, write_mesh, write_points
 from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult, summarise
 from slam_bringup.report.figures import map_figure, save_png
 from slam_bringup.report.foxglove import write_layout
-from slam_bringup.report.report import write_report
+from slam_bringup.report.report import Charts, draw_charts, write_report
 from slam_bringup.version import VERSION
 from slam_core.files import atomic_text
 from slam_core.point_cloud import write_ply
 from slam_core.process_life import STARTED_S
 from slam_core.trajectory import write_covariance_csv, write_tum
 
+SaveMap = Callable[[Path], object]
+"""Writes the loadable map to a folder."""
 
-def write_results(
-    out: Path, result: RunResult, save_map: Callable[[Path], object] | None = None, *, pictures: bool = True
-) -> dict[str, Any]:
-    """Write all files of a run into the folder ``out`` (made if absent) and return the summary.
 
-    ``save_map`` is called with the path of ``map/`` and writes the loadable map there, before all else. Drawing takes
-    most of the time: without ``pictures`` there is no ``map.png`` and no ``report.html``. ``summary.json`` comes last,
-    so that a folder that has one is complete.
-    """
+def write_mapped(out: Path, result: RunResult, save_map: SaveMap | None = None) -> None:
+    """Write what needs no dense model into the folder ``out`` (made if absent): ``map/``, trajectories, landmarks."""
     out.mkdir(parents=True, exist_ok=True)
-    (out / "summary.json").unlink(missing_ok=True)
     if save_map is not None:
         save_map(out / "map")
     _write_trajectories(out, result.agents)
     _write_landmarks(out / "landmarks.ply", result.landmarks)
+
+
+def write_results(
+    out: Path,
+    result: RunResult,
+    save_map: SaveMap | None = None,
+    *,
+    pictures: bool = True,
+    charts: Charts | None = None,
+    is_mapped: bool = False,
+) -> dict[str, Any]:
+    """Write all files of a run into the folder ``out`` (made if absent) and return the summary.
+
+    ``save_map`` is called with the path of ``map/``, before all else. Drawing takes most of the time: without
+    ``pictures`` there is no ``map.png`` and no ``report.html``. ``summary.json`` comes last, so that a folder that has
+    one is complete. Made before, if so: ``charts`` by :func:`~slam_bringup.report.report.draw_charts`, and
+    (``is_mapped``) the files of :func:`write_mapped`.
+    """
+    if not is_mapped:
+        write_mapped(out, result, save_map)
+    (out / "summary.json").unlink(missing_ok=True)
     write_points(out / "map.ply", result.dense)
     write_mesh(out / "mesh.ply", result.dense)
     write_glb(out / "mesh.glb", result.dense)
@@ -58,7 +74,7 @@ def write_results(
     if pictures:
         save_png(out / "map.png", map_figure(result))
         map_png = (out / "map.png").read_bytes()  # drawn once: it is the dearest of the figures
-        write_report(out / "report.html", result, summary | _in_all(result), map_png)
+        write_report(out / "report.html", result, summary | _in_all(result), map_png, charts or draw_charts(result))
     summary |= _in_all(result)
     atomic_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
     return summary

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,44 @@ from slam_bringup.report.structure_figures import sparsity_figure, submaps_figur
 from slam_core.evaluation import Evaluation
 from slam_core.files import atomic_text
 
+_AGENT_CHARTS: dict[str, Callable[[AgentResult], Figure | None]] = {
+    "errors": error_figure,
+    "sigmas": sigma_figure,
+    "motion": motion_figure,
+    "features": features_figure,
+}
 _PICTURES = 6
 _DISHONEST = 1.6
 """Factor between errors and claimed sigmas from which the report warns."""
 
 
-def write_report(path: Path, result: RunResult, summary: dict[str, Any], map_png: bytes) -> None:
+@dataclass(frozen=True)
+class Charts:
+    """Charts as URLs, None where there is nothing to draw: of the map, and of each agent by name."""
+
+    side: str | None
+    submaps: str | None
+    sparsity: str | None
+    agents: list[dict[str, str | None]]
+
+
+def draw_charts(result: RunResult, go_on: Callable[[], None] = lambda: None) -> Charts:
+    """The charts that need no dense model. ``go_on`` is called before each: what it raises ends the drawing."""
+
+    def drawn(figure: Callable[[Any], Figure | None], of: Any) -> str | None:
+        go_on()
+        return _embedded(figure(of))
+
+    graph = result.global_map.graph
+    return Charts(
+        drawn(side_view, result),
+        drawn(submaps_figure, graph),
+        drawn(sparsity_figure, graph),
+        [{name: drawn(figure, agent) for name, figure in _AGENT_CHARTS.items()} for agent in result.agents],
+    )
+
+
+def write_report(path: Path, result: RunResult, summary: dict[str, Any], map_png: bytes, charts: Charts) -> None:
     """Write the page, with the map's picture as it is; it needs no other file and no network."""
     template = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
         resources.files("slam_bringup.report").joinpath("report.html.j2").read_text(encoding="utf-8")
@@ -39,22 +72,19 @@ def write_report(path: Path, result: RunResult, summary: dict[str, Any], map_png
             "length": agent.trajectory.length_m,
             "evaluation": agent.evaluation(),
             "verdict": verdict(agent.evaluation()),
-            "errors": _embedded(error_figure(agent)),
-            "sigmas": _embedded(sigma_figure(agent)),
-            "motion": _embedded(motion_figure(agent)),
-            "features": _embedded(features_figure(agent)) if len(agent.feature_counts) else None,
+            **drawn,
             "pictures": [_picture(frame, agent) for frame in _spread(agent.frames, _PICTURES)],
         }
-        for agent in result.agents
+        for agent, drawn in zip(result.agents, charts.agents, strict=True)
     ]
     html = template.render(
         summary=summary,
         agents=agents,
         map=_as_url(map_png),
-        side=_embedded(side_view(result)),
+        side=charts.side,
         scene=scene_page(result),
-        submaps=_embedded(submaps_figure(result.global_map.graph)),
-        sparsity=_embedded(sparsity_figure(result.global_map.graph)),
+        submaps=charts.submaps,
+        sparsity=charts.sparsity,
         timing=_embedded(timing_figure(result)),
         plans=[_embedded(floor_plan_figure(result, plan)) for plan in result.floor_plans],
     )

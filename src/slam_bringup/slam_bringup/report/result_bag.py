@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from dense_mapping.surface_cloud import cloud_of
 from sjsam_node.map_messages import graph_message, marks_message
 from slam_bringup.bags.bag import BagReader, BagWriter
-from slam_bringup.bags.bag_types import BagTypes
+from slam_bringup.bags.bag_types import BagTypes, typestore
 from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_bringup.pipeline.results import AgentResult, RunResult
 from slam_core.evaluation import associate
@@ -47,14 +48,35 @@ _TYPES = BagTypes()
 _Stamped = tuple[int, str, Message]
 
 
-def write_result_bag(path: Path, result: RunResult) -> None:
-    """Write the bag; a run without any pose gives a bag without messages."""
-    messages = [m for agent in result.agents for m in _agent_messages(agent)]
+class Written(NamedTuple):
+    """A message as it is in the bag."""
+
+    stamp_ns: int
+    topic: str
+    type_name: str
+    cdr: bytes
+
+
+def agents_messages(result: RunResult) -> list[Written]:
+    """Messages of every agent, frame by frame, for which no dense model is needed."""
+    return [_written(m) for agent in result.agents for m in _agent_messages(agent)]
+
+
+def write_result_bag(path: Path, result: RunResult, of_agents: list[Written] | None = None) -> None:
+    """Write the bag, with :func:`agents_messages` if made before; one without messages for a run without any pose."""
+    messages = agents_messages(result) if of_agents is None else of_agents
     if messages:
-        messages += _lasting_messages(result, min(stamp for stamp, _, _ in messages))
+        lasting = _lasting_messages(result, min(m.stamp_ns for m in messages))
+        messages = sorted([*messages, *map(_written, lasting)], key=lambda m: (m.stamp_ns, m.topic))
     with BagWriter(path) as bag:
-        for stamp, topic, message in sorted(messages, key=lambda m: (m[0], m[1])):
-            bag.write(topic, message, stamp)
+        for stamp, topic, type_name, cdr in messages:
+            bag.write_raw(topic, type_name, cdr, stamp)
+
+
+def _written(message: _Stamped) -> Written:
+    stamp, topic, content = message
+    type_name = content.__msgtype__
+    return Written(stamp, topic, type_name, bytes(typestore().serialize_cdr(content, type_name)))
 
 
 def complete_recording(path: Path, result: RunResult) -> None:
