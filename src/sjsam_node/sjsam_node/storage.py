@@ -10,7 +10,6 @@ checked before anything is made of it (:mod:`sjsam_node.map_validation`).
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 from dataclasses import dataclass
@@ -24,11 +23,12 @@ from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.near_pairs import Compared
 from sjsam_node.map_validation import arrays_of, check_arrays, check_manifest
 from sjsam_node.marks import Mark, Marks
-from slam_core.files import atomic_path
+from slam_core.files import atomic_path, digest
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
 FORMAT, VERSION = "indoor-slam-map", 6
 _MANIFEST = "manifest.json"
+_ARRAYS_PART = "arrays.part.npz"
 Arrays = dict[str, AnyArray]
 
 
@@ -83,25 +83,35 @@ def pack(stored: StoredMap) -> PackedMap:
 
 def write_packed(folder: Path, packed: PackedMap) -> None:
     """Write a packed map, as :func:`write` does."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **packed.arrays)  # type: ignore[arg-type]
-    data = buffer.getvalue()
-    digest = hashlib.sha256(data).hexdigest()
-    name = f"arrays-{digest[:16]}.npz"
-    manifest = packed.manifest | {"arrays": name, "sha256": digest}
-    text = json.dumps(manifest | {"manifest_sha256": _digest(manifest)}, indent=1) + "\n"
     if not is_map(folder):
         with atomic_path(folder) as temporary:
             temporary.mkdir()
-            _write_synced(temporary / name, data)
-            _write_synced(temporary / _MANIFEST, text.encode())
+            manifest = packed.manifest | _write_arrays(temporary, packed.arrays)
+            _write_synced(temporary / _MANIFEST, _text(manifest))
         return
-    _write_synced(folder / name, data)
-    _write_synced(folder / f"{_MANIFEST}.part", text.encode())
+    manifest = packed.manifest | _write_arrays(folder, packed.arrays)
+    _write_synced(folder / f"{_MANIFEST}.part", _text(manifest))
     os.replace(folder / f"{_MANIFEST}.part", folder / _MANIFEST)
     for old in folder.glob("arrays*.npz"):
-        if old.name != name:
+        if old.name != manifest["arrays"]:
             old.unlink()
+
+
+def _write_arrays(folder: Path, arrays: Arrays) -> dict[str, str]:
+    """Name and digest of the file that is written; straight to disk, for a map fills much of the memory already."""
+    part = folder / _ARRAYS_PART
+    with part.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+        file.flush()
+        os.fsync(file.fileno())
+    sha256 = digest(part)
+    name = f"arrays-{sha256[:16]}.npz"
+    os.replace(part, folder / name)
+    return {"arrays": name, "sha256": sha256}
+
+
+def _text(manifest: dict[str, Any]) -> bytes:
+    return (json.dumps(manifest | {"manifest_sha256": _digest(manifest)}, indent=1) + "\n").encode()
 
 
 def _write_synced(path: Path, data: bytes) -> None:
