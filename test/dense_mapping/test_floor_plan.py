@@ -14,8 +14,9 @@ from dense_mapping.floor_plan import (
     FloorPlan,
     FloorPlanConfig,
     Obstacles,
+    _areas,
+    _middles,
     _occupied,
-    _triangles,
 )
 from dense_mapping.levelling import floor_heights, level_transform, up_direction
 from dense_mapping.navigation import frontiers, way
@@ -67,7 +68,7 @@ def both_rooms() -> DenseModel:
 
 def plan_of(model: DenseModel) -> FloorPlan:
     surface = model.surface()
-    model.release_field()  # is not needed for a plan
+    model.volume.clear()  # is not needed for a plan
     (plan,) = model.floor_plans(surface)
     return plan
 
@@ -176,7 +177,7 @@ def test_a_table_top_is_drawn_whole_though_its_points_lie_as_wide_apart_as_cells
     k = np.arange(len(points)).reshape(u.shape)
     corners = [part.ravel() for part in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:])]
     faces = np.concatenate([np.stack([corners[i] for i in t], axis=1) for t in ((0, 1, 2), (0, 2, 3))])
-    middles, areas = _triangles(points, faces.astype(np.int32))
+    middles, areas = (measure(points, faces.astype(np.int32)) for measure in (_middles, _areas))
     assert areas.sum() == pytest.approx(1.17**2)
     occupied = _occupied(Obstacles(middles, areas), np.array([-0.1, -0.1]), FloorPlanConfig(), (30, 30))
     assert occupied[3:24, 3:24].all()

@@ -7,7 +7,7 @@ above the floor on its way to what it measured, and unknown otherwise. Where a c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -34,6 +34,8 @@ _STOREY_HEIGHT = 2.0
 """Least height from one floor to the next."""
 _MAX_CELLS = 25_000_000
 """A plan with more cells is not made."""
+
+_ROWS_AT_ONCE = 1 << 14
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """Values of nav_msgs/OccupancyGrid."""
@@ -117,27 +119,45 @@ def floor_plans(
     image_ups = np.stack([-k.T_map_camera[:3, 1] for k in keyframes])
     T_level_map = level_transform(up_direction(surface, image_ups, gravity_up))
     points = transform_points(T_level_map, surface.points.astype(np.float64))
-    middles, areas = _triangles(points, surface.faces)
-    normals = surface.normals.astype(np.float64) @ T_level_map[:3, :3].T
+    heights = _middles(points[:, 2:], surface.faces)[:, 0]
     poses = [T_level_map @ k.T_map_camera for k in keyframes]
     cameras = np.stack([T[:3, 3] for T in poses])
-    floors = floor_heights(points, normals, cameras, _STOREY_HEIGHT, config.camera_height)
+    floors = floor_heights(
+        points, surface.normals @ T_level_map[:3, :3].T, cameras, _STOREY_HEIGHT, config.camera_height
+    )
     storeys = storey_of(cameras, floors)
     plans = []
     for i, floor in enumerate(floors):
         own = np.flatnonzero(storeys == i).tolist()
-        band = (middles[:, 2] > floor + config.lowest) & (middles[:, 2] < floor + config.highest)
+        between = surface.faces[(heights > floor + config.lowest) & (heights < floor + config.highest)]
         rays = [_rays(keyframes[k], poses[k]) for k in own]
         if own:
-            obstacles = Obstacles(middles[band], areas[band])
+            obstacles = Obstacles(_middles(points, between), _areas(points, between))
             plans.append(_plan(obstacles, rays, float(floor), config, T_level_map))
     return tuple(plans)
 
 
-def _triangles(points: FloatArray, faces: npt.NDArray[np.int32]) -> tuple[FloatArray, FloatArray]:
-    """Middles (n, 3) and areas (n,) of triangles."""
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    return (a + b + c) / 3.0, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+def _middles(points: FloatArray, faces: npt.NDArray[np.int32]) -> FloatArray:
+    """Middles (n, k) of triangles, of the coordinates that ``points`` (m, k) have."""
+    out = np.empty((len(faces), points.shape[1]))
+    for part in _parts(len(faces)):
+        a, b, c = (points[faces[part, k]] for k in range(3))
+        out[part] = (a + b + c) / 3.0
+    return out
+
+
+def _areas(points: FloatArray, faces: npt.NDArray[np.int32]) -> FloatArray:
+    """Areas (n,) of triangles."""
+    out = np.empty(len(faces))
+    for part in _parts(len(faces)):
+        a, b, c = (points[faces[part, k]] for k in range(3))
+        out[part] = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return out
+
+
+def _parts(count: int) -> Iterator[slice]:
+    """Rows at once: the corners of all triangles of a storey would take 100 MB, and the cache holds these."""
+    return (slice(start, start + _ROWS_AT_ONCE) for start in range(0, count, _ROWS_AT_ONCE))
 
 
 def _rays(placed: PlacedKeyframe, T_level_camera: FloatArray) -> FloatArray:
