@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ndt_registration.eigen import symmetric_eigen3
+from ndt_registration.eigen import LANES, symmetric_eigen3
 from slam_core.geometry import FloatArray, so3_exp
 
 SPECTRA = [
@@ -16,9 +16,13 @@ SPECTRA = [
 
 
 def eigen(A: FloatArray) -> tuple[FloatArray, FloatArray]:
-    vectors, values = np.empty((3, 3)), np.empty(3)
-    symmetric_eigen3(A.copy(), vectors, values)
-    return vectors, values
+    """Vectors (3, 3) and values (3,) of a matrix in the last lane; the others hold unit matrices times their number."""
+    room = np.full((19, LANES), np.nan)
+    room[:6] = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])[:, None] * np.arange(LANES)
+    room[:6, -1] = A[np.triu_indices(3)]
+    symmetric_eigen3(room.ravel(), np.empty((3, 3)), np.empty((3, 3)), np.empty(3))
+    np.testing.assert_allclose(room[6:9, :-1], [np.arange(LANES - 1.0)] * 3)
+    return room[9:18, -1].reshape(3, 3).T, room[6:9, -1]
 
 
 @pytest.mark.parametrize("spectrum", SPECTRA)
@@ -41,3 +45,12 @@ def test_a_diagonal_matrix_and_one_in_the_plane() -> None:
     flat = np.zeros((3, 3))
     flat[:2, :2] = [[0.02, 0.01], [0.01, 0.09]]
     assert eigen(flat)[1][0] == pytest.approx(0.0, abs=1e-16)  # the kernels tell scans in the plane by it
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_matrices_of_any_size(scale: float, rng: np.random.Generator) -> None:
+    A = rng.normal(size=(3, 3))
+    A = scale * (A @ A.T)
+    vectors, values = eigen(A)
+    np.testing.assert_allclose(values, np.linalg.eigvalsh(A), rtol=1e-9, atol=1e-12 * scale)
+    np.testing.assert_allclose(vectors @ np.diag(values) @ vectors.T, A, atol=1e-10 * scale)

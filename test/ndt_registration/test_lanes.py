@@ -8,9 +8,10 @@ import pytest
 
 from ndt_registration.block_table import find_block
 from ndt_registration.lanes import LANES, gather, groups_of, mean_over_cells, no_neighbours
+from ndt_registration.moments import block_moments
 from ndt_registration.ndt import Layer
 from ndt_registration.score_loss import ScoreLoss, point_fits
-from ndt_registration.voxel_grid import NormalGrid, block_moments, normal_grid
+from ndt_registration.voxel_grid import NormalGrid, normal_grid
 from slam_core.geometry import FloatArray, boxplus
 
 POINTS = 3 * LANES + 5
@@ -34,7 +35,7 @@ def numpy_fits(points: FloatArray, grid: NormalGrid) -> FloatArray:
     """Mean of Eq. 8.5 over the cells of each point, -1 where there is none."""
     fits = np.full(len(points), -1.0)
     for i, x in enumerate(points):
-        row = find_block(grid.keys, grid.rows, *(int(c) for c in np.floor(x / grid.block_size)))
+        row = find_block(grid.table, *(int(c) for c in np.floor(x / grid.block_size)))
         cells = grid.cells[row][grid.cells[row] >= 0] if row >= 0 else np.empty(0, int)
         if len(cells):
             B = np.zeros((len(cells), 3, 3))

@@ -6,8 +6,9 @@ from __future__ import annotations
 import numpy as np
 
 from ndt_registration.matching import block_gradients, fit_to_grid
+from ndt_registration.moments import block_moments
 from ndt_registration.ndt import Layer, ndt_align
-from ndt_registration.voxel_grid import block_moments, normal_grid, note_spurious_information
+from ndt_registration.voxel_grid import normal_grid, note_spurious_information
 from slam_core.geometry import FloatArray
 
 

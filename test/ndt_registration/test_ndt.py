@@ -6,8 +6,9 @@ import pytest
 
 from ndt_registration.block_table import find_block
 from ndt_registration.lanes import Neighbours, groups_of, no_neighbours
+from ndt_registration.moments import block_moments
 from ndt_registration.ndt import Layer, cost_and_derivatives, ndt_align
-from ndt_registration.voxel_grid import block_moments, normal_grid
+from ndt_registration.voxel_grid import normal_grid
 from slam_core.geometry import FloatArray, boxminus, boxplus, make_transform, transform_points
 
 STATES = [np.zeros(6), np.array([0.03, -0.02, 0.01, 0.02, -0.05, 0.03]), np.array([-0.1, 0.05, 0.02, -0.3, 0.2, 0.6])]
@@ -29,7 +30,7 @@ def numpy_cost(layer: Layer, T: FloatArray, T_cells: FloatArray | None = None) -
     grid, total = layer.grid, 0.0
     placed = transform_points(T if T_cells is None else T_cells, layer.points)
     for x, place in zip(transform_points(T, layer.points), placed, strict=True):
-        row = find_block(grid.keys, grid.rows, *(int(c) for c in np.floor(place / grid.block_size)))
+        row = find_block(grid.table, *(int(c) for c in np.floor(place / grid.block_size)))
         cells = grid.cells[row][grid.cells[row] >= 0] if row >= 0 else np.empty(0, int)
         B = np.zeros((len(cells), 3, 3))
         B[:, *np.triu_indices(3)] = grid.information[cells]

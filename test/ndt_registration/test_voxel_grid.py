@@ -5,33 +5,10 @@ import numpy as np
 import pytest
 
 from ndt_registration.block_table import find_block
-from ndt_registration.eigen import cholesky_solve6, symmetric_eigen3
-from ndt_registration.voxel_grid import (
-    NormalGrid,
-    adopt_planes,
-    block_counts,
-    block_moments,
-    coarser,
-    normal_grid,
-)
+from ndt_registration.eigen import cholesky_solve6
+from ndt_registration.moments import block_counts, block_moments, coarser
+from ndt_registration.voxel_grid import NormalGrid, adopt_planes, normal_grid
 from slam_core.geometry import FloatArray
-
-
-def test_eigenvalues_agree_with_lapack(rng: np.random.Generator) -> None:
-    for scale in (1e-6, 1.0, 1e6):
-        A = rng.normal(size=(3, 3))
-        A = scale * (A @ A.T)
-        vectors, values = np.empty((3, 3)), np.empty(3)
-        symmetric_eigen3(A.copy(), vectors, values)
-        np.testing.assert_allclose(values, np.linalg.eigvalsh(A), rtol=1e-9, atol=1e-12 * scale)
-        np.testing.assert_allclose(vectors @ np.diag(values) @ vectors.T, A, atol=1e-10 * scale)
-
-
-def test_eigenvectors_of_a_plane_with_equal_eigenvalues() -> None:
-    vectors, values = np.empty((3, 3)), np.empty(3)
-    symmetric_eigen3(np.diag([2.0, 0.0, 2.0]), vectors, values)
-    np.testing.assert_allclose(values, [0.0, 2.0, 2.0])
-    np.testing.assert_allclose(np.abs(vectors[:, 0]), [0.0, 1.0, 0.0])
 
 
 def test_cholesky_solves_and_refuses_indefinite_matrices(rng: np.random.Generator) -> None:
@@ -50,7 +27,7 @@ def test_cells_have_the_moments_of_the_points_in_them(rng: np.random.Generator) 
     grid = normal_grid(moments, block, min_points=6, relative_floor=1e-3, variance_floor=0.0, slack=0.0)
     for point in points[:50]:
         corner = np.floor(point / block).astype(int)
-        row = find_block(grid.keys, grid.rows, *(int(c) for c in corner))
+        row = find_block(grid.table, *(int(c) for c in corner))
         for k in range(8):
             low = (corner - [k & 1, (k >> 1) & 1, k >> 2]) * block
             inside = points[((points >= low) & (points < low + 2 * block)).all(axis=1)]
@@ -147,4 +124,4 @@ def test_the_table_grows_where_cells_share_no_blocks(rng: np.random.Generator) -
     corners = np.floor(points / 0.5).astype(int)[:, None] - np.indices((2, 2, 2)).reshape(3, 8).T
     _, counts = np.unique(corners.reshape(-1, 3), axis=0, return_counts=True)
     assert np.sort(grid.counts).tolist() == np.sort(counts[counts >= 3]).tolist()
-    assert all(find_block(grid.keys, grid.rows, *np.floor(p / 0.5).astype(int).tolist()) >= 0 for p in points[::30])
+    assert all(find_block(grid.table, *np.floor(p / 0.5).astype(int).tolist()) >= 0 for p in points[::30])

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from numba import njit
 
 from ndt_registration.edges import rim_points
+from ndt_registration.moments import block_counts, block_moments
 from ndt_registration.visibility import mean_spacing, range_image
-from ndt_registration.voxel_grid import block_counts, block_moments
 from slam_core.geometry import FloatArray
 
 _COVERAGE_SIZE = 64
@@ -104,8 +104,17 @@ def is_planar(points: npt.ArrayLike) -> bool:
 
 def prepare(points: FloatArray, limit: int, *, planar: bool, centre: FloatArray) -> Cloud:
     """Thin finite points (n, 3) to at most ``limit`` and move ``centre`` to the origin."""
+    return thinned(evened(points - centre if centre.any() else points), limit, planar=planar)
+
+
+def evened(points: FloatArray) -> FloatArray:
+    """Finite points (n, 3) without strays, and where they crowd together, their means in small blocks."""
+    return _evened(*_without_strays(points))
+
+
+def thinned(points: FloatArray, limit: int, *, planar: bool) -> Cloud:
+    """The cloud of at most ``limit`` of :func:`evened` points (n, 3)."""
     rng = np.random.default_rng(_SEED)
-    points = _evened(*_without_strays(points - centre if centre.any() else points))
     n = len(points)
     if n > limit:
         points = points[((np.arange(limit) + rng.random(limit)) * (n / limit)).astype(np.int64)]

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from numba import njit
 
 from ndt_registration.block_table import MAX_CELLS_PER_AXIS, Int32Array, find_block
-from ndt_registration.voxel_grid import NormalGrid
+from ndt_registration.voxel_grid import ABSENT, NormalGrid
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 
@@ -31,8 +31,6 @@ _VALUES = 9
 NOWHERE = -(2**31)
 """Coordinate that no block has."""
 _REACH = float(MAX_CELLS_PER_AXIS)
-_ABSENT = np.float32(1e18)
-"""Mean of a cell that is not there: so far off that it does not count."""
 FAR = np.float32(20.0)
 """Half a squared Mahalanobis distance beyond which a cell does not count."""
 _SIXTEENTH = np.float32(-1.0 / 16.0)
@@ -95,7 +93,7 @@ def gather(
         if at.block[begin + j, 3] != -1:
             at.block[begin + j, 3] = -1
             for k in range(8):
-                _set_absent(cells, np.uintp(k * _VALUES * LANES + j), True)
+                _set_absent(cells, np.uintp(k * _VALUES * LANES + j))
     return count
 
 
@@ -112,12 +110,15 @@ def _move(
     corner: Int32Array,
 ) -> None:
     inverse_size = 1.0 / size
+    xa, xb, xc, xt = R[0, 0], R[0, 1], R[0, 2], t[0]
+    ya, yb, yc, yt = R[1, 0], R[1, 1], R[1, 2], t[1]
+    za, zb, zc, zt = R[2, 0], R[2, 1], R[2, 2], t[2]
     for j in range(count):
         x, y, z = points[first + j, 0], points[first + j, 1], points[first + j, 2]
-        px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
-        py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
-        pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
-        mx, my, mz = px + t[0], py + t[1], pz + t[2]
+        px = xa * x + xb * y + xc * z
+        py = ya * x + yb * y + yc * z
+        pz = za * x + zb * y + zc * z
+        mx, my, mz = px + xt, py + yt, pz + zt
         ix = min(max(np.floor(mx * inverse_size), -_REACH), _REACH)
         iy = min(max(np.floor(my * inverse_size), -_REACH), _REACH)
         iz = min(max(np.floor(mz * inverse_size), -_REACH), _REACH)
@@ -126,19 +127,17 @@ def _move(
         corner[j], corner[LANES + j], corner[2 * LANES + j] = np.int32(ix), np.int32(iy), np.int32(iz)
 
 
-@in_place()
-def _look_up(grid: NormalGrid, ix: int, iy: int, iz: int, block: Int32Array, cells: Float32Array, lane: int) -> None:
+# Inlined here: a call would pass the hundred numbers that a grid's arrays consist of.
+@njit(cache=True, nogil=True, inline="always")
+def _look_up(grid, ix, iy, iz, block, cells, lane):  # type: ignore[no-untyped-def]
     """Write a block, its row, and its cells into a lane."""
-    row = find_block(grid.keys, grid.rows, ix, iy, iz)
-    fresh, size, records = block[0] == NOWHERE, np.float32(grid.block_size), grid.records
+    row = find_block(grid.table, ix, iy, iz)
+    size, records, absent = np.float32(grid.block_size), grid.records, grid.records.shape[0] - 1
     block[0], block[1], block[2], block[3] = ix, iy, iz, row
     for k in range(8):
         start = np.uintp(k * _VALUES * LANES + lane)
         cell = grid.cells[row, k] if row >= 0 else -1
-        if cell < 0:
-            _set_absent(cells, start, fresh)
-            continue
-        c = np.uintp(cell)
+        c = np.uintp(cell if cell >= 0 else absent)
         cells[start] = records[c, np.uintp(0)] - size * np.float32(k & 1)
         cells[start + _ROW] = records[c, np.uintp(1)] - size * np.float32((k >> 1) & 1)
         cells[start + _ROW * np.uintp(2)] = records[c, np.uintp(2)] - size * np.float32(k >> 2)
@@ -151,12 +150,11 @@ def _look_up(grid: NormalGrid, ix: int, iy: int, iz: int, block: Int32Array, cel
 
 
 @in_place()
-def _set_absent(cells: Float32Array, start: int, fresh: bool) -> None:
-    """Move a cell far off; what it held may stay, but for the memory's first contents, which may be no numbers."""
-    if fresh:
-        for j in range(_VALUES):
-            cells[start + _ROW * np.uintp(j)] = _ZERO
-    cells[start], cells[start + _ROW * np.uintp(3)] = _ABSENT, _ONE
+def _set_absent(cells: Float32Array, start: int) -> None:
+    """Move a cell far off, and set the rest, which may be the memory's first contents, to numbers."""
+    for j in range(_VALUES):
+        cells[start + _ROW * np.uintp(j)] = _ZERO
+    cells[start], cells[start + _ROW * np.uintp(3)] = ABSENT, _ONE
 
 
 # Sums may be reordered, which vectorising takes, but products not fused with them: a copy of this compiled into another
@@ -216,7 +214,7 @@ def mean_over_cells(cells: Float32Array, place: Float32Array, sums: Float32Array
     for k in range(8):
         for j in range(LANES):
             sums[j] += bell(exponent_in_cell(cells, k, place, j))
-            sums[LANES + j] += _ONE if cells[k * _VALUES * LANES + j] < _ABSENT else _ZERO
+            sums[LANES + j] += _ONE if cells[k * _VALUES * LANES + j] < ABSENT else _ZERO
     for j in range(LANES):
         cells_there = sums[LANES + j]
         sums[j] = sums[j] / max(cells_there, _ONE) if cells_there > _ZERO else -_ONE

@@ -147,7 +147,7 @@ def _sums_of_fit(points, R, t, grid, max_distance, at, room, hessian_moments, ma
             row = at.block[j, 3]
             for k in range(8):
                 cell = grid.cells[row, k] if row >= 0 else -1
-                room[k * LANES + j] = grid.records[cell, SPURIOUS] if cell >= 0 else _ZERO
+                room[k * LANES + j] = grid.records[cell, SPURIOUS]  # the last where there is none
         _fit_of_cells(at.cells[0], at.place, room)
         _add_moments(at.turned, room, 9, majorant_moments)
         _add_moments(at.turned, room, 10, hessian_moments)

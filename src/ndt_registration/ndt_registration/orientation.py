@@ -11,11 +11,12 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
+from ndt_registration.moments import block_moments
 from ndt_registration.visibility import direction_bin
-from ndt_registration.voxel_grid import block_moments, plane_fits
+from ndt_registration.voxel_grid import plane_fits
 from slam_core.geometry import FloatArray, so3_exp
+from slam_core.in_place import in_place
 
 _IMAGE_SIZE = 48
 """Edge of the octahedral map of directions: bins of about 4 degrees."""
@@ -109,34 +110,55 @@ def _direction_image(normals: FloatArray, width: float) -> FloatArray:
     return np.asarray(image / max(image.max(), 1e-300))
 
 
-@njit(cache=True, nogil=True)
 def direction_density(directions: FloatArray, normals: FloatArray, width: float) -> FloatArray:
     """Mean over normals (n, 3) of a bell of standard deviation ``width`` rad, at unit directions (k, 3)."""
-    out = np.zeros(directions.shape[0])
-    least = 1.0 - 8.0 * width * width
-    for i in range(directions.shape[0]):
-        for j in range(normals.shape[0]):
-            cosine = (
-                directions[i, 0] * normals[j, 0] + directions[i, 1] * normals[j, 1] + directions[i, 2] * normals[j, 2]
-            )
-            if cosine > least:
-                out[i] += np.exp((cosine - 1.0) / (width * width))
-        out[i] /= normals.shape[0]
+    out = np.empty(len(directions))
+    _fill_density(directions, np.ascontiguousarray(normals.T), 1.0 / (width * width), out)
     return out
 
 
-@njit(cache=True, nogil=True)
+# Here and below no branch and sums in any order: so the compiler takes eight normals at once.
+@in_place(fastmath={"reassoc"}, error_model="numpy")
+def _fill_density(directions, normals, inverse_variance, out):  # type: ignore[no-untyped-def]
+    """The bell is 0 beyond four standard deviations: a power of 16 of a Taylor series, which errs by 1e-7."""
+    nx, ny, nz = normals[0], normals[1], normals[2]
+    for i in range(directions.shape[0]):
+        x, y, z, total = directions[i, 0], directions[i, 1], directions[i, 2], 0.0
+        for j in range(normals.shape[1]):
+            exponent = (1.0 - (x * nx[j] + y * ny[j] + z * nz[j])) * inverse_variance
+            t = min(exponent, _FARTHEST_EXPONENT) * (-1.0 / 16.0)
+            e = 1.0 + t * (1.0 + t * (0.5 + t * (_C3 + t * (_C4 + t * (_C5 + t * (_C6 + t * (_C7 + t * _C8)))))))
+            e *= e
+            e *= e
+            e *= e
+            e *= e
+            total += e if exponent < _FARTHEST_EXPONENT else 0.0
+        out[i] = total / normals.shape[1]
+
+
+_FARTHEST_EXPONENT = 8.0
+_C3, _C4, _C5, _C6, _C7, _C8 = 1 / 6, 1 / 24, 1 / 120, 1 / 720, 1 / 5040, 1 / 40320
+
+
 def rotation_scores(
     rotations: FloatArray, normals: FloatArray, weights: FloatArray, image: FloatArray, size: int
 ) -> FloatArray:
     """Weighted mean of an image of directions at the normals (n, 3) turned by each rotation (k, 3, 3)."""
-    out = np.zeros(rotations.shape[0])
-    for k in range(rotations.shape[0]):
-        R = rotations[k]
-        for i in range(normals.shape[0]):
-            a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
-            x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
-            y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-            z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
-            out[k] += weights[i] * image[direction_bin(x, y, z, size)]
+    out = np.empty(len(rotations))
+    _fill_scores(rotations, np.ascontiguousarray(normals.T), weights, image, np.int32(size), out)
     return out
+
+
+@in_place(fastmath={"reassoc"}, error_model="numpy")
+def _fill_scores(rotations, normals, weights, image, size, out):  # type: ignore[no-untyped-def]
+    nx, ny, nz = normals[0], normals[1], normals[2]
+    for k in range(rotations.shape[0]):
+        xa, xb, xc = rotations[k, 0, 0], rotations[k, 0, 1], rotations[k, 0, 2]
+        ya, yb, yc = rotations[k, 1, 0], rotations[k, 1, 1], rotations[k, 1, 2]
+        za, zb, zc = rotations[k, 2, 0], rotations[k, 2, 1], rotations[k, 2, 2]
+        total = 0.0
+        for i in range(normals.shape[1]):
+            a, b, c = nx[i], ny[i], nz[i]
+            x, y, z = xa * a + xb * b + xc * c, ya * a + yb * b + yc * c, za * a + zb * b + zc * c
+            total += weights[i] * image[direction_bin(x, y, z, size)]
+        out[k] = total

@@ -6,16 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ndt_registration.cloud import Cloud
+from ndt_registration.moments import Moments, block_moments, coarser
 from ndt_registration.ndt import Layer
-from ndt_registration.voxel_grid import (
-    Moments,
-    NormalGrid,
-    adopt_planes,
-    block_moments,
-    coarser,
-    normal_grid,
-    note_spurious_information,
-)
+from ndt_registration.voxel_grid import NormalGrid, adopt_planes, normal_grid, note_spurious_information
 from slam_core.config import Config, parameter
 
 _BLOCK_POINTS = 1.2

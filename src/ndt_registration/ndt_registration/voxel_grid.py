@@ -16,52 +16,41 @@ import numpy.typing as npt
 from numba import njit
 
 from ndt_registration.block_table import (
-    MAX_CELLS_PER_AXIS,
+    BlockTable,
     Int32Array,
     IntArray,
-    doubled,
+    block_table,
+    brick_around,
     find_block,
-    hash_table,
-    pack_key,
-    slot_of,
+    has_room,
+    place_in_brick,
+    with_room,
 )
-from ndt_registration.eigen import symmetric_eigen3
+from ndt_registration.eigen import LANES, symmetric_eigen3
+from ndt_registration.moments import ENTRIES_PER_BRICK, Moments, accumulated
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
 
 Float32Array = npt.NDArray[np.float32]
 
-_SHARED = 2
-"""So many corners for each entry are made room for at first: surfaces need two to three for each."""
+ABSENT = np.float32(1e18)
+"""Mean of a cell that is not there: so far off that it does not count."""
 SPURIOUS = 9
 """Column of a cell's record that holds the information along its plane that errors of its normal make."""
-
-
-class Moments(NamedTuple):
-    """Sums over the points of each block.
-
-    Corner (m, 3) in blocks, counts (m,), sums (m, 3), outers (m, 6) xx xy xz yy yz zz.
-    """
-
-    corner: IntArray
-    counts: FloatArray
-    sums: FloatArray
-    outers: FloatArray
 
 
 class NormalGrid(NamedTuple):
     """Normal distributions in overlapping cells of edge ``2 * block_size``, as flat arrays for the kernels.
 
-    ``keys`` and ``rows`` are the hash table of blocks; ``cells`` (m, 8) holds the cells that cover a block, -1 where
-    there is none; ``mean`` (k, 3), ``information`` (k, 6) upper triangle of the inverse covariance, ``normal`` (k, 3)
-    direction of least variance, ``variance`` (k, 3) raw ascending eigenvalues, ``counts`` (k,) points. ``records``
-    (k, 16): mean from the cell's own corner (3) and information (6) once more, one cell in one line of the cache, and
-    what :func:`note_spurious_information` writes.
+    ``table`` holds the rows of blocks; ``cells`` (m, 8) holds the cells that cover a block, -1 where there is none;
+    ``mean`` (k, 3), ``information`` (k, 6) upper triangle of the inverse covariance, ``normal`` (k, 3) direction of
+    least variance, ``variance`` (k, 3) raw ascending eigenvalues, ``counts`` (k,) points. ``records`` (k + 1, 16): mean
+    from the cell's own corner (3) and information (6) once more, one cell in one line of the cache, and what
+    :func:`note_spurious_information` writes; the last stands for cells that are not there.
     """
 
     block_size: float
-    keys: IntArray
-    rows: Int32Array
+    table: BlockTable
     cells: Int32Array
     mean: FloatArray
     information: FloatArray
@@ -69,89 +58,6 @@ class NormalGrid(NamedTuple):
     variance: FloatArray
     counts: FloatArray
     records: Float32Array
-
-
-@njit(cache=True, nogil=True)
-def _numbered_corners(corner: IntArray, children: int) -> tuple[Int32Array, IntArray]:
-    """Number (n * children,) of each entry's corners, in order of first appearance, and those corners (m, 3).
-
-    The table starts with the room that surfaces take, where children share most corners, and grows where that fails.
-    """
-    n = corner.shape[0]
-    keys = hash_table(n * _SHARED if children > 1 else n)
-    rows = np.empty(keys.shape[0], np.int32)
-    number, out = np.empty(n * children, np.int32), np.empty((n * children, 3), np.int64)
-    used = 0
-    for i in range(n):
-        if 2 * (used + children) > keys.shape[0]:
-            keys, rows = doubled(keys, rows)
-        for child in range(children):
-            ix = corner[i, 0] - (child & 1)
-            iy = corner[i, 1] - ((child >> 1) & 1)
-            iz = corner[i, 2] - (child >> 2)
-            key = pack_key(ix, iy, iz)
-            slot = slot_of(keys, key)
-            if keys[slot] == -1:
-                keys[slot], rows[slot] = key, used
-                out[used, 0], out[used, 1], out[used, 2] = ix, iy, iz
-                used += 1
-            number[i * children + child] = rows[slot]
-    return number, out[:used].copy()
-
-
-@njit(cache=True, nogil=True)
-def _accumulate(
-    corner: IntArray, count: FloatArray, first: FloatArray, outer: FloatArray, children: int
-) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Sum entries with equal corners; with ``children`` = 8 each entry goes to the eight corners below it as well."""
-    number, out_corner = _numbered_corners(corner, children)
-    used = out_corner.shape[0]
-    out_count, out_sum, out_outer = np.zeros(used), np.zeros((used, 3)), np.zeros((used, 6))
-    for i in range(corner.shape[0]):
-        for child in range(children):
-            row = number[i * children + child]
-            out_count[row] += count[i]
-            for k in range(3):
-                out_sum[row, k] += first[i, k]
-            for k in range(6):
-                out_outer[row, k] += outer[i, k]
-    return out_corner, out_count, out_sum, out_outer
-
-
-@njit(cache=True, nogil=True)
-def _point_moments(points: FloatArray, block_size: float) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Moments of the points' blocks, in order of first appearance."""
-    n = points.shape[0]
-    keys = hash_table(n)
-    rows = np.empty(keys.shape[0], np.int32)
-    corner = np.empty((n, 3), np.int64)
-    count = np.zeros(n)
-    first = np.zeros((n, 3))
-    outer = np.zeros((n, 6))
-    used, last, row = 0, -1, 0
-    for i in range(n):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        ix, iy, iz = int(np.floor(x / block_size)), int(np.floor(y / block_size)), int(np.floor(z / block_size))
-        key = pack_key(ix, iy, iz)
-        if key != last:  # neighbours in the list often share a block
-            slot = slot_of(keys, key)
-            if keys[slot] == -1:
-                keys[slot] = key
-                rows[slot] = used
-                corner[used, 0], corner[used, 1], corner[used, 2] = ix, iy, iz
-                used += 1
-            last, row = key, int(rows[slot])
-        count[row] += 1.0
-        first[row, 0] += x
-        first[row, 1] += y
-        first[row, 2] += z
-        outer[row, 0] += x * x
-        outer[row, 1] += x * y
-        outer[row, 2] += x * z
-        outer[row, 3] += y * y
-        outer[row, 4] += y * z
-        outer[row, 5] += z * z
-    return corner[:used], count[:used], first[:used], outer[:used]
 
 
 @njit(cache=True, nogil=True)
@@ -165,114 +71,105 @@ def _distributions(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Mean, information, normal and raw eigenvalues of each cell; see :func:`normal_grid` for floor and slack."""
     n = count.shape[0]
-    mean = np.empty((n, 3))
-    information = np.empty((n, 6))
-    normal = np.empty((n, 3))
-    variance = np.empty((n, 3))
-    a = np.empty((3, 3))
-    vectors = np.empty((3, 3))
-    values = np.empty(3)
-    for i in range(n):
-        for k in range(3):
-            mean[i, k] = first[i, k] / count[i]
-        m = 0
-        for r in range(3):
-            for c in range(r, 3):
-                a[r, c] = (outer[i, m] - count[i] * mean[i, r] * mean[i, c]) / (count[i] - 1.0)
-                a[c, r] = a[r, c]
-                m += 1
-        symmetric_eigen3(a, vectors, values)
-        floor = max(relative_floor * values[2], variance_floor)
-        free = slack / max(values[2], floor)
-        m = 0
-        for r in range(3):
-            normal[i, r] = vectors[r, 0]
-            variance[i, r] = max(values[r], 0.0)
-            for c in range(r, 3):
-                s = 0.0
-                for k in range(3):
-                    s += vectors[r, k] * vectors[c, k] * max(1.0 / max(values[k], floor) - free, 0.0)
-                information[i, m] = s
-                m += 1
+    mean, information = np.empty((n, 3)), np.empty((n, 6))
+    normal, variance = np.empty((n, 3)), np.empty((n, 3))
+    room, a, vectors, values = np.empty(19 * LANES), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    for start in range(0, n, LANES):
+        _read_covariances(count, first, outer, start, mean, room)
+        symmetric_eigen3(room, a, vectors, values)
+        for j in range(min(LANES, n - start)):
+            for k in range(3):
+                variance[start + j, k] = max(room[(6 + k) * LANES + j], 0.0)
+                normal[start + j, k] = room[(9 + k) * LANES + j]
+        _invert(room, relative_floor, variance_floor, slack)
+        for j in range(min(LANES, n - start)):
+            for k in range(6):
+                information[start + j, k] = room[k * LANES + j]
     return mean, information, normal, variance
 
 
+@in_place(error_model="numpy")
+def _read_covariances(count, first, outer, start, mean, room):  # type: ignore[no-untyped-def]
+    """Write means (n, 3), and covariances to the first six rows of ``room``; the last one fills what would be empty."""
+    last = count.shape[0] - 1
+    for j in range(LANES):
+        i = min(start + j, last)
+        n, freedom = count[i], count[i] - 1.0
+        x, y, z = first[i, 0] / n, first[i, 1] / n, first[i, 2] / n
+        mean[i, 0], mean[i, 1], mean[i, 2] = x, y, z
+        room[j] = (outer[i, 0] - n * x * x) / freedom
+        room[LANES + j] = (outer[i, 1] - n * x * y) / freedom
+        room[2 * LANES + j] = (outer[i, 2] - n * x * z) / freedom
+        room[3 * LANES + j] = (outer[i, 3] - n * y * y) / freedom
+        room[4 * LANES + j] = (outer[i, 4] - n * y * z) / freedom
+        room[5 * LANES + j] = (outer[i, 5] - n * z * z) / freedom
+
+
+@in_place(error_model="numpy")
+def _invert(room, relative_floor, variance_floor, slack):  # type: ignore[no-untyped-def]
+    """Information in the first six rows of ``room`` from the eigenvalues and vectors in those after them."""
+    for j in range(LANES):
+        floor = max(relative_floor * room[8 * LANES + j], variance_floor)
+        free = slack / max(room[8 * LANES + j], floor)
+        a = max(1.0 / max(room[6 * LANES + j], floor) - free, 0.0)
+        b = max(1.0 / max(room[7 * LANES + j], floor) - free, 0.0)
+        c = max(1.0 / max(room[8 * LANES + j], floor) - free, 0.0)
+        ax, ay, az = room[9 * LANES + j], room[10 * LANES + j], room[11 * LANES + j]
+        bx, by, bz = room[12 * LANES + j], room[13 * LANES + j], room[14 * LANES + j]
+        cx, cy, cz = room[15 * LANES + j], room[16 * LANES + j], room[17 * LANES + j]
+        room[j] = a * ax * ax + b * bx * bx + c * cx * cx
+        room[LANES + j] = a * ax * ay + b * bx * by + c * cx * cy
+        room[2 * LANES + j] = a * ax * az + b * bx * bz + c * cx * cz
+        room[3 * LANES + j] = a * ay * ay + b * by * by + c * cy * cy
+        room[4 * LANES + j] = a * ay * az + b * by * bz + c * cy * cz
+        room[5 * LANES + j] = a * az * az + b * bz * bz + c * cz * cz
+
+
 @njit(cache=True, nogil=True)
-def _cover(corner: IntArray) -> tuple[IntArray, Int32Array, Int32Array]:
-    """Hash table from a block to the eight cells that cover it, in a fixed order of offsets."""
+def _records(mean: FloatArray, information: FloatArray, corner: IntArray, block_size: float) -> Float32Array:
+    """See :class:`NormalGrid`."""
+    records = np.zeros((mean.shape[0] + 1, 16), np.float32)
+    records[-1, 0], records[-1, 3] = ABSENT, 1.0
+    for i in range(mean.shape[0]):
+        for k in range(3):
+            records[i, k] = mean[i, k] - block_size * corner[i, k]
+        for k in range(6):
+            records[i, 3 + k] = information[i, k]
+    return records
+
+
+@njit(cache=True, nogil=True)
+def _cover(corner: IntArray) -> tuple[BlockTable, Int32Array]:
+    """Table from a block to the eight cells that cover it, in a fixed order of offsets."""
     n = corner.shape[0]
-    keys = hash_table(_SHARED * n)
-    rows = np.empty(keys.shape[0], np.int32)
-    cells = np.empty((8 * n, 8), np.int32)
-    used = 0
-    for i in range(n):
-        if 2 * (used + 8) > keys.shape[0]:
-            keys, rows = doubled(keys, rows)
-        for child in range(8):
-            key = pack_key(corner[i, 0] + (child & 1), corner[i, 1] + ((child >> 1) & 1), corner[i, 2] + (child >> 2))
-            slot = slot_of(keys, key)
-            if keys[slot] == -1:
-                keys[slot], rows[slot] = key, used
-                cells[used] = -1
-                used += 1
-            cells[rows[slot], child] = i
-    return keys, rows, cells[:used].copy()
-
-
-@njit(cache=True, nogil=True)
-def _point_counts(points: FloatArray, block_size: float) -> FloatArray:
-    """Points of each block, in order of first appearance."""
-    n = points.shape[0]
-    keys, count = hash_table(n), np.zeros(n)
-    rows = np.empty(keys.shape[0], np.int32)
-    return count[: _count_points(points, block_size, keys, rows, count)]
+    table = block_table(n // ENTRIES_PER_BRICK + 8)
+    cells, bricks = np.empty((8 * n, 8), np.int32), np.empty(8, np.int32)
+    done, used = 0, 0
+    while done < n:
+        table = with_room(table, 8)
+        done, used = _cover_blocks(corner, table, bricks, cells, done, used)
+    return table, cells[:used].copy()
 
 
 @in_place()
-def _count_points(points: FloatArray, block_size: float, keys: IntArray, rows: Int32Array, count: FloatArray) -> int:
-    """Fill an empty table, and ``count`` row by row; returns the number of blocks."""
-    used, last, row = 0, -1, 0
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        key = pack_key(int(np.floor(x / block_size)), int(np.floor(y / block_size)), int(np.floor(z / block_size)))
-        if key != last:  # neighbours in a picture often share a block
-            slot = slot_of(keys, key)
-            if keys[slot] == -1:
-                keys[slot] = key
-                rows[slot] = used
+def _cover_blocks(corner, table, bricks, cells, done, used):  # type: ignore[no-untyped-def]
+    """Enter cells from ``done`` on at their eight blocks while the table has room; returns the next cell and row."""
+    while done < corner.shape[0] and has_room(table, 8):
+        x, y, z = corner[done, 0], corner[done, 1], corner[done, 2]
+        bricks[:] = -1
+        for child in range(8):
+            ix, iy, iz = x + (child & 1), y + ((child >> 1) & 1), z + (child >> 2)
+            brick, place = brick_around(table, x, y, z, ix, iy, iz, bricks), place_in_brick(ix, iy, iz)
+            row = table.rows[brick, place]
+            if row < 0:
+                row = used
+                table.rows[brick, place] = row
+                for k in range(8):
+                    cells[row, k] = -1
                 used += 1
-            last, row = key, int(rows[slot])
-        count[row] += 1.0
-    return used
-
-
-def block_counts(points: FloatArray, block_size: float) -> FloatArray:
-    """Points (m,) in each block of :func:`block_moments`, in half of the time."""
-    _require_keys(points, block_size)
-    return np.asarray(_point_counts(np.ascontiguousarray(points, dtype=np.float64), block_size))
-
-
-def block_moments(points: FloatArray, block_size: float) -> Moments:
-    """Sums over the points, shape (n, 3) m, in blocks of edge ``block_size`` m.
-
-    Raises
-    ------
-    ValueError
-        If the blocks are so small beside the extent of the cloud that their coordinates overflow the hash key.
-    """
-    _require_keys(points, block_size)
-    return Moments(*_point_moments(np.ascontiguousarray(points, dtype=np.float64), block_size))
-
-
-def _require_keys(points: FloatArray, block_size: float) -> None:
-    reach = float(np.abs(points).max(initial=0.0)) / block_size
-    if not reach < MAX_CELLS_PER_AXIS:
-        raise ValueError(f"blocks of {block_size} m are too small for a cloud that reaches {reach * block_size:.3g} m")
-
-
-def coarser(moments: Moments) -> Moments:
-    """Moments in blocks of twice the edge."""
-    return Moments(*_accumulate(moments.corner >> 1, moments.counts, moments.sums, moments.outers, 1))
+            cells[row, child] = done
+        done += 1
+    return done, used
 
 
 def normal_grid(
@@ -283,17 +180,13 @@ def normal_grid(
     Each eigenvalue of a cell's covariance is at least ``relative_floor`` times the largest (8.2.1) and
     ``variance_floor`` m2.
     """
-    corner, count, first, outer = _accumulate(moments.corner, moments.counts, moments.sums, moments.outers, 8)
-    keep = count >= max(min_points, 2)
-    count = count[keep]
-    mean, information, normal, variance = _distributions(
-        count, first[keep], outer[keep], relative_floor, variance_floor, slack
+    corner, count, first, outer = accumulated(
+        moments.corner, moments.counts, moments.sums, moments.outers, 8, max(min_points, 2)
     )
-    corner = corner[keep]
-    keys, rows, cells = _cover(corner)
-    records = np.zeros((len(mean), 16), np.float32)
-    records[:, :3], records[:, 3:9] = mean - block_size * corner, information
-    return NormalGrid(block_size, keys, rows, cells, mean, information, normal, variance, count, records)
+    mean, information, normal, variance = _distributions(count, first, outer, relative_floor, variance_floor, slack)
+    table, cells = _cover(corner)
+    records = _records(mean, information, corner, block_size)
+    return NormalGrid(block_size, table, cells, mean, information, normal, variance, count, records)
 
 
 def plane_fits(moments: Moments, min_points: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -312,7 +205,7 @@ _TINY = 1e-12
 def _nearest_cell(grid: NormalGrid, x: float, y: float, z: float) -> int:
     """Of the eight cells around a place (in edges of a block), that whose centre is nearest; -1: none."""
     ix, iy, iz = np.floor(x), np.floor(y), np.floor(z)
-    row = find_block(grid.keys, grid.rows, int(ix), int(iy), int(iz))
+    row = find_block(grid.table, int(ix), int(iy), int(iz))
     if row < 0:
         return -1
     return int(grid.cells[row, int(x - ix < 0.5) + 2 * int(y - iy < 0.5) + 4 * int(z - iz < 0.5)])
