@@ -7,11 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ndt_registration import edges
 from ndt_registration.near_field import FULL, lattice_costs, near_field
-from ndt_registration.orientation import _bin_directions, best_rotations, direction_density, facing_normals
+from ndt_registration.orientation import (
+    _bin_directions,
+    best_rotations,
+    direction_density,
+    facing_normals,
+    rotation_scores,
+)
 from ndt_registration.search import PRICES
-from ndt_registration.visibility import direction_bin, range_image, visibility_cost
-from slam_core.geometry import FloatArray, so3_exp, so3_log
+from ndt_registration.visibility import LEAST_MATCH, direction_bin, range_image, visibility_cost
+from slam_core.geometry import FloatArray, make_transform, so3_exp, so3_log
 
 
 def test_facing_normals_of_a_wall_look_at_the_viewer(rng: np.random.Generator) -> None:
@@ -69,4 +76,44 @@ def test_the_lattice_prefers_the_true_pose(room: Any, start: FloatArray, at: Cal
     assert costs.shape == (1, 4)
     assert costs.argmin() == 0
     without = lattice_costs(source, np.eye(3)[None], shifts, image, 0.1, PRICES, field, 0.0)[0]
-    assert without[0] == pytest.approx(visibility_cost(source, shifts[0], image, 0.1, PRICES), abs=1e-9)
+    assert without[0] == pytest.approx(
+        visibility_cost(source, make_transform(np.eye(3), shifts[0]), image, 0.1, PRICES), abs=1e-9
+    )
+
+
+def test_visibility_cost_is_the_mean_over_points(rng: np.random.Generator) -> None:
+    seen = rng.normal([0.0, 0.0, 2.0], size=(4000, 3))
+    image = range_image(3.0 * seen / np.linalg.norm(seen, axis=1, keepdims=True), 16)
+    points, T = rng.normal([0.0, 0.2, 3.0], 0.8, size=(203, 3)), make_transform(np.eye(3), np.array([0.1, 0.0, 0.3]))
+    cost, matches = 0.0, 0
+    for x, y, z in points + T[:3, 3]:
+        k, r = direction_bin(x, y, z, np.int32(16)), np.sqrt(x * x + y * y + z * z)
+        near, far = image.near[k], image.far[k]
+        if far == 0.0:
+            cost += PRICES.unseen
+        elif r > far + 0.1:
+            cost += PRICES.hidden * min((r - far) / 0.1 - 1.0, 1.0)
+        elif r < near - 0.1:
+            cost += PRICES.free * min((near - r) / 0.1 - 1.0, 1.0)
+        else:
+            matches += 1
+    assert 10 < matches < 0.5 * len(points)
+    expected = cost / len(points) + max(1.0 - matches / len(points) / LEAST_MATCH, 0.0)
+    assert visibility_cost(points, T, image, 0.1, PRICES) == pytest.approx(expected, abs=1e-12)
+
+
+def test_rotation_scores_look_up_the_turned_normals(rng: np.random.Generator) -> None:
+    normals, weights, image = rng.normal(size=(37, 3)), rng.random(37), rng.random(16 * 16)
+    R = so3_exp(rng.normal(size=(5, 3)))
+    expected = [sum(w * image[direction_bin(*n, 16)] for w, n in zip(weights, normals @ r.T, strict=True)) for r in R]
+    np.testing.assert_allclose(rotation_scores(R, normals, weights, image, 16), expected, atol=1e-12)
+
+
+def test_no_rim_is_lost_where_nothing_farther_is_near(room: Any, start: FloatArray) -> None:
+    points = room.scan(start, np.random.default_rng(3))[::7].copy()
+    size, reach, step = 40, 0.03, 0.1
+    sorted_points = edges._sorted_by_bin(points, size)
+    found = [np.zeros_like(points) for _ in range(2)]
+    for out, farthest in zip(found, (sorted_points[4], np.full(size * size, np.inf)), strict=True):
+        assert edges._find_rims(size, reach, step, *sorted_points[:4], farthest, out) > 20
+    np.testing.assert_array_equal(*found)

@@ -24,12 +24,13 @@ MAX_IMAGE_SIZE = 512
 
 
 @njit(cache=True, nogil=True)
-def _sorted_by_bin(points: FloatArray, size: int) -> tuple[FloatArray, FloatArray, Int32Array, Int32Array]:
+def _sorted_by_bin(points: FloatArray, size: int) -> tuple[FloatArray, FloatArray, Int32Array, Int32Array, FloatArray]:
     """Unit directions (n, 3) and ranges (n,) in the order of their bins.
 
-    Also the bin of each, and the first of each bin (size^2 + 1,).
+    Also the bin of each, the first of each bin (size^2 + 1,) and the farthest range of each bin (size^2,).
     """
     n = points.shape[0]
+    farthest = np.zeros(size * size)
     bins = np.empty(n, np.int32)
     first = np.zeros(size * size + 1, np.int32)
     for i in range(n):
@@ -44,9 +45,10 @@ def _sorted_by_bin(points: FloatArray, size: int) -> tuple[FloatArray, FloatArra
         place[bins[i]] += 1
         r = np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2)
         ranges[j], sorted_bins[j] = r, bins[i]
+        farthest[bins[i]] = max(farthest[bins[i]], r)
         for c in range(3):
             directions[j, c] = points[i, c] / max(r, 1e-12)
-    return directions, ranges, sorted_bins, first
+    return directions, ranges, sorted_bins, first, farthest
 
 
 @in_place()
@@ -88,11 +90,21 @@ def _surface_goes_on(
     return False
 
 
+@in_place()
+def _farthest_around(k: int, size: int, farthest: FloatArray) -> float:
+    """Farthest range in a bin and those beside it."""
+    row, column, limit = k // size, k % size, 0.0
+    for a in range(max(row - 1, 0), min(row + 2, size)):
+        for b in range(max(column - 1, 0), min(column + 2, size)):
+            limit = max(limit, farthest[a * size + b])
+    return limit
+
+
 @njit(cache=True, nogil=True)
 def _rims(points: FloatArray, size: int, reach: float, step: float) -> FloatArray:
-    d, r, bins, first = _sorted_by_bin(points, size)
+    d, r, bins, first, farthest = _sorted_by_bin(points, size)
     out = np.empty((points.shape[0], 3))
-    used = _find_rims(size, reach, step, d, r, bins, first, out)
+    used = _find_rims(size, reach, step, d, r, bins, first, farthest, out)
     return out[:used].copy()
 
 
@@ -105,11 +117,16 @@ def _find_rims(
     r: FloatArray,
     bins: Int32Array,
     first: Int32Array,
+    farthest: FloatArray,
     out: FloatArray,
 ) -> int:
     """Write the rims to ``out``; returns their number."""
-    used = 0
+    used, last, limit = 0, -1, 0.0
     for i in range(len(r)):
+        if bins[i] != last:
+            last, limit = bins[i], _farthest_around(bins[i], size, farthest)
+        if not limit > r[i] + step:  # on most surfaces nothing is farther by so much
+            continue
         behind = _nearest_behind(i, size, reach, step, d, r, bins, first)
         if behind < 0 or _surface_goes_on(i, behind, size, step, d, r, bins, first):
             continue

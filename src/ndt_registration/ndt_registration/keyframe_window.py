@@ -8,19 +8,20 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from ndt_registration.cloud import Cloud, finite_points, is_planar, prepare
+from ndt_registration.cloud import Cloud, evened, finite_points, is_planar, thinned
 from ndt_registration.pyramid import Pyramid
 from ndt_registration.registration import IMAGE_SIZE, RegistrationConfig, Target, check_cloud
 from ndt_registration.visibility import range_image
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 
 
-class ScanPoints(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ScanPoints:
     """Finite points (n, 3) m of a scan, and whether they came as (n, 2)."""
 
     points: FloatArray
@@ -30,6 +31,14 @@ class ScanPoints(NamedTuple):
     def of(points: npt.ArrayLike) -> ScanPoints:
         """The scan of an array (..., 3) or (..., 2), NaN where invalid."""
         return ScanPoints(finite_points(points), is_planar(points))
+
+    @cached_property
+    def _evened(self) -> FloatArray:
+        return evened(self.points)
+
+    def cloud(self, limit: int) -> Cloud:
+        """At most ``limit`` of the points, made ready for registration; what is alike for all limits is done once."""
+        return thinned(self._evened, limit, planar=self.planar)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +76,7 @@ class KeyframeWindow:
     def add(self, T: FloatArray, covariance: FloatArray, scan: ScanPoints, config: RegistrationConfig) -> None:
         """Append a keyframe and rebuild the target."""
         check_cloud(scan.points, "target", config)
-        cloud = prepare(scan.points, config.target_points, planar=scan.planar, centre=np.zeros(3))
+        cloud = scan.cloud(config.target_points)
         self._keyframes.append(ScanKeyframe(T, covariance, cloud.points, cloud.rims))
         self._target = self._build(cloud, config)
 

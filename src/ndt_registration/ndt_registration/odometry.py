@@ -20,7 +20,15 @@ from ndt_registration.gyro import Gyro, GyroConfig
 from ndt_registration.keyframe_window import KeyframeWindow, ScanPoints
 from ndt_registration.motion_filter import MotionFilter, MotionFilterConfig, rotated
 from ndt_registration.pyramid import GridConfig
-from ndt_registration.registration import RegistrationConfig, RegistrationResult, for_dimension, register
+from ndt_registration.registration import (
+    DegenerateCloudError,
+    RegistrationConfig,
+    RegistrationResult,
+    check_cloud,
+    failure,
+    for_dimension,
+    register_cloud,
+)
 from ndt_registration.uncertainty import UncertaintyConfig
 from slam_core.config import Config, group
 from slam_core.geometry import FloatArray, boxminus, compose_jacobians, invert_transform
@@ -158,15 +166,22 @@ class ScanOdometry:
 
     def _register(self, scan: ScanPoints, *, lost: bool) -> RegistrationResult:
         """The scan's pose in the newest keyframe."""
-        target = self._map.target
-        assert target is not None
-        config = self._registration(scan)
         guess = invert_transform(self._map.newest.T) @ self._filter.T
-        result = self._plausible(register(scan.points, target, guess, config))
+        result = self._plausible(self._registered(scan, guess))
         if not result.converged and lost:
             self._filter.lose()
-            return register(scan.points, target, None, config)
+            return self._registered(scan, None)
         return result
+
+    def _registered(self, scan: ScanPoints, guess: FloatArray | None) -> RegistrationResult:
+        """The scan registered to the map, from a guess or searched."""
+        target, config = self._map.target, self._registration(scan)
+        assert target is not None
+        try:
+            check_cloud(scan.points, "source", config)
+        except DegenerateCloudError as error:
+            return failure(str(error))
+        return register_cloud(scan.cloud(config.source_points), target, guess, config)
 
     def _plausible(self, result: RegistrationResult) -> RegistrationResult:
         """The result, as a failure where it would move the pose too far; where it may slide it does not count."""

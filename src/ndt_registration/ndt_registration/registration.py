@@ -178,10 +178,10 @@ def register(
         check_cloud(points, "source", config)
         prepared = target if isinstance(target, Target) else Target.build(target, config)
     except DegenerateCloudError as error:
-        return _failure(str(error))
+        return failure(str(error))
     cloud = prepare(points, config.source_points, planar=prepared.cloud.planar, centre=prepared.centre)
     guess = None if initial_guess is None else _shifted(np.asarray(initial_guess, dtype=np.float64), -prepared.centre)
-    return _register(cloud, prepared, guess, config)
+    return register_cloud(cloud, prepared, guess, config)
 
 
 class DegenerateCloudError(ValueError):
@@ -210,9 +210,10 @@ def for_dimension(config: RegistrationConfig, *, planar: bool) -> RegistrationCo
     return replace(config, grid=grid, min_points=min(config.min_points, _PLANAR_SCAN_POINTS))
 
 
-def _register(
+def register_cloud(
     source: Cloud, target: Target, guess: FloatArray | None, config: RegistrationConfig
 ) -> RegistrationResult:
+    """:func:`register` of a cloud made ready, with a guess in coordinates about the target's centre."""
     scale = max(target.cloud.scale, 1e-6)
     views = Views(source, range_image(source.points, IMAGE_SIZE), target.cloud, target.image)
     candidates: list[Candidate] = []
@@ -318,7 +319,7 @@ def _result(
         planar_constraint(source.planar) > 0.0,
         config.uncertainty,
     )
-    reason = _reason_of_failure(optimum, fit.overlap, cost)
+    reason = _reason_offailure(optimum, fit.overlap, cost)
     if reason and not 1.0 / _UNITS_APART < source.scale / scale < _UNITS_APART:
         reason = f"the source is {source.scale / scale:.2g} times as large as the target: is one of them in mm?"
     names = direction_names(uncertainty.free)
@@ -342,7 +343,7 @@ _LEAST_RADIUS = 0.05
 """Spread of the matched points, over the scale, below which rotations would be measured against nothing."""
 
 
-def _reason_of_failure(optimum: NdtOptimum, overlap: float, cost: float) -> str:
+def _reason_offailure(optimum: NdtOptimum, overlap: float, cost: float) -> str:
     if overlap < _MIN_OVERLAP:
         needed = 100 * _MIN_OVERLAP
         return f"only {100 * overlap:.0f} % of the source lie on the target, at least {needed:.0f} % are needed"
@@ -353,7 +354,8 @@ def _reason_of_failure(optimum: NdtOptimum, overlap: float, cost: float) -> str:
     return ""
 
 
-def _failure(reason: str) -> RegistrationResult:
+def failure(reason: str) -> RegistrationResult:
+    """Result of a cloud that cannot be registered."""
     return RegistrationResult(np.eye(4), unknown(1.0), False, 0, 0.0, 0.0, 0.0, reason)
 
 

@@ -165,8 +165,7 @@ def judge(views: Views, optimum: NdtOptimum) -> Candidate:
         (views.source.sample(_JUDGE_POINTS), views.target_image, T),
         (views.target.sample(_JUDGE_POINTS), views.source_image, invert_transform(T)),
     ):
-        turned = np.ascontiguousarray(points @ pose[:3, :3].T)
-        conflict += 0.5 * visibility_cost(turned, pose[:3, 3].copy(), image, tolerance, PRICES)
+        conflict += 0.5 * visibility_cost(points, pose, image, tolerance, PRICES)
     curvature = optimum.majorant / max(optimum.points, 1)
     return Candidate(T, conflict - _SCORE_GAIN * score, conflict, score, curvature)
 

@@ -72,37 +72,37 @@ def range_image(points: FloatArray, size: int) -> RangeImage:
     return RangeImage(size, near, far)
 
 
-@in_place()
-def point_cost(x: float, y: float, z: float, image: RangeImage, tolerance: float, costs: Prices) -> tuple[float, bool]:
-    """Cost of a point, from 0 to the full one between 1 and 2 tolerances, and True if it matches a surface."""
-    k = direction_bin(x, y, z, image.size)
-    far = image.far[k]
-    if far == 0.0:
-        return costs.unseen, False
-    r = np.sqrt(x * x + y * y + z * z)
-    if r > far + tolerance:
-        return costs.hidden * min((r - far) / tolerance - 1.0, 1.0), False
-    if r < image.near[k] - tolerance:
-        return costs.free * min((image.near[k] - r) / tolerance - 1.0, 1.0), False
-    return 0.0, True
-
-
-@in_place()
-def visibility_cost(points: FloatArray, t: FloatArray, image: RangeImage, tolerance: float, costs: Prices) -> float:
-    """Mean :func:`point_cost` of points (n, 3), moved by ``t`` (3,).
+@njit(cache=True, nogil=True)
+def visibility_cost(points: FloatArray, T: FloatArray, image: RangeImage, tolerance: float, costs: Prices) -> float:
+    """Mean cost of points (n, 3), moved by ``T`` (4, 4): from 0 to the full one between 1 and 2 tolerances.
 
     Where hardly anything matches nothing can be said: below a share ``LEAST_MATCH`` of matches the cost rises towards
     1.
     """
-    cost = 0.0
-    matches = 0
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0] + t[0], points[i, 1] + t[1], points[i, 2] + t[2]
-        added, matched = point_cost(x, y, z, image, tolerance, costs)
-        cost += added
-        matches += matched
-    share = matches / points.shape[0]
-    return float(cost / points.shape[0] + max(1.0 - share / LEAST_MATCH, 0.0))
+    turned = np.ascontiguousarray(T[:3, :3]) @ points.T
+    return float(_mean_cost(turned, T[0, 3], T[1, 3], T[2, 3], image, tolerance, costs))
+
+
+# No branch: so the compiler takes eight points at once.
+@in_place(fastmath={"reassoc"}, error_model="numpy")
+def _mean_cost(points, tx, ty, tz, image, tolerance, costs):  # type: ignore[no-untyped-def]
+    """:func:`visibility_cost` of points (3, n), moved by (tx, ty, tz)."""
+    xs, ys, zs = points[0], points[1], points[2]
+    size, near, far, inverse = np.int32(image.size), image.near, image.far, 1.0 / tolerance
+    unseen, hidden, free = costs.unseen, costs.hidden, costs.free
+    cost, matches = 0.0, 0.0
+    for i in range(points.shape[1]):
+        x, y, z = xs[i] + tx, ys[i] + ty, zs[i] + tz
+        k = direction_bin(x, y, z, size)
+        r = np.sqrt(x * x + y * y + z * z)
+        is_behind, is_before = r > far[k] + tolerance, r < near[k] - tolerance
+        behind = hidden * min((r - far[k]) * inverse - 1.0, 1.0)
+        before = free * min((near[k] - r) * inverse - 1.0, 1.0)
+        seen = behind if is_behind else (before if is_before else 0.0)
+        cost += unseen if far[k] == 0.0 else seen
+        matches += 0.0 if (far[k] == 0.0) | is_behind | is_before else 1.0
+    share = matches / points.shape[1]
+    return float(cost / points.shape[1] + max(1.0 - share / LEAST_MATCH, 0.0))
 
 
 @in_place()
