@@ -214,6 +214,32 @@ def test_without_the_imu_darkness_is_the_end_of_the_map() -> None:
     assert False in [s.follows_previous for s in submaps[1:]]
 
 
+@pytest.mark.parametrize("imu", ["auto", "off"])
+def test_a_place_that_looks_like_another_is_told_from_it_by_the_imu(imu: str) -> None:
+    """Nothing is seen for two seconds, a quarter of a turn; then the view of 2.3 s ago."""
+    rng = np.random.default_rng(7)
+    world, samples = room(rng), iter(readings(9.0, rng))
+    config = EkfSlamConfig()
+    slam, stamp = EkfSlam(replace(config, motion=replace(config.motion, imu=imu))), -1
+    for k in (*range(60), 80):
+        while stamp < k * STEP_NS:
+            sample = next(samples)
+            stamp = sample.stamp_ns
+            slam.process_imu(sample)
+        features, _ = world.features(carried(5.7 if k == 80 else 0.1 * k), k * STEP_NS, rng, max_features=80)
+        result = slam.process(features)
+    assert (result.state is TrackingState.OK) == (imu == "off")
+    assert (slam.counters.counts.get("links_refuted", 0) > 0) == (imu != "off")
+
+
+def test_an_imu_refutes_a_few_frames_in_a_row_and_no_more() -> None:
+    aids = followed(readings(8.0, np.random.default_rng(3)), 6.0, np.random.default_rng(4))
+    aside = make_transform(so3_exp(0.5 * Z), np.zeros(3))
+    refuted = [aids.refute(60 * STEP_NS, k * STEP_NS, aside, 1e-6 * np.eye(6)) for k in range(61, 71)]
+    assert refuted == [True] * sum(refuted) + [False] * (10 - sum(refuted))
+    assert 1 <= sum(refuted) <= 4
+
+
 def test_gravity_holds_roll_and_pitch_of_a_long_chain() -> None:
     """Submaps whose ends are tilted at random: without gravity the errors add up."""
     rng, drift = np.random.default_rng(5), np.repeat([0.002, np.radians(0.1)], 3)

@@ -11,6 +11,7 @@ from ekf_slam_node.config import InertialConfig, MotionConfig
 from ekf_slam_node.inertial import InertialFilter, at_place
 from ekf_slam_node.odometry import UpDirection
 from ekf_slam_node.preintegration import ImuReadings, Preintegral
+from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import (
     FloatArray,
     both_halves,
@@ -26,6 +27,9 @@ _AID_STAMP_TOLERANCE = 0.005
 """Largest difference of the stamps of a motion aid and of the frames it joins."""
 _SIGMA_TURN_RATE = 0.1
 """By how much (rad/s) the turn rate of a moment may differ from that of a single reading."""
+_ELSEWHERE = np.repeat([0.3, np.radians(5.0)], 3)
+"""Places (m, rad) that look the same are at least so far apart."""
+_GATE = chi_square_bound(0.999, 6)
 
 ALL = slice(0, 6)
 ROTATION = slice(3, 6)
@@ -53,7 +57,7 @@ class MotionAids:
         self._readings = ImuReadings()
         self.inertial = InertialFilter(config, inertial or InertialConfig())
         self._newest: tuple[int, int, Preintegral | None] = (0, 0, None)
-        self._reached_ns = 0
+        self._reached_ns = self._doubted_ns = 0
 
     def add_motion(self, motion: RelativeMotion) -> bool:
         """Take a motion; False if it is not finite, not positive definite or not forward in time."""
@@ -110,6 +114,26 @@ class MotionAids:
             self.inertial.advance(step)
             return True
         return self.inertial.measure(step, *at_place(T_previous_now, covariance, self._place()))
+
+    def refute(
+        self, start_stamp_ns: int, end_stamp_ns: int, T_previous_now: FloatArray, covariance: FloatArray
+    ) -> bool:
+        """True if the IMU rules out a motion that rests on looks alone, with its covariance (6, 6).
+
+        Only by much: places that look the same are not next to each other. It counts against the IMU, too, which soon
+        refutes no more if it is the one that is wrong.
+        """
+        told = self.bridge(start_stamp_ns, end_stamp_ns) or self._rotation_between(start_stamp_ns, end_stamp_ns)
+        if told is None or not self.inertial.is_proven:
+            return False
+        error = np.abs(boxminus(told.T, T_previous_now))
+        is_far = (error > _ELSEWHERE)[told.rows].any()
+        if not is_far or not contradicts(told, T_previous_now, covariance, _GATE):
+            return False
+        if end_stamp_ns != self._doubted_ns:
+            self._doubted_ns = end_stamp_ns
+            self.inertial.doubt()
+        return True
 
     @property
     def newest_stamp_ns(self) -> int:

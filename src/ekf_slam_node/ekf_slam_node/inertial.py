@@ -47,6 +47,8 @@ _CONTRADICTION = 8.0
 """Mean normalised error squared, 1 if all is as claimed, beyond which an accelerometer is left out."""
 _LARGEST_ERROR = 20.0
 """Larger ones count as this: a few frames that are wrong themselves do not condemn an IMU."""
+_PROVEN = 4.0
+"""Mean normalised error squared of the turns below which an IMU is believed: it may refute four frames in a row."""
 _KNOWN = 0.5
 """Standard deviation (m/s2) of each axis of gravity below which its direction is known."""
 _UPRIGHT = np.radians(2.0)
@@ -115,6 +117,11 @@ class InertialFilter:
     def can_bridge(self) -> bool:
         """True if velocity and gravity are known well enough to go on without images."""
         return self.uses_force and self._steps >= _ENOUGH and self.sigma_tilt < _UPRIGHT
+
+    @property
+    def is_proven(self) -> bool:
+        """True if the turn rates have agreed with the images so far: they are believed when a motion does not."""
+        return self.uses_turns and self._judged > 0 and self._turn_excess < _PROVEN
 
     @property
     def up(self) -> FloatArray:
@@ -198,6 +205,10 @@ class InertialFilter:
         if self._first_s >= _FIRST_S and not low < mean / GRAVITY < high:
             told = f"accelerometer left out: it reads {mean:.2f} m/s2 where gravity has 9.81 (REP-145: with gravity)"
             self._leave_out(told if mean > 0.0 else "")
+
+    def doubt(self) -> None:
+        """The images tell another turn by far, and are not believed: it may be the IMU that is wrong."""
+        self._judge_turns(_LARGEST_ERROR)
 
     # ----------------------------------------------------------------------------------------------------- inside
     def _leave_out(self, complaint: str) -> None:

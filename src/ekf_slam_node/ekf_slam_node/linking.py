@@ -6,6 +6,7 @@ Association under the prediction, or under a motion guess where the prediction f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,8 +73,17 @@ class Linker:
         self._config = config
         self._T_rig_optical = T_rig_optical
 
-    def link(self, candidates: Candidates, frame: Frame, prior: MotionPrior) -> FrameLink | None:
-        """Pairs of candidates and features and their motion; None if the frame cannot be linked."""
+    def link(
+        self,
+        candidates: Candidates,
+        frame: Frame,
+        prior: MotionPrior,
+        is_refuted: Callable[[FrameLink], bool] = lambda link: False,
+    ) -> FrameLink | None:
+        """Pairs of candidates and features and their motion; None if the frame cannot be linked.
+
+        ``is_refuted`` is asked of what looks alone have found: places may look the same.
+        """
         if min(len(candidates), len(frame)) < self._config.min_inliers:
             return None
         # Seeded by the frame's own stamp: the result does not depend on what happened before.
@@ -82,7 +92,7 @@ class Linker:
         if predicted is not None and len(predicted.rows) >= _CONVINCING * min(len(candidates), len(frame)):
             return predicted
         # A prediction that is wrong and sure of itself finds the few pairs that agree with it: looks alone decide.
-        guessed = self._by_guess(candidates, frame, rng)
+        guessed = self._by_guess(candidates, frame, rng, is_refuted)
         return max((link for link in (predicted, guessed) if link is not None), key=_number_of_pairs, default=None)
 
     def _by_prediction(
@@ -105,7 +115,13 @@ class Linker:
             return None
         return self._settle(candidates, frame, guess, config.min_inliers)
 
-    def _by_guess(self, candidates: Candidates, frame: Frame, rng: np.random.Generator) -> FrameLink | None:
+    def _by_guess(
+        self,
+        candidates: Candidates,
+        frame: Frame,
+        rng: np.random.Generator,
+        is_refuted: Callable[[FrameLink], bool],
+    ) -> FrameLink | None:
         """First with the descriptors that agree well, then with all that agree at all."""
         config = self._config
         similarity = candidates.descriptors @ frame.descriptors.T
@@ -124,7 +140,7 @@ class Linker:
             if guess is None or guess.inliers.sum() < enough:
                 continue
             link = self._settle(candidates, frame, guess, _GUESS_MIN_INLIERS)
-            if link is not None:
+            if link is not None and not is_refuted(link):
                 return link
         return None
 

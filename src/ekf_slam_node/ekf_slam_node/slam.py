@@ -7,6 +7,7 @@ Features in, poses, landmarks and finished submaps out (thesis chapter 6, Algori
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from ekf_slam_node.common_error import CommonError
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import TimeUpdate
 from ekf_slam_node.frame_input import frame_of_strongest, usable_features
-from ekf_slam_node.linking import Linker
+from ekf_slam_node.linking import FrameLink, Linker
 from ekf_slam_node.missed_frames import MissedFrames
 from ekf_slam_node.models import CORE_DIM, Frame, seconds_between
 from ekf_slam_node.motion_checks import StandingDetector, aided, explaining_sigma, is_known, is_surprising, widened
@@ -183,7 +184,7 @@ class EkfSlam:
         prior = aided(expected, aid)
         known = None if aid is None else prior.T
         predicted = self._shutter.corrected(frame, dt, known)
-        link = self._linker.link(local.candidates(), predicted, prior)
+        link = self._linker.link(local.candidates(), predicted, prior, partial(self._is_refuted, frame.stamp_ns))
         if link is None:
             return None
         measured = self._noise.learn(frame, link.excess)
@@ -193,6 +194,12 @@ class EkfSlam:
         common = self._common.sigma(frame)
         aid = None if aid is None else widened(aid, common)
         return LinkedFrame(frame, measured, dt, link, aid, common, surprising, len(local.table))
+
+    def _is_refuted(self, stamp_ns: int, link: FrameLink) -> bool:
+        """True if looks alone have led to a place where the IMU says that the rig cannot be."""
+        refuted = self._aids.refute(self._chain.stamp_ns, stamp_ns, link.T, link.covariance)
+        self.counters.add("links_refuted", int(refuted))
+        return refuted
 
     def _augment(self, linked: LinkedFrame) -> Sight:
         """Add the landmarks that the frame confirms, at the previous pose; returns all landmarks that it sees."""
