@@ -7,6 +7,7 @@ triangle that it would shape is dropped, so the mesh ends where the knowledge en
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,8 @@ _MIN_TRIANGLES = 60
 
 _CHUNK = 6
 """Blocks along the edge of a cube that marching cubes runs over at once."""
+_THREADS = 2
+"""Cubes at once; more threads would only wait for the interpreter between their kernels."""
 _UNSEEN = 150
 """Grey of a surface that no picture shows."""
 
@@ -71,7 +74,8 @@ class Surface:
 def extract_surface(volume: TsdfVolume, config: SurfaceConfig, *, release: bool = False) -> Surface:
     """The zero level of the field, with everything known of it; ``release``: the field is emptied on the way."""
     voxel_size = volume.config.voxel_size
-    pieces = [_chunk_surface(volume, chunk, config) for chunk in _chunks(volume)]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        pieces = list(pool.map(lambda chunk: _chunk_surface(volume, chunk, config), _chunks(volume)))
     pieces = [piece for piece in pieces if len(piece[1])]
     if release:  # by far the largest part, and what follows needs room
         volume.clear()
