@@ -349,9 +349,10 @@ class GlobalMap:
         ``is_last``: nobody adds to the map or asks for covariances any more, so that only its graph is kept.
         """
         self.settle()
-        storage.write(Path(path), self.stored())
         if is_last:
             self.smoother.forget()
+        storage.write(Path(path), self.stored())
+        if is_last:
             self._offload.forget()
         else:
             self.smoother.resume()
