@@ -3,7 +3,8 @@
 
 Left and right image are extracted on two threads, disparities refined half on each. The parts are processor time of one
 thread, the whole is time on the wall, so it only says something on an idle machine; "on two cores" is what the parts
-add up to: the slower image, matching, half of the disparities. "one core" is their sum.
+add up to: the slower image, matching, half of the disparities, and left keypoints with one described. "one core" is
+their sum.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
 from typing import TypeVar
 
 import cv2
@@ -23,7 +23,7 @@ from slam_core.types import StereoImages
 from stereo_frontend.disparity import refine_disparity
 from stereo_frontend.features import FeatureExtractor
 from stereo_frontend.frontend import RIGHT_SURPLUS, Frontend, FrontendConfig
-from stereo_frontend.matching import disparity_bounds, has_candidate, match_stereo
+from stereo_frontend.matching import disparity_bounds, match_stereo
 
 T = TypeVar("T")
 WARM_UP = 4
@@ -51,7 +51,7 @@ class Watch:
 def measure(title: str, pairs: Iterable[StereoImages], config: FrontendConfig) -> None:
     watch, frontend = Watch(), Frontend(config)
     more = replace(config.features, target=int(RIGHT_SURPLUS * config.features.target))
-    left, right = FeatureExtractor(config.features), FeatureExtractor(more)
+    left, right = (FeatureExtractor(c, for_pairs=True) for c in (config.features, more))
     features = 0
     pairs = list(pairs)
     for images in pairs:
@@ -59,15 +59,15 @@ def measure(title: str, pairs: Iterable[StereoImages], config: FrontendConfig) -
         a = watch("left", left, images.left)
         camera = images.stereo.camera
         bounds = disparity_bounds(config.matching, camera.fx * images.stereo.baseline)
-        wanted = partial(has_candidate, a, config=config.matching, bounds=bounds)
-        b = watch("right", right, images.right, wanted)
+        b = watch("right", right, images.right)
         matches = watch("match", match_stereo, a, b, config.matching, bounds)
         uv, u_right = a.uv[matches.left], b.uv[matches.right, 0]
-        watch("disparity", refine_disparity, images.left, images.right, uv, u_right, config.disparity)
+        refined = watch("disparity", refine_disparity, images.left, images.right, uv, u_right, config.disparity)
+        watch("describe", left.describe, images.left, a.select(matches.left[refined.valid]))
     height, width = pairs[0].left.shape
     ms = watch.medians()
-    ms["one core"] = ms["left"] + ms["right"] + ms["match"] + ms["disparity"]
-    ms["on two cores"] = max(ms["left"], ms["right"]) + ms["match"] + 0.5 * ms["disparity"]
+    ms["one core"] = ms["left"] + ms["right"] + ms["match"] + ms["disparity"] + ms["describe"]
+    ms["on two cores"] = max(ms["left"], ms["right"]) + ms["match"] + 0.5 * ms["disparity"] + ms["describe"]
     text = "   ".join(f"{name} {value:.1f}" for name, value in ms.items())
     print(f"{title} {width}x{height}: {features / len(pairs):.0f} features with depth; ms: {text}")
 

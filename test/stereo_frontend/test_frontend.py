@@ -11,6 +11,7 @@ import pytest
 from slam_core.camera import Camera
 from slam_core.config import from_mapping
 from slam_core.types import DepthImage, FeatureSource, StereoImages
+from stereo_frontend.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.frontend import Frontend, FrontendConfig
 
 DEPTH = 200.0 * 0.12 / 12.3
@@ -51,6 +52,26 @@ def test_xyz_uv_and_depth_agree_and_arrays_are_single_precision(stereo_pair):
     for field in set(FIELDS) - {"source"}:
         assert getattr(features, field).dtype == np.float32
     assert features.source.dtype == np.uint8
+
+
+@pytest.mark.parametrize("mode", ["stereo", "replace"])
+def test_features_are_described_for_other_moments(stereo_pair, mode):
+    pair = stereo_pair()
+    features = frontend(mode).process(pair, tof_image(pair), IDENTITY)
+    every = FeatureExtractor(FeatureConfig(target=300))(pair.left)
+    place = {tuple(uv): k for k, uv in enumerate(every.uv)}
+    own = every.descriptors[[place[tuple(uv)] for uv in features.uv]]
+    np.testing.assert_allclose(features.descriptors, own, atol=1e-4)
+
+
+def test_features_that_look_alike_are_left_out(stereo_pair):
+    pair = stereo_pair()
+    halves = {side: getattr(pair, side)[:120] for side in ("left", "right")}
+    twice = dataclasses.replace(pair, **{side: np.vstack([half, half]) for side, half in halves.items()})
+    once, both = (frontend().process(images) for images in (pair, twice))
+    upper = once.uv[:, 1] < 60
+    assert upper.sum() > 20
+    assert np.sum(both.uv[:, 1] < 60) < 0.4 * upper.sum()
 
 
 def test_the_same_frames_give_the_same_bytes(stereo_pair):

@@ -12,8 +12,8 @@ from stereo_frontend.matching import (
     MAX_SIZE_RATIO,
     MatchingConfig,
     disparity_bounds,
-    has_candidate,
     has_consistent_neighbour,
+    is_distinct,
     match_stereo,
     swapped_share,
 )
@@ -48,17 +48,14 @@ def test_all_partners_are_found(pair):
     assert np.all(matches.similarity > 0.9)
 
 
-def test_what_no_left_keypoint_could_match_may_be_left_out(pair, rng):
-    left, right, _ = pair
-    left, config = left.select(np.arange(30)), MatchingConfig(epipolar_band=1.0)
-    right.size[:40] *= rng.uniform(0.5, 2.0, 40).astype(np.float32)
-    reachable = has_candidate(left, right.uv, right.size, config, BOUNDS)
-    assert 20 < reachable.sum() < 60
-    whole, part = (match_stereo(left, r, config, BOUNDS) for r in (right, right.select(reachable)))
-    assert len(whole) > 15
-    np.testing.assert_array_equal(part.left, whole.left)
-    np.testing.assert_array_equal(np.flatnonzero(reachable)[part.right], whole.right)
-    np.testing.assert_array_equal(part.similarity, whole.similarity)
+def test_descriptors_that_resemble_each_other_are_not_distinct(rng):
+    descriptors = rng.normal(size=(6, 128)).astype(np.float32)
+    descriptors[4] = descriptors[1] + 0.1 * descriptors[0]
+    descriptors /= np.linalg.norm(descriptors, axis=1)[:, None]
+    np.testing.assert_array_equal(is_distinct(descriptors, 0.97), [True, False, True, True, False, True])
+    assert is_distinct(descriptors, 0.999).all()
+    assert is_distinct(descriptors[:1], 0.97).all()
+    assert is_distinct(descriptors[:0], 0.97).shape == (0,)
 
 
 def test_partners_off_the_row_or_beyond_the_disparities_are_not(pair):

@@ -14,6 +14,7 @@ from stereo_frontend.surf_descriptor import describe_oriented, describe_upright,
 from stereo_frontend.surf_detector import find_keypoints, find_maxima, fitting_octaves, halved, integral_image
 from stereo_frontend.surf_hessian import FILTER_SIZES, determinant_at, row_filter
 from stereo_frontend.surf_integral import KEPT_ROWS, integral_room, next_integral_row
+from stereo_frontend.surf_pair import LANES, SAMPLES, STEP, describe_for_pair, pair_weights
 
 
 @pytest.fixture(scope="module")
@@ -239,6 +240,38 @@ def test_oriented_descriptor_equals_its_twin(image, place):
     describe_oriented(integral_image(image), keypoint[None], region_weights(), out)
     angle = orientation(integral_image(image), keypoint)
     np.testing.assert_allclose(out[0], twin_descriptor(image, *keypoint, angle), atol=2e-6)
+
+
+def twin_pair_descriptor(image: np.ndarray, u: float, v: float, scale: float) -> np.ndarray:
+    """Sample by sample; wavelets that reach beyond the image are zero."""
+    weights, out, middle = pair_weights(), np.zeros((4, 4, 8)), 0.5 * (SAMPLES - 1)
+    for j in range(SAMPLES):
+        for i in range(SAMPLES):
+            x, y = u + 0.5 + (i - middle) * STEP * scale, v + 0.5 + (j - middle) * STEP * scale
+            dx, dy = twin_wavelet(image, x, y, STEP * scale)
+            terms = np.zeros(8)
+            terms[[0, 1] if dy >= 0 else [2, 3]] = dx, abs(dx)
+            terms[[4, 5] if dx >= 0 else [6, 7]] = dy, abs(dy)
+            out += weights[:, j, None, None] * weights[None, :, i, None] * terms
+    return out.ravel() / np.linalg.norm(out)
+
+
+@pytest.mark.parametrize("number", [1, LANES, LANES + 5])
+def test_pair_descriptors_equal_their_twins_within_the_image_and_at_its_edges(image, number):
+    places = np.random.default_rng(number).uniform([3, 3, 1.2], [167, 127, 3.0], (number, 3))
+    out = np.empty((number, 128), np.float32)
+    describe_for_pair(integral_image(image), places, pair_weights(), out)
+    np.testing.assert_allclose(out, [twin_pair_descriptor(image, *place) for place in places], atol=2e-6)
+
+
+def test_a_detector_for_pairs_finds_the_same_and_describes_it_for_other_moments_when_asked(image):
+    plain, for_pairs = (SurfDetector(for_pairs=only) for only in (False, True))
+    described, brief = (detector(image, 0.3, keep_all) for detector in (plain, for_pairs))
+    assert len(described) > 5
+    np.testing.assert_array_equal(brief.uv, described.uv)
+    assert not np.allclose(brief.descriptors, described.descriptors, atol=0.1)
+    later = for_pairs.describe(image, brief)
+    np.testing.assert_allclose(later.descriptors, described.descriptors, atol=1e-4)
 
 
 def test_orientation_follows_a_turned_image(image):

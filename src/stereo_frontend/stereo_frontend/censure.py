@@ -57,6 +57,10 @@ class CensureDetector:
         descriptors = describe(image, places, upright=True, extended=self._surf.extended)
         return Keypoints(found[:, :2].copy(), found[:, 2].copy(), found[:, 3].copy(), descriptors)
 
+    def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
+        """Those keypoints, which are described already."""
+        return keypoints
+
 
 @njit(cache=True, nogil=True)
 def responses(image: ByteArray):  # type: ignore[no-untyped-def]

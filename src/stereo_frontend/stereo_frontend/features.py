@@ -10,7 +10,6 @@ OpenCV (:mod:`stereo_frontend.opencv_detectors`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,9 +37,6 @@ _FIRST_THRESHOLD = 0.3
 """Of the customary one: the first image rather gives too many candidates than too few."""
 _MOST_PASSES = 3
 
-Wanted = Callable[[Float32Array, Float32Array], npt.NDArray[np.bool_]]
-"""Mask (n,) of the keypoints at uv (n, 2) px, of size (n,) px, that are of any use."""
-
 
 @dataclass(frozen=True)
 class FeatureConfig(Config):
@@ -51,10 +47,10 @@ class FeatureConfig(Config):
     surf: SurfConfig = group(SurfConfig)
 
 
-def make_detector(config: FeatureConfig) -> Detector:
-    """The configured detector."""
+def make_detector(config: FeatureConfig, *, for_pairs: bool = False) -> Detector:
+    """The configured detector; ``for_pairs``: its descriptors need do for matching within a stereo pair only."""
     if config.detector == "surf":
-        return SurfDetector(config.surf)
+        return SurfDetector(config.surf, for_pairs=for_pairs)
     return CensureDetector(config.surf) if config.detector == "censure" else OpenCvDetector(config.detector)
 
 
@@ -64,15 +60,13 @@ class FeatureExtractor:
     The state is that one number, so equal images give equal features however they arrive.
     """
 
-    def __init__(self, config: FeatureConfig | None = None) -> None:
+    def __init__(self, config: FeatureConfig | None = None, *, for_pairs: bool = False) -> None:
         self.config = config or FeatureConfig()
         self.threshold = _FIRST_THRESHOLD
-        self._detect = make_detector(self.config)
+        self._detect = make_detector(self.config, for_pairs=for_pairs)
 
-    def __call__(self, image: ByteArray, wanted: Wanted | None = None) -> Keypoints:
+    def __call__(self, image: ByteArray) -> Keypoints:
         """At most ``target`` keypoints of an image, uint8 (height, width), best of each grid cell first.
-
-        Those that are not ``wanted`` are left out before they are described, which is what costs most.
 
         Raises
         ------
@@ -82,28 +76,31 @@ class FeatureExtractor:
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f"features need a uint8 grey image (height, width), got {image.dtype} {image.shape}")
         for _ in range(_MOST_PASSES):
-            keypoints, candidates = self._one_pass(image, wanted)
+            keypoints, candidates = self._one_pass(image)
             enough = candidates >= self.config.target or self.threshold <= _THRESHOLD_RANGE[0]
             self._adapt(candidates)
             if enough or _ADAPTATION == 0.0:
                 break
         return keypoints
 
+    def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
+        """Keypoints found in ``image`` with the descriptors that other moments are compared by."""
+        return self._detect.describe(image, keypoints)
+
     def reset(self) -> None:
         """Forget the threshold."""
         self.threshold = _FIRST_THRESHOLD
 
-    def _one_pass(self, image: ByteArray, wanted: Wanted | None) -> tuple[Keypoints, int]:
+    def _one_pass(self, image: ByteArray) -> tuple[Keypoints, int]:
         candidates = 0
 
         def select(uv: Float32Array, size: Float32Array, response: Float32Array) -> npt.NDArray[np.intp]:
             nonlocal candidates
             candidates = len(uv)
             c = self.config
-            kept = spread_over_grid(
+            return spread_over_grid(
                 uv, response, (image.shape[0], image.shape[1]), (_GRID_ROWS, _GRID_COLUMNS), c.target
             )
-            return kept if wanted is None else kept[wanted(uv[kept], size[kept])]
 
         keypoints = self._detect(image, self.threshold, select)
         return keypoints, candidates

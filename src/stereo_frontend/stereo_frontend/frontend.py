@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from slam_core.camera import StereoCamera
 from slam_core.config import Config, group, parameter
@@ -28,8 +29,8 @@ from stereo_frontend.matching import (
     Matches,
     MatchingConfig,
     disparity_bounds,
-    has_candidate,
     has_consistent_neighbour,
+    is_distinct,
     match_stereo,
     swapped_share,
 )
@@ -46,6 +47,10 @@ RIGHT_SURPLUS = 1.6
 """Features wanted in the right image per feature of the left, so that few partners are missing."""
 _NEIGHBOURS = 16
 """A match must share its disparity with one of so many neighbours; 0 switches it off."""
+
+_MOST_ALIKE = 0.97
+"""Greatest scalar product of the descriptors of two features of an image. Stereo partners are found by another
+descriptor; features that this one confuses, like the corners of a tile, would be taken for one another later."""
 
 MODES = ("stereo", "tof", "replace", "fuse")
 _FEW_TRUSTED = 0.1
@@ -99,8 +104,8 @@ class Frontend:
     def __init__(self, config: FrontendConfig | None = None) -> None:
         self.config = config or FrontendConfig()
         self.counters = Counters()
-        self._left = FeatureExtractor(self.config.features)
-        self._right = FeatureExtractor(_more(self.config.features, RIGHT_SURPLUS))
+        self._left = FeatureExtractor(self.config.features, for_pairs=True)
+        self._right = FeatureExtractor(_more(self.config.features, RIGHT_SURPLUS), for_pairs=True)
         self._noise = PixelNoise(self.config.noise)
         self.self_calibration = StereoSelfCalibration(self.config.self_calibration)
         self.range_calibration = RangeSelfCalibration(self.config.range_calibration)
@@ -115,18 +120,17 @@ class Frontend:
         return self.measure(self.extract(images), images, depth, T_left_tof)
 
     def extract(self, images: StereoImages | None) -> tuple[Keypoints, Keypoints] | None:
-        """Keypoints of the left image, and of the right image those that a left one could match.
+        """Keypoints of both images, described as far as matching them with each other needs.
 
-        Both images have a thread each. None in mode ``tof``, whose keypoints need the depth image. A caller may extract
+        Each image has a thread. None in mode ``tof``, whose keypoints need the depth image. A caller may extract
         from one frame while :meth:`measure` is at the one before.
         """
         if self.config.mode == "tof":
             return None
         if images is None:
             raise ValueError(f"mode '{self.config.mode}' needs a stereo pair, got none")
-        bounds = disparity_bounds(self.config.matching, images.stereo.camera.fx * images.stereo.baseline)
         left = self._pool.submit(self._left, images.left)
-        right = self._right(images.right, lambda uv, size: has_candidate(left.result(), uv, size, self._wide, bounds))
+        right = self._right(images.right)
         return left.result(), right
 
     def measure(
@@ -163,9 +167,14 @@ class Frontend:
         if images is None or keypoints is None:
             raise ValueError(f"mode '{self.config.mode}' needs a stereo pair, got none")
         left, right = keypoints
-        estimate = self._stereo_depth(images, left, right)
+        stereo, refined = self._stereo_depth(images, left, right)
+        estimate = stereo
         if self.config.mode != "stereo":
-            estimate = self._with_tof(images, left, estimate, depth, T_left_tof)
+            estimate = self._with_tof(images, left, stereo, depth, T_left_tof)
+        left = self._described(images, left, np.isfinite(stereo.depth) | np.isfinite(estimate.depth))
+        self._learn(images, left, stereo, refined)
+        by_stereo = np.flatnonzero(np.isfinite(stereo.depth))
+        estimate.depth[by_stereo[~is_distinct(left.descriptors[by_stereo], _MOST_ALIKE)]] = np.nan
         return make_features(
             images.stamp_ns,
             left,
@@ -195,7 +204,17 @@ class Frontend:
             self.range_calibration.figures(),
         )
 
-    def _stereo_depth(self, images: StereoImages, left: Keypoints, right: Keypoints) -> DepthEstimate:
+    def _described(self, images: StereoImages, left: Keypoints, needed: npt.NDArray[np.bool_]) -> Keypoints:
+        """The left keypoints with descriptors for other moments: of those ``needed``, zeros for the others."""
+        described = self._left.describe(images.left, left.select(needed)).descriptors
+        descriptors = np.zeros((len(left), described.shape[1]), np.float32)
+        descriptors[needed] = described
+        return dataclasses.replace(left, descriptors=descriptors)
+
+    def _stereo_depth(
+        self, images: StereoImages, left: Keypoints, right: Keypoints
+    ) -> tuple[DepthEstimate, RefinedDisparity]:
+        """Depth of the left keypoints, and the disparities of those that have one."""
         stereo, calibration = images.stereo, self.self_calibration
         focal_baseline = stereo.camera.fx * stereo.baseline
         bounds = disparity_bounds(self.config.matching, focal_baseline)
@@ -218,9 +237,7 @@ class Frontend:
         estimate.depth[matches.left] = stereo.depth_from_disparity(disparity)
         estimate.sigma[matches.left] = focal_baseline / disparity**2 * sigma
         self._count(left, right, len(matches), int(np.isfinite(disparity).sum()))
-        kept = np.flatnonzero(np.isfinite(disparity))
-        calibration.learn(self._view(images, left.select(matches.left[kept]), refined.select(kept)))
-        return estimate
+        return estimate, refined.select(np.flatnonzero(np.isfinite(disparity)))
 
     def _match(self, images: StereoImages, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> Matches:
         """Matches along the rows as they are; those of a first pair are found out with a wider band."""
@@ -231,6 +248,10 @@ class Frontend:
         error = calibration.rows(right.uv, np.zeros(len(right)))
         aligned = dataclasses.replace(right, uv=right.uv - np.column_stack([np.zeros_like(error), error]))
         return match_stereo(left, aligned, self.config.matching, bounds)
+
+    def _learn(self, images: StereoImages, left: Keypoints, stereo: DepthEstimate, refined: RefinedDisparity) -> None:
+        """Self-calibration from the keypoints with a depth by stereo."""
+        self.self_calibration.learn(self._view(images, left.select(np.isfinite(stereo.depth)), refined))
 
     def _view(self, images: StereoImages, left: Keypoints, refined: RefinedDisparity) -> StereoView:
         """View that self-calibration learns from."""

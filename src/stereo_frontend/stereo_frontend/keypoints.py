@@ -52,6 +52,10 @@ class Detector(Protocol):
         """
         ...
 
+    def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
+        """Those keypoints of ``image``, described for other moments' if they were so for a stereo partner's only."""
+        ...
+
 
 def spread_over_grid(
     uv: Float32Array, response: Float32Array, shape: tuple[int, int], grid: tuple[int, int], target: int

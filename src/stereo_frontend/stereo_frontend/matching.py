@@ -18,7 +18,7 @@ from slam_core.geometry import FloatArray
 from slam_core.types import Float32Array
 from stereo_frontend.keypoints import Keypoints
 
-MAX_SIZE_RATIO = 1.5
+MAX_SIZE_RATIO = 1.25
 """Most ratio of the two keypoints' sizes."""
 
 IndexArray = npt.NDArray[np.intp]
@@ -108,29 +108,11 @@ def _best_in_band(uv, log_size, descriptors, uv_right, log_size_right, descripto
     return best, value, second, best_of_right
 
 
-def has_candidate(
-    left: Keypoints, uv_right: Float32Array, size: Float32Array, config: MatchingConfig, bounds: tuple[float, float]
-) -> npt.NDArray[np.bool_]:
-    """Mask (n,) of the places (n, 2) px in the right image, of size (n,) px, that any left keypoint could match."""
-    by_row = np.argsort(left.uv[:, 1], kind="stable")
-    return np.asarray(
-        _any_in_band(uv_right, np.log(size), left.uv[by_row], np.log(left.size[by_row]), _limits(config, bounds))
-    )
-
-
-@njit(cache=True, nogil=True)
-def _any_in_band(uv_right, log_size_right, uv, log_size, limits):  # type: ignore[no-untyped-def]
-    out = np.zeros(len(uv_right), np.bool_)
-    rows = uv[:, 1].copy()
-    for j in range(len(uv_right)):
-        for i in range(np.searchsorted(rows, uv_right[j, 1] - limits[0]), len(rows)):
-            if rows[i] > uv_right[j, 1] + limits[0]:
-                break
-            disparity = uv[i, 0] - uv_right[j, 0]
-            if limits[1] <= disparity <= limits[2] and abs(log_size[i] - log_size_right[j]) <= limits[3]:
-                out[j] = True
-                break
-    return out
+def is_distinct(descriptors: Float32Array, max_similarity: float) -> npt.NDArray[np.bool_]:
+    """Mask (n,) of the descriptors (n, d) whose scalar product with any other one is at most ``max_similarity``."""
+    similarity = descriptors @ descriptors.T
+    np.fill_diagonal(similarity, -1.0)
+    return np.asarray(similarity.max(axis=1, initial=-1.0) <= max_similarity)
 
 
 def _limits(config: MatchingConfig, bounds: tuple[float, float]) -> FloatArray:

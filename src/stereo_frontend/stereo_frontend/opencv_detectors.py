@@ -42,6 +42,10 @@ class OpenCvDetector:
         kept = _without_repeats(uv, select(uv, size, response))
         return Keypoints(uv[kept], size[kept], response[kept], self._normalise(raw[kept]))
 
+    def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
+        """Those keypoints, which are described already."""
+        return keypoints
+
 
 def unit_norm(vectors: AnyArray) -> Float32Array:
     """Rows (n, d) scaled to unit length; rows of zeros stay."""

@@ -15,7 +15,7 @@ have their status checked; SIFT, whose patent US 6,711,293 ended in March 2020, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from stereo_frontend.surf_descriptor import (
     region_weights,
 )
 from stereo_frontend.surf_detector import MAX_PIXELS, find_keypoints, fitting_octaves, integral_image
+from stereo_frontend.surf_pair import PAIR_DIMENSION, describe_for_pair, pair_weights
 
 _OCTAVES = 3
 """Octaves of four filter sizes."""
@@ -41,7 +42,7 @@ _DIAMETER = 9.0 / 1.2
 """Size of a keypoint (px) per unit of its scale: that of the filter that found it."""
 
 
-_WEIGHTS = region_weights()
+_WEIGHTS, _PAIR_WEIGHTS = region_weights(), pair_weights()
 
 
 @dataclass(frozen=True)
@@ -55,10 +56,10 @@ class SurfConfig(Config):
 
 
 class SurfDetector:
-    """Finds and describes SURF keypoints."""
+    """Finds and describes SURF keypoints; ``for_pairs``: only as well as matching within a stereo pair needs it."""
 
-    def __init__(self, config: SurfConfig | None = None) -> None:
-        self.config = config or SurfConfig()
+    def __init__(self, config: SurfConfig | None = None, *, for_pairs: bool = False) -> None:
+        self.config, self.for_pairs = config or SurfConfig(), for_pairs
         self._found = np.empty((MOST_KEYPOINTS, 4), np.float32)
 
     def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
@@ -75,8 +76,16 @@ class SurfDetector:
         found = self._find_all(image, threshold * _CUSTOMARY_THRESHOLD)
         found = found[select(found[:, :2], _DIAMETER * found[:, 2], found[:, 3])]
         places = found[:, :3].astype(np.float64)
-        descriptors = describe(image, places, upright=self.config.upright, extended=self.config.extended)
+        descriptors = pair_descriptors(image, places) if self.for_pairs else self._describe(image, places)
         return Keypoints(found[:, :2].copy(), _DIAMETER * found[:, 2], found[:, 3].copy(), descriptors)
+
+    def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
+        """Those keypoints of ``image`` with the descriptors that tell moments apart."""
+        places = np.column_stack([keypoints.uv, keypoints.size / _DIAMETER]).astype(np.float64)
+        return replace(keypoints, descriptors=self._describe(image, places))
+
+    def _describe(self, image: ByteArray, places: FloatArray) -> Float32Array:
+        return describe(image, places, upright=self.config.upright, extended=self.config.extended)
 
     def _find_all(self, image: ByteArray, threshold: float) -> Float32Array:
         """Rows of u, v, scale, response, in pixels of ``image``."""
@@ -96,3 +105,10 @@ def describe(image: ByteArray, places: FloatArray, *, upright: bool, extended: b
     kernel = describe_upright if upright else describe_oriented
     kernel(integral_image(image), places, _WEIGHTS, descriptors)
     return descriptors if extended else merged_signs(descriptors)
+
+
+def pair_descriptors(image: ByteArray, places: FloatArray) -> Float32Array:
+    """Descriptors (n, 128) of the same places, for matching within a stereo pair."""
+    descriptors = np.empty((len(places), PAIR_DIMENSION), np.float32)
+    describe_for_pair(integral_image(image), places, _PAIR_WEIGHTS, descriptors)
+    return descriptors
