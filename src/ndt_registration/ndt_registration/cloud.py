@@ -13,6 +13,7 @@ from ndt_registration.edges import rim_points
 from ndt_registration.moments import block_counts, block_moments
 from ndt_registration.visibility import mean_spacing, range_image
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 
 _COVERAGE_SIZE = 64
 """Size of the range image from which the part of the sphere that a scan covers is measured."""
@@ -108,8 +109,25 @@ def prepare(points: FloatArray, limit: int, *, planar: bool, centre: FloatArray)
 
 
 def evened(points: FloatArray) -> FloatArray:
-    """Finite points (n, 3) without strays, and where they crowd together, their means in small blocks."""
-    return _evened(*_without_strays(points))
+    """Finite points (n, 3) without strays, and where they crowd together, their means in small blocks.
+
+    Strays are so far off that cells of a useful size could not be numbered up to them. A turning scanner's points crowd
+    near it: left alone, the floor at its feet would outweigh the whole building.
+    """
+    if len(points) == 0:
+        return points
+    distance = _distances(points)
+    median, wide = np.percentile(distance, (50.0, 90.0))
+    near = distance <= _FARTHEST * median
+    if median > 0.0 and not near.all():
+        points, wide = points[near], np.percentile(distance[near], 90.0)
+    size = _EVEN_SIZE * max(float(wide), 1e-6)
+    counts = block_counts(points, size)
+    crowding = float((counts**2).sum() / counts.sum() / np.median(counts))
+    if not crowding > _CROWDED:
+        return points
+    blocks = block_moments(points, size)
+    return blocks.sums / blocks.counts[:, None]
 
 
 def thinned(points: FloatArray, limit: int, *, planar: bool) -> Cloud:
@@ -135,32 +153,6 @@ def _distances(points: FloatArray) -> FloatArray:
     return out
 
 
-def _without_strays(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The points but those so far off that cells of a useful size could not be numbered up to them; their distances."""
-    distance = _distances(points)
-    median = float(np.median(distance)) if len(points) else 0.0
-    if median == 0.0 or distance.max() <= _FARTHEST * median:
-        return points, distance
-    near = distance <= _FARTHEST * median
-    return points[near], distance[near]
-
-
-def _evened(points: FloatArray, distance: FloatArray) -> FloatArray:
-    """The points, or where they crowd together, as a turning scanner's do near it, their means in small blocks.
-
-    Left alone, the floor at the scanner's feet would outweigh the whole building.
-    """
-    if len(points) == 0:
-        return points
-    size = _EVEN_SIZE * max(float(np.percentile(distance, 90.0)), 1e-6)
-    counts = block_counts(points, size)
-    crowding = float((counts**2).sum() / counts.sum() / np.median(counts))
-    if not crowding > _CROWDED:
-        return points
-    blocks = block_moments(points, size)
-    return blocks.sums / blocks.counts[:, None]
-
-
 def viewpoint(points: FloatArray) -> FloatArray:
     """The origin if the cloud lies around it, as a scan does, else the centroid, as of a cloud in map coordinates.
 
@@ -168,6 +160,21 @@ def viewpoint(points: FloatArray) -> FloatArray:
     """
     if len(points) == 0:
         return np.zeros(3)
-    centroid = points.mean(axis=0)
-    radius = float(np.sqrt(((points - centroid) ** 2).sum(axis=1).mean()))
+    centroid = np.zeros(3)
+    radius = _spread(points, centroid)
     return np.zeros(3) if np.linalg.norm(centroid) <= 4.0 * radius else centroid
+
+
+@in_place()
+def _spread(points: FloatArray, centroid: FloatArray) -> float:
+    """Write the centroid (3,) of points (n, 3), n > 0; returns their root mean square distance from it."""
+    n, squares = points.shape[0], 0.0
+    for i in range(n):
+        for k in range(3):
+            centroid[k] += points[i, k]
+    for k in range(3):
+        centroid[k] /= n
+    for i in range(n):
+        for k in range(3):
+            squares += (points[i, k] - centroid[k]) ** 2
+    return float(np.sqrt(squares / n))

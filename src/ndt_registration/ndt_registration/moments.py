@@ -149,10 +149,10 @@ def _number_blocks(points: FloatArray, block_size: float, number: Int32Array, co
 @in_place()
 def _number_points(points, block_size, table, number, corner, done, used):  # type: ignore[no-untyped-def]
     """Number the blocks of points from ``done`` on while the table has room; returns the next point and number."""
-    last, brick = -1, 0
+    last, brick, inverse = -1, 0, 1.0 / block_size
     while done < points.shape[0] and has_room(table, 1):
         x, y, z = points[done, 0], points[done, 1], points[done, 2]
-        ix, iy, iz = int(np.floor(x / block_size)), int(np.floor(y / block_size)), int(np.floor(z / block_size))
+        ix, iy, iz = int(np.floor(x * inverse)), int(np.floor(y * inverse)), int(np.floor(z * inverse))
         key = brick_key(ix, iy, iz)
         if key != last:  # neighbours in a picture often share a brick
             brick, last = brick_of(table, key), key
