@@ -52,3 +52,10 @@ def test_setup_and_package_xml_name_every_import(package: str) -> None:
             assert PIP_NAME.get(name, name) in required, f"setup.py of {package} lacks {name}"
             key = name if name in PACKAGES else ROSDEP_KEY.get(name)
             assert key is None or key in named, f"package.xml of {package} lacks {key}"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_setup_installs_files_by_their_ending(package: str) -> None:
+    """A pattern that takes all takes a folder of compiled modules too, with which the next build fails."""
+    patterns = re.findall(r'glob\("([^"]*)"\)', (SRC / package / "setup.py").read_text())
+    assert not [pattern for pattern in patterns if pattern.endswith("*")]
