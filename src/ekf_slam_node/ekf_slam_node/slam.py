@@ -197,9 +197,10 @@ class EkfSlam:
 
     def _is_refuted(self, stamp_ns: int, link: FrameLink) -> bool:
         """True if looks alone have led to a place where the IMU says that the rig cannot be."""
-        refuted = self._aids.refute(self._chain.stamp_ns, stamp_ns, link.T, link.covariance)
-        self.counters.add("links_refuted", int(refuted))
-        return refuted
+        if not self._aids.refute(self._chain.stamp_ns, stamp_ns, link.T, link.covariance):
+            return False
+        self.counters.add("links_refuted")
+        return True
 
     def _augment(self, linked: LinkedFrame) -> Sight:
         """Add the landmarks that the frame confirms, at the previous pose; returns all landmarks that it sees."""
