@@ -93,7 +93,8 @@ def test_a_run_that_is_asked_to_end_writes_what_is_mapped(run: Run, number: sign
     if number == signal.SIGHUP:
         run.process.stdout.close()  # a terminal that is closed takes no more words
     run.process.send_signal(number)
-    assert run.process.wait(240.0) == 130
+    code = run.process.wait(240.0)
+    assert code == 130, "" if run.process.stdout.closed else run.process.stdout.read()
     assert not run.nodes()
     summary = json.loads((run.out / "summary.json").read_text())
     assert 0 < summary["frames"] < 52
