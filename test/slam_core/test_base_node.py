@@ -18,6 +18,7 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from slam_core import ros  # noqa: E402
 from slam_core.base_node import SlamNode  # noqa: E402
 from slam_core.config import Config, parameter  # noqa: E402
 from slam_core.exchange import Exchange  # noqa: E402
@@ -97,6 +98,19 @@ def test_odd_stamps_are_rejected_and_only_a_lasting_jump_begins_a_session(node: 
     send(node, "frames", *again)
     assert node.heard == good + again
     assert (node.sessions, node.resets) == (1, 0)
+
+
+def test_messages_without_end_do_not_keep_a_node_from_its_work(node: EarNode) -> None:
+    class Flood:
+        """An executor for which another message has always come."""
+
+        def spin_once(self, timeout_sec: float) -> None:
+            node.calls += 1
+            if node.calls > 10_000:
+                raise RecursionError
+
+    ros._serve(node, Flood())
+    assert node.calls > 10
 
 
 def test_an_operators_stamp_means_nothing(node: EarNode) -> None:

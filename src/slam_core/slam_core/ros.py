@@ -46,6 +46,8 @@ _SIGNAL_PERIOD_S = 0.1
 """Longest time that a node without traffic takes to notice a signal."""
 _SERVICE_PERIOD_S = 0.02
 """Period in which a node that always has work to do looks after timers and services."""
+_SERVICE_CALLS = 100
+"""Callbacks at a time that it looks after: messages that come faster than that would keep it from its work for ever."""
 
 
 class RosTypes(MessageTypes):
@@ -219,10 +221,11 @@ def _wait(node: GuardedNode, executor: SingleThreadedExecutor) -> None:
 
 def _serve(node: GuardedNode, executor: SingleThreadedExecutor) -> None:
     """Call back all that is ready: timers and services too, of which a node that has work to do hears only here."""
-    calls = -1
-    while calls != node.calls:
+    for _ in range(_SERVICE_CALLS):
         calls = node.calls
         executor.spin_once(timeout_sec=0.0)
+        if calls == node.calls:
+            return
 
 
 def run_node(
