@@ -81,6 +81,17 @@ def test_saving_replaces_and_leaves_nothing_else(agent: Agent, tmp_path: Path) -
     assert files[1] == "manifest.json"
 
 
+def test_a_users_file_in_a_map_folder_stays(agent: Agent, tmp_path: Path) -> None:
+    joined, _ = join(agent.submaps()[:3])
+    joined.save(tmp_path / "map")
+    own = tmp_path / "map" / "arrays_backup.npz"
+    own.write_bytes(b"mine")
+    with pytest.raises(ValueError, match="map"):
+        joined.save(tmp_path / "map")
+    assert own.read_bytes() == b"mine"
+    GlobalMap.load(tmp_path / "map")
+
+
 def test_foreign_newer_and_damaged_folders_are_refused(agent: Agent, tmp_path: Path) -> None:
     folder = tmp_path / "map"
     with pytest.raises(ValueError, match="not a map"):

@@ -14,7 +14,7 @@ from stereo_frontend.surf_descriptor import describe_oriented, describe_upright,
 from stereo_frontend.surf_detector import find_keypoints, find_maxima, fitting_octaves, halved, integral_image
 from stereo_frontend.surf_hessian import FILTER_SIZES, determinant_at, row_filter
 from stereo_frontend.surf_integral import KEPT_ROWS, integral_room, next_integral_row
-from stereo_frontend.surf_pair import LANES, SAMPLES, STEP, describe_for_pair, pair_weights
+from stereo_frontend.surf_pair import LANES, SAMPLES, STEP, WEIGHT_SIGMA, describe_for_pair
 
 
 @pytest.fixture(scope="module")
@@ -244,7 +244,7 @@ def test_oriented_descriptor_equals_its_twin(image, place):
 
 def twin_pair_descriptor(image: np.ndarray, u: float, v: float, scale: float) -> np.ndarray:
     """Sample by sample; wavelets that reach beyond the image are zero."""
-    weights, out, middle = pair_weights(), np.zeros((4, 4, 8)), 0.5 * (SAMPLES - 1)
+    weights, out, middle = region_weights(SAMPLES, WEIGHT_SIGMA), np.zeros((4, 4, 8)), 0.5 * (SAMPLES - 1)
     for j in range(SAMPLES):
         for i in range(SAMPLES):
             x, y = u + 0.5 + (i - middle) * STEP * scale, v + 0.5 + (j - middle) * STEP * scale
@@ -260,7 +260,7 @@ def twin_pair_descriptor(image: np.ndarray, u: float, v: float, scale: float) ->
 def test_pair_descriptors_equal_their_twins_within_the_image_and_at_its_edges(image, number):
     places = np.random.default_rng(number).uniform([3, 3, 1.2], [167, 127, 3.0], (number, 3))
     out = np.empty((number, 128), np.float32)
-    describe_for_pair(integral_image(image), places, pair_weights(), out)
+    describe_for_pair(integral_image(image), places, region_weights(SAMPLES, WEIGHT_SIGMA), out)
     np.testing.assert_allclose(out, [twin_pair_descriptor(image, *place) for place in places], atol=2e-6)
 
 

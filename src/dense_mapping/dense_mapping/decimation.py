@@ -37,7 +37,7 @@ def at_most(surface: Surface, faces: int) -> Surface:
 
 def _cells(surface: Surface, size: float) -> _Cells:
     """The vertices by cells of ``size`` m, in the order of their places; a face within two cells is none."""
-    # By sorting: without inverse or index NumPy 2.3 has a table of values made, which takes ten times as long.
+    # By sorting: without inverse or index NumPy 2.3 makes a table of values, and the search takes 2.5 times as long.
     cell = np.unique(row_keys(np.floor(surface.points / size).astype(np.int64)), return_inverse=True)[1]
     faces = cell[surface.faces]
     a, b, c = faces.T

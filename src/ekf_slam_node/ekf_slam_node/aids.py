@@ -29,7 +29,8 @@ _SIGMA_TURN_RATE = 0.1
 """By how much (rad/s) the turn rate of a moment may differ from that of a single reading."""
 _ELSEWHERE = np.repeat([0.3, np.radians(5.0)], 3)
 """Places (m, rad) that look the same are at least so far apart."""
-_GATE = chi_square_bound(0.999, 6)
+AID_GATE = chi_square_bound(0.999, 6)
+"""Gate of a motion's six coordinates by two sensors, 99.9 % of true ones inside."""
 
 ALL = slice(0, 6)
 ROTATION = slice(3, 6)
@@ -128,7 +129,7 @@ class MotionAids:
             return False
         error = np.abs(boxminus(told.T, T_previous_now))
         is_far = (error > _ELSEWHERE)[told.rows].any()
-        if not is_far or not contradicts(told, T_previous_now, covariance, _GATE):
+        if not is_far or not contradicts(told, T_previous_now, covariance, AID_GATE):
             return False
         if end_stamp_ns != self._doubted_ns:
             self._doubted_ns = end_stamp_ns

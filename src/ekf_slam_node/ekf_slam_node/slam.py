@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from ekf_slam_node.aids import ALL, Aid, MotionAids, aid_error, contradicts
+from ekf_slam_node.aids import AID_GATE, ALL, Aid, MotionAids, aid_error, contradicts
 from ekf_slam_node.candidates import motion_prior
 from ekf_slam_node.common_error import CommonError
 from ekf_slam_node.config import EkfSlamConfig
@@ -27,12 +27,8 @@ from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.rolling_shutter import RollingShutter
 from ekf_slam_node.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submap_chain import SubmapChain
-from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
 from slam_core.types import Counters, Features, ImuSample, PoseEstimate, RelativeMotion, Submap
-
-_AID_GATE = chi_square_bound(0.999, 6)
-"""Gate of the motion by another sensor: its six coordinates, 99.9 % of true ones inside."""
 
 _STANDING_VELOCITY = np.repeat([0.02, np.radians(0.5)], 3)
 """Standard deviations (m/s, rad/s) of the velocities of a rig that stands."""
@@ -222,7 +218,7 @@ class EkfSlam:
         step = ekf.time_update(linked.dt, sigma, link.T)
         ekf.apply_time_update(step)
         if aid is not None:
-            if contradicts(aid, link.T, linked.motion_covariance, _AID_GATE):
+            if contradicts(aid, link.T, linked.motion_covariance, AID_GATE):
                 self.counters.add("aids_rejected")
             else:
                 self._use_aid(step, aid, link.T)
@@ -269,7 +265,7 @@ class EkfSlam:
         """Measure the step just predicted, unless the aid contradicts the prediction."""
         rotation = step.T[:3, :3] @ T_previous_now[:3, :3].T
         error, covariance = aid_error(aid, T_previous_now, rotation)
-        applied = self._chain.local.ekf.update_increment(step, error, covariance, aid.rows, _AID_GATE).applied
+        applied = self._chain.local.ekf.update_increment(step, error, covariance, aid.rows, AID_GATE).applied
         self.counters.add("aids_used" if applied else "aids_rejected")
 
     def _arrive(self, frame: Frame, standing: bool = False) -> None:

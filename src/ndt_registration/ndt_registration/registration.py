@@ -319,7 +319,7 @@ def _result(
         planar_constraint(source.planar) > 0.0,
         config.uncertainty,
     )
-    reason = _reason_offailure(optimum, fit.overlap, cost)
+    reason = _reason_of_failure(optimum, fit.overlap, cost)
     if reason and not 1.0 / _UNITS_APART < source.scale / scale < _UNITS_APART:
         reason = f"the source is {source.scale / scale:.2g} times as large as the target: is one of them in mm?"
     names = direction_names(uncertainty.free)
@@ -343,7 +343,7 @@ _LEAST_RADIUS = 0.05
 """Spread of the matched points, over the scale, below which rotations would be measured against nothing."""
 
 
-def _reason_offailure(optimum: NdtOptimum, overlap: float, cost: float) -> str:
+def _reason_of_failure(optimum: NdtOptimum, overlap: float, cost: float) -> str:
     if overlap < _MIN_OVERLAP:
         needed = 100 * _MIN_OVERLAP
         return f"only {100 * overlap:.0f} % of the source lie on the target, at least {needed:.0f} % are needed"

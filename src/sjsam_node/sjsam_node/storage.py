@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ from slam_core.types import AnyArray, PoseEstimate, Submap
 FORMAT, VERSION = "indoor-slam-map", 6
 _MANIFEST = "manifest.json"
 _ARRAYS_PART = "arrays.part.npz"
+_ARRAYS = re.compile(r"arrays(-[0-9a-f]{16}|\.part)?\.npz")
+"""Names of the files of arrays that versions of this program wrote."""
 Arrays = dict[str, AnyArray]
 
 
@@ -92,8 +95,8 @@ def write_packed(folder: Path, packed: PackedMap) -> None:
     manifest = packed.manifest | _write_arrays(folder, packed.arrays)
     _write_synced(folder / f"{_MANIFEST}.part", _text(manifest))
     os.replace(folder / f"{_MANIFEST}.part", folder / _MANIFEST)
-    for old in folder.glob("arrays*.npz"):
-        if old.name != manifest["arrays"]:
+    for old in folder.iterdir():
+        if _ARRAYS.fullmatch(old.name) and old.name != manifest["arrays"]:
             old.unlink()
 
 
@@ -166,7 +169,7 @@ def is_map(folder: Path) -> bool:
         return False
     is_ours = isinstance(content, dict) and content.get("format") == FORMAT
     return is_ours and all(
-        p.name in (_MANIFEST, f"{_MANIFEST}.part") or p.match("arrays*.npz") for p in folder.iterdir()
+        p.name in (_MANIFEST, f"{_MANIFEST}.part") or _ARRAYS.fullmatch(p.name) for p in folder.iterdir()
     )
 
 

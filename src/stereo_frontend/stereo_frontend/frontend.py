@@ -172,7 +172,7 @@ class Frontend:
         if self.config.mode != "stereo":
             estimate = self._with_tof(images, left, stereo, depth, T_left_tof)
         left = self._described(images, left, np.isfinite(stereo.depth) | np.isfinite(estimate.depth))
-        self._learn(images, left, stereo, refined)
+        self.self_calibration.learn(self._view(images, left.select(np.isfinite(stereo.depth)), refined))
         by_stereo = np.flatnonzero(np.isfinite(stereo.depth))
         estimate.depth[by_stereo[~is_distinct(left.descriptors[by_stereo], _MOST_ALIKE)]] = np.nan
         return make_features(
@@ -248,10 +248,6 @@ class Frontend:
         error = calibration.rows(right.uv, np.zeros(len(right)))
         aligned = dataclasses.replace(right, uv=right.uv - np.column_stack([np.zeros_like(error), error]))
         return match_stereo(left, aligned, self.config.matching, bounds)
-
-    def _learn(self, images: StereoImages, left: Keypoints, stereo: DepthEstimate, refined: RefinedDisparity) -> None:
-        """Self-calibration from the keypoints with a depth by stereo."""
-        self.self_calibration.learn(self._view(images, left.select(np.isfinite(stereo.depth)), refined))
 
     def _view(self, images: StereoImages, left: Keypoints, refined: RefinedDisparity) -> StereoView:
         """View that self-calibration learns from."""

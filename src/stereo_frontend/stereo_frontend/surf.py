@@ -23,15 +23,9 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import ByteArray, Float32Array
 from stereo_frontend.keypoints import MOST_KEYPOINTS, Keypoints, Selector
-from stereo_frontend.surf_descriptor import (
-    DIMENSION,
-    describe_oriented,
-    describe_upright,
-    merged_signs,
-    region_weights,
-)
+from stereo_frontend.surf_descriptor import DIMENSION, describe_oriented, describe_upright, merged_signs, region_weights
 from stereo_frontend.surf_detector import MAX_PIXELS, find_keypoints, fitting_octaves, integral_image
-from stereo_frontend.surf_pair import PAIR_DIMENSION, describe_for_pair, pair_weights
+from stereo_frontend.surf_pair import PAIR_DIMENSION, SAMPLES, WEIGHT_SIGMA, describe_for_pair
 
 _OCTAVES = 3
 """Octaves of four filter sizes."""
@@ -42,7 +36,7 @@ _DIAMETER = 9.0 / 1.2
 """Size of a keypoint (px) per unit of its scale: that of the filter that found it."""
 
 
-_WEIGHTS, _PAIR_WEIGHTS = region_weights(), pair_weights()
+_WEIGHTS, _PAIR_WEIGHTS = region_weights(), region_weights(SAMPLES, WEIGHT_SIGMA)
 
 
 @dataclass(frozen=True)

@@ -56,16 +56,17 @@ _BORDERS = np.tan(np.arange(1, _PER_QUADRANT) * (0.5 * np.pi / _PER_QUADRANT)).a
 """Tangents of the directions that divide a quadrant."""
 
 
-def region_weights() -> Float32Array:
-    """Weight of every sample of one axis in each of the four subregions, shape (4, 20): Gaussian, with soft borders.
+def region_weights(samples: int = SAMPLES, sigma: float = WEIGHT_SIGMA) -> Float32Array:
+    """Weight of every sample of one axis in each of the four subregions, (4, samples): Gaussian, with soft borders.
 
     A sample counts for the two subregions beside it in proportion to its distance from their centres, so that a small
-    shift does not move it from one number to another.
+    shift does not move it from one number to another. ``sigma`` is the width of the Gaussian, in samples.
     """
-    position = np.arange(SAMPLES) - (SAMPLES - 1) / 2.0
-    centres = (np.arange(4) - 1.5) * 5.0
-    overlap = np.clip(1.0 - np.abs(position[None, :] - centres[:, None]) / 5.0, 0.0, 1.0)
-    return np.asarray(overlap * np.exp(-0.5 * (position / WEIGHT_SIGMA) ** 2), np.float32)
+    width = samples / 4
+    position = np.arange(samples) - (samples - 1) / 2.0
+    centres = (np.arange(4) - 1.5) * width
+    overlap = np.clip(1.0 - np.abs(position[None, :] - centres[:, None]) / width, 0.0, 1.0)
+    return np.asarray(overlap * np.exp(-0.5 * (position / sigma) ** 2), np.float32)
 
 
 def merged_signs(descriptors: Float32Array) -> Float32Array:
@@ -185,7 +186,7 @@ def _turned_samples(dx, dy, cosine, sine, nodes, room, split):  # type: ignore[n
         _between_nodes(nodes, at, shares[0], shares[1], x, y)
         for i in range(SAMPLES):
             x[i], y[i] = cosine * x[i] + sine * y[i], cosine * y[i] - sine * x[i]
-        _split(x, y, split[j])
+        split_by_sign(x, y, SAMPLES, split[j])
 
 
 @njit(cache=True, nogil=True)
@@ -232,24 +233,25 @@ def _lerp(first, second, share):  # type: ignore[no-untyped-def]
 def _split_samples(dx, dy, split):  # type: ignore[no-untyped-def]
     """The terms of all samples of a square along the axes of the image."""
     for j in range(SAMPLES):
-        _split(dx[j * STRIDE : j * STRIDE + SAMPLES], dy[j * STRIDE : j * STRIDE + SAMPLES], split[j])
+        row = slice(j * STRIDE, j * STRIDE + SAMPLES)
+        split_by_sign(dx[row], dy[row], SAMPLES, split[j])
 
 
 @in_place()
-def _split(dx, dy, out):  # type: ignore[no-untyped-def]
-    """Write the eight terms of a row of samples (20,), term after term (8 * 20,).
+def split_by_sign(dx, dy, count, out):  # type: ignore[no-untyped-def]
+    """Write the eight terms of ``count`` samples, term after term (8 * count,).
 
     x and |x| where y is not negative, where it is, then y by the sign of x.
     """
     zero = np.float32(0.0)
-    for i in range(SAMPLES):
+    for i in range(count):
         x, y = dx[i], dy[i]
         positive_x = x if y >= zero else zero
         positive_y = y if x >= zero else zero
-        out[i], out[SAMPLES + i] = positive_x, abs(positive_x)
-        out[2 * SAMPLES + i], out[3 * SAMPLES + i] = x - positive_x, abs(x - positive_x)
-        out[4 * SAMPLES + i], out[5 * SAMPLES + i] = positive_y, abs(positive_y)
-        out[6 * SAMPLES + i], out[7 * SAMPLES + i] = y - positive_y, abs(y - positive_y)
+        out[i], out[count + i] = positive_x, abs(positive_x)
+        out[2 * count + i], out[3 * count + i] = x - positive_x, abs(x - positive_x)
+        out[4 * count + i], out[5 * count + i] = positive_y, abs(positive_y)
+        out[6 * count + i], out[7 * count + i] = y - positive_y, abs(y - positive_y)
 
 
 @in_place()

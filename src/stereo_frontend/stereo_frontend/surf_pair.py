@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from slam_core.in_place import in_place
-from slam_core.types import Float32Array
+from stereo_frontend.surf_descriptor import split_by_sign
 
 LANES = 16
 """Keypoints described at a time."""
@@ -32,17 +32,8 @@ _TERMS = 8
 """Numbers per subregion."""
 _CELL = _TERMS * LANES
 PAIR_DIMENSION = _REGIONS * _REGIONS * _TERMS
-_WEIGHT_SIGMA = 2.5
+WEIGHT_SIGMA = 2.5
 """Width of the Gaussian over the samples, in samples."""
-
-
-def pair_weights() -> Float32Array:
-    """Weight of every sample of one axis in each of the four subregions, shape (4, 8): Gaussian, with soft borders."""
-    width = SAMPLES / _REGIONS
-    position = np.arange(SAMPLES) - 0.5 * (SAMPLES - 1)
-    centres = (np.arange(_REGIONS) - 0.5 * (_REGIONS - 1)) * width
-    overlap = np.clip(1.0 - np.abs(position[None, :] - centres[:, None]) / width, 0.0, 1.0)
-    return np.asarray(overlap * np.exp(-0.5 * (position / _WEIGHT_SIGMA) ** 2), np.float32)
 
 
 @njit(cache=True, nogil=True)
@@ -137,7 +128,7 @@ def _sum_regions(dx, dy, weights, terms, rows, sums):  # type: ignore[no-untyped
     for j in range(SAMPLES):
         for i in range(SAMPLES):
             at = j * _LINE + i * LANES
-            _split(dx[at : at + LANES], dy[at : at + LANES], terms)
+            split_by_sign(dx[at : at + LANES], dy[at : at + LANES], LANES, terms)
             for region in range(_REGIONS):
                 if weights[region, j] > 0.0:
                     _add(terms, weights[region, j], rows[region * SAMPLES + i])
@@ -146,20 +137,6 @@ def _sum_regions(dx, dy, weights, terms, rows, sums):  # type: ignore[no-untyped
             for i in range(SAMPLES):
                 if weights[column, i] > 0.0:
                     _add(rows[region * SAMPLES + i], weights[column, i], sums[region * _REGIONS + column])
-
-
-@in_place()
-def _split(dx, dy, out):  # type: ignore[no-untyped-def]
-    """The eight terms of a sample: x and |x| where y is not negative, where it is, then y by the sign of x."""
-    zero = np.float32(0.0)
-    for k in range(LANES):
-        x, y = dx[k], dy[k]
-        positive_x = x if y >= zero else zero
-        positive_y = y if x >= zero else zero
-        out[k], out[LANES + k] = positive_x, abs(positive_x)
-        out[2 * LANES + k], out[3 * LANES + k] = x - positive_x, abs(x - positive_x)
-        out[4 * LANES + k], out[5 * LANES + k] = positive_y, abs(positive_y)
-        out[6 * LANES + k], out[7 * LANES + k] = y - positive_y, abs(y - positive_y)
 
 
 @in_place()
