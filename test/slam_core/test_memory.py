@@ -49,3 +49,28 @@ rooms = [[] for _ in range(50_000)]
 print(gc.get_freeze_count() > 1000, left() is None)
 """
     assert subprocess.check_output([sys.executable, "-c", script], text=True).split() == ["True", "True"]
+
+
+LIBRARIES = """
+import re
+import numpy as np
+import scipy.linalg
+from slam_core.memory import leave_libraries
+
+def of_files_mib():
+    return int(re.search(r"RssFile:\\s+(\\d+)", open("/proc/self/status").read())[1]) / 1024
+
+before = scipy.linalg.solve(np.eye(30) + 1.0, np.arange(30.0))
+loaded = of_files_mib()
+leave_libraries()
+left = of_files_mib()
+after = scipy.linalg.solve(np.eye(30) + 1.0, np.arange(30.0))
+print(loaded, left, np.array_equal(before, after))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the memory of Linux")
+def test_libraries_work_as_before_after_their_code_was_left_to_the_system() -> None:
+    loaded, left, is_same = subprocess.check_output([sys.executable, "-c", LIBRARIES], text=True).split()
+    assert float(left) < 0.6 * float(loaded)
+    assert is_same == "True"

@@ -12,13 +12,13 @@ import ctypes
 import gc
 import mmap
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 """Parameters of ``mallopt`` (malloc.h)."""
-_LLVM = "libllvmlite.so"
 _KEPT_BYTES = 64 << 20
 _LARGE_BYTES = 8 << 20
 _FEW_BYTES = 1 << 20
@@ -58,15 +58,32 @@ def search_less_garbage() -> None:
 
 
 def give_back() -> None:
-    """Return freed memory to the system, between two parts of a run that need it for different things.
+    """Return freed memory to the system, between two parts of a run that need it for different things."""
+    library = _glibc()
+    if library is not None:
+        library.malloc_trim(0)
+    leave_libraries()
 
-    So is the code of LLVM, 50 MB, which loads kernels and then does nothing; whoever needs it again reads it again.
+
+def leave_libraries() -> None:
+    """Leave code and tables of the loaded libraries to the system, 80 to 110 MB; what is needed is read again.
+
+    That is little of it: most has served to load modules and kernels, above all LLVM's 70 MB. Takes 20 ms.
     """
     library = _glibc()
-    if library is None:
-        return
-    library.malloc_trim(0)
-    for line in Path("/proc/self/maps").read_text().splitlines():
-        if line.endswith(_LLVM) and " r-xp " in line:
-            first, end = (int(address, 16) for address in line.split()[0].split("-"))
+    if library is not None:
+        for first, end in _clean_parts_of_libraries():
             library.madvise(ctypes.c_void_p(first), ctypes.c_size_t(end - first), mmap.MADV_DONTNEED)
+
+
+def _clean_parts_of_libraries() -> Iterator[tuple[int, int]]:
+    """Addresses (first, end) of parts of libraries that are as in their files: no page was written to."""
+    part = None
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        words = line.split(None, 5)
+        if not words[0].endswith(":"):  # addresses, rights, offset, device, inode, name
+            is_code = len(words) == 6 and ".so" in words[5] and words[1] in ("r-xp", "r--p")
+            first, _, end = words[0].partition("-")
+            part = (int(first, 16), int(end, 16)) if is_code else None
+        elif part is not None and words[0] == "Anonymous:" and words[1] == "0":
+            yield part

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sjsam_node.graph.offload import Offload
+from sjsam_node.graph.offload import Offload, forget
 
 OPEN = Path("/proc/self/fd")
 
@@ -42,6 +42,16 @@ def test_what_was_read_is_left_to_the_system_and_read_again(rng: np.random.Gener
     disk.forget()
     assert _mapped_mib() < read - 30
     assert np.array_equal(on_disk, large)
+    forget(on_disk[3:5])
+    assert _mapped_mib() < read - 30
+    assert np.array_equal(on_disk, large)
+
+
+def test_an_array_that_is_not_on_disk_stays(rng: np.random.Generator) -> None:
+    array = rng.normal(size=(5, 7))
+    before = array.copy()
+    forget(array[1:])
+    assert np.array_equal(array, before)
 
 
 def _mapped_mib() -> float:

@@ -20,6 +20,17 @@ _SEGMENT = 1 << 26
 _ALIGNMENT = 64
 
 
+def forget(array: AnyArray) -> None:
+    """Leave an array that :meth:`Offload.put` returned, and its neighbours, to the operating system; others stay."""
+    owner: Any = array
+    while isinstance(owner, np.ndarray):
+        owner = owner.base
+    if isinstance(owner, memoryview):
+        owner = owner.obj
+    if isinstance(owner, mmap.mmap):
+        owner.madvise(mmap.MADV_DONTNEED)
+
+
 @dataclass
 class Offload:
     """Arrays that are read from disk where they are used; the operating system keeps what is used often."""

@@ -13,6 +13,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from sjsam_node.graph import offload
 from sjsam_node.graph.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.joining import JoiningProblem, joint_errors, map_residual
@@ -231,6 +232,7 @@ class Estimator:
             if i not in self._cache:
                 record, recover = graph.records[i], not graph.redundant[i]
                 self._cache[i] = reduce_map(record, tying[record.observations], self.config.rows, recover=recover)
+                offload.forget(record.submap.covariance)  # of the whole of it, two thirds of a map, none is used again
         return [self._cache[i] for i in records]
 
     def forget(self) -> None:

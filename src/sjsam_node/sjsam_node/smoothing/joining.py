@@ -92,9 +92,12 @@ class JoiningProblem:
     def solve(self, damping: float) -> FloatArray | None:
         """Damped step, or None where the matrix is not positive definite."""
         self._factorized, self._damping = None, np.inf
-        values = self._values.copy()
-        values[self.layout.pattern.diagonal] *= 1.0 + damping
-        if not self.factor.factorize(values):
+        diagonal = self.layout.pattern.diagonal
+        undamped = self._values[diagonal]
+        self._values[diagonal] = (1.0 + damping) * undamped
+        is_positive = self.factor.factorize(self._values)
+        self._values[diagonal] = undamped
+        if not is_positive:
             return None
         self._damping = damping
         return self.factor.solve(-self._gradient)

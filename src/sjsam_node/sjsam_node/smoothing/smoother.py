@@ -155,6 +155,7 @@ class Smoother:
         And where they do not contradict each other: then fewer say more. ``coarse``: as near to it as an update does.
         """
         self._choose_ties()
+        self._solved.clear()  # the graph has its estimate; problem and factor of before are as large as the new ones
         self.parked = Parked()
         self.regions.clear(len(self.graph.records))
         for component in np.unique(self.graph.component_of).tolist():

@@ -22,7 +22,7 @@ from slam_bringup.pipeline.map_growth import MapGrowth
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges
 from slam_bringup.pipeline.sensor_pipeline import AgentItem
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_core.memory import give_back
+from slam_core.memory import give_back, leave_libraries
 from slam_core.messages import rounded
 from slam_core.types import Features, ImuSample, PoseEstimate, Submap
 
@@ -51,7 +51,7 @@ class Mapper:
         self._diaries = {agent: _Diary() for agent in sensors}
         self._joiner = JoinerStage()
         self._joins: list[Future[None]] = []
-        self._submaps = 0
+        self._submaps = self._added = 0
         self._events: list[str] = []
 
     def process(self, item: AgentItem) -> None:
@@ -137,6 +137,9 @@ class Mapper:
     def _add(self, submap: Submap) -> None:
         with self._times.measure("sjsam"):
             self.growth.add(rounded(submap) if self._compact else submap)
+        self._added += 1
+        if self._added.bit_count() == 1:  # kernels and modules are loaded with the first of something
+            leave_libraries()
 
 
 class _Diary:

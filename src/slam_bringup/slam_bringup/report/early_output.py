@@ -54,12 +54,14 @@ class EarlyOutput:
         return write_results(self._out, result, self._save_map, pictures=pictures, charts=charts, is_mapped=is_mapped)
 
     def _write_mapped(self, result: RunResult) -> list[Written]:
+        self._out.mkdir(parents=True, exist_ok=True)
+        self._save_map(self._out / "map")
+        give_back()  # what the map was solved with
         # What draws and writes is loaded when there is something to write: mapping needs the memory.
         from slam_bringup.report.output import write_mapped
         from slam_bringup.report.result_bag import agents_messages
 
-        write_mapped(self._out, result, self._save_map)
-        give_back()  # what the map was solved with
+        write_mapped(self._out, result)
         return agents_messages(result)
 
     def _draw(self, result: RunResult) -> Charts:
