@@ -14,6 +14,7 @@ from ndt_registration.moments import block_counts, block_moments
 from ndt_registration.visibility import mean_spacing, range_image
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
+from slam_core.least_squares import median
 
 _COVERAGE_SIZE = 64
 """Size of the range image from which the part of the sphere that a scan covers is measured."""
@@ -89,13 +90,15 @@ def _finite_rows(points: FloatArray) -> FloatArray:
 @njit(cache=True, nogil=True)
 def largest_extent(points: FloatArray) -> float:
     """Largest difference of a coordinate among points (n, 3), n > 0."""
-    largest = 0.0
-    for c in range(3):
-        low = high = points[0, c]
-        for i in range(points.shape[0]):
-            low, high = min(low, points[i, c]), max(high, points[i, c])
-        largest = max(largest, high - low)
-    return largest
+    x0 = x1 = points[0, 0]
+    y0 = y1 = points[0, 1]
+    z0 = z1 = points[0, 2]
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        x0, x1 = (x if x < x0 else x0), (x if x > x1 else x1)
+        y0, y1 = (y if y < y0 else y0), (y if y > y1 else y1)
+        z0, z1 = (z if z < z0 else z0), (z if z > z1 else z1)
+    return float(max(x1 - x0, y1 - y0, z1 - z0))
 
 
 def is_planar(points: npt.ArrayLike) -> bool:
@@ -117,17 +120,25 @@ def evened(points: FloatArray) -> FloatArray:
     if len(points) == 0:
         return points
     distance = _distances(points)
-    median, wide = np.percentile(distance, (50.0, 90.0))
-    near = distance <= _FARTHEST * median
-    if median > 0.0 and not near.all():
-        points, wide = points[near], np.percentile(distance[near], 90.0)
-    size = _EVEN_SIZE * max(float(wide), 1e-6)
+    distance.sort()
+    farthest = _FARTHEST * _quantile(distance, 0.5)
+    if 0.0 < farthest < distance[-1]:
+        points, distance = points[_distances(points) <= farthest], distance[distance <= farthest]
+    size = _EVEN_SIZE * max(_quantile(distance, 0.9), 1e-6)
     counts = block_counts(points, size)
-    crowding = float((counts**2).sum() / counts.sum() / np.median(counts))
-    if not crowding > _CROWDED:
+    if not (counts**2).sum() / counts.sum() / median(counts) > _CROWDED:
         return points
     blocks = block_moments(points, size)
     return blocks.sums / blocks.counts[:, None]
+
+
+def _quantile(ordered: FloatArray, share: float) -> float:
+    """``np.quantile`` of numbers (n,), n > 0, in rising order: sorting them once takes half of its time."""
+    place = share * (len(ordered) - 1)
+    below = int(place)
+    low, high = float(ordered[below]), float(ordered[min(below + 1, len(ordered) - 1)])
+    part = place - below
+    return low + (high - low) * part if part < 0.5 else high - (high - low) * (1.0 - part)
 
 
 def thinned(points: FloatArray, limit: int, *, planar: bool) -> Cloud:
