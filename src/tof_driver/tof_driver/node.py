@@ -141,10 +141,8 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
     def _publish(self, depth: DepthImage) -> None:
         assert self.stage.info is not None
         header = header_message(self.types, depth.stamp_ns, depth.frame_id)
-        outputs = depth_messages(self.types, depth)._replace(
-            points=cloud_message(self.types, header, depth_cloud(depth)),
-            camera_info=camera_info_message(self.types, header, self.stage.info),
-        )
+        outputs = depth_messages(self.types, depth, cloud_message(self.types, header, depth_cloud(depth)))
+        outputs = outputs._replace(camera_info=camera_info_message(self.types, header, self.stage.info))
         for topic, message in zip(DEPTH_TOPICS, outputs, strict=True):
             if topic in self._topics:
                 self.publish(topic, message)

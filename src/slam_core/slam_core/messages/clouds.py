@@ -88,8 +88,12 @@ def points_from_message(message: Message) -> Float32Array:
     names = cloud.dtype.names or ()
     if missing := [name for name in "xyz" if name not in names]:
         raise ValueError(f"point cloud has no field {', '.join(missing)}; it has {', '.join(names) or 'none'}")
-    points = np.stack([cloud[name].ravel().astype(np.float32) for name in "xyz"], axis=-1)
-    points[np.abs(points).max(axis=1, initial=0.0) > FARTHEST_M] = np.nan
+    points = np.empty((cloud.size, 3), np.float32)
+    for axis, name in enumerate("xyz"):
+        points[:, axis] = cloud[name].ravel()
+    far = np.abs(points) > FARTHEST_M
+    if far.any():
+        points[far.any(axis=1)] = np.nan
     return points
 
 

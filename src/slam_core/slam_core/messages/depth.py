@@ -36,9 +36,10 @@ DEPTH_TOPICS = {
 """Topic and type of each field of :class:`DepthMessages`, in its order."""
 
 
-def depth_messages(types: MessageTypes, image: DepthImage) -> DepthMessages:
-    """Messages that carry ``image`` exactly, and its points, organised, NaN where there is no depth."""
+def depth_messages(types: MessageTypes, image: DepthImage, points: Message | None = None) -> DepthMessages:
+    """Messages that carry ``image`` exactly, with ``points``, or its own: organised, NaN where there is no depth."""
     header = header_message(types, image.stamp_ns, image.frame_id)
+    points = points_message(types, header, image.points()) if points is None else points
 
     def picture(pixels: Float32Array | None) -> Message | None:
         return None if pixels is None else image_message(types, header, np.asarray(pixels, dtype="<f4"))
@@ -47,7 +48,7 @@ def depth_messages(types: MessageTypes, image: DepthImage) -> DepthMessages:
         picture(image.depth),
         picture(image.sigma),
         camera_info_message(types, header, rectified_info(image.camera)),
-        points_message(types, header, image.points()),
+        points,
         picture(image.amplitude),
         picture(image.intensity),
     )
