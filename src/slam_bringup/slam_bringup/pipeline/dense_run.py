@@ -21,12 +21,16 @@ from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
 from slam_core.geometry import FloatArray
+from slam_core.memory import trim
 from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray, DepthImage
 from stereo_frontend.corrected_info import corrected_right
 from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.stage import StereoStage
 from tof_driver.stage import DepthStage
+
+_TRIMMED = 16
+"""Key frames after which freed memory is returned."""
 
 
 def dense_model(
@@ -85,6 +89,7 @@ class FieldThread:
 
     def __init__(self, model: DenseModel) -> None:
         self.model = model
+        self._added = 0
         self._pool = ThreadPoolExecutor(1, "field")
         self._last: Future[None] | None = None
 
@@ -99,6 +104,9 @@ class FieldThread:
         """Put a key frame into the model when the one before is there."""
         self._wait()
         self._last = self._pool.submit(self.model.add, camera, T_map_camera, image, picture)
+        self._added += 1
+        if self._added % _TRIMMED == 0:
+            trim()
 
     def _wait(self) -> None:
         if self._last is not None:

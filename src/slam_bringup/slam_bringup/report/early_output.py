@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -58,6 +59,9 @@ class EarlyOutput:
         self._save_map(self._out / "map")
         give_back()  # what the map was solved with
         # What draws and writes is loaded when there is something to write: mapping needs the memory.
+        from slam_bringup.report.drawing import load_without_documentation
+
+        load_without_documentation()
         from slam_bringup.report.output import write_mapped
         from slam_bringup.report.result_bag import agents_messages
 
@@ -67,7 +71,10 @@ class EarlyOutput:
     def _draw(self, result: RunResult) -> Charts:
         from slam_bringup.report.report import draw_charts
 
-        return draw_charts(result, self._go_on)
+        charts = draw_charts(result, self._go_on)
+        gc.collect()  # parts of figures name each other
+        give_back()
+        return charts
 
     def _go_on(self) -> None:
         if self._ended:

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from dense_mapping.floor_plan import FREE, OCCUPIED, FloorPlan
 from dense_mapping.navigation import frontiers
@@ -22,6 +23,7 @@ from slam_core.files import atomic_path
 from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
 
 matplotlib.use("Agg")
+matplotlib.rcParams["axes.titley"] = 1.0  # else titles look for what they might touch: a sixth of the time to draw
 
 COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd")
 _TRUTH = "#222222"
@@ -205,6 +207,8 @@ def timing_figure(result: RunResult) -> Figure:
     axes.set_xlabel("share of the run")
     axes.set_ylabel("ms per call")
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")  # powers of ten as formulas load fonts and a parser
+    axes.yaxis.set_minor_formatter(NullFormatter())
     if result.stage_ms:
         axes.legend(fontsize=8, ncols=3)
     axes.grid(color="0.92")
