@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dense_mapping.stereo_depth import StereoDepthConfig, stereo_depth
-from dense_mapping.stereo_kernels import StepNoise, refine
+from dense_mapping.stereo_kernels import StepNoise, drop_occluded, refine
 from slam_core.camera import Camera, StereoCamera
 from slam_core.types import StereoImages
 from slam_simulation.scenario import Scenario
@@ -124,3 +124,33 @@ def test_a_surface_nearer_than_all_else_is_searched_for(rng):
     image = stereo_depth(StereoImages(0, left, right, STEREO), StereoDepthConfig(min_depth=0.5))
     assert abs(np.nanmedian(image.depth[90:150, 190:230]) - 20.0 / 37.0) < 0.01
     assert np.isfinite(image.depth[90:150, 190:230]).mean() > 0.9
+
+
+def occluded_by_numpy(disparity: np.ndarray, most: float) -> np.ndarray:
+    kept = np.full_like(disparity, np.nan)
+    for row in range(len(disparity)):
+        known = np.nonzero(np.isfinite(disparity[row]))[0]
+        d = disparity[row, known]
+        partner = np.rint(known - d)
+        nearest = np.array([d[partner == p].max() for p in partner])
+        seen = (partner >= 0) & (d >= nearest - most)
+        kept[row, known[seen]] = d[seen]
+    return kept
+
+
+def test_the_compiled_drop_of_what_is_occluded_is_that_of_numpy(rng):
+    disparity = rng.uniform(0.5, 30.0, (12, 80)).astype(np.float32)
+    disparity[rng.random(disparity.shape) < 0.2] = np.nan
+    expected = occluded_by_numpy(disparity, 1.0)
+    drop_occluded(disparity, 1.0, np.empty(80, np.float32))
+    np.testing.assert_array_equal(disparity, expected)
+    assert 0.2 < np.isfinite(disparity).mean() < 0.7
+
+
+def test_what_stands_behind_a_post_is_left_out():
+    """Left of a post the right camera sees the post where the left one sees the wall."""
+    disparity = np.full((4, 60), 5.0, np.float32)
+    disparity[:, 30:40] = 15.0
+    drop_occluded(disparity, 1.0, np.empty(60, np.float32))
+    expected = [*range(5), *range(20, 30)]
+    assert np.nonzero(np.isnan(disparity[0]))[0].tolist() == expected

@@ -26,8 +26,8 @@ _SIGMA_UNIT = 0.0005
 class KeyframeConfig(Config):
     """Selection of key frames, and of their pixels that count."""
 
-    distance: float = parameter(0.2, "a key frame every so much way", unit="m", minimum=0.01)
-    angle_deg: float = 10.0
+    distance: float = parameter(0.22, "a key frame every so much way", unit="m", minimum=0.01)
+    angle_deg: float = 11.0
     """Or every so much turn, deg."""
     min_depth: float = parameter(0.3, "depth below which a pixel is left out", unit="m", minimum=0.0)
     max_depth: float = parameter(5.0, "depth beyond which a pixel is left out", unit="m", minimum=0.5, maximum=16.0)

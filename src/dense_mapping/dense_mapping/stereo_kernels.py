@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled parts of dense stereo: the left-right check, and the sub-pixel step with its sigma.
+"""The compiled parts of dense stereo: what only one camera sees, and the sub-pixel step with its sigma.
 
 Sums over windows are sums over columns, which move down with the rows, added up along each row that is kept.
 """
@@ -143,11 +143,21 @@ def _step_along_row(
 
 
 @in_place()
-def drop_contradicted(left: Float32Array, right: Float32Array, most: float) -> None:  # pragma: no cover - compiled
-    """Set those disparities (h, w) of the left image to NaN whose partner does not point back to them."""
-    for row in range(left.shape[0]):
-        for u in range(left.shape[1]):
-            d = left[row, u]
+def drop_occluded(disparity: Float32Array, most: float, nearest: Float32Array) -> None:  # pragma: no cover - compiled
+    """Set those disparities (h, w) of the left image to NaN that the right camera cannot see.
+
+    At their partner, which may lie outside of the right image, another one is larger by more than ``most``: it is
+    nearer. ``nearest`` (w,): room for the largest disparity at each pixel of a row of the right image.
+    """
+    for row in range(disparity.shape[0]):
+        nearest[:] = 0.0
+        for u in range(disparity.shape[1]):
+            d = disparity[row, u]
             partner = np.int64(np.rint(u - d)) if d == d else -1
-            if partner < 0 or not abs(d - right[row, partner]) <= most:
-                left[row, u] = np.nan
+            if partner >= 0:
+                nearest[partner] = max(nearest[partner], d)
+        for u in range(disparity.shape[1]):
+            d = disparity[row, u]
+            partner = np.int64(np.rint(u - d)) if d == d else -1
+            if partner < 0 or d < nearest[partner] - most:
+                disparity[row, u] = np.nan
