@@ -25,6 +25,7 @@ So row differences, which every match shows, tell most of what bends the dispari
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -67,55 +68,60 @@ class RectificationError:
 
     def columns(self, uv_right: AnyArray) -> FloatArray:
         """Error (n,) px along the row at pixels (n, 2) of the right image: seen minus ideal column."""
-        return np.asarray(self.camera.fx * column_basis(self._rays(uv_right)) @ self.parameters)
+        return np.asarray(self.camera.fx * column_basis(_rays(self.camera, uv_right)) @ self.parameters)
 
     def column_sigma(self, uv_right: AnyArray) -> FloatArray:
         """Standard deviation (n,) px of :meth:`columns`."""
-        J = self.camera.fx * column_basis(self._rays(uv_right))
+        J = self.camera.fx * column_basis(_rays(self.camera, uv_right))
         return _sigmas(J, self.covariance)
 
     def rows(self, uv_right: AnyArray, disparity: AnyArray) -> FloatArray:
         """Error (n,) px across the rows at pixels (n, 2) of the right image, of ``disparity`` (n,) px."""
-        basis = row_basis(self._rays(uv_right), disparity / self.camera.fx)
+        basis = row_basis(_rays(self.camera, uv_right), disparity / self.camera.fx)
         return np.asarray(self.camera.fx * basis @ self.parameters)
 
     def row_rms(self) -> float:
         """Root mean square (px) of :meth:`rows` over the image, far away."""
-        return _rms(self._row_jacobian() @ self.parameters)
+        return _rms(self.parameters, _moments(self.camera)[0])
 
     def row_sigma_rms(self) -> float:
         """Standard deviation (px) of the same."""
-        return _rms(_sigmas(self._row_jacobian(), self.covariance))
+        return _sigma_rms(self.covariance, _moments(self.camera)[0])
 
     def column_rms(self) -> float:
         """Root mean square (px) of :meth:`columns` over the image."""
-        return _rms(self.columns(self._grid()))
-
-    def column_moment(self) -> FloatArray:
-        """M (10, 10): the mean square (px2) of :meth:`columns` over the image is ``parameters^T M parameters``."""
-        J = self.camera.fx * column_basis(self._rays(self._grid()))
-        return np.asarray(J.T @ J / len(J))
+        return _rms(self.parameters, self.column_moment())
 
     def column_sigma_rms(self) -> float:
         """Standard deviation (px) of the same."""
-        return _rms(self.column_sigma(self._grid()))
+        return _sigma_rms(self.covariance, self.column_moment())
 
-    def _row_jacobian(self) -> FloatArray:
-        rays = self._rays(self._grid())
-        return np.asarray(self.camera.fx * row_basis(rays, np.zeros(len(rays))))
+    def column_moment(self) -> FloatArray:
+        """M (10, 10): the mean square (px2) of :meth:`columns` over the image is ``parameters^T M parameters``."""
+        return _moments(self.camera)[1]
 
-    def _grid(self) -> FloatArray:
-        u, v = np.meshgrid(_GRID * self.camera.width, _GRID * self.camera.height)
-        return np.column_stack([u.ravel(), v.ravel()])
 
-    def _rays(self, uv: AnyArray) -> FloatArray:
-        c = self.camera
-        return (np.asarray(uv, dtype=np.float64) - [c.cx, c.cy]) / [c.fx, c.fy]
+@lru_cache(maxsize=4)
+def _moments(camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """Mean products (10, 10) px2 of the derivatives across and along the rows over the image, far away."""
+    u, v = np.meshgrid(_GRID * camera.width, _GRID * camera.height)
+    rays = _rays(camera, np.column_stack([u.ravel(), v.ravel()]))
+    bases = camera.fx * row_basis(rays, np.zeros(len(rays))), camera.fx * column_basis(rays)
+    across, along = (np.asarray(J.T @ J / len(J)) for J in bases)
+    return across, along
+
+
+def _rays(camera: Camera, uv: AnyArray) -> FloatArray:
+    return (np.asarray(uv, dtype=np.float64) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
 
 
 def _sigmas(J: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J)))
 
 
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+def _rms(parameters: FloatArray, moment: FloatArray) -> float:
+    return float(np.sqrt(max(float(parameters @ moment @ parameters), 0.0)))
+
+
+def _sigma_rms(covariance: FloatArray, moment: FloatArray) -> float:
+    return float(np.sqrt(np.vdot(moment, covariance)))
