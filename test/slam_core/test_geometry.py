@@ -79,8 +79,16 @@ def test_quaternion_agrees_with_scipy(phi: FloatArray) -> None:
 
 @pytest.mark.parametrize("quaternion", [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.1], [np.nan, 0.0, 0.0, 1.0]])
 def test_a_quaternion_without_unit_norm_is_refused(quaternion: list[float]) -> None:
-    with pytest.raises(ValueError, match="unit norm"):
-        g.rotation_from_quaternion(np.array(quaternion))
+    for one_or_many in (np.array(quaternion), np.array([quaternion, [0.0, 0.0, 0.0, 1.0]])):
+        with pytest.raises(ValueError, match="unit norm"):
+            g.rotation_from_quaternion(one_or_many)
+
+
+def test_the_rotation_of_one_quaternion_is_that_of_many_to_the_bit(rng: np.random.Generator) -> None:
+    quaternions = rng.normal(size=(200, 4))
+    quaternions *= rng.uniform(0.995, 1.005, (200, 1)) / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    each = np.array([g.rotation_from_quaternion(q) for q in quaternions])
+    np.testing.assert_array_equal(each, g.rotation_from_quaternion(quaternions))
 
 
 @given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
