@@ -17,6 +17,8 @@ from slam_core.types import AnyArray
 from stereo_frontend.rectify import StereoRectifier
 
 _PAIRS_PER_BURST = 3
+_MOST_PIXELS = 160_000
+"""Larger images are halved: their features lie to a fraction of a pixel there, too, in a quarter of the time."""
 _FEWEST_MATCHES, _FEWEST_KEYPOINTS = 40, 100
 _UPSIDE_DOWN_SHARE = 0.15
 _SWAPPED_SHARE, _ROWS_APART_PX, _SEEN_BY_BOTH = 0.8, 1.5, 0.04
@@ -67,14 +69,18 @@ def match_pairs(evidence: Evidence) -> PixelMatches | None:
 
 
 def _match(left: AnyArray, right: AnyArray) -> tuple[FloatArray, FloatArray, int]:
-    sift = cv2.SIFT_create(400)  # type: ignore[attr-defined]
-    (kl, dl), (kr, dr) = (sift.detectAndCompute(image, None) for image in (left, right))
+    sift, scale = cv2.SIFT_create(400), 1  # type: ignore[attr-defined]
+    while left.size // scale**2 > _MOST_PIXELS:
+        scale *= 2
+    size = (left.shape[1] // scale, left.shape[0] // scale)
+    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) if scale > 1 else image for image in (left, right)]
+    (kl, dl), (kr, dr) = (sift.detectAndCompute(image, None) for image in small)
     none = np.empty((0, 2))
     if dl is None or dr is None or len(kr) < 2:
         return none, none, len(kl)
     ratio = [m for m, n in cv2.BFMatcher().knnMatch(dl, dr, k=2) if m.distance < 0.7 * n.distance]
     points = ([kl[m.queryIdx].pt for m in ratio], [kr[m.trainIdx].pt for m in ratio])
-    a, b = (np.array(p, dtype=np.float64).reshape(-1, 2) for p in points)
+    a, b = (scale * (np.array(p, dtype=np.float64).reshape(-1, 2) + 0.5) - 0.5 for p in points)
     return a, b, len(kl)
 
 
