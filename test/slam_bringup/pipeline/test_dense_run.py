@@ -135,6 +135,31 @@ def test_a_stereo_camera_in_colour_colours_the_surface_and_features_see_grey(tmp
     assert colours.mean() > 40, "as bright as the wall"
 
 
+def test_a_bag_that_was_read_before_gives_the_same_model_from_its_key_frames_alone(monkeypatch) -> None:
+    unpacked: list[int] = []
+    with SensorBag(DEMO) as bag:
+        agent = bag.agents[0]
+        truth = bag.ground_truth(agent)
+        poses = truth.select(np.arange(len(truth) - 3))  # the last images have no pose
+        raw = bag.reader.raw
+        monkeypatch.setattr(bag.reader, "raw", lambda *a: (unpacked.append(len(m.data)) or m for m in raw(*a)))
+        models, heard, passed = [], [], []
+        for _ in range(2):
+            unpacked.clear()
+            models.append(dense_model(bag, load_system_config(None), {agent: poses}, lambda: heard.append(1)))
+            passed.append(sum(unpacked))
+            heard.clear()
+            readings = sum(1 for _ in bag.readings())
+        dense_model(bag, load_system_config(None), {agent: poses}, lambda: heard.append(1))
+    assert len(heard) == readings
+    first, second = models
+    assert passed[1] < 0.6 * passed[0]
+    assert [k.keyframe.stamp_ns for k in first.keyframes] == [k.keyframe.stamp_ns for k in second.keyframes]
+    assert len(first.keyframes) > 5
+    np.testing.assert_array_equal(first.volume.voxels, second.volume.voxels)
+    np.testing.assert_array_equal(first._specific_force, second._specific_force)
+
+
 def test_dense_stereo_is_rectified_as_self_calibration_says(monkeypatch: pytest.MonkeyPatch) -> None:
     with SensorBag(DEMO) as bag:
         sensors = bag.sensors[bag.agents[0]]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 import struct
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -268,17 +268,28 @@ class BagReader:
         """Time from the first to the last message, s."""
         return max(int(self._reader.duration) - 1, 0) / 1e9
 
-    def raw(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """Messages of some topics (all by default) as bytes, in the order of their time."""
+    @property
+    def is_indexed(self) -> bool:
+        """True if what was recorded at some time is found without reading all that is before."""
+        return all(getattr(storage, "chunks", True) for storage in getattr(self._reader, "storages", ()))
+
+    def raw(
+        self, topics: Collection[str] | None = None, spans: Iterable[tuple[int, int]] | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of some topics (all by default) as bytes, in the order of their time.
+
+        ``spans``: only of these times, each from the first until before the second, ns, in their order.
+        """
         wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
         if not wanted:
             return
-        messages = iter(self._reader.messages(wanted))
         count = 0
-        while (message := self._next(messages, count)) is not None:
-            connection, stamp, data = message
-            yield RawMessage(connection.topic, int(stamp), bytes(data))
-            count += 1
+        for start, stop in [(None, None)] if spans is None else spans:
+            messages = iter(self._reader.messages(wanted, start, stop))
+            while (message := self._next(messages, count)) is not None:
+                connection, stamp, data = message
+                yield RawMessage(connection.topic, int(stamp), bytes(data))
+                count += 1
 
     def _next(
         self, messages: Iterator[tuple[Connection, int, bytes]], count: int

@@ -152,7 +152,10 @@ _UNPAIRED_ROLES: dict[str, Callable[[AgentSensors, Message], Reading]] = {
 }
 """Decoders of the roles whose every message is a reading by itself."""
 
-ROLES_READ = ("left", "right", "depth", "amplitude", "intensity", *_UNPAIRED_ROLES)
+IMAGE_ROLES = ("left", "right", "depth", "amplitude", "intensity")
+"""Roles whose messages are paired by stamp to readings of cameras."""
+
+ROLES_READ = (*IMAGE_ROLES, *_UNPAIRED_ROLES)
 """Roles whose messages become readings."""
 
 

@@ -53,7 +53,9 @@ class Ros1Reader:
         """Time from the first message to just after the last, ns."""
         return self._reader.duration
 
-    def messages(self, connections: Collection[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
-        """Messages in the order of their time: connection, time in ns, CDR bytes."""
-        for connection, stamp, data in self._reader.messages(connections):
+    def messages(
+        self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Messages in the order of their time, from ``start`` until before ``stop``: connection, ns, CDR bytes."""
+        for connection, stamp, data in self._reader.messages(connections, start, stop):
             yield connection, stamp, bytes(typestore().ros1_to_cdr(data, connection.msgtype))

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
 from typing import Self
@@ -29,7 +30,9 @@ from typing import Self
 import numpy as np
 
 from slam_bringup.bags.bag import BagReader
+from slam_bringup.bags.reading_times import ReadingTimes, Stamps
 from slam_bringup.bags.readings import (
+    IMAGE_ROLES,
     ROLES_READ,
     AgentPairing,
     AgentSensors,
@@ -73,6 +76,8 @@ class SensorBag:
         self.reader = BagReader(path)
         self.left_out: Counter[str] = Counter()
         """Messages that the last :meth:`readings` left out, by reason."""
+        self.times = ReadingTimes()
+        """Stamps and times of what the last :meth:`readings` passed."""
         self._warnings: list[str] = []
         self._names = names or BagNames()
         self._true_poses: dict[str, list[bytes]] = {}
@@ -96,32 +101,59 @@ class SensorBag:
         What helps a frame thus comes before it, as at the node, which waits for it. ``colours``: the colour pictures
         too, which only the dense model needs.
         """
-        for _, together in groupby(self._in_order_of_arrival(colours), key=lambda reading: reading.stamp_ns):
-            yield from sorted(together, key=_rank)
+        return _with_ranks(self._in_order_of_arrival(colours))
+
+    def images_at(self, wanted: Mapping[str, Stamps]) -> Generator[Reading, None, None]:
+        """The stereo and depth readings with some stamps, by agent, and perhaps others; after :meth:`readings`.
+
+        Of the bag only what holds them is unpacked, as ``times`` has it.
+        """
+        return _with_ranks(self._at(wanted))
 
     def _in_order_of_arrival(self, colours: bool) -> Iterator[Reading]:
         """A pair comes when its last image does."""
         self.left_out.clear()
+        self.times = times = ReadingTimes()
         pairing = {agent: AgentPairing(sensors, self.left_out) for agent, sensors in self.sensors.items()}
-        route: dict[str, list[tuple[str, str]]] = {}
-        for agent, sensors in self.sensors.items():
-            for role in (role for role in ROLES_READ if role in sensors.topics and (colours or role != "color")):
-                route.setdefault(sensors.topics[role], []).append((agent, role))
+        route = self._route([role for role in ROLES_READ if colours or role != "color"])
         types = {name: info.type_name for name, info in self.reader.topics.items()}
         true_poses: dict[str, list[bytes]] = {topic: [] for topic in self._truth_topics()}
-        for topic, _, data in self.reader.raw({*route, *true_poses}):
+        for topic, recorded_ns, data in self.reader.raw({*route, *true_poses}):
             if topic in true_poses:
                 true_poses[topic].append(data)
                 continue
             try:
                 message = self.reader.decode(types[topic], data)
                 for agent, role in route[topic]:
-                    yield from pairing[agent].add(role, message)
+                    if role in IMAGE_ROLES:
+                        times.add_image(agent, stamp_ns(message), recorded_ns)
+                    for reading in pairing[agent].add(role, message):
+                        times.add(reading)
+                        yield reading
             except ValueError as error:
                 self._count_unusable(topic, error)
         self._true_poses = true_poses
+        times.is_whole = self.reader.is_indexed
         for p in pairing.values():
             p.finish()
+
+    def _at(self, wanted: Mapping[str, Stamps]) -> Iterator[Reading]:
+        pairing = {agent: AgentPairing(self.sensors[agent], Counter()) for agent in wanted}
+        route = self._route(IMAGE_ROLES)
+        types = {name: info.type_name for name, info in self.reader.topics.items()}
+        for topic, _, data in self.reader.raw(route, self.times.spans(wanted)):
+            for agent, role in route[topic]:
+                if agent in pairing:
+                    with suppress(ValueError):  # told by the first reading
+                        yield from pairing[agent].add(role, self.reader.decode(types[topic], data))
+
+    def _route(self, roles: Sequence[str]) -> dict[str, list[tuple[str, str]]]:
+        """Agents and roles that messages of each topic are for."""
+        route: dict[str, list[tuple[str, str]]] = {}
+        for agent, sensors in self.sensors.items():
+            for role in (role for role in roles if role in sensors.topics):
+                route.setdefault(sensors.topics[role], []).append((agent, role))
+        return route
 
     def _count_unusable(self, topic: str, error: ValueError) -> None:
         reason = f"unusable messages on {topic}"
@@ -239,6 +271,11 @@ class SensorBag:
             for transform in message.transforms:
                 tree.add(*transform_from_message(transform))
         return tree
+
+
+def _with_ranks(readings: Iterator[Reading]) -> Generator[Reading, None, None]:
+    for _, together in groupby(readings, key=lambda reading: reading.stamp_ns):
+        yield from sorted(together, key=_rank)
 
 
 def _rank(reading: Reading) -> int:

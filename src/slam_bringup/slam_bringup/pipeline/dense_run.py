@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -13,8 +13,9 @@ import numpy as np
 
 from dense_mapping.colours import NO_PICTURE, RecentColours, stereo_picture
 from dense_mapping.dense_model import DenseConfig, DenseModel
-from dense_mapping.keyframes import grey_levels
+from dense_mapping.keyframes import KeyframeSelector, grey_levels
 from dense_mapping.stereo_depth import stereo_depth
+from slam_bringup.bags.reading_times import ReadingTimes, Stamps
 from slam_bringup.bags.readings import AgentSensors, ColourReading, DepthReading, ImuReading, Reading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.ahead import ahead
@@ -46,38 +47,45 @@ def dense_model(
     ``corrections``: by agent, what the rectification of its right images is wrong by, where that is sure.
     """
     model = DenseModel(config.dense_mapper, fixed=True)
-    with FieldThread(model) as field, closing(ahead(bag.readings(colours=True), _is_an_image)) as readings:
-        _add_all(readings, bag, config, trajectories, field, on_reading, stopped, corrections or {})
-    return model
-
-
-def _add_all(
-    readings: Iterator[Reading],
-    bag: SensorBag,
-    config: SystemConfig,
-    trajectories: Mapping[str, Trajectory],
-    field: FieldThread,
-    on_reading: Callable[[], None],
-    stopped: Callable[[], bool],
-    corrections: Mapping[str, RectificationError | None],
-) -> None:
     cameras = {
-        agent: AgentDepth(bag.sensors[agent], config, trajectory, corrections.get(agent))
+        agent: AgentDepth(bag.sensors[agent], config, trajectory, (corrections or {}).get(agent))
         for agent, trajectory in trajectories.items()
         if len(trajectory)
     }
-    last_ns = max((int(t.stamps_ns[-1]) for t in trajectories.values() if len(t)), default=0)
-    for reading in readings:
-        if isinstance(reading, StereoReading | DepthReading) and reading.stamp_ns > last_ns:
-            break
-        if stopped():
-            break
-        if reading.agent in cameras:
-            cameras[reading.agent].add(reading, field)
-        if not isinstance(reading, ColourReading):
-            on_reading()
+    with FieldThread(model) as field, closing(_readings(bag, cameras, on_reading)) as readings:
+        for reading in readings:
+            if stopped() or all(camera.is_over(reading) for camera in cameras.values()):
+                break
+            if reading.agent in cameras:
+                cameras[reading.agent].add(reading, field)
+        for camera in cameras.values():
+            camera.finish(field)
+    return model
+
+
+def _readings(
+    bag: SensorBag, cameras: Mapping[str, AgentDepth], on_reading: Callable[[], None]
+) -> Generator[Reading, None, None]:
+    """Readings of the bag: where it has been read before, its key frames alone, with what accelerometers read then."""
+    times = bag.times
+    if not times.is_whole or any(camera.needs_colours for camera in cameras.values()):
+        with closing(ahead(bag.readings(colours=True), _is_an_image)) as readings:
+            for reading in readings:
+                yield reading
+                if not isinstance(reading, ColourReading):
+                    on_reading()
+        return
     for camera in cameras.values():
-        camera.finish(field)
+        camera.add_forces(times)
+    wanted = {agent: camera.key_stamps(times) for agent, camera in cameras.items()}
+    expected, passed = max(1, sum(map(len, wanted.values()))), 0
+    with closing(ahead(bag.images_at(wanted), _is_an_image)) as readings:
+        for k, reading in enumerate(readings, 1):
+            yield reading
+            now = min(times.count, k * times.count // expected)
+            for _ in range(now - passed):
+                on_reading()
+            passed = now
 
 
 def _is_an_image(reading: Reading) -> bool:
@@ -129,16 +137,45 @@ class AgentDepth:
         self._stereo: StereoStage | None = None
         self._forces: list[tuple[int, FloatArray]] = []
         self._has_colours = config.dense_mapper.use_tof and "color" in sensors.topics
+        self._cameras: list[tuple[type[Reading], FloatArray]] = []
         self._colours = RecentColours()
         self._uncoloured: list[tuple[str, FloatArray, DepthImage]] = []
         if self._config.use_tof and sensors.is_mounted("tof"):
             self._depth = depth_stage(config, sensors)
             self._T_base_tof = sensors.transform("base", "tof")
+            self._cameras.append((DepthReading, self._T_base_tof))
         if self._config.use_stereo and sensors.right is not None and sensors.is_mounted("left"):
             if correction is not None:
                 sensors = replace(sensors, right=corrected_right(sensors.right, correction)[0])
             self._stereo = stereo_stage(sensors)
             self._T_base_left = sensors.transform("base", "left")
+            self._cameras.append((StereoReading, self._T_base_left))
+
+    @property
+    def needs_colours(self) -> bool:
+        """True if pictures of a colour camera belong to the depth images."""
+        return self._has_colours and self._depth is not None
+
+    def is_over(self, reading: Reading) -> bool:
+        """True if an image comes after the end of the trajectory."""
+        return isinstance(reading, StereoReading | DepthReading) and reading.stamp_ns > self._trajectory.stamps_ns[-1]
+
+    def key_stamps(self, times: ReadingTimes) -> Stamps:
+        """Stamps of the readings that make key frames, of those that a reading of the bag has passed."""
+        chosen, span = [np.empty(0, dtype=np.int64)], self._trajectory.stamps_ns[[0, -1]]
+        for kind, T_base_camera in self._cameras:
+            stamps = times.stamps(self._agent, kind)
+            stamps = stamps[(stamps >= span[0]) & (stamps <= span[1])]
+            selector = KeyframeSelector(self._config.keyframe)
+            poses = self._trajectory.interpolate(stamps) @ T_base_camera
+            chosen.append(stamps[[selector.wants(T) for T in poses]] if len(stamps) else stamps)
+        return np.concatenate(chosen)
+
+    def add_forces(self, times: ReadingTimes) -> None:
+        """Take what the accelerometer read while the bag was read."""
+        for frame, stamps, forces in times.forces(self._agent):
+            R_base_imu = self._sensors.frames.lookup(self._sensors.base_frame, frame)[:3, :3]
+            self._forces += [(stamp, R_base_imu @ force) for stamp, force in zip(stamps.tolist(), forces, strict=True)]
 
     def add(self, reading: Reading, field: FieldThread) -> None:
         """Put the reading into the model if it is an image of a key frame."""
