@@ -142,6 +142,16 @@ def test_the_evidence_of_a_camera_that_stands_still_counts_once():
     assert calibration.error.column_sigma_rms() > 1.0
 
 
+@pytest.mark.parametrize(("turn", "looks"), [(np.zeros(3), range(10, 14)), (TURN, [23])])
+def test_only_a_calibration_that_needs_no_correction_is_learnt_from_now_and_then(monkeypatch, turn, looks):
+    monkeypatch.setattr("stereo_frontend.self_calibration._SETTLED", 5)
+    looked, compare = [], "stereo_frontend.self_calibration.match_views"
+    monkeypatch.setattr(compare, lambda *views: looked.append(len(views)) or match_views(*views))
+    calibration = learnt(turn, 0, frames=24)
+    assert calibration.corrects == bool(turn.any())
+    assert len(looked) in looks
+
+
 def test_off_is_off():
     calibration = learnt(TURN, 0, mode="off")
     assert calibration.error is None or not calibration.corrects

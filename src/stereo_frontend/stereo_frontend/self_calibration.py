@@ -47,6 +47,10 @@ _MIN_SIMILARITY = 0.85
 _MAX_RATIO = 0.8
 """Most ratio of the best to the second-best distance."""
 
+_SETTLED = 40
+"""Pairs of moments after which a calibration that asks for no correction is taken to be good."""
+_EVERY = 3
+"""Frames of which one is learnt from then: it shows much the same keypoints as the others."""
 _GROUP = 4
 """Consecutive pieces of evidence that are not independent: they share keypoints."""
 _FEW = 30
@@ -86,7 +90,7 @@ class StereoSelfCalibration:
         self.corrects_rows = self.corrects = self._is_significant = False
         self._reference: StereoView | None = None
         self._evidence = EvidenceWindow(_GROUP, _MEMORY)
-        self._moments = 0
+        self._moments = self._views = 0
 
     # ---- what is known
     def widened(self, matching: MatchingConfig) -> MatchingConfig:
@@ -143,7 +147,9 @@ class StereoSelfCalibration:
 
     def learn(self, view: StereoView) -> None:
         """Take in the matches of one pair; disparities and rows as measured, without any correction."""
-        if self.error is None or len(view) < _FEW:
+        self._views += 1
+        needless = self._moments >= _SETTLED and not (self.corrects_rows or self.corrects) and self._views % _EVERY > 0
+        if self.error is None or len(view) < _FEW or needless:
             return
         if self._reference is None:
             self._take(view, row_equations(view, self.error, self.config.row_floor))
