@@ -10,7 +10,7 @@ from ekf_slam_node.association import associate_ccda, associate_jcbb, associate_
 from ekf_slam_node.candidates import Candidates
 from ekf_slam_node.config import EkfSlamConfig, FeatureAssociationConfig, LandmarkConfig, SubmapConfig
 from ekf_slam_node.ekf import Ekf
-from ekf_slam_node.landmarks import LandmarkTable
+from ekf_slam_node.landmarks import LandmarkTable, spread_choice
 from ekf_slam_node.models import CORE_DIM, frame_from_features, rig_points
 from ekf_slam_node.slam import EkfSlam
 from ekf_slam_node.submap_builder import conditional_start
@@ -22,6 +22,18 @@ def book_of(sightings: list[int]) -> LandmarkTable:
     n = len(sightings)
     table.add(np.arange(n), np.array(sightings), np.eye(4, dtype=np.float32)[np.arange(n) % 4], frame=10)
     return table
+
+
+def test_points_are_chosen_from_the_emptiest_cells_in_the_order_given(rng):
+    size, cells = (640, 480), np.array([8, 6])
+    points, occupied = rng.uniform([-5.0, -5.0], [650.0, 485.0], (2, 150, 2))
+    column_row = [np.clip((px * cells / size).astype(int), 0, cells - 1) for px in (points, occupied)]
+    load, own = np.zeros(cells), column_row[0]
+    np.add.at(load, tuple(column_row[1].T), 1)
+    place = [load[tuple(cell)] + (own[:n] == cell).all(axis=1).sum() for n, cell in enumerate(own)]
+    expected = np.argsort(place, kind="stable")[:60]
+    np.testing.assert_array_equal(spread_choice(points, occupied, 60, size), expected)
+    assert len(spread_choice(points[:0], occupied, 60, size)) == 0
 
 
 def test_landmarks_with_too_few_sightings_leave_after_their_probation():

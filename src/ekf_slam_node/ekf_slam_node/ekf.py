@@ -270,7 +270,11 @@ class Ekf:
     # ------------------------------------------------------------------------------------------------------- views
     def pose_covariance(self) -> FloatArray:
         """Covariance (6, 6) of the rig's pose."""
-        return self.covariance.head(6)[:6].copy()
+        return np.asarray(self.covariance.blocks(np.array([0]), 6)[0])
+
+    def velocity_covariance(self) -> FloatArray:
+        """Covariance (6, 6) of the rig's velocities."""
+        return np.asarray(self.covariance.blocks(np.array([6]), 6)[0])
 
     @property
     def is_finite(self) -> bool:

@@ -12,7 +12,11 @@ from ekf_slam_node.config import LandmarkConfig
 from ekf_slam_node.covariance import IndexArray
 from ekf_slam_node.landmark_noise import LandmarkNoise
 from slam_core.geometry import FloatArray
+from slam_core.in_place import in_place
 from slam_core.types import Float32Array
+
+_COLUMNS, _ROWS = 8, 6
+"""Cells of the image that landmarks are spread over."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,21 +108,27 @@ class LandmarkTable:
 def spread_choice(points_px: FloatArray, occupied_px: FloatArray, amount: int, size: tuple[int, int]) -> IndexArray:
     """Choose up to ``amount`` of the points (n, 2) px so that, with the occupied ones (m, 2), they cover the image.
 
-    The image is divided into 8 x 6 cells; each next point comes from the cell with the fewest so far, in the order
+    The image is divided into cells; each next point comes from the cell with the fewest so far, in the order
     given.
     """
-    cells = np.array([8, 6])
-    to_cell = np.array([8.0 / size[0], 6.0 / size[1]])
+    load, place = np.zeros(_COLUMNS * _ROWS, dtype=np.int64), np.empty(len(points_px), dtype=np.int64)
+    to_cell = np.array([_COLUMNS / size[0], _ROWS / size[1]])
+    _places_in_cells(points_px, occupied_px, to_cell, load, place)
+    return np.argsort(place, kind="stable")[:amount]
 
-    def cell(px: FloatArray) -> np.ndarray:
-        column_row = np.clip((px * to_cell).astype(np.int64), 0, cells - 1)
-        return np.asarray(column_row[:, 0] * cells[1] + column_row[:, 1])
 
-    load = np.bincount(cell(occupied_px), minlength=48)
-    own = cell(points_px)
-    order = np.argsort(own, kind="stable")
-    # The place of a point in its cell's queue on top of what the cell already holds: the smallest come first.
-    place = np.empty(len(own), dtype=np.int64)
-    first = np.searchsorted(own[order], own[order])
-    place[order] = np.arange(len(own)) - first
-    return np.argsort(load[own] + place, kind="stable")[:amount]
+@in_place()
+def _places_in_cells(points_px, occupied_px, to_cell, load, place):  # type: ignore[no-untyped-def]
+    """Place (n,) of each point in its cell's queue, behind what the cell already holds: the smallest come first."""
+    for n in range(len(occupied_px)):
+        load[_cell(occupied_px[n], to_cell)] += 1
+    for n in range(len(points_px)):
+        cell = _cell(points_px[n], to_cell)
+        place[n] = load[cell]
+        load[cell] += 1
+
+
+@in_place()
+def _cell(px, to_cell):  # type: ignore[no-untyped-def]
+    column = min(max(int(px[0] * to_cell[0]), 0), _COLUMNS - 1)
+    return column * _ROWS + min(max(int(px[1] * to_cell[1]), 0), _ROWS - 1)

@@ -19,7 +19,7 @@ from ekf_slam_node.ekf import TimeUpdate
 from ekf_slam_node.frame_input import frame_of_strongest, usable_features
 from ekf_slam_node.linking import FrameLink, Linker
 from ekf_slam_node.missed_frames import MissedFrames
-from ekf_slam_node.models import CORE_DIM, Frame, seconds_between
+from ekf_slam_node.models import Frame, seconds_between
 from ekf_slam_node.motion_checks import StandingDetector, aided, explaining_sigma, is_known, is_surprising, widened
 from ekf_slam_node.noise_monitor import NoiseMonitor
 from ekf_slam_node.open_submap import Sight, pending_of
@@ -175,8 +175,7 @@ class EkfSlam:
     def _link(self, frame: Frame, dt: float, aid: Aid | None) -> LinkedFrame | None:
         """Associate a frame with what is known, and learn its noise from the pairs; None if nothing fits."""
         local = self._chain.local
-        velocity_covariance = local.ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:]
-        expected = motion_prior(local.ekf.velocity, velocity_covariance, self.config.motion.sigma, dt)
+        expected = motion_prior(local.ekf.velocity, local.ekf.velocity_covariance(), self.config.motion.sigma, dt)
         prior = aided(expected, aid)
         known = None if aid is None else prior.T
         predicted = self._shutter.corrected(frame, dt, known)

@@ -182,9 +182,8 @@ class SubmapChain:
         """
         ekf = self.local.ekf
         pose = widened_by_calibration(self.pose(stamp_ns) if pose is None else pose, self._config.calibration)
-        velocity_covariance = ekf.covariance.head(CORE_DIM)[6:CORE_DIM, 6:]
         result = EkfResult(
-            stamp_ns, pose, ekf.velocity, velocity_covariance, state, reason, submaps, self._landmark_view()
+            stamp_ns, pose, ekf.velocity, ekf.velocity_covariance(), state, reason, submaps, self._landmark_view()
         )
         if updated is None:
             return result
