@@ -164,7 +164,7 @@ def accuracy(watch: Stopwatch, supervisor: Supervisor, graph: NodeGraph, given: 
     """ATE of ``odom`` and of the map that the nodes end with."""
     for name in (*graph.finishers, "/sjsam"):
         supervisor.call(f"{name}/finish")
-    supervisor.wait_until_quiet(1.0, 60.0)
+    supervisor.wait_until_quiet(60.0)
     supervisor.call("/sjsam/finish")
     supervisor.call("/sjsam/save_map")
     with SensorBag(given.bag) as bag:

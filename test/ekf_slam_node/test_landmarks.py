@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import numpy as np
-from feature_world import T_RIG_OPTICAL, loop, room
 
 from ekf_slam_node.association import associate_ccda, associate_jcbb, associate_mahalanobis, associate_nearest
 from ekf_slam_node.candidates import Candidates
@@ -14,6 +13,7 @@ from ekf_slam_node.landmarks import LandmarkTable, spread_choice
 from ekf_slam_node.models import CORE_DIM, frame_from_features, rig_points
 from ekf_slam_node.slam import EkfSlam
 from ekf_slam_node.submap_builder import conditional_start
+from feature_world import T_RIG_OPTICAL, loop, room
 from slam_core.geometry import make_transform, rotation_from_euler
 
 

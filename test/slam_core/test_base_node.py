@@ -206,6 +206,27 @@ def test_a_node_reports_at_once_that_its_inputs_are_connected(node: EarNode, mon
     assert reported == ["/frames", ""]
 
 
+def test_what_has_come_belongs_to_an_input_that_ends_and_the_end_is_reported(
+    node: EarNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reported: list[str] = []
+    monkeypatch.setattr(node, "_diagnostics", Sender(reported))
+    other = rclpy.create_node("other")
+    output = other.create_publisher(node.types.PointCloud2, "frames", sensor_qos(10))
+    until = time.monotonic() + 60.0
+    while not output.get_subscription_count() and time.monotonic() < until:
+        time.sleep(0.02)
+    output.publish(node.types.PointCloud2(header=header_message(node.types, START, "")))
+    while not node.heard and time.monotonic() < until:  # it is on its way for a moment; nobody spins the node
+        time.sleep(0.02)
+        with pytest.raises(StopIteration) as end:
+            node._on_finish_service(None, Trigger.Response()).send(None)
+        assert end.value.value.success
+    assert node.heard == [START]
+    assert reported
+    other.destroy_node()
+
+
 def test_another_publisher_of_what_a_node_alone_should_say_is_reported(node: EarNode) -> None:
     node.advertise("info", "CameraInfo", alone=True)
     node.advertise("image", "Image")

@@ -195,6 +195,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self._take_joined(agent, submap, found)
         elif isinstance(found, Localization):
             self._take_located(agent, found)
+        self.report_now()
 
     def _take_joined(self, agent: str, submap: Submap, joined: Joined) -> None:
         if joined.report.reason == ALREADY_JOINED:  # sent again to a node that was started again

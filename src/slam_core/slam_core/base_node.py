@@ -316,12 +316,14 @@ class SlamNode(TransformNode, Generic[C]):
         return response
 
     async def _on_finish_service(self, _: Any, response: Any) -> Any:
-        self.finish_work()  # what has come so far belongs to the input
+        self.receive()  # what has come so far belongs to the input
+        self.finish_work()
         try:
             line = self.on_finish()
             response.success, response.message = True, line if isinstance(line, str) else await line
         except ValueError as error:
             response.success, response.message = False, str(error)
+        self.report_now()
         return response
 
     # -- diagnostics ---------------------------------------------------------------------------------------------------
@@ -349,13 +351,17 @@ class SlamNode(TransformNode, Generic[C]):
         """Whoever waits for the nodes learns at once that one is there, and when its inputs are connected."""
         if (unconnected := self._unconnected()) != self._reported_unconnected:
             self._reported_unconnected = unconnected
-            self._diagnostics.publish(self._diagnostic_message(""))
+            self.report_now()
 
     def _report_change(self) -> None:
         """A change of state is reported at once, with the stamp of the input that brought it."""
         if self.health.state != self._reported_state:
             self._reported_state = self.health.state
-            self._diagnostics.publish(self._diagnostic_message(""))
+            self.report_now()
+
+    def report_now(self) -> None:
+        """Publish diagnostics that somebody may wait for, beside those of every second."""
+        self._diagnostics.publish(self._diagnostic_message(""))
 
     def _diagnostic_message(self, silence: str) -> Message:
         self.health.counters["unpaired"] = sum(s.unpaired for s in self._synchronizers)

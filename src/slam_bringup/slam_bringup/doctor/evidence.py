@@ -184,9 +184,13 @@ def _read_frames(bag: BagReader) -> FrameTree:
 
 
 def _decode_sample(bag: BagReader, evidence: Evidence, messages: int | None) -> None:
-    """Bursts of the left camera, or of the depth camera without one, and all that is nearest to them in time."""
+    """Bursts of the left camera, or of the depth camera without one, and all that is nearest to them in time.
+
+    Of the first ``messages`` of a bag, one burst.
+    """
     leader = "left" if "left" in evidence.streams else evidence.depth_role
-    wanted = _bursts(evidence.streams[leader].stamps)
+    stamps = evidence.streams[leader].stamps
+    wanted = _bursts(stamps) if messages is None else stamps[:BURST]
     chosen = {
         evidence.topics[role]: _nearest_stamps(evidence.streams[role].stamps, wanted)
         for role in _PICTURES

@@ -32,13 +32,13 @@ START_TIMEOUT_S = 180.0
 _SERVICE_TIMEOUT_S = 300.0
 _HURRIED_TIMEOUT_S, _HURRIED_STOP_S = 2.0, 4.0
 """Longest wait for each step of the end, and for the nodes, once somebody wants the run to end."""
-_QUIET_S, _HURRIED_QUIET_S = 1.0, 0.3
 _HOPELESS_AFTER_S = 15.0
 """A run in which no frame has reached a filter by then, while messages are rejected, never will."""
 _LAST_REPORT_S = 1.5
 """Longest wait for the last diagnostics: every node reports once a second."""
 _WINDOW = 4
 _SJSAM = "/sjsam"
+_SAVE_MAP = f"{_SJSAM}/save_map"
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +153,7 @@ class _Choreography:
         self._graph = graph
         self._recording = out / "result.mcap"
         self._stopped = stopped
+        self._reports_before: dict[str, int] = {}
 
     def start_nodes(self, *, composed: bool) -> None:
         """All nodes and the recorder at once; returns when every topic has reached whoever listens to it."""
@@ -208,6 +209,7 @@ class _Choreography:
         }
         player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
         self._supervisor.count_submaps(f"{name.rpartition('/')[0]}/submap/info" for name in self._graph.filters)
+        self._supervisor.prepare((*(f"{name}/finish" for name in self._graph.finishers), _SAVE_MAP))
         self._wait_until_ready(from_outside=())
         heard = self._supervisor.progress.total
         self._supervisor.call("/bag_player/start", has_effect=lambda: heard() > 0 or not player.is_running)
@@ -238,18 +240,19 @@ class _Choreography:
     def finish(self) -> None:
         """Tell the nodes that the input has ended, front to back, and have the map saved when all is joined."""
         filters = self._graph.filters
+        self._reports_before = dict(self._supervisor.reports)
         for names in ([name for name in self._graph.finishers if name not in filters], filters):
             for name in names:
                 self._patiently(partial(self._supervisor.call, f"{name}/finish"))
-            self._supervisor.wait_until_quiet(_HURRIED_QUIET_S if self._stopped() else _QUIET_S, self._limit_s)
+            self._supervisor.wait_until_quiet(self._limit_s)
         self._patiently(partial(self._supervisor.wait, self._all_joined, what="joining of the last submap"))
-        self._supervisor.call(f"{_SJSAM}/save_map", _SERVICE_TIMEOUT_S)
+        self._supervisor.call(_SAVE_MAP, _SERVICE_TIMEOUT_S)
 
     def save_at_once(self) -> None:
         """Have the map saved as it is, if there is any and that is quick."""
         if int(self._supervisor.diagnostics.get(_SJSAM, {}).get("submaps joined", "0")):
             with suppress(TimeoutError, ValueError):
-                self._supervisor.call(f"{_SJSAM}/save_map", _HURRIED_TIMEOUT_S)
+                self._supervisor.call(_SAVE_MAP, _HURRIED_TIMEOUT_S)
 
     @property
     def _limit_s(self) -> float:
@@ -266,7 +269,7 @@ class _Choreography:
     def last_diagnostics(self) -> dict[str, dict[str, str]]:
         """The final values of the nodes that map, once they have reported after the end; a page's own are none."""
         names = [command.full_name for command in self._graph.commands]
-        self._supervisor.wait_for_reports(names, _LAST_REPORT_S)
+        self._supervisor.wait_for_reports(names, self._reports_before, _LAST_REPORT_S)
         return {name: self._supervisor.diagnostics[name] for name in names if name in self._supervisor.diagnostics}
 
     def _all_joined(self) -> bool:

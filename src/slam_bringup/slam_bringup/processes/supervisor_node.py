@@ -25,6 +25,7 @@ from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.ros import RosTypes, sensor_qos
 
 _SPIN_S = 0.1
+_QUIET_TIMES = 3
 _MATCHING_S = 0.3
 _ASK_AGAIN_S = 10.0
 
@@ -56,11 +57,13 @@ class Supervisor:
         self._executor.add_node(self._node)
         self.diagnostics: dict[str, dict[str, str]] = {}
         """Latest diagnostic values by full node name."""
-        self._reports: Counter[str] = Counter()
+        self.reports: Counter[str] = Counter()
+        """Diagnostics received so far by full node name."""
         self._connections = Connections()
         self.progress: Counter[str] = Counter()
         """Inputs processed so far by full node name."""
         self.submaps = 0
+        self._clients: dict[str, tuple[Any, float]] = {}
         types = RosTypes()
         self._node.create_subscription(types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(1000))
         self._node.create_subscription(types.Header, PROGRESS_TOPIC, self._on_progress, sensor_qos(10_000))
@@ -87,23 +90,24 @@ class Supervisor:
         """Listen until ``condition`` holds; TimeoutError saying ``what`` did not happen after ``timeout_s``."""
         deadline = time.monotonic() + timeout_s
         while not condition():
-            self.listen(_SPIN_S)
+            self._executor.spin_once(timeout_sec=_SPIN_S)
+            self._check()
             if time.monotonic() > deadline:
                 raise TimeoutError(f"{what} did not happen within {timeout_s:.0f} s")
 
-    def wait_until_quiet(self, quiet_s: float, timeout_s: float) -> None:
-        """Listen until no progress has been reported for ``quiet_s``."""
-        deadline, since, seen = time.monotonic() + timeout_s, time.monotonic(), self.progress.total()
-        while time.monotonic() - since < quiet_s and time.monotonic() < deadline:
+    def wait_until_quiet(self, timeout_s: float) -> None:
+        """Listen until nobody has reported progress several times in a row: one time may pass while all stand still."""
+        deadline, quiet = time.monotonic() + timeout_s, 0
+        while quiet < _QUIET_TIMES and time.monotonic() < deadline:
+            seen = self.progress.total()
             self.listen(_SPIN_S)
-            if self.progress.total() != seen:
-                since, seen = time.monotonic(), self.progress.total()
+            quiet = quiet + 1 if self.progress.total() == seen else 0
 
-    def wait_for_reports(self, names: Iterable[str], timeout_s: float) -> None:
-        """Listen until every node has reported its diagnostics anew, but no longer than ``timeout_s``."""
-        waiting = {name: self._reports[name] for name in names}
+    def wait_for_reports(self, names: Iterable[str], before: Mapping[str, int], timeout_s: float) -> None:
+        """Listen until every node has reported more often than ``before``, but no longer than ``timeout_s``."""
+        waiting = list(names)
         deadline = time.monotonic() + timeout_s
-        while any(self._reports[name] == before for name, before in waiting.items()) and time.monotonic() < deadline:
+        while any(self.reports[n] <= before.get(n, 0) for n in waiting) and time.monotonic() < deadline:
             self.listen(_SPIN_S)
 
     def listen(self, seconds: float) -> None:
@@ -125,15 +129,24 @@ class Supervisor:
         """True if anybody publishes a topic."""
         return bool(self._node.get_publishers_info_by_topic(topic))
 
+    def prepare(self, services: Iterable[str]) -> None:
+        """Have both ends of services that will be called find each other meanwhile."""
+        for service in services:
+            if service not in self._clients:
+                self._clients[service] = self._node.create_client(Trigger, service), time.monotonic()
+
     def call(self, service: str, timeout_s: float = 60.0, has_effect: Callable[[], bool] = lambda: False) -> str:
         """Call a std_srvs/Trigger service; returns its text. ValueError if it fails, TimeoutError if it is silent.
 
-        The server may not have discovered our end when it answers, and then the answer is lost: we ask again, unless
-        the call ``has_effect`` already.
+        The server may not have discovered our end when it answers, and then the answer is lost: a service that is new,
+        or was not prepared, has some time for that, and we ask again, unless the call ``has_effect`` already.
         """
-        client = self._node.create_client(Trigger, service)
-        self.wait(client.service_is_ready, timeout_s, f"service {service}")
-        self.listen(_MATCHING_S)
+        self.prepare([service])
+        client, since = self._clients[service]
+        if not client.service_is_ready():
+            self.wait(client.service_is_ready, timeout_s, f"service {service}")
+            since = time.monotonic()
+        self.listen(since + _MATCHING_S - time.monotonic())
         futures: list[Any] = []
 
         def answered() -> bool:
@@ -144,7 +157,6 @@ class Supervisor:
         started = time.monotonic()
         self.wait(answered, timeout_s, f"answer of {service}")
         response = next((future.result() for future in futures if future.done()), Trigger.Response(success=True))
-        self._node.destroy_client(client)
         if not response.success:
             raise ValueError(f"{service}: {response.message}")
         return str(response.message)
@@ -153,7 +165,7 @@ class Supervisor:
         for status in message.status:
             values = {entry.key: entry.value for entry in status.values}
             self.diagnostics[status.name] = values | {"message": status.message}
-            self._reports[status.name] += 1
+            self.reports[status.name] += 1
             self._connections.report(status.name, values)
 
     def _on_progress(self, header: Any) -> None:
