@@ -86,6 +86,7 @@ class Mapper:
             else:
                 self._events.append(f"a submap could not be joined: {error!r}")
         self._events += self.growth.finish()
+        give_back()
 
     def stop(self) -> None:
         """End the thread that joins, at the latest after the submap it is at."""

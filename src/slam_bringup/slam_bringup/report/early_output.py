@@ -45,6 +45,7 @@ class EarlyOutput:
     def write_rest(self, result: RunResult, *, pictures: bool) -> dict[str, Any]:
         """Write all that is not there yet; the summary is returned. Without ``pictures`` nothing is drawn any more."""
         self._ended = not pictures
+        give_back()  # images and field of the dense model
         from slam_bringup.report.output import write_results
         from slam_bringup.report.result_bag import write_result_bag
 

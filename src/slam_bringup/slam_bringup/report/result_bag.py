@@ -58,13 +58,14 @@ class Written(NamedTuple):
 
 
 def agents_messages(result: RunResult) -> list[Written]:
-    """Messages of every agent, frame by frame, for which no dense model is needed."""
+    """Messages of every agent, frame by frame, for which no dense model is needed; pictures, 20 MB, are not among."""
     return [_written(m) for agent in result.agents for m in _agent_messages(agent)]
 
 
 def write_result_bag(path: Path, result: RunResult, of_agents: list[Written] | None = None) -> None:
     """Write the bag, with :func:`agents_messages` if made before; one without messages for a run without any pose."""
     messages = agents_messages(result) if of_agents is None else of_agents
+    messages = [*messages, *(_written(m) for agent in result.agents for m in _pictures(agent))]
     if messages:
         lasting = _lasting_messages(result, min(m.stamp_ns for m in messages))
         messages = sorted([*messages, *map(_written, lasting)], key=lambda m: (m.stamp_ns, m.topic))
@@ -107,9 +108,12 @@ def _agent_messages(agent: AgentResult) -> Iterator[_Stamped]:
     truth = _during(agent.truth, agent)
     for stamp, T in zip(truth.stamps_ns.tolist(), truth.poses, strict=True):
         yield stamp, f"{prefix}/ground_truth/pose", pose_stamped_message(_TYPES, stamp, WORLD, T)
-    for frame in agent.frames:
-        yield from _frame_messages(prefix, frame)
     yield from _transforms(agent, prefix, odom)
+
+
+def _pictures(agent: AgentResult) -> Iterator[_Stamped]:
+    for frame in agent.frames:
+        yield from _frame_messages(f"/{agent.name}" if agent.name else "", frame)
 
 
 def _during(truth: Trajectory, agent: AgentResult) -> Trajectory:
