@@ -54,6 +54,10 @@ class TestCovariance:
     def test_an_impossible_innovation_covariance_is_refused(self) -> None:
         assert whiten(-np.eye(2), np.zeros((4, 2), order="F"), np.ones(2)) is None
 
+    def test_a_cross_covariance_row_by_row_is_refused(self) -> None:
+        with pytest.raises(ValueError, match="Fortran order"):
+            whiten(np.eye(2), np.zeros((4, 2)), np.ones(2))
+
 
 def test_agrees_with_filterpy(rng: np.random.Generator) -> None:
     """Time update, augmentation and measurement update in the plain error state."""

@@ -10,11 +10,10 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from numba import njit
-from scipy.linalg import lapack
 
 from slam_core.geometry import FloatArray
 from slam_core.in_place import in_place
-from slam_core.linear_algebra import blas
+from slam_core.linear_algebra import blas, blas_kernels
 
 IndexArray = npt.NDArray[np.int64]
 _GROWTH = 1.4
@@ -204,7 +203,7 @@ def whiten(S: FloatArray, cross: FloatArray, innovation: FloatArray) -> tuple[Fl
     S
         Innovation covariance (k, k), lower triangle used; in Fortran order it is overwritten.
     cross
-        ``P H'`` (n, k), overwritten.
+        ``P H'`` (n, k) in Fortran order, overwritten.
     innovation
         (k,).
 
@@ -213,9 +212,7 @@ def whiten(S: FloatArray, cross: FloatArray, innovation: FloatArray) -> tuple[Fl
     W = P H' L^-T and y = L^-1 innovation with S = L L'; the gain is applied as ``x += W y``, ``P -= W W'`` and y'y is
     the NIS. None if S is not positive definite.
     """
-    L = np.asfortranarray(S)
-    if not blas.cholesky(L):
-        return None
-    y, _ = lapack.dtrtrs(L, innovation, lower=1)
-    blas.solve_right(L, cross)
-    return cross, np.asarray(y).ravel()
+    if not cross.flags.f_contiguous:
+        raise ValueError(f"P H' must be in Fortran order, got strides {cross.strides}")
+    y = np.array(innovation, dtype=np.float64)
+    return (cross, y) if blas_kernels.whiten(np.asfortranarray(S), cross, y) else None

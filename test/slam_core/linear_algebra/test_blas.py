@@ -35,15 +35,12 @@ def test_the_leading_part_of_a_larger_matrix_is_changed_alone(rng):
 
 
 @pytest.mark.parametrize("k", [1, 5, 48, 130])
-def test_cholesky_and_its_solution(rng, k):
-    A, B = fortran(k, k, rng=rng), fortran(9, k, rng=rng)
+def test_cholesky_factor(rng, k):
+    A = fortran(k, k, rng=rng)
     S = np.asfortranarray(A @ A.T + np.eye(k))
     L = S.copy(order="F")
     assert blas.cholesky(L)
     np.testing.assert_allclose(np.tril(L), np.linalg.cholesky(S), atol=1e-12)
-    W = B.copy(order="F")
-    blas.solve_right(L, W)
-    np.testing.assert_allclose(W @ W.T, B @ np.linalg.inv(S) @ B.T, atol=1e-10)
 
 
 @pytest.mark.parametrize("n", [0, 1, 40])

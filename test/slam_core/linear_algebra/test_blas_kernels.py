@@ -28,6 +28,19 @@ def test_a_front_is_eliminated_in_place(k: int, n: int, rng: np.random.Generator
     assert np.array_equal(np.triu(rest, 1), np.triu(S[k:, k:], 1))
 
 
+@pytest.mark.parametrize(("k", "n"), [*SIZES, (1, 9), (96, 20)])
+def test_an_innovation_is_whitened_in_place(k: int, n: int, rng: np.random.Generator) -> None:
+    root, B, y = rng.normal(size=(k, k + 3)), np.asfortranarray(rng.normal(size=(n, k))), rng.normal(size=k)
+    S = np.asfortranarray(root @ root.T)
+    L, W, whitened = S.copy(order="F"), B.copy(order="F"), y.copy()
+    assert blas_kernels.whiten(L, W, whitened)
+    expected = np.linalg.cholesky(S)
+    np.testing.assert_allclose(np.tril(L), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(W @ expected.T, B, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(expected @ whitened, y, rtol=1e-9, atol=1e-9)
+    assert not blas_kernels.whiten(-S, W, whitened)
+
+
 @pytest.mark.parametrize("spoilt", [0.0, -1.0, np.nan])
 def test_a_matrix_that_is_not_positive_definite_is_refused(spoilt: float) -> None:
     S = np.eye(5)

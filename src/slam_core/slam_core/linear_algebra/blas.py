@@ -18,9 +18,7 @@ from scipy.linalg import cython_blas, cython_lapack
 
 from slam_core.geometry import FloatArray
 
-_BLOCK = 48
-"""Columns that a triangular solution takes at once."""
-_LOWER, _PLAIN, _TRANSPOSED, _RIGHT = c_char(b"L"), c_char(b"N"), c_char(b"T"), c_char(b"R")
+_LOWER, _PLAIN = c_char(b"L"), c_char(b"N")
 
 
 def address_of(module: Any, name: str) -> int:
@@ -39,9 +37,7 @@ def _routine(module: Any, name: str, arguments: int) -> Any:
 
 _dsyrk = _routine(cython_blas, "dsyrk", 10)
 _dsyr2k = _routine(cython_blas, "dsyr2k", 12)
-_dtrsm = _routine(cython_blas, "dtrsm", 11)
 _dpotrf = _routine(cython_lapack, "dpotrf", 5)
-_dgemm = _routine(cython_blas, "dgemm", 13)
 _dpotri = _routine(cython_lapack, "dpotri", 5)
 
 
@@ -83,37 +79,6 @@ def add_product(C: FloatArray, A: FloatArray, B: FloatArray) -> None:
     _dsyr2k(
         byref(_LOWER), byref(_PLAIN), byref(c_int(n)), byref(c_int(k)), byref(one), _pointer(A), _stride(A),
         _pointer(B), _stride(B), byref(one), _pointer(C), _stride(C),
-    )  # fmt: skip
-
-
-def solve_right(L: FloatArray, B: FloatArray) -> None:
-    """``B <- B L^-T`` for L (k, k) lower triangular, B (n, k).
-
-    Block by block of columns: BLAS's own solution is half as fast as its products are.
-    """
-    for first in range(0, len(L), _BLOCK):
-        own = slice(first, first + _BLOCK)
-        if first:
-            _subtract_product(B[:, own], B[:, :first], L[own, :first])
-        _solve_right(L[own, own], B[:, own])
-
-
-def _subtract_product(C: FloatArray, A: FloatArray, B: FloatArray) -> None:
-    """``C <- C - A B'`` for A (n, k), B (m, k)."""
-    (n, k), m = A.shape, len(B)
-    alpha, beta = c_double(-1.0), c_double(1.0)
-    _dgemm(
-        byref(_PLAIN), byref(_TRANSPOSED), byref(c_int(n)), byref(c_int(m)), byref(c_int(k)), byref(alpha),
-        _pointer(A), _stride(A), _pointer(B), _stride(B), byref(beta), _pointer(C), _stride(C),
-    )  # fmt: skip
-
-
-def _solve_right(L: FloatArray, B: FloatArray) -> None:
-    n, k = B.shape
-    one = c_double(1.0)
-    _dtrsm(
-        byref(_RIGHT), byref(_LOWER), byref(_TRANSPOSED), byref(_PLAIN), byref(c_int(n)), byref(c_int(k)), byref(one),
-        _pointer(L), _stride(L), _pointer(B), _stride(B),
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@
 The routines (SciPy's, see :mod:`slam_core.linear_algebra.blas`) are made known to the compiler by name, so that
 kernels which call them can be cached. Matrices are float64, row by row, without gaps between the rows; of symmetric
 and triangular ones the lower triangle counts. To Fortran each is its transpose, hence upper triangles in the calls.
+Only :func:`whiten` takes them in Fortran order, as the filter has them.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -19,9 +20,12 @@ from scipy.linalg import cython_blas, cython_lapack
 from slam_core.linear_algebra.blas import address_of
 
 # Addresses do not keep an array alive: what is behind them are constants, or arguments, which the caller holds.
-_LETTERS = np.frombuffer(b"ULTN", dtype=np.uint8)
-_UPPER, _LEFT, _TRANSPOSED, _PLAIN = 0, 1, 2, 3
+_LETTERS = np.frombuffer(b"ULTNR", dtype=np.uint8)
+_UPPER, _LEFT, _TRANSPOSED, _PLAIN, _RIGHT = 0, 1, 2, 3, 4
+_LOWER = _LEFT
 _FACTORS = np.array([1.0, -1.0])
+_BLOCK = 48
+"""Columns that :func:`whiten` solves for at once."""
 
 
 def _known(module: Any, name: str, arguments: int) -> Any:
@@ -34,6 +38,8 @@ def _known(module: Any, name: str, arguments: int) -> Any:
 _dpotrf = _known(cython_lapack, "dpotrf", 5)
 _dtrsm = _known(cython_blas, "dtrsm", 11)
 _dsyrk = _known(cython_blas, "dsyrk", 10)
+_dgemm = _known(cython_blas, "dgemm", 13)
+_dtrtrs = _known(cython_lapack, "dtrtrs", 10)
 
 
 @njit(cache=True, nogil=True)
@@ -61,6 +67,40 @@ def subtract_square(A, C):
     """``C <- C - A A^T`` for A (n, k), C (n, n)."""
     if A.size > 0:
         _multiply(A, C, _sizes(A.shape[1], A.shape[0]))
+
+
+@njit(cache=True, nogil=True)
+def whiten(S, B, y):
+    """``S <- L`` with S = L L^T (k, k), ``B <- B L^-T`` for B (n, k), ``y <- L^-1 y`` for y (k,).
+
+    In Fortran order. False, with all three spoilt, if S is not positive definite.
+    """
+    k, n = len(S), len(B)
+    sizes = np.array([k, n, 1, 0, 0, 0], np.int32)
+    size, one, failed = sizes.ctypes.data, sizes[2:].ctypes.data, sizes[3:].ctypes.data
+    lower, plain = _LETTERS[_LOWER:].ctypes.data, _LETTERS[_PLAIN:].ctypes.data
+    _dpotrf(lower, size, S.ctypes.data, size, failed)
+    if sizes[3]:
+        return False
+    _dtrtrs(lower, plain, plain, size, one, S.ctypes.data, size, y.ctypes.data, size, failed)
+    for first in range(0, k, _BLOCK):
+        sizes[4], sizes[5] = first, min(_BLOCK, k - first)
+        _solve_block(S, B, first, sizes)
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _solve_block(L, B, first, sizes):
+    """Solve for some columns of B, block by block: BLAS's own solution is half as fast as its products are."""
+    k, n, before, own = sizes.ctypes.data, sizes[1:].ctypes.data, sizes[4:].ctypes.data, sizes[5:].ctypes.data
+    plain, transposed = _LETTERS[_PLAIN:].ctypes.data, _LETTERS[_TRANSPOSED:].ctypes.data
+    one, minus = _FACTORS.ctypes.data, _FACTORS[1:].ctypes.data
+    out = B[:, first:].ctypes.data
+    if first:
+        below = L[first:].ctypes.data
+        _dgemm(plain, transposed, n, own, before, minus, B.ctypes.data, n, below, k, one, out, n)
+    right, lower = _LETTERS[_RIGHT:].ctypes.data, _LETTERS[_LOWER:].ctypes.data
+    _dtrsm(right, lower, transposed, plain, n, own, one, L[first:, first:].ctypes.data, k, out, n)
 
 
 @njit(cache=True, nogil=True)
