@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, room, wander
 from filterpy.kalman import ExtendedKalmanFilter
 
 from ekf_slam_node import models
 from ekf_slam_node.covariance import Covariance, whiten
 from ekf_slam_node.ekf import Ekf
+from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, room, wander
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, transform_points
 

@@ -9,7 +9,6 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from slam_core.geometry import FloatArray, pose7_from_transform, quaternion_from_rotation, transform_from_pose7
 
@@ -69,6 +68,8 @@ def read_extrinsics(path: Path) -> StaticTransform:
 
 def extrinsics_urdf(parent: str, child: str, T: FloatArray) -> str:
     """A link and a fixed joint of T_parent_child (4, 4) to paste into a robot's description."""
+    from scipy.spatial.transform import Rotation  # 0.3 s, which a player of bags need not spend
+
     xyz = " ".join(f"{value:.9g}" for value in T[:3, 3])
     rpy = " ".join(f"{angle:.9g}" for angle in Rotation.from_matrix(T[:3, :3]).as_euler("xyz"))
     return f"""\

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.lapack import dpocon
 
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, Float32Array
@@ -43,6 +42,8 @@ def pack_gaussian(mean: FloatArray, covariance: FloatArray) -> AnyArray:
 
 def _condition(L: FloatArray, covariance: FloatArray) -> float:
     """Condition of a factor whose rows are scaled to one, as LAPACK estimates it from the correlations."""
+    from scipy.linalg.lapack import dpocon  # 0.2 s, which programs that pack nothing need not spend
+
     sigma = np.sqrt(np.diag(covariance))
     norm = float(np.abs(covariance / np.outer(sigma, sigma)).sum(axis=0).max())
     inverse, _ = dpocon(L / sigma[:, None], norm, uplo="L")
