@@ -16,12 +16,12 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE / "ekf_slam_node")]
 
-from feature_world import T_RIG_OPTICAL, loop, room  # noqa: E402
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped, TransformStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from nav_msgs.msg import Path as PathMessage  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from feature_world import T_RIG_OPTICAL, loop, room  # noqa: E402
 from ros_probe import Probe  # noqa: E402
 from sjsam_node.global_map import GlobalMap  # noqa: E402
 from slam_core.messages import (  # noqa: E402

@@ -28,9 +28,10 @@ from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test" / "ekf_slam_node"))
-from feature_world import PointWorld, loop, room, tour_of_two_rooms, two_rooms, wander
 from monte_carlo import Run, mean_nis, seam_nees, simulate
 from planar_monte_carlo import planar_nees
+
+from feature_world import PointWorld, loop, room, tour_of_two_rooms, two_rooms, wander
 
 WALK_SIGMA = np.repeat([0.5, 0.4], 3)
 WALK_START = np.repeat([0.3, 0.2], 3)

@@ -24,11 +24,11 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "test"), str(ROOT / "test" / "ekf_slam_node"), *map(str, (ROOT / "src").iterdir())]
 
 import rclpy  # noqa: E402
-from feature_world import loop  # noqa: E402
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 
 from feature_chain import HOUR, START, STEP_NS, Chain, below, stamp_of  # noqa: E402
+from feature_world import loop  # noqa: E402
 from slam_core.messages import FEATURE_TOPICS, features_messages, header_message  # noqa: E402
 
 FRAMES, STRUCK, LASTS = 60, 30, 10

@@ -24,9 +24,9 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "test"), str(ROOT / "test" / "ekf_slam_node"), *map(str, (ROOT / "src").iterdir())]
 
 import rclpy  # noqa: E402
-from feature_world import loop  # noqa: E402
 
 from feature_chain import START, STEP_NS, Chain, stamp_of  # noqa: E402
+from feature_world import loop  # noqa: E402
 from slam_core.base_node import PROGRESS_TOPIC  # noqa: E402
 from slam_core.ros import sensor_qos  # noqa: E402
 

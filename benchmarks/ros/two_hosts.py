@@ -83,9 +83,9 @@ def run(name: str, folder: Path) -> Outcome:
 def robot(folder: Path, cut: bool) -> None:
     """The robot's side: filter, features, and what it hears of the map."""
     import rclpy
-    from feature_world import loop
 
     from feature_chain import START, STEP_NS, Chain, stamp_of
+    from feature_world import loop
     from slam_core.messages import path_from_message
 
     domain = int(os.environ["ROS_DOMAIN_ID"])

@@ -8,11 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from feature_world import PointWorld, room
 from scipy.stats import chi2
 
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.slam import EkfSlam
+from feature_world import PointWorld, room
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray, boxminus, invert_transform, skew, transform_points
 from slam_core.types import PoseEstimate, Submap

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feature_world import loop, room
 
 from ekf_slam_node.aids import ALL, ROTATION, MotionAids
 from ekf_slam_node.config import EkfSlamConfig, MotionConfig
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.slam import EkfSlam
+from feature_world import loop, room
 from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, make_transform, so3_exp, so3_log
 from slam_core.types import ImuSample, RelativeMotion
 

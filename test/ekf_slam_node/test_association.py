@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feature_world import T_RIG_OPTICAL, PointWorld, room
 
 from ekf_slam_node import association
 from ekf_slam_node.candidates import Candidates, MotionPrior, innovation_covariance, motion_prior, predict
@@ -13,6 +12,7 @@ from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.linking import Linker
 from ekf_slam_node.models import Frame, frame_from_features, relative_motion, rig_points
 from ekf_slam_node.motion_guess import guess_motion
+from feature_world import T_RIG_OPTICAL, PointWorld, room
 from slam_core.geometry import FloatArray, boxminus
 
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from feature_world import T_RIG_OPTICAL, loop, room
 
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.slam import EkfSlam
+from feature_world import T_RIG_OPTICAL, loop, room
 from slam_core.calibration_error import CalibrationErrorConfig, pose_sensitivity
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, make_transform, so3_exp

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, loop, room
 
 from ekf_slam_node.aids import ALL, ROTATION, Aid
 from ekf_slam_node.common_error import CommonError
@@ -16,6 +15,7 @@ from ekf_slam_node.ekf import Ekf
 from ekf_slam_node.models import observe
 from ekf_slam_node.motion_checks import widened
 from ekf_slam_node.slam import EkfSlam
+from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, loop, room
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray, boxminus, boxplus
 

@@ -10,10 +10,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from feature_world import loop, wander
 from monte_carlo import Run, mean_nis, seam_nees, simulate
 
 from ekf_slam_node.config import EkfSlamConfig
+from feature_world import loop, wander
 from slam_core.config import from_mapping
 from slam_core.evaluation import anees_bounds
 from slam_core.geometry import FloatArray

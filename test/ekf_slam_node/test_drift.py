@@ -6,11 +6,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from feature_world import loop, room
 
 from ekf_slam_node.config import EkfSlamConfig, SubmapConfig
 from ekf_slam_node.drift import Drift
 from ekf_slam_node.slam import EkfSlam
+from feature_world import loop, room
 from slam_core.geometry import FloatArray
 from slam_core.types import Features
 

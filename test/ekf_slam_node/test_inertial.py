@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from feature_world import room
 from imu_world import ACCELEROMETER_BIAS, GYRO_BIAS, PLACE, carried, imu_place, readings, velocity
 
 from ekf_slam_node.aids import MotionAids
@@ -16,6 +15,7 @@ from ekf_slam_node.odometry import OdometryChain, UpDirection
 from ekf_slam_node.preintegration import ImuNoise, ImuReadings, Preintegral
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.slam import EkfSlam
+from feature_world import room
 from slam_core.geometry import (
     FloatArray,
     boxminus,

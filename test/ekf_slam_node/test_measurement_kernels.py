@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feature_world import CAMERA, T_RIG_OPTICAL
 
 from ekf_slam_node import measurement_kernels as kernels
 from ekf_slam_node.covariance import Covariance
@@ -19,6 +18,7 @@ from ekf_slam_node.models import (
     project_jacobian,
     rig_points,
 )
+from feature_world import CAMERA, T_RIG_OPTICAL
 from slam_core.geometry import FloatArray, make_transform, skew, so3_exp, so3_left_jacobian
 
 M = 7

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feature_world import CAMERA, T_RIG_OPTICAL
 
 from ekf_slam_node import models
+from feature_world import CAMERA, T_RIG_OPTICAL
 from slam_core.geometry import (
     FloatArray,
     boxminus,

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feature_world import CAMERA, T_RIG_OPTICAL, room
 
 from ekf_slam_node import motion_kernels as kernels
 from ekf_slam_node.models import frame_from_features, rig_points
+from feature_world import CAMERA, T_RIG_OPTICAL, room
 from slam_core.geometry import boxplus, invert_transform, make_transform, so3_exp
 from slam_core.rigid_alignment import umeyama
 

@@ -17,13 +17,13 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from feature_world import T_RIG_OPTICAL, loop, room  # noqa: E402
 from geometry_msgs.msg import TransformStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from ekf_slam_node.config import EkfSlamConfig  # noqa: E402
 from ekf_slam_node.slam import EkfSlam  # noqa: E402
+from feature_world import T_RIG_OPTICAL, loop, room  # noqa: E402
 from ros_probe import Probe  # noqa: E402
 from slam_core.messages import (  # noqa: E402
     FEATURE_TOPICS,

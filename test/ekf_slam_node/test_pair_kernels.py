@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feature_world import T_RIG_OPTICAL, room
 
 from ekf_slam_node.candidates import Candidates, innovation_covariance, predict, squared_distances
 from ekf_slam_node.models import Frame, Observation, frame_from_features, relative_motion, rig_points
 from ekf_slam_node.pair_kernels import PairErrors, gated, normal_equations, pair_errors
+from feature_world import T_RIG_OPTICAL, room
 
 T = relative_motion(np.array([0.3, -0.2, 0.1, 0.05, 0.1, 0.4]), 1.0)
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, room
 
 from ekf_slam_node.config import EkfSlamConfig, MeasurementConfig
 from ekf_slam_node.models import Frame, frame_from_features
 from ekf_slam_node.rolling_shutter import RollingShutter, _robust_mean
 from ekf_slam_node.slam import EkfSlam
+from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, room
 from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform, so3_exp, transform_points
 from slam_core.types import Features
 

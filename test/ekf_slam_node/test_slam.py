@@ -8,13 +8,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from feature_world import PointWorld, loop, room
 
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.ekf import Ekf
 from ekf_slam_node.models import Observation
 from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.slam import EkfSlam
+from feature_world import PointWorld, loop, room
 from slam_core.config import from_mapping
 from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform, so3_exp
 from slam_core.types import Features, Submap

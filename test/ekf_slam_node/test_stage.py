@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from feature_world import T_RIG_OPTICAL, loop, room
 
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.stage import IMU, MOTION, FilterConfig, FilterStage, FrameResult
+from feature_world import T_RIG_OPTICAL, loop, room
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import invert_transform
 from slam_core.types import Features, ImuSample, RelativeMotion

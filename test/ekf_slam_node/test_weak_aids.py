@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from feature_world import loop, room
 
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.slam import EkfSlam
+from feature_world import loop, room
 from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, so3_log
 from slam_core.types import ImuSample, RelativeMotion
 

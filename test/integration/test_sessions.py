@@ -14,10 +14,10 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 pytestmark = pytest.mark.ros
 
-from feature_world import loop  # noqa: E402
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped  # noqa: E402
 
 from feature_chain import HOUR, START, STEP_NS, Chain, stamp_of  # noqa: E402
+from feature_world import loop  # noqa: E402
 from sjsam_node.global_map import GlobalMap  # noqa: E402
 from sjsam_node.storage import is_map  # noqa: E402
 
