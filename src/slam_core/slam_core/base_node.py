@@ -12,9 +12,6 @@
             result = self.odometry.process(stamp_ns(cloud), points_from_message(cloud))
             self.publish("ndt/odometry", odometry_message(self.types, "odom", "base_link", result.pose))
 
-        def on_reset(self) -> None:
-            self.odometry.reset()
-
     def main() -> None:
         run_node(NdtNode)  # of slam_core.ros
 
@@ -338,13 +335,11 @@ class SlamNode(TransformNode, Generic[C]):
 
     def _rivals(self) -> str:
         """Other nodes that publish what only this one should, or ""."""
-        texts = []
+        texts, own = [], self.get_fully_qualified_name()
         for topic in sorted(self._alone):
             publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
-            others = {f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers}
-            others -= {self.get_fully_qualified_name()}
-            if others:
-                texts.append(f"{topic} is published by {', '.join(sorted(others))} too: remap it there")
+            if others := sorted({f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers} - {own}):
+                texts.append(f"{topic} is published by {', '.join(others)} too: remap it there")
         return "; ".join(texts)
 
     def _report_connections(self) -> None:
