@@ -27,6 +27,7 @@ from slam_core.config import from_mapping
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test" / "ekf_slam_node"))
 from monte_carlo import Run, mean_nis, seam_nees, simulate
 from planar_monte_carlo import planar_nees

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT / "test"), str(ROOT / "test" / "ekf_slam_node"), *map(str, (ROOT / "src").iterdir())]
+sys.path[:0] = [str(ROOT / "test"), *map(str, (ROOT / "src").iterdir())]
 
 import rclpy  # noqa: E402
 

