@@ -19,6 +19,9 @@ from sjsam_node.global_map import GlobalMap
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "bags" / "demo"
 
+_MAPPED_S = 9.0
+"""From ready nodes to some seconds of the bag, so that there is a map: they find each other first."""
+
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 
@@ -88,7 +91,7 @@ def test_a_killed_run_leaves_no_nodes(run: Run) -> None:
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
 def test_a_run_that_is_asked_to_end_writes_what_is_mapped(run: Run, number: signal.Signals) -> None:
     assert wait_for(lambda: is_playing(run))
-    time.sleep(6.0)  # some seconds of the bag, so that there is a map
+    time.sleep(_MAPPED_S)
     assert run.process.stdout is not None
     if number == signal.SIGHUP:
         run.process.stdout.close()  # a terminal that is closed takes no more words
@@ -104,7 +107,7 @@ def test_a_run_that_is_asked_to_end_writes_what_is_mapped(run: Run, number: sign
 
 def test_a_second_ctrl_c_leaves_at_once_with_the_map(run: Run) -> None:
     assert wait_for(lambda: is_playing(run))
-    time.sleep(6.0)
+    time.sleep(_MAPPED_S)
     run.process.send_signal(signal.SIGINT)
     assert wait_for(lambda: any(run.out.glob(".slam.*.part/map/manifest.json")))
     run.process.send_signal(signal.SIGINT)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self
 
@@ -22,13 +23,27 @@ from std_srvs.srv import Trigger
 
 from slam_bringup.bags.pacing import Connections
 from slam_core.base_node import PROGRESS_TOPIC
-from slam_core.ros import RosTypes, sensor_qos
+from slam_core.ros import RosTypes, sensor_qos, use_fast_dds_profile
 
 _SPIN_S = 0.1
 _QUIET_TIMES = 3
 """Turns of ``_SPIN_S`` without progress after which nothing is on its way any more."""
 _MATCHING_S = 0.3
 _ASK_AGAIN_S = 10.0
+_TRANSPORT_VARIABLES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+
+
+@contextmanager
+def transport_of_the_nodes(environment: Mapping[str, str]) -> Iterator[None]:
+    """What the transport reads when a participant is made is as in the nodes: their discovery range and profile."""
+    before = dict(os.environ)
+    os.environ |= {name: environment[name] for name in _TRANSPORT_VARIABLES if name in environment}
+    use_fast_dds_profile()
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 class Supervisor:
@@ -43,17 +58,15 @@ class Supervisor:
     """
 
     def __init__(self, environment: Mapping[str, str], check: Callable[[], None]) -> None:
-        for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE"):
-            if name in environment:
-                os.environ[name] = environment[name]
         self._check = check
         self._context = Context()
-        rclpy.init(
-            context=self._context,
-            domain_id=int(environment["ROS_DOMAIN_ID"]),
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        self._node = Node("supervisor", context=self._context)
+        with transport_of_the_nodes(environment):
+            rclpy.init(
+                context=self._context,
+                domain_id=int(environment["ROS_DOMAIN_ID"]),
+                signal_handler_options=SignalHandlerOptions.NO,
+            )
+            self._node = Node("supervisor", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.diagnostics: dict[str, dict[str, str]] = {}
