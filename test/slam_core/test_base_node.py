@@ -247,19 +247,6 @@ def test_gaps_of_the_stamps_are_counted(node: EarNode) -> None:
     assert values["missing"] == "2"
 
 
-def test_a_frame_that_waits_too_long_goes_on_by_the_clock(node: EarNode, monkeypatch: pytest.MonkeyPatch) -> None:
-    now, overdue = [100.0], []
-    monkeypatch.setattr("slam_core.base_node.time.monotonic", lambda: now[0])
-    monkeypatch.setattr(node, "oldest_waiting_ns", lambda: START)
-    monkeypatch.setattr(node, "on_overdue", lambda: overdue.append(now[0]))
-    for _ in range(8):
-        node._look_for_overdue()
-        while node.work():
-            pass
-        now[0] += 0.25
-    assert overdue[0] == 101.25
-
-
 def test_a_node_is_managed_and_starts_active(node: EarNode) -> None:
     assert node._state_machine.current_state[1] == "active"
     node.trigger_deactivate()

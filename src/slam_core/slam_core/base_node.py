@@ -76,7 +76,6 @@ class SlamNode(TransformNode, Generic[C]):
         self._silent = False
         self._skipped = 0
         self._held_back = False
-        self._waiting: tuple[int | None, float] = (None, 0.0)
         self._input_stamp_ns = 0
         self._reported_state = State.OK
         self._progress = self.create_publisher(
@@ -90,8 +89,6 @@ class SlamNode(TransformNode, Generic[C]):
         self._reported_unconnected: list[str] | None = None
         self.create_timer(1.0, self._tick, clock=steady)
         self.create_timer(_CONNECTION_PERIOD_S, self._report_connections, clock=steady)
-        if self.input_config.policy == "newest":
-            self.create_timer(0.25 * self.input_config.overdue, self._look_for_overdue, clock=steady)
 
     # -- for the nodes -------------------------------------------------------------------------------------------------
 
@@ -381,20 +378,3 @@ class SlamNode(TransformNode, Generic[C]):
         skipped = self._jobs.skipped.total()
         new, self._skipped = skipped - self._skipped, skipped
         return f"{new} frames left out: they come faster than they are processed" if new else ""
-
-    # -- frames that wait ----------------------------------------------------------------------------------------------
-
-    def oldest_waiting_ns(self) -> int | None:
-        """Stamp of the frame that has waited longest for another sensor; override where frames wait."""
-        return None
-
-    def on_overdue(self) -> None:
-        """Go on without the sensor that frames wait for; override where frames wait."""
-
-    def _look_for_overdue(self) -> None:
-        """The clock's part in patience, for live nodes: the stages count frames, which may have ended as well."""
-        waiting, now = self.oldest_waiting_ns(), time.monotonic()
-        if waiting is None or waiting != self._waiting[0]:
-            self._waiting = (waiting, now)
-        elif now - self._waiting[1] > self.input_config.overdue:
-            self._jobs.add(QueuedCall("overdue", self.on_overdue))

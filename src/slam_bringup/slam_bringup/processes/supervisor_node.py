@@ -35,7 +35,7 @@ _TRANSPORT_VARIABLES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFI
 
 @contextmanager
 def transport_of_the_nodes(environment: Mapping[str, str]) -> Iterator[None]:
-    """What the transport reads when a participant is made is as in the nodes: their discovery range and profile."""
+    """Within the block a participant is made with the nodes' discovery range and profile."""
     before = dict(os.environ)
     os.environ |= {name: environment[name] for name in _TRANSPORT_VARIABLES if name in environment}
     use_fast_dds_profile()
