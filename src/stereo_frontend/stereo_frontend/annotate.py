@@ -6,6 +6,8 @@ Features over the image, coloured by depth, shaped by where the depth came from.
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 
@@ -36,7 +38,12 @@ def annotated_image(image: ByteArray, features: Features) -> ByteArray:
 
 def _depth_colours(depth: np.ndarray) -> list[tuple[int, int, int]]:
     share = np.clip((1.0 / np.maximum(depth, 1e-3) - 1.0 / _FAR) / (1.0 / _NEAR - 1.0 / _FAR), 0.0, 1.0)
-    if not len(share):
-        return []
-    table = cv2.applyColorMap((255 * share).astype(np.uint8)[:, None], cv2.COLORMAP_JET)[:, 0]
+    colours = _colours()
+    return [colours[level] for level in (255 * share).astype(np.uint8).tolist()]
+
+
+@cache
+def _colours() -> list[tuple[int, int, int]]:
+    """The 256 colours of the scale, blue first; OpenCV makes the table anew for every picture."""
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_JET)[:, 0]
     return [(b, g, r) for b, g, r in table.tolist()]

@@ -15,8 +15,8 @@ from stereo_frontend.tof_features import normalised_picture
 
 _MOST = 1500
 """Frames kept; beyond that every other one goes."""
-_APART_NS = 150_000_000
-"""From one frame that is kept to the next: to draw and pack a picture takes 5 ms."""
+_APART_NS = 270_000_000
+"""From one frame that is kept to the next: to draw and pack a picture takes 3 ms."""
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 85)
 _CLIP, _GAMMA = 0.005, 0.7
 """Share of the darkest and of the brightest pixels of a depth camera that are not told apart, and exponent."""
@@ -43,7 +43,7 @@ class LoggedFrame:
 
 
 class FrameLog:
-    """Keeps up to six frames a second, of a long run fewer: between 750 and 1500 in all."""
+    """Keeps up to four frames a second, of a long run fewer: between 750 and 1500 in all."""
 
     def __init__(self) -> None:
         self.frames: list[LoggedFrame] = []
