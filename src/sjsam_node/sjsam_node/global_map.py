@@ -286,6 +286,7 @@ class GlobalMap:
                 break
         self.smoother.settle()
         self._account(self.consistency.relieve(), 0)
+        self.smoother.resume()  # from here on it says the same as one that is saved and loaded
         self._offload.forget()
         self._has_moved, self._is_settled = False, True
 
@@ -354,8 +355,6 @@ class GlobalMap:
         storage.write(Path(path), self.stored())
         if is_last:
             self._offload.forget()
-        else:
-            self.smoother.resume()
 
     def stored(self) -> StoredMap:
         """The map as it is, to be written; nothing is settled."""

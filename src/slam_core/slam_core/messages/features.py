@@ -56,13 +56,16 @@ def features_from_messages(cloud: Message, descriptors: Message, camera_info: Me
     names = points.dtype.names or ()
     if missing := [name for name in FEATURE_FIELDS if name not in names]:
         raise ValueError(f"features cloud has no field {', '.join(missing)}")
-    table = np.column_stack([points[name].ravel().astype(np.float32) for name in FEATURE_FIELDS])
+    fields = [points[name].ravel().astype(np.float32) for name in FEATURE_FIELDS]
     rows = image_from_message(descriptors)
-    if rows.dtype != np.float32 or rows.ndim != 2 or len(rows) != len(table):
-        raise ValueError(f"{len(table)} features need as many rows of 32FC1 descriptors, got {rows.dtype} {rows.shape}")
-    if not (np.isfinite(table).all() and np.isfinite(rows).all()):
+    count = points.size
+    if rows.dtype != np.float32 or rows.ndim != 2 or len(rows) != count:
+        raise ValueError(f"{count} features need as many rows of 32FC1 descriptors, got {rows.dtype} {rows.shape}")
+    if not all(np.isfinite(values).all() for values in (*fields, rows)):
         raise ValueError("features contain numbers that are not finite")
+    # Each array is contiguous, as the extractor made it: sums over views of one table round otherwise.
     return Features(
-        stamp_ns(cloud), table[:, 0:3], table[:, 3:5], table[:, 5], table[:, 6:8], table[:, 8], table[:, 9],
-        table[:, 10].astype(np.uint8), rows, camera_info_from_message(camera_info).rectified, cloud.header.frame_id,
+        stamp_ns(cloud), np.column_stack(fields[0:3]), np.column_stack(fields[3:5]), fields[5],
+        np.column_stack(fields[6:8]), *fields[8:10], fields[10].astype(np.uint8), rows,
+        camera_info_from_message(camera_info).rectified, cloud.header.frame_id,
     )  # fmt: skip
