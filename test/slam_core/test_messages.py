@@ -279,6 +279,7 @@ def test_features_survive(rng: np.random.Generator, n: int) -> None:
     back = m.features_from_messages(*map(over_the_wire, sent))
     for name in ("xyz", "uv", "depth", "sigma_uv", "sigma_depth", "response", "source", "descriptors"):
         np.testing.assert_array_equal(getattr(back, name), getattr(features, name))
+        assert getattr(back, name).flags.c_contiguous, "sums over another layout round otherwise"
     assert (back.stamp_ns, back.camera, back.frame_id) == (STAMP, CAMERA, "left")
 
 
@@ -428,6 +429,11 @@ def test_motions_survive_and_an_unknown_one_is_none(rng: np.random.Generator) ->
     assert back is not None
     assert (back.start_stamp_ns, back.end_stamp_ns) == (STAMP - 10**8, STAMP)
     np.testing.assert_allclose(back.T, motion.T, atol=1e-14)
+    received = m.motion_as_received(motion)
+    assert received is not None
+    np.testing.assert_array_equal(received.T, back.T)
+    np.testing.assert_array_equal(received.covariance, back.covariance)
+    assert m.motion_as_received(None) is None
     assert m.motion_from_message(m.motion_message(TYPES, "base_link", STAMP, None)) is None
     with pytest.raises(ValueError, match="<frame>@<start ns>"):
         m.motion_from_message(m.pose_with_covariance_message(TYPES, "odom", PoseEstimate(1, np.eye(4), np.eye(6))))
@@ -443,6 +449,11 @@ def test_paths_and_transforms_survive(rng: np.random.Generator) -> None:
     parent, child, T = m.transform_from_message(message)
     assert (parent, child) == ("map", "odom")
     np.testing.assert_allclose(T, poses[0].T, atol=1e-14)
+    pose = rng.normal(size=7)
+    pose[3:] /= 1.001 * np.linalg.norm(pose[3:])
+    parent, child, same = m.pose7_from_message(over_the_wire(m.pose7_message(TYPES, STAMP, "map", "odom", pose)))
+    assert (parent, child) == ("map", "odom")
+    np.testing.assert_array_equal(same, pose)
 
 
 def test_poses_that_are_none_are_refused() -> None:

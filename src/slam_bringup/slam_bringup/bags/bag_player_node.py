@@ -25,10 +25,10 @@ from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.config import Config, parameter
 from slam_core.messages import (
     STATIC_TRANSFORMS_TOPIC,
+    pose7_from_message,
+    pose7_message,
     stamp_ns,
     time_message,
-    transform_from_message,
-    transform_message,
 )
 from slam_core.ros import RosTypes, declare_config, message_class, run_node, sensor_qos
 
@@ -190,11 +190,14 @@ class BagPlayerNode(Node):
         topics = [t for t in self._reader.topics if t.endswith("/tf_static")]
         for _, _, message in self._reader.messages(topics):
             for transform in message.transforms:
-                parent, child, T = transform_from_message(transform)
-                if child not in own:
-                    self._static_output.publish(transform_message(self._types, stamp_ns(transform), parent, child, T))
+                t = StaticTransform(*pose7_from_message(transform))
+                if t.child not in own:
+                    self._send_static(t, stamp_ns(transform))
         for t in self._transforms:
-            self._static_output.publish(transform_message(self._types, 0, t.parent, t.child, t.T))
+            self._send_static(t, 0)
+
+    def _send_static(self, t: StaticTransform, stamp: int) -> None:
+        self._static_output.publish(pose7_message(self._types, stamp, t.parent, t.child, t.pose))
 
     def _wait_for_subscribers(self) -> None:
         """Until nobody new has subscribed for a second: what is sent before discovery ends is lost to latecomers."""

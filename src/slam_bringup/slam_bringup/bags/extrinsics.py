@@ -17,16 +17,27 @@ EXTRINSICS, URDF = "extrinsics.yaml", "extrinsics.urdf"
 
 @dataclass(frozen=True, eq=False)
 class StaticTransform:
-    """T_parent_child (4, 4) between two frames of a rig."""
+    """T_parent_child between two frames of a rig.
+
+    pose: (7,) ``x y z qx qy qz qw`` with the numbers of its source, which a way through a matrix would round.
+    """
 
     parent: str
     child: str
-    T: FloatArray
+    pose: FloatArray
+
+    def __post_init__(self) -> None:
+        transform_from_pose7(self.pose)  # ValueError where the quaternion is none
+
+    @property
+    def T(self) -> FloatArray:
+        """T_parent_child (4, 4)."""
+        return transform_from_pose7(self.pose)
 
     @property
     def text(self) -> str:
         """``PARENT CHILD x y z qx qy qz qw``."""
-        numbers = " ".join(repr(float(v)) for v in pose7_from_transform(self.T))
+        numbers = " ".join(repr(float(v)) for v in self.pose)
         return f"{self.parent} {self.child} {numbers}"
 
     @classmethod
@@ -34,7 +45,7 @@ class StaticTransform:
         """Of a :attr:`text`; ValueError if it is none."""
         try:
             parent, child, *numbers = text.split()
-            return cls(parent, child, transform_from_pose7(np.array(numbers, dtype=np.float64)))
+            return cls(parent, child, np.array(numbers, dtype=np.float64))
         except ValueError as error:
             raise ValueError(f"'{text}' is not PARENT CHILD x y z qx qy qz qw: {error}") from error
 
@@ -61,7 +72,7 @@ def read_extrinsics(path: Path) -> StaticTransform:
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
         pose = np.array([*document["translation_m"], *document["rotation_xyzw"]], dtype=np.float64)
-        return StaticTransform(str(document["parent_frame"]), str(document["child_frame"]), transform_from_pose7(pose))
+        return StaticTransform(str(document["parent_frame"]), str(document["child_frame"]), pose)
     except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is no extrinsics file of slam calibrate: {error}") from error
 

@@ -50,7 +50,7 @@ class RigCalibration:
         """The static transforms between the frames of the images; none without both cameras."""
         if self.T_left_tof is None or not (left_frame and tof_frame):
             return ()
-        return (StaticTransform(left_frame, tof_frame, self.T_left_tof.T),)
+        return (StaticTransform(left_frame, tof_frame, self.T_left_tof.pose),)
 
     def driver_parameters(self) -> dict[str, dict[str, Any]]:
         """Parameters of the driver nodes, by executable."""

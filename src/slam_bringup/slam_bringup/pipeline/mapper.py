@@ -23,7 +23,7 @@ from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, St
 from slam_bringup.pipeline.sensor_pipeline import AgentItem
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.memory import give_back, leave_libraries
-from slam_core.messages import rounded
+from slam_core.messages import motion_as_received, rounded
 from slam_core.types import Features, ImuSample, PoseEstimate, Submap
 
 
@@ -61,7 +61,7 @@ class Mapper:
             stage.add_imu(value)
         elif isinstance(value, ScanEstimate):
             self._diaries[item.agent].scans.append(value.pose)
-            stage.add_motion(value.pose.stamp_ns, value.motion)
+            stage.add_motion(value.pose.stamp_ns, motion_as_received(value.motion))
         elif isinstance(value, Features):
             stage.add_features(value)
         self._take_results(item.agent)

@@ -66,6 +66,6 @@ def features_from_messages(cloud: Message, descriptors: Message, camera_info: Me
     # Each array is contiguous, as the extractor made it: sums over views of one table round otherwise.
     return Features(
         stamp_ns(cloud), np.column_stack(fields[0:3]), np.column_stack(fields[3:5]), fields[5],
-        np.column_stack(fields[6:8]), *fields[8:10], fields[10].astype(np.uint8), rows,
+        np.column_stack(fields[6:8]), fields[8], fields[9], fields[10].astype(np.uint8), rows,
         camera_info_from_message(camera_info).rectified, cloud.header.frame_id,
     )  # fmt: skip

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -102,6 +103,13 @@ def motion_from_message(message: Message) -> RelativeMotion | None:
     return motion if motion.start_stamp_ns != motion.end_stamp_ns else None
 
 
+def motion_as_received(motion: RelativeMotion | None) -> RelativeMotion | None:
+    """A motion after its way through :func:`motion_message`, whose quaternion rounds the rotation by 1e-16."""
+    if motion is None:
+        return None
+    return replace(motion, T=transform_from_pose7(pose7_from_transform(motion.T)))
+
+
 def path_message(types: MessageTypes, stamp: int, frame_id: str, poses: Iterable[PoseEstimate]) -> Message:
     """nav_msgs/Path of poses T_frame_rig; each keeps its own stamp."""
     stamped = [pose_stamped_message(types, p.stamp_ns, frame_id, p.T) for p in poses]
@@ -115,7 +123,12 @@ def path_from_message(message: Message) -> list[tuple[int, FloatArray]]:
 
 def transform_message(types: MessageTypes, stamp: int, parent: str, child: str, T_parent_child: FloatArray) -> Message:
     """geometry_msgs/TransformStamped."""
-    x, y, z, qx, qy, qz, qw = (float(v) for v in pose7_from_transform(T_parent_child))
+    return pose7_message(types, stamp, parent, child, pose7_from_transform(T_parent_child))
+
+
+def pose7_message(types: MessageTypes, stamp: int, parent: str, child: str, pose: FloatArray) -> Message:
+    """geometry_msgs/TransformStamped of ``x y z qx qy qz qw``, the same numbers."""
+    x, y, z, qx, qy, qz, qw = (float(v) for v in pose)
     transform = types.Transform(
         translation=types.Vector3(x=x, y=y, z=z), rotation=types.Quaternion(x=qx, y=qy, z=qz, w=qw)
     )
@@ -126,9 +139,14 @@ def transform_message(types: MessageTypes, stamp: int, parent: str, child: str, 
 
 def transform_from_message(message: Message) -> tuple[str, str, FloatArray]:
     """Parent, child and T_parent_child (4, 4) of a geometry_msgs/TransformStamped."""
+    parent, child, pose = pose7_from_message(message)
+    return parent, child, transform_from_pose7(pose)
+
+
+def pose7_from_message(message: Message) -> tuple[str, str, FloatArray]:
+    """Parent, child and ``x y z qx qy qz qw`` of a geometry_msgs/TransformStamped, as they are written there."""
     transform = message.transform
-    T = _transform(transform.translation, transform.rotation)
-    return message.header.frame_id, message.child_frame_id, T
+    return message.header.frame_id, message.child_frame_id, _pose7(transform.translation, transform.rotation)
 
 
 def imu_message(types: MessageTypes, frame_id: str, sample: ImuSample) -> Message:
@@ -162,13 +180,17 @@ def _with_covariance(types: MessageTypes, estimate: PoseEstimate) -> Message:
 
 
 def _transform(position: Message, orientation: Message) -> FloatArray:
+    return transform_from_pose7(_pose7(position, orientation))
+
+
+def _pose7(position: Message, orientation: Message) -> FloatArray:
     q = orientation
     pose = np.array([*_xyz(position), q.x, q.y, q.z, q.w], dtype=np.float64)
     if not np.isfinite(pose).all():
         raise ValueError(f"pose is not finite: {pose.tolist()}")
     if np.abs(pose[:3]).max() > FARTHEST_M:
         raise ValueError(f"position is beyond {FARTHEST_M:g} m: {pose[:3].tolist()}")
-    return transform_from_pose7(pose)
+    return pose
 
 
 def _vector(types: MessageTypes, xyz: FloatArray) -> Message:
