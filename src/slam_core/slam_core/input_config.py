@@ -25,7 +25,7 @@ class InputConfig(Config):
         " counted; all: every frame is processed, however late",
         choices=POLICIES,
     )
-    waiting: int = 2
+    waiting: int = 1
     """Frames of an input that may wait with policy newest."""
     depth: int = parameter(200, "messages kept per topic until received, and until paired", minimum=1)
     overdue: float = 1.0

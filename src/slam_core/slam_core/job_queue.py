@@ -43,7 +43,7 @@ class JobQueue:
         With ``newest``: jobs of a source that may wait.
     """
 
-    def __init__(self, policy: str = "newest", waiting: int = 2) -> None:
+    def __init__(self, policy: str = "newest", waiting: int = 1) -> None:
         if policy not in POLICIES or waiting < 1:
             raise ValueError(f"jobs need a policy of {', '.join(POLICIES)} and room for one, got {policy}, {waiting}")
         self._policy = policy
