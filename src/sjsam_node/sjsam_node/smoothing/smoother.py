@@ -27,6 +27,7 @@ from sjsam_node.smoothing.region import Region
 from sjsam_node.smoothing.regions import RegionConfig, Regions
 from slam_core.config import Config, group
 from slam_core.geometry import FloatArray, compose_covariance
+from slam_core.memory import trim
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,7 @@ class Smoother:
         self._solved.clear()  # the graph has its estimate; problem and factor of before are as large as the new ones
         self.parked = Parked()
         self.regions.clear(len(self.graph.records))
+        trim()
         for component in np.unique(self.graph.component_of).tolist():
             self._solve(component, coarse=coarse)
 

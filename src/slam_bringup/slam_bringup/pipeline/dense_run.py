@@ -22,7 +22,7 @@ from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
 from slam_core.geometry import FloatArray
-from slam_core.memory import trim
+from slam_core.memory import give_back, trim
 from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray, DepthImage
 from stereo_frontend.corrected_info import corrected_right
@@ -30,7 +30,7 @@ from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.stage import StereoStage
 from tof_driver.stage import DepthStage
 
-_TRIMMED = 16
+_TRIMMED = 4
 """Key frames after which freed memory is returned."""
 
 
@@ -113,7 +113,9 @@ class FieldThread:
         self._wait()
         self._last = self._pool.submit(self.model.add, camera, T_map_camera, image, picture)
         self._added += 1
-        if self._added % _TRIMMED == 0:
+        if self._added == _TRIMMED:
+            give_back()  # all that measuring and fusing needs is loaded
+        elif self._added % _TRIMMED == 0:
             trim()
 
     def _wait(self) -> None:

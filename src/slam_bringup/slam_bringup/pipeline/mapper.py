@@ -26,6 +26,9 @@ from slam_core.memory import give_back, leave_libraries
 from slam_core.messages import motion_as_received, rounded
 from slam_core.types import Features, ImuSample, PoseEstimate, Submap
 
+_LOADED = 1, 4
+"""Frames of an agent after which what images, and what the filter needs, is loaded."""
+
 
 class Mapper:
     """Takes the inputs of all filters in order, and hands every submap that one of them finishes to the map.
@@ -75,8 +78,8 @@ class Mapper:
         for agent, stage in self._filters.items():
             stage.give_up()
             self._take_results(agent)
-            last += stage.finish()
             self._events += [stage.finding] if stage.finding else []
+            last += stage.start_session()  # which no frame begins: the filter forgets its state
         give_back()
         self._join(in_order(last))
         for join in self._joins:
@@ -130,6 +133,8 @@ class Mapper:
     def _take_results(self, agent: str) -> None:
         for frame in self._times.each("ekf", self._filters[agent].ready()):
             self._diaries[agent].add(frame)
+            if len(self._diaries[agent].poses) in _LOADED:
+                leave_libraries()
             self._join(frame.estimate.submaps)
 
     def _join(self, submaps: Iterable[Submap]) -> None:

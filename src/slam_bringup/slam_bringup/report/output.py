@@ -13,36 +13,21 @@ import json
 import shlex
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.plan_io import write_plan
 from dense_mapping.surface_io import write_glb, write_mesh, write_points
-from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult, summarise
+from slam_bringup.pipeline.results import RunResult, summarise
 from slam_bringup.report.figures import map_figure, save_png
 from slam_bringup.report.foxglove import write_layout
+from slam_bringup.report.mapped_files import SaveMap, write_mapped
 from slam_bringup.report.report import Charts, draw_charts, write_report
 from slam_bringup.version import VERSION
 from slam_core.files import atomic_text
-from slam_core.point_cloud import write_ply
+from slam_core.memory import give_back
 from slam_core.process_life import STARTED_S
-from slam_core.trajectory import write_covariance_csv, write_tum
-
-SaveMap = Callable[[Path], object]
-"""Writes the loadable map to a folder."""
-
-
-def write_mapped(out: Path, result: RunResult, save_map: SaveMap | None = None) -> None:
-    """Write what needs no dense model into the folder ``out`` (made if absent): ``map/``, trajectories, landmarks."""
-    out.mkdir(parents=True, exist_ok=True)
-    if save_map is not None:
-        save_map(out / "map")
-    _write_trajectories(out, result.agents)
-    _write_landmarks(out / "landmarks.ply", result.landmarks)
 
 
 def write_results(
@@ -59,7 +44,7 @@ def write_results(
     ``save_map`` is called with the path of ``map/``, before all else. Drawing takes most of the time: without
     ``pictures`` there is no ``map.png`` and no ``report.html``. ``summary.json`` comes last, so that a folder that has
     one is complete. Made before, if so: ``charts`` by :func:`~slam_bringup.report.report.draw_charts`, and
-    (``is_mapped``) the files of :func:`write_mapped`.
+    (``is_mapped``) the files of :func:`~slam_bringup.report.mapped_files.write_mapped`.
     """
     if not is_mapped:
         write_mapped(out, result, save_map)
@@ -67,6 +52,7 @@ def write_results(
     write_points(out / "map.ply", result.dense)
     write_mesh(out / "mesh.ply", result.dense)
     write_glb(out / "mesh.glb", result.dense)
+    give_back()  # it takes 70 MB for a moment, as drawing does
     _write_plans(out, result.floor_plans)
     if (out / "result.mcap").is_file():
         write_layout(out / "foxglove_layout.json", out / "result.mcap")
@@ -74,6 +60,7 @@ def write_results(
     if pictures:
         save_png(out / "map.png", map_figure(result))
         map_png = (out / "map.png").read_bytes()  # drawn once: it is the dearest of the figures
+        give_back()
         write_report(out / "report.html", result, summary | _in_all(result), map_png, charts or draw_charts(result))
     summary |= _in_all(result)
     atomic_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
@@ -96,21 +83,3 @@ def _write_plans(out: Path, plans: tuple[FloorPlan, ...]) -> None:
     """``floor_plan.yaml`` and its image; of several storeys one each, from the lowest: ``floor_plan_0.yaml`` ..."""
     for number, plan in enumerate(plans):
         write_plan(out / (f"floor_plan_{number}.yaml" if len(plans) > 1 else "floor_plan.yaml"), plan)
-
-
-def _write_landmarks(path: Path, landmarks: LandmarkMap) -> None:
-    """Positions with the upper triangle of each covariance, m2, and the number of sightings."""
-    entries = {f"cov_{'xyz'[i]}{'xyz'[j]}": landmarks.covariances[:, i, j] for i in range(3) for j in range(i, 3)}
-    write_ply(path, landmarks.positions.astype(np.float32), scalars={**entries, "sightings": landmarks.sightings})
-
-
-def _write_trajectories(out: Path, agents: tuple[AgentResult, ...]) -> None:
-    named = [("", agent) for agent in agents[:1]]
-    if len(agents) > 1:
-        named += [(f"_{agent.name}", agent) for agent in agents]
-    for suffix, agent in named:
-        write_tum(out / f"trajectory{suffix}.tum", agent.trajectory)
-        if agent.trajectory.covariances is not None:
-            write_covariance_csv(out / f"trajectory{suffix}_covariance.csv", agent.trajectory)
-        if len(agent.truth):
-            write_tum(out / f"ground_truth{suffix}.tum", agent.truth)

@@ -44,19 +44,14 @@ class Charts:
     agents: list[dict[str, str | None]]
 
 
-def draw_charts(result: RunResult, go_on: Callable[[], None] = lambda: None) -> Charts:
-    """The charts that need no dense model. ``go_on`` is called before each: what it raises ends the drawing."""
-
-    def drawn(figure: Callable[[Any], Figure | None], of: Any) -> str | None:
-        go_on()
-        return _embedded(figure(of))
-
+def draw_charts(result: RunResult) -> Charts:
+    """The charts of a page, without the map's picture."""
     graph = result.global_map.graph
     return Charts(
-        drawn(side_view, result),
-        drawn(submaps_figure, graph),
-        drawn(sparsity_figure, graph),
-        [{name: drawn(figure, agent) for name, figure in _AGENT_CHARTS.items()} for agent in result.agents],
+        _embedded(side_view(result)),
+        _embedded(submaps_figure(graph)),
+        _embedded(sparsity_figure(graph)),
+        [{name: _embedded(figure(agent)) for name, figure in _AGENT_CHARTS.items()} for agent in result.agents],
     )
 
 
