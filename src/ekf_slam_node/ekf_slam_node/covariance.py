@@ -126,9 +126,8 @@ class Covariance:
 
     def head(self, rows: int) -> FloatArray:
         """The first ``rows`` columns (n, rows): covariance of everything with the head of the state."""
-        out = self._P[: self.size, :rows].copy()
-        for k in range(rows - 1):
-            out[k, k + 1 :] = out[k + 1 : rows, k]
+        out = np.empty((self.size, rows))
+        _gather_columns(self._P, np.arange(rows), self.size, out)
         return out
 
     def blocks(self, first: IndexArray, width: int = 3) -> FloatArray:

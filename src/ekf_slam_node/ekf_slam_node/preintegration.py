@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 
@@ -64,11 +65,12 @@ class ImuReadings:
     def add(self, sample: ImuSample) -> bool:
         """Take a reading; False if it is not finite or not newer than the last."""
         newer = not self._samples or sample.stamp_ns > self._samples[-1].stamp_ns
-        finite = np.isfinite(sample.angular_velocity).all() and np.isfinite(sample.linear_acceleration).all()
-        if newer and finite:
-            self._samples.append(sample)
-            self.forget_before(sample.stamp_ns - round(2e9 * _LONGEST_S))
-        return bool(newer and finite)
+        values = (*sample.angular_velocity.tolist(), *sample.linear_acceleration.tolist())
+        if not newer or not all(map(isfinite, values)):
+            return False
+        self._samples.append(sample)
+        self.forget_before(sample.stamp_ns - round(2e9 * _LONGEST_S))
+        return True
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop the readings before a stamp but for the last of them."""
@@ -91,9 +93,10 @@ class ImuReadings:
         inside = (stamps > start_ns) & (stamps < end_ns)
         edges = np.concatenate([[start_ns], stamps[inside], [end_ns]])
         middle = 0.5 * (edges[1:] + edges[:-1]) - start_ns
-        readings = np.array([[*s.angular_velocity, *s.linear_acceleration] for s in self._samples])
+        turn_rates = np.array([sample.angular_velocity for sample in self._samples])
+        forces = np.array([sample.linear_acceleration for sample in self._samples])
         times = (stamps - start_ns).astype(np.float64)
-        at_middle = np.column_stack([np.interp(middle, times, column) for column in readings.T])
+        at_middle = np.column_stack([np.interp(middle, times, column) for column in (*turn_rates.T, *forces.T)])
         silent = np.clip(np.diff(edges) * 1e-9 - LONGEST_IMU_STEP_S, 0.0, None) > 0.0
         silent |= (middle < times[0]) | (middle > times[-1])
         return _integrated(at_middle, biases, np.diff(edges) * 1e-9, silent, noise)
@@ -105,8 +108,8 @@ def _integrated(
     """Preintegral of readings (n, 6), each held for dt (n,) s."""
     size = float(np.linalg.norm(readings[:, 3:], axis=1).mean())
     readings = readings - biases
-    turns = so3_exp(readings[:, :3] * dt[:, None])
-    half = so3_exp(0.5 * readings[:, :3] * dt[:, None])
+    rates = readings[:, :3]
+    turns, half = np.split(so3_exp(np.concatenate([rates * dt[:, None], 0.5 * rates * dt[:, None]])), 2)
     R, before = np.eye(3), np.empty_like(turns)
     for k, turn in enumerate(turns):
         before[k] = R

@@ -99,9 +99,9 @@ class FilterStage:
     def add_imu(self, sample: ImuSample) -> None:
         """Take an IMU's reading; ValueError if it is not known where the IMU sits."""
         T_base_imu = self._frames.lookup(self._base_frame, sample.frame_id)
-        stamp_ns = sample.stamp_ns + round(self._config.inertial.time_offset * 1e9)
-        self._samples.append(replace(sample.seen_from(T_base_imu, self._base_frame), stamp_ns=stamp_ns))
-        self._awaited.heard(IMU, stamp_ns)
+        seen = sample.seen_from(T_base_imu, self._base_frame, round(self._config.inertial.time_offset * 1e9))
+        self._samples.append(seen)
+        self._awaited.heard(IMU, seen.stamp_ns)
 
     def ready(self) -> Iterator[FrameResult]:
         """Results of the frames that need not wait, oldest first.

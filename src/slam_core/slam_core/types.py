@@ -164,11 +164,11 @@ class ImuSample:
     frame_id: str = "base_link"
     position: FloatArray = field(default_factory=lambda: np.zeros(3))
 
-    def seen_from(self, T: FloatArray, frame_id: str) -> ImuSample:
-        """The same reading along the axes of another frame, ``T`` = T_frame_own (4, 4)."""
-        R = T[:3, :3]
+    def seen_from(self, T: FloatArray, frame_id: str, delay_ns: int = 0) -> ImuSample:
+        """The same reading along the axes of another frame, ``T`` = T_frame_own (4, 4), and so much later."""
+        R, stamp_ns = T[:3, :3], self.stamp_ns + delay_ns
         position = R @ self.position + T[:3, 3]
-        return ImuSample(self.stamp_ns, R @ self.angular_velocity, R @ self.linear_acceleration, frame_id, position)
+        return ImuSample(stamp_ns, R @ self.angular_velocity, R @ self.linear_acceleration, frame_id, position)
 
 
 @dataclass(frozen=True, eq=False)
