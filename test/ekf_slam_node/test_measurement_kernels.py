@@ -79,6 +79,19 @@ def test_features_lie_where_numpy_has_them(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(spread, np.einsum("nij,nj,nkj->nik", J, frame.variance, J), rtol=1e-9, atol=1e-15)
 
 
+def test_rows_exposed_one_after_the_other_move_points_as_numpy_has_it(rng: np.random.Generator) -> None:
+    z = rng.uniform([0.0, 0.0, 0.2], [640.0, 480.0, 2.0], (30, 3))
+    turn, shift, readout = rng.standard_normal(3), rng.standard_normal(3), 0.02
+    points = back_project(z, CAMERA)
+    share = (z[:, 1] - 0.5 * (CAMERA.height - 1)) / CAMERA.height
+    expected = share[:, None] * (shift + np.cross(turn, points))
+    rates, moved = np.empty((30, 3)), np.empty((30, 3))
+    kernels.rolling_rates(z, CAMERA.lens, CAMERA.height, turn, shift, rates)
+    kernels.moved_measurements(z, CAMERA.lens, rates, readout, moved)
+    np.testing.assert_allclose(rates, expected, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(moved, project(points + readout * expected, CAMERA), rtol=1e-12)
+
+
 def test_innovation_covariances(ekf: Ekf, rng: np.random.Generator) -> None:
     """Each observation's own, and the lower triangle of the joint one."""
     J_pose, J_point = rng.standard_normal((M, 3, 6)), rng.standard_normal((M, 3, 3))

@@ -41,6 +41,33 @@ def observed(points, T, centre, lens, z, depth, J_pose, J_point):  # type: ignor
 
 
 @in_place(error_model="numpy")
+def rolling_rates(z, lens, height, turn, shift, rates):  # type: ignore[no-untyped-def]
+    """Fill rates (n, 3): m per second of readout by which points measured as z (n, 3) move in the optical frame.
+
+    ``turn``, ``shift`` (3,): the camera's rotation and translation, rad/s and m/s, in the same frame.
+    """
+    for n in range(len(z)):
+        depth = 1.0 / z[n, 2]
+        x, y = (z[n, 0] - lens[2]) / lens[0] * depth, (z[n, 1] - lens[3]) / lens[1] * depth
+        share = (z[n, 1] - 0.5 * (height - 1)) / height
+        rates[n, 0] = share * (shift[0] + (turn[1] * depth - turn[2] * y))
+        rates[n, 1] = share * (shift[1] + (turn[2] * x - turn[0] * depth))
+        rates[n, 2] = share * (shift[2] + (turn[0] * y - turn[1] * x))
+
+
+@in_place(error_model="numpy")
+def moved_measurements(z, lens, rates, readout, moved):  # type: ignore[no-untyped-def]
+    """Fill moved (n, 3): measurements of points measured as z (n, 3) after ``readout`` (s) at rates (n, 3) m/s."""
+    for n in range(len(z)):
+        depth = 1.0 / z[n, 2]
+        x, y = (z[n, 0] - lens[2]) / lens[0] * depth, (z[n, 1] - lens[3]) / lens[1] * depth
+        w = 1.0 / max(depth + readout * rates[n, 2], LEAST_DEPTH)
+        moved[n, 0] = lens[0] * (x + readout * rates[n, 0]) * w + lens[2]
+        moved[n, 1] = lens[1] * (y + readout * rates[n, 1]) * w + lens[3]
+        moved[n, 2] = w
+
+
+@in_place(error_model="numpy")
 def placed(z, variance, T, lens, points, covariances):  # type: ignore[no-untyped-def]
     """Fill points (n, 3) and covariances (n, 3, 3) of measurements z of variance (n, 3) by a camera at T (4, 4)."""
     for n in range(len(z)):

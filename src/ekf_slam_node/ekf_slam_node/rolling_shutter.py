@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ekf_slam_node.candidates import Candidates
-from ekf_slam_node.models import Frame, back_project, project, rig_points, velocity_of_motion
+from ekf_slam_node.measurement_kernels import moved_measurements, rolling_rates
+from ekf_slam_node.models import Frame, rig_points, velocity_of_motion
 from ekf_slam_node.motion_guess import refine_motion
 from ekf_slam_node.pair_kernels import PairErrors, pair_errors
 from slam_core.chi_square import chi_square_bound
@@ -186,13 +187,15 @@ class RollingShutter:
         """By what (n, 3) m the points of a frame move in the optical frame per second of readout."""
         R, place = self._T_rig_optical[:3, :3], self._T_rig_optical[:3, 3]
         turn, shift = R.T @ velocity[3:], R.T @ (velocity[:3] + np.cross(velocity[3:], place))
-        share = (frame.z[:, 1] - 0.5 * (frame.camera.height - 1)) / frame.camera.height
-        return np.asarray(share[:, None] * (shift + np.cross(turn, back_project(frame.z, frame.camera))))
+        rates = np.empty((len(frame), 3))
+        rolling_rates(frame.z, frame.camera.lens, frame.camera.height, turn, shift, rates)
+        return rates
 
     def _moved(self, frame: Frame, velocity: FloatArray, readout: float) -> FloatArray:
         """Measurements (n, 3) of the frame's points as the instant of the middle row has them."""
-        points = back_project(frame.z, frame.camera) + readout * self._rates(frame, velocity)
-        return project(points, frame.camera)
+        moved = np.empty((len(frame), 3))
+        moved_measurements(frame.z, frame.camera.lens, self._rates(frame, velocity), readout, moved)
+        return moved
 
 
 def _velocity(moment: _Moment, after: _Moment) -> FloatArray:
