@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import mmap
+import re
 import sys
 from collections.abc import Iterator
 from functools import cache
@@ -22,6 +23,12 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 _KEPT_BYTES = 64 << 20
 _LARGE_BYTES = 8 << 20
 _FEW_BYTES = 1 << 20
+_CLEAN_PART = re.compile(
+    rb"^(?P<first>[0-9a-f]+)-(?P<end>[0-9a-f]+) r-[x-]p .*\.so.*\n"  # addresses, rights, ..., name
+    rb"(?:[A-Z].*\n)*?Anonymous: +0 kB",
+    re.MULTILINE,
+)
+"""A part of a library, read only, without a page of the process's own, in ``smaps`` (proc(5))."""
 _NEW_OBJECTS = 10_000
 """Objects made, less those freed, that begin a search for garbage; Python has 700."""
 
@@ -83,12 +90,5 @@ def leave_libraries() -> None:
 
 def _clean_parts_of_libraries() -> Iterator[tuple[int, int]]:
     """Addresses (first, end) of parts of libraries that are as in their files: no page was written to."""
-    part = None
-    for line in Path("/proc/self/smaps").read_text().splitlines():
-        words = line.split(None, 5)
-        if not words[0].endswith(":"):  # addresses, rights, offset, device, inode, name
-            is_code = len(words) == 6 and ".so" in words[5] and words[1] in ("r-xp", "r--p")
-            first, _, end = words[0].partition("-")
-            part = (int(first, 16), int(end, 16)) if is_code else None
-        elif part is not None and words[0] == "Anonymous:" and words[1] == "0":
-            yield part
+    for found in _CLEAN_PART.finditer(Path("/proc/self/smaps").read_bytes()):
+        yield int(found["first"], 16), int(found["end"], 16)

@@ -54,7 +54,7 @@ class Mapper:
         self._diaries = {agent: _Diary() for agent in sensors}
         self._joiner = JoinerStage()
         self._joins: list[Future[None]] = []
-        self._submaps = self._added = 0
+        self._submaps = 0
         self._events: list[str] = []
 
     def process(self, item: AgentItem) -> None:
@@ -143,9 +143,6 @@ class Mapper:
     def _add(self, submap: Submap) -> None:
         with self._times.measure("sjsam"):
             self.growth.add(rounded(submap) if self._compact else submap)
-        self._added += 1
-        if self._added.bit_count() == 1:  # kernels and modules are loaded with the first of something
-            leave_libraries()
 
 
 class _Diary:
