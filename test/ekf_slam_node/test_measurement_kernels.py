@@ -162,3 +162,16 @@ def test_a_right_invariant_error_moves_points(rng: np.random.Generator) -> None:
     stacked = np.zeros((3 * M, 3), order="F")
     kernels.crossed(moved, stacked)
     np.testing.assert_array_equal(stacked, -skew(moved).reshape(-1, 3))
+
+
+def test_features_become_measurements_with_floors_on_their_noise(rng: np.random.Generator) -> None:
+    uv, depth = rng.uniform(0.0, 400.0, (M, 2)).astype(np.float32), rng.uniform(1.0, 9.0, M).astype(np.float32)
+    sigma_uv = rng.uniform(0.0, 0.1, (M, 2)).astype(np.float32)
+    sigma_depth = rng.uniform(0.0, 0.02, M).astype(np.float32)
+    index, z, variance = np.array([5, 0, 3]), np.empty((3, 3)), np.empty((3, 3))
+    kernels.measured(uv, depth, sigma_uv, sigma_depth, index, 0.05, 0.01, z, variance)
+    d = depth[index].astype(np.float64)
+    sigma_w = np.maximum(sigma_depth[index].astype(np.float64), 0.01) / d**2
+    np.testing.assert_array_equal(z, np.column_stack([uv[index], 1.0 / d]))
+    expected = np.column_stack([np.maximum(sigma_uv[index].astype(np.float64), 0.05), sigma_w]) ** 2
+    np.testing.assert_allclose(variance, expected, rtol=1e-15)

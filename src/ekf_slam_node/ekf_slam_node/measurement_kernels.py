@@ -6,10 +6,25 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from slam_core.in_place import in_place
 
 LEAST_DEPTH = 1e-3
 """Depths are kept away from zero, m."""
+
+
+@in_place(error_model="numpy")
+def measured(uv, depth, sigma_uv, sigma_depth, index, least_px, least_depth, z, variance):  # type: ignore[no-untyped-def]
+    """Fill z and variance (k, 3) of the float32 features ``index`` (k,), with floors on their standard deviations."""
+    for k in range(len(index)):
+        n = index[k]
+        d = np.float64(depth[n])
+        z[k, 0], z[k, 1], z[k, 2] = uv[n, 0], uv[n, 1], 1.0 / d
+        sigma_w = max(np.float64(sigma_depth[n]), least_depth) / (d * d)
+        variance[k, 0] = max(np.float64(sigma_uv[n, 0]), least_px) ** 2
+        variance[k, 1] = max(np.float64(sigma_uv[n, 1]), least_px) ** 2
+        variance[k, 2] = sigma_w**2
 
 
 @in_place(error_model="numpy")

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekf_slam_node.measurement_kernels import LEAST_DEPTH, observed, placed
+from ekf_slam_node.measurement_kernels import LEAST_DEPTH, measured, observed, placed
 from slam_core.camera import MIN_DEPTH, Camera
 from slam_core.geometry import FloatArray, make_transform, skew, so3_exp, so3_left_jacobian, so3_log
 from slam_core.types import Features
@@ -103,12 +103,11 @@ class Frame:
 
 def frame_from_features(features: Features, usable: np.ndarray, min_sigma_px: float, min_sigma_depth: float) -> Frame:
     """Measurements of the features at ``usable`` (indices), with floors on their noise."""
-    uv = features.uv[usable].astype(np.float64)
-    depth = features.depth[usable].astype(np.float64)
-    sigma_uv = np.maximum(features.sigma_uv[usable].astype(np.float64), min_sigma_px)
-    sigma_depth = np.maximum(features.sigma_depth[usable].astype(np.float64), min_sigma_depth)
-    z = np.column_stack([uv, 1.0 / depth])
-    variance = np.column_stack([sigma_uv, sigma_depth / depth**2]) ** 2
+    z, variance = np.empty((len(usable), 3)), np.empty((len(usable), 3))
+    measured(
+        features.uv, features.depth, features.sigma_uv, features.sigma_depth, usable, min_sigma_px, min_sigma_depth,
+        z, variance,
+    )  # fmt: skip
     return Frame(features.stamp_ns, z, variance, features.descriptors[usable], features.camera, usable)
 
 
