@@ -19,6 +19,7 @@ rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import TransformStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
+from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from ekf_slam_node.config import EkfSlamConfig  # noqa: E402
@@ -51,6 +52,7 @@ class FeatureProbe(Probe):
         for topic, kind in SUBMAP_TOPICS.items():
             self.listen(topic, getattr(self.types, kind), latched=True)
         self.listen("odom", Odometry)
+        self.listen("landmarks", PointCloud2)
         self.listen("/diagnostics", DiagnosticArray)
         for topic, kind in FEATURE_TOPICS.items():
             self.senders[topic] = self.node.create_publisher(getattr(self.types, kind), topic, sensor_qos(100))
@@ -108,6 +110,8 @@ def test_poses_and_submaps_are_those_of_the_offline_filter(probe: FeatureProbe, 
     for frame in frames:
         probe.send_features(frame)
     probe.wait(lambda: len(probe.received["odom"]) == len(frames), "poses are missing")
+    probe.wait(lambda: len(probe.received["landmarks"]) == len(frames), "landmarks are missing")
+    assert probe.received["landmarks"][-1].width == len(offline.landmark_view().ids) > 0
     client = probe.node.create_client(Trigger, "/ekf_slam/finish")
     probe.wait(client.service_is_ready, "no finish service")
     client.call_async(Trigger.Request())

@@ -179,7 +179,7 @@ def test_a_new_session_keeps_the_open_submap_and_begins_anew(world: PointWorld, 
     assert {s.session for r in results for s in r.submaps} | {closed[0].session} == {0}
     results = run(slam, world, loop(20), rng)  # stamps of the past
     np.testing.assert_array_equal(results[0].pose.T, np.eye(4))
-    assert len(results[0].landmarks.ids) == 0
+    assert len(results[0].landmark_ids) == 0
     submaps = [s for r in results for s in r.submaps] + list(slam.finish())
     assert [(s.session, s.index) for s in submaps] == [(1, k) for k in range(len(submaps))]
     assert not submaps[0].follows_previous

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from ekf_slam_node.results import EkfResult, TrackingState
+from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.stage import FilterConfig, FilterStage
 from slam_core.config import parameter
 from slam_core.health import State
@@ -135,10 +135,11 @@ class EkfNode(StageNode[EkfNodeConfig]):
         self.broadcast(transform_message(types, pose.stamp_ns, self.odom_frame, self.config.base_frame, pose.T))
         if self.has_listeners("path"):
             self.publish("path", path_message(types, pose.stamp_ns, self.odom_frame, self.path))
-        self._publish_landmarks(result)
+        if self.has_listeners("landmarks") or self.has_listeners("landmark_ellipsoids"):
+            self._publish_landmarks(result.stamp_ns, self.stage.landmark_view())
 
-    def _publish_landmarks(self, result: EkfResult) -> None:
-        header, view = header_message(self.types, result.stamp_ns, self.odom_frame), result.landmarks
+    def _publish_landmarks(self, stamp_ns: int, view: LandmarkView) -> None:
+        header = header_message(self.types, stamp_ns, self.odom_frame)
         if self.has_listeners("landmarks"):
             cloud = landmark_cloud(self.types, header, view.positions, view.covariances, view.ids, view.sightings)
             self.publish("landmarks", cloud)

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from slam_core.geometry import FloatArray
-from slam_core.types import Float32Array, PoseEstimate, Submap
+from slam_core.types import PoseEstimate, Submap
 
 
 class TrackingState(Enum):
@@ -24,14 +24,13 @@ class TrackingState(Enum):
 class LandmarkView:
     """Landmarks of the open submap in the odom frame.
 
-    Ids (n,), positions (n, 3), covariances (n, 3, 3), sightings (n,), descriptors.
+    Ids (n,), positions (n, 3), covariances (n, 3, 3), sightings (n,).
     """
 
     ids: np.ndarray
     positions: FloatArray
     covariances: FloatArray
     sightings: np.ndarray
-    descriptors: Float32Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +38,8 @@ class EkfResult:
     """One frame's outcome.
 
     pose: T_odom_rig. twist: (6,) linear m/s and angular rad/s in the rig frame. twist_covariance: (6, 6). submaps:
-    those finished by this frame. landmarks: the open submap. nis, nis_dof: of the update. landmark_ids: (k,) ids of
-    the landmarks measured; feature_index: (k,) the features they are.
+    those finished by this frame. nis, nis_dof: of the update. landmark_ids: (k,) ids of the landmarks measured;
+    feature_index: (k,) the features they are.
     """
 
     stamp_ns: int
@@ -50,7 +49,6 @@ class EkfResult:
     state: TrackingState
     reason: str
     submaps: tuple[Submap, ...]
-    landmarks: LandmarkView
     nis: float = 0.0
     nis_dof: int = 0
     landmark_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))

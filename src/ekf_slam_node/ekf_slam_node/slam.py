@@ -23,7 +23,7 @@ from ekf_slam_node.models import Frame, seconds_between
 from ekf_slam_node.motion_checks import StandingDetector, aided, explaining_sigma, is_known, is_surprising, widened
 from ekf_slam_node.noise_monitor import NoiseMonitor
 from ekf_slam_node.open_submap import Sight, pending_of
-from ekf_slam_node.results import EkfResult, TrackingState
+from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.rolling_shutter import RollingShutter
 from ekf_slam_node.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submap_chain import SubmapChain
@@ -142,6 +142,10 @@ class EkfSlam:
         The time is 0 where rows are exposed at once.
         """
         return self._shutter.readout_s, self._shutter.sigma_s
+
+    def landmark_view(self) -> LandmarkView:
+        """The landmarks of the open submap after the newest frame."""
+        return self._chain.landmark_view()
 
     def finish(self) -> tuple[Submap, ...]:
         """Close the open submap; the next frame begins a new one that does not follow it."""

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from ekf_slam_node.config import EkfSlamConfig
-from ekf_slam_node.results import EkfResult, TrackingState
+from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.slam import EkfSlam
 from slam_core.awaited_streams import PATIENCE, AwaitedStreams
 from slam_core.config import parameter
@@ -125,6 +125,11 @@ class FilterStage:
         readout, sigma = (1e3 * s for s in self.readout_s)
         rows = "first row to the last" if readout > 0.0 else "last row to the first"
         return f"rolling shutter: {abs(readout):.1f} +- {sigma:.1f} ms from the {rows}, corrected" if readout else ""
+
+    def landmark_view(self) -> LandmarkView:
+        """The landmarks of the open submap after the newest result, of which there must be one."""
+        assert self._slam is not None
+        return self._slam.landmark_view()
 
     def give_up(self) -> None:
         """Stop waiting for what a live node has not heard for long, until it is heard again."""

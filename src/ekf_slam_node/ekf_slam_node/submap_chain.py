@@ -182,9 +182,7 @@ class SubmapChain:
         """
         ekf = self.local.ekf
         pose = widened_by_calibration(self.pose(stamp_ns) if pose is None else pose, self._config.calibration)
-        result = EkfResult(
-            stamp_ns, pose, ekf.velocity, ekf.velocity_covariance(), state, reason, submaps, self._landmark_view()
-        )
+        result = EkfResult(stamp_ns, pose, ekf.velocity, ekf.velocity_covariance(), state, reason, submaps)
         if updated is None:
             return result
         report = updated.report
@@ -192,8 +190,9 @@ class SubmapChain:
             result, nis=report.nis, nis_dof=report.dof, landmark_ids=updated.ids, feature_index=updated.index
         )
 
-    def _landmark_view(self) -> LandmarkView:
+    def landmark_view(self) -> LandmarkView:
+        """The landmarks of the open submap as they are now."""
         ekf, table = self.local.ekf, self.local.table
         blocks = ekf.covariance.blocks(CORE_DIM + 3 * np.arange(len(ekf.landmarks)))
         positions, covariances = self._odometry.points(ekf.landmarks, blocks)
-        return LandmarkView(table.ids.copy(), positions, covariances, table.sightings.copy(), table.descriptors.copy())
+        return LandmarkView(table.ids.copy(), positions, covariances, table.sightings.copy())
