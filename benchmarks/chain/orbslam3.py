@@ -33,6 +33,7 @@ from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_core.evaluation import associate, evaluate
 from slam_core.geometry import invert_transform
+from slam_core.memory import search_less_garbage, share_one_heap
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate, StereoImages
 from stereo_frontend.rectify import StereoRectifier
@@ -153,7 +154,9 @@ def write_pairs(opened: SensorBag, agent: str, folder: Path) -> None:
 
 
 def ours(bag: Path) -> list[str]:
-    """Our figures on the same bag, stereo alone."""
+    """Our figures on the same bag, stereo alone, with the memory's settings of ``slam run``."""
+    share_one_heap()
+    search_less_garbage()
     system = choose(load_system_config(None, bag), "stereo", "sjsam", "none", "off")
     system = replace(system, dense_mapper=replace(system.dense_mapper, use_stereo=False, use_tof=False))
     start = time.process_time()
