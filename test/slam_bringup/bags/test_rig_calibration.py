@@ -119,3 +119,16 @@ def test_a_urdf_joint_says_the_same() -> None:
     # URDF: turns about the fixed axes x, y and z, in this order.
     np.testing.assert_allclose(Rotation.from_euler("xyz", rpy).as_matrix(), T[:3, :3], atol=1e-8)
     assert RigCalibration().transforms("left", "tof") == ()
+
+
+@pytest.mark.parametrize(
+    "text", ["a b 1 2 3", "a b 1 2 3 0 0 0 1 5", "a b 1 2 3 0 0 0 2", "a b 1 2 3 0 0 x 1", "a", ""]
+)
+def test_a_line_that_is_no_transform_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="is not PARENT CHILD x y z qx qy qz qw"):
+        StaticTransform.parse(text)
+
+
+def test_the_numbers_of_a_transform_stay_as_they_were_written() -> None:
+    text = "a b 0.1 0.2 0.3 0.1825741858350554 0.3651483716701107 0.5477225575051661 0.7302967433402213"
+    assert StaticTransform.parse(text).text == text

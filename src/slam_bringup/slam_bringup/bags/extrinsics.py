@@ -27,6 +27,8 @@ class StaticTransform:
     pose: FloatArray
 
     def __post_init__(self) -> None:
+        if self.pose.shape != (7,):
+            raise ValueError(f"a pose has seven numbers, got {self.pose.size}")
         transform_from_pose7(self.pose)  # ValueError where the quaternion is none
 
     @property
