@@ -116,7 +116,7 @@ class DenseModel:
         return len(chosen)
 
     def surface(self) -> Surface:
-        """The mesh of all key frames. Of poses that are final it is made once: its field is forgotten."""
+        """Mesh of all key frames. Of poses that are final it is made once: its field is forgotten."""
         return extract_surface(self.volume, self.config.surface, release=self._fixed)
 
     def add_specific_force(self, force: FloatArray) -> None:

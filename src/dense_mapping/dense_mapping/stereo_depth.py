@@ -35,7 +35,7 @@ _REACH = 3.0
 _UNIQUENESS_PERCENT = 15
 """Share by which the best disparity must be better than the second best, %."""
 _NEARER = 1.0
-"""Of two disparities that lead to one pixel of the right image the smaller is occluded if smaller by more, px."""
+"""Difference (px) from which the smaller of two disparities that lead to one pixel of the right image is occluded."""
 _SPECKLE_SIZE = 200
 """Islands of disparity up to this size are dropped, px."""
 _EDGE_RADIUS = 2
@@ -121,7 +121,7 @@ def _halved(image: ByteArray, max_pixels: int) -> ByteArray:
 def _steps_needed(left: ByteArray, right: ByteArray, most: int) -> int:
     """Disparities to search, in sixteens, for what is in the picture: rooms seldom reach up to ``min_depth``.
 
-    The same matching of halved images finds the nearest surface in a tenth of the time.
+    Matching of halved images finds the nearest surface in a tenth of the time.
     """
     if most <= _STEP:
         return most

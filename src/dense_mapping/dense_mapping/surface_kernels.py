@@ -29,7 +29,7 @@ def fill_means(
 ) -> None:  # pragma: no cover - compiled
     """Mean distances m of the voxels (n, 512, 4) of ``blocks`` (m,) to ``corners`` (m, 3) of a cube of voxels.
 
-    Those that are not seen well enough stay as they are. ``limits``: fewest images, largest sigma; ``noise``: share of
+    Voxels that are not seen well enough keep their values. ``limits``: fewest images, largest sigma; ``noise``: share of
     the variance that images have in common, sigma that stays.
     """
     for b in range(blocks.shape[0]):

@@ -115,7 +115,7 @@ def _null_vector(x, y, z, p, q, r):  # type: ignore[no-untyped-def]
 
 @in_place()
 def _jacobi_eigen3(a: FloatArray, vectors: FloatArray, values: FloatArray) -> None:
-    """The same by cyclic Jacobi rotations."""
+    """Eigenvalues and eigenvectors by cyclic Jacobi rotations."""
     for i in range(3):
         for j in range(3):
             vectors[i, j] = 1.0 if i == j else 0.0

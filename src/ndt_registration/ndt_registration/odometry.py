@@ -41,7 +41,7 @@ _KEYFRAME_ANGLE_DEG = 12.0
 _MAX_CORRECTION = 0.5
 """Largest deviation from the guess."""
 _MAX_CORRECTION_DEG = 20.0
-"""Likewise, deg."""
+"""Largest turn away from the guess, deg."""
 _MAX_GAP = 1.0
 """Gap between scans above which the velocity is not used."""
 _SEARCH_AFTER = 1

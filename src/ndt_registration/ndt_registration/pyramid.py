@@ -20,7 +20,7 @@ _SURFACE_LEVELS = 2
 _SLACK = 10.0
 """Information taken off the cells of a surface, over that of its widest direction."""
 _AGREEMENT = 4.0
-"""And whose plane its own mean and normal meet within so many standard deviations."""
+"""Standard deviations within which its mean and normal must meet the other's plane."""
 _SURFACE_SMOOTHING = 0.03
 """Like smoothing, on the surface levels."""
 _RIM_RATIO = 2.0

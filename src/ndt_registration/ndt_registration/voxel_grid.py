@@ -203,7 +203,7 @@ _TINY = 1e-12
 
 @in_place()
 def _nearest_cell(grid: NormalGrid, x: float, y: float, z: float) -> int:
-    """Of the eight cells around a place (in edges of a block), that whose centre is nearest; -1: none."""
+    """Index of the cell whose centre is nearest to a place (in edges of a block), of the eight around it; -1: none."""
     ix, iy, iz = np.floor(x), np.floor(y), np.floor(z)
     row = find_block(grid.table, int(ix), int(iy), int(iz))
     if row < 0:

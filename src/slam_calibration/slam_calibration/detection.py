@@ -135,7 +135,7 @@ def _find_charuco(board: Charuco, image: ByteArray) -> Corners:
 
 
 def _confirmed(image: ByteArray, rough: FloatArray, gap: FloatArray) -> Corners:
-    """Of the predicted corners those that are there: refined, not moved far, a saddle of brightness.
+    """Predicted corners that are there: refined, not moved far, a saddle of brightness.
 
     ``rough`` (n, 2) by corner id, NaN where unknown; ``gap`` (n,) width of the pattern's bars at each corner, px.
     """

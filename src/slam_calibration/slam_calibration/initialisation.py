@@ -63,7 +63,7 @@ def _zhang(board_points: FloatArray, views: Sequence[Corners], width: int, heigh
 def board_pose(board_points: FloatArray, corners: Corners, state: LensState) -> tuple[FloatArray, float]:
     """``T_camera_board`` of one view and its rms reprojection error (px); infinite where there is no pose.
 
-    Of the two poses that a plane seen from afar allows (Collins and Bartoli 2014) the one with the smaller error.
+    A plane seen from afar allows two poses (Collins and Bartoli 2014); the one with the smaller error is taken.
     """
     camera = state.camera
     ideal = camera.normalised_from_pixels(corners.pixels)

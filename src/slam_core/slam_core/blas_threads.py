@@ -15,7 +15,7 @@ VARIABLE = "OPENBLAS_NUM_THREADS"
 
 
 def use_one_blas_thread() -> None:
-    """Of the libraries that are loaded and those that will be, unless the environment gives a number."""
+    """Set one thread for BLAS libraries, loaded or to come, unless the environment gives a number."""
     if VARIABLE not in os.environ:
         os.environ[VARIABLE] = "1"
         threadpool_limits(1, user_api="blas")

@@ -109,7 +109,7 @@ class SharedMessage:
         self._fields[name] = value
 
     def to_ros(self) -> Message:
-        """The same message for the transport."""
+        """Message for the transport."""
         return getattr(self._ros, self._type)(**{name: self._value(value) for name, value in self._fields.items()})
 
     def _value(self, value: Any) -> Any:

@@ -21,7 +21,7 @@ State = TypeVar("State")
 _NEAR = 0.2
 """A factor is used again from where a step promised less than this share of the cost: close to the optimum."""
 _REUSE_RATE = 0.25
-"""And as long as each step promises less than this share of what the one before did."""
+"""It is used again as long as each step promises less than this share of what the one before did."""
 _DOUBT = 4.0
 """Factor by which a step may promise more than the linear model was wrong by at the one before."""
 

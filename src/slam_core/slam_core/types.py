@@ -165,7 +165,7 @@ class ImuSample:
     position: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def seen_from(self, T: FloatArray, frame_id: str, delay_ns: int = 0) -> ImuSample:
-        """The same reading along the axes of another frame, ``T`` = T_frame_own (4, 4), and so much later."""
+        """Reading along the axes of another frame, ``T`` = T_frame_own (4, 4), and so much later."""
         R, stamp_ns = T[:3, :3], self.stamp_ns + delay_ns
         position = R @ self.position + T[:3, 3]
         return ImuSample(stamp_ns, R @ self.angular_velocity, R @ self.linear_acceleration, frame_id, position)

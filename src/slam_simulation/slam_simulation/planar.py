@@ -75,7 +75,7 @@ def simulate_planar(config: PlanarWorldConfig, rng: np.random.Generator) -> Plan
 
 
 def wrap_angle(angle: FloatArray) -> FloatArray:
-    """The same angle in [-pi, pi)."""
+    """Angle (rad) between -pi (included) and pi."""
     return np.asarray(np.mod(angle + np.pi, 2.0 * np.pi) - np.pi)
 
 

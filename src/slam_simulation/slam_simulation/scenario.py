@@ -169,7 +169,7 @@ class Scenario:
         return replace(self, profile=profile, suite=replace(self.suite, stereo=stereo, realism=REAL))
 
     def shortened(self, frames: int) -> Scenario:
-        """The same scenario, cut off after ``frames`` frames; the motion stays as it was."""
+        """Scenario cut off after ``frames`` frames; the motion stays as it was."""
         if frames < 1:
             raise ValueError(f"a scenario needs at least one frame, got {frames}")
         full = self.full_frames or self.frames

@@ -21,7 +21,7 @@ MAXIMUM_INCIDENCE_DEG = 75.0
 NOISE_MULTIPLE = 3.5
 """Difference of neighbours explained by noise, sigma."""
 MINIMUM_NEIGHBOURS = 3
-"""Of the eight neighbours, how many must lie on the same surface."""
+"""Number of the eight neighbours that must lie on the same surface."""
 
 
 class Reason(IntEnum):

@@ -39,7 +39,7 @@ class RectificationMap:
         return np.asarray(cv2.remap(image, self.u, self.v, cv2.INTER_LINEAR), dtype=np.float32)
 
     def colour(self, image: ByteArray) -> ByteArray:
-        """The same of a colour picture (height, width, 3) uint8."""
+        """Resampled colour picture (height, width, 3) uint8."""
         return np.asarray(cv2.remap(image, self.u, self.v, cv2.INTER_LINEAR), dtype=np.uint8)
 
     def depth(

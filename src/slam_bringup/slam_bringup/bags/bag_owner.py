@@ -87,7 +87,7 @@ def _record(file: BinaryIO) -> tuple[int, bytes]:
 
 
 def _serialized_metadata(content: bytes) -> str:
-    """Of a metadata record: its name, the length of a map, and strings in turn key and value."""
+    """Value of a metadata record: after its name and the length of a map, strings in turn key and value."""
     name, position = _string(content, 0)
     key, position = _string(content, position + 4)
     value, _ = _string(content, position)

@@ -44,7 +44,7 @@ class StaticTransform:
 
     @classmethod
     def parse(cls, text: str) -> StaticTransform:
-        """Of a :attr:`text`; ValueError if it is none."""
+        """Transform from its :attr:`text`; ValueError if it is none."""
         try:
             parent, child, *numbers = text.split()
             return cls(parent, child, np.array(numbers, dtype=np.float64))

@@ -106,7 +106,7 @@ class SensorBag:
     def images_at(self, wanted: Mapping[str, Stamps]) -> Generator[Reading, None, None]:
         """The stereo and depth readings with some stamps, by agent, and perhaps others; after :meth:`readings`.
 
-        Of the bag only what holds them is unpacked, as ``times`` has it.
+        Only the parts of the bag that hold them are unpacked, as ``times`` has it.
         """
         return _with_ranks(self._at(wanted))
 
@@ -226,7 +226,7 @@ class SensorBag:
         return AgentSensors(agent, left, right, tof, measurement, tree, left_frame, tof_frame, base, topics)
 
     def _base_frame(self, agent: str, tree: FrameTree, camera_frame: str) -> str:
-        """Of a bag without base_link the root above the camera, which is as much of the rig as the bag knows."""
+        """Frame of the rig: base_link, or the root above the camera in a bag that has none."""
         usual = [frame for frame in (join(agent, "base_link")[1:], "base_link") if frame in tree]
         if self._names.base_frame or usual:
             return self._names.base_frame or usual[0]

@@ -186,7 +186,7 @@ def _read_frames(bag: BagReader) -> FrameTree:
 def _decode_sample(bag: BagReader, evidence: Evidence, messages: int | None) -> None:
     """Bursts of the left camera, or of the depth camera without one, and all that is nearest to them in time.
 
-    Of the first ``messages`` of a bag, one burst.
+    A bag's first ``messages`` are one burst.
     """
     leader = "left" if "left" in evidence.streams else evidence.depth_role
     stamps = evidence.streams[leader].stamps

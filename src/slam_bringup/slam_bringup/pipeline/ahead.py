@@ -16,7 +16,7 @@ _AHEAD = 8
 
 
 def ahead(items: Generator[T, None, None], ends_batch: Callable[[T], bool]) -> Generator[T, None, None]:
-    """The same items, made by another thread a few batches ahead of their use.
+    """Items of an iterator, made by another thread a few batches ahead of their use.
 
     Handing over wakes threads: IMU samples, ten to a frame, go together with the image that they come before.
     """

@@ -104,7 +104,7 @@ class RunRecord:
     def with_front_ends(
         self, reports: Mapping[str, FrontendReport], frames: Mapping[str, Sequence[LoggedFrame]] | None = None
     ) -> RunRecord:
-        """The same with what the agents' front ends report, and some of their pictures, by agent."""
+        """The record with what the agents' front ends report, and some of their pictures, by agent."""
         pictures = frames or {}
         return replace(
             self,

@@ -89,7 +89,7 @@ def plan_launch(values: Mapping[str, str]) -> LaunchPlan:
 
 
 def _overrides(values: Mapping[str, str]) -> Overrides:
-    """Of the file, then of the arguments with a name of their own, then of ``set``."""
+    """Overrides of the file, then of the arguments with a name of their own, then of ``set``."""
     origin = values["config"] or "launch arguments"
     rules = read_overrides(Path(values["config"]).expanduser()).rules if values["config"] else ()
     own: dict[str, dict[str, Any]] = {"sjsam": {}}

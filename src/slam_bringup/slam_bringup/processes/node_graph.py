@@ -45,7 +45,7 @@ class NodeSpec:
 
     @property
     def command(self) -> NodeCommand:
-        """The same as a command line."""
+        """The node as a command line."""
         arguments = ros_arguments(self.parameters, self.namespace)
         return NodeCommand(self.package, self.executable, tuple(arguments), self.namespace)
 

@@ -36,7 +36,7 @@ _DOMAINS = range(1, 101)
 _STOP_AFTER_S = 10.0
 """Longest that a node may take to end; the recorder needs some of it to complete its bag."""
 _GIVEN_UP_STOP_S = 1.0
-"""The same for a user who does not want to wait for that."""
+"""Longest that a node may take to end for a user who does not want to wait."""
 
 
 def find_executable(package: str, executable: str, prefixes: Sequence[str] | None = None) -> list[str]:

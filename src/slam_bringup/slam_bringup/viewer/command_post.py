@@ -36,7 +36,7 @@ class WayOut:
 
     @property
     def text(self) -> str:
-        """The same in words."""
+        """Way to the exit and uncertainty, in words."""
         if self.way is None:
             return "no way out through what was seen free or walked on"
         narrow = f", {2 * self.way.clearance:.1f} m wide at its narrowest" if self.way.clearance < 0.5 else ""

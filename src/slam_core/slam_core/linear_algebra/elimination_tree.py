@@ -100,7 +100,7 @@ def inverse_stack_size(symbolic: Symbolic) -> int:
 def _fill(column_ptr, rows):
     """Parent of every block column and its rows below the diagonal in the factor (unsorted).
 
-    Those of the matrix and of its children.
+    The rows are those of the matrix and of its children.
     """
     n = len(column_ptr) - 1
     parent, mark = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
