@@ -29,8 +29,8 @@ def fill_means(
 ) -> None:  # pragma: no cover - compiled
     """Mean distances m of the voxels (n, 512, 4) of ``blocks`` (m,) to ``corners`` (m, 3) of a cube of voxels.
 
-    Voxels that are not seen well enough keep their values. ``limits``: fewest images, largest sigma; ``noise``: share of
-    the variance that images have in common, sigma that stays.
+    Voxels that are not seen well enough keep their values. ``limits``: fewest images, largest sigma; ``noise``:
+    share of the variance that images have in common, sigma that stays.
     """
     for b in range(blocks.shape[0]):
         for i in range(voxels.shape[1]):

@@ -40,7 +40,7 @@ class ImuSensor:
         self.accel_bias = config.accel_bias * rng.standard_normal(3)
 
     def read(self, path: Path, first_s: float, last_s: float, start_ns: int) -> tuple[ImuSample, ...]:
-        """Samples at the multiples of the period after ``first`` up to ``last``; ``start_ns`` is the stamp of time zero."""
+        """Samples at multiples of the period after ``first`` up to ``last``; ``start_ns``: stamp of time zero."""
         c = self.config
         k0, k1 = int(np.floor(first_s * c.rate + 1e-9)) + 1, int(np.floor(last_s * c.rate + 1e-9))
         samples = []
