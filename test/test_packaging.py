@@ -26,7 +26,7 @@ FROM_ROS = re.compile(r"rclpy|launch(_ros)?|ament_index_python|std_srvs|rcl_inte
 PEERS = {"gtsam"}
 """What results are compared with, where it is installed."""
 
-BROUGHT_BY_ANOTHER = {"llvmlite": "numba", "mpl_toolkits": "matplotlib", "dask": "distributed"}
+BROUGHT_BY_ANOTHER = {"llvmlite": "numba", "mpl_toolkits": "matplotlib", "dask": "distributed", "websockets": "viser"}
 
 
 def imported(package: str) -> set[str]:

@@ -4,13 +4,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult
+from dense_mapping.surface import Surface
+from slam_bringup.commands.console import show
+from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult, summarise
 from slam_bringup.report.agent_figures import motion_figure, side_view, sigma_figure
-from slam_bringup.report.report import verdict
+from slam_bringup.report.figures import map_figure, png
+from slam_bringup.report.report import draw_charts, verdict, write_report
+from slam_bringup.report.summary_table import summary_table
 from slam_core.evaluation import evaluate
 from slam_core.geometry import boxplus
 from slam_core.trajectory import Trajectory
@@ -62,3 +67,22 @@ def test_the_side_view_needs_a_path(circle):
     object.__setattr__(empty, "agents", (AgentResult("", circle),))
     object.__setattr__(empty, "landmarks", LandmarkMap.empty())
     assert side_view(empty).axes[0].get_ylabel() == "z [m]"
+
+
+def test_hostile_names_and_reasons_are_plain_text_in_the_report_and_on_the_terminal(circle, tmp_path, capsys):
+    hostile = "<img src=x onerror='alert(1)'> [/b] $\\frac{1$"
+    result = RunResult(
+        bag=hostile, mode="stereo", mapper="sjsam", odometry="none",
+        agents=(AgentResult(hostile, circle, sensors=(hostile,)),),
+        landmarks=LandmarkMap.empty(), dense=Surface.empty(), floor_plans=(), submaps=0, loop_closures=0, frames=3,
+        dropped={hostile: 1}, rejections={hostile: 1}, sensor_s=1.0, wall_s=1.0, stage_ms={}, events=(hostile,),
+        solver=hostile, changed={hostile: hostile},
+    )  # fmt: skip
+    made = {"version": hostile, "command": hostile, "date": hostile, "total_s": 1.0}
+    summary = summarise(result) | made
+    write_report(tmp_path / "report.html", result, summary, png(map_figure(result), 50), draw_charts(result))
+    html = (tmp_path / "report.html").read_text()
+    assert "<img src=x" not in html
+    assert html.count("&lt;img src=x onerror=&#39;alert(1)&#39;&gt; [/b] $") >= 9
+    show(summary_table(summary, Path(hostile)))
+    assert "[/b]" in capsys.readouterr().out

@@ -15,7 +15,8 @@ from browser import Browser, find_chromium
 from dense_mapping.decimation import at_most
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
-from slam_bringup.viewer.page import AgentRow, ViewerPage
+from slam_bringup.viewer.page import ViewerPage
+from slam_bringup.viewer.panel import AgentRow
 from slam_core.geometry import boxplus
 from slam_core.types import ByteArray
 
@@ -43,18 +44,18 @@ def hill() -> Surface:
 
 def fill(page: ViewerPage) -> None:
     poses = boxplus(np.tile(np.eye(4), (20, 1, 1)), np.linspace([0] * 6, [2, 1, 0, 0, 0, 1], 20))
-    page.show_headline("### a test")
+    page.show_headline("a test")
     page.show_agent_table([AgentRow("one", "OK"), AgentRow("two", "LOST", "the wall is white")])
     page.show_mesh(hill())
     page.show_points(hill().points)
     page.show_plan(FloorPlan(np.zeros((40, 40), dtype=np.int8), 0.1, np.eye(4)))
-    page.show_trajectory("one", 0, poses)
+    page.show_trajectory(0, poses)
     page.show_agent("one", 0, poses[-1])
     page.show_landmarks(poses[:, :3, 3], np.tile(0.01 * np.eye(3), (20, 1, 1)))
     page.show_submaps(poses[:-1, :3, 3], poses[1:, :3, 3])
     page.show_closures(poses[[0, -1], :3, 3][None])
     page.show_frontiers(poses[:2, :3, 3], [1.0, 2.0])
-    page.show_way("one", 0, poses[:, :3, 3], "2.2 m to the exit")
+    page.show_way(0, poses[:, :3, 3], "2.2 m to the exit")
     page.show_marks(["door", "gas"], poses[:2, :3, 3])
     page.show_picture(np.zeros((48, 64, 3), dtype=np.uint8), "dark")
     page.show_camera(poses[-1], np.zeros((48, 64, 3), dtype=np.uint8))

@@ -62,9 +62,12 @@ def is_quiet() -> bool:
 
 
 def show(table: Any) -> None:
-    """Print the result of a command for a person, unless only errors are wanted."""
+    """Print the result of a command for a person, unless only errors are wanted.
+
+    Its texts come from recordings: brackets in them are no markup.
+    """
     if not is_quiet():
-        Console().print(table)
+        Console(markup=False).print(table)
 
 
 def progress_bar() -> Progress:
@@ -123,7 +126,7 @@ class Transcript:
     def write(self, path: Path, table: Table) -> None:
         """Write everything kept so far, and the table that the run ends with."""
         with io.StringIO() as text:
-            Console(file=text, width=120).print(table)
+            Console(file=text, width=120, markup=False).print(table)
             lines = [*self._lines, text.getvalue()]
         path.parent.mkdir(parents=True, exist_ok=True)
         atomic_text(path, "\n".join(lines))

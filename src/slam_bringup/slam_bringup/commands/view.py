@@ -27,7 +27,12 @@ from slam_bringup.processes.processes import become_node
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="port of the page; 0: any free one"
 )
-@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 lets other machines see the page")
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    help="0.0.0.0 lets other machines see the page, by an address with a token",
+)
 @click.option("--no-browser", is_flag=True, help="only serve the page")
 def command(
     out: Path | None, live: bool, bag: Path | None, agents: tuple[str, ...], port: int, host: str, no_browser: bool

@@ -23,6 +23,7 @@ from slam_core.files import atomic_path
 from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
 
 matplotlib.use("Agg")
+matplotlib.rcParams["text.parse_math"] = False  # names come from recordings: a dollar sign in one begins no formula
 matplotlib.rcParams["axes.titley"] = 1.0  # else titles look for what they might touch: a sixth of the time to draw
 
 COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd")

@@ -7,14 +7,17 @@ from collections.abc import Callable
 
 import numpy as np
 
+from slam_bringup.plural import plural
 from slam_bringup.viewer.command_post import position_radius, radius_text, unseen, ways_out
-from slam_bringup.viewer.page import AgentRow, ViewerPage
+from slam_bringup.viewer.page import ViewerPage
+from slam_bringup.viewer.panel import AgentRow
 from slam_bringup.viewer.pictures import CaptionedImage
 from slam_bringup.viewer.run_folder import RunFolder
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
 
+_COUNTS = {"landmarks": "landmark", "submaps": "submap", "loop_closures": "loop closure"}
 _STEP_S = 0.05
 """Step of the time line."""
 
@@ -37,14 +40,13 @@ class FinishedView:
         with page.overview:
             duration = np.ceil(max((last - first) / 1e9, 0.1) / _STEP_S) * _STEP_S
             self.slider = page.server.gui.add_slider("time [s]", 0.0, duration, _STEP_S, duration)
-            self.post = page.server.gui.add_markdown("")
         self.slider.on_update(lambda _: self.show_until(first + round(self.slider.value * 1e9)))
         self.show_until(last)
 
     def _show_map(self) -> None:
         page, run = self.page, self.run
         landmarks = run.global_map.landmarks()
-        page.show_headline(_headline(run))
+        page.show_headline(str(run.summary.get("bag", run.path.name)), _headline(run))
         page.show_mesh(run.surface)
         page.show_points(run.surface.points, run.surface.colours)
         for number, plan in enumerate(run.plans):
@@ -74,7 +76,7 @@ class FinishedView:
             if not len(so_far):
                 rows.append(AgentRow(agent, "not yet there"))
                 continue
-            self.page.show_trajectory(agent, index, so_far.poses)
+            self.page.show_trajectory(index, so_far.poses)
             poses[agent] = _last(so_far)
             self.page.show_agent(agent, index, so_far.poses[-1])
             rows.append(AgentRow(agent, _state(so_far, stamp_ns), _way_text(so_far, poses[agent])))
@@ -98,21 +100,20 @@ class FinishedView:
         for out in ways_out(self.run.plans, poses, paths):
             index = list(self.run.trajectories).index(out.agent)
             points = np.empty((0, 3)) if out.way is None else out.way.points
-            self.page.show_way(out.agent, index, points, out.label)
-            texts.append(f"- **{out.agent or 'rig'}**: {out.text}")
-        unseen_count = len(unseen(self.run.plans)) if self.run.plans else 0
-        text = "\n".join(["#### Way back out", *texts, "", f"{unseen_count} places where nobody has looked yet."])
-        self.post.content = text if self.run.plans else "No floor plan in this run."
+            self.page.show_way(index, points, out.label)
+            texts.append((out.agent, out.text))
+        unseen_count = len(unseen(self.run.plans))
+        note = f"{plural(unseen_count, 'place')} where nobody has looked yet."
+        self.page.show_ways_text(texts, note if self.run.plans else "No floor plan in this run.")
 
 
-def _headline(run: RunFolder) -> str:
+def _headline(run: RunFolder) -> list[str]:
+    """Lines below the run's name. A summary comes from a folder that anybody may have written."""
     s = run.summary
-    accuracy = f", ATE {1000 * s['ate_rmse_m']:.1f} mm" if s.get("ate_rmse_m") is not None else ""
-    note = f"\n\n{run.note}" if run.note else ""
-    return (
-        f"### {s.get('bag', run.path.name)}\n{s.get('path_length_m', 0.0):.1f} m, {s.get('landmarks', 0)} landmarks, "
-        f"{s.get('submaps', 0)} submaps, {s.get('loop_closures', 0)} closures{accuracy}{note}"
-    )
+    counts = [plural(int(s.get(key, 0)), word) for key, word in _COUNTS.items()]
+    figures = ", ".join([f"{float(s.get('path_length_m', 0.0)):.1f} m", *counts])
+    accuracy = f", ATE {1000 * float(s['ate_rmse_m']):.1f} mm" if s.get("ate_rmse_m") is not None else ""
+    return [figures + accuracy, *filter(None, [run.note])]
 
 
 def _last(trajectory: Trajectory) -> PoseEstimate:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page: named layers of one 3D scene, a panel with what is shown, and an overview of the agents.
 
-Whoever has news calls ``show_...``; a layer that comes again is replaced. The page is viser's: it is served from this
-machine, asks no other one, and works without a network.
+Whoever has news calls ``show_...``; a layer that comes again is replaced. Nodes of the scene have numbers for names,
+and what a message or a file says is shown as plain text. The page is viser's: it is served from this machine, asks no
+other one, and works without a network.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ import viser
 from dense_mapping.decimation import at_most
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
+from slam_bringup.viewer.access import Access
+from slam_bringup.viewer.panel import AgentRow, agent_table, headline, legend, ways_text
 from slam_bringup.viewer.picture_of_plan import plan_picture
 from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, quaternion_from_rotation
@@ -29,7 +31,6 @@ from slam_core.types import ByteArray, Float32Array
 COLOURS = ((214, 39, 40), (31, 119, 180), (44, 160, 44), (148, 103, 189), (255, 127, 14), (23, 190, 207))
 """One for each agent, in their order."""
 
-_STATE_COLOURS = {"OK": "#2a9d3a", "DEGRADED": "#d98e04", "LOST": "#d62728"}
 _LARGEST_ELLIPSOID_M = 1.5
 """An ellipsoid as large as a room says only that the landmark is far away, and hides the room."""
 _MOST_ELLIPSOIDS = 4000
@@ -38,16 +39,19 @@ _LAYERS = (
     "mesh", "dense points", "floor plan", "trajectories", "ground truth", "landmarks", "ellipsoids", "submaps",
     "closures", "agents", "frontiers", "ways out", "marks", "camera image",
 )  # fmt: skip
+_SUBMAPS, _CLOSURES, _UNSEEN, _MARKS, _LANDMARKS = (
+    (25, 100, 255), (255, 190, 0), (255, 80, 200), (20, 190, 60), (230, 140, 0)
+)  # fmt: skip
+_LEGEND = (
+    (_UNSEEN, "ball: a place where nobody has looked yet, the larger the wider"),
+    (_CLOSURES, "line: a loop closure between two submaps"),
+    (_MARKS, "ball: a marked place"),
+    ((130, 130, 130), "thin line: the way walked; thick line on the floor: the way back out"),
+    ((60, 60, 60), "dark line: ground truth, where there is some"),
+    (_SUBMAPS, "submaps (off at first, see Layers)"),
+    (_LANDMARKS, "landmarks, green where many submaps have them (off at first)"),
+)
 _HIDDEN_AT_FIRST = ("dense points", "landmarks", "ellipsoids", "submaps")
-
-
-@dataclass(frozen=True)
-class AgentRow:
-    """Row of an agent in the overview: ``state`` OK, DEGRADED or LOST, or since when it is silent."""
-
-    name: str
-    state: str
-    note: str = ""
 
 
 class ViewerPage:
@@ -58,9 +62,9 @@ class ViewerPage:
     port
         Where it is served; 0: any free port.
     host
-        Address it listens on; the default is this machine alone.
+        Address it listens on; the default is this machine alone, any other gives the page's address a token.
     title
-        Above the panel.
+        Above the panel, and of the page in the browser.
 
     Raises
     ------
@@ -69,20 +73,23 @@ class ViewerPage:
     """
 
     def __init__(self, port: int = 8080, host: str = "127.0.0.1", title: str = "Indoor SLAM") -> None:
-        with contextlib.redirect_stdout(io.StringIO()):
+        self.access = Access(host, title)
+        with contextlib.redirect_stdout(io.StringIO()), self.access.guarding():
             self.server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         if port not in (0, self.server.get_port()):
             self.server.stop()
             raise ValueError(f"port {port} is taken: give another one with --port")
-        self.host, self.port = host, self.server.get_port()
+        self.port = self.server.get_port()
         self.server.gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False)
         self.server.scene.set_up_direction("+z")
         self.server.gui.set_panel_label(title)
         tabs = self.server.gui.add_tab_group()
         self.overview, self.layers, self.camera = (tabs.add_tab(name) for name in ("Overview", "Layers", "Image"))
         with self.overview:
-            self._headline = self.server.gui.add_markdown("")
+            self._headline = self.server.gui.add_html("")
             self._agents = self.server.gui.add_html("")
+            self._ways = self.server.gui.add_html("")
+            self.server.gui.add_html(legend(_LEGEND))
         self._ticked: set[str] = set()
         self._roots: dict[str, viser.FrameHandle] = {}
         self._boxes: dict[str, viser.GuiCheckboxHandle] = {name: self._checkbox(name) for name in _LAYERS}
@@ -90,8 +97,8 @@ class ViewerPage:
 
     @property
     def url(self) -> str:
-        """Address of the page for a browser."""
-        return f"http://{'localhost' if self.host in ('127.0.0.1', '0.0.0.0') else self.host}:{self.port}"
+        """Address of the page for a browser, with its token where it has one."""
+        return self.access.url(self.port)
 
     def stop(self) -> None:
         """Close the page."""
@@ -111,13 +118,17 @@ class ViewerPage:
 
     # -- words ---------------------------------------------------------------------------------------------------------
 
-    def show_headline(self, markdown: str) -> None:
-        """The text above the agents."""
-        self._headline.content = markdown
+    def show_headline(self, title: str, lines: Sequence[str] = ()) -> None:
+        """A title and lines above the agents, as plain text."""
+        self._headline.content = headline(title, lines)
 
     def show_agent_table(self, rows: Sequence[AgentRow]) -> None:
         """One line for each agent, with its colour and state."""
-        self._agents.content = "".join(_agent_html(row, COLOURS[i % len(COLOURS)]) for i, row in enumerate(rows))
+        self._agents.content = agent_table(rows, COLOURS)
+
+    def show_ways_text(self, ways: Sequence[tuple[str, str]], note: str = "") -> None:
+        """Name and way out of each agent, and a note below, as plain text."""
+        self._ways.content = ways_text(ways, note)
 
     def show_picture(self, picture: ByteArray, caption: str = "") -> None:
         """A picture (h, w, 3) uint8, RGB, in the panel."""
@@ -162,27 +173,25 @@ class ViewerPage:
             position=centre,
         )
 
-    def show_trajectory(self, agent: str, index: int, poses: FloatArray, layer: str = "trajectories") -> None:
+    def show_trajectory(self, index: int, poses: FloatArray, layer: str = "trajectories") -> None:
         """The way of an agent, poses (n, 4, 4)."""
         colour = (60, 60, 60) if layer == "ground truth" else COLOURS[index % len(COLOURS)]
-        self._lines(f"/{layer}/{agent or 'rig'}", _chain(poses[:, :3, 3]), colour, 0.03)
+        self._lines(f"/{layer}/{index}", _chain(poses[:, :3, 3]), colour, 0.03)
 
-    def show_agent(self, agent: str, index: int, T_map_base: FloatArray, note: str = "") -> None:
+    def show_agent(self, agent: str, index: int, T_map_base: FloatArray) -> None:
         """Show an agent with its axes and name."""
-        name, colour = f"/agents/{agent or 'rig'}", COLOURS[index % len(COLOURS)]
+        name, colour = f"/agents/{index}", COLOURS[index % len(COLOURS)]
         wxyz, position = _wxyz(T_map_base[:3, :3]), T_map_base[:3, 3]
         self.server.scene.add_frame(name, axes_length=0.35, axes_radius=0.018, wxyz=wxyz, position=position)
         self.server.scene.add_icosphere(f"{name}/body", radius=0.09, color=colour)
-        self.server.scene.add_label(
-            f"{name}/name", " ".join(filter(None, (agent or "rig", note))), position=(0, 0, 0.3)
-        )
+        self.server.scene.add_label(f"{name}/name", agent or "rig", position=(0, 0, 0.3))
 
     def show_landmarks(
         self, positions: FloatArray, covariances: FloatArray, sightings: npt.NDArray[np.int64] | None = None
     ) -> None:
         """Landmarks (n, 3) m and their 99.5 % ellipsoids; orange are new, green those seen in many submaps."""
         # viser takes no empty list of colours.
-        tint = (230, 140, 0) if sightings is None or not len(sightings) else _age_colours(sightings)
+        tint = _LANDMARKS if sightings is None or not len(sightings) else _age_colours(sightings)
         self.server.scene.add_point_cloud(
             "/landmarks/points",
             positions.astype(np.float32),
@@ -196,11 +205,11 @@ class ViewerPage:
 
     def show_submaps(self, starts: FloatArray, ends: FloatArray) -> None:
         """Submaps as lines from where they start to where they end, (n, 3) m each, with a ball at each start."""
-        self._lines("/submaps/lines", np.stack([starts, ends], axis=1), (25, 100, 255), 0.02)
+        self._lines("/submaps/lines", np.stack([starts, ends], axis=1), _SUBMAPS, 0.02)
         self.server.scene.add_point_cloud(
             "/submaps/starts",
             starts.astype(np.float32),
-            (25, 100, 255),
+            _SUBMAPS,
             point_size=0.12,
             point_shape="circle",
             precision="float32",
@@ -208,7 +217,7 @@ class ViewerPage:
 
     def show_closures(self, lines: FloatArray) -> None:
         """Closures as lines (n, 2, 3) m between the submaps that they tie together."""
-        self._lines("/closures/lines", lines, (255, 190, 0), 0.02)
+        self._lines("/closures/lines", lines, _CLOSURES, 0.02)
 
     def show_frontiers(self, points: FloatArray, lengths: Sequence[float]) -> None:
         """Show the borders of what nobody has seen yet, (n, 3) m."""
@@ -216,12 +225,12 @@ class ViewerPage:
         for k, (point, length) in enumerate(zip(points, lengths, strict=True)):
             above = point + np.array([0, 0, 0.15])
             self.server.scene.add_icosphere(
-                f"/frontiers/{k}", radius=0.08 + 0.02 * min(length, 5.0), color=(255, 80, 200), position=above
+                f"/frontiers/{k}", radius=0.08 + 0.02 * min(length, 5.0), color=_UNSEEN, position=above
             )
 
-    def show_way(self, agent: str, index: int, points: FloatArray, note: str) -> None:
+    def show_way(self, index: int, points: FloatArray, note: str) -> None:
         """The way back out of an agent, (n, 3) m on the floor."""
-        name = f"/ways out/{agent or 'rig'}"
+        name = f"/ways out/{index}"
         raised = points + np.array([0, 0, 0.06])
         self._lines(name, np.stack([raised[:-1], raised[1:]], axis=1), COLOURS[index % len(COLOURS)], 0.08)
         if len(points):
@@ -231,9 +240,9 @@ class ViewerPage:
     def show_marks(self, names: Sequence[str], positions: FloatArray) -> None:
         """Marked finds, (n, 3) m."""
         self._remove("/marks")
-        for name, position in zip(names, positions, strict=True):
-            self.server.scene.add_icosphere(f"/marks/{name}", radius=0.12, color=(20, 190, 60), position=position)
-            self.server.scene.add_label(f"/marks/{name}/name", name, position=(0, 0, 0.25))
+        for k, (name, position) in enumerate(zip(names, positions, strict=True)):
+            self.server.scene.add_icosphere(f"/marks/{k}", radius=0.12, color=_MARKS, position=position)
+            self.server.scene.add_label(f"/marks/{k}/name", name, position=(0, 0, 0.25))
 
     def show_camera(self, T_map_base: FloatArray, picture: ByteArray, fov: float = 1.2) -> None:
         """A picture (h, w, 3) uint8 where the camera is that took it, looking along the rig's X axis."""
@@ -330,10 +339,3 @@ def _chain(points: FloatArray) -> FloatArray:
 def _brightened(colours: ByteArray) -> ByteArray:
     """Colours for a lit scene: grey pictures are darker than what lamps make of white."""
     return np.asarray(np.clip(60.0 + 0.95 * colours.astype(np.float32), 0, 255), dtype=np.uint8)
-
-
-def _agent_html(row: AgentRow, colour: tuple[int, int, int]) -> str:
-    dot = f"<span style='color:rgb{colour};font-size:1.4em'>&#9679;</span>"
-    state = f"<b style='color:{_STATE_COLOURS.get(row.state.split(' ')[0], '#777')}'>{row.state}</b>"
-    note = f"<br><span style='opacity:.75;font-size:.85em'>{row.note}</span>" if row.note else ""
-    return f"<div style='margin:.35em 1em'>{dot} {row.name or 'rig'}: {state}{note}</div>"

@@ -15,7 +15,8 @@ from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 
 from dense_mapping.floor_plan import FloorPlan
 from slam_bringup.viewer.command_post import position_radius, radius_text, unseen, ways_out
-from slam_bringup.viewer.page import AgentRow, ViewerPage
+from slam_bringup.viewer.page import ViewerPage
+from slam_bringup.viewer.panel import AgentRow
 from slam_core.base_node import SlamNode
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
@@ -45,7 +46,10 @@ class ViewerConfig(Config):
 
     agents: tuple[str, ...] = parameter(("",), "namespaces of the agents that are shown")
     port: int = parameter(8080, "port of the page; 0: any that is free", minimum=0, maximum=65535)
-    host: str = parameter("127.0.0.1", "address the page listens on; 0.0.0.0 lets other machines see it")
+    host: str = parameter(
+        "127.0.0.1",
+        "address the page listens on; 0.0.0.0 lets other machines see it, who know the token in its address",
+    )
     map_frame: str = parameter("map", "frame of the map")
     post_period_s: float = 2.0
     """Time from one look for ways out to the next, s."""
@@ -82,7 +86,6 @@ class ViewerNode(SlamNode[ViewerConfig]):
             self._listen_to(index, agent)
         self._listen_to_map()
         with self.page.overview:
-            self._post = self.page.server.gui.add_markdown("")
             button = self.page.server.gui.add_button("Mark a place: then click into the scene")
             button.on_click(lambda _: self.page.on_click(self._on_click))
             for agent in self.config.agents:
@@ -172,7 +175,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
             return
         matrices = np.stack([T for _, T in poses])
         self._agents[agent].path = matrices[:, :3, 3]
-        self.page.show_trajectory(agent, index, matrices)
+        self.page.show_trajectory(index, matrices)
 
     def _on_picture(self, agent: str, message: Message) -> None:
         own, now = self._agents[agent], self._now_ns()
@@ -255,9 +258,9 @@ class ViewerNode(SlamNode[ViewerConfig]):
         texts = []
         for out in ways_out(tuple(self._plans.values()), poses, paths) if self._plans else ():
             points = np.empty((0, 3)) if out.way is None else out.way.points
-            self.page.show_way(out.agent, list(self._agents).index(out.agent), points, out.label)
-            texts.append(f"- **{out.agent or 'rig'}**: {out.text}")
-        self._post.content = "\n".join(["#### Way back out", *texts]) if texts else ""
+            self.page.show_way(list(self._agents).index(out.agent), points, out.label)
+            texts.append((out.agent, out.text))
+        self.page.show_ways_text(texts)
 
     def _row(self, agent: str, own: _Agent) -> AgentRow:
         silent_s = (self._now_ns() - own.heard_at_ns) / 1e9
