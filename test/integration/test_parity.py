@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,9 +18,12 @@ from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.bags.sensor_writer import IMU_FRAME, SensorWriter
 from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.map_growth import map_growth
 from slam_bringup.pipeline.offline import run_bag
+from slam_bringup.pipeline.results import summarise
 from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.recorded_run import collect
+from slam_bringup.processes.start_map import StartMap
 from slam_core.geometry import make_transform, so3_exp, so3_log
 from slam_core.types import ImuSample
 
@@ -95,3 +99,30 @@ def test_nodes_and_the_offline_pipeline_agree(
     np.testing.assert_allclose(a.filtered.poses, b.filtered.poses, rtol=0, atol=ROUNDED_IN_A_QUATERNION)
     np.testing.assert_array_equal(a.filtered.covariances, b.filtered.covariances)
     np.testing.assert_array_equal(online.landmarks.positions, offline.landmarks.positions)
+
+
+def test_a_rig_is_located_in_a_map_through_the_nodes_as_offline(
+    domain_environment: dict[str, str], short_bag: Path, tmp_path: Path
+) -> None:
+    config = choose(load_system_config(None), "fuse", "sjsam", "none")
+    _, grown = run_bag(short_bag, config)
+    grown.save(tmp_path / "map")
+    start = StartMap.read(config, tmp_path, localize_only=True)
+    assert start is not None
+    before = {path.name: path.read_bytes() for path in (tmp_path / "map").iterdir()}
+    run = run_nodes(short_bag, config, tmp_path / "out", odometry=False, composed=True, start_map=start)
+    online, _ = collect(short_bag, config, run, mapper="sjsam", odometry="none", start_map=start)
+    located = map_growth(config.sjsam, tmp_path, localize_only=True)
+    offline, _ = run_bag(short_bag, config, growth=located)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "map").iterdir()} == before
+    assert online.loop_closures == offline.loop_closures > 0
+    told = summarise(online)["localization"][""]
+    assert 0.0 < told["located_share"] < 1.0, "live, a place is known after the submap in which it was recognised"
+    assert told["first_located_s"] > 0.0
+    assert summarise(replace(offline, is_localized=True))["localization"][""] == {
+        "located_share": 1.0, "first_located_s": 0.0,
+    }  # fmt: skip
+    a, b = online.agents[0].trajectory, offline.agents[0].trajectory
+    common = np.isin(b.stamps_ns, a.stamps_ns)
+    assert common.sum() == len(a)
+    np.testing.assert_allclose(a.poses[:, :3, 3], b.poses[common, :3, 3], atol=0.02)

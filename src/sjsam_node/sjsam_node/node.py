@@ -112,10 +112,12 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         return Autosave(Path(path).expanduser(), 0.0 if self.config.localize_only else self.config.autosave_period_s)
 
     def _go_on_from_last_time(self) -> None:
-        """The map of a node that was killed, or the one to localise in."""
-        if self.config.localize_only:
-            self._show_loaded(*self.map.load(self.map_path, self._seen).result())
-            self.get_logger().info(self._size("read from"))
+        """The map of a node that was killed, or the one to begin with or to localise in."""
+        initial = self.config.initial_map or (self.config.map_path if self.config.localize_only else "")
+        if initial and (self.config.localize_only or self.map.killed() is None):
+            path = Path(initial).expanduser()
+            self._show_loaded(*self.map.load(path, self._seen).result())
+            self.get_logger().info(f"{len(self.global_map.graph.records)} submaps read from {path}")
         elif (copy := self.map.killed()) is not None:
             try:
                 self._show_loaded(*self.map.load(copy, self._seen).result())

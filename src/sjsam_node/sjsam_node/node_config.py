@@ -17,6 +17,9 @@ class SjsamNodeConfig(GlobalMapConfig):
     map_frame: str = parameter("map", "frame of the map")
     odom_frame: str = parameter("odom", "frame of each agent's odometry, below its namespace")
     map_path: str = parameter("map", "folder that save_map writes and load_map reads")
+    initial_map: str = parameter(
+        "", "folder of the map to begin with, which is only read; empty: none, with localize_only that of map_path"
+    )
     ply_path: str = parameter("map_landmarks.ply", "file that export_ply writes")
     localize_only: bool = parameter(False, "locate the agents in the loaded map without changing it")
     autosave_period_s: float = parameter(

@@ -8,6 +8,7 @@ import pytest
 from slam_bringup.bags.readings import AgentSensors
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.processes.node_graph import live_nodes, plan_nodes
+from slam_bringup.processes.start_map import StartMap
 from slam_core.frame_tree import FrameTree
 
 CONFIG_FILES = sorted((Path(__file__).resolve().parents[3] / "src" / "slam_bringup" / "config").glob("*.yaml"))
@@ -36,6 +37,16 @@ def test_every_mode_starts_what_it_needs() -> None:
     assert executables("fuse", "ndt") == [
         "stereo_driver", "tof_driver", "ndt_odometry", "feature_extractor", "ekf_slam", "sjsam"
     ]  # fmt: skip
+
+
+def test_nodes_begin_with_the_map_of_a_run_and_a_session_of_their_own() -> None:
+    config, start = choose(load_system_config(None), "fuse", "sjsam", "none"), StartMap(Path("/old/map"), True, 6, 3)
+    graph = plan_nodes(config, {"one": sensors("one")}, False, "/out/map", start_map=start)
+    found = {spec.executable: spec.parameters for spec in graph.specs}
+    assert found["sjsam"]["initial_map"] == "/old/map"
+    assert found["sjsam"]["map_path"] == "/out/map", "the old folder is only read"
+    assert found["sjsam"]["localize_only"] is True
+    assert found["ekf_slam"]["session"] == 3
 
 
 def test_parameters_follow_from_the_choice_and_the_bag() -> None:

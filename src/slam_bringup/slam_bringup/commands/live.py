@@ -4,69 +4,60 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from slam_bringup.bags.rig_calibration import read_rig_calibration
-from slam_bringup.commands.paths import calibration_option
-from slam_bringup.pipeline.configuration import ODOMETRIES, choose, load_system_config
-from slam_bringup.processes.node_graph import live_nodes
-from stereo_frontend.frontend import MODES
+from slam_bringup.commands.mapping_options import rig_options
+from slam_bringup.pipeline.map_growth import map_folder
+from slam_bringup.processes.launch_plan import plan_launch
+from slam_bringup.processes.node_graph import NodeSpec
 
 
 @click.command()
 @click.argument("camera", required=False)
-@click.option("--topics", is_flag=True, help="the sensors publish topics; instead of CAMERA")
+@click.option("--topics", "by_topics", is_flag=True, help="the sensors publish topics; instead of CAMERA")
 @click.option("--left-info", type=click.Path(exists=True, dir_okay=False), help="camera_info YAML of its left half")
 @click.option("--right-info", type=click.Path(exists=True, dir_okay=False), help="camera_info YAML of its right half")
-@calibration_option()
-@click.option("--mode", type=click.Choice(MODES), default="stereo", show_default=True, help="where depth comes from")
-@click.option(
-    "--odometry",
-    type=click.Choice(ODOMETRIES),
-    default="none",
-    show_default=True,
-    help="scan odometry from the ToF camera",
-)
 @click.option("--agents", default="", help="names of the agents, comma-separated [one rig]")
-@click.option(
-    "--config",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="YAML, one group per node, as in docs/parameters.md",
-)
+@rig_options
 def command(
-    camera: str | None, topics: bool, left_info: str | None, right_info: str | None, calibrations: tuple[Path, ...],
-    mode: str, odometry: str, agents: str, config: Path | None,
+    camera: str | None, by_topics: bool, left_info: str | None, right_info: str | None, agents: str, mode: str | None,
+    odometry: str, config: Path | None, topics: tuple[str, ...], calibrations: tuple[Path, ...], base_frame: str,
+    old_map: Path | None, localize_only: bool,
 ) -> None:  # fmt: skip
     """Map live, until Ctrl-C: CAMERA is a side-by-side stereo camera (number or device), or --topics are there.
 
-    The map is saved by the service ~/save_map of sjsam, as with separate nodes.
+    The map is saved by the service ~/save_map of sjsam, as with separate nodes. With --map it goes on in the map of a
+    finished run, with --localize-only the rig is only located in it.
     """
-    if topics == (camera is not None):
+    if (by_topics or bool(topics)) == (camera is not None):
         raise ValueError("say what to map: a CAMERA, or --topics of the sensors' drivers")
-    calibration = read_rig_calibration(calibrations)
-    system = choose(load_system_config(config, known=calibration.parameters), mode, "sjsam", odometry)
-    names = [name.strip() for name in agents.split(",")]
-    if calibration.is_given and len(names) > 1:
-        raise ValueError(f"a calibration is that of one rig, and there are {len(names)} agents")
-    extra = calibration.driver_parameters()
+    given = {
+        "agents": agents, "mode": mode, "odometry": odometry, "config": config, "topics": ",".join(topics),
+        "base_frame": base_frame, "calibration": ",".join(map(str, calibrations)),
+        "initial_map": map_folder(old_map, localize_only=localize_only),
+        "localize_only": "true" if localize_only else None,
+    }  # fmt: skip
+    plan = plan_launch({name: str(value) for name, value in given.items() if value})
+    nodes = plan.nodes
     if camera is not None:
-        extra["stereo_driver"] |= _camera_parameters(camera, left_info, right_info, extra["stereo_driver"])
-    specs = live_nodes(system, names, odometry=odometry != "none", extra=extra)
+        nodes = tuple(_with_camera(spec, camera, left_info, right_info) for spec in nodes)
+    remapped = [word for inner, outer in plan.remappings for word in ("-r", f"{inner}:={outer}")]
     try:
         composed = importlib.import_module("slam_bringup.processes.composed_node")
     except ImportError as error:
         raise ValueError(f"live mapping needs ROS 2 Jazzy ({error}): source an installation, or use ./slam") from error
-    composed.run_composed([spec.command for spec in specs])
+    composed.run_composed([spec.command for spec in nodes], ["--ros-args", *remapped])
 
 
-def _camera_parameters(
-    camera: str, left_info: str | None, right_info: str | None, known: Mapping[str, str]
-) -> dict[str, str]:
-    given = {"left_info": left_info, "right_info": right_info}
-    infos = {**known, **{name: path for name, path in given.items() if path}}
-    if len(infos) < 2:
+def _with_camera(spec: NodeSpec, camera: str, left_info: str | None, right_info: str | None) -> NodeSpec:
+    """The node with the parameters of a camera, if it is the driver."""
+    if spec.executable != "stereo_driver":
+        return spec
+    given = {name: path for name, path in (("left_info", left_info), ("right_info", right_info)) if path}
+    parameters = spec.parameters | given
+    if not parameters.keys() >= {"left_info", "right_info"}:
         raise ValueError("a camera needs --calibration FOLDER, as slam calibrate stereo makes it")
-    return {"source": "camera", "path": camera, **infos}
+    return replace(spec, parameters=parameters | {"source": "camera", "path": camera})

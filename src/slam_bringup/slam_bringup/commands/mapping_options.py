@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Common parts of ``slam run`` and ``slam nodes``: arguments, options, and the progress bar."""
+"""Common parts of ``slam run``, ``slam nodes`` and ``slam live``: arguments, options, and their meaning."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ from slam_bringup.pipeline.results import RunResult
 from stereo_frontend.frontend import MODES
 
 # fmt: off
-_OPTIONS = (
+_BAG_OPTIONS = (
     click.argument("bag", type=UserPath(exists=True)),
     click.option(
         "-o", "--output", type=UserPath(file_okay=False), required=True, help="folder to write"
     ),
-    click.option("--mode", type=click.Choice(MODES), help="where depth comes from [stereo; tof without stereo]"),
     click.option(
         "--mapper", type=click.Choice(MAPPERS), default="sjsam", show_default=True, help="one filter, or submaps"
     ),
-    click.option("--odometry", type=click.Choice(ODOMETRIES), default="none", show_default=True, help="scan odometry"),
     click.option("--imu", type=click.Choice(("auto", "on", "off")), help="use of an IMU [auto: if there is one]"),
+    overwrite_option("results of another bag or command, or results that were changed since"),
+)
+_RIG_OPTIONS = (
+    click.option("--mode", type=click.Choice(MODES), help="where depth comes from [stereo; tof without stereo]"),
+    click.option("--odometry", type=click.Choice(ODOMETRIES), default="none", show_default=True, help="scan odometry"),
     click.option(
         "--config", type=UserPath(exists=True, dir_okay=False),
         help="YAML, one group per node, as in docs/parameters.md",
@@ -41,14 +44,23 @@ _OPTIONS = (
         "--base-frame", default="", metavar="FRAME",
         help="the frame whose poses are wanted [base_link; else the root above the camera]",
     ),
-    overwrite_option("results of another bag or command, or results that were changed since"),
+    click.option(
+        "--map", "old_map", type=UserPath(exists=True, file_okay=False),
+        help="go on in the map of a finished run, which is only read: its folder OUT, or OUT/map",
+    ),
+    click.option("--localize-only", is_flag=True, help="with --map: only find the way in that map"),
 )
 # fmt: on
 
 
+def rig_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options that a rig needs, recorded or live."""
+    return reduce(lambda decorated, option: option(decorated), reversed(_RIG_OPTIONS), command)
+
+
 def mapping_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the argument BAG and the options of mapping."""
-    return reduce(lambda decorated, option: option(decorated), reversed(_OPTIONS), command)
+    """Give a command the argument BAG and the options of mapping one."""
+    return reduce(lambda decorated, option: option(decorated), reversed(_BAG_OPTIONS), rig_options(command))
 
 
 def mode_for(bag: SensorBag, mode: str | None) -> str:

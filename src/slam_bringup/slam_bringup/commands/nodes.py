@@ -23,6 +23,7 @@ from slam_bringup.pipeline.configuration import choose, overrides_for, system_co
 from slam_bringup.pipeline.overrides import Overrides, read_overrides
 from slam_bringup.processes.interrupt import INTERRUPTED, MAP, Interrupt, giving_up
 from slam_bringup.processes.online_run import run_nodes
+from slam_bringup.processes.start_map import StartMap
 from slam_bringup.report.summary_table import summary_table
 from slam_bringup.version import VERSION
 from slam_core.output_folder import LOGS, OutputFolder
@@ -39,7 +40,7 @@ _PAGE_PORT = 8080
 def command(
     bag: Path, output: Path, rate: float, mode: str | None, mapper: str, odometry: str, imu: str | None,
     config: Path | None, topics: tuple[str, ...], calibrations: tuple[Path, ...], base_frame: str, overwrite: bool,
-    composed: bool, view: bool,
+    old_map: Path | None, localize_only: bool, composed: bool, view: bool,
 ) -> None:  # fmt: skip
     """Map BAG with the nodes of the workspace: starts them, plays the bag, and writes what ``slam run`` does."""
     names = BagNames(parse_topics(topics), base_frame, read_rig_calibration(calibrations))
@@ -49,6 +50,7 @@ def command(
     own = read_overrides(config) if config is not None else Overrides()
     overrides = overrides_for(bag, with_files(own, names.calibration.parameters))
     system = choose(system_config(overrides), mode, mapper, odometry, imu)
+    start = StartMap.read(system, old_map, localize_only=localize_only)
     if mode != "tof":
         require_stereo(bag, names)
     port = _page(view)
@@ -58,7 +60,7 @@ def command(
             task = progress.add_task(f"nodes mapping {bag.name}", total=frames)
             run = run_nodes(
                 bag, system, folder, logs=results.logs, odometry=odometry != "none", composed=composed, rate=rate,
-                names=names, overrides=overrides, view_port=port,
+                names=names, overrides=overrides, view_port=port, start_map=start,
                 on_progress=lambda done: progress.update(task, completed=done), stopped=lambda: interrupt.asked,
             )  # fmt: skip
         # What draws and writes is loaded now: the nodes have needed the processor.
@@ -66,7 +68,7 @@ def command(
         from slam_bringup.report.output import write_results
         from slam_bringup.report.result_bag import complete_recording
 
-        result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names)
+        result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names, start_map=start)
         require_map(result)
         complete_recording(run.recording, result)
         summary = write_results(folder, result, pictures=not run.stopped)

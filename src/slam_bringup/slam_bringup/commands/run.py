@@ -16,12 +16,7 @@ from slam_bringup.bags.rig_calibration import read_rig_calibration
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, parse_topics
 from slam_bringup.commands.console import LOG_NAME, Transcript, is_quiet, progress_bar, show
-from slam_bringup.commands.mapping_options import (
-    mapping_options,
-    mode_for,
-    require_map,
-)
-from slam_bringup.commands.paths import UserPath
+from slam_bringup.commands.mapping_options import mapping_options, mode_for, require_map
 from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.map_growth import MapGrowth, map_growth
@@ -38,13 +33,6 @@ FAILED = 1
 
 @click.command()
 @mapping_options
-@click.option(
-    "--map",
-    "old_map",
-    type=UserPath(exists=True, file_okay=False),
-    help="go on in the map of a finished run: its folder OUT, or OUT/map",
-)
-@click.option("--localize-only", is_flag=True, help="with --map: only find the way in that map, which stays as it is")
 def command(
     bag: Path, output: Path, mode: str | None, mapper: str, odometry: str, imu: str | None, config: Path | None,
     topics: tuple[str, ...], calibrations: tuple[Path, ...], base_frame: str, overwrite: bool, old_map: Path | None,
@@ -85,6 +73,7 @@ def command(
                 on_mapped=early.start,
             )
         require_map(result)
+        result = replace(result, is_localized=localize_only)
         if interrupt.asked:
             result = replace(result, events=(STOPPED, *result.events))
         with Console(stderr=True, quiet=is_quiet()).status(f"writing {output}"):

@@ -59,14 +59,26 @@ def map_growth(config: GlobalMapConfig, old: Path | None = None, *, localize_onl
     ValueError
         If there is no map in ``old``, or none is given to locate in.
     """
-    if old is None:
-        if localize_only:
-            raise ValueError("--localize-only needs a map to locate in: name the folder of a finished run with --map")
+    folder = map_folder(old, localize_only=localize_only)
+    if folder is None:
         return Joining(GlobalMap(config))
-    loaded = GlobalMap.load(old / "map" if (old / "map").is_dir() else old, config)
+    loaded = GlobalMap.load(folder, config)
     if not loaded.graph.records:
         raise ValueError(f"the map in {old} is empty: nothing can be found again in it")
     return Locating(loaded) if localize_only else Joining(loaded)
+
+
+def map_folder(old: Path | None, *, localize_only: bool) -> Path | None:
+    """Folder of the map that ``old`` names: OUT/map of a run's folder OUT, else itself; None without one.
+
+    Raises
+    ------
+    ValueError
+        If there is none to locate in.
+    """
+    if old is None and localize_only:
+        raise ValueError("--localize-only needs a map to locate in: name the folder of a finished run with --map")
+    return old / "map" if old is not None and (old / "map").is_dir() else old
 
 
 class Joining:

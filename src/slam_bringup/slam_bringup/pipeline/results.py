@@ -102,6 +102,8 @@ class RunResult:
     backlog: Mapping[str, int] = field(default_factory=dict)
     changed: Mapping[str, Any] = field(default_factory=dict)
     """Parameters that are not at their defaults."""
+    is_localized: bool = False
+    """True if the agents were located in a map of an earlier run, and nothing was mapped."""
 
 
 def summarise(result: RunResult) -> dict[str, Any]:
@@ -137,7 +139,18 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "events": list(result.events),
         **_accuracy(first, first.trajectory),
     }
+    if result.is_localized:
+        summary["localization"] = {agent.name: _located(agent) for agent in result.agents}
     return summary | _only_some_have(result, first)
+
+
+def _located(agent: AgentResult) -> dict[str, float | None]:
+    """Share of an agent's frames with a pose in the map, and time (s) from its first frame to the first such one."""
+    frames, known = agent.filtered.stamps_ns, agent.trajectory.stamps_ns
+    if not len(frames) or not len(known):
+        return {"located_share": 0.0, "first_located_s": None}
+    share = float(np.isin(frames, known).mean())
+    return {"located_share": share, "first_located_s": float(known[0] - frames[0]) / 1e9}
 
 
 def _only_some_have(result: RunResult, first: AgentResult) -> dict[str, Any]:

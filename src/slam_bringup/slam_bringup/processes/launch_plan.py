@@ -52,6 +52,7 @@ ARGUMENTS = (
     LaunchArgument("pictures", AUTO, "ToF pictures beside depth: auto, none, amplitude, both"),
     LaunchArgument("measurement", AUTO, "what the ToF camera measures", (AUTO, "range", "depth")),
     LaunchArgument("map_path", "", "folder that save_map writes and load_map reads"),
+    LaunchArgument("initial_map", "", "folder of the map to begin with, which is only read"),
     LaunchArgument("localize_only", "false", "locate the agents in the loaded map without changing it", _BOOLEANS),
     LaunchArgument("bag", "", "a bag to play; topics, frames and sensors are then the bag's"),
     LaunchArgument("rate", "1.0", "speed of the bag; 0: as fast as the nodes follow"),
@@ -93,8 +94,9 @@ def _overrides(values: Mapping[str, str]) -> Overrides:
     origin = values["config"] or "launch arguments"
     rules = read_overrides(Path(values["config"]).expanduser()).rules if values["config"] else ()
     own: dict[str, dict[str, Any]] = {"sjsam": {}}
-    if values["map_path"]:
-        own["sjsam"]["map_path"] = str(Path(values["map_path"]).expanduser())
+    for name in ("map_path", "initial_map"):
+        if values[name]:
+            own["sjsam"][name] = str(Path(values[name]).expanduser())
     if values["localize_only"] == "true":
         own["sjsam"]["localize_only"] = True
     given = {node: p for node, p in own.items() if p}

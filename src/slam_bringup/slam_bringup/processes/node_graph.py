@@ -15,6 +15,7 @@ from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.overrides import Overrides, is_parameter_of
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand
+from slam_bringup.processes.start_map import StartMap
 from slam_core.config import Config, iterate_parameters
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC
 
@@ -117,18 +118,22 @@ def plan_nodes(
     *,
     autosave: bool = False,
     calibration: RigCalibration | None = None,
+    start_map: StartMap | None = None,
 ) -> NodeGraph:
     """The nodes of a run over the agents of a bag; ``autosave`` where nobody has the map saved at the end.
 
-    ``calibration``: instead of the bag's.
+    ``calibration``: instead of the bag's. ``start_map``: what ``sjsam`` begins with instead of an empty map.
     """
     calibration = calibration or RigCalibration()
     mode = config.feature_extractor.mode
     first = next(iter(sensors.values()))
     base_frames = {agent: sensor.base_frame for agent, sensor in sensors.items()}
+    extra = _bag_parameters(config, first, map_path, autosave, calibration)
+    for executable, parameters in (start_map.parameters if start_map else {}).items():
+        extra[executable] = extra.get(executable, {}) | parameters
     specs = live_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
-        extra=_bag_parameters(config, first, map_path, autosave, calibration), base_frames=base_frames,
+        extra=extra, base_frames=base_frames,
         overrides=overrides,
         with_imu=[a for a, s in sensors.items() if "imu" in s.topics and config.ekf_slam.motion.imu != "off"],
         with_laser=[a for a, s in sensors.items() if s.scanner == "scan"],

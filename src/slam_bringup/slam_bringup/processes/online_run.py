@@ -23,6 +23,7 @@ from slam_bringup.pipeline.overrides import Overrides
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.node_graph import NodeGraph, plan_nodes, viewer_nodes
 from slam_bringup.processes.processes import NodeCommand, NodeGroup, PrivateDomain, node_environment
+from slam_bringup.processes.start_map import StartMap
 from slam_core.files import atomic_text
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC
 
@@ -37,6 +38,8 @@ _HOPELESS_AFTER_S = 15.0
 _LAST_REPORT_S = 1.5
 """Longest wait for the last diagnostics: every node reports once a second."""
 _WINDOW = 4
+_DONE = ("submaps joined", "localized", "not recognised", "rejected")
+"""Counts of submaps that ``sjsam`` has done with."""
 _SJSAM = "/sjsam"
 _SAVE_MAP = f"{_SJSAM}/save_map"
 
@@ -70,6 +73,7 @@ def run_nodes(
     names: BagNames | None = None,
     overrides: Overrides | None = None,
     view_port: int = 0,
+    start_map: StartMap | None = None,
     on_progress: Callable[[int], None] = lambda frames: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> OnlineRun:
@@ -97,6 +101,8 @@ def run_nodes(
         Where ``config`` is from: parameters that only the nodes have, or one agent's.
     view_port
         Port of a page that shows the nodes at work, with the dense model; 0: none.
+    start_map
+        Map of an earlier run to go on in, or to be located in.
     on_progress
         Called with the number of frames that the filters have processed.
     stopped
@@ -110,8 +116,9 @@ def run_nodes(
     """
     with SensorBag(bag, names) as opened:
         graph = plan_nodes(
-            config, opened.sensors, odometry, str(out / "map"), overrides, calibration=opened.calibration
-        )
+            config, opened.sensors, odometry, str(out / "map"), overrides, calibration=opened.calibration,
+            start_map=start_map,
+        )  # fmt: skip
         viewers = viewer_nodes(config, opened.sensors, view_port) if view_port else []
     with PrivateDomain() as domain:
         environment = node_environment(domain)
@@ -250,7 +257,8 @@ class _Choreography:
 
     def save_at_once(self) -> None:
         """Have the map saved as it is, if there is any and that is quick."""
-        if int(self._supervisor.diagnostics.get(_SJSAM, {}).get("submaps joined", "0")):
+        values = self._supervisor.diagnostics.get(_SJSAM, {})
+        if any(int(values.get(key, "0")) for key in _DONE[:2]):
             with suppress(TimeoutError, ValueError):
                 self._supervisor.call(_SAVE_MAP, _HURRIED_TIMEOUT_S)
 
@@ -274,7 +282,7 @@ class _Choreography:
 
     def _all_joined(self) -> bool:
         values = self._supervisor.diagnostics.get(_SJSAM, {})
-        joined = sum(int(values.get(key, "0")) for key in ("submaps joined", "rejected"))
+        joined = sum(int(values.get(key, "0")) for key in _DONE)
         return joined >= int(self._supervisor.submaps)
 
 

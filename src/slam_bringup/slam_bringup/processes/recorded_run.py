@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from sjsam_node.global_map import GlobalMap
@@ -16,6 +17,7 @@ from slam_bringup.pipeline.results import RunResult
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges, run_result
 from slam_bringup.processes.interrupt import STOPPED
 from slam_bringup.processes.online_run import OnlineRun, unclean_ends
+from slam_bringup.processes.start_map import StartMap
 from slam_core.messages import estimate_from_message
 from slam_core.types import PoseEstimate
 from stereo_frontend.frontend import FrontendReport
@@ -29,6 +31,7 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self._odometry: dict[str, list[PoseEstimate]] = defaultdict(list)
+        self._in_map: dict[str, dict[int, PoseEstimate]] = defaultdict(dict)
         self._feature_counts: dict[str, list[int]] = defaultdict(list)
         self.stage_ms: dict[str, list[float]] = defaultdict(list)
         self.submaps = 0
@@ -37,6 +40,9 @@ class Recording:
             for topic, _, message in bag.messages():
                 if topic.endswith("/odom") or topic.endswith("/ndt/odometry"):
                     self._odometry[topic].append(estimate_from_message(message))
+                elif topic.endswith("/pose"):
+                    pose = estimate_from_message(message)
+                    self._in_map[topic][pose.stamp_ns] = pose
                 elif topic.endswith("/features"):
                     self._feature_counts[topic].append(int(message.width) * int(message.height))
                 elif topic.endswith("/submap/info"):
@@ -58,33 +64,49 @@ class Recording:
             lost_share=self._states[_topic(agent, "ekf_slam")].lost_share,
         )
 
+    def located(self, agent: str) -> list[PoseEstimate]:
+        """Poses of an agent in the map, as ``sjsam`` published them."""
+        poses = self._in_map[_topic(agent, "pose")]
+        return [poses[stamp] for stamp in sorted(poses)]
+
     def _add_latency(self, node: str, values: dict[str, str]) -> None:
         if "latency_mean_ms" in values:
             self.stage_ms[node.strip("/")].append(float(values["latency_mean_ms"]))
 
 
 def collect(
-    bag: Path, config: SystemConfig, run: OnlineRun, *, mapper: str, odometry: str, names: BagNames | None = None
+    bag: Path,
+    config: SystemConfig,
+    run: OnlineRun,
+    *,
+    mapper: str,
+    odometry: str,
+    names: BagNames | None = None,
+    start_map: StartMap | None = None,
 ) -> tuple[RunResult, GlobalMap]:
-    """The result of a run of nodes, and the map that ``sjsam`` saved."""
+    """The result of a run of nodes, and the map that ``sjsam`` saved; ``start_map``: what it began with."""
     recording = Recording(run.recording)
     global_map = GlobalMap.load(run.map_folder)
+    is_localized = start_map is not None and start_map.localize_only
+    joiner = run.diagnostics.get("/sjsam", {})
     with SensorBag(bag, names) as opened:
         record = RunRecord(
             agents={agent: recording.of_agent(agent) for agent in opened.agents},
             global_map=global_map,
-            trajectories=global_map.trajectory(),
+            trajectories={agent: recording.located(agent) for agent in opened.agents}
+            if is_localized
+            else global_map.view.trajectory(start_map.submaps if start_map else 0),
             submaps=recording.submaps,
-            loop_closures=int(run.diagnostics.get("/sjsam", {}).get("closures", "0")),
+            loop_closures=int(joiner.get("localized" if is_localized else "closures", "0")),
             wall_s=run.wall_s,
             dropped=_losses(run.diagnostics),
             stage_ms=recording.stage_ms,
-            backlog=_backlog(run.diagnostics.get("/sjsam", {})),
+            backlog=_backlog(joiner),
             events=tuple([STOPPED] * run.stopped + unclean_ends(run)),
         )
         record = record.with_front_ends({agent: _front_end(agent, run.diagnostics) for agent in opened.agents})
         result = run_result(opened, config, record, mapper=mapper, odometry=odometry, stopped=lambda: run.stopped)
-    return result, global_map
+    return replace(result, is_localized=is_localized), global_map
 
 
 def _front_end(agent: str, diagnostics: dict[str, dict[str, str]]) -> FrontendReport:

@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
+from slam_bringup.plural import plural
 from slam_bringup.processes.interrupt import STOPPED
 
 _SHOWN_EVENTS = 8
@@ -26,10 +27,17 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
     for reason, count in summary["dropped_by_reason"].items():
         table.add_row("dropped", f"{count} x {reason}")
     table.add_row("path", f"{summary['path_length_m']:.2f} m")
-    table.add_row("map", f"{summary['landmarks']} landmarks, {summary['submaps']} submaps")
+    submaps = plural(summary["submaps"], "submap")
+    if "localization" in summary:
+        table.add_row("recognised", f"{summary['loop_closures']} of {submaps} in the map, which stays as it is")
+        for name, part in summary["localization"].items():
+            table.add_row(f"located {name}".strip(), _located(part))
+    else:
+        table.add_row("map", f"{plural(summary['landmarks'], 'landmark')}, {submaps}")
     if "features_from" in summary and summary["mode"] == "tof":
         table.add_row("features from", f"{summary['features_from']} images")
-    table.add_row("loop closures", str(summary["loop_closures"]))
+    if "localization" not in summary:
+        table.add_row("loop closures", str(summary["loop_closures"]))
     for name, part in summary.get("agents", {"": summary}).items():
         table.add_row(f"accuracy {name}".strip(), _accuracy(part))
     if "scan_odometry" in summary:
@@ -48,6 +56,12 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
     report = "" if STOPPED in summary["events"] else "report.html in a browser, "
     table.add_row("to look at", f"slam view {shlex.quote(str(out))}; {report}result.mcap in Foxglove")
     return table
+
+
+def _located(part: dict[str, float | None]) -> str:
+    if part["first_located_s"] is None:
+        return "never"
+    return f"in {part['located_share']:.0%} of the frames, first after {part['first_located_s']:.1f} s"
 
 
 def _lost(summary: dict[str, Any]) -> str:

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map of an earlier run that nodes begin with: to go on in it, or to be located in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.map_growth import map_folder, map_growth
+
+
+@dataclass(frozen=True)
+class StartMap:
+    """The map in ``folder``, with its number of ``submaps`` and a ``session`` that none of its agents has had."""
+
+    folder: Path
+    localize_only: bool
+    submaps: int
+    session: int
+
+    @classmethod
+    def read(cls, config: SystemConfig, old: Path | None, *, localize_only: bool) -> StartMap | None:
+        """The map of a run's folder ``old``, None without one; ValueError if it holds no map, or an empty one."""
+        folder = map_folder(old, localize_only=localize_only)
+        if folder is None:
+            return None
+        records = map_growth(config.sjsam, folder, localize_only=localize_only).global_map.graph.records
+        return cls(folder, localize_only, len(records), 1 + max(record.key[1] for record in records))
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Parameters of the nodes by executable."""
+        return {
+            "sjsam": {"initial_map": str(self.folder), "localize_only": self.localize_only},
+            "ekf_slam": {"session": self.session},
+        }

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes that ``slam live`` starts: topics, frames, calibration and a map to begin with; nothing is started."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from calibration_folder import write_calibrations
+from slam_bringup.cli import slam
+from slam_bringup.processes.processes import NodeCommand
+
+DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Arguments by executable, and ``rest``: what every node is given; filled by the command."""
+    found: dict[str, Any] = {}
+
+    def run_composed(commands: Sequence[NodeCommand], arguments: Sequence[str]) -> None:
+        found.update({c.executable: " ".join(c.arguments) for c in commands}, rest=list(arguments))
+
+    module = ModuleType("composed_node")
+    module.run_composed = run_composed  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "slam_bringup.processes.composed_node", module)
+    return found
+
+
+def test_topics_frames_and_a_map_reach_the_nodes(started: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "map").mkdir()
+    words = ["live", "--topic", "left=/cam/left/image_raw", "--base-frame", "rig", "--map", str(tmp_path)]
+    result = CliRunner().invoke(slam, [*words, "--localize-only"])
+    assert result.exit_code == 0, result.output
+    assert started["rest"] == ["--ros-args", "-r", "/stereo/left/image_raw:=/cam/left/image_raw"]
+    assert 'base_frame:="rig"' in started["ekf_slam"]
+    assert f'initial_map:="{tmp_path}/map"' in started["sjsam"]
+    assert "localize_only:=true" in started["sjsam"]
+    assert "map_path" not in started["sjsam"], "the old map is only read"
+
+
+def test_a_camera_needs_its_calibration(started: dict[str, Any], tmp_path: Path) -> None:
+    refused = CliRunner().invoke(slam, ["live", "0"])
+    assert refused.exit_code != 0
+    assert "--calibration" in refused.output + str(refused.exception)
+    folder = write_calibrations(DEMO, tmp_path)[0]
+    result = CliRunner().invoke(slam, ["live", "0", "--calibration", str(folder)])
+    assert result.exit_code == 0, result.output
+    assert 'source:="camera"' in started["stereo_driver"]
+    assert "left_info:=" in started["stereo_driver"]
+
+
+def test_what_to_map_is_asked_for(started: dict[str, Any]) -> None:
+    for words in ([], ["0", "--topics"], ["0", "--topic", "left=/l"]):
+        assert CliRunner().invoke(slam, ["live", *words]).exit_code != 0
+    refused = CliRunner().invoke(slam, ["live", "--topics", "--localize-only"])
+    assert "--map" in refused.output + str(refused.exception)
+    assert not started
