@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,15 @@ def test_a_copy_is_found_after_a_kill_and_not_after_an_end_in_order(joined: Glob
     autosave._job.result()
     assert not autosave.is_due(9.0)  # however late it is looked whether the copy is written
     assert autosave.is_due(10.1)
-    copy = GlobalMap.load(Autosave(path, 10.0).found() or "")
+    with pytest.raises(ValueError, match=f"in use by another process, number {os.getpid()}"):
+        Autosave(path, 10.0)
+    autosave.close()  # and not put away, as a killed one
+    second = Autosave(path, 10.0)
+    copy = GlobalMap.load(second.found() or Path())
     assert np.array_equal(copy.graph.poses, joined.graph.poses)
-    autosave.put_away()
+    second.put_away()
+    second.close()
+    assert [p.name for p in tmp_path.iterdir()] == ["map.autosave.ended"]
     assert Autosave(path, 10.0).found() is None
     assert len(GlobalMap.load(autosave.ended).graph.records) == len(joined.graph.records)
 

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
-from slam_core.files import atomic_path, atomic_text
+from slam_core.files import PathLock, atomic_path, atomic_text, read_bytes, read_json, read_yaml
 from slam_core.output_file import OutputFile
 
 
@@ -66,3 +67,46 @@ def test_a_results_file_replaces_its_own_kind_alone(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="not written by slam"):
             OutputFile(path, "evaluate", "y", overwrite=True)
         assert path.read_text() == foreign
+
+
+def test_only_files_of_a_size_that_can_be_are_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for name, why in (("pipe", "a pipe or a device"), ("zero", "a pipe or a device"), (".", "a folder")):
+        with pytest.raises(ValueError, match=why):
+            read_bytes(tmp_path / name)
+    (tmp_path / "a").write_bytes(b"12345")
+    assert read_bytes(tmp_path / "a", at_most=5) == b"12345"
+    with pytest.raises(ValueError, match="5 bytes, more than the 4"):
+        read_bytes(tmp_path / "a", at_most=4)
+    with pytest.raises(FileNotFoundError):
+        read_bytes(tmp_path / "absent")
+
+
+def test_json_and_yaml_that_are_none_or_nested_too_deeply_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    for text, read, why in (
+        ("[" * 10**5, read_json, "nested too deeply"),
+        ("[" * 10**4, read_yaml, "nested too deeply"),
+        ("{", read_json, "not JSON"),
+        ("{a: ]", read_yaml, "not YAML"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=why):
+            read(path)
+    path.write_text('{"a": [1]}')
+    assert read_json(path) == read_yaml(path) == {"a": [1]}
+
+
+def test_a_path_is_kept_for_one_until_it_is_released(tmp_path: Path) -> None:
+    lock = PathLock(tmp_path / "new" / "map")
+    with pytest.raises(ValueError, match=f"in use by another process, number {os.getpid()}"):
+        PathLock(tmp_path / "new" / "map")
+    PathLock(tmp_path / "new" / "other").release()
+    lock.release()
+    lock.release()
+    assert list((tmp_path / "new").iterdir()) == []
+    PathLock(tmp_path / "new" / "map").release()
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="cannot be written"):
+        PathLock(tmp_path / "file" / "map")

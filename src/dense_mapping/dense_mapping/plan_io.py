@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from dense_mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
-from slam_core.files import atomic_path, atomic_text
+from slam_core.files import atomic_path, atomic_text, read_yaml
 from slam_core.geometry import FloatArray, euler_from_rotation, make_transform, rotation_from_euler
 
 _PIXELS = {FREE: 254, OCCUPIED: 0, UNKNOWN: 205}
@@ -54,14 +54,14 @@ def read_plan(path: Path) -> FloorPlan:
         If it is no such file or its image cannot be read.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = read_yaml(path)
         image = _read_image(path.parent / content["image"])
         resolution, (x, y, yaw) = float(content["resolution"]), content["origin"]
         darkness = np.asarray((image if content["negate"] else 255.0 - image) / 255.0)
         occupied, free = float(content["occupied_thresh"]), float(content["free_thresh"])
         pose = make_transform(rotation_from_euler(yaw), np.array([x, y, 0.0]))
         pose = np.array(content.get("plan_pose", pose), dtype=np.float64)
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path} is no map of map_server: {error}") from error
     cells = np.full(darkness.shape, UNKNOWN, dtype=np.int8)
     cells[darkness <= free] = FREE

@@ -16,6 +16,7 @@ import plyfile
 import yaml
 
 from ndt_registration.lzf import lzf_decompress
+from slam_core.files import read_bytes
 from slam_core.geometry import FloatArray
 from slam_core.messages import points_from_scan
 
@@ -35,7 +36,7 @@ def read_cloud(path: Path) -> FloatArray:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise ValueError(f"{path}: unknown kind of cloud '{path.suffix}', known: {', '.join(READERS)}")
-    content = path.read_bytes()
+    content = read_bytes(path)
     if not content.strip():
         raise ValueError(f"{path}: the file is empty")
     try:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A copy of the map on disk that is never much older than the map, so that a killed node goes on from it.
 
-While a node lives its copy is at ``path``. One that ends in order renames it to ``<path>.ended``; a copy still at
-``path`` when a node starts is therefore that of a node that was killed.
+While a node lives its copy is at ``path``, which a lock that ends with the process keeps for it alone. One that ends in
+order renames it to ``<path>.ended``; a copy still at ``path`` when a node starts is therefore that of a node that was
+killed.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from sjsam_node import storage
 from sjsam_node.storage import PackedMap, StoredMap
-from slam_core.files import remove
+from slam_core.files import PathLock, remove
 
 _SHARE = 20.0
 """Writing takes at most one part in so many of the time."""
@@ -24,12 +25,18 @@ class Autosave:
     """Writes copies of a map, on a thread of its own, ``period_s`` apart or more where writing takes long.
 
     Times are those of any steady clock, s.
+
+    Raises
+    ------
+    ValueError
+        If another one that is open writes to the same path, or nothing can be written there.
     """
 
     def __init__(self, path: Path, period_s: float) -> None:
         self.path = path
         self.ended = path.with_name(f"{path.name}.ended")
         self._period_s = period_s
+        self._lock = PathLock(path) if self.is_on else None
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="autosave")
         self._job: Future[float] | None = None
         self._due_s = 0.0
@@ -76,5 +83,7 @@ class Autosave:
             self._job = None
 
     def close(self) -> None:
-        """End the writer's thread."""
+        """End the writer's thread and give up the path."""
         self._writer.shutdown()
+        if self._lock is not None:
+            self._lock.release()

@@ -36,6 +36,8 @@ def arrays_of(data: bytes) -> Arrays:
             infos = archive.infolist()
             if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
                 raise ValueError("the arrays are compressed, which a map's never are")
+            if sum(info.file_size for info in infos) > len(data):
+                raise ValueError(f"the arrays claim to be larger than their {len(data)} bytes")
             return {info.filename.removesuffix(".npy"): _array(info.filename, archive.read(info)) for info in infos}
     except zipfile.BadZipFile as error:
         raise ValueError(f"the arrays are not an npz archive: {error}") from error
@@ -59,6 +61,8 @@ def check_manifest(manifest: dict[str, Any]) -> None:
     name = manifest["arrays"]
     if not isinstance(name, str) or "/" in name or "\\" in name or not name.endswith(".npz"):
         raise ValueError(f"arrays must name a file of the folder, got {name!r}")
+    if not _is_int(manifest.get("bytes", 0)):
+        raise ValueError(f"bytes must be the size of the arrays, got {manifest['bytes']!r}")
     for record in manifest["records"]:
         agent, index, session, start, follows = record
         if not (isinstance(agent, str) and isinstance(follows, bool) and all(map(_is_int, (index, session, start)))):

@@ -30,7 +30,7 @@ from sjsam_node.map_messages import (
     landmarks_message,
     marks_message,
 )  # fmt: skip
-from sjsam_node.node_config import SjsamNodeConfig
+from sjsam_node.node_config import SjsamNodeConfig, copy_path
 from sjsam_node.pose_tracker import PoseTracker
 from sjsam_node.submap_order import SubmapOrder, gap_text
 from slam_core.base_node import SlamNode
@@ -108,8 +108,13 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         return self.map.global_map
 
     def _make_autosave(self) -> Autosave:
-        path = self.config.autosave_path or f"{self.map_path}.autosave"
-        return Autosave(Path(path).expanduser(), 0.0 if self.config.localize_only else self.config.autosave_period_s)
+        period_s = 0.0 if self.config.localize_only else self.config.autosave_period_s
+        try:
+            return Autosave(copy_path(self.config, self.get_namespace()), period_s)
+        except ValueError as error:
+            raise ValueError(
+                f"{error}: set autosave_path to another place, or autosave_period_s to 0 for none"
+            ) from None
 
     def _go_on_from_last_time(self) -> None:
         """The map of a node that was killed, or the one to begin with or to localise in."""
@@ -125,9 +130,9 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
                 self.get_logger().error(f"the autosaved map cannot be used, a new one begins: {error}")
                 self.map.reset(forget=True)
                 return
-            count = len(self.global_map.graph.records)
+            count, written = len(self.global_map.graph.records), time.ctime((copy / "manifest.json").stat().st_mtime)
             self.get_logger().warning(
-                f"a node was killed: going on from {count} submaps in {copy} (~/reset forgets them)"
+                f"a node was killed: going on from {count} submaps of {written} in {copy} (~/reset forgets them)"
             )
 
     def _start_trackers(self, last: Mapping[str, FloatArray] = MappingProxyType({})) -> None:

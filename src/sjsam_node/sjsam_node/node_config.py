@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 from sjsam_node.global_map import GlobalMapConfig
 from slam_core.config import parameter
@@ -25,7 +27,19 @@ class SjsamNodeConfig(GlobalMapConfig):
     autosave_period_s: float = parameter(
         10.0, "time between two copies of the map that a killed node goes on from; 0: none", unit="s", minimum=0.0
     )
-    autosave_path: str = parameter("", "folder of that copy; empty: map_path with the ending .autosave")
+    autosave_path: str = parameter(
+        "", "folder of that copy; empty: map_path with the ending .autosave, a relative one below the user's state"
+    )
     transform_tolerance_s: float = parameter(
         0.2, "how far ahead map_to_odom is stamped, so that a lookup at the present time works", unit="s", minimum=0.0
     )
+
+
+def copy_path(config: SjsamNodeConfig, namespace: str) -> Path:
+    """Folder of the copy that a killed node goes on from: the same wherever the node is started.
+
+    A relative path is one below ``$XDG_STATE_HOME/indoor_slam`` (``~/.local/state/indoor_slam``) and the namespace.
+    """
+    path = Path(config.autosave_path or f"{config.map_path}.autosave").expanduser()
+    state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    return path if path.is_absolute() else state / "indoor_slam" / namespace.strip("/") / path

@@ -19,6 +19,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchContext, LaunchDescription
+from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.processes.launch_plan import ARGUMENTS, plan_launch
 
 SHARE = Path(get_package_share_directory("slam_bringup"))
@@ -36,6 +37,7 @@ def generate_launch_description() -> LaunchDescription:
 
 def _nodes(context: LaunchContext) -> list[Node]:
     plan = plan_launch({a.name: LaunchConfiguration(a.name).perform(context) for a in ARGUMENTS})
+    compile_kernels_once()
     nodes = [
         Node(
             package=spec.package,

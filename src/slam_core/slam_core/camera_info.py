@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from slam_core.camera import Camera, CameraInfo
-from slam_core.files import atomic_text
+from slam_core.files import atomic_text, read_yaml
 from slam_core.geometry import FloatArray
 
 COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
@@ -71,10 +71,7 @@ def read_camera_info(path: str | Path) -> CameraInfoFile:
     OSError
         If the file cannot be opened.
     """
-    try:
-        document = yaml.safe_load(Path(path).read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not a camera_info YAML file: {str(error).splitlines()[0]}") from error
+    document = read_yaml(Path(path))
     if not isinstance(document, dict):
         raise ValueError(f"{path} is not a camera_info YAML file: expected a mapping of names to values")
     try:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from slam_core.files import atomic_text
+from slam_core.files import atomic_text, read_json
 
 _KEY = "written_by"
 
@@ -42,7 +42,7 @@ class OutputFile:
 def _writer_of(path: Path) -> dict[str, str]:
     """Name of the command that wrote a file; empty if it was not this program."""
     try:
-        writer = json.loads(path.read_text(encoding="utf-8"))[_KEY]
+        writer = read_json(path)[_KEY]
         return dict(writer) if writer["program"] == "slam" else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}

@@ -22,7 +22,7 @@ from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Any, Self
 
-from slam_core.files import digest, remove
+from slam_core.files import digest, read_json, remove
 
 MANIFEST = ".slam.json"
 LOGS = "logs"
@@ -45,7 +45,7 @@ class Manifest:
         if not path.is_file():
             return None
         try:
-            content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            content: dict[str, Any] = read_json(path)
             files = {str(name): [str(d) for d in digests] for name, digests in content["files"].items()}
             manifest = cls(str(content["command"]), str(content["source"]), files)
         except (ValueError, KeyError, TypeError, AttributeError) as error:

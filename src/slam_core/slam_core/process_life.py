@@ -14,6 +14,9 @@ from types import FrameType
 STARTED_S = time.monotonic()
 """Start of this program; whoever measures it imports this module first."""
 
+INTERRUPTED = 130
+"""Exit code of a program that Ctrl-C has ended."""
+
 PARENT = "SLAM_PARENT_PID"
 """Environment variable with the process that started this one and without which it is of no use."""
 

@@ -13,11 +13,14 @@ import array
 import importlib
 import importlib.util
 import os
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -35,7 +38,7 @@ from slam_core.guarded_node import GuardedNode
 from slam_core.memory import search_less_garbage, share_one_heap
 from slam_core.messages import MessageTypes
 from slam_core.messages.base import Message
-from slam_core.process_life import end_with_parent, on_request_to_end
+from slam_core.process_life import INTERRUPTED, end_with_parent, on_request_to_end
 from slam_core.tf_message import tf_message_class
 from slam_core.types import AnyArray
 
@@ -44,6 +47,8 @@ C = TypeVar("C", bound=Config)
 _PROFILE_VARIABLES = {"FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"}
 _SIGNAL_PERIOD_S = 0.1
 """Longest time that a node without traffic takes to notice a signal."""
+_INSISTED_S = 1.0
+"""A SIGINT so long after the first one, or longer, is that of somebody who does not want to wait."""
 _SERVICE_PERIOD_S = 0.02
 """Period in which a node that always has work to do looks after timers and services."""
 _SERVICE_CALLS = 100
@@ -228,14 +233,22 @@ def _serve(node: GuardedNode, executor: SingleThreadedExecutor) -> None:
             return
 
 
+def _ask_to_end(stopped: threading.Event, asked_s: list[float], number: int, _frame: FrameType | None) -> None:
+    """Handle a signal; a terminal and ``ros2 launch`` each send one, and launch sends SIGTERM after 5 s."""
+    if asked_s and number == signal.SIGINT and time.monotonic() > asked_s[0] + _INSISTED_S:
+        os._exit(INTERRUPTED)
+    asked_s.append(time.monotonic())
+    stopped.set()
+
+
 def run_node(
     node_type: Callable[[], RunnableNode], args: list[str] | None = None, *, small_packets: bool = False
 ) -> None:
     """Run a node until SIGINT, SIGTERM, SIGHUP or shutdown: exit code 0; a bad parameter ends it with one line and 2.
 
     A signal only asks for the end: rclpy's own handlers would shut the context down under a callback that still
-    publishes. The message in hand is finished first. ``small_packets``: it speaks to other hosts
-    (:func:`use_fast_dds_profile`).
+    publishes. The message in hand is finished first. A SIGINT a second after that ends the process at once, whatever it
+    waits for, with exit code 130. ``small_packets``: it speaks to other hosts (:func:`use_fast_dds_profile`).
     """
     share_one_heap()
     search_less_garbage()
@@ -243,7 +256,7 @@ def run_node(
     use_fast_dds_profile(small_packets=small_packets)
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     stopped = threading.Event()
-    on_request_to_end(lambda *_: stopped.set())
+    on_request_to_end(partial(_ask_to_end, stopped, []))
     executor = SingleThreadedExecutor()
     node: RunnableNode | None = None
     try:

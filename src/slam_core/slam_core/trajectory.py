@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from slam_core.files import atomic_text
+from slam_core.files import atomic_text, read_text
 from slam_core.geometry import (
     FloatArray,
     interpolate_transform,
@@ -100,7 +100,7 @@ def read_trajectory(path: Path) -> Trajectory:
     """
     stamps: list[int] = []
     rows: list[list[float]] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for number, line in enumerate(read_text(path, errors="replace").splitlines(), 1):
         fields = line.split("#")[0].replace(",", " ").split()
         if not fields:
             continue
@@ -155,7 +155,7 @@ def write_covariance_csv(path: Path, trajectory: Trajectory) -> None:
 def read_covariance_csv(path: Path) -> tuple[Stamps, FloatArray]:
     """Stamps (n,) and covariances (n, 6, 6) of a file by :func:`write_covariance_csv`."""
     stamps, covariances = [], []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines()[1:], 2):
+    for number, line in enumerate(read_text(path).splitlines()[1:], 2):
         fields = line.split(",")
         if len(fields) != 22:
             raise ValueError(f"{path}, line {number}: expected 22 columns, found {len(fields)}")

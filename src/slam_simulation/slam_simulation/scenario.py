@@ -25,9 +25,9 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
-import yaml
 
 from slam_core.config import Config, from_mapping, group, parameter
+from slam_core.files import read_yaml
 from slam_simulation.building import WALL_GAP, Doorway, Room, build_doorways, build_shell, room_walls
 from slam_simulation.furniture import Spot, chair, furnish_wall, pillar, table
 from slam_simulation.imu import ImuSensorConfig
@@ -131,10 +131,7 @@ class Scenario:
             If it does not exist (with the names that do) or its contents are wrong.
         """
         path = _find(name_or_path)
-        try:
-            values = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except yaml.YAMLError as error:
-            raise ValueError(f"{path}: not valid YAML: {error}") from error
+        values = read_yaml(path)
         if not isinstance(values, Mapping):
             raise ValueError(f"{path}: a scenario is a mapping, got {type(values).__name__}")
         return cls.from_mapping(path.stem, values)

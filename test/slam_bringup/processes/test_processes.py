@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -80,7 +82,30 @@ def test_a_node_that_died_is_reported_with_the_end_of_its_log(tmp_path: Path, mo
 def test_domains_are_private() -> None:
     with PrivateDomain() as first, PrivateDomain() as second:
         assert first != second
-        assert {first, second} <= set(range(1, 102))
+        assert {first, second} <= set(range(1, 101))
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root may become another user")
+def test_two_users_share_the_domains_of_a_machine() -> None:
+    script = (
+        "import os\n"
+        "from slam_bringup.processes.processes import PrivateDomain\n"
+        "os.setgid(65534), os.setuid(65534)\n"
+        "with PrivateDomain() as domain: print(domain)"
+    )
+    all_but_one = [PrivateDomain() for _ in range(99)]
+    held = {domain.__enter__() for domain in all_but_one}
+    try:
+        out = subprocess.run(
+            [sys.executable, "-c", script],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            capture_output=True,
+            text=True,
+        )
+    finally:
+        for domain in all_but_one:
+            domain.__exit__()
+    assert out.stdout.strip() in {str(d) for d in range(1, 101)} - {str(d) for d in held}, out.stderr
 
 
 def test_arguments_are_those_of_ros2_run() -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slam_core.files import read_text
 from slam_core.geometry import FloatArray
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
@@ -74,7 +75,7 @@ def read_maps(paths: Iterable[Path]) -> tuple[list[TextMap], int]:
 def _read(path: Path) -> tuple[int, IntArray, IntArray, FloatArray, FloatArray]:
     """Reference, ids with the number of values of each, all values, information."""
     try:
-        numbers = np.array(path.read_text(encoding="utf-8-sig").split(), dtype=np.float64)
+        numbers = np.array(read_text(path).split(), dtype=np.float64)
     except ValueError as error:
         raise ValueError(f"{path}: not a text submap: {error}") from error
     if len(numbers) < 2:

@@ -10,6 +10,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import yaml
 
+from slam_core.files import read_yaml
 from slam_core.geometry import FloatArray, pose7_from_transform, quaternion_from_rotation, transform_from_pose7
 
 EXTRINSICS, URDF = "extrinsics.yaml", "extrinsics.urdf"
@@ -72,10 +73,10 @@ def extrinsics_text(parent: str, child: str, T: FloatArray, covariance: FloatArr
 def read_extrinsics(path: Path) -> StaticTransform:
     """The transform of an ``extrinsics.yaml``; ValueError if the file is none."""
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        document = read_yaml(path)
         pose = np.array([*document["translation_m"], *document["rotation_xyzw"]], dtype=np.float64)
         return StaticTransform(str(document["parent_frame"]), str(document["child_frame"]), pose)
-    except (yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is no extrinsics file of slam calibrate: {error}") from error
 
 

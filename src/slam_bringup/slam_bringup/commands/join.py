@@ -18,7 +18,7 @@ from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.report.joined_map import draw_joined
 from slam_core.config import from_mapping
-from slam_core.files import atomic_text
+from slam_core.files import atomic_text, read_yaml
 from slam_core.output_folder import OutputFolder
 
 
@@ -76,12 +76,7 @@ def command(
 def _yaml(path: Path | None) -> dict[str, Any]:
     if path is None:
         return {}
-    import yaml
-
-    try:
-        values = yaml.safe_load(path.read_text()) or {}
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: not YAML: {error}") from error
+    values = read_yaml(path) or {}
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected a mapping of parameters, got {type(values).__name__}")
     return values

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import click
 import numpy as np
-import yaml
 from rich.console import Console
 from rich.table import Table
 
@@ -19,7 +18,7 @@ from ndt_registration.cloud_io import read_cloud
 from ndt_registration.registration import RegistrationConfig, RegistrationResult, register
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.config import from_mapping
-from slam_core.files import atomic_text
+from slam_core.files import atomic_text, read_text, read_yaml
 from slam_core.geometry import (
     FloatArray,
     make_transform,
@@ -64,7 +63,7 @@ def command(
     Clouds without z, or of one height only, are aligned in the plane: x, y and yaw.
     Prints a table on a terminal and one JSON object elsewhere. Ends with exit code 1 if the clouds were not registered.
     """
-    values = yaml.safe_load(config_file.read_text(encoding="utf-8")) or {} if config_file else {}
+    values = read_yaml(config_file) or {} if config_file else {}
     config = from_mapping(RegistrationConfig, {**values, "method": method})
     source_points, target_points = _both_alike(_read(source), _read(target))
     guess = parse_guess(initial_guess) if initial_guess else None
@@ -162,7 +161,7 @@ def parse_guess(text: str) -> FloatArray:
         If there are not 3, 6, 7 or 16 finite numbers.
     """
     path = Path(text)
-    content = path.read_text(encoding="utf-8") if len(text) < 255 and path.is_file() else text
+    content = read_text(path) if len(text) < 255 and path.is_file() else text
     try:
         values = np.array([float(word) for word in content.replace(",", " ").split()])
     except ValueError as error:

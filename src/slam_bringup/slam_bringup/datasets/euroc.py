@@ -26,6 +26,7 @@ import yaml
 from slam_bringup.bags.sensor_writer import IMU_FRAME, LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_bringup.datasets.files import StampedPair, existing, read_grey, refuse_rate
 from slam_core.camera import Camera, CameraInfo
+from slam_core.files import read_text
 from slam_core.geometry import FloatArray, invert_transform, make_transform
 from slam_core.trajectory import Trajectory, read_trajectory
 from slam_core.types import ImuSample
@@ -169,8 +170,7 @@ def _read_mount(path: Path) -> _Mount:
 
 
 def _read_sensor_yaml(path: Path) -> dict[str, Any]:
-    text = path.read_text(encoding="utf-8").replace("%YAML:1.0", "")
-    document = yaml.safe_load(text)
+    document = yaml.safe_load(read_text(path).replace("%YAML:1.0", ""))
     if not isinstance(document, dict):
         raise ValueError(f"{path} is no EuRoC sensor.yaml")
     return document

@@ -17,6 +17,7 @@ import numpy as np
 from slam_bringup.bags.sensor_writer import LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_bringup.datasets.files import START_NS, Clock, StampedPair, existing, read_grey, refuse_rate
 from slam_core.camera import Camera, CameraInfo
+from slam_core.files import read_text
 from slam_core.geometry import FloatArray, invert_transform, make_transform
 from slam_core.trajectory import read_trajectory
 
@@ -91,7 +92,7 @@ def _read_times(path: Path, count: int, rate: float | None) -> tuple[list[int], 
         clock = Clock(_RATE, rate)
         return clock.stamps_ns(count), clock.assumed
     refuse_rate(rate, path)
-    stamps = [START_NS + int(Decimal(line) * 10**9) for line in path.read_text().split()]
+    stamps = [START_NS + int(Decimal(line) * 10**9) for line in read_text(path).split()]
     if len(stamps) < count:
         raise ValueError(f"{path} has {len(stamps)} times for {count} images")
     return stamps[:count], []
@@ -99,7 +100,7 @@ def _read_times(path: Path, count: int, rate: float | None) -> tuple[list[int], 
 
 def _read_projections(path: Path, left_folder: str) -> tuple[FloatArray, FloatArray]:
     """P of the left and right camera: two lines in their order, or the lines ``P0:`` to ``P3:`` of the benchmark."""
-    rows = [line.split() for line in existing(path, "calibration").read_text().splitlines() if line.strip()]
+    rows = [line.split() for line in read_text(existing(path, "calibration")).splitlines() if line.strip()]
     named = {row[0].rstrip(":"): row[1:] for row in rows if row[0].startswith("P")}
     wanted = ("P2", "P3") if left_folder == "image_2" else ("P0", "P1")
     numbers = [named[name] for name in wanted if name in named] or rows[:2]

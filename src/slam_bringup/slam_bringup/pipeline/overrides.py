@@ -27,6 +27,7 @@ from typing import Any
 import yaml
 
 from slam_core.config import Config, iterate_parameters
+from slam_core.files import read_yaml
 
 NODE_CONFIGS = {
     "stereo_driver": ("stereo_frontend.driver_node", "StereoDriverConfig"),
@@ -76,10 +77,7 @@ def read_overrides(path: Path) -> Overrides:
     ValueError
         If the file is no mapping of nodes to parameters, or names a node that there is not.
     """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not YAML: {error}") from error
+    content = read_yaml(path) or {}
     if not isinstance(content, Mapping):
         raise ValueError(f"{path} must hold one mapping per node, found {type(content).__name__}")
     return overrides_of(content, str(path))

@@ -12,6 +12,7 @@ from scipy.io.matlab import MatReadError
 
 from ekf_slam_node.planar import move, turn, wrap
 from slam_bringup.planar.log import PlanarLog, RobotLog
+from slam_core.files import read_text
 from slam_core.geometry import FloatArray
 
 _MRCLAM_SIGMA = (0.17, 0.015)
@@ -149,7 +150,7 @@ def read_gtsam(path: Path) -> PlanarLog:
     odometry: dict[int, tuple[int, FloatArray, FloatArray]] = {}
     seen: dict[int, list[tuple[int, FloatArray]]] = {}
     spread = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
         try:
             if words and words[0] == "ODOMETRY":
@@ -196,7 +197,7 @@ def _from_lines(
 def _table(path: Path, columns: int) -> npt.NDArray[np.float64]:
     """Numbers of a text table with ``columns`` columns or more; lines with # are comments."""
     try:
-        table = np.loadtxt(path, comments="#", ndmin=2)
+        table = np.loadtxt(read_text(path).splitlines(), comments="#", ndmin=2)
     except (OSError, ValueError) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
     if table.shape[1] < columns or not np.isfinite(table).all():

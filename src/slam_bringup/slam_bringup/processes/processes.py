@@ -3,17 +3,16 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import signal
+import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, NoReturn
+from typing import NoReturn
 
 from slam_core.process_life import PARENT
 
@@ -91,26 +90,27 @@ def node_environment(domain_id: int) -> dict[str, str]:
 
 
 class PrivateDomain:
-    """A ROS domain that no other run on this machine uses, held by a locked file until the ``with`` block ends."""
+    """A ROS domain that no other run on this machine uses, whoever started it, until the ``with`` block ends.
+
+    Each run binds a name of Linux's abstract sockets: it belongs to nobody, has no file, is gone with the process, and
+    two containers see each other's names just where they see each other's domains.
+    """
 
     def __enter__(self) -> int:
-        folder = Path(tempfile.gettempdir()) / "slam-domains"
-        folder.mkdir(mode=0o777, exist_ok=True)
         first = os.getpid() % len(_DOMAINS)
         domains: list[int] = [*_DOMAINS[first:], *_DOMAINS[:first]]
         for domain in domains:
-            file = (folder / f"{domain}.lock").open("a")
+            self._socket = socket.socket(socket.AF_UNIX)
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                self._socket.bind(f"\0slam-domain-{domain}")
             except OSError:
-                file.close()
+                self._socket.close()
                 continue
-            self._file: IO[str] = file
             return domain
         raise ValueError("all ROS domains 1-100 are in use on this machine")
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        self._socket.close()
 
 
 @dataclass(frozen=True)

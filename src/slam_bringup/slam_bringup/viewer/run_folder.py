@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from dense_mapping.plan_io import read_plan
 from dense_mapping.surface import Surface
 from dense_mapping.surface_io import read_mesh
 from sjsam_node.global_map import GlobalMap
+from slam_core.files import read_json
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajectory
 
@@ -43,7 +43,7 @@ class RunFolder:
         if not (path / "summary.json").is_file():
             raise ValueError(f"{path} holds no finished run (no summary.json): slam run BAG -o {path} makes one")
         try:
-            summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
+            summary = read_json(path / "summary.json")
         except ValueError as error:
             raise ValueError(f"{path / 'summary.json'} is damaged: {error}") from error
         mesh = path / "mesh.ply"
