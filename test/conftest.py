@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import os
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded, as slam_core.blas_threads
@@ -32,3 +35,19 @@ def rng() -> np.random.Generator:
 def state_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Nodes keep their copies here, not in the user's state, and go on from nobody else's."""
     os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
+
+
+@pytest.fixture
+def full_disk() -> Callable[[], AbstractContextManager[None]]:
+    """A context in which the system refuses to make any file larger than 16 KiB, as a full disk does."""
+
+    @contextmanager
+    def is_full() -> Iterator[None]:
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2**14, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return is_full

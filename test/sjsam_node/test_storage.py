@@ -5,6 +5,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -231,3 +232,17 @@ def test_a_stranger_is_not_located(agent: Agent, rng: np.random.Generator) -> No
     elsewhere = Agent(ring_world(4.0, rng, 12.0), circle(4.0, 0.3), rng, "visitor")
     localizer = Localizer(joined)
     assert all(localizer.process(s).pose is None for s in elsewhere.submaps())
+
+
+def test_a_full_disk_leaves_the_old_map_and_nothing_beside_it(
+    small_map: Path, tmp_path: Path, full_disk: Callable[[], AbstractContextManager[None]]
+) -> None:
+    joined = GlobalMap.load(small_map)
+    before = sorted(p.name for p in small_map.iterdir())
+    joined.marks.add(joined.graph.poses, np.zeros(3))
+    for folder in (small_map, tmp_path / "new"):
+        with full_disk(), pytest.raises(OSError, match=str(folder)):
+            joined.save(folder)
+    assert sorted(p.name for p in small_map.iterdir()) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["map"]
+    assert GlobalMap.load(small_map).marks.marks == []

@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -110,3 +113,11 @@ def test_a_path_is_kept_for_one_until_it_is_released(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="cannot be written"):
         PathLock(tmp_path / "file" / "map")
+
+
+def test_a_full_disk_is_told_with_the_file_and_nothing_half_written_stays(
+    tmp_path: Path, full_disk: Callable[[], AbstractContextManager[None]]
+) -> None:
+    with full_disk(), pytest.raises(OSError, match=re.escape(str(tmp_path / "a"))):
+        atomic_text(tmp_path / "a", "x" * 10**6)
+    assert list(tmp_path.iterdir()) == []

@@ -24,11 +24,12 @@ from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.near_pairs import Compared
 from sjsam_node.map_validation import arrays_of, check_arrays, check_manifest
 from sjsam_node.marks import Mark, Marks
-from slam_core.files import MOST_BYTES, atomic_path, digest, read_bytes, read_json
+from slam_core.files import MOST_BYTES, atomic_path, digest, naming, read_bytes, read_json, remove
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
 FORMAT, VERSION = "indoor-slam-map", 6
 _MANIFEST = "manifest.json"
+_MANIFEST_PART = f"{_MANIFEST}.part"
 _ARRAYS_PART = "arrays.part.npz"
 _ARRAYS = re.compile(r"arrays(-[0-9a-f]{16}|\.part)?\.npz")
 """Names of the files of arrays that versions of this program wrote."""
@@ -92,9 +93,14 @@ def write_packed(folder: Path, packed: PackedMap) -> None:
             manifest = packed.manifest | _write_arrays(temporary, packed.arrays)
             _write_synced(temporary / _MANIFEST, _text(manifest))
         return
-    manifest = packed.manifest | _write_arrays(folder, packed.arrays)
-    _write_synced(folder / f"{_MANIFEST}.part", _text(manifest))
-    os.replace(folder / f"{_MANIFEST}.part", folder / _MANIFEST)
+    try:
+        with naming(folder):
+            manifest = packed.manifest | _write_arrays(folder, packed.arrays)
+            _write_synced(folder / _MANIFEST_PART, _text(manifest))
+            os.replace(folder / _MANIFEST_PART, folder / _MANIFEST)
+    finally:  # nothing half-written stays, on a disk that is full
+        for part in (_ARRAYS_PART, _MANIFEST_PART):
+            remove(folder / part)
     for old in folder.iterdir():
         if _ARRAYS.fullmatch(old.name) and old.name != manifest["arrays"]:
             old.unlink()
@@ -168,9 +174,7 @@ def is_map(folder: Path) -> bool:
     except (OSError, ValueError):
         return False
     is_ours = isinstance(content, dict) and content.get("format") == FORMAT
-    return is_ours and all(
-        p.name in (_MANIFEST, f"{_MANIFEST}.part") or _ARRAYS.fullmatch(p.name) for p in folder.iterdir()
-    )
+    return is_ours and all(p.name in (_MANIFEST, _MANIFEST_PART) or _ARRAYS.fullmatch(p.name) for p in folder.iterdir())
 
 
 def _manifest(folder: Path) -> dict[str, Any]:

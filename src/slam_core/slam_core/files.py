@@ -46,11 +46,28 @@ def atomic_path(path: Path, may_replace: Callable[[Path], bool] = _never) -> Ite
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part{path.suffix}")
     remove(temporary)
     try:
-        yield temporary
-        _require_replaceable(path, may_replace)
-        replace(temporary, path)
+        with naming(path):
+            yield temporary
+            _require_replaceable(path, may_replace)
+            replace(temporary, path)
     finally:
         remove(temporary)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Have an OSError of the block that names no file, as that of a full disk, name ``path``."""
+    try:
+        yield
+    except OSError as error:
+        name_file(error, path)
+        raise
+
+
+def name_file(error: BaseException, path: Path) -> None:
+    """Have an OSError that names no file name ``path``; any other error stays as it is."""
+    if isinstance(error, OSError):
+        error.filename = error.filename or str(path)
 
 
 def atomic_text(path: Path, text: str) -> None:

@@ -22,7 +22,7 @@ from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Any, Self
 
-from slam_core.files import digest, read_json, remove
+from slam_core.files import digest, naming, read_json, remove
 
 MANIFEST = ".slam.json"
 LOGS = "logs"
@@ -132,13 +132,14 @@ class OutputFolder:
         """
         remove(self._staging)
         self._staging.mkdir()
-        try:
-            yield self._staging
-        except KeyboardInterrupt:
-            if rescue and (self._staging / rescue).exists():
-                self._rescue(rescue)
-            raise
-        self._commit()
+        with naming(self.path):
+            try:
+                yield self._staging
+            except KeyboardInterrupt:
+                if rescue and (self._staging / rescue).exists():
+                    self._rescue(rescue)
+                raise
+            self._commit()
 
     def _rescue(self, name: str) -> None:
         self.rescued, self._made_here = free_name(self.path / name), False

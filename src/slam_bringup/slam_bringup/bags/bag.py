@@ -37,7 +37,7 @@ from slam_bringup.bags.bag_owner import OWNER, require_free
 from slam_bringup.bags.bag_salvage import is_whole_mcap, salvage_mcap
 from slam_bringup.bags.bag_types import typestore
 from slam_bringup.bags.ros1_bag import Ros1Reader
-from slam_core.files import atomic_text, replace
+from slam_core.files import atomic_text, name_file, naming, replace
 from slam_core.messages.base import Message
 from slam_core.output_folder import free_name
 
@@ -177,11 +177,13 @@ class BagWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            if kind is not None:
-                self._writer.abort()
-                return
-            self._writer.close()
-            self._rename()
+            with naming(self.path):
+                if error is not None:
+                    name_file(error, self.path)
+                    self._writer.abort()
+                    return
+                self._writer.close()
+                self._rename()
         finally:
             shutil.rmtree(self._workshop, ignore_errors=True)
 
