@@ -8,10 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from slam_bringup.bags.bag import BagWriter
 from slam_bringup.bags.readings import DepthReading, ImuReading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bringup.commands.convert import command
 from slam_bringup.datasets.euroc import EurocDataset
 from slam_bringup.datasets.files import Dataset
 from slam_bringup.datasets.kitti import KittiDataset
@@ -125,6 +127,61 @@ def test_tum_rgbd_folders(tmp_path: Path) -> None:
     np.testing.assert_allclose(truth.poses[0][:3, 3], [3.0, -1.0, -2.0], atol=1e-9)
 
 
+@pytest.mark.parametrize(("number", "fx", "distortion"), [(1, 517.3, 5), (2, 520.9, 5), (3, 535.4, 0)])
+def test_the_head_of_a_tum_list_names_the_camera(tmp_path: Path, number: int, fx: float, distortion: int) -> None:
+    source = make_tum(tmp_path / "tum")
+    rgb = source / "rgb.txt"
+    rgb.write_text(f"# color images\n# file: 'rgbd_dataset_freiburg{number}_xyz.bag'\n" + rgb.read_text())
+    dataset = RgbdDataset(source)
+    assert [f"TUM RGB-D publishes for freiburg{number}" in said for said in dataset.assumed] == [True]
+    with convert(dataset, tmp_path / "bag") as bag:
+        tof = bag.sensors[""].tof
+    assert tof is not None
+    assert (tof.camera.fx, len(tof.camera.distortion)) == (fx, distortion)
+    (tmp_path / "camera-intrinsics.txt").write_text("50 0 31.5\n0 51 23.5\n0 0 1\n")
+    dataset = RgbdDataset(source)
+    assert dataset.assumed == [f"the camera matrix of {tmp_path / 'camera-intrinsics.txt'}, a folder above the images"]
+    with convert(dataset, tmp_path / "again") as bag:
+        tof = bag.sensors[""].tof
+    assert tof is not None
+    assert (tof.camera.fx, tof.camera.distortion) == (50.0, ())
+
+
+@pytest.mark.parametrize(
+    ("stamps", "why"),
+    [(("2.0", "1.9", "2.1"), "do not ascend .1.png after 0.png."), (("1e-6", "2e-6", "3e-6"), "0.001 ms")],
+)
+def test_tum_stamps_that_are_no_camera_s_are_refused_and_the_order_of_the_lists_taken_with_a_rate(
+    tmp_path: Path, stamps: tuple[str, ...], why: str
+) -> None:
+    source = make_tum(tmp_path / "tum")
+    for name in ("rgb", "depth"):
+        write_image(
+            source / name / "2.png",
+            np.full((48, 64), 5000 if name == "depth" else 90, "u2" if name == "depth" else "u1"),
+        )
+        rows = [f"{stamp} {name}/{i}.png" for i, stamp in enumerate(stamps)]
+        (source / f"{name}.txt").write_text("\n".join(rows))
+    with pytest.raises(ValueError, match=f"stamps of rgb.txt .*{why}.*--rate HZ"):
+        RgbdDataset(source)
+    dataset = RgbdDataset(source, rate=20.0)
+    assert dataset.left_out["poses, as the stamps of the frames are not those of the recording"] == 1
+    with convert(dataset, tmp_path / "bag") as bag:
+        readings = [r for r in bag.readings() if isinstance(r, DepthReading)]
+        assert bag.ground_truth("") is None
+    assert [(r.stamp_ns, r.raw.image[0, 0]) for r in readings] == [
+        (10**9, 2.0),
+        (1_050_000_000, 2.0),
+        (1_100_000_000, 1.0),
+    ]
+
+
+def test_a_data_set_s_own_name_leads_to_its_kind() -> None:
+    result = CliRunner().invoke(command, ["tum", "x", "-o", "y"])
+    assert result.exit_code == 2
+    assert "'tum' is read by rgbd: slam convert rgbd SOURCE -o BAG" in result.output
+
+
 def make_numbered(root: Path) -> Path:
     for i in (3, 4, 5):
         write_image(root / "images" / f"{i:05d}.png", np.full((48, 64, 3), 90, np.uint8))
@@ -170,7 +227,7 @@ def test_stamps_that_a_source_does_not_have_are_told(tmp_path: Path) -> None:
     assert stamps == [10**9, 10**9 + 100_000_000]
     tum = make_tum(tmp_path / "tum")
     assert RgbdDataset(tum).assumed == [
-        "fx 525, fy 525, cx 319.5, cy 239.5, as TUM RGB-D gives for all its cameras (--calibration FILE)"
+        "fx 525, fy 525, cx 319.5, cy 239.5: usual values, as nothing names the camera (--calibration FILE)"
     ]
     for kind, folder in ((RgbdDataset, tum), (EurocDataset, make_euroc(tmp_path / "euroc")[0])):
         with pytest.raises(ValueError, match="has the stamps of the frames: leave --rate out"):

@@ -25,6 +25,19 @@ DATASETS: dict[str, Callable[[Path, Path | None, Path | None, float | None], Dat
 }
 
 
+_OTHER_NAMES = {"tum": "rgbd", "7-scenes": "rgbd", "7scenes": "rgbd", "hololens": "rgbd", "asl": "euroc"}
+
+
+class Kind(click.Choice[str]):
+    """One of the kinds of data sets; a data set's own name leads to the kind that reads it."""
+
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The kind; a usage error that says which reads ``value`` if it is none."""
+        if kind := _OTHER_NAMES.get(value.lower()):
+            self.fail(f"'{value}' is read by {kind}: slam convert {kind} SOURCE -o BAG", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 def convert(
     dataset: Dataset, target: Path, storage: str = "mcap", *, overwrite: bool = False, compression: str = "zstd"
 ) -> int:
@@ -37,12 +50,16 @@ def convert(
 
 
 @click.command()
-@click.argument("kind", type=click.Choice(sorted(DATASETS)))
+@click.argument("kind", type=Kind(sorted(DATASETS)))
 @click.argument("source", type=UserPath())
 @click.option("-o", "--output", type=UserPath(), required=True, help="the bag to write")
 @click.option("--calibration", type=UserPath(), help="calibration, where the source has none")
 @click.option("--ground-truth", type=UserPath(), help="poses, where the source has none")
-@click.option("--rate", type=click.FloatRange(0.1, 1000.0), help="frames per second, where the source has no stamps")
+@click.option(
+    "--rate",
+    type=click.FloatRange(0.1, 1000.0),
+    help="frames per second, where the source has no stamps, or none that ascend",
+)
 @click.option("--storage", type=click.Choice(["mcap", "sqlite3"]), default="mcap", show_default=True)
 @click.option(
     "--compression", type=click.Choice(COMPRESSIONS), default="zstd", show_default=True, help="compression of mcap bags"

@@ -3,8 +3,8 @@
 
 - 7-Scenes (Shotton et al. 2013): ``frame-000000.color.png``, ``.depth.png`` (mm; 0 and 65535 are invalid),
   ``.pose.txt`` (camera to world); 30 Hz; ``camera-intrinsics.txt`` if there is one.
-- TUM RGB-D (Sturm et al. 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; depth in 1/5000 m; paired by time, and
-  stamped as the picture: what a frame says of the motion is in its pixels, the depth changes little within 20 ms.
+- TUM RGB-D (Sturm et al. 2012): ``rgb.txt``, ``depth.txt``, ``groundtruth.txt``; depth in 1/5000 m; paired by time
+  (:mod:`slam_bringup.datasets.tum_rgbd`).
 - plain: ``color/<n>.png``, ``depth/<n>.png`` (mm), ``K.txt``, ``pose.txt`` with x y z qx qy qz qw per frame; no stamps,
   taken as 30 Hz.
 - numbered, as deep-video-mvs (Duzceker et al. 2021) has it: ``images/<n>.png``, ``depth/<n>.png`` (mm, registered),
@@ -18,20 +18,20 @@ amplitude in grey, which features come from, and ``tof/color/image_raw``.
 
 from __future__ import annotations
 
-import bisect
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 
 from slam_bringup.bags.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
-from slam_bringup.datasets.files import Clock, StampedPair, existing, read_colour, read_depth, read_grey, refuse_rate
+from slam_bringup.datasets.files import Clock, StampedPair, existing, read_colour, read_depth, read_grey
 from slam_bringup.datasets.picture_registration import ColourCamera, register_pictures
+from slam_bringup.datasets.tum_rgbd import camera_of, read_pairs
 from slam_core.camera import Camera, CameraInfo
 from slam_core.camera_info import read_camera_info
+from slam_core.files import read_text
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, invert_transform, make_transform, transform_from_pose7
 from slam_core.messages import rectified_info
 from slam_core.trajectory import read_trajectory
@@ -40,12 +40,9 @@ from tof_driver.depth import MILLIMETRES_INVALID
 
 _RATE = 30.0
 _NUMBERED_RATE = 10.0
-_PAIRING_NS = 20_000_000
 _KINECT_SEVEN_SCENES = (585.0, 585.0, 320.0, 240.0)
 _KINECT_SEVEN_SCENES_COLOUR = ColourCamera((530.0, 530.0, 320.0, 240.0), (0.0256, 0.0, 0.0))
 """7-Scenes does not register its pictures. Focal length and offset put depth edges on picture edges (redkitchen)."""
-_KINECT_TUM = (525.0, 525.0, 319.5, 239.5)
-
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, px."""
@@ -65,6 +62,7 @@ class _Layout:
     assumed: list[str] = field(default_factory=list)
     usual: str = ""
     """Intrinsics that are those of the data set, not of this recording, in words."""
+    distortion: tuple[float, ...] = ()
 
 
 class RgbdDataset:
@@ -124,7 +122,11 @@ class RgbdDataset:
         if self._calibration is not None:
             numbers = _read_camera_matrix(existing(self._calibration, "calibration"))
         assert numbers is not None, "asked for when the folder was read"
-        return rectified_info(Camera(shape[1], shape[0], *numbers))
+        distortion = self._layout.distortion if self._calibration is None else ()
+        if not distortion:
+            return rectified_info(Camera(shape[1], shape[0], *numbers))
+        camera = Camera(shape[1], shape[0], *numbers, "plumb_bob", distortion)
+        return CameraInfo(camera, np.eye(3), np.zeros((3, 4)))
 
 
 def _level(T_world_camera: FloatArray) -> FloatArray:
@@ -144,8 +146,7 @@ def _find_layout(source: Path, rate: float | None) -> _Layout:
         if any(candidate.glob("frame-*.depth.png")):
             return _seven_scenes(candidate, Clock(_RATE, rate))
         if (candidate / "depth.txt").exists():
-            refuse_rate(rate, candidate / "depth.txt")
-            return _tum(candidate)
+            return _tum(candidate, rate)
         if (candidate / "depth").is_dir() and (candidate / "color").is_dir():
             return _plain(candidate, Clock(_RATE, rate))
         if (candidate / "depth").is_dir() and (candidate / "images").is_dir():
@@ -165,43 +166,37 @@ def _seven_scenes(folder: Path, clock: Clock) -> _Layout:
         pose = folder / f"{stem}.pose.txt"
         if pose.exists():
             poses.append((stamp, _read_matrix(pose)))
-    stated = _stated(folder / "camera-intrinsics.txt")
+    stated, said = _stated(folder, "camera-intrinsics.txt", folder.parent)
     return _Layout(
         pairs,
         1000.0,
         stated or _KINECT_SEVEN_SCENES,
         poses,
         _KINECT_SEVEN_SCENES_COLOUR,
-        assumed=clock.assumed,
-        usual="" if stated else _usual(_KINECT_SEVEN_SCENES, "7-Scenes"),
+        assumed=clock.assumed + said,
+        usual="" if stated else _usual(_KINECT_SEVEN_SCENES),
     )
 
 
-def _tum(folder: Path) -> _Layout:
-    colour, depth = (_read_file_list(folder, name) for name in ("rgb.txt", "depth.txt"))
-    depth_stamps = sorted(depth)
-    pairs = []
-    for stamp in sorted(colour):
-        nearest = _nearest(depth_stamps, stamp)
-        if nearest is not None and abs(nearest - stamp) <= _PAIRING_NS and _nearest(sorted(colour), nearest) == stamp:
-            pairs.append(StampedPair(stamp, colour[stamp], depth[nearest]))
-    if not pairs:
-        raise ValueError(f"{folder}: no depth image has a colour image within {_PAIRING_NS / 1e6:.0f} ms")
+def _tum(folder: Path, rate: float | None) -> _Layout:
+    pairs, left_out = read_pairs(folder, rate)
     truth = folder / "groundtruth.txt"
-    left_out = Counter(
-        {
-            "pictures without depth near in time": len(colour) - len(pairs),
-            "depth images without a picture near in time": len(depth) - len(pairs),
-        }
-    )
     poses = _read_tum(truth) if truth.exists() else []
-    return _Layout(pairs, 5000.0, _KINECT_TUM, poses, left_out=left_out, usual=_usual(_KINECT_TUM, "TUM RGB-D"))
-
-
-def _nearest(stamps: list[int], stamp: int) -> int | None:
-    """The one of sorted stamps that is nearest in time."""
-    after = bisect.bisect_left(stamps, stamp)
-    return min(stamps[max(after - 1, 0) : after + 1], key=lambda s: abs(s - stamp), default=None)
+    if rate is not None:
+        left_out["poses, as the stamps of the frames are not those of the recording"] = len(poses)
+        poses = []
+    camera, (stated, said) = camera_of(folder), _stated(folder, "camera-intrinsics.txt", folder.parent)
+    usual = _usual(camera.intrinsics, f"TUM RGB-D publishes for {camera.name}" if camera.name else "")
+    return _Layout(
+        pairs,
+        5000.0,
+        stated or camera.intrinsics,
+        poses,
+        left_out=left_out,
+        assumed=said,
+        usual="" if stated else usual,
+        distortion=() if stated else camera.distortion,
+    )
 
 
 def _plain(folder: Path, clock: Clock) -> _Layout:
@@ -211,9 +206,9 @@ def _plain(folder: Path, clock: Clock) -> _Layout:
         for stamp, p in zip(clock.stamps_ns(len(depths)), depths, strict=True)
     ]
     pose_file = folder / "pose.txt"
-    rows = np.loadtxt(pose_file, ndmin=2) if pose_file.exists() else np.empty((0, 7))
+    rows = np.loadtxt(read_text(pose_file).splitlines(), ndmin=2) if pose_file.exists() else np.empty((0, 7))
     poses = [(pair.stamp_ns, transform_from_pose7(row)) for pair, row in zip(pairs, rows, strict=False)]
-    return _Layout(pairs, 1000.0, _stated(folder / "K.txt"), poses, assumed=clock.assumed)
+    return _Layout(pairs, 1000.0, _stated(folder, "K.txt")[0], poses, assumed=clock.assumed)
 
 
 def _numbered(folder: Path, clock: Clock) -> _Layout:
@@ -225,7 +220,11 @@ def _numbered(folder: Path, clock: Clock) -> _Layout:
     if not pairs:
         raise ValueError(f"{folder}: no picture of images/ has a depth image of the same name in depth/")
     pose_file = folder / "poses.txt"
-    rows = np.loadtxt(pose_file, ndmin=2).reshape(-1, 4, 4) if pose_file.exists() else np.empty((0, 4, 4))
+    rows = (
+        np.loadtxt(read_text(pose_file).splitlines(), ndmin=2).reshape(-1, 4, 4)
+        if pose_file.exists()
+        else np.empty((0, 4, 4))
+    )
     usable = [(stamp, T) for stamp, T in zip(stamps, rows, strict=False) if np.isfinite(T).all()]
     left_out = Counter(
         {
@@ -234,13 +233,7 @@ def _numbered(folder: Path, clock: Clock) -> _Layout:
         }
     )
     poses = [(s, _rigid(T)) for s, T in usable]
-    return _Layout(pairs, 1000.0, _stated(folder / "K.txt"), poses, left_out=left_out, assumed=clock.assumed)
-
-
-def _read_file_list(folder: Path, name: str) -> dict[int, Path]:
-    lines = existing(folder / name, "file list").read_text().splitlines()
-    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
-    return {int(Decimal(row[0]) * 10**9): folder / row[1] for row in rows}
+    return _Layout(pairs, 1000.0, _stated(folder, "K.txt")[0], poses, left_out=left_out, assumed=clock.assumed)
 
 
 def _read_tum(path: Path) -> list[tuple[int, FloatArray]]:
@@ -249,7 +242,7 @@ def _read_tum(path: Path) -> list[tuple[int, FloatArray]]:
 
 
 def _read_matrix(path: Path) -> FloatArray:
-    T = np.loadtxt(path)
+    T = np.loadtxt(read_text(path).splitlines())
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise ValueError(f"{path} holds no finite 4x4 pose")
     return _rigid(T)
@@ -261,17 +254,23 @@ def _rigid(T: FloatArray) -> FloatArray:
     return make_transform(U @ Vt, T[:3, 3])
 
 
-def _usual(intrinsics: Intrinsics, name: str) -> str:
+def _usual(intrinsics: Intrinsics, published: str = "") -> str:
     fx, fy, cx, cy = intrinsics
-    return f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}, as {name} gives for all its cameras (--calibration FILE)"
+    whose = f"as {published}" if published else "usual values, as nothing names the camera"
+    return f"fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}: {whose} (--calibration FILE)"
 
 
-def _stated(path: Path) -> Intrinsics | None:
-    return _read_camera_matrix(path) if path.exists() else None
+def _stated(folder: Path, name: str, above: Path | None = None) -> tuple[Intrinsics | None, list[str]]:
+    """Intrinsics of the file ``name`` of a folder, or of the one ``above``, which is then said."""
+    if (folder / name).exists():
+        return _read_camera_matrix(folder / name), []
+    if above is not None and (above / name).exists():
+        return _read_camera_matrix(above / name), [f"the camera matrix of {above / name}, a folder above the images"]
+    return None, []
 
 
 def _read_camera_matrix(path: Path) -> Intrinsics:
-    K = np.loadtxt(path)
+    K = np.loadtxt(read_text(path).splitlines())
     if K.shape != (3, 3):
         raise ValueError(f"{path} holds no 3x3 camera matrix, found {K.shape}")
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
