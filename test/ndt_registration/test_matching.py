@@ -40,7 +40,7 @@ def test_a_plane_holds_points_along_itself_by_the_errors_of_its_normals(rng: np.
     for _ in range(8):
         layer = noisy_layer(rng)
         there = ndt_align((layer,), np.eye(3), np.zeros(3), np.zeros(6), 1.0, 0, 0.0)
-        fit = fit_to_grid(layer.points, np.eye(3), np.zeros(3), layer.grid, 0.3)
+        fit = fit_to_grid(layer.points, np.eye(3), np.zeros(3), layer.grid, layer.grid, 0.3)
         spurious += np.stack([fit.spurious_hessian, fit.spurious_majorant])
         curvature += np.stack([there.hessian, there.majorant])
     along = [0, 1, 5]  # both translations, and the turn about the normal

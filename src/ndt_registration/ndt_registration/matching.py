@@ -58,21 +58,25 @@ def _hessian_of_weights(sums: FloatArray) -> FloatArray:
 
 
 @njit(cache=True, nogil=True)
-def fit_to_grid(points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGrid, max_distance: float) -> Fit:
+def fit_to_grid(
+    points: FloatArray, R: FloatArray, t: FloatArray, grid: NormalGrid, wider: NormalGrid, max_distance: float
+) -> Fit:
     """Fit of points (n, 3) at a pose.
 
-    A point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m of its plane.
+    A point is an inlier within 3 sigma of its nearest cell and ``max_distance`` m of its plane. Where the target is so
+    thin that the grid has no cell, that of the wider grid decides: no cell is no evidence that there is no surface.
     """
-    hessian_moments, majorant_moments = np.zeros(10), np.zeros(10)
-    room = np.empty((8 + _FIT_ROWS) * LANES, np.float32)
-    inliers, squares, cx, cy, cz, second = _sums_of_fit(
-        points, R, t, grid, max_distance, no_neighbours(1), room, hessian_moments, majorant_moments
-    )
-    centre = np.array([cx, cy, cz]) / max(inliers, 1)
-    radius = np.sqrt(max(second / max(inliers, 1) - (centre * centre).sum(), 1e-12))
+    hessian_moments, majorant_moments, unused = np.zeros(10), np.zeros(10), np.zeros(10)
+    room, sums, bare = np.empty((8 + _FIT_ROWS) * LANES, np.float32), np.zeros(6), np.empty(points.shape[0], np.bool_)
+    _add_fits(points, R, t, grid, max_distance, no_neighbours(1), room, hessian_moments, majorant_moments, sums, bare)
+    rest = points[bare]
+    _add_fits(rest, R, t, wider, max_distance, no_neighbours(1), room, unused, unused, sums, bare)
+    inliers = max(sums[0], 1.0)
+    centre = sums[2:5] / inliers
+    radius = np.sqrt(max(sums[5] / inliers - (centre * centre).sum(), 1e-12))
     return Fit(
-        inliers / max(points.shape[0], 1),
-        np.sqrt(squares / max(inliers, 1)),
+        sums[0] / max(points.shape[0], 1),
+        np.sqrt(sums[1] / inliers),
         centre,
         radius,
         _hessian_of_weights(hessian_moments),
@@ -133,14 +137,11 @@ def _add_moments(p, weights, row, moments):  # type: ignore[no-untyped-def]
 
 
 @in_place()
-def _sums_of_fit(points, R, t, grid, max_distance, at, room, hessian_moments, majorant_moments):  # type: ignore[no-untyped-def]
-    """Number of inliers, the sum of their squared distances, of their coordinates (three) and of these squared.
+def _add_fits(points, R, t, grid, max_distance, at, room, hessian_moments, majorant_moments, sums, bare):  # type: ignore[no-untyped-def]
+    """Add to ``sums`` (6,) of the inliers: number, squared distances, coordinates (three) and these squared.
 
-    Adds to the moments (10,) of both weights.
+    Adds to the moments (10,) of both weights; ``bare`` (n,) tells the points around which there is no cell.
     """
-    inliers = 0
-    squares = 0.0
-    cx = cy = cz = second = 0.0
     for group in range(groups_of(points.shape[0])):
         count = gather(points, group, grid, R, t, at, -group)
         for j in range(LANES):
@@ -152,18 +153,18 @@ def _sums_of_fit(points, R, t, grid, max_distance, at, room, hessian_moments, ma
         _add_moments(at.turned, room, 9, majorant_moments)
         _add_moments(at.turned, room, 10, hessian_moments)
         for j in range(count):
+            bare[group * LANES + j] = at.block[j, 3] < 0
             if not room[11 * LANES + j] < _MATCHED:
                 continue
             px, py, pz = at.turned[j], at.turned[LANES + j], at.turned[2 * LANES + j]
             distance = _distance(grid, grid.cells[at.block[j, 3], int(room[12 * LANES + j])], px, py, pz, t)
             if distance < max_distance:
-                inliers += 1
-                squares += distance * distance
-                cx += px
-                cy += py
-                cz += pz
-                second += px * px + py * py + pz * pz
-    return inliers, squares, cx, cy, cz, second
+                sums[0] += 1.0
+                sums[1] += distance * distance
+                sums[2] += px
+                sums[3] += py
+                sums[4] += pz
+                sums[5] += px * px + py * py + pz * pz
 
 
 @in_place()

@@ -11,8 +11,10 @@ from ndt_registration.ndt import Layer
 from ndt_registration.voxel_grid import NormalGrid, adopt_planes, normal_grid, note_spurious_information
 from slam_core.config import Config, parameter
 
-_BLOCK_POINTS = 1.2
-"""Mean points per eighth of a cell; sparser clouds get larger cells."""
+_LEAST_COVERAGE = 0.5
+"""Share of the places of a cloud's points in the finest cells that hold enough of them; sparser clouds get larger cells."""
+_WIDEST = 0.25
+"""Cells this wide, over the scale, are not made wider for that."""
 _EIGENVALUE_FLOOR = 1e-3
 """Least eigenvalue over the largest (8.2.1)."""
 _SURFACE_LEVELS = 2
@@ -61,15 +63,16 @@ class Pyramid:
         """Grids of a cloud: one pass over its points, then every level from the one below."""
         edge = config.voxel_size or config.relative_voxel_size * cloud.scale
         surfaces = block_moments(cloud.points, 0.5 * edge)
-        while not config.voxel_size and edge < 0.25 * cloud.scale and surfaces.counts.mean() < _BLOCK_POINTS:
+        finest = _surface_grid(surfaces, edge, 0, config)
+        while not config.voxel_size and edge < _WIDEST * cloud.scale and _coverage(finest, cloud) < _LEAST_COVERAGE:
             surfaces, edge = coarser(surfaces), 2.0 * edge
+            finest = _surface_grid(surfaces, edge, 0, config)
         rims = block_moments(cloud.rims, 0.5 * _RIM_RATIO * edge)
-        surface_grids, rim_grids = [], []
-        for level in range(config.levels):
-            size = edge * 2**level
-            surface_grids.append(_surface_grid(surfaces, size, level, config))
-            rim_grids.append(_rim_grid(rims, _RIM_RATIO * size, level))
+        surface_grids, rim_grids = [finest], [_rim_grid(rims, _RIM_RATIO * edge, 0)]
+        for level in range(1, config.levels):
             surfaces, rims = coarser(surfaces), coarser(rims)
+            surface_grids.append(_surface_grid(surfaces, edge * 2**level, level, config))
+            rim_grids.append(_rim_grid(rims, _RIM_RATIO * edge * 2**level, level))
         if not cloud.planar:  # where all lies in the plane, its normal is every cell's
             for level in range(config.levels - 2, -1, -1):
                 slack = _SLACK if level < _SURFACE_LEVELS else -1.0
@@ -90,6 +93,11 @@ class Pyramid:
 
 _FEW_RIMS = 30
 """Fewer rim points than this do not get the full weight of the rims."""
+
+
+def _coverage(grid: NormalGrid, cloud: Cloud) -> float:
+    """Share of the cells around the points of a cloud, eight each, that are in the grid, as it was made."""
+    return float(grid.counts.sum() / max(8 * len(cloud), 1))
 
 
 def _surface_grid(moments: Moments, size: float, level: int, config: GridConfig) -> NormalGrid:

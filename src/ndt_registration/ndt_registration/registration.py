@@ -302,8 +302,9 @@ def _result(
     config: RegistrationConfig,
 ) -> RegistrationResult:
     scale = max(target.cloud.scale, 1e-6)
-    grid = target.pyramid.grids[0]
-    fit = fit_to_grid(source.points, optimum.rotation, optimum.translation, grid, 3.0 * grid.block_size)
+    grids = target.pyramid.grids
+    wider, limit = grids[min(1, len(grids) - 1)], 3.0 * grids[0].block_size
+    fit = fit_to_grid(source.points, optimum.rotation, optimum.translation, grids[0], wider, limit)
     layers = target.pyramid.layers(source, 0, len(source), config.rim_share)
     gradients = [block_gradients(layer, optimum.rotation, optimum.translation) for layer in layers]
     uncertainty = sandwich(
