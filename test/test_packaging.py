@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -59,3 +61,44 @@ def test_setup_installs_files_by_their_ending(package: str) -> None:
     """A pattern that takes all takes a folder of compiled modules too, with which the next build fails."""
     patterns = re.findall(r'glob\("([^"]*)"\)', (SRC / package / "setup.py").read_text())
     assert not [pattern for pattern in patterns if pattern.endswith("*")]
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Path:
+    """What a wheel and a colcon install hold of the packages that bring data."""
+    folder = tmp_path_factory.mktemp("installed")
+    for package in ("slam_simulation", "slam_bringup"):
+        build = [sys.executable, "setup.py", "-q", "build_py", "-d", str(folder)]
+        subprocess.run(build, cwd=SRC / package, check=True, capture_output=True, timeout=120)
+    return folder
+
+
+def test_scenarios_bounds_and_demo_bag_are_installed(installed):
+    for link, source in (
+        ("slam_simulation/scenarios", "scenarios"),
+        ("slam_simulation/expected.yaml", "expected.yaml"),
+        ("slam_bringup/demo", "demo"),
+    ):
+        there, here = installed / link, SRC.parent / "bags" / source
+        assert not there.is_symlink()
+        for path in [here] if here.is_file() else sorted(here.iterdir()):
+            copy = there if here.is_file() else there / path.name
+            assert copy.read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("simulate", "nonsense", "-o", "bag"), 2, "known: conference, demo"),
+        (("simulate", "demo", "-o", "bag", "--frames", "1"), 0, ""),
+        (("experiment", "planar", "--quick", "-o", "page"), 0, "written to"),
+        (("demo", "--help"), 0, "--view"),
+    ],
+)
+def test_installed_commands_run_in_an_empty_folder(installed, tmp_path, arguments, code, said):
+    others = (str(SRC / package) for package in PACKAGES if not (installed / package).is_dir())
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(installed), *others))}
+    command = [sys.executable, "-m", "slam_bringup.cli", *arguments]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == code, done.stderr
+    assert said in " ".join((done.stdout + done.stderr).split())

@@ -11,7 +11,7 @@ setup(
     name=PACKAGE,
     version="0.2.0",
     packages=find_packages(),
-    package_data={"": ["py.typed", "*.j2"]},
+    package_data={"": ["py.typed", "*.j2", "demo/*.mcap", "demo/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -9,7 +9,7 @@ setup(
     name=PACKAGE,
     version="0.2.0",
     packages=find_packages(),
-    package_data={"": ["py.typed"]},
+    package_data={"": ["py.typed", "scenarios/*.yaml", "expected.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -22,6 +22,7 @@ use_one_blas_thread()
 COMMANDS = {
     "run": "offline pipeline: a bag to a map and a trajectory",
     "nodes": "the same through the real ROS nodes: starts them, plays the bag, records",
+    "demo": "the demo: the real nodes, in one process, on the bag that comes with the program",
     "live": "map live: all nodes in one process, on a camera or on topics",
     "simulate": "render a scenario to a bag with ground truth",
     "convert": "a public data set (EuRoC, KITTI, RGB-D) to a bag",

@@ -112,8 +112,7 @@ class OutputFolder:
     ) -> None:
         remove(self._staging)
         logs = [p for p in self._logs.glob("*") if p.is_file()] if self._logs.is_dir() else []
-        if kind is not None and self._made_here and not logs:
-            _remove_if_empty(self.path)
+        if kind is not None and self._made_here and not logs and _remove_if_empty(self.path):
             return
         self._write(self._manifest.files | {f"{LOGS}/{log.name}": [] for log in logs if log.suffix == ".log"})
 
@@ -244,12 +243,16 @@ def _unlink(folder: Path, name: str) -> None:
         parent.rmdir()
 
 
-def _remove_if_empty(folder: Path) -> None:
-    """Remove a folder in which nothing but our own list is."""
+def _remove_if_empty(folder: Path) -> bool:
+    """Remove a folder in which nothing but our own list is; False where there is more, which stays with the list."""
+    logs = folder / LOGS
+    if logs.is_dir() and not any(logs.iterdir()):
+        logs.rmdir()
+    if any(path.name != MANIFEST for path in folder.iterdir()):
+        return False
     (folder / MANIFEST).unlink(missing_ok=True)
-    for empty in (folder / LOGS, folder):
-        if empty.is_dir() and not any(empty.iterdir()):
-            empty.rmdir()
+    folder.rmdir()
+    return True
 
 
 def _is_running(pid: str) -> bool:

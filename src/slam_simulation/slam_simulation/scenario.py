@@ -40,7 +40,8 @@ from slam_simulation.world import World
 
 SENSORS = ("stereo", "tof", "imu")
 _SUITE = (*SENSORS, "realism")
-SCENARIO_FOLDERS = (FilePath("bags/scenarios"), FilePath(__file__).resolve().parents[4] / "bags/scenarios")
+SCENARIOS = FilePath(__file__).with_name("scenarios")
+"""``bags/scenarios`` of the sources, installed with the package."""
 
 
 @dataclass(frozen=True)
@@ -236,8 +237,8 @@ def _find(name_or_path: str | FilePath) -> FilePath:
         if path.is_file():
             return path
         raise ValueError(f"no scenario file {path}")
-    for folder in SCENARIO_FOLDERS:
-        if (folder / f"{name_or_path}.yaml").is_file():
-            return folder / f"{name_or_path}.yaml"
-    known = sorted({p.stem for folder in SCENARIO_FOLDERS for p in folder.glob("*.yaml")})
-    raise ValueError(f"unknown scenario '{name_or_path}', known: {', '.join(known)}")
+    known = {p.stem: p for p in sorted(SCENARIOS.glob("*.yaml"))}
+    if str(name_or_path) in known:
+        return known[str(name_or_path)]
+    names = ", ".join(known) or f"none, {SCENARIOS} is missing: install slam_simulation again from a whole clone"
+    raise ValueError(f"unknown scenario '{name_or_path}', known: {names}")

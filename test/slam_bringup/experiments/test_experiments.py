@@ -99,6 +99,23 @@ def test_a_folder_of_others_is_refused(tmp_path):
     assert (tmp_path / "experiments.html").read_text() == "mine"
 
 
+def test_a_run_that_failed_is_gone_on_with(tmp_path, monkeypatch):
+    """What was computed stays in the cache, and the folder stays ours."""
+
+    def fail(*_):
+        raise ValueError("no more")
+
+    out = tmp_path / "out"
+    with monkeypatch.context() as patched:
+        patched.setattr("slam_bringup.commands.experiment.write_page", fail)
+        with pytest.raises(ValueError, match="no more"):
+            CliRunner().invoke(slam, ["experiment", "planar", "-o", str(out), "--quick"], catch_exceptions=False)
+    assert {p.name for p in out.iterdir()} == {".slam.json", "cache"}
+    result = CliRunner().invoke(slam, ["experiment", "planar", "-o", str(out), "--quick"], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert (out / "experiments.html").exists()
+
+
 def test_an_unmet_mark_is_said(planar_run, tmp_path):
     out, (entry,) = planar_run
     failed = {**entry, "quick": False, "comparisons": [{**entry["comparisons"][0], "met": False}]}

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam_bringup.experiments.job import Job, execute, in_order, load
+import slam_simulation
+from slam_bringup.experiments.job import Job, _files_of, execute, in_order, load
 from slam_bringup.experiments.runner import run_jobs
 
 HERE = "slam_bringup.experiments.planar"
@@ -42,6 +43,12 @@ def test_the_name_follows_the_source(monkeypatch):
     true_source = job._source_of
     monkeypatch.setattr(job, "_source_of", lambda name: true_source(name) + ("changed" if name == "slam_core" else ""))
     assert drive().digest != before
+
+
+def test_the_name_follows_the_scenarios():
+    """They lie behind a link, which Path.rglob does not follow."""
+    files = _files_of(Path(slam_simulation.__file__).parent)
+    assert {"demo.yaml", "scenario.py"} <= {path.name for path in files}
 
 
 def test_an_unknown_package_is_named():

@@ -22,7 +22,7 @@ from slam_core.files import atomic_text
 from slam_core.output_folder import OutputFolder
 
 
-@click.command(epilog="Experiments: " + ", ".join(EXPERIMENTS))
+@click.command(epilog="\b\nExperiments:\n" + "\n".join(f"  {e.name:18}{e.title}" for e in EXPERIMENTS.values()))
 @click.argument("names", nargs=-1, required=True, metavar="NAME...|all")
 @click.option("-o", "--output", metavar="OUT", required=True, type=UserPath(file_okay=False), help="folder to write")
 @click.option("--quick", is_flag=True, help="short runs that show that everything works; held to no mark")

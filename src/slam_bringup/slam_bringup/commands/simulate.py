@@ -88,7 +88,7 @@ def command(
     scenario: str, output: Path, every: int, frames: int | None, seed: int | None, profile: str | None, storage: str,
     images: str, compact: bool, rectified: bool, truth: bool, threads: int | None, overwrite: bool,
 ) -> None:  # fmt: skip
-    """Render SCENARIO (a YAML file, or a name of bags/scenarios) to a bag with ground truth."""
+    """Render SCENARIO (a YAML file, or the name of one in bags/scenarios) to a bag with ground truth."""
     require_free(output, overwrite=overwrite)
     plan = Scenario.load(scenario)
     plan = plan.with_profile(profile or plan.profile or "real")

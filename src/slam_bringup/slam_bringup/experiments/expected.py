@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from slam_simulation.scenario import SCENARIO_FOLDERS
+from slam_simulation.scenario import SCENARIOS
 
 _KEYS = {"mode", "ate_mm", "end_mm", "anees", "lost"}
 
@@ -19,12 +19,11 @@ def expected() -> dict[str, dict[str, Any]]:
     Raises
     ------
     ValueError
-        If the file is missing, or names something that is no bound.
+        If the file names something that is no bound.
+    OSError
+        If the file is missing.
     """
-    candidates = [folder.parent / "expected.yaml" for folder in SCENARIO_FOLDERS]
-    path = next((p for p in candidates if p.exists()), None)
-    if path is None:
-        raise ValueError(f"no bags/expected.yaml at {' or '.join(str(p) for p in candidates)}")
+    path = SCENARIOS.with_name("expected.yaml")
     bounds: dict[str, dict[str, Any]] = yaml.safe_load(path.read_text(encoding="utf-8"))
     for name, values in bounds.items():
         if set(values) != _KEYS:

@@ -22,6 +22,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -131,8 +132,13 @@ def _source_of(package: str) -> str:
     if spec is None or spec.origin is None:
         raise ValueError(f"there is no package {package}")
     origin = Path(spec.origin)
-    files = sorted(origin.parent.rglob("*.py")) if origin.name == "__init__.py" else [origin]
+    files = sorted(_files_of(origin.parent)) if origin.name == "__init__.py" else [origin]
     digest = hashlib.sha256()
     for path in files:
         digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
+
+
+def _files_of(folder: Path) -> list[Path]:
+    """Source and scenarios of a package; unlike :meth:`Path.rglob`, glob follows links to folders."""
+    return [Path(name) for ending in ("py", "yaml") for name in glob(f"{folder}/**/*.{ending}", recursive=True)]
