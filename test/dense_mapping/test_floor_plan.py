@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -41,9 +43,11 @@ FLAT = {
 }
 
 
-def flat_model(stations: list[tuple[float, float]], tilt: np.ndarray | None = None) -> DenseModel:
+def flat_model(
+    stations: list[tuple[float, float]], tilt: np.ndarray | None = None, flat: dict[str, Any] = FLAT
+) -> DenseModel:
     """A model from full turns at some places; the whole map tilted by a rotation vector."""
-    table, rays = compile_world(Scenario.from_mapping("flat", FLAT).world()), camera_rays(CAMERA)
+    table, rays = compile_world(Scenario.from_mapping("flat", flat).world()), camera_rays(CAMERA)
     T_map_world = make_transform(so3_exp(np.zeros(3) if tilt is None else tilt), np.zeros(3))
     model = DenseModel()
     for x, y in stations:
@@ -81,6 +85,28 @@ def test_walls_are_occupied_rooms_and_the_door_free_and_outside_unknown(both_roo
     assert OCCUPIED in near_wall
     assert plan.cells[0, 0] == UNKNOWN
     assert 12.0 < plan.free_m2 < 23.4, "23.4 m2 is both rooms without furniture"
+
+
+def test_the_walls_of_an_unsymmetrical_flat_stand_where_they_were_built_and_nothing_is_mirrored():
+    """Room b reaches 2 m further along y, and its door is not in the middle: no turn or mirror image of it fits."""
+    rooms = [{**FLAT["rooms"][0]}, {**FLAT["rooms"][1], "x": [4.2, 6.2], "y": [1, 5]}]
+    flat = FLAT | {"rooms": rooms, "doorways": [{"at": [4.1, 2.2], "width": 1.0}]}
+    plan = plan_of(flat_model([(1.5, 1.5), (3.0, 2.2), (4.1, 2.2), (5.2, 2.2), (5.2, 3.8)], flat=flat))
+    seen = {}
+    for room in rooms:
+        (x0, x1), (y0, y1) = room["x"], room["y"]
+        along_x, along_y = np.arange(x0 + 0.3, x1 - 0.3, 0.05), np.arange(y0 + 0.3, y1 - 0.3, 0.05)
+        for name, wall in {
+            "south": [(x, y0, 0.0) for x in along_x], "north": [(x, y1, 0.0) for x in along_x],
+            "west": [(x0, y, 0.0) for y in along_y], "east": [(x1, y, 0.0) for y in along_y],
+        }.items():  # fmt: skip
+            at_door = [abs(x - 4.1) < 0.3 and abs(y - 2.2) < 0.6 for x, y, _ in wall]
+            rows, columns = plan.cell_of(np.array([p for p, out in zip(wall, at_door, strict=True) if not out])).T
+            around = [plan.cells[r - 1 : r + 2, c - 1 : c + 2] for r, c in zip(rows, columns, strict=True)]
+            seen[room["name"], name] = np.mean([OCCUPIED in cells for cells in around])
+    assert min(seen.values()) > 0.9, seen
+    assert value_at(plan, (1.5, 1.5, 0), (5.2, 4.2, 0), (4.1, 2.2, 0)) == [FREE] * 3
+    assert value_at(plan, (1.5, 4.2, 0), (5.2, 0.6, 0)) == [UNKNOWN] * 2, "beside the rooms there is nothing"
 
 
 def test_a_room_nobody_entered_is_a_frontier_at_its_door():

@@ -23,10 +23,10 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from sjsam_node.global_map import GlobalMap, JoinReport  # noqa: E402
 from sjsam_node.node import SjsamNode  # noqa: E402
-from slam_core.geometry import boxminus  # noqa: E402
-from slam_core.messages import SUBMAP_TOPICS, path_from_message, submap_messages  # noqa: E402
+from slam_core.geometry import boxminus, make_transform, rotation_from_euler, transform_from_pose7  # noqa: E402
+from slam_core.messages import SUBMAP_TOPICS, odometry_message, path_from_message, submap_messages  # noqa: E402
 from slam_core.ros import RosTypes, sensor_qos  # noqa: E402
-from slam_core.types import Submap  # noqa: E402
+from slam_core.types import PoseEstimate, Submap  # noqa: E402
 
 
 class Bench:
@@ -128,6 +128,28 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
     assert len(bench.node.global_map.graph.records) == 0
     assert bench.call("load_map").success
     assert len(bench.node.global_map.graph.records) == len(submaps)
+
+
+def test_map_to_odom_leads_from_odometry_to_where_the_rig_is_in_the_map(bench: Bench, submaps: list[Submap]) -> None:
+    """The odometry's origin is turned by a quarter and 5 m away: an inverse or an identity would be far off."""
+    T_odom_map = make_transform(rotation_from_euler(np.pi / 2), np.array([5.0, -3.0, 0.5]))
+    offline, _ = join(submaps)
+    bench.listen("map_to_odom", "TransformStamped")
+    bench.listen("pose", "PoseWithCovarianceStamped")
+    publisher = bench.publisher("odom", "Odometry")
+    for pose in offline.trajectory(""):
+        in_odom = PoseEstimate(pose.stamp_ns, T_odom_map @ pose.T, 1e-6 * np.eye(6))
+        publisher.publish(odometry_message(bench.types, "odom", "base_link", in_odom))
+        bench.spin_until(lambda: False, 0.01)
+    bench.send(submaps)
+    assert bench.spin_until(lambda: bench.counters["submaps joined"] == len(submaps))
+    heard = len(bench.received["map_to_odom"])
+    assert bench.spin_until(lambda: len(bench.received["map_to_odom"]) > heard + 2)
+    sent = bench.received["map_to_odom"][-1]
+    t, q = sent.transform.translation, sent.transform.rotation
+    T_map_odom = transform_from_pose7(np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w]))
+    end = offline.end_pose("").T
+    assert np.abs(boxminus(T_map_odom @ T_odom_map @ end, end)).max() < 0.05
 
 
 def test_a_submap_that_did_not_arrive_is_asked_for_again_and_then_told(bench: Bench, rng: np.random.Generator) -> None:

@@ -36,7 +36,7 @@ class Autosave:
         self.path = path
         self.ended = path.with_name(f"{path.name}.ended")
         self._period_s = period_s
-        self._lock = PathLock(path) if self.is_on else None
+        self._lock = _lock(path) if self.is_on else None
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="autosave")
         self._job: Future[float] | None = None
         self._due_s = 0.0
@@ -87,3 +87,10 @@ class Autosave:
         self._writer.shutdown()
         if self._lock is not None:
             self._lock.release()
+
+
+def _lock(path: Path) -> PathLock:
+    try:
+        return PathLock(path)
+    except ValueError as error:
+        raise ValueError(f"{error}: set autosave_path to another place, or autosave_period_s to 0 for none") from None

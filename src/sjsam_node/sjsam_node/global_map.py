@@ -38,6 +38,12 @@ from slam_core.types import Counters, PoseEstimate, Submap
 
 ALREADY_JOINED = "already joined"
 
+ADVICE = (
+    "Poses are as much less certain. Most often the calibration does not fit: slam doctor BAG tells; slam calibrate "
+    "refine BAG corrects that of a stereo pair, --odometry ndt helps a depth camera"
+)
+"""What a user can do whose submaps contradict each other."""
+
 _PASSES = 2
 """Times that settling looks for closures, and lets go what the map contradicts: one finding lets another follow."""
 
@@ -299,7 +305,7 @@ class GlobalMap:
         tied = {i for k in self.graph.links if not k.is_closure for i in k.ends}
         alone = sum(i not in tied for i in strained.tolist())
         return (f"submaps contradict each other {self.graph.doubt.max():.0f} times more than they claim: "
-                f"{alone} of {len(self.graph.records)} are chained as the filter made them")  # fmt: skip
+                f"{alone} of {len(self.graph.records)} are chained as the filter made them. {ADVICE}")  # fmt: skip
 
     def centrally(self) -> GlobalMap:
         """The settled map that does not depend on who came first: all submaps joined in the order of their stamps.

@@ -19,7 +19,7 @@ from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
 from sjsam_node.autosave import Autosave
-from sjsam_node.global_map import ALREADY_JOINED, GlobalMap
+from sjsam_node.global_map import ADVICE, ALREADY_JOINED, GlobalMap
 from sjsam_node.joiner_stage import result_of
 from sjsam_node.live_map import Joined, LiveMap
 from sjsam_node.localization import Localization
@@ -108,13 +108,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         return self.map.global_map
 
     def _make_autosave(self) -> Autosave:
-        period_s = 0.0 if self.config.localize_only else self.config.autosave_period_s
-        try:
-            return Autosave(copy_path(self.config, self.get_namespace()), period_s)
-        except ValueError as error:
-            raise ValueError(
-                f"{error}: set autosave_path to another place, or autosave_period_s to 0 for none"
-            ) from None
+        path = copy_path(self.config, self.get_namespace())
+        return Autosave(path, 0.0 if self.config.localize_only else self.config.autosave_period_s)
 
     def _go_on_from_last_time(self) -> None:
         """The map of a node that was killed, or the one to begin with or to localise in."""
@@ -282,6 +277,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         reasons = [f"{report.components} separate parts"] if report.components > 1 else []
         if report.is_strained:
             reasons.append(f"submaps contradict each other {report.variance_factor:.0f} times more than they claim")
+            self.get_logger().warning(f"{reasons[-1]}. {ADVICE}", once=True)
         self.health.set(State.DEGRADED if reasons else State.OK, ", ".join(reasons))
 
     # -- services ------------------------------------------------------------------------------------------------------

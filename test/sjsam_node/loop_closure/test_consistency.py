@@ -17,6 +17,7 @@ from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.association import match
 from sjsam_node.loop_closure.consistency import Consistency, Verdict
 from sjsam_node.loop_closure.point_sets import at_start
+from sjsam_node.loop_closure.verification import ClosureConfig
 from sjsam_node.smoothing.smoother import Smoother, UpdateResult
 from slam_core.geometry import boxminus, invert_transform
 from slam_core.types import Submap
@@ -96,6 +97,19 @@ def test_a_false_closure_on_trial_is_refused_and_leaves_no_trace(agent: Agent) -
     assert np.abs(boxminus(joined.graph.poses[-1], before[-1])).max() < 1e-6
 
 
+def test_a_false_closure_that_odometry_does_not_rule_out_is_refused_by_the_map(agent: Agent) -> None:
+    """With so much drift to expect, odometry lets it pass: what refuses it is that chi2 of the map rises."""
+    submaps = agent.submaps()
+    joined, _ = join(submaps, GlobalMap(GlobalMapConfig(closure=ClosureConfig(drift=0.05, drift_angle=0.05))))
+    before, links = joined.graph.poses.copy(), len(joined.graph.links)
+    false = false_link(joined, agent)
+    assert not joined.consistency._are_against_odometry([false]).any()
+    _, verdict = joined.consistency.update([false], len(submaps) - 1)
+    assert not verdict.accepted
+    assert len(joined.graph.links) == links
+    assert np.abs(boxminus(joined.graph.poses[-1], before[-1])).max() < 1e-5
+
+
 def test_agents_joined_by_rooms_that_look_alike_are_told_apart_by_what_they_see_later(agent: Agent) -> None:
     """Nothing but what comes later can tell two such rooms apart."""
     path, sensor = agent.path, agent.sensor
@@ -165,6 +179,7 @@ def test_joining_submaps_that_contradict_each_other_is_not_worse_than_their_chai
     assert ate(e) < 1.05 * chain_ate(agent, submaps)
     assert nees.mean() / 6.0 < 2.0, "and says so"
     assert f"{len(submaps)} of {len(submaps)} are chained" in joined.doubt
+    assert "slam calibrate refine" in joined.doubt, "and says what to do"
     loaded = GlobalMap.load(tmp_path / "map")
     assert loaded.doubt == joined.doubt
     assert np.array_equal(errors(loaded, agent)[1], nees)

@@ -7,9 +7,9 @@ import bisect
 import re
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,8 @@ _FASTEST_NS = 1_000_000
 _NAME = re.compile(r"freiburg([123])")
 
 
-class TumCamera(NamedTuple):
+@dataclass(frozen=True)
+class TumCamera:
     """fx, fy, cx, cy (px) and the distortion k1, k2, p1, p2, k3 of a recording; ``name``: whose they are, in words."""
 
     intrinsics: tuple[float, float, float, float]
