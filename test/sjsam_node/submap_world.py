@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from sjsam_node.loop_closure.association import PointSet
 from slam_core.geometry import (
     FloatArray,
     boxplus,
@@ -23,6 +24,7 @@ from slam_core.geometry import (
     make_transform,
     rotation_from_euler,
     skew,
+    transform_points,
 )
 from slam_core.types import PoseEstimate, Submap
 
@@ -167,6 +169,23 @@ class Agent:
             cross = J.T @ weight @ R.T
             information[pose, at] += cross
             information[at, pose] += cross.T
+
+
+def two_views(
+    rng: np.random.Generator, n: int = 25, sigma: float = 0.03
+) -> tuple[PointSet, PointSet, np.ndarray, np.ndarray]:
+    """The same landmarks in two frames with correlated noise, their descriptors noisy; T_first_second, true pairs."""
+    T = boxplus(np.eye(4), np.array([1.0, -0.5, 0.2, 0.1, -0.2, 0.7]))
+    points, order = rng.uniform(-3, 3, (n, 3)), rng.permutation(n)
+    looks = unit(rng.normal(size=(n, 128)))
+    sets = []
+    for frame, index in ((points, np.arange(n)), (transform_points(np.linalg.inv(T), points), order)):
+        root = sigma * (np.eye(3 * n) + 0.3 * rng.normal(size=(3 * n, 3 * n)) / np.sqrt(3 * n))
+        P = root @ root.T
+        seen = frame[index] + (root @ rng.normal(size=3 * n)).reshape(-1, 3)
+        descriptors = unit(looks[index] + 0.04 * rng.normal(size=(n, 128))).astype(np.float32)
+        sets.append(PointSet(seen, P, descriptors))
+    return sets[0], sets[1], T, np.stack([order, np.arange(n)], axis=1)
 
 
 def unit(v: FloatArray) -> FloatArray:

@@ -224,7 +224,8 @@ def test_an_agent_that_falls_silent_does_no_harm(rng: np.random.Generator) -> No
     last = joined.trajectory("a")[-1]
     _, reports = join(B[6:], joined)
     assert all(r.accepted for r in reports)
-    assert ate(errors(joined, b)[0]) < 0.15
+    assert joined.components == 1  # at the end of the ring it sees the place where the silent one began
+    assert ate(errors(joined, b, origin=a)[0]) < 0.15
     known = joined.trajectory("a")[-1]
     assert known.stamp_ns == last.stamp_ns
     assert np.all(np.isfinite(known.covariance))
@@ -236,7 +237,8 @@ def test_after_a_loss_the_new_stretch_is_tied_to_the_map_when_a_place_is_recogni
     submaps = agent.submaps()
     lost = [replace(s, follows_previous=False) if s.index == 12 else s for s in submaps]
     joined, reports = join(lost)
-    assert max(r.components for r in reports) == 2
+    assert joined.graph.records[12].start != joined.graph.records[11].end  # nothing but what it looks like ties it
+    assert reports[12].closures
     assert reports[-1].components == 1
     e, _ = errors(joined, agent)
     assert ate(e) < 0.15

@@ -2,7 +2,8 @@
 """Locates an agent in a map that is not to change: by an initial pose or a look at the surroundings, then tracking.
 
 A new submap is matched to the stored submaps around its predicted pose, or, without prediction, to those that look
-like it. Between matches its odometry carries the pose on, with growing covariance.
+like it, as far as chance would hardly make it look so. Between matches its odometry carries the pose on, with growing
+covariance.
 """
 
 from __future__ import annotations
@@ -58,12 +59,13 @@ class Localizer:
         """Pose of the submap's start from the stored submap that matches best; the prediction where none does."""
         seen = PointSet(submap.landmarks, submap.covariance[6:, 6:], submap.descriptors)
         best, most = self._pose, 0
+        verifier = self._map.detector.verifier
         for record in self._candidates(submap):
-            link, status = self._map.detector.verifier.verify(
-                at_start(self._map.graph.records[record]), seen, self._prior(record), 0.0, record
-            )
-            trusted = status is Status.CONSISTENT or self._pose is None
-            if link is not None and len(link.pairs) > most and trusted:
+            known = at_start(self._map.graph.records[record])
+            link, status = verifier.verify(known, seen, self._prior(record), 0.0, record)
+            if link is None or len(link.pairs) <= most:
+                continue
+            if status is Status.CONSISTENT or (self._pose is None and verifier.is_evident(known, seen, link)):
                 anchor = self._map.start_pose(record)
                 covariance = compose_covariance(anchor.T, anchor.covariance, link.T, link.covariance)
                 best, most = PoseEstimate(submap.start_stamp_ns, anchor.T @ link.T, covariance), len(link.pairs)

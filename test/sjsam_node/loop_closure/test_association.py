@@ -5,30 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from submap_world import Agent, circle, ring_world, unit
+from submap_world import Agent, circle, ring_world, two_views, unit
 
 from sjsam_node.graph.links import Prior
 from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.association import AssociationConfig, PointSet, match, mutual_best, variance_factor
 from sjsam_node.loop_closure.point_sets import at_end
 from slam_core.geometry import boxminus, boxplus, invert_transform, transform_points
-
-
-def two_views(
-    rng: np.random.Generator, n: int = 25, sigma: float = 0.03
-) -> tuple[PointSet, PointSet, np.ndarray, np.ndarray]:
-    """The same landmarks in two frames with correlated noise, their descriptors noisy; T_first_second, true pairs."""
-    T = boxplus(np.eye(4), np.array([1.0, -0.5, 0.2, 0.1, -0.2, 0.7]))
-    points, order = rng.uniform(-3, 3, (n, 3)), rng.permutation(n)
-    looks = unit(rng.normal(size=(n, 128)))
-    sets = []
-    for frame, index in ((points, np.arange(n)), (transform_points(np.linalg.inv(T), points), order)):
-        root = sigma * (np.eye(3 * n) + 0.3 * rng.normal(size=(3 * n, 3 * n)) / np.sqrt(3 * n))
-        P = root @ root.T
-        seen = frame[index] + (root @ rng.normal(size=3 * n)).reshape(-1, 3)
-        descriptors = unit(looks[index] + 0.04 * rng.normal(size=(n, 128))).astype(np.float32)
-        sets.append(PointSet(seen, P, descriptors))
-    return sets[0], sets[1], T, np.stack([order, np.arange(n)], axis=1)
 
 
 @pytest.mark.parametrize("method", ["nearest", "mahalanobis", "joint"])

@@ -94,7 +94,7 @@ def candidate_pairs(first: PointSet, second: PointSet, prior: Prior, config: Ass
         distance = np.linalg.norm(first.points[i] - seen[j], axis=1)
         inside = distance < config.nearest_gate
         return mutual_best(i[inside], j[inside], distance[inside])
-    own, other = first.variances() + config.position_noise**2 * np.eye(3), _variances_seen(second, prior)
+    own, other = first.variances() + config.position_noise**2 * np.eye(3), variances_seen(second, prior)
     return mutual_best(*_gated(alike, first.points, seen, own, other, chi_square_bound(config.probability, 3)))
 
 
@@ -124,7 +124,7 @@ def _gated(alike, first, second, own, other, bound):  # type: ignore[no-untyped-
     return i[:count], j[:count], score[:count]
 
 
-def _variances_seen(points: PointSet, prior: Prior) -> FloatArray:
+def variances_seen(points: PointSet, prior: Prior) -> FloatArray:
     """Covariance (n, 3, 3) of each landmark as the prior places it."""
     R = prior.T[:3, :3]
     seen = R @ points.variances() @ R.T
@@ -166,7 +166,7 @@ def jointly_compatible(
     sample = np.linspace(0, len(pairs) - 1, config.joint_pairs).astype(np.int64)
     found, scale = _compatible(first, second, pairs[sample], prior, config)
     others = np.delete(pairs, sample, axis=0)
-    nis = _nis_one_by_one(first, second, others, Prior(found.T, found.covariance), config)
+    nis = nis_one_by_one(first, second, others, Prior(found.T, found.covariance), config)
     fitting = others[nis <= scale * chi_square_bound(config.probability, 3)]
     kept = np.concatenate([found.pairs, fitting])
     return replace(found, pairs=kept[np.argsort(kept[:, 0], kind="stable")])
@@ -190,14 +190,14 @@ def _compatible(
         pairs = np.delete(pairs, np.argsort(solved.nis)[-count:], axis=0)
 
 
-def _nis_one_by_one(
+def nis_one_by_one(
     first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig
 ) -> FloatArray:
     """Normalised squared error (n,) of each pair by itself, 3 degrees of freedom."""
     i, j = pairs[:, 0], pairs[:, 1]
     error = first.points[i] - transform_points(prior.T, second.points[j])
     own = first.variances()[i] + config.position_noise**2 * np.eye(3)
-    S = own + _variances_seen(second, prior)[j]
+    S = own + variances_seen(second, prior)[j]
     return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(S, error[..., None])[..., 0]))
 
 

@@ -2,33 +2,37 @@
 """Links between submaps: to the ones just before, to ones the estimate says are near, and to ones that look alike.
 
 Candidates come from where the map believes the new submap to be and from what it looks like; geometry verifies them
-(:mod:`sjsam_node.loop_closure.verification`), and where the map cannot tell, a second link has to say the same. A place
-is compared with a bounded number of submaps, and with none that show nothing new.
+(:mod:`sjsam_node.loop_closure.verification`). Where the map cannot tell, a link is believed if chance would hardly make
+one like it, by itself (:mod:`sjsam_node.loop_closure.evidence`) or in a cycle that closes
+(:mod:`sjsam_node.loop_closure.cycles`); otherwise it waits. A place is compared with a bounded number of submaps, and
+with none that show nothing new.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
 from sjsam_node.graph.links import Link, Prior, Status
 from sjsam_node.graph.map_graph import MapGraph
-from sjsam_node.loop_closure.association import match
+from sjsam_node.loop_closure.association import Alignment, match
+from sjsam_node.loop_closure.cycles import Hop, cycles_through
 from sjsam_node.loop_closure.near_pairs import NearPairs
 from sjsam_node.loop_closure.novelty import Novelty
 from sjsam_node.loop_closure.place_recognition import PlaceIndex
 from sjsam_node.loop_closure.point_sets import at_end, at_start
 from sjsam_node.loop_closure.verification import ClosureConfig, Verifier, largest_sigma
 from sjsam_node.smoothing.smoother import Smoother
-from slam_core.geometry import FloatArray, boxminus, compose_covariance, invert_transform
+from slam_core.geometry import FloatArray, compose_covariance
 from slam_core.linear_algebra.block_pattern import IntArray
 
 
 @dataclass
 class LoopDetector:
-    """Finds and verifies the links of a new record; ``pending`` closures wait for another that says the same."""
+    """Finds and verifies the links of a new record; ``pending`` closures wait for others to close a cycle with."""
 
     smoother: Smoother
     config: ClosureConfig = field(default_factory=ClosureConfig)
@@ -36,6 +40,7 @@ class LoopDetector:
     index: PlaceIndex = field(init=False)
     near: NearPairs = field(init=False)
     pending: list[Link] = field(default_factory=list)
+    _alarms: dict[frozenset[int], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.verifier = Verifier(self.config)
@@ -106,9 +111,11 @@ class LoopDetector:
     def missed(self, chained: IntArray, most: int) -> list[Link]:
         """Links between records that have come near each other since they were compared, if ever they were.
 
-        Of ``most`` pairs, the nearest; none of those ``chained`` (n, 2) along the odometry.
+        Of ``most`` pairs, the nearest; none of those ``chained`` (n, 2) along the odometry. And links that waited, as
+        far as they are believed by now.
         """
-        return self._verified(self.near.due(self.graph, chained)[:most], self._novelty())
+        waited = self.reconsidered()
+        return waited + self._verified(self.near.due(self.graph, chained)[:most], self._novelty())
 
     def around(self, middle: FloatArray, records: Iterable[int], excluded: set[int]) -> list[int]:
         """Those of ``records`` whose landmarks are around a point (3,) of the map, nearest first."""
@@ -145,7 +152,7 @@ class LoopDetector:
                 continue
             if link.status is Status.CONSISTENT:
                 known.note(link)
-            out += self._confirmed(link) if link.status is Status.UNINFORMATIVE else [link]
+            out += self._judged(link) if link.status is Status.UNINFORMATIVE else [link]
         return out
 
     def _compared(self, old: int, new: int, prior: Prior | None, by_looks: bool) -> Link | None:
@@ -162,43 +169,77 @@ class LoopDetector:
         error = self.verifier.error_against(found, prior, 0.0) if may_move and prior is not None else 0.0
         return Link(old, new, found.pairs, found.T, found.covariance, True, error, status)
 
-    def _confirmed(self, link: Link) -> list[Link]:
-        """The link with those waiting that say the same, if together they are enough; otherwise it waits too."""
-        agreeing = [other for other in self.pending if _same_loop(self.graph, other, link)]
-        self.pending.append(link)
-        if len(agreeing) + 1 < self.config.confirmations:
-            return []
-        group_ = [*agreeing, link]
-        self.pending = [p for p in self.pending if not any(p is g for g in group_)]
-        return group_
+    def _judged(self, link: Link) -> list[Link]:
+        """The link if it is evident, or if a cycle with others that wait is, with these; otherwise it waits."""
+        self.pending = [k for k in self.pending if k.ends != link.ends]
+        self._alarms.pop(frozenset(link.ends), None)
+        if self._log10_false_alarms(link) <= np.log10(self.config.false_alarms):
+            return [link]
+        self.pending = [*self.pending, link][-self.config.waiting :]
+        return self._believed(self._evident_cycle(link, cache(self._hop)))
 
+    def reconsidered(self) -> list[Link]:
+        """Links that waited and are believed now, or that the map can judge now that it ties their submaps."""
+        out: list[Link] = []
+        for link in self.pending[:]:
+            prior = self.smoother.relative_pose(*link.ends)
+            if prior is not None and self._can_judge(link, prior):
+                self.pending = [k for k in self.pending if k is not link]
+                self.near.note(self.graph, *link.ends)
+                again = self._compared(*link.ends, prior, True)
+                out += [again] if again is not None and again.status is not Status.UNINFORMATIVE else []
+        hop = cache(self._hop)
+        for link in self.pending[:]:
+            if any(k is link for k in self.pending):  # not believed with another one yet
+                out += self._believed(self._evident_cycle(link, hop))
+        return out
 
-def _same_loop(graph: MapGraph, a: Link, b: Link) -> bool:
-    """True if two links between the same parts of the map move the second part alike, within what both claim."""
-    if (graph.component(a.first), graph.component(a.second)) != (
-        graph.component(b.first),
-        graph.component(b.second),
-    ):
-        b = b.inverted()
-        if (graph.component(a.first), graph.component(a.second)) != (
-            graph.component(b.first), graph.component(b.second),
-        ):  # fmt: skip
-            return False
-    if {a.first, a.second} == {b.first, b.second}:
-        return False
-    T_a, T_b = _movement(graph, a), _movement(graph, b)
-    here, there = _middle(graph, b.second), _middle(graph, a.second)
-    gap = np.linalg.norm((T_a[:3, :3] - T_b[:3, :3]) @ here + T_a[:3, 3] - T_b[:3, 3])
-    # Between the two the odometry has drifted on both stretches.
-    way = np.linalg.norm(there - here) + np.linalg.norm(_middle(graph, a.first) - _middle(graph, b.first))
-    allowed = 0.1 + 0.05 * way + 3.0 * (largest_sigma(a.covariance) + largest_sigma(b.covariance))
-    return bool(gap < allowed and np.linalg.norm(boxminus(T_a, T_b)[3:]) < 0.15)
+    def _can_judge(self, link: Link, prior: Prior) -> bool:
+        """True if the map, which could not tell, can tell now."""
+        found = Alignment(link.pairs, link.T, link.covariance, 0.0, 0)
+        is_sure = largest_sigma(prior.covariance) < self.config.informative_sigma
+        return is_sure or self.verifier.is_against(found, prior, self.graph.way_between(*link.ends))
 
+    def _believed(self, links: tuple[Link, ...]) -> list[Link]:
+        """The links of ``pending`` between the same records, which wait no longer."""
+        ends = {frozenset(k.ends) for k in links}
+        out = [k for k in self.pending if frozenset(k.ends) in ends]
+        self.pending = [k for k in self.pending if frozenset(k.ends) not in ends]
+        return out
 
-def _movement(graph: MapGraph, link: Link) -> FloatArray:
-    """Movement (4, 4) that a link asks of the part of the map that its second record is in."""
-    T_first, T_second = (graph.poses[graph.records[i].start] for i in (link.first, link.second))
-    return np.asarray(T_first @ link.T @ invert_transform(T_second))
+    def _evident_cycle(self, link: Link, hop: Hop) -> tuple[Link, ...]:
+        """The links of the most improbable cycle of links that wait, if it closes and is improbable enough."""
+        others = [k for k in self.pending if k is not link]
+        cycles, found = list(cycles_through(link, others, hop)), []
+        for k, cycle in enumerate(cycles):
+            if cycle.closes(self.config.probability):
+                weakest = max((self._log10_false_alarms(one), one.ends) for one in cycle.links)
+                chance = cycle.chance(self.config.probability, sum(map(self._reach, weakest[1])))
+                found.append((weakest[0] + np.log10(chance * len(cycles)), k))
+        best = min(found, default=(np.inf, 0))
+        return cycles[best[1]].links if best[0] <= np.log10(self.config.false_alarms) else ()
+
+    def _hop(self, first: int, second: int) -> Prior | None:
+        """T_first_second by the map, with the drift to expect; None where nothing ties the two."""
+        if first == second:
+            return Prior(np.eye(4), None)
+        prior, way = self.smoother.relative_pose(first, second), self.graph.way_between(first, second)
+        if prior is None or prior.covariance is None:
+            return prior
+        return Prior(prior.T, prior.covariance + self.verifier.drift(way))
+
+    def _log10_false_alarms(self, link: Link) -> float:
+        """See :meth:`Verifier.log10_false_alarms`; of a link that waits it is kept."""
+        ends = frozenset(link.ends)
+        if ends not in self._alarms:
+            first, second = (at_start(self.graph.records[i]) for i in link.ends)
+            found = Alignment(link.pairs, link.T, link.covariance, 0.0, 0)
+            self._alarms[ends] = self.verifier.log10_false_alarms(first, second, found)
+        return self._alarms[ends]
+
+    def _reach(self, record: int) -> float:
+        """Distance of the landmarks of a record from its start, their median, m."""
+        return float(np.median(np.linalg.norm(self.graph.records[record].submap.landmarks, axis=1)))
 
 
 def _middle(graph: MapGraph, record: int) -> FloatArray:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compares two submaps.
 
-Enough landmarks, spread in space, must agree on one rigid alignment within both submaps' joint covariance, and that
-must agree with what the map already knows of the two poses.
+More landmarks, spread in space, must agree on one rigid alignment within both submaps' joint covariance than chance
+would make agree (:mod:`sjsam_node.loop_closure.evidence`), and that must agree with what the map already knows of the
+two poses.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from sjsam_node.loop_closure.association import (
     mutual_best,
     similarity,
 )  # fmt: skip
+from sjsam_node.loop_closure.evidence import evidence_of
 from sjsam_node.loop_closure.place_recognition import PlaceRecognitionConfig
 from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, group, parameter
@@ -58,14 +60,16 @@ class ClosureConfig(Config):
     """Largest distance of an inlier of the first alignment (m)."""
     min_near_inliers: int = 5
     """Least matches of a link to a near submap."""
-    min_inliers: int = 10
-    """Least matches of a link to a submap found by its looks."""
+    min_alike_pairs: int = 5
+    """Least pairs by descriptors alone that agree, for a submap found by its looks to be compared."""
+    false_alarms: float = 1e-6
+    """Closures like one found by its looks that chance makes in a comparison, at most, for it to be believed."""
     min_spread: float = 0.25
     """Least second-largest standard deviation of the matched landmarks (m)."""
     min_overlap: float = 0.3
     """Least share of the landmarks expected in both that match."""
-    confirmations: int = 2
-    """Links that must agree where the map cannot judge."""
+    waiting: int = 20
+    """Links that wait for others to close a cycle with, at most."""
     probability: float = 0.9999
     """Share of true closures inside the chi-square gate."""
     seed: int = parameter(1, "seed of the random samples", minimum=0)
@@ -107,11 +111,11 @@ class Verifier:
     ) -> tuple[Alignment | None, Status]:
         """The alignment of two submaps by their looks, if geometry supports it, and what the prior says of it."""
         guess = self._by_looks(first, second, key)
-        if guess is None or not self._supported(first, second, guess):
+        if guess is None or not self._is_supported(first, second, guess):
             return None, Status.UNINFORMATIVE
-        if prior is not None and self.error_against(guess, prior, way) > chi_square_bound(self.config.probability, 6):
-            return guess, Status.INCONSISTENT
-        return guess, Status.UNINFORMATIVE
+        if prior is None or not self.is_against(guess, prior, way):
+            return guess, Status.UNINFORMATIVE
+        return guess if self.is_evident(first, second, guess) else None, Status.INCONSISTENT
 
     def _around(self, first: PointSet, second: PointSet, prior: Prior) -> Alignment:
         """Match around a prior, then around what that found.
@@ -129,12 +133,12 @@ class Verifier:
     def _by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
         """Alignment from descriptors alone, refined with all landmarks around it."""
         pairs = self._distinct_pairs(first, second)
-        if len(pairs) < self._few_pairs:
+        if len(pairs) < self.config.min_alike_pairs:
             return None
         rng = np.random.default_rng([self.config.seed, *key])
         coarse = ransac_rigid_transform(
             second.points[pairs[:, 1]], first.points[pairs[:, 0]], self.config.ransac_distance, rng,
-            min_inliers=self._few_pairs,
+            min_inliers=self.config.min_alike_pairs,
         )  # fmt: skip
         if not coarse.success:
             return None
@@ -144,13 +148,9 @@ class Verifier:
         free = Prior(found.T, 1e4 * np.eye(6))
         return jointly_compatible(first, second, found.pairs, free, self.config.association)
 
-    @property
-    def _few_pairs(self) -> int:
-        return max(3, self.config.min_inliers // 2)
-
     def is_alike(self, first: PointSet, second: PointSet) -> bool:
         """True if descriptors alone leave a chance; asked before anything dearer."""
-        return len(self._distinct_pairs(first, second)) >= self._few_pairs
+        return len(self._distinct_pairs(first, second)) >= self.config.min_alike_pairs
 
     def _distinct_pairs(self, first: PointSet, second: PointSet) -> IntArray:
         """Mutually best descriptor pairs, clearly better than the second best."""
@@ -162,8 +162,19 @@ class Verifier:
         angle = np.arccos(np.clip(np.partition(S[pairs[:, 0]], -2, axis=1)[:, -2:], -1.0, 1.0))
         return pairs[angle[:, 1] <= self.config.ratio * angle[:, 0]]
 
-    def _supported(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
-        return len(found.pairs) >= self.config.min_inliers and self._overlaps(first, second, found)
+    def is_evident(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
+        """True if an alignment by looks needs nothing else that speaks for it."""
+        return self.log10_false_alarms(first, second, found) <= float(np.log10(self.config.false_alarms))
+
+    def log10_false_alarms(self, first: PointSet, second: PointSet, found: Alignment) -> float:
+        """log10 of how many alignments as good as this one chance would make of the descriptors' distinct pairs."""
+        pairs = self._distinct_pairs(first, second)
+        return evidence_of(first, second, pairs, found, self.config.association).log10_false_alarms
+
+    def _is_supported(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
+        """Fewer than one false alarm to expect of this comparison, and matches as spread and many as the overlap."""
+        enough = len(found.pairs) >= self.config.min_near_inliers and self._overlaps(first, second, found)
+        return enough and self.log10_false_alarms(first, second, found) < 0.0
 
     def _overlaps(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
         """Matches are spread, and most landmarks that lie among them on both sides are matched."""
@@ -175,12 +186,19 @@ class Verifier:
         expected = min(_inside(first.points, low, high), _inside(moved, low, high))
         return len(matched) >= self.config.min_overlap * expected
 
+    def is_against(self, found: Alignment, prior: Prior, way: float) -> bool:
+        """True if an alignment contradicts the prior, which has drifted along the ``way`` (m)."""
+        return self.error_against(found, prior, way) > chi_square_bound(self.config.probability, 6)
+
     def error_against(self, found: Alignment, prior: Prior, way: float) -> float:
         """Normalised squared error of an alignment against the prior, which has drifted along the ``way`` (m)."""
         assert prior.covariance is not None
         error = boxminus(found.T, prior.T)
-        drift = np.diag([(self.config.drift * way) ** 2] * 3 + [(self.config.drift_angle * way) ** 2] * 3)
-        return float(error @ np.linalg.solve(prior.covariance + found.covariance + drift, error))
+        return float(error @ np.linalg.solve(prior.covariance + found.covariance + self.drift(way), error))
+
+    def drift(self, way: float) -> FloatArray:
+        """Covariance (6, 6) of the drift to expect on a ``way`` (m) beyond what the odometry claims."""
+        return np.diag([(self.config.drift * way) ** 2] * 3 + [(self.config.drift_angle * way) ** 2] * 3)
 
 
 def largest_sigma(covariance: FloatArray | None) -> float:
