@@ -8,7 +8,7 @@ integer nanoseconds, the only time an estimator knows.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any
 
@@ -96,7 +96,8 @@ class Features:
 
     xyz (n, 3) m in the optical frame ``frame_id``; uv (n, 2) px in the rectified image of ``camera``; depth (n,) m
     along z; sigma_uv (n, 2) px; sigma_depth (n,) m; response (n,); source (n,) uint8, see :class:`FeatureSource`;
-    descriptors (n, d), unit norm, d = 128 for SURF-128 and SIFT.
+    descriptors (n, d), unit norm, d = 128 for SURF-128 and SIFT. track_ids (n,): equal in frames that follow one another
+    where the front end has followed a feature; 0 where it has not.
     """
 
     stamp_ns: int
@@ -110,9 +111,19 @@ class Features:
     descriptors: Float32Array
     camera: Camera
     frame_id: str = "stereo_left_optical_frame"
+    track_ids: npt.NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+
+    def __post_init__(self) -> None:
+        if len(self.track_ids) != len(self.uv):
+            object.__setattr__(self, "track_ids", np.zeros(len(self.uv), np.int32))
 
     def __len__(self) -> int:
         return len(self.uv)
+
+    def joined(self, others: Features) -> Features:
+        """These and others of the same instant."""
+        names = ("xyz", "uv", "depth", "sigma_uv", "sigma_depth", "response", "source", "descriptors", "track_ids")
+        return replace(self, **{n: np.concatenate([getattr(self, n), getattr(others, n)]) for n in names})
 
     def select(self, index: AnyArray) -> Features:
         """The features at ``index`` (mask or indices)."""
@@ -128,6 +139,7 @@ class Features:
             self.descriptors[index],
             self.camera,
             self.frame_id,
+            self.track_ids[index],
         )
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from slam_core.camera import Camera
 from slam_core.geometry import FloatArray
@@ -38,6 +39,7 @@ def make_features(
     camera: Camera,
     frame_id: str,
     max_relative_sigma: float,
+    track_ids: npt.NDArray[np.int32] | None = None,
 ) -> Features:
     """The keypoints with a positive depth known to better than ``max_relative_sigma`` of itself, in their order."""
     known = np.isfinite(estimate.depth) & np.isfinite(estimate.sigma) & (estimate.depth > 0.0)
@@ -48,11 +50,12 @@ def make_features(
         xyz=camera.unproject(uv.astype(np.float64), depth).astype(np.float32),
         uv=uv,
         depth=depth.astype(np.float32),
-        sigma_uv=np.repeat(sigma_uv[keep, None], 2, axis=1).astype(np.float32),
+        sigma_uv=sigma_uv[keep].astype(np.float32),
         sigma_depth=estimate.sigma[keep].astype(np.float32),
         response=keypoints.response[keep],
         source=estimate.source[keep],
         descriptors=keypoints.descriptors[keep],
         camera=camera,
         frame_id=frame_id,
+        track_ids=np.zeros(len(keep), np.int32) if track_ids is None else track_ids[keep],
     )

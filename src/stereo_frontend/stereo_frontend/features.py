@@ -44,6 +44,10 @@ class FeatureConfig(Config):
 
     detector: str = parameter("surf", "keypoint detector and descriptor", choices=DETECTORS)
     target: int = parameter(600, "number of features wanted per image", minimum=10, maximum=20000)
+    tracking: bool = parameter(
+        False, "follow features from frame to frame by their patches, and detect new ones only where these are few"
+    )
+    max_tracks: int = parameter(150, "most features followed at a time", minimum=20, maximum=2000)
     surf: SurfConfig = group(SurfConfig)
 
 

@@ -39,6 +39,7 @@ from stereo_frontend.range_self_calibration import RangeDifferences, RangeSelfCa
 from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.self_calibration import SelfCalibrationConfig, StereoSelfCalibration
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
+from stereo_frontend.tracker import Followed, Tracker
 from stereo_frontend.two_view_consistency import StereoView
 
 _MAX_RELATIVE_SIGMA = 0.35
@@ -111,6 +112,7 @@ class Frontend:
         self.range_calibration = RangeSelfCalibration(self.config.range_calibration)
         self._wide = self.self_calibration.widened(self.config.matching)
         self._tof = TofFeatures(self.config.tof, self.config.features, self.config.noise)
+        self._tracker = Tracker(self.config.features.max_tracks) if self.config.features.tracking else None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="second_core")
 
     def process(
@@ -129,6 +131,9 @@ class Frontend:
             return None
         if images is None:
             raise ValueError(f"mode '{self.config.mode}' needs a stereo pair, got none")
+        return self._extract(images) if self._tracker is None else None
+
+    def _extract(self, images: StereoImages) -> tuple[Keypoints, Keypoints]:
         left = self._pool.submit(self._left, images.left)
         right = self._right(images.right)
         return left.result(), right
@@ -164,9 +169,37 @@ class Frontend:
             if depth is None:
                 raise ValueError("mode 'tof' needs a depth image, got none")
             return self._tof(depth, _MAX_RELATIVE_SIGMA)
-        if images is None or keypoints is None:
+        if images is None:
             raise ValueError(f"mode '{self.config.mode}' needs a stereo pair, got none")
-        left, right = keypoints
+        if self._tracker is not None:
+            return self._followed(self._tracker, images, depth, T_left_tof)
+        if keypoints is None:
+            raise ValueError("the keypoints of a pair are missing: extract them first")
+        left, estimate = self._measured(images, *keypoints, depth, T_left_tof)
+        return self._features(images, left, estimate, np.repeat(self._noise.sigma(left.size)[:, None], 2, axis=1))
+
+    def _features(
+        self,
+        images: StereoImages,
+        left: Keypoints,
+        estimate: DepthEstimate,
+        sigma_uv: Float32Array,
+        track_ids: npt.NDArray[np.int32] | None = None,
+    ) -> Features:
+        camera, frame_id = images.stereo.camera, "stereo_left_optical_frame"
+        return make_features(
+            images.stamp_ns, left, estimate, sigma_uv, camera, frame_id, _MAX_RELATIVE_SIGMA, track_ids
+        )
+
+    def _measured(
+        self,
+        images: StereoImages,
+        left: Keypoints,
+        right: Keypoints,
+        depth: DepthImage | None,
+        T_left_tof: FloatArray | None,
+    ) -> tuple[Keypoints, DepthEstimate]:
+        """Left keypoints with their descriptors for other moments, and their depth."""
         stereo, refined = self._stereo_depth(images, left, right)
         estimate = stereo
         if self.config.mode != "stereo":
@@ -175,20 +208,75 @@ class Frontend:
         self.self_calibration.learn(self._view(images, left.select(np.isfinite(stereo.depth)), refined))
         by_stereo = np.flatnonzero(np.isfinite(stereo.depth))
         estimate.depth[by_stereo[~is_distinct(left.descriptors[by_stereo], _MOST_ALIKE)]] = np.nan
-        return make_features(
-            images.stamp_ns,
-            left,
-            estimate,
-            self._noise.sigma(left.size),
-            images.stereo.camera,
-            "stereo_left_optical_frame",
-            _MAX_RELATIVE_SIGMA,
-        )
+        return left, estimate
+
+    def _followed(
+        self, tracker: Tracker, images: StereoImages, depth: DepthImage | None, T_left_tof: FloatArray | None
+    ) -> Features:
+        """Features of the tracks; of new ones, too, in a frame that has few."""
+        camera, parts = images.stereo.camera, []
+        followed = tracker.follow(images.left, camera, images.stamp_ns)
+        measured = 0
+        if followed is not None:
+            stereo = self._depth_of_tracks(images, followed)
+            estimate = stereo
+            if self.config.mode != "stereo":
+                estimate = self._with_tof(images, followed.keypoints, stereo, depth, T_left_tof)
+            tracker.measured(followed, estimate.depth, camera)
+            measured = int(np.isfinite(estimate.depth).sum())
+            parts.append(self._features(images, followed.keypoints, estimate, followed.sigma_uv, followed.ids))
+        if tracker.needs_key_frame(measured):
+            self.counters.add("key_frames")
+            left, right = self._extract(images)
+            left, estimate = self._measured(images, left.select(tracker.is_free(left.uv)), right, depth, T_left_tof)
+            ids = tracker.begin(images.left, left, estimate.depth, camera)
+            if not tracker.has_lost_sight(measured):
+                estimate.depth[ids == 0] = np.nan
+            sigma = np.repeat(self._noise.sigma(left.size)[:, None], 2, axis=1)
+            parts.append(self._features(images, left, estimate, sigma, ids))
+        return parts[0] if len(parts) == 1 else parts[0].joined(parts[1])
+
+    def _depth_of_tracks(self, images: StereoImages, followed: Followed) -> DepthEstimate:
+        """Depth by stereo of what was followed, looked for near the predicted depths."""
+        uv, disparity = followed.keypoints.uv, images.stereo.camera.fx * images.stereo.baseline / followed.depth
+        partner = np.column_stack([uv[:, 0] - disparity, uv[:, 1]]).astype(np.float32)
+        disparity, sigma, _ = self._disparities(images, uv, partner)
+        self.counters.add("frames")
+        self.counters.add("tracks", len(uv))
+        estimate = DepthEstimate.unknown(len(uv))
+        estimate.depth[:] = images.stereo.depth_from_disparity(disparity)
+        estimate.sigma[:] = images.stereo.camera.fx * images.stereo.baseline / disparity**2 * sigma
+        return estimate
+
+    def _disparities(
+        self, images: StereoImages, uv: Float32Array, partner: Float32Array, size: Float32Array | None = None
+    ) -> tuple[FloatArray, FloatArray, RefinedDisparity]:
+        """Disparities (n,) px of left pixels whose partners are near ``partner`` (n, 2) px, NaN where not trusted.
+
+        Corrected for what is known of the rectification's error, with their standard deviations; and as measured.
+        ``size`` (n,) px is that of keypoints that were found in both images: their rows tell the noise.
+        """
+        calibration = self.self_calibration
+        bounds = disparity_bounds(self.config.matching, images.stereo.camera.fx * images.stereo.baseline)
+        row_error = calibration.rows(partner, uv[:, 0] - partner[:, 0])
+        refined = self._refine(images, uv, partner[:, 0], row_error)
+        if size is not None:
+            trusted = refined.valid
+            self._noise.learn((uv - partner)[trusted, 1] + row_error[trusted], size[trusted])
+            self._noise.learn_rectification((refined.row_shift - row_error)[trusted], refined.row_sigma[trusted])
+        correction, correction_sigma = calibration.columns(partner)
+        disparity = refined.disparity + correction
+        disparity[~(disparity >= bounds[0])] = np.nan
+        disparity[~has_consistent_neighbour(uv, disparity, _NEIGHBOURS)] = np.nan
+        sigma = np.sqrt(refined.sigma**2 + self._noise.rectification_sigma**2 + correction_sigma**2)
+        return disparity, sigma, refined
 
     def reset(self) -> None:
         """Forget thresholds, noise and counts."""
         for part in (self._left, self._right, self._noise, self.self_calibration, self.range_calibration, self._tof):
             part.reset()
+        if self._tracker is not None:
+            self._tracker.reset()
         self.counters = Counters()
 
     def report(self) -> FrontendReport:
@@ -215,26 +303,15 @@ class Frontend:
         self, images: StereoImages, left: Keypoints, right: Keypoints
     ) -> tuple[DepthEstimate, RefinedDisparity]:
         """Depth of the left keypoints, and the disparities of those that have one."""
-        stereo, calibration = images.stereo, self.self_calibration
-        focal_baseline = stereo.camera.fx * stereo.baseline
+        focal_baseline = images.stereo.camera.fx * images.stereo.baseline
         bounds = disparity_bounds(self.config.matching, focal_baseline)
         matches = self._match(images, left, right, bounds)
-        uv, partner = left.uv[matches.left], right.uv[matches.right]
-        row_error = calibration.rows(partner, uv[:, 0] - partner[:, 0])
-        refined = self._refine(images, uv, partner[:, 0], row_error)
-        trusted = refined.valid
-        if trusted.sum() < _FEW_TRUSTED * len(left):
+        found = left.select(matches.left)
+        disparity, sigma, refined = self._disparities(images, found.uv, right.uv[matches.right], found.size)
+        if refined.valid.sum() < _FEW_TRUSTED * len(left):
             self._reject_swapped(left, right, bounds)
-        size = left.size[matches.left]
-        self._noise.learn((uv - partner)[trusted, 1] + row_error[trusted], size[trusted])
-        self._noise.learn_rectification((refined.row_shift - row_error)[trusted], refined.row_sigma[trusted])
-        correction, correction_sigma = calibration.columns(partner)
-        disparity = refined.disparity + correction
-        disparity[~(disparity >= bounds[0])] = np.nan
-        disparity[~has_consistent_neighbour(uv, disparity, _NEIGHBOURS)] = np.nan
-        sigma = np.sqrt(refined.sigma**2 + self._noise.rectification_sigma**2 + correction_sigma**2)
         estimate = DepthEstimate.unknown(len(left))
-        estimate.depth[matches.left] = stereo.depth_from_disparity(disparity)
+        estimate.depth[matches.left] = images.stereo.depth_from_disparity(disparity)
         estimate.sigma[matches.left] = focal_baseline / disparity**2 * sigma
         self._count(left, right, len(matches), int(np.isfinite(disparity).sum()))
         return estimate, refined.select(np.flatnonzero(np.isfinite(disparity)))

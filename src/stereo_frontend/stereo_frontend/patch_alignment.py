@@ -82,17 +82,17 @@ def align_patches(left, right, uv_left, u_right, row_offset, radius, max_shift, 
                 for j in range(UNKNOWNS):
                     normal[i, j] = hessian[i, j]
                 normal[i, i] += noise * information[i]
-            if not _factorise(normal):
+            if not factorise(normal):
                 break
             if length < _CONVERGED:
-                noise = _noise_of_residual(template, patch, gain, mean[4] - gain * total / n, inside, side, freedom)
+                noise = noise_of_residual(template, patch, gain, mean[4] - gain * total / n, inside, side, freedom)
                 out[k, 0] = u - u_right[k] - p[0]
                 out[k, 2] = cross / np.sqrt(power * energy)
                 out[k, 3] = row_offset[k] + p[1]
                 for i in range(2):
-                    out[k, 1 + 3 * i] = noise * _diagonal_of_inverse(normal, i, step)
+                    out[k, 1 + 3 * i] = noise * diagonal_of_inverse(normal, i, step)
                 break
-            _substitute(normal, step)
+            substitute(normal, step)
             length = abs(step[0]) + abs(step[1])
             scale = 1.0 / max(length, 1.0)
             for i in range(UNKNOWNS):
@@ -246,7 +246,7 @@ def _patch_sums(patch, template, jacobian, out):  # type: ignore[no-untyped-def]
 
 
 @in_place(fastmath=REORDER)
-def _noise_of_residual(template, patch, gain, offset, inside, side, freedom):  # type: ignore[no-untyped-def]
+def noise_of_residual(template, patch, gain, offset, inside, side, freedom):  # type: ignore[no-untyped-def]
     """Variance of the residual, times what correlated noise leaves over white: ``(1 + 2 rho_u) (1 + 2 rho_v)``.
 
     Rectification interpolates, which makes neighbouring pixels share their noise: the residual's own correlation shows
@@ -263,10 +263,10 @@ def _noise_of_residual(template, patch, gain, offset, inside, side, freedom):  #
 
 
 @in_place()
-def _factorise(matrix):  # type: ignore[no-untyped-def]
+def factorise(matrix):  # type: ignore[no-untyped-def]
     """Lower Cholesky factor in place; False if the matrix is not positive definite."""
-    for j in range(UNKNOWNS):
-        for i in range(j, UNKNOWNS):
+    for j in range(len(matrix)):
+        for i in range(j, len(matrix)):
             value = matrix[i, j]
             for k in range(j):
                 value -= matrix[i, k] * matrix[j, k]
@@ -280,23 +280,23 @@ def _factorise(matrix):  # type: ignore[no-untyped-def]
 
 
 @in_place()
-def _substitute(lower, vector):  # type: ignore[no-untyped-def]
+def substitute(lower, vector):  # type: ignore[no-untyped-def]
     """Solve ``lower lower^T x = vector`` in place."""
-    for i in range(UNKNOWNS):
+    for i in range(len(lower)):
         for k in range(i):
             vector[i] -= lower[i, k] * vector[k]
         vector[i] /= lower[i, i]
-    for i in range(UNKNOWNS - 1, -1, -1):
-        for k in range(i + 1, UNKNOWNS):
+    for i in range(len(lower) - 1, -1, -1):
+        for k in range(i + 1, len(lower)):
             vector[i] -= lower[k, i] * vector[k]
         vector[i] /= lower[i, i]
 
 
 @in_place()
-def _diagonal_of_inverse(lower, index, room):  # type: ignore[no-untyped-def]
-    """Diagonal element of the inverse of ``lower lower^T``; ``room`` (4,) is filled."""
+def diagonal_of_inverse(lower, index, room):  # type: ignore[no-untyped-def]
+    """Diagonal element of the inverse of ``lower lower^T``; ``room`` is filled."""
     total = 0.0
-    for i in range(UNKNOWNS):
+    for i in range(len(lower)):
         room[i] = 1.0 if i == index else 0.0
         for k in range(i):
             room[i] -= lower[i, k] * room[k]

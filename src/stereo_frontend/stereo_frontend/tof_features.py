@@ -54,7 +54,7 @@ class TofFeatures:
         """Features of ``image`` in the ToF optical frame; those without a single surface below them are left out."""
         keypoints = _joined([self._extractors[name](picture) for name, picture in self._pictures(image).items()])
         samples = sample_depth(image, keypoints.uv)
-        sigma_uv = self._noise.sigma(keypoints.size)
+        sigma_uv = np.repeat(self._noise.sigma(keypoints.size)[:, None], 2, axis=1)
         source = np.full(len(keypoints), FeatureSource.TOF, np.uint8)
         estimate = DepthEstimate(samples.depth, samples.sigma, source)
         return make_features(

@@ -16,7 +16,10 @@ from slam_core.types import Features
 FEATURE_FIELDS = ("x", "y", "z", "u", "v", "depth", "sigma_u", "sigma_v", "sigma_depth", "response", "source")
 """Fields of the ``features`` cloud in this order, each FLOAT32 and of count 1."""
 
-_DTYPE = np.dtype([(name, "<f4") for name in FEATURE_FIELDS])
+TRACK_FIELD = "track"
+"""Last field, FLOAT32: id of a feature that was followed, below 2^24, or 0. Older bags have none."""
+
+_DTYPE = np.dtype([(name, "<f4") for name in (*FEATURE_FIELDS, TRACK_FIELD)])
 
 
 class FeatureMessages(NamedTuple):
@@ -34,8 +37,8 @@ FEATURE_TOPICS = {"features": "PointCloud2", "features/descriptors": "Image", "f
 def features_messages(types: MessageTypes, features: Features) -> FeatureMessages:
     """Messages that carry ``features`` exactly."""
     f = features
-    columns = [f.xyz, f.uv, f.depth, f.sigma_uv, f.sigma_depth, f.response, f.source]
-    table = np.column_stack([np.asarray(c, dtype="<f4") for c in columns]) if len(f) else np.empty((0, 11), "<f4")
+    columns = [f.xyz, f.uv, f.depth, f.sigma_uv, f.sigma_depth, f.response, f.source, f.track_ids]
+    table = np.column_stack([np.asarray(c, dtype="<f4") for c in columns]) if len(f) else np.empty((0, len(_DTYPE)), "<f4")
     header = header_message(types, f.stamp_ns, f.frame_id)
     return FeatureMessages(
         cloud_message(types, header, np.ascontiguousarray(table).view(_DTYPE)[:, 0]),
@@ -57,6 +60,7 @@ def features_from_messages(cloud: Message, descriptors: Message, camera_info: Me
     if missing := [name for name in FEATURE_FIELDS if name not in names]:
         raise ValueError(f"features cloud has no field {', '.join(missing)}")
     fields = [points[name].ravel().astype(np.float32) for name in FEATURE_FIELDS]
+    tracks = points[TRACK_FIELD].ravel().astype(np.int32) if TRACK_FIELD in names else np.zeros(points.size, np.int32)
     rows = image_from_message(descriptors)
     count = points.size
     if rows.dtype != np.float32 or rows.ndim != 2 or len(rows) != count:
@@ -67,5 +71,5 @@ def features_from_messages(cloud: Message, descriptors: Message, camera_info: Me
     return Features(
         stamp_ns(cloud), np.column_stack(fields[0:3]), np.column_stack(fields[3:5]), fields[5],
         np.column_stack(fields[6:8]), fields[8], fields[9], fields[10].astype(np.uint8), rows,
-        camera_info_from_message(camera_info).rectified, cloud.header.frame_id,
+        camera_info_from_message(camera_info).rectified, cloud.header.frame_id, tracks,
     )  # fmt: skip
