@@ -115,6 +115,12 @@ class RunRecord:
         )
 
 
+_ONE_FILTER = (
+    "one filter for the whole way (mapper ekf) claims less error than it makes: where covariances matter, map with "
+    "submaps (--mapper sjsam, the default)"
+)
+
+
 def run_result(
     bag: SensorBag,
     config: SystemConfig,
@@ -161,7 +167,8 @@ def run_result(
     )
     on_mapped(mapped)
     surface, plans, failure = _dense(bag, config, record, agents, on_reading, stopped)
-    events = _logged((*(failure,) * bool(failure), *bag.warnings, *record.events, *_events(record.agents)))
+    doubt = (_ONE_FILTER,) * (mapper == "ekf")
+    events = _logged((*(failure,) * bool(failure), *doubt, *bag.warnings, *record.events, *_events(record.agents)))
     return replace(mapped, dense=surface, floor_plans=plans, events=events, failure=failure)
 
 
