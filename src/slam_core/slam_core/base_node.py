@@ -43,7 +43,7 @@ from slam_core.listening_node import LATCHED_DEPTH, Input
 from slam_core.messages import MessageTypes, header_message, stamp_ns
 from slam_core.messages.base import Message
 from slam_core.ros import changed_config, declare_config, sensor_qos
-from slam_core.stamp_guard import StampGuard, StampPolicy
+from slam_core.stamp_guard import StampDecision, StampGuard, StampPolicy
 from slam_core.synchronizer import StampSynchronizer
 from slam_core.transform_node import TransformNode
 
@@ -73,7 +73,7 @@ class SlamNode(TransformNode, Generic[C]):
         self._outputs: dict[str, Any] = {}
         self._latched: set[str] = set()
         self._alone: set[str] = set()
-        self._silent = False
+        self._silence_text = ""
         self._skipped = 0
         self._held_back = False
         self._input_stamp_ns = 0
@@ -214,6 +214,7 @@ class SlamNode(TransformNode, Generic[C]):
 
     def _receive(self, entry: Input, message: Message) -> None:
         entry.seen_at_s = time.monotonic()
+        self._has_ended = False
         if self._paused:
             self.health.count("ignored_while_paused")
             return
@@ -222,16 +223,20 @@ class SlamNode(TransformNode, Generic[C]):
             entry.handler(stamp, message)
             return
         starts = entry.policy is StampPolicy.FRAMES
-        decision = self._stamps.add(entry.topic, stamp, message, starts_sessions=starts)
-        if decision.rejected:
+        self._act_on(entry, self._stamps.add(entry.topic, stamp, message, starts_sessions=starts))
+
+    def _act_on(self, entry: Input, decision: StampDecision[Message]) -> None:
+        """Count what a decision rejects, and hand on what it releases."""
+        if decision.fault is not None:
             self._reject(f"{entry.topic}: message rejected: {decision.reason}", len(decision.rejected))
+            self.health.count(decision.fault.value.replace(" ", "_"), len(decision.rejected))
         if decision.new_session:
             self._flush()
             why = f"{decision.reason} on {entry.topic}"
             self._jobs.add(QueuedCall("session", lambda: self.start_session(why)))
         self._held_back = len(decision.released) > 1
         for released_ns, released in decision.released:
-            if starts:
+            if entry.policy is StampPolicy.FRAMES:
                 entry.gaps.add(released_ns)
             entry.handler(released_ns, released)
 
@@ -311,6 +316,10 @@ class SlamNode(TransformNode, Generic[C]):
 
     async def _on_finish_service(self, _: Any, response: Any) -> Any:
         self.receive()  # what has come so far belongs to the input
+        inputs = {entry.topic: entry for entry in self._inputs.values()}
+        for topic, decision in self._stamps.finish():
+            self._act_on(inputs[topic], decision)
+        self._has_ended = True
         self.finish_work()
         try:
             line = self.on_finish()
@@ -325,10 +334,10 @@ class SlamNode(TransformNode, Generic[C]):
     def _tick(self) -> None:
         self._match_publishers()
         silence = "; ".join(filter(None, (self._silence(), self._rivals())))
-        if silence and not self._silent:
+        if silence and not self._silence_text:
             self.get_logger().warning(silence)
-        self._silent = bool(silence)
-        self._diagnostics.publish(self._diagnostic_message(silence))
+        self._silence_text = silence
+        self.report_now()
 
     def _rivals(self) -> str:
         """Other nodes that publish what only this one should, or ""."""
@@ -352,22 +361,21 @@ class SlamNode(TransformNode, Generic[C]):
             self.report_now()
 
     def report_now(self) -> None:
-        """Publish diagnostics that somebody may wait for, beside those of every second."""
-        self._diagnostics.publish(self._diagnostic_message(""))
+        """Publish diagnostics, every second and where somebody may wait for them."""
+        self._diagnostics.publish(self._diagnostic_message())
 
-    def _diagnostic_message(self, silence: str) -> Message:
+    def _diagnostic_message(self) -> Message:
         self.health.counters["unpaired"] = sum(s.unpaired for s in self._synchronizers)
         self.health.counters["skipped"] = self._jobs.skipped.total()
         self.health.counters["missing"] = max((entry.gaps.missing for entry in self._inputs.values()), default=0)
         late = self._lateness()
-        values = self.health.report(time.monotonic())
+        values = self.health.report(time.monotonic(), self._silence_text)
         values["unconnected"] = " ".join(self._unconnected())
         values["input_stamp_ns"] = str(self._input_stamp_ns)
-        level = max(int(self.health.state), int(State.DEGRADED) if silence else 0)
         status = self._ros_types.DiagnosticStatus(
-            level=bytes([level]),
+            level=bytes([State[values["state"]]]),
             name=self.get_fully_qualified_name(),
-            message="; ".join(filter(None, (silence, self.health.reason, late))) or "OK",
+            message="; ".join(filter(None, (values["reason"], late))) or "OK",
             values=[self._ros_types.KeyValue(key=key, value=value) for key, value in values.items()],
         )
         header = self._ros_types.Header(stamp=self.get_clock().now().to_msg())

@@ -74,6 +74,7 @@ class ListeningNode(GuardedNode):
         self._inbox: deque[tuple[Input, Message]] = deque()
         self._topics_out: list[str] = []
         self._at_work = False
+        self._has_ended = False
         self._wake = self.create_guard_condition(self._guarded("inbox", self._empty_inbox))
         self._started_at_s = time.monotonic()
 
@@ -202,7 +203,12 @@ class ListeningNode(GuardedNode):
         return [entry.topic for entry in inputs if entry.required and not entry.has_publisher]
 
     def _silence(self) -> str:
-        """Names of required topics that have been silent for five seconds, with the reason, or ""."""
+        """Names of required topics that have been silent for five seconds, with the reason, or "".
+
+        After ``~/finish`` silence is as it should be.
+        """
+        if self._has_ended:
+            return ""
         now, texts = time.monotonic(), []
         for entry in self._inputs.values():
             if entry.required and not self._paused and now - (entry.seen_at_s or self._started_at_s) > WATCHDOG_S:

@@ -9,11 +9,15 @@ is *held* together with its message until others have shown what it is:
 - three in a row agree and lie behind: the clock has jumped back for good, a new *session* begins with them.
 
 Only frames begin sessions; what accompanies them (IMU, motions) follows. The other streams join a session when their
-stamps are near its own; stragglers of the session before are rejected.
+stamps are near its own; stragglers of the session before are rejected, and so is a stamp that comes twice in a row.
+
+The nodes judge what they receive by it, ``slam run`` what it reads from a bag, ``slam doctor`` a recording and ``slam
+convert`` the stamps of a data set.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Generic, TypeVar
@@ -44,17 +48,26 @@ class StampPolicy(Enum):
     ANY = "any"
 
 
+class StampFault(Enum):
+    """Kind of a rejected stamp; the values are what it is called where it is counted."""
+
+    DUPLICATE = "duplicate stamps"
+    LATE = "stamps out of order"
+    ODD = "stamps off their stream"
+
+
 @dataclass(frozen=True)
 class StampDecision(Generic[T]):
     """Decision about messages: those ``released`` as (stamp_ns, item) in order, stamps ``rejected`` and why.
 
-    new_session: what was released is the first of a new session.
+    new_session: what was released is the first of a new session. fault: kind of those rejected, None if none are.
     """
 
     released: tuple[tuple[int, T], ...] = ()
     rejected: tuple[int, ...] = ()
     reason: str = ""
     new_session: bool = False
+    fault: StampFault | None = None
 
 
 @dataclass
@@ -75,6 +88,10 @@ class _Stream(Generic[T]):
         if self.last_ns is None or self.floor_ns is None:
             return LONGEST_STEP_NS
         return max(LONGEST_STEP_NS, 3 * (self.last_ns - self.floor_ns))
+
+    def repeats(self, stamp_ns: int) -> bool:
+        """True if a stamp is the newest accepted, or the newest held, once more."""
+        return stamp_ns == self.last_ns or (bool(self.held) and stamp_ns == self.held[-1][0])
 
     def goes_on(self, stamp_ns: int) -> bool:
         """True if a stamp is the stream's next."""
@@ -112,15 +129,33 @@ class StampGuard(Generic[T]):
     def add(self, name: str, stamp_ns: int, item: T, *, starts_sessions: bool = True) -> StampDecision[T]:
         """Judge one message of stream ``name``."""
         stream = self._streams.setdefault(name, _Stream())
+        if stream.repeats(stamp_ns):
+            return StampDecision(rejected=(stamp_ns,), reason="its stamp has come before", fault=StampFault.DUPLICATE)
         if stream.last_ns is None and self._is_near(stamp_ns):
             return self._join(stream, stamp_ns, item)
         if stream.goes_on(stamp_ns):
             return self._release(stream, [(stamp_ns, item)], outliers=stream.held)
         if stream.is_late(stamp_ns):
             return StampDecision(
-                rejected=(stamp_ns,), reason=f"{_seconds(stream.last_ns, stamp_ns)} older than the one before"
+                rejected=(stamp_ns,),
+                reason=f"{_seconds(stream.last_ns, stamp_ns)} older than the one before",
+                fault=StampFault.LATE,
             )
         return self._hold(stream, stamp_ns, item, starts_sessions)
+
+    def finish(self) -> list[tuple[str, StampDecision[T]]]:
+        """Decide on what is held when the input has ended, by stream.
+
+        What lies ahead by no more than streams of one session differ is released as what follows a gap.
+        """
+        return [(name, self._decide(stream)) for name, stream in self._streams.items() if stream.held]
+
+    def _decide(self, stream: _Stream[T]) -> StampDecision[T]:
+        last, held = self._reference(stream), stream.held
+        if last is not None and 0 < held[0][0] - last <= NEAR_NS:
+            return self._release(stream, held, outliers=[])
+        stream.held = []
+        return _rejection(last, held)
 
     def restart(self) -> None:
         """Forget all streams: whatever comes next is the first."""
@@ -144,12 +179,11 @@ class StampGuard(Generic[T]):
     def _release(
         self, stream: _Stream[T], items: list[tuple[int, T]], outliers: list[tuple[int, T]]
     ) -> StampDecision[T]:
-        rejected = tuple(stamp for stamp, _ in outliers)
-        reason = _off(stream.last_ns, rejected[0]) if rejected else ""
+        decision = _rejection(stream.last_ns, outliers, items)
         stream.accept(items)
         for other in self._streams.values():
             other.contradicted |= other is not stream and bool(other.held)
-        return StampDecision(tuple(items), rejected, reason)
+        return decision
 
     def _hold(self, stream: _Stream[T], stamp_ns: int, item: T, starts_sessions: bool) -> StampDecision[T]:
         refuted: list[tuple[int, T]] = []
@@ -162,8 +196,7 @@ class StampGuard(Generic[T]):
             if starts_sessions and (stream.last_ns is not None or not stream.contradicted):
                 return self._begin_session(stream)
             refuted.append(stream.held.pop(0))
-        rejected = tuple(stamp for stamp, _ in refuted)
-        return StampDecision(rejected=rejected, reason=_off(self._reference(stream), rejected[0]) if rejected else "")
+        return _rejection(self._reference(stream), refuted)
 
     def _is_gap(self, stream: _Stream[T]) -> bool:
         """True if what is held lies ahead in the stream's own time, or in that of the session where it has none."""
@@ -187,6 +220,16 @@ class StampGuard(Generic[T]):
         """The stamp that a stream's next one is compared with."""
         known = [s.last_ns for s in self._streams.values() if s.last_ns is not None]
         return stream.last_ns if stream.last_ns is not None else max(known, default=None)
+
+
+def _rejection(
+    reference_ns: int | None, outliers: list[tuple[int, T]], released: Sequence[tuple[int, T]] = ()
+) -> StampDecision[T]:
+    """Decision that rejects outliers, if there are any, beside what is released."""
+    rejected = tuple(stamp for stamp, _ in outliers)
+    if not rejected:
+        return StampDecision(tuple(released))
+    return StampDecision(tuple(released), rejected, _off(reference_ns, rejected[0]), fault=StampFault.ODD)
 
 
 def _seconds(later_ns: int | None, earlier_ns: int) -> str:

@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Generic, TypeVar
 
-import numpy as np
-
+from slam_core.calibration_watch import same_calibration
 from slam_core.camera import CameraInfo
 
 T = TypeVar("T")
@@ -31,7 +30,7 @@ class CalibratedPairs(Generic[T]):
     def set_info(self, side: str, info: CameraInfo) -> bool:
         """Take the info of "left" or "right"; whether it differs from the one known."""
         known = self._infos.get(side)
-        if known is not None and _equal(known, info):
+        if known is not None and same_calibration(known, info):
             return False
         self._infos[side] = info
         return True
@@ -50,7 +49,3 @@ class CalibratedPairs(Generic[T]):
     def clear(self) -> None:
         """Forget the items; calibrations stay."""
         self._waiting.clear()
-
-
-def _equal(a: CameraInfo, b: CameraInfo) -> bool:
-    return a.camera == b.camera and np.array_equal(a.R, b.R) and np.array_equal(a.P, b.P)

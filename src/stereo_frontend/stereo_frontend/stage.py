@@ -166,5 +166,9 @@ class FeatureStage:
     def reset(self) -> None:
         """Forget thresholds, noise and what waits."""
         self._frontend.reset()
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what waits, while another thread may measure."""
         self._pairing.clear()
         self._ready.clear()

@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from ndt_registration.stage import Scan
+from slam_bringup.bags.left_out import LeftOut
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
@@ -25,8 +25,6 @@ from slam_core.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
 from slam_core.types import ByteArray, ImuSample
 from stereo_frontend.sources import RawPair
 from tof_driver.stage import RawDepth
-
-_UNPAIRED = f"images without a partner within {1000 * PAIRING_TOLERANCE_S:g} ms of their stamp"
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +88,25 @@ class ColourReading:
     image: ByteArray
 
 
-Reading = StereoReading | DepthReading | LaserReading | ImuReading | ColourReading
+@dataclass(frozen=True)
+class SessionStart:
+    """The clock of an agent's sensors has jumped back for good: what follows has nothing to do with what was before."""
+
+    agent: str
+    stamp_ns: int
+
+
+@dataclass(frozen=True, eq=False)
+class InfoReading:
+    """A camera info that is the first of its camera ("left", "right", "depth") or differs from the one before."""
+
+    agent: str
+    stamp_ns: int
+    camera: str
+    info: CameraInfo
+
+
+Reading = StereoReading | DepthReading | LaserReading | ImuReading | ColourReading | SessionStart
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +161,7 @@ def _colour_reading(sensors: AgentSensors, message: Message) -> Reading:
     return ColourReading(sensors.agent, stamp_ns(message), colour_from_message(message))
 
 
-_UNPAIRED_ROLES: dict[str, Callable[[AgentSensors, Message], Reading]] = {
+UNPAIRED_ROLES: dict[str, Callable[[AgentSensors, Message], Reading]] = {
     "imu": _imu_reading,
     "scan": _laser_reading,
     "color": _colour_reading,
@@ -155,18 +171,21 @@ _UNPAIRED_ROLES: dict[str, Callable[[AgentSensors, Message], Reading]] = {
 IMAGE_ROLES = ("left", "right", "depth", "amplitude", "intensity")
 """Roles whose messages are paired by stamp to readings of cameras."""
 
-ROLES_READ = (*IMAGE_ROLES, *_UNPAIRED_ROLES)
+ROLES_READ = (*IMAGE_ROLES, *UNPAIRED_ROLES)
 """Roles whose messages become readings."""
 
 
-class AgentPairing:
-    """Pairs one agent's messages by stamp; what it drops is counted in ``left_out``."""
+INFO_ROLES = {"left_info": "left", "right_info": "right", "tof_info": "depth"}
+"""Camera of each role of a camera info."""
 
-    def __init__(self, sensors: AgentSensors, left_out: Counter[str]) -> None:
+
+class AgentPairing:
+    """Pairs one agent's messages by stamp, whatever these are; messages of no use are counted in ``left_out``."""
+
+    def __init__(self, sensors: AgentSensors, left_out: LeftOut) -> None:
         self._sensors = sensors
         self._left_out = left_out
         self._ready: list[Reading] = []
-        self._newest_ns: dict[type[Reading], int] = {}
         has_stereo = {"left", "right"} <= sensors.topics.keys()
         depth_roles = [role for role in ("depth", "amplitude", "intensity") if role in sensors.topics]
         stereo_roles = ("left", "right") if has_stereo else ()
@@ -178,37 +197,35 @@ class AgentPairing:
     def add(self, role: str, message: Message) -> list[Reading]:
         """The readings that this message completes."""
         self._ready = []
-        if role in _UNPAIRED_ROLES:
-            self._hand_on(_UNPAIRED_ROLES[role](self._sensors, message))
-        elif role in ("left", "right"):
-            self._stereo.add(role, stamp_ns(message), message)
-        else:
-            self._depth.add(role, stamp_ns(message), message)
+        try:
+            if role in UNPAIRED_ROLES:
+                self._ready.append(UNPAIRED_ROLES[role](self._sensors, message))
+            elif role in ("left", "right"):
+                self._stereo.add(role, stamp_ns(message), message)
+            else:
+                self._depth.add(role, stamp_ns(message), message)
+        except ValueError as error:
+            self._left_out.unusable(self._sensors.topics[role], error)
         return self._ready
 
-    def finish(self) -> None:
-        """Count the images that never found their partner."""
-        waiting = [*self._stereo.waiting.values(), *self._depth.waiting.values()]
-        if unpaired := self._stereo.unpaired + self._depth.unpaired + sum(waiting):
-            self._left_out[_UNPAIRED] += unpaired
+    @property
+    def unpaired(self) -> int:
+        """Images that were dropped because their partners never came."""
+        return self._stereo.unpaired + self._depth.unpaired
+
+    def flush(self) -> None:
+        """Let no image wait any more; those that do are unpaired."""
+        self._stereo.clear()
+        self._depth.clear()
 
     def _on_stereo(self, stamp: int, messages: tuple[Message, ...]) -> None:
         left, colour = grey_and_colour_from_message(messages[0])
         pair = RawPair(stamp, left, grey_from_message(messages[1]), self._sensors.left_frame, colour)
-        self._hand_on(StereoReading(self._sensors.agent, pair))
+        self._ready.append(StereoReading(self._sensors.agent, pair))
 
     def _on_depth(self, stamp: int, messages: tuple[Message, ...]) -> None:
         images = dict(zip(self._depth_roles, (picture_from_message(m) for m in messages), strict=True))
         raw = RawDepth(
             stamp, images["depth"], images.get("amplitude"), images.get("intensity"), self._sensors.tof_frame
         )
-        self._hand_on(DepthReading(self._sensors.agent, raw))
-
-    def _hand_on(self, reading: Reading) -> None:
-        """Only what is newer than all before: a message may have come twice, or time jumped back."""
-        stamp = reading.stamp_ns
-        if stamp <= self._newest_ns.get(type(reading), -1):
-            self._left_out["not newer than what came before"] += 1
-            return
-        self._newest_ns[type(reading)] = stamp
-        self._ready.append(reading)
+        self._ready.append(DepthReading(self._sensors.agent, raw))

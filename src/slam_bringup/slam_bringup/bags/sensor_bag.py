@@ -14,8 +14,8 @@ Topics are those of the nodes, or given by role, see :mod:`slam_bringup.bags.sen
   no other;
 - ``scan`` of a laser scanner, ``imu`` and ``ground_truth/pose``.
 
-Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts. A
-message that is broken, has no partner, or is older than what came before it is left out and counted.
+Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts, and
+images under another one are left out. So is a message that is broken, has no partner or an odd stamp; all are counted.
 """
 
 from __future__ import annotations
@@ -25,26 +25,32 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 
+from slam_bringup.bags.agent_stream import AgentStream
 from slam_bringup.bags.bag import BagReader
+from slam_bringup.bags.left_out import LeftOut
 from slam_bringup.bags.reading_times import ReadingTimes, Stamps
 from slam_bringup.bags.readings import (
     IMAGE_ROLES,
+    INFO_ROLES,
     ROLES_READ,
     AgentPairing,
     AgentSensors,
     ColourReading,
     DepthReading,
     ImuReading,
+    InfoReading,
     LaserReading,
     Reading,
+    SessionStart,
     StereoReading,
 )
 from slam_bringup.bags.rig_calibration import RigCalibration
 from slam_bringup.bags.sensor_topics import BagNames, find_agents, is_rectified, join, topics_of
+from slam_core.calibration_watch import CalibrationWatch
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.messages import (
@@ -53,7 +59,17 @@ from slam_core.messages import (
     stamp_ns,
     transform_from_message,
 )
+from slam_core.messages.base import Message
 from slam_core.trajectory import Trajectory
+
+R = TypeVar("R", bound=Reading | InfoReading)
+
+_RANKS = (SessionStart, InfoReading, ImuReading, ColourReading, DepthReading, LaserReading, StereoReading)
+_LEADER: dict[type[Reading], str] = {StereoReading: "left", DepthReading: "depth"}
+"""Role of the first image of each kind of reading of a camera."""
+_IMAGES_OF: dict[str, type[Reading]] = {"left": StereoReading, "right": StereoReading, "depth": DepthReading}
+_AFTER_STAMP = 12
+"""Bytes of a message up to its stamp's end: encapsulation, seconds, nanoseconds."""
 
 
 class SensorBag:
@@ -74,10 +90,9 @@ class SensorBag:
 
     def __init__(self, path: Path, names: BagNames | None = None) -> None:
         self.reader = BagReader(path)
-        self.left_out: Counter[str] = Counter()
-        """Messages that the last :meth:`readings` left out, by reason."""
         self.times = ReadingTimes()
         """Stamps and times of what the last :meth:`readings` passed."""
+        self._left_out = LeftOut()
         self._warnings: list[str] = []
         self._names = names or BagNames()
         self._true_poses: dict[str, list[bytes]] = {}
@@ -101,44 +116,84 @@ class SensorBag:
         What helps a frame thus comes before it, as at the node, which waits for it. ``colours``: the colour pictures
         too, which only the dense model needs.
         """
-        return _with_ranks(self._in_order_of_arrival(colours))
+        self._left_out, self.times = LeftOut(), ReadingTimes()
+        watches = {agent: self._calibrations(sensors) for agent, sensors in self.sensors.items()}
+        for reading in _with_ranks(self._in_order_of_arrival(colours)):
+            if isinstance(reading, InfoReading):
+                watches[reading.agent][_IMAGES_OF[reading.camera]].hear(reading.camera, reading.info)
+                continue
+            watch = watches[reading.agent].get(type(reading))
+            if watch is not None and (complaint := watch.complaint):
+                topic = self.sensors[reading.agent].topics[_LEADER[type(reading)]]
+                self._left_out.add(f"images on {topic} under another calibration", warning=f"{topic}: {complaint}")
+                continue
+            self.times.add(reading)
+            yield reading
 
     def images_at(self, wanted: Mapping[str, Stamps]) -> Generator[Reading, None, None]:
         """The stereo and depth readings with some stamps, by agent, and perhaps others; after :meth:`readings`.
 
         Only the parts of the bag that hold them are unpacked, as ``times`` has it.
         """
-        return _with_ranks(self._at(wanted))
+        given = set()
+        for reading in _with_ranks(self._at(wanted)):
+            key = (reading.agent, type(reading), reading.stamp_ns)
+            if isinstance(reading, StereoReading | DepthReading) and key not in given:
+                given.add(key)
+                yield reading
 
-    def _in_order_of_arrival(self, colours: bool) -> Iterator[Reading]:
+    def _in_order_of_arrival(self, colours: bool) -> Iterator[Reading | InfoReading]:
         """A pair comes when its last image does."""
-        self.left_out.clear()
-        self.times = times = ReadingTimes()
-        pairing = {agent: AgentPairing(sensors, self.left_out) for agent, sensors in self.sensors.items()}
+        left_out, times = self._left_out, self.times
+        streams = {agent: AgentStream(sensors, left_out) for agent, sensors in self.sensors.items()}
         route = self._route([role for role in ROLES_READ if colours or role != "color"])
+        infos = self._route([role for role in INFO_ROLES if self._names.calibration.info(_file_of(role)) is None])
         types = {name: info.type_name for name, info in self.reader.topics.items()}
         true_poses: dict[str, list[bytes]] = {topic: [] for topic in self._truth_topics()}
-        for topic, recorded_ns, data in self.reader.raw({*route, *true_poses}):
+        newest: dict[str, bytes] = {}
+        for topic, recorded_ns, data in self.reader.raw({*route, *infos, *true_poses}):
             if topic in true_poses:
                 true_poses[topic].append(data)
                 continue
+            if topic in infos and newest.get(topic) == data[_AFTER_STAMP:]:
+                continue
             try:
                 message = self.reader.decode(types[topic], data)
-                for agent, role in route[topic]:
-                    if role in IMAGE_ROLES:
-                        times.add_image(agent, stamp_ns(message), recorded_ns)
-                    for reading in pairing[agent].add(role, message):
-                        times.add(reading)
-                        yield reading
             except ValueError as error:
-                self._count_unusable(topic, error)
+                left_out.unusable(topic, error)
+                continue
+            if topic in infos:
+                newest[topic] = data[_AFTER_STAMP:]
+                yield from self._infos(infos[topic], topic, message)
+            for agent, role in route.get(topic, ()):
+                if role in IMAGE_ROLES:
+                    times.add_image(agent, stamp_ns(message), recorded_ns)
+                yield from streams[agent].add(role, message)
+        for stream in streams.values():
+            yield from stream.finish()
         self._true_poses = true_poses
         times.is_whole = self.reader.is_indexed
-        for p in pairing.values():
-            p.finish()
+
+    def _infos(self, route: Sequence[tuple[str, str]], topic: str, message: Message) -> Iterator[InfoReading]:
+        """A camera info for each agent and camera that it is of."""
+        for agent, role in route:
+            camera = INFO_ROLES[role]
+            try:
+                info = _as_recorded(camera_info_from_message(message), camera, self.sensors[agent].topics[camera])
+                yield InfoReading(agent, stamp_ns(message), camera, info)
+            except ValueError as error:
+                self._left_out.unusable(topic, error)
+
+    def _calibrations(self, sensors: AgentSensors) -> dict[type[Reading], CalibrationWatch]:
+        """Watches over an agent's stereo and depth camera, which know the calibrations in use."""
+        watches: dict[type[Reading], CalibrationWatch] = {kind: CalibrationWatch() for kind in _LEADER}
+        for camera, info in (("left", sensors.left), ("right", sensors.right), ("depth", sensors.tof)):
+            if info is not None:
+                watches[_IMAGES_OF[camera]].hear(camera, info)
+        return watches
 
     def _at(self, wanted: Mapping[str, Stamps]) -> Iterator[Reading]:
-        pairing = {agent: AgentPairing(self.sensors[agent], Counter()) for agent in wanted}
+        pairing = {agent: AgentPairing(self.sensors[agent], LeftOut()) for agent in wanted}
         route = self._route(IMAGE_ROLES)
         types = {name: info.type_name for name, info in self.reader.topics.items()}
         for topic, _, data in self.reader.raw(route, self.times.spans(wanted)):
@@ -155,13 +210,6 @@ class SensorBag:
                 route.setdefault(sensors.topics[role], []).append((agent, role))
         return route
 
-    def _count_unusable(self, topic: str, error: ValueError) -> None:
-        reason = f"unusable messages on {topic}"
-        self.left_out[reason] += 1
-        text = f"{topic}: {error}"
-        if self.left_out[reason] == 1 and text not in self._warnings:
-            self._warnings.append(text)
-
     def _truth_topics(self) -> set[str]:
         """Topics of true poses: read along with the rest, for another pass would unpack the whole bag."""
         return {s.topics["ground_truth"] for s in self.sensors.values() if "ground_truth" in s.topics}
@@ -172,9 +220,14 @@ class SensorBag:
         return self._names.calibration
 
     @property
+    def left_out(self) -> Counter[str]:
+        """Messages that the last :meth:`readings` left out, by reason."""
+        return self._left_out.counts
+
+    @property
     def warnings(self) -> list[str]:
         """Warnings about this bag, as far as it has been read."""
-        return self._warnings + [self.reader.warning] * bool(self.reader.warning)
+        return [*self._warnings, *self._left_out.warnings, *[self.reader.warning] * bool(self.reader.warning)]
 
     def count(self, agent: str, role: str) -> int:
         """Messages of a role ("left", "depth", "imu", ...) of an agent; 0 if there is no such topic."""
@@ -249,10 +302,7 @@ class SensorBag:
                 raise ValueError(f"the images on {topics[role]} are rectified: a calibration is for raw images")
             return given, self._frame_of((topic, topics[role]))
         for _, _, message in self.reader.messages([topic]):
-            info = camera_info_from_message(message)
-            if role != "depth" and is_rectified(topics[role]):
-                info = CameraInfo(info.rectified, P=info.P)
-            return info, message.header.frame_id
+            return _as_recorded(camera_info_from_message(message), role, topics[role]), message.header.frame_id
         raise ValueError(
             f"{self.reader.path} has images but no camera info on {topic}: record it (slam calibrate makes one), or "
             f"say where it is: --topic {info_role}=/..."
@@ -273,10 +323,16 @@ class SensorBag:
         return tree
 
 
-def _with_ranks(readings: Iterator[Reading]) -> Generator[Reading, None, None]:
+def _as_recorded(info: CameraInfo, role: str, image_topic: str) -> CameraInfo:
+    """Calibration of a camera's images as they are in the bag."""
+    return CameraInfo(info.rectified, P=info.P) if role != "depth" and is_rectified(image_topic) else info
+
+
+def _file_of(role: str) -> str:
+    """Camera of a camera info's role as a calibration's files name it."""
+    return role.removesuffix("_info")
+
+
+def _with_ranks(readings: Iterator[R]) -> Generator[R, None, None]:
     for _, together in groupby(readings, key=lambda reading: reading.stamp_ns):
-        yield from sorted(together, key=_rank)
-
-
-def _rank(reading: Reading) -> int:
-    return (ImuReading, ColourReading, DepthReading, LaserReading, StereoReading).index(type(reading))
+        yield from sorted(together, key=lambda reading: _RANKS.index(type(reading)))

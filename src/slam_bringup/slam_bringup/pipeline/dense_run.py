@@ -135,6 +135,7 @@ class AgentDepth:
     ) -> None:
         self._config: DenseConfig = config.dense_mapper
         self._agent, self._trajectory, self._sensors = sensors.agent, trajectory, sensors
+        self._has_begun = False
         self._depth: DepthStage | None = None
         self._stereo: StereoStage | None = None
         self._forces: list[tuple[int, FloatArray]] = []
@@ -159,8 +160,12 @@ class AgentDepth:
         return self._has_colours and self._depth is not None
 
     def is_over(self, reading: Reading) -> bool:
-        """True if an image comes after the end of the trajectory."""
-        return isinstance(reading, StereoReading | DepthReading) and reading.stamp_ns > self._trajectory.stamps_ns[-1]
+        """True if an image comes after the end of the trajectory, and not before the session that it is of."""
+        if not isinstance(reading, StereoReading | DepthReading):
+            return False
+        first, last = self._trajectory.stamps_ns[[0, -1]]
+        self._has_begun |= first <= reading.stamp_ns <= last
+        return self._has_begun and reading.stamp_ns > last
 
     def key_stamps(self, times: ReadingTimes) -> Stamps:
         """Stamps of the readings that make key frames, of those that a reading of the bag has passed."""

@@ -16,7 +16,7 @@ from ekf_slam_node.stage import FilterStage, FrameResult
 from ndt_registration.stage import ScanEstimate
 from sjsam_node.agents import in_order
 from sjsam_node.joiner_stage import JoinerStage
-from slam_bringup.bags.readings import AgentSensors
+from slam_bringup.bags.readings import AgentSensors, SessionStart
 from slam_bringup.pipeline.configuration import SystemConfig, filter_config
 from slam_bringup.pipeline.map_growth import MapGrowth
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges
@@ -67,6 +67,9 @@ class Mapper:
             stage.add_motion(value.pose.stamp_ns, motion_as_received(value.motion))
         elif isinstance(value, Features):
             stage.add_features(value)
+        elif isinstance(value, SessionStart):
+            self._process_waiting(item.agent)
+            self._join(stage.start_session())
         self._take_results(item.agent)
 
     def finish(self) -> None:
@@ -76,8 +79,7 @@ class Mapper:
         """
         last: list[Submap] = []
         for agent, stage in self._filters.items():
-            stage.give_up()
-            self._take_results(agent)
+            self._process_waiting(agent)
             self._events += [stage.finding] if stage.finding else []
             last += stage.start_session()  # which no frame begins: the filter forgets its state
         give_back()
@@ -90,6 +92,11 @@ class Mapper:
                 self._events.append(f"a submap could not be joined: {error!r}")
         self._events += self.growth.finish()
         give_back()
+
+    def _process_waiting(self, agent: str) -> None:
+        """Process an agent's frames that wait for another stream: there will be no more of it."""
+        self._filters[agent].give_up()
+        self._take_results(agent)
 
     def stop(self) -> None:
         """End the thread that joins, at the latest after the submap it is at."""

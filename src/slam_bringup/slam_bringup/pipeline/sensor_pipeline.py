@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 from ndt_registration.stage import Scan, ScanEstimate, ScanOdometryStage
 from slam_bringup.bags.readings import (
@@ -19,6 +20,7 @@ from slam_bringup.bags.readings import (
     ImuReading,
     LaserReading,
     Reading,
+    SessionStart,
     StereoReading,
 )
 from slam_bringup.pipeline.configuration import SystemConfig
@@ -29,13 +31,15 @@ from stereo_frontend.frontend import FrontendReport
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
 from tof_driver.stage import DepthStage
 
+Value: TypeAlias = ExtractedFrame | Features | ScanEstimate | ImuSample | SessionStart
+
 
 @dataclass(frozen=True, eq=False)
 class AgentItem:
     """Output of the sensors of ``agent``; an extracted frame has yet to be measured."""
 
     agent: str
-    value: ExtractedFrame | Features | ScanEstimate | ImuSample
+    value: Value
 
 
 class SensorPipeline:
@@ -74,6 +78,8 @@ class SensorPipeline:
         elif isinstance(reading, LaserReading) and self._odometry is not None:
             self._odometry.add_scan(reading.scan)
             yield from self._scans()
+        elif isinstance(reading, SessionStart):
+            yield from self._on_session(reading)
 
     def finish(self) -> Iterator[AgentItem]:
         """Yield what still waits when the input has ended."""
@@ -95,6 +101,16 @@ class SensorPipeline:
     def front_end(self) -> FrontendReport:
         """Findings of the front end about the images."""
         return self._features.report()
+
+    def _on_session(self, start: SessionStart) -> Iterator[AgentItem]:
+        """What waits belongs to the session before; the calibration and what is known of the camera stay."""
+        yield from self.finish()
+        self._stereo.reset()
+        self._depth.reset()
+        self._features.clear()
+        if self._odometry is not None:
+            self._odometry.reset()
+        yield self._item(start)
 
     def _on_imu(self, sample: ImuSample) -> Iterator[AgentItem]:
         yield self._item(sample)
@@ -124,7 +140,7 @@ class SensorPipeline:
     def _frames(self) -> Iterator[AgentItem]:
         yield from map(self._item, self._times.each("keypoints", self._features.extracted()))
 
-    def _item(self, value: ExtractedFrame | Features | ScanEstimate | ImuSample) -> AgentItem:
+    def _item(self, value: Value) -> AgentItem:
         return AgentItem(self._agent, value)
 
     def _require(self, mode: str, sensors: AgentSensors, odometry: bool) -> None:
