@@ -14,7 +14,7 @@ import pytest
 
 from slam_bringup.bags.bag import BagReader, BagWriter
 
-DEMO = Path(__file__).resolve().parents[4] / "bags" / "demo"
+DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
 HOUR_S = 3600
 
 
