@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ambiguity of a global search: another refined pose that explains the scan as well makes the answer doubtful.
+"""Ambiguity of a global search: another minimum that explains the scan as well makes the answer doubtful.
 
-Where two scans share little, a wrong pose can look as good as the true one. An answer is doubted where another pose
-costs hardly more.
+Where two scans share little, a wrong pose can look as good as the true one. An answer is doubted where another minimum
+costs hardly more; one that lies near widens the covariance instead.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from ndt_registration.search import SEPARATION, Candidate, pose_distance
 from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxminus
 
-_MARGIN = 0.03
+_MARGIN = 0.02
 """Cost by which the answer must beat every rival."""
 _GATE = chi_square_bound(0.999, 6)
 """Squared Mahalanobis distance within which a pose is no rival: the covariance covers it."""
@@ -30,7 +30,7 @@ def ambiguity_reason(
     Parameters
     ----------
     best, others
-        The answer and the other poses that were refined.
+        The answer and the other minima.
     covariance
         Shape (6, 6), of the answer; poses that it covers, such as those along a corridor, are no rivals.
     scale
@@ -40,6 +40,18 @@ def ambiguity_reason(
         if other.cost < best.cost + _MARGIN and _differs(best, other, covariance, scale):
             return f"ambiguous: a pose {_difference(best.T, other.T)} away explains the scan about equally well"
     return ""
+
+
+def spread_of_neighbours(minima: list[Candidate], scale: float) -> FloatArray:
+    """Covariance (6, 6) of the minima near the first that cost hardly more: any of them may be the true one."""
+    best = minima[0]
+    near = [
+        boxminus(other.T, best.T)
+        for other in minima
+        if other.cost < best.cost + _MARGIN and pose_distance(other.T, best.T, scale) <= SEPARATION
+    ]
+    offsets = np.array(near)
+    return np.asarray(offsets.T @ offsets / len(near))
 
 
 def _differs(best: Candidate, other: Candidate, covariance: FloatArray, scale: float) -> bool:

@@ -22,7 +22,9 @@ _RELATIVE_MAX_DISTANCE = 0.2
 _SHRINKAGE = 0.6
 """Factor of the limit from stage to stage."""
 _ITERATIONS = 20
-"""Most iterations per stage."""
+"""Most iterations per stage before the last limit is reached, where the next stage goes on."""
+_LAST_ITERATIONS = 150
+"""Most iterations with the last limit: points against points slide along surfaces by small steps."""
 _TOLERANCE = 1e-4
 """Length of the last step, over the scale."""
 _NEIGHBOURS = 12
@@ -91,19 +93,20 @@ def icp_align(
 ) -> IcpOutcome:
     """Move ``source`` (n, 3), in random order, onto ``target`` from the pose ``T``.
 
-    All its points are used with the last rejection limit, ``coarse_points`` of them before. ``planar`` allows x, y and
-    yaw only.
+    ``coarse_points`` of them are used until the last rejection limit is reached and the steps have become small with
+    it, then all. ``planar`` allows x, y and yaw only.
     """
     limit = config.max_distance or _RELATIVE_MAX_DISTANCE * scale
     last = min(config.final_spacings * target.spacing, limit)
+    stages = [(source[:coarse_points], last, _LAST_ITERATIONS), (source, last, _LAST_ITERATIONS)]
+    while limit > last:
+        stages.insert(-2, (source[:coarse_points], limit, _ITERATIONS))
+        limit *= _SHRINKAGE
     iterations, converged = 0, False
-    while True:
-        points = source if limit <= last else source[:coarse_points]
-        T, used, converged = _stage(points, target, T, limit, scale, config, plane, planar)
+    for points, limit, most in stages:
+        T, used, converged = _stage(points, target, T, limit, most, scale, config, plane, planar)
         iterations += used
-        if limit <= last:
-            return IcpOutcome(T, iterations, converged)
-        limit = max(limit * _SHRINKAGE, last)
+    return IcpOutcome(T, iterations, converged)
 
 
 def _stage(
@@ -111,13 +114,14 @@ def _stage(
     target: IcpTarget,
     T: FloatArray,
     limit: float,
+    most: int,
     scale: float,
     config: IcpConfig,
     plane: bool,
     planar: bool,
 ) -> tuple[FloatArray, int, bool]:
-    """Iterations with one rejection limit: pose, number, whether it settled."""
-    for iteration in range(1, _ITERATIONS + 1):
+    """At most so many iterations with one rejection limit: pose, number, whether the steps became small."""
+    for iteration in range(1, most + 1):
         moved = transform_points(T, source)
         distance, nearest = target.tree.query(moved, distance_upper_bound=limit)
         pairs = np.flatnonzero(np.isfinite(distance))
@@ -135,7 +139,7 @@ def _stage(
         T = T_new
         if change < _TOLERANCE * scale:
             return T, iteration, True
-    return T, _ITERATIONS, False
+    return T, most, False
 
 
 def _point_step(points: FloatArray, matches: FloatArray, planar: bool) -> FloatArray:

@@ -12,7 +12,7 @@ from ndt_registration.voxel_grid import NormalGrid, adopt_planes, normal_grid, n
 from slam_core.config import Config, parameter
 
 _LEAST_COVERAGE = 0.5
-"""Share of the places of a cloud's points in the finest cells that hold enough of them; sparser clouds get larger cells."""
+"""Least share of a cloud in cells that hold enough points: sparser clouds get larger cells."""
 _WIDEST = 0.25
 """Cells this wide, over the scale, are not made wider for that."""
 _EIGENVALUE_FLOOR = 1e-3

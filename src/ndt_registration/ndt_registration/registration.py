@@ -14,14 +14,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from ndt_registration.ambiguity import ambiguity_reason
+from ndt_registration.ambiguity import ambiguity_reason, spread_of_neighbours
 from ndt_registration.cloud import Cloud, finite_points, is_planar, largest_extent, prepare, viewpoint
+from ndt_registration.descent import COARSE_POINTS, Answer, descend, orthonormal_pose, searched_minima
 from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
 from ndt_registration.matching import block_gradients, fit_to_grid
-from ndt_registration.ndt import NdtOptimum, ndt_align
+from ndt_registration.ndt import Layer, NdtOptimum, ndt_align
 from ndt_registration.pyramid import GridConfig, Pyramid
 from ndt_registration.score_loss import ScoreLoss
-from ndt_registration.search import Candidate, SearchConfig, Views, judge, planar_constraint, search
+from ndt_registration.search import Candidate, SearchConfig, Views, judge, planar_constraint
 from ndt_registration.uncertainty import (
     Curvature,
     Extent,
@@ -38,17 +39,9 @@ from slam_core.geometry import (
     FloatArray,
     is_rigid_transform,
     make_transform,
-    quaternion_from_rotation,
-    rotation_from_quaternion,
     skew,
 )
 
-_COARSE_POINTS = 2000
-"""Most points of the source on all but the finest level, and with all but ICP's last limit."""
-_MAX_ITERATIONS = 50
-"""Most iterations per level."""
-_TOLERANCE = 1e-4
-"""Length of the last step, over the scale."""
 IMAGE_SIZE = 64
 """Edge of the range image that holds free space, px."""
 _MIN_OVERLAP = 0.15
@@ -62,8 +55,6 @@ _PLANAR_VOXEL_SIZE = 0.18
 """Edge of the finest cells of a scan in the plane, over its scale."""
 _PLANAR_CELL_POINTS, _PLANAR_SCAN_POINTS = 4, 30
 """Fewest points of a cell, and finite ones of a scan, in the plane."""
-_COARSE_TOLERANCE = 10.0
-"""So many times the tolerance ends a coarser level: its optimum only starts the next one."""
 _ROUNDING = 4e-15
 """Variance of rounding over the trace of a covariance (6, 6): what keeps it positive definite at a long lever."""
 
@@ -216,40 +207,36 @@ def register_cloud(
     """:func:`register` of a cloud made ready, with a guess in coordinates about the target's centre."""
     scale = max(target.cloud.scale, 1e-6)
     views = Views(source, range_image(source.points, IMAGE_SIZE), target.cloud, target.image)
-    candidates: list[Candidate] = []
+    answers: list[Answer] = []
     if guess is not None:
         T, start = guess, config.start_level
     elif config.search.enabled:
-        candidates = search(views, target.pyramid, config.rim_share, config.search)
-        T, start = candidates[0].T, 1
+        answers = searched_minima(views, target.pyramid, config.rim_share, config.search)
+        T, start = answers[0].candidate.T, 0
     else:
         T, start = np.eye(4), config.grid.levels - 1
-    optimum, iterations = _aligned(source, target, T, start, scale, config)
-    conflict = judge(views, optimum).conflict
-    result = _result(source, target, optimum, iterations, conflict, config)
-    if candidates and result.converged:
-        return _without_ambiguity(result, candidates[0], candidates[1:], target)
+    if answers and config.method == "ndt":
+        optimum, iterations = answers[0].optimum, answers[0].iterations
+    else:
+        optimum, iterations = _aligned(source, target, T, start, scale, config)
+    result = _result(source, target, optimum, iterations, judge(views, optimum).conflict, config)
+    if answers and result.converged:
+        return _without_ambiguity(result, [answer.candidate for answer in answers], target)
     return result
 
 
-def _without_ambiguity(
-    result: RegistrationResult, best: Candidate, others: list[Candidate], target: Target
-) -> RegistrationResult:
+def _without_ambiguity(result: RegistrationResult, minima: list[Candidate], target: Target) -> RegistrationResult:
     """The result of a search, as a failure where it is not the only answer."""
-    scale = max(target.cloud.scale, 1e-6)
+    scale, best = max(target.cloud.scale, 1e-6), minima[0]
     centred = _shifted_covariance(result.covariance, -best.T[:3, :3] @ target.centre)
-    reason = ambiguity_reason(best, others, centred, scale)
+    centred = centred + spread_of_neighbours(minima, scale)
+    reason = ambiguity_reason(best, minima[1:], centred, scale)
     if not reason and result.degenerate:
-        return replace(result, converged=False, reason=f"without a guess {result.reason}")
-    if not reason:
-        return result
-    covariance = _shifted_covariance(unknown(scale), best.T[:3, :3] @ target.centre)
-    return replace(result, covariance=covariance, converged=False, reason=reason)
-
-
-def _pose(optimum: NdtOptimum) -> FloatArray:
-    """The optimum's pose, its rotation exactly orthonormal again."""
-    return make_transform(rotation_from_quaternion(quaternion_from_rotation(optimum.rotation)), optimum.translation)
+        reason = f"without a guess {result.reason}"
+    else:
+        centred = unknown(scale) if reason else centred
+    covariance = _shifted_covariance(centred, best.T[:3, :3] @ target.centre)
+    return replace(result, covariance=covariance, converged=not reason, reason=reason or result.reason)
 
 
 def _aligned(
@@ -257,7 +244,7 @@ def _aligned(
 ) -> tuple[NdtOptimum, int]:
     """The optimum by the chosen method from a pose, with the derivatives of the NDT cost there, and the iterations."""
     if config.method == "ndt":
-        return _descend(source, target, T, start, scale, config)
+        return descend(source, target.pyramid, T, start, scale, config.rim_share)
     plane = config.method == "icp_plane"
     outcome = icp_align(
         source.points,
@@ -265,7 +252,7 @@ def _aligned(
         T,
         scale,
         config.icp,
-        coarse_points=_COARSE_POINTS,
+        coarse_points=COARSE_POINTS,
         plane=plane,
         planar=source.planar,
     )
@@ -273,24 +260,6 @@ def _aligned(
     layers = target.pyramid.layers(source, 0, len(source), config.rim_share)
     there = ndt_align(layers, R, t, planar_constraint(source.planar), scale, 0, 0.0)
     return there._replace(converged=outcome.converged), outcome.iterations
-
-
-def _descend(
-    source: Cloud, target: Target, T: FloatArray, start: int, scale: float, config: RegistrationConfig
-) -> tuple[NdtOptimum, int]:
-    """NDT from level ``start`` down to the finest; the optimum there and the iterations in all."""
-    grids = target.pyramid.grids
-    iterations = 0
-    fixed = planar_constraint(source.planar)
-    R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
-    for level in range(min(start, len(grids) - 1), -1, -1):
-        count = len(source) if level == 0 else _COARSE_POINTS
-        layers = target.pyramid.layers(source, level, count, config.rim_share)
-        tolerance = _TOLERANCE * scale * (1.0 if level == 0 else _COARSE_TOLERANCE)
-        optimum = ndt_align(layers, R, t, fixed, scale, _MAX_ITERATIONS, tolerance)
-        R, t = optimum.rotation, optimum.translation
-        iterations += optimum.iterations
-    return optimum, iterations
 
 
 def _result(
@@ -306,14 +275,13 @@ def _result(
     wider, limit = grids[min(1, len(grids) - 1)], 3.0 * grids[0].block_size
     fit = fit_to_grid(source.points, optimum.rotation, optimum.translation, grids[0], wider, limit)
     layers = target.pyramid.layers(source, 0, len(source), config.rim_share)
-    gradients = [block_gradients(layer, optimum.rotation, optimum.translation) for layer in layers]
     uncertainty = sandwich(
         Curvature(optimum.hessian, optimum.majorant, fit.spurious_hessian, fit.spurious_majorant),
-        gradient_scatter(gradients, len(source) / len(target.cloud)),
+        _scatter(layers, optimum, scale, len(source) / len(target.cloud)),
         Extent(fit.centre, max(fit.radius, _LEAST_RADIUS * scale)),
         ScoreLoss(
-            target.pyramid.layers(source, 0, _COARSE_POINTS, config.rim_share),
-            _pose(optimum),
+            target.pyramid.layers(source, 0, COARSE_POINTS, config.rim_share),
+            orthonormal_pose(optimum),
             clear_loss(config.uncertainty),
         ).loss,
         scale,
@@ -326,7 +294,7 @@ def _result(
     names = direction_names(uncertainty.free)
     covariance = uncertainty.covariance if not reason else unknown(scale)
     return RegistrationResult(
-        T_target_source=_shifted(_pose(optimum), target.centre),
+        T_target_source=_shifted(orthonormal_pose(optimum), target.centre),
         covariance=_shifted_covariance(covariance, optimum.rotation @ target.centre),
         converged=not reason,
         iterations=iterations,
@@ -338,6 +306,20 @@ def _result(
     )
 
 
+def _scatter(layers: tuple[Layer, Layer], optimum: NdtOptimum, scale: float, density_ratio: float) -> FloatArray:
+    """Covariance of the cost's gradient; blocks of both layers in cubes of one size and place."""
+    (surfaces, places), (rims, rim_places) = (
+        block_gradients(layer, optimum.rotation, optimum.translation) for layer in layers
+    )
+    size = layers[0].grid.block_size
+    wide = round(layers[1].grid.block_size / size)
+    all_places = np.concatenate([places, wide * rim_places])
+    width = max(round(_SHARED_ERRORS * scale / size), 1)
+    return gradient_scatter(np.concatenate([surfaces, rims]), all_places, width, density_ratio)
+
+
+_SHARED_ERRORS = 1 / 8
+"""Edge of the cubes whose points share errors of a depth camera, over the scale."""
 _UNITS_APART = 100.0
 """Clouds of one place differ less in scale than so many times, unless their units do."""
 _LEAST_RADIUS = 0.05

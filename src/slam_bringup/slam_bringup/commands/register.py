@@ -44,7 +44,9 @@ UNIT_RATIO = 20.0
     "--initial-guess",
     help="T_target_source: x y z, x y z yaw pitch roll (m, deg), x y z qx qy qz qw, 16 numbers, or a file of them",
 )
-@click.option("--config", "config_file", type=UserPath(exists=True, dir_okay=False), help="YAML with RegistrationConfig values")
+@click.option(
+    "--config", "config_file", type=UserPath(exists=True, dir_okay=False), help="YAML with RegistrationConfig values"
+)
 @click.option("-o", "--output", type=UserPath(), help="folder for result.json and registration.png")
 @click.option("--json", "as_json", is_flag=True, help="print JSON on a terminal as well")
 @overwrite_option("results of other clouds, or results that were changed since")
