@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ndt_registration.ambiguity import ambiguity_reason
+from ndt_registration.ambiguity import ambiguity_reason, spread_of_neighbours
 from ndt_registration.registration import register
 from ndt_registration.search import Candidate
 from slam_core.geometry import FloatArray, boxminus, make_transform
@@ -53,3 +53,11 @@ def test_a_row_of_equal_pillars_is_ambiguous_without_a_guess(
     assert searched.covariance[1, 1] > 1.0
     assert guessed.converged
     assert abs(boxminus(guessed.T_target_source, truth)[1]) < 0.01
+
+
+def test_a_minimum_next_to_the_answer_widens_the_covariance() -> None:
+    near, far, dear = at_x(0.04, -0.11), at_x(1.0, -0.11), at_x(0.05, 0.1)
+    spread = spread_of_neighbours([at_x(0.0, -0.12), near, far, dear], 2.0)
+    expected = np.zeros((6, 6))
+    expected[0, 0] = 0.04**2 / 2
+    np.testing.assert_allclose(spread, expected, atol=1e-12)
