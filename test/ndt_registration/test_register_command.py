@@ -117,7 +117,7 @@ def test_a_thin_map_lies_on_itself(tmp_path: Path, method: str) -> None:
     rng = np.random.default_rng(3)
     places = rng.uniform(0.0, 1.0, (3, 900, 2)) ** 1.5 * [6.0, 4.0]
     floor, wall, front = (np.insert(places[k], k, 0.01 * rng.normal(size=900), axis=1) for k in range(3))
-    path = str(write_ply(tmp_path / "map.ply", np.concatenate([floor, wall, front]) + [1.0, 1.0, 0.0]))
+    path = str(write_ply(tmp_path / "map.ply", np.add(np.concatenate([floor, wall, front]), [1.0, 1.0, 0.0])))
     outcome = CliRunner().invoke(command, [path, path, "--method", method], catch_exceptions=False)
     result = json.loads(outcome.stdout)
     assert result["converged"], result["reason"]
