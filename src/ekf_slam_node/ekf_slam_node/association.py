@@ -139,6 +139,14 @@ def associate_mahalanobis(
     return pair_up(rows, columns, costs, (len(candidates), len(frame)))
 
 
+def same_tracks(tracks: npt.NDArray[np.integer], frame_tracks: npt.NDArray[np.integer]) -> tuple[IndexArray, IndexArray]:
+    """Rows and columns of equal tracks, 0 being none, in the order of the columns."""
+    _, rows, columns = np.intersect1d(tracks, frame_tracks, return_indices=True)
+    named = tracks[rows] > 0
+    order = np.argsort(columns[named], kind="stable")
+    return rows[named][order], columns[named][order]
+
+
 def associate_nearest(
     candidates: Candidates, frame: Frame, T_previous_now: FloatArray, T_rig_optical: FloatArray, gate: float
 ) -> tuple[IndexArray, IndexArray]:

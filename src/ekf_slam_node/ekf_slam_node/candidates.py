@@ -22,22 +22,26 @@ from slam_core.types import Float32Array
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Points (n, 3) m in the previous rig frame, their covariances (n, 3, 3), descriptors (n, d)."""
+    """Points (n, 3) m in the previous rig frame, their covariances (n, 3, 3), descriptors (n, d).
+
+    tracks: (n,) of the front end, by which they were last seen; 0 without one.
+    """
 
     points: FloatArray
     covariances: FloatArray
     descriptors: Float32Array
+    tracks: np.ndarray
 
     def __len__(self) -> int:
         return len(self.points)
 
     def select(self, index: np.ndarray) -> Candidates:
         """The candidates at ``index``."""
-        return Candidates(self.points[index], self.covariances[index], self.descriptors[index])
+        return Candidates(self.points[index], self.covariances[index], self.descriptors[index], self.tracks[index])
 
     def places(self, index: np.ndarray) -> Candidates:
         """The candidates at ``index`` without their descriptors, which are the larger part."""
-        return Candidates(self.points[index], self.covariances[index], self.descriptors[:0])
+        return Candidates(self.points[index], self.covariances[index], self.descriptors[:0], self.tracks[index])
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,6 +51,8 @@ class LandmarkTable:
         self.ids = np.zeros(0, dtype=np.int64)
         self.sightings = np.zeros(0, dtype=np.int32)
         self.descriptors: Float32Array = np.zeros((0, descriptor_size), dtype=np.float32)
+        self.tracks = np.zeros(0, dtype=np.int32)
+        """Tracks of the front end by which the landmarks were last seen, 0 without one."""
         self.noise = LandmarkNoise.unknown(0)
         self._first_frame = np.zeros(0, dtype=np.int64)
         self._expected = np.zeros(0, dtype=np.int64)
@@ -59,11 +61,14 @@ class LandmarkTable:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def add(self, ids: IndexArray, sightings: np.ndarray, descriptors: Float32Array, frame: int) -> None:
+    def add(
+        self, ids: IndexArray, sightings: np.ndarray, descriptors: Float32Array, tracks: np.ndarray, frame: int
+    ) -> None:
         """Append landmarks first seen in ``frame``."""
         self.ids = np.concatenate([self.ids, ids])
         self.sightings = np.concatenate([self.sightings, sightings.astype(np.int32)])
         self.descriptors = np.concatenate([self.descriptors, descriptors])
+        self.tracks = np.concatenate([self.tracks, tracks])
         self.noise = self.noise.extended(len(ids))
         self._first_frame = np.concatenate([self._first_frame, np.full(len(ids), frame)])
         self._expected = np.concatenate([self._expected, np.zeros(len(ids), dtype=np.int64)])
@@ -72,7 +77,7 @@ class LandmarkTable:
     def select(self, slots: IndexArray) -> LandmarkTable:
         """A table of the landmarks ``slots`` alone, their record of hits and misses starting anew."""
         table = LandmarkTable(self.descriptors.shape[1])
-        table.add(self.ids[slots], self.sightings[slots], self.descriptors[slots], 0)
+        table.add(self.ids[slots], self.sightings[slots], self.descriptors[slots], self.tracks[slots], 0)
         return table
 
     def count(self, seen: IndexArray, descriptors: Float32Array, expected: np.ndarray) -> None:
@@ -98,7 +103,7 @@ class LandmarkTable:
 
     def remove(self, slot: int) -> None:
         """Drop a landmark; the last one takes its slot, as in the filter."""
-        for name in ("ids", "sightings", "descriptors", "_first_frame", "_expected", "_hits"):
+        for name in ("ids", "sightings", "descriptors", "tracks", "_first_frame", "_expected", "_hits"):
             values = getattr(self, name)
             values[slot] = values[-1]
             setattr(self, name, values[:-1])

@@ -18,6 +18,7 @@ from ekf_slam_node.association import (
     associate_mahalanobis,
     associate_nearest,
     match_descriptors,
+    same_tracks,
 )
 from ekf_slam_node.candidates import Candidates, MotionPrior
 from ekf_slam_node.config import NEAREST_ASSOCIATE, FeatureAssociationConfig
@@ -34,6 +35,10 @@ _GUESS_RATIO = 0.85
 """A match of a motion guess needs a second best whose descriptor distance is larger by 1 / this."""
 _GUESS_DESCRIPTOR_THRESHOLD = 0.6
 """Least cosine of the descriptors in the second attempt at a motion guess."""
+_FOLLOWED = 0.3
+"""Share of the features, or of the candidates where these are fewer, that must have been followed to rely on tracks."""
+_TRACK_HYPOTHESES = 30
+"""Samples drawn for the motion of tracks, few of which are wrong."""
 _HYPOTHESES = 200
 """Samples drawn for the motion guess."""
 _MAX_GATE_PX = 80.0
@@ -88,12 +93,44 @@ class Linker:
             return None
         # Seeded by the frame's own stamp: the result does not depend on what happened before.
         rng = np.random.default_rng((self._config.seed, frame.stamp_ns))
-        predicted = self._by_prediction(candidates, frame, prior, rng)
+        predicted = self._by_tracks(candidates, frame, prior, rng)
+        if predicted is None:
+            predicted = self._by_prediction(candidates, frame, prior, rng)
         if predicted is not None and len(predicted.rows) >= _CONVINCING * min(len(candidates), len(frame)):
             return predicted
         # A prediction that is wrong and sure of itself finds the few pairs that agree with it: looks alone decide.
         guessed = self._by_guess(candidates, frame, rng, is_refuted)
         return max((link for link in (predicted, guessed) if link is not None), key=_number_of_pairs, default=None)
+
+    def _by_tracks(
+        self, candidates: Candidates, frame: Frame, prior: MotionPrior, rng: np.random.Generator
+    ) -> FrameLink | None:
+        """The pairs that the front end has followed, and what of the rest fits their motion; None if these are few."""
+        config = self._config
+        rows, columns = same_tracks(candidates.tracks, frame.tracks)
+        if len(rows) < max(config.min_inliers, _FOLLOWED * min(len(candidates), len(frame))):
+            return None
+        followed = candidates.places(rows), frame.places(columns)
+        guess = guess_motion(*followed, self._T_rig_optical, rng, _TRACK_HYPOTHESES, config.gate, prior.T)
+        if guess is None or guess.inliers.sum() < max(config.min_inliers, 0.5 * len(rows)):
+            return None
+        more = self._of_the_rest(candidates, frame, guess, rows, columns)
+        rows, columns = np.concatenate([rows, more[0]]), np.concatenate([columns, more[1]])
+        return self._link_of(candidates, frame, guess.T, rows, columns, config.min_inliers)
+
+    def _of_the_rest(
+        self, candidates: Candidates, frame: Frame, guess: MotionGuess, rows: IndexArray, columns: IndexArray
+    ) -> tuple[IndexArray, IndexArray]:
+        """Pairs of candidates and features of no common track, which a new track may have in sight again."""
+        free_rows = np.setdiff1d(np.arange(len(candidates)), rows)
+        free_columns = np.setdiff1d(np.arange(len(frame)), columns)
+        if min(len(free_rows), len(free_columns)) == 0:
+            return rows[:0], columns[:0]
+        noisier = frame.select(free_columns).with_larger_noise(np.maximum(guess.excess, 1.0))
+        more_rows, more_columns = associate_mahalanobis(
+            candidates.select(free_rows), noisier, guess.T, guess.covariance, self._T_rig_optical, self._config
+        )
+        return free_rows[more_rows], free_columns[more_columns]
 
     def _by_prediction(
         self, candidates: Candidates, frame: Frame, prior: MotionPrior, rng: np.random.Generator
@@ -160,8 +197,14 @@ class Linker:
             rows, columns = associate_mahalanobis(
                 candidates, noisier, guess.T, guess.covariance, self._T_rig_optical, self._config
             )
+        return self._link_of(candidates, frame, guess.T, rows, columns, least)
+
+    def _link_of(
+        self, candidates: Candidates, frame: Frame, T: FloatArray, rows: IndexArray, columns: IndexArray, least: int
+    ) -> FrameLink | None:
+        """The motion of pairs, from T, and those that agree with it; None if these are fewer than ``least``."""
         final = refine_motion(
-            candidates.places(rows), frame.places(columns), self._T_rig_optical, guess.T, self._config.gate
+            candidates.places(rows), frame.places(columns), self._T_rig_optical, T, self._config.gate
         )
         if final is None or final.inliers.sum() < least or not _is_usable(final):
             return None

@@ -11,7 +11,7 @@ for a ToF depth, whose sigma is small against d, both are the same.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -72,7 +72,7 @@ class Frame:
     """The usable features of one instant as measurements.
 
     z: (n, 3) u px, v px, inverse depth 1/m. variance: (n, 3) of z. descriptors: (n, d) float32, unit norm. index: (n,)
-    into the features they came from.
+    into the features they came from. tracks: (n,) of the front end, 0 without one.
     """
 
     stamp_ns: int
@@ -81,24 +81,26 @@ class Frame:
     descriptors: np.ndarray
     camera: Camera
     index: np.ndarray
+    tracks: np.ndarray
 
     def __len__(self) -> int:
         return len(self.z)
 
     def with_larger_noise(self, factor: FloatArray) -> Frame:
         """The same measurements with their variances multiplied by (3,)."""
-        return Frame(self.stamp_ns, self.z, self.variance * factor, self.descriptors, self.camera, self.index)
+        return replace(self, variance=self.variance * factor)
 
     def select(self, index: np.ndarray) -> Frame:
         """The measurements at ``index``."""
         return Frame(
-            self.stamp_ns, self.z[index], self.variance[index], self.descriptors[index], self.camera, self.index[index]
-        )
+            self.stamp_ns, self.z[index], self.variance[index], self.descriptors[index], self.camera, self.index[index],
+            self.tracks[index],
+        )  # fmt: skip
 
     def places(self, index: np.ndarray) -> Frame:
         """The measurements at ``index`` without their descriptors, which are the larger part."""
-        z, variance, own = self.z[index], self.variance[index], self.index[index]
-        return Frame(self.stamp_ns, z, variance, self.descriptors[:0], self.camera, own)
+        z, variance, own, tracks = self.z[index], self.variance[index], self.index[index], self.tracks[index]
+        return Frame(self.stamp_ns, z, variance, self.descriptors[:0], self.camera, own, tracks)
 
 
 def frame_from_features(features: Features, usable: np.ndarray, min_sigma_px: float, min_sigma_depth: float) -> Frame:
@@ -108,7 +110,8 @@ def frame_from_features(features: Features, usable: np.ndarray, min_sigma_px: fl
         features.uv, features.depth, features.sigma_uv, features.sigma_depth, usable, min_sigma_px, min_sigma_depth,
         z, variance,
     )  # fmt: skip
-    return Frame(features.stamp_ns, z, variance, features.descriptors[usable], features.camera, usable)
+    descriptors, tracks = features.descriptors[usable], features.track_ids[usable]
+    return Frame(features.stamp_ns, z, variance, descriptors, features.camera, usable, tracks)
 
 
 def project(points: FloatArray, camera: Camera) -> FloatArray:

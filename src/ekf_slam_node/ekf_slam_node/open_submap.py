@@ -79,6 +79,7 @@ class OpenSubmap:
             np.concatenate([points, pending.points]),
             np.concatenate([covariances, pending.covariances]),
             np.concatenate([self.table.descriptors, pending.descriptors]),
+            np.concatenate([self.table.tracks, pending.tracks]),
         )
 
     # ---------------------------------------------------------------------------------------------- one frame, in order
@@ -111,7 +112,7 @@ class OpenSubmap:
         candidates = pending.candidates.select(which)
         slots = self.ekf.augment(candidates.points, candidates.covariances)
         ids = np.where(pending.ids[which] >= 0, pending.ids[which], new_ids[: len(which)])
-        self.table.add(ids, pending.sightings[which], candidates.descriptors, self._frames)
+        self.table.add(ids, pending.sightings[which], candidates.descriptors, candidates.tracks, self._frames)
         return slots
 
     def measure(self, frame: Frame, sight: Sight, common: FloatArray) -> tuple[UpdateReport, Sight]:
@@ -156,6 +157,7 @@ class OpenSubmap:
     def tidy(self, frame: Frame, sight: Sight) -> None:
         """Count who was seen and who should have been, and remove landmarks that cannot be relied on."""
         view = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks, frame.camera)
+        self.table.tracks[sight.slots] = frame.tracks[sight.columns]
         self.table.count(sight.slots, frame.descriptors[sight.columns], view.in_image(frame.camera, margin_px=10.0))
         self._frames += 1
         for slot in self.table.unreliable(self._frames, self._config.landmark):
@@ -168,7 +170,7 @@ def pending_of(frame: Frame, T_rig_optical: FloatArray) -> Pending:
     points, covariances = rig_points(frame, T_rig_optical)
     n = len(frame)
     return Pending(
-        Candidates(points, covariances, frame.descriptors),
+        Candidates(points, covariances, frame.descriptors, frame.tracks),
         np.full(n, -1, dtype=np.int64),
         np.ones(n, dtype=np.int32),
         np.ones(n, dtype=bool),

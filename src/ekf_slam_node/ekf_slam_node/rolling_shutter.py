@@ -165,7 +165,7 @@ class RollingShutter:
         for moment in moments[1:-1]:
             T = T @ moment.T_previous_now
         points, covariances = rig_points(before, self._T_rig_optical)
-        candidates = Candidates(points, covariances, before.descriptors)
+        candidates = Candidates(points, covariances, before.descriptors, before.tracks)
         motion = refine_motion(candidates, now, self._T_rig_optical, T, _GATE)
         if motion is None:
             return None
