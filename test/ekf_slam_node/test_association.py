@@ -28,7 +28,7 @@ def view(world: PointWorld, T: FloatArray, rng: np.random.Generator, stamp_ns: i
 
 def candidates_of(frame: Frame) -> Candidates:
     points, covariances = rig_points(frame, T_RIG_OPTICAL)
-    return Candidates(points, covariances, frame.descriptors)
+    return Candidates(points, covariances, frame.descriptors, frame.tracks)
 
 
 def two_views(

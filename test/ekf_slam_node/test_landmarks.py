@@ -20,7 +20,7 @@ from slam_core.geometry import make_transform, rotation_from_euler
 def book_of(sightings: list[int]) -> LandmarkTable:
     table = LandmarkTable(4)
     n = len(sightings)
-    table.add(np.arange(n), np.array(sightings), np.eye(4, dtype=np.float32)[np.arange(n) % 4], frame=10)
+    table.add(np.arange(n), np.array(sightings), np.eye(4, dtype=np.float32)[np.arange(n) % 4], 1 + np.arange(n), frame=10)
     return table
 
 
@@ -98,7 +98,7 @@ def test_every_algorithm_pairs_what_is_the_same(rng):
     world = room(rng, 400)
     views = [world.features(np.eye(4), k, rng, max_features=80) for k in (1, 2)]
     (before, first), (now, second) = [(frame_from_features(f, np.arange(len(f)), 0.01, 1e-5), i) for f, i in views]
-    candidates = Candidates(*rig_points(before, T_RIG_OPTICAL), before.descriptors)
+    candidates = Candidates(*rig_points(before, T_RIG_OPTICAL), before.descriptors, before.tracks)
     config, covariance = FeatureAssociationConfig(), 1e-4 * np.eye(6)
     common = len(np.intersect1d(first, second))
     for associate, share in ((associate_mahalanobis, 0.95), (associate_jcbb, 0.2), (associate_ccda, 0.2)):

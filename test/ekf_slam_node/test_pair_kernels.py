@@ -20,7 +20,7 @@ def scene(rng: np.random.Generator) -> tuple[Candidates, Frame]:
     frame = frame_from_features(features, np.arange(len(features)), 0.01, 1e-5)
     points, covariances = rig_points(frame, T_RIG_OPTICAL)
     points[0, 0] = -1.0  # behind the camera
-    return Candidates(points, covariances, frame.descriptors), frame
+    return Candidates(points, covariances, frame.descriptors, frame.tracks), frame
 
 
 @pytest.fixture

@@ -139,7 +139,9 @@ def associate_mahalanobis(
     return pair_up(rows, columns, costs, (len(candidates), len(frame)))
 
 
-def same_tracks(tracks: npt.NDArray[np.integer], frame_tracks: npt.NDArray[np.integer]) -> tuple[IndexArray, IndexArray]:
+def same_tracks(
+    tracks: npt.NDArray[np.integer], frame_tracks: npt.NDArray[np.integer]
+) -> tuple[IndexArray, IndexArray]:
     """Rows and columns of equal tracks, 0 being none, in the order of the columns."""
     _, rows, columns = np.intersect1d(tracks, frame_tracks, return_indices=True)
     named = tracks[rows] > 0

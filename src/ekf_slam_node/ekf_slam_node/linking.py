@@ -203,9 +203,7 @@ class Linker:
         self, candidates: Candidates, frame: Frame, T: FloatArray, rows: IndexArray, columns: IndexArray, least: int
     ) -> FrameLink | None:
         """The motion of pairs, from T, and those that agree with it; None if these are fewer than ``least``."""
-        final = refine_motion(
-            candidates.places(rows), frame.places(columns), self._T_rig_optical, T, self._config.gate
-        )
+        final = refine_motion(candidates.places(rows), frame.places(columns), self._T_rig_optical, T, self._config.gate)
         if final is None or final.inliers.sum() < least or not _is_usable(final):
             return None
         # In the order of the features, not of their errors: to measure the best-fitting first would choose by noise.

@@ -96,8 +96,8 @@ class Features:
 
     xyz (n, 3) m in the optical frame ``frame_id``; uv (n, 2) px in the rectified image of ``camera``; depth (n,) m
     along z; sigma_uv (n, 2) px; sigma_depth (n,) m; response (n,); source (n,) uint8, see :class:`FeatureSource`;
-    descriptors (n, d), unit norm, d = 128 for SURF-128 and SIFT. track_ids (n,): equal in frames that follow one another
-    where the front end has followed a feature; 0 where it has not.
+    descriptors (n, d), unit norm, d = 128 for SURF-128 and SIFT. track_ids (n,): equal in the frames through which
+    the front end has followed a feature, 0 where it has not.
     """
 
     stamp_ns: int

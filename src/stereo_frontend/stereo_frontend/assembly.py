@@ -25,6 +25,10 @@ class DepthEstimate:
     sigma: FloatArray
     source: ByteArray
 
+    def select(self, index: npt.NDArray[np.intp]) -> DepthEstimate:
+        """The estimates at ``index``."""
+        return DepthEstimate(self.depth[index], self.sigma[index], self.source[index])
+
     @staticmethod
     def unknown(n: int) -> DepthEstimate:
         """No depth for any of ``n`` keypoints."""

@@ -39,6 +39,7 @@ from stereo_frontend.range_self_calibration import RangeDifferences, RangeSelfCa
 from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.self_calibration import SelfCalibrationConfig, StereoSelfCalibration
 from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
+from stereo_frontend.tracked_features import follow_or_detect
 from stereo_frontend.tracker import Followed, Tracker
 from stereo_frontend.two_view_consistency import StereoView
 
@@ -214,27 +215,23 @@ class Frontend:
         self, tracker: Tracker, images: StereoImages, depth: DepthImage | None, T_left_tof: FloatArray | None
     ) -> Features:
         """Features of the tracks; of new ones, too, in a frame that has few."""
-        camera, parts = images.stereo.camera, []
-        followed = tracker.follow(images.left, camera, images.stamp_ns)
-        measured = 0
-        if followed is not None:
+
+        def measure(followed: Followed) -> DepthEstimate:
             stereo = self._depth_of_tracks(images, followed)
-            estimate = stereo
-            if self.config.mode != "stereo":
-                estimate = self._with_tof(images, followed.keypoints, stereo, depth, T_left_tof)
-            tracker.measured(followed, estimate.depth, camera)
-            measured = int(np.isfinite(estimate.depth).sum())
-            parts.append(self._features(images, followed.keypoints, estimate, followed.sigma_uv, followed.ids))
-        if tracker.needs_key_frame(measured):
+            if self.config.mode == "stereo":
+                return stereo
+            return self._with_tof(images, followed.keypoints, stereo, depth, T_left_tof)
+
+        def detect() -> tuple[Keypoints, DepthEstimate, Float32Array]:
             self.counters.add("key_frames")
             left, right = self._extract(images)
-            left, estimate = self._measured(images, left.select(tracker.is_free(left.uv)), right, depth, T_left_tof)
-            ids = tracker.begin(images.left, left, estimate.depth, camera)
-            if not tracker.has_lost_sight(measured):
-                estimate.depth[ids == 0] = np.nan
-            sigma = np.repeat(self._noise.sigma(left.size)[:, None], 2, axis=1)
-            parts.append(self._features(images, left, estimate, sigma, ids))
-        return parts[0] if len(parts) == 1 else parts[0].joined(parts[1])
+            left = left.select(tracker.is_free(left.uv))
+            left, estimate = self._measured(images, left, right, depth, T_left_tof)
+            return left, estimate, self._noise.sigma(left.size)
+
+        parts = follow_or_detect(tracker, images.left, images.stereo.camera, images.stamp_ns, measure, detect)
+        features = [self._features(images, p.keypoints, p.estimate, p.sigma_uv, p.track_ids) for p in parts]
+        return features[0] if len(features) == 1 else features[0].joined(features[1])
 
     def _depth_of_tracks(self, images: StereoImages, followed: Followed) -> DepthEstimate:
         """Depth by stereo of what was followed, looked for near the predicted depths."""

@@ -21,6 +21,8 @@ from stereo_frontend.depth_lookup import sample_depth
 from stereo_frontend.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
+from stereo_frontend.tracked_features import MeasuredKeypoints, follow_or_detect
+from stereo_frontend.tracker import Followed, Tracker
 
 CLIP = 0.005
 """Share of pixels beyond the black and the white point each."""
@@ -47,24 +49,50 @@ class TofFeatures:
         self.config = config
         self._extractors = {name: FeatureExtractor(features) for name in ("amplitude", "intensity", "range")}
         self._noise = PixelNoise(noise)
+        self._tracker = Tracker(features.max_tracks) if features.tracking else None
         self.used: tuple[str, ...] = ()
         """Names of the images that the newest features come from."""
 
     def __call__(self, image: DepthImage, max_relative_sigma: float = 1.0) -> Features:
         """Features of ``image`` in the ToF optical frame; those without a single surface below them are left out."""
-        keypoints = _joined([self._extractors[name](picture) for name, picture in self._pictures(image).items()])
-        samples = sample_depth(image, keypoints.uv)
-        sigma_uv = np.repeat(self._noise.sigma(keypoints.size)[:, None], 2, axis=1)
-        source = np.full(len(keypoints), FeatureSource.TOF, np.uint8)
-        estimate = DepthEstimate(samples.depth, samples.sigma, source)
-        return make_features(
-            image.stamp_ns, keypoints, estimate, sigma_uv, image.camera, "tof_optical_frame", max_relative_sigma
-        )
+        before, pictures = self.used, self._pictures(image)
+        if self._tracker is None or len(pictures) > 1:
+            keypoints = _joined([self._extractors[name](picture) for name, picture in pictures.items()])
+            sigma_uv = np.repeat(self._noise.sigma(keypoints.size)[:, None], 2, axis=1)
+            parts = [
+                MeasuredKeypoints(keypoints, _depth_at(image, keypoints), sigma_uv, np.zeros(len(keypoints), np.int32))
+            ]
+        else:
+            if self.used != before:
+                self._tracker.reset()
+            parts = self._followed(self._tracker, image, *pictures.popitem())
+        features = [
+            make_features(
+                image.stamp_ns, p.keypoints, p.estimate, p.sigma_uv, image.camera, "tof_optical_frame",
+                max_relative_sigma, p.track_ids,
+            )
+            for p in parts
+        ]  # fmt: skip
+        return features[0] if len(features) == 1 else features[0].joined(features[1])
+
+    def _followed(self, tracker: Tracker, image: DepthImage, name: str, picture: ByteArray) -> list[MeasuredKeypoints]:
+        """Tracks in the picture of that name, and new keypoints where they are few."""
+
+        def measure(followed: Followed) -> DepthEstimate:
+            return _depth_at(image, followed.keypoints)
+
+        def detect() -> tuple[Keypoints, DepthEstimate, Float32Array]:
+            keypoints = self._extractors[name](picture)
+            return keypoints, _depth_at(image, keypoints), self._noise.sigma(keypoints.size)
+
+        return follow_or_detect(tracker, picture, image.camera, image.stamp_ns, measure, detect)
 
     def reset(self) -> None:
         """Forget the detector thresholds."""
         for extractor in self._extractors.values():
             extractor.reset()
+        if self._tracker is not None:
+            self._tracker.reset()
         self.used = ()
 
     def advice(self) -> str:
@@ -93,6 +121,11 @@ class TofFeatures:
         values = _values(image, name)
         assert values is not None
         return normalised_picture(values, CLIP, 1.0 if name == "range" else GAMMA)
+
+
+def _depth_at(image: DepthImage, keypoints: Keypoints) -> DepthEstimate:
+    samples = sample_depth(image, keypoints.uv)
+    return DepthEstimate(samples.depth, samples.sigma, np.full(len(keypoints), FeatureSource.TOF, np.uint8))
 
 
 def _values(image: DepthImage, name: str) -> Float32Array | None:

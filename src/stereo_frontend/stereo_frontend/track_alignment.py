@@ -76,7 +76,9 @@ def align_to_references(image, windows, offset, start, predicted, max_shift, inf
             if not factorise(normal):
                 break
             if length < _CONVERGED:
-                noise = noise_of_residual(template, patch, gain, mean[UNKNOWNS] - gain * total / n, inside, side, freedom)
+                noise = noise_of_residual(
+                    template, patch, gain, mean[UNKNOWNS] - gain * total / n, inside, side, freedom
+                )
                 for i in range(6):
                     out[k, i] = place[i]
                 vv = noise * diagonal_of_inverse(normal, 1, step)

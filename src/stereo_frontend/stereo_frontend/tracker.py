@@ -114,11 +114,15 @@ class Tracker:
         self._picture, self._stamp_ns = picture, stamp_ns
         if tracks is None or before is None or len(tracks) == 0:
             return None
-        expected = np.eye(4) if self._motion is None or dt <= 0.0 else scaled_motion(self._motion[0], dt / self._motion[1])
+        expected = (
+            np.eye(4) if self._motion is None or dt <= 0.0 else scaled_motion(self._motion[0], dt / self._motion[1])
+        )
         start, T = self._guess(before, picture, tracks, camera, expected)
         self._motion = None if T is None or dt <= 0.0 else (T, dt)
         T = expected if T is None else T
-        warp = np.where(np.isfinite(tracks.points[:, :1]), _composed(facing_warp(T, tracks.points), tracks.warp), tracks.warp)
+        warp = np.where(
+            np.isfinite(tracks.points[:, :1]), _composed(facing_warp(T, tracks.points), tracks.warp), tracks.warp
+        )
         found = np.full((len(tracks), OUTPUTS), np.nan)
         align_to_references(
             picture, tracks.references, tracks.offset, start, warp, _MAX_SHIFT, 1.0 / _WARP_SIGMA**2, found
@@ -134,7 +138,9 @@ class Tracker:
             points=np.where(good[:, None], camera.unproject(uv, points[:, 2]), points),
             missed=np.where(good, 0, tracks.missed + 1).astype(np.int32),
         )
-        kept = np.flatnonzero((tracks.missed <= _MAX_MISSED) & np.isfinite(uv).all(axis=1) & _in_sight(points, uv, camera))
+        kept = np.flatnonzero(
+            (tracks.missed <= _MAX_MISSED) & np.isfinite(uv).all(axis=1) & _in_sight(points, uv, camera)
+        )
         self._tracks = tracks.select(kept)
         index = np.flatnonzero(good[kept])
         return Followed(

@@ -38,7 +38,9 @@ def features_messages(types: MessageTypes, features: Features) -> FeatureMessage
     """Messages that carry ``features`` exactly."""
     f = features
     columns = [f.xyz, f.uv, f.depth, f.sigma_uv, f.sigma_depth, f.response, f.source, f.track_ids]
-    table = np.column_stack([np.asarray(c, dtype="<f4") for c in columns]) if len(f) else np.empty((0, len(_DTYPE)), "<f4")
+    table = (
+        np.column_stack([np.asarray(c, dtype="<f4") for c in columns]) if len(f) else np.empty((0, len(_DTYPE)), "<f4")
+    )
     header = header_message(types, f.stamp_ns, f.frame_id)
     return FeatureMessages(
         cloud_message(types, header, np.ascontiguousarray(table).view(_DTYPE)[:, 0]),
