@@ -19,6 +19,9 @@ _MIN_FRAMES = 5
 _MIN_SHARED = 15
 """Landmarks seen in the last frame, below which the end is put off."""
 
+_FOUND_AGAIN_S = 0.5
+"""Age at which a submap that begins after a loss ends, so that the map soon hears of what it can be recognised by."""
+
 _LEAST_EIGENVALUE = 1e-12
 """Share of the largest eigenvalue that rounding may reach."""
 
@@ -67,12 +70,15 @@ class SubmapBuilder:
         """True if the rig is far enough from the start, or the submap large or old enough.
 
         Landmarks ``shared`` with the next submap hold the two together: with too few of them the end is put off, up to
-        twice the limits.
+        twice the limits. The first after a loss is old soon: the map may recognise its place.
         """
+        is_lost = not self._follows_previous and (self.index > 0 or self._session > 0)
+        age = 1e-9 * (self._path[-1].stamp_ns - self._start_stamp_ns)
         size = max(
             float(np.linalg.norm(ekf.T[:3, 3])) / config.max_distance,
             len(ekf.landmarks) / config.max_landmarks,
             (len(self._path) - self._standing) / config.max_frames,
+            age / _FOUND_AGAIN_S if is_lost else 0.0,
         )
         limit = 1.0 if shared >= _MIN_SHARED else 2.0
         return len(self._path) >= _MIN_FRAMES and size > limit

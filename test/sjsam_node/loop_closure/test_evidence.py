@@ -82,3 +82,12 @@ def test_submaps_too_sure_of_themselves_agree_within_wider_gates(rng: np.random.
     far = Alignment(truth, found.T, found.covariance, 0.0, 0)
     moved = replace(first, points=first.points + np.array([3.0, 0.0, 0.0]))
     assert evidence_of(moved, second, truth, far, CONFIG).agreeing < 20
+
+
+def test_where_many_landmarks_lie_in_a_gate_agreement_says_less(rng: np.random.Generator) -> None:
+    first, second, T, truth = two_views(rng, 40)
+    found = align(first, second, truth, Prior(T, 1e2 * np.eye(6)), CONFIG)
+    sparse = evidence_of(first, second, truth, found, CONFIG)
+    assert sparse.chance == pytest.approx(1.0 / 40.0, rel=0.1)
+    spread = PointSet(first.points, 100.0 * first.covariance, first.descriptors)
+    assert evidence_of(spread, second, truth, found, CONFIG).chance > 1.8 * sparse.chance

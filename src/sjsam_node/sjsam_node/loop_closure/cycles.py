@@ -55,7 +55,7 @@ def cycles_through(link: Link, others: Sequence[Link], hop: Hop) -> Iterator[Cyc
     variance = np.full((len(steps), len(steps)), np.inf)
     for i, before in enumerate(steps):
         for j, after in enumerate(steps[1:], start=1):
-            way = hop(before.second, after.first) if frozenset(before.ends) != frozenset(after.ends) else None
+            way = hop(before.second, after.first)
             if way is not None:
                 variance[i, j] = _position_variance(way) + np.trace(after.covariance[:3, :3])
     before_it = dijkstra(np.where(np.isinf(variance), 0.0, variance), indices=0, return_predecessors=True)[1]
