@@ -65,10 +65,11 @@ def row(path: Path, camera: str, frames: int, run: Path | None) -> list[str]:
     started = time.process_time()
     with SensorBag(path) as bag:
         trajectories = {agent: poses_of(bag, agent, frames, run) for agent in bag.agents}
-        model = dense_model(bag, system, trajectories)
+        stage = dense_model(bag, system, trajectories)
+    model = stage.model
     megabytes = (model.volume.voxels.nbytes + model.volume.colours.nbytes) / 2**20
     between = time.process_time()
-    surface = model.surface()
+    surface = stage.surface()
     ended = time.process_time()
     points = surface.points.astype(np.float64)
     near = nearest_camera(model, points) <= NEAR_M

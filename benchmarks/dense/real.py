@@ -66,8 +66,8 @@ def aligned(estimate: FloatArray, truth: FloatArray) -> FloatArray:
 
 def model_on(bag: SensorBag, trajectory: Trajectory) -> tuple[Surface, np.ndarray]:
     """The surface of the first agent on a trajectory, and its cameras' places (n, 3)."""
-    model = dense_model(bag, SystemConfig(), {bag.agents[0]: trajectory})
-    return model.surface(), np.array([k.T_map_camera[:3, 3] for k in model.keyframes])
+    stage = dense_model(bag, SystemConfig(), {bag.agents[0]: trajectory})
+    return stage.surface(), np.array([k.T_map_camera[:3, 3] for k in stage.model.keyframes])
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
 from dense_mapping.floor_plan import OCCUPIED  # noqa: E402
@@ -18,13 +19,17 @@ from slam_core.messages import (  # noqa: E402
     depth_messages,
     header_message,
     image_message,
+    imu_message,
     occupancy_from_message,
     odometry_message,
     path_message,
     points_from_message,
+    rectified_info,
 )
 from slam_core.ros import RosTypes  # noqa: E402
-from slam_core.types import DepthImage, PoseEstimate  # noqa: E402
+from slam_core.types import DepthImage, ImuSample, PoseEstimate  # noqa: E402
+from stereo_frontend.rectification_error import NAMES, RectificationError  # noqa: E402
+from stereo_frontend.sources import RawPair  # noqa: E402
 
 pytestmark = pytest.mark.ros
 
@@ -137,3 +142,35 @@ def test_key_frames_take_the_colour_of_their_time_whether_it_comes_before_or_aft
     pictures = [k.keyframe.picture for k in node.mapper.model.keyframes]
     assert [tuple(p[30, 40]) if p.size else () for p in pictures[:4]] == [(200, 10, 10 * (k + 1)) for k in range(4)]
     assert pictures[4].size == 0, "the last one's was never sent"
+
+
+def test_gravity_levels_the_plan_of_a_rig_that_started_tilted(node):
+    poses = drive(node)
+    up = np.array([0.3, 0.0, 9.8]) / np.linalg.norm([0.3, 0.0, 9.8])
+    for pose in poses:
+        node._on_imu("", imu_message(TYPES, "base_link", ImuSample(pose.stamp_ns, np.zeros(3), 9.81 * up)))
+    node._on_path("", path_message(TYPES, poses[-1].stamp_ns, "map", poses))
+    node._publish_news()
+    T_map_plan = occupancy_from_message(node.sent["map/occupancy"][-1])[2]
+    np.testing.assert_allclose(T_map_plan[:3, 2], up, atol=1e-3)
+
+
+def test_pairs_are_rectified_as_the_front_end_has_found_out(node):
+    stage = node._pairs[""]
+    info = rectified_info(CAMERA), rectified_info(CAMERA, 0.1)
+    for side, each in zip(("left", "right"), info, strict=True):
+        stage.set_info(side, each)
+    error = RectificationError(CAMERA, np.linspace(1e-4, 2e-3, len(NAMES)), np.eye(len(NAMES)))
+    rng = np.random.default_rng(1)
+    pair = RawPair(0, *rng.integers(0, 256, (2, 60, 80), dtype=np.uint8), "stereo_left_optical_frame")
+
+    def rights(text: str) -> np.ndarray:
+        values = [KeyValue(key="correction", value=text)]
+        status = DiagnosticStatus(name="/feature_extractor", level=bytes([0]), values=values)
+        node._on_diagnostics(DiagnosticArray(status=[status]))
+        stage.add(pair)
+        return next(stage.ready()).right.astype(float)
+
+    plain, corrected = rights(""), rights(error.text)
+    assert np.abs(plain - corrected).mean() > 1.0
+    np.testing.assert_array_equal(rights(""), plain)

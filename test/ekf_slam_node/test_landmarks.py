@@ -20,7 +20,9 @@ from slam_core.geometry import make_transform, rotation_from_euler
 def book_of(sightings: list[int]) -> LandmarkTable:
     table = LandmarkTable(4)
     n = len(sightings)
-    table.add(np.arange(n), np.array(sightings), np.eye(4, dtype=np.float32)[np.arange(n) % 4], 1 + np.arange(n), frame=10)
+    table.add(
+        np.arange(n), np.array(sightings), np.eye(4, dtype=np.float32)[np.arange(n) % 4], 1 + np.arange(n), frame=10
+    )
     return table
 
 

@@ -71,7 +71,9 @@ def back_project_jacobian(z: FloatArray) -> FloatArray:
 
 def test_features_lie_where_numpy_has_them(rng: np.random.Generator) -> None:
     z = rng.uniform([0.0, 0.0, 0.2], [640.0, 480.0, 2.0], (30, 3))
-    frame = Frame(0, z, rng.uniform(0.1, 1.0, (30, 3)), np.zeros((30, 1)), CAMERA, np.arange(30), np.zeros(30, np.int32))
+    frame = Frame(
+        0, z, rng.uniform(0.1, 1.0, (30, 3)), np.zeros((30, 1)), CAMERA, np.arange(30), np.zeros(30, np.int32)
+    )
     points, spread = rig_points(frame, T_RIG_OPTICAL)
     R = T_RIG_OPTICAL[:3, :3]
     J = R @ back_project_jacobian(z)

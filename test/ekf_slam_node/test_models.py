@@ -80,7 +80,9 @@ def test_back_projection_inverts_and_differentiates(rng: np.random.Generator) ->
     z = np.column_stack([rng.uniform(0, 640, 6), rng.uniform(0, 480, 6), rng.uniform(0.1, 1.0, 6)])
     np.testing.assert_allclose(models.project(models.back_project(z, CAMERA), CAMERA), z, rtol=1e-12)
     J = numeric(lambda d: models.back_project(z + d, CAMERA), 3)
-    frame = models.Frame(0, z, rng.uniform(0.1, 1.0, (6, 3)), np.zeros((6, 1)), CAMERA, np.arange(6), np.zeros(6, np.int32))
+    frame = models.Frame(
+        0, z, rng.uniform(0.1, 1.0, (6, 3)), np.zeros((6, 1)), CAMERA, np.arange(6), np.zeros(6, np.int32)
+    )
     covariances = models.rig_points(frame, np.eye(4))[1]
     np.testing.assert_allclose(covariances, np.einsum("nij,nj,nkj->nik", J, frame.variance, J), rtol=1e-6, atol=1e-7)
 

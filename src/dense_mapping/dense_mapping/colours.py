@@ -30,13 +30,14 @@ class RecentColours:
 
     def __init__(self) -> None:
         self._pictures: deque[tuple[int, ByteArray]] = deque(maxlen=_KEPT)
+        self.newest_ns = -1
+        """Stamp up to which pictures have come."""
 
-    def __bool__(self) -> bool:
-        return bool(self._pictures)
-
-    def add(self, stamp_ns: int, picture: ByteArray) -> None:
-        """Take a picture (h, w, 3) uint8."""
-        self._pictures.append((stamp_ns, picture))
+    def add(self, stamp_ns: int, picture: ByteArray | None) -> None:
+        """Take a picture (h, w, 3) uint8; None: there is none at this stamp."""
+        self.newest_ns = stamp_ns
+        if picture is not None:
+            self._pictures.append((stamp_ns, picture))
 
     def near(self, stamp_ns: int) -> ByteArray | None:
         """The picture nearest in time, or None if none is within the tolerance."""

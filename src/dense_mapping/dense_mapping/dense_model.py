@@ -78,7 +78,6 @@ class DenseModel:
         self.volume = TsdfVolume(self.config.tsdf)
         self._selectors: dict[str, KeyframeSelector] = {}
         self._placed: list[PlacedKeyframe] = []
-        self._specific_force = np.zeros(3)
 
     @property
     def keyframes(self) -> tuple[PlacedKeyframe, ...]:
@@ -119,13 +118,11 @@ class DenseModel:
         """Mesh of all key frames. Of poses that are final it is made once: its field is forgotten."""
         return extract_surface(self.volume, self.config.surface, release=self._fixed)
 
-    def add_specific_force(self, force: FloatArray) -> None:
-        """Take an accelerometer's reading (3,) m/s2, turned into the map frame: on the whole it points up."""
-        self._specific_force += force
+    def floor_plans(self, surface: Surface, gravity_up: FloatArray | None = None) -> tuple[FloorPlan, ...]:
+        """Plans of all storeys, lowest first.
 
-    def floor_plans(self, surface: Surface) -> tuple[FloorPlan, ...]:
-        """Plans of all storeys, lowest first; ``surface`` is that of :meth:`surface`."""
-        gravity_up = self._specific_force if self._specific_force.any() else None
+        ``surface``: that of :meth:`surface`. ``gravity_up`` (3,): specific force in the map frame, where it is known.
+        """
         return floor_plans(surface, self._placed, self.config.floor_plan, gravity_up)
 
     def _put(self, placed: PlacedKeyframe) -> None:

@@ -10,15 +10,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
-from dense_mapping.colours import NO_PICTURE, stereo_picture
+from dense_mapping.colours import NO_PICTURE
 from dense_mapping.dense_model import DenseConfig
-from dense_mapping.keyframes import Keyframe, make_keyframe
-from dense_mapping.live_mapper import LiveMapper
+from dense_mapping.dense_stage import DenseStage
 from dense_mapping.plan_io import write_plan
-from dense_mapping.stereo_depth import stereo_depth
 from dense_mapping.surface_cloud import cloud_of
 from dense_mapping.surface_io import write_mesh
 from slam_core.base_node import SlamNode
@@ -32,15 +31,19 @@ from slam_core.messages import (
     grey_and_colour_from_message,
     grey_from_message,
     header_message,
+    imu_from_message,
     occupancy_message,
     path_from_message,
     pose_from_message,
     stamp_ns,
 )
 from slam_core.messages.base import Message
-from slam_core.ros import run_node
+from slam_core.ros import run_node, sensor_qos
 from slam_core.stamp_guard import StampPolicy
+from slam_core.trajectory import Trajectory
+from slam_core.types import PoseEstimate
 from stereo_frontend.calibrated_pairs import SIDES
+from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.sources import RawPair
 from stereo_frontend.stage import StereoStage
 
@@ -61,8 +64,9 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
 
     def __init__(self) -> None:
         super().__init__("dense_mapper", DenseNodeConfig)
-        self.mapper = LiveMapper(self.config)
+        self.mapper = DenseStage(self.config)
         self._pairs = {agent: StereoStage(rectified=True) for agent in self.config.agents}
+        self._corrections: dict[str, str] = {}
         self._stamp_ns = 0
         self._is_news = False
         self.advertise("map/dense_cloud", "PointCloud2", latched=True, depth=1)
@@ -95,6 +99,7 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         below = partial(_below, agent)
         self.listen(below("odom"), "Odometry", partial(self._on_odometry, agent))
         self.listen(below("map/path"), "Path", partial(self._on_path, agent), latched=True, stamps=StampPolicy.ANY)
+        self.listen(below("imu"), "Imu", partial(self._on_imu, agent), required=False)
         if self.config.use_tof:
             topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
             topics = {below(topic): kind for topic, kind in topics.items()}
@@ -106,6 +111,8 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
                 self.listen(topic, "CameraInfo", partial(self._on_info, agent, side), required=False)
             pairs = {below(f"stereo/{side}/image_rect"): "Image" for side in SIDES}
             self.listen_together(pairs, partial(self._on_pair, agent), required=False)
+            # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
+            self.create_subscription(self.types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
             colours = below("stereo/left/image_rect_color")
             self.listen(colours, "Image", partial(self._on_colour, agent, "stereo"), required=False)
 
@@ -114,11 +121,8 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
 
     def _on_depth(self, agent: str, depth: Message, noise: Message, info: Message) -> None:
         T_base_camera = self.lookup(_below(agent, self.config.base_frame), depth.header.frame_id)
-
-        def make() -> Keyframe:
-            return make_keyframe(depth_from_messages(depth, noise, info), self.config.keyframe, NO_PICTURE)
-
-        self.mapper.add_image(agent, "tof", T_base_camera, make)
+        if self.mapper.wants(agent, "tof", stamp_ns(depth), T_base_camera):
+            self.mapper.add(agent, "tof", T_base_camera, depth_from_messages(depth, noise, info), NO_PICTURE)
 
     def _on_colour(self, agent: str, sensor: str, message: Message) -> None:
         self.mapper.add_colour(agent, sensor, stamp_ns(message), colour_from_message(message))
@@ -128,21 +132,30 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
 
     def _on_pair(self, agent: str, left: Message, right: Message) -> None:
         T_base_camera = self.lookup(_below(agent, self.config.base_frame), left.header.frame_id)
-        stage = self._pairs[agent]
         grey, colour = grey_and_colour_from_message(left)
-        stage.add(RawPair(stamp_ns(left), grey, grey_from_message(right), left.header.frame_id, colour))
-        for images in stage.ready():
+        pair = RawPair(stamp_ns(left), grey, grey_from_message(right), left.header.frame_id, colour)
+        self.mapper.add_pair(agent, T_base_camera, pair, self._pairs[agent])
 
-            def make() -> Keyframe:
-                depth = stereo_depth(images, self.config.stereo)  # noqa: B023 - called before the next turn
-                picture = stereo_picture(images, self.mapper.has_colours(agent))  # noqa: B023
-                return make_keyframe(depth, self.config.keyframe, picture)
+    def _on_imu(self, agent: str, message: Message) -> None:
+        sample = imu_from_message(message)
+        R_base_imu = self.lookup(_below(agent, self.config.base_frame), sample.frame_id)[:3, :3]
+        self.mapper.add_force(agent, sample.stamp_ns, R_base_imu @ sample.linear_acceleration)
 
-            self.mapper.add_image(agent, "stereo", T_base_camera, make)
+    def _on_diagnostics(self, message: Message) -> None:
+        """Rectify as the front end has found out that one should."""
+        for status in message.status:
+            for agent, stage in self._pairs.items():
+                if status.name != f"/{_below(agent, 'feature_extractor')}" or stage.infos is None:
+                    continue
+                text = next((entry.value for entry in status.values if entry.key == "correction"), "")
+                if text != self._corrections.get(agent, ""):
+                    self._corrections[agent] = text
+                    stage.correct(RectificationError.from_text(stage.infos[0].rectified, text))
 
     def _on_path(self, agent: str, message: Message) -> None:
         self._stamp_ns = max(self._stamp_ns, stamp_ns(message))
-        if self.mapper.set_path(agent, path_from_message(message)):
+        poses = [PoseEstimate(stamp, T, np.zeros((6, 6))) for stamp, T in path_from_message(message)]
+        if self.mapper.set_path(agent, Trajectory.from_estimates(poses)):
             self._is_news = True
         self.health.take(
             {
@@ -164,10 +177,10 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
 
     def _publish_model(self) -> None:
         self._is_news = False
-        surface = self.mapper.model.surface()
+        surface = self.mapper.surface()
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
         self.publish("map/dense_cloud", cloud_message(self.types, header, cloud_of(surface)))
-        plans = self.mapper.model.floor_plans(surface)
+        plans = self.mapper.floor_plans(surface)
         self._advertise_storeys(len(plans))
         for number, plan in enumerate(plans):
             grid = occupancy_message(self.types, header, plan.cells, plan.resolution, plan.T_map_plan)
@@ -179,10 +192,10 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         self._storeys = max(self._storeys, count)
 
     def _on_save(self, _: object, response: Message) -> Message:
-        folder, surface = Path(self.config.output_path), self.mapper.model.surface()
+        folder, surface = Path(self.config.output_path), self.mapper.surface()
         try:
             write_mesh(folder / "mesh.ply", surface)
-            plans = self.mapper.model.floor_plans(surface)
+            plans = self.mapper.floor_plans(surface)
             for number, plan in enumerate(plans):
                 write_plan(folder / (f"floor_plan_{number}.yaml" if len(plans) > 1 else "floor_plan.yaml"), plan)
             response.success, response.message = True, f"{len(surface)} points, {len(plans)} storeys in {folder}"

@@ -138,6 +138,7 @@ class FeatureNode(StageNode[FrontendConfig]):
             self.health.show(f"rectification_{name}", value)
         for name, value in report.ranges.items():
             self.health.show(f"ranges_{name}", value)
+        self.health.show("correction", report.correction.text if report.correction else "")
         self.health.show("picture", report.picture)
         self.health.show("advice", "; ".join(report.advice))
         few = f"only {number} features" if number < FEW_FEATURES else ""

@@ -66,6 +66,22 @@ class RectificationError:
         """No error, as far as is known."""
         return cls(camera, np.zeros(len(NAMES)), np.diag(PRIOR_SIGMA**2))
 
+    @classmethod
+    def from_text(cls, camera: Camera, text: str) -> RectificationError | None:
+        """The error that :attr:`text` tells of, without its covariance; None for another text."""
+        try:
+            parameters = np.array([float(word) for word in text.split()])
+        except ValueError:
+            return None
+        if parameters.shape != (len(NAMES),) or not np.isfinite(parameters).all():
+            return None
+        return cls(camera, parameters, np.zeros((len(NAMES), len(NAMES))))
+
+    @property
+    def text(self) -> str:
+        """The parameters in words that give back every bit."""
+        return " ".join(repr(float(value)) for value in self.parameters)
+
     def columns(self, uv_right: AnyArray) -> FloatArray:
         """Error (n,) px along the row at pixels (n, 2) of the right image: seen minus ideal column."""
         return np.asarray(self.camera.fx * column_basis(_rays(self.camera, uv_right)) @ self.parameters)

@@ -15,9 +15,11 @@ from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.types import DepthImage, Features, StereoImages
 from stereo_frontend.calibrated_pairs import CalibratedPairs
+from stereo_frontend.corrected_info import corrected_right
 from stereo_frontend.depth_pairing import DepthPairing
 from stereo_frontend.frontend import Frontend, FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
+from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.rectify import StereoRectifier
 from stereo_frontend.sources import RawPair
 
@@ -35,6 +37,7 @@ class StereoStage:
         self._rectified = rectified
         self._pairs = CalibratedPairs[RawPair]()
         self._rectifier: StereoRectifier | None = None
+        self._error: RectificationError | None = None
 
     @property
     def infos(self) -> tuple[CameraInfo, CameraInfo] | None:
@@ -51,6 +54,10 @@ class StereoStage:
         if self._pairs.set_info(side, CameraInfo(info.rectified, P=info.P) if self._rectified else info):
             self._rectifier = None
 
+    def correct(self, error: RectificationError | None) -> None:
+        """Rectify with the infos' error taken out, from the next pair on; None: with the infos as they are."""
+        self._error, self._rectifier = error, None
+
     def add(self, pair: RawPair) -> None:
         """Take a pair; :meth:`ready` returns it rectified."""
         self._pairs.add(pair)
@@ -65,7 +72,9 @@ class StereoStage:
         """
         while self.infos is not None and (pair := self._pairs.pop()) is not None:
             if self._rectifier is None:
-                self._rectifier = StereoRectifier(*self.infos)
+                left, right = self.infos
+                right = right if self._error is None else corrected_right(right, self._error)[0]
+                self._rectifier = StereoRectifier(left, right)
             images = self._rectifier(pair.stamp_ns, pair.left, pair.right, pair.colour)
             yield replace(images, frame_id=pair.frame_id)
 

@@ -11,21 +11,19 @@ import pytest
 
 from slam_bringup.bags.bag import BagReader, BagWriter
 from slam_bringup.bags.bag_types import BagTypes
-from slam_bringup.bags.readings import AgentSensors, ColourReading, DepthReading, StereoReading
+from slam_bringup.bags.readings import ColourReading, DepthReading, StereoReading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.bags.sensor_writer import LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_bringup.datasets.rgbd import RgbdDataset
-from slam_bringup.pipeline import dense_run
 from slam_bringup.pipeline.configuration import load_system_config
-from slam_bringup.pipeline.dense_run import AgentDepth, dense_model
+from slam_bringup.pipeline.dense_run import dense_model
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import make_transform
 from slam_core.messages import compressed_image_message, header_message, image_message
-from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
-from stereo_frontend.corrected_info import corrected_right
-from stereo_frontend.rectification_error import NAMES, RectificationError
+from stereo_frontend.rectification_error import RectificationError
+from stereo_frontend.stage import StereoStage
 
 DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
 ORANGE = (240, 130, 20)
@@ -154,22 +152,20 @@ def test_a_bag_that_was_read_before_gives_the_same_model_from_its_key_frames_alo
     assert len(heard) == readings
     first, second = models
     assert passed[1] < 0.6 * passed[0]
-    assert [k.keyframe.stamp_ns for k in first.keyframes] == [k.keyframe.stamp_ns for k in second.keyframes]
-    assert len(first.keyframes) > 5
-    np.testing.assert_array_equal(first.volume.voxels, second.volume.voxels)
-    np.testing.assert_array_equal(first._specific_force, second._specific_force)
+    one, other = (stage.model for stage in models)
+    assert [k.keyframe.stamp_ns for k in one.keyframes] == [k.keyframe.stamp_ns for k in other.keyframes]
+    assert len(one.keyframes) > 5
+    np.testing.assert_array_equal(one.volume.voxels, other.volume.voxels)
+    np.testing.assert_array_equal(first.specific_force(), second.specific_force())
 
 
 def test_dense_stereo_is_rectified_as_self_calibration_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[RectificationError | None] = []
+    monkeypatch.setattr(StereoStage, "correct", lambda _, error: used.append(error))
     with SensorBag(DEMO) as bag:
-        sensors = bag.sensors[bag.agents[0]]
-    used: list[AgentSensors] = []
-    made = dense_run.stereo_stage
-    monkeypatch.setattr(dense_run, "stereo_stage", lambda s: (used.append(s), made(s))[1])
-    error = RectificationError(sensors.left.rectified, np.full(len(NAMES), 1e-4), np.eye(len(NAMES)))
-    for correction in (None, error):
-        AgentDepth(sensors, load_system_config(None), Trajectory.from_estimates([]), correction)
-    wrong, right = (s.right for s in used)
-    assert wrong == sensors.right
-    np.testing.assert_array_equal(right.R, corrected_right(sensors.right, error)[0].R)
-    assert np.abs(right.R - sensors.right.R).max() > 1e-5
+        agent = bag.agents[0]
+        error = RectificationError.unknown(bag.sensors[agent].left.rectified)
+        truth = bag.ground_truth(agent).select(np.arange(3))
+        for corrections in (None, {agent: error}):
+            dense_model(bag, load_system_config(None), {agent: truth}, corrections=corrections)
+    assert used == [None, error]

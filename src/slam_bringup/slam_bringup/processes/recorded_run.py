@@ -10,6 +10,7 @@ from pathlib import Path
 
 from sjsam_node.global_map import GlobalMap
 from slam_bringup.bags.bag import BagReader
+from slam_bringup.bags.readings import AgentSensors
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
@@ -21,6 +22,7 @@ from slam_bringup.processes.start_map import StartMap
 from slam_core.messages import estimate_from_message
 from slam_core.types import PoseEstimate
 from stereo_frontend.frontend import FrontendReport
+from stereo_frontend.rectification_error import RectificationError
 
 _FIGURES = ("rectification_", "ranges_")
 _LOSSES = ("lost_by_transport", "rejected", "skipped", "unpaired")
@@ -104,20 +106,24 @@ def collect(
             backlog=_backlog(joiner),
             events=tuple([STOPPED] * run.stopped + unclean_ends(run)),
         )
-        record = record.with_front_ends({agent: _front_end(agent, run.diagnostics) for agent in opened.agents})
+        record = record.with_front_ends(
+            {agent: _front_end(opened.sensors[agent], run.diagnostics) for agent in opened.agents}
+        )
         result = run_result(opened, config, record, mapper=mapper, odometry=odometry, stopped=lambda: run.stopped)
     return replace(result, is_localized=is_localized), global_map
 
 
-def _front_end(agent: str, diagnostics: dict[str, dict[str, str]]) -> FrontendReport:
+def _front_end(sensors: AgentSensors, diagnostics: dict[str, dict[str, str]]) -> FrontendReport:
     """Findings about an agent's images in the last diagnostics of its ``feature_extractor``."""
-    values = diagnostics.get(_topic(agent, "feature_extractor"), {})
+    values = diagnostics.get(_topic(sensors.agent, "feature_extractor"), {})
+    text, left = values.get("correction", ""), sensors.left
+    correction = RectificationError.from_text(left.rectified, text) if text and left is not None else None
     rectification, ranges = (
         {key.removeprefix(prefix): _number(text) for key, text in values.items() if key.startswith(prefix)}
         for prefix in _FIGURES
     )
     advice = tuple(text for text in values.get("advice", "").split("; ") if text)
-    return FrontendReport(rectification, advice, values.get("picture", ""), ranges=ranges)
+    return FrontendReport(rectification, advice, values.get("picture", ""), correction, ranges)
 
 
 def _number(text: str) -> float | str:
