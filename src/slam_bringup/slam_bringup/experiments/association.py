@@ -87,7 +87,8 @@ def _pairs(
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Candidates of the first frame and features of the second that the method pairs."""
     before, now = _frame(first), _frame(second)
-    candidates = Candidates(*rig_points(before, T_rig_optical), before.descriptors)
+    points, covariances = rig_points(before, T_rig_optical)
+    candidates = Candidates(points, covariances, before.descriptors, np.zeros(len(points), dtype=np.int32))
     if config.method == "nearest":
         rows, columns = associate_nearest(candidates, now, prior.T, T_rig_optical, NEAREST_ASSOCIATE)
         similarity = np.einsum("nd,nd->n", candidates.descriptors[rows], now.descriptors[columns])
