@@ -174,7 +174,7 @@ class Chain(Probe):
         self.wait_for_map(newest_ns, agent)
         answer = self.call("/sjsam/save_map")
         assert answer.success, answer.message
-        return [record.key for record in GlobalMap.load(self.map_path).graph.records]
+        return GlobalMap.load(self.map_path).snapshot().keys
 
     def wait_until_dead_are_forgotten(self) -> None:
         """A killed node is matched until its lease ends, and what is sent to it meanwhile is lost."""

@@ -157,7 +157,7 @@ def map_of(take: Take, system: SystemConfig, variant: str, name: str, run: str, 
     return Outcome(
         row_of(name, f"{run}, {variant}", joined, truth, known, lost, None),
         row_of(name, f"{run}, {variant}, filter", filtered, truth, known, lost, None),
-        record.global_map.doubt != "",
+        mapping.growth.global_map.overconfidence != "",
     )
 
 

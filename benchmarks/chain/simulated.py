@@ -25,7 +25,7 @@ from self_calibration import scale_error_percent
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.smoothing.estimator import EstimatorConfig
-from sjsam_node.smoothing.smoother import SmootherConfig
+from sjsam_node.smoothing.solver import SmootherConfig
 from slam_bringup.bags.bag_types import BagTypes, typestore
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.configuration import choose, load_system_config
@@ -67,7 +67,7 @@ def main() -> None:
             name, _, mode = run.partition(":")
             bag = bag_of(name, arguments.keep or Path(scratch), arguments.profile)
             result, mapping = run_bag(bag, choose(load_system_config(None, bag), mode or "stereo", "sjsam", "none"))
-            submaps = [record.submap for record in mapping.global_map.graph.records]
+            submaps = list(mapping.global_map.snapshot().submaps)
             table.add_row(run, *row(result, submaps))
             if len(result.agents) > 1:
                 for cells in agent_rows(result, submaps):

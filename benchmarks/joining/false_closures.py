@@ -35,10 +35,10 @@ def look_alike_rooms(seeds: int = 4) -> None:
         world, walk = building(rng, alike=True)
         agent = Agent(world, path_through(walk), rng, "a", Sensor(max_range=3.5))
         joined, _ = join(agent.submaps())
-        x = joined.graph.poses[:, 0, 3]
-        records = joined.graph.records
+        x = joined.state.poses[:, 0, 3]
+        records = joined.estimate.graph.records
         # The rooms are 14 m apart: a link between them joins starts that are about as far apart.
-        gaps = [abs(x[records[k.first].start] - x[records[k.second].start]) for k in joined.graph.links]
+        gaps = [abs(x[records[k.first].start] - x[records[k.second].start]) for k in joined.estimate.graph.links]
         false = sum(gap > 11.0 for gap in gaps)
         print(f"  seed {seed}: {false}  {ate(errors(joined, agent)[0]):.3f}")
 

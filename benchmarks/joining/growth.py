@@ -25,7 +25,7 @@ def grow(count: int, laps: float, label: str) -> None:
         began = time.process_time()
         global_map.add(submap)
         times.append(time.process_time() - began)
-        unknowns.append(global_map.smoother.assembled(0).problem.layout.pattern.n)
+        unknowns.append(global_map.state.problem(0).problem.layout.pattern.n)
     began = time.process_time()
     global_map.settle()
     global_map.trajectory()

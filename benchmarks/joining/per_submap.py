@@ -82,7 +82,7 @@ def measure(path: Path, is_read: bool, every: bool, most: int) -> None:
             )
     live = closed(global_map)
     began = time.process_time()
-    final = global_map.centrally()
+    final = global_map.rebuilt_in_time_order()
     with tempfile.TemporaryDirectory() as folder:
         final.save(Path(folder) / "map")
     finish = time.process_time() - began
@@ -102,7 +102,7 @@ def print_row(name: str, recording: Recording, final: GlobalMap, reports: list[J
         f"{ms.mean():.0f}", f"{np.percentile(ms, 95):.0f}", f"{ms.max():.0f}", f"{stretch(ms, 20, 40):.0f}",
         f"{ms[-20:].mean():.0f}", f"{growth:.2f}", f"{finish:.2f}", f"{100 * total / span:.1f}",
         f"{total / features:.2f}", f"{sum(len(r.closures) for r in reports)}, {live}, {closed(final)}",
-        final.components, "{:.0f}/{}".format(*final.smoother.totals()),
+        final.components, "{:.0f}/{}".format(*final.state.totals()),
         ", ".join(f"{a:.1f}" for a in ate), ", ".join(f"{a:.2f}" for a in anees),
         ", ".join(f"{a:.1f}" for a in filtered),
     )  # fmt: skip
@@ -115,7 +115,7 @@ def stretch(ms: np.ndarray, first: int, last: int) -> float:
 
 
 def closed(global_map: GlobalMap) -> int:
-    return sum(link.is_closure for link in global_map.graph.links)
+    return len(global_map.snapshot().closures)
 
 
 def accuracy(recording: Recording, final: GlobalMap) -> tuple[list[float], list[float], list[float]]:
@@ -137,8 +137,7 @@ def publish(global_map: GlobalMap, agent: str) -> None:
     global_map.landmarks()
     global_map.path() if hasattr(global_map, "path") else global_map.trajectory()
     global_map.map_to_odom(agent)
-    graph = global_map.graph
-    np.array([graph.poses[[r.start, r.end], :3, 3] for r in graph.records])
+    global_map.snapshot().skeleton_lines()
 
 
 def warm_up(path: Path) -> None:

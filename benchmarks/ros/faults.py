@@ -195,7 +195,7 @@ def keys(chain: Chain, answer: object) -> list[tuple[str, int, int]]:
     from sjsam_node.global_map import GlobalMap
 
     assert answer.success, answer.message  # type: ignore[attr-defined]
-    return [record.key for record in GlobalMap.load(chain.map_path).graph.records]
+    return GlobalMap.load(chain.map_path).snapshot().keys
 
 
 def main() -> None:

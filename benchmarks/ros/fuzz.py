@@ -245,7 +245,7 @@ def run(count: int, domain: int, folder: Path, *, composed: bool = False) -> tup
             )
             for name, process in processes.items()
         }
-        same = len(after.graph.records) == records and np.array_equal(after.graph.poses, before.graph.poses)
+        same = len(after.snapshot()) == records and np.array_equal(after.state.poses, before.state.poses)
         return outcome, same
     finally:
         for process in processes.values():

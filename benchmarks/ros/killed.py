@@ -141,7 +141,7 @@ def run(name: str, folder: Path) -> str:
             rig.probe.wait(lambda: len(rig.stamps) >= STRUCK, "no odometry", PATIENCE_S)
             ready = 0.0 if name == "none" else rig.kill(name)
             rig.probe.wait(lambda: not rig.player.is_running, "the player does not end", PATIENCE_S)
-            keys = [record.key for record in rig.saved_map().graph.records]
+            keys = rig.saved_map().snapshot().keys
             stamps = sorted(set(rig.stamps))
             gap = max((b - a) / STEP_NS - 1 for a, b in itertools.pairwise(stamps))
             alive = all(process.is_running for process in rig.processes.values())

@@ -105,4 +105,4 @@ def test_ctrl_c_ends_all_nodes_with_the_map_on_disk(domain_environment: dict[str
     assert started == finished, text[-3000:]
     assert "Traceback" not in text, text[-3000:]
     assert launch.process.returncode == 0, text[-3000:]
-    assert GlobalMap.load(tmp_path / "map.autosave.ended").graph.records
+    assert len(GlobalMap.load(tmp_path / "map.autosave.ended").snapshot())

@@ -65,10 +65,10 @@ def test_both_nodes_killed_and_started_again_go_on_with_the_map(chain: Chain, tm
     assert chain.call("/ekf_slam/finish").success
     chain.wait_for_map(START + (half - 1) * STEP_NS)
     copy = tmp_path / "map.autosave"
-    chain.wait(lambda: is_map(copy) and len(GlobalMap.load(copy).graph.records) >= 2, "no autosave")
+    chain.wait(lambda: is_map(copy) and len(GlobalMap.load(copy).snapshot()) >= 2, "no autosave")
     for name in ("sjsam", "ekf_slam"):
         chain.kill(name)
-    before = [record.key for record in GlobalMap.load(copy).graph.records]
+    before = GlobalMap.load(copy).snapshot().keys
     chain.wait_until_dead_are_forgotten()
     for name in ("sjsam", "ekf_slam"):
         chain.start(name)
@@ -116,4 +116,4 @@ def test_an_emptied_map_is_shown_and_never_saved_over_another(chain: Chain) -> N
     answer = chain.call("/sjsam/save_map")
     assert not answer.success
     assert "empty" in answer.message
-    assert len(GlobalMap.load(chain.map_path).graph.records) == len(keys)
+    assert len(GlobalMap.load(chain.map_path).snapshot()) == len(keys)

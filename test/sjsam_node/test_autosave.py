@@ -34,12 +34,12 @@ def test_a_copy_is_found_after_a_kill_and_not_after_an_end_in_order(joined: Glob
     autosave.close()  # and not put away, as a killed one
     second = Autosave(path, 10.0)
     copy = GlobalMap.load(second.found() or Path())
-    assert np.array_equal(copy.graph.poses, joined.graph.poses)
+    assert np.array_equal(copy.state.poses, joined.state.poses)
     second.put_away()
     second.close()
     assert [p.name for p in tmp_path.iterdir()] == ["map.autosave.ended"]
     assert Autosave(path, 10.0).found() is None
-    assert len(GlobalMap.load(autosave.ended).graph.records) == len(joined.graph.records)
+    assert len(GlobalMap.load(autosave.ended).estimate.graph.records) == len(joined.estimate.graph.records)
 
 
 def test_what_is_not_ours_stays(joined: GlobalMap, tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ def test_a_map_that_is_saved_again_is_never_absent(
 ) -> None:
     """Killed at the worst moment, before the manifest is renamed, the old map is still there."""
     joined.save(tmp_path / "map")
-    joined.marks.add(joined.graph.poses, np.zeros(3))
+    joined.marks.add(joined.state.poses, np.zeros(3))
 
     def killed(*_: object) -> None:
         raise KeyboardInterrupt

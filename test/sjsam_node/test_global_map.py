@@ -10,8 +10,8 @@ from judging import ate, chain_error, errors, join
 from submap_world import Agent, Sensor, World, circle, path_through, pose, ring_world, room
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
-from sjsam_node.smoothing.regions import RegionConfig
-from sjsam_node.smoothing.smoother import SmootherConfig
+from sjsam_node.smoothing.condensing import RegionConfig
+from sjsam_node.smoothing.solver import SmootherConfig
 from slam_core.geometry import boxminus, invert_transform
 from slam_core.types import Submap
 
@@ -66,9 +66,9 @@ def read_all(joined: GlobalMap) -> None:
     for agent in "ab":
         joined.end_pose(agent)
         joined.map_to_odom(agent)
-    joined.start_pose(len(joined.graph.records) // 2)
-    joined.smoother.relative_pose(0, len(joined.graph.records) - 1)
-    joined.marks.positions(joined.graph.poses)
+    joined.start_pose(len(joined.estimate.graph.records) // 2)
+    joined.estimate.relative_pose(0, len(joined.estimate.graph.records) - 1)
+    joined.marks.positions(joined.state.poses)
 
 
 def same_reports(one: list[JoinReport], other: list[JoinReport]) -> bool:
@@ -78,8 +78,8 @@ def same_reports(one: list[JoinReport], other: list[JoinReport]) -> bool:
 def same_map(one: GlobalMap, other: GlobalMap) -> bool:
     """Whether two maps are the same to the last bit, covariances included."""
     pairs = [
-        (one.graph.poses, other.graph.poses),
-        (one.graph.points, other.graph.points),
+        (one.state.poses, other.state.poses),
+        (one.state.points, other.state.points),
         (one.landmarks().covariances, other.landmarks().covariances),
         *(
             (p.covariance, q.covariance)
@@ -103,7 +103,7 @@ def test_reading_the_map_changes_nothing_to_the_last_bit(rng: np.random.Generato
     for submap in submaps:
         reports.append(read.add(submap))
         read_all(read)
-        closed += len(read.smoother.assembled(0).regions)
+        closed += len(read.state.problem(0).condensed)
     assert any(r.closures for r in reports)
     assert closed > 10
     assert same_reports(reports, join(submaps, unread)[1])
@@ -118,7 +118,7 @@ def test_settling_brings_the_map_to_its_optimum_with_all_landmarks(rng: np.rando
     submaps = ring_agent(rng, turns=1.0).submaps()
     few, _ = join(submaps, GlobalMap(GlobalMapConfig(ties=6)))
     every, _ = join(submaps, GlobalMap(GlobalMapConfig(ties=24)))
-    assert few.smoother.totals()[1] < 0.5 * every.smoother.totals()[1]
+    assert few.state.totals()[1] < 0.5 * every.state.totals()[1]
     gaps = []
     for _ in range(2):
         a, b = few.trajectory("a"), every.trajectory("a")
@@ -187,7 +187,7 @@ def test_joining_does_not_depend_on_the_order_of_agents(rng: np.random.Generator
     other, _ = join(B + A)
     one.settle()
     other.settle()
-    assert one.smoother.totals()[0] == pytest.approx(other.smoother.totals()[0], rel=0.02)
+    assert one.state.totals()[0] == pytest.approx(other.state.totals()[0], rel=0.02)
     for name in "ab":
         gap = [
             np.abs(boxminus(p.T, q.T)).max() for p, q in zip(one.trajectory(name), other.trajectory(name), strict=True)
@@ -237,7 +237,9 @@ def test_after_a_loss_the_new_stretch_is_tied_to_the_map_when_a_place_is_recogni
     submaps = agent.submaps()
     lost = [replace(s, follows_previous=False) if s.index == 12 else s for s in submaps]
     joined, reports = join(lost)
-    assert joined.graph.records[12].start != joined.graph.records[11].end  # nothing but what it looks like ties it
+    assert (
+        joined.estimate.graph.records[12].start != joined.estimate.graph.records[11].end
+    )  # nothing but what it looks like ties it
     assert reports[12].closures
     assert reports[-1].components == 1
     e, _ = errors(joined, agent)
@@ -247,7 +249,7 @@ def test_after_a_loss_the_new_stretch_is_tied_to_the_map_when_a_place_is_recogni
 def test_what_cannot_be_joined_is_refused_and_changes_nothing(rng: np.random.Generator) -> None:
     submaps = ring_agent(rng, turns=0.2).submaps()
     joined, _ = join(submaps)
-    before = joined.graph.poses.copy()
+    before = joined.state.poses.copy()
     bad = submaps[0].covariance.copy()
     bad[0, 0] = -1.0
     nan = submaps[0].landmarks.copy()
@@ -262,7 +264,7 @@ def test_what_cannot_be_joined_is_refused_and_changes_nothing(rng: np.random.Gen
         report = joined.add(fault)
         assert not report.accepted
         assert report.reason
-    assert np.array_equal(joined.graph.poses, before)
+    assert np.array_equal(joined.state.poses, before)
     assert sum(joined.counters.counts.values()) == 4
 
 
@@ -321,12 +323,14 @@ def test_a_restarted_filter_goes_on_in_a_session_of_its_own(rng: np.random.Gener
     again = [replace(s, session=7, index=s.index - 14, follows_previous=s.index > 14) for s in submaps[14:]]
     joined, reports = join([*submaps[:14], *again])
     assert all(r.accepted for r in reports)
-    assert len(joined.graph.records) == len(submaps)
+    assert len(joined.estimate.graph.records) == len(submaps)
     assert reports[-1].components == 1
     end = np.linalg.multi_dot([s.end_pose for s in again])
     assert np.allclose(joined.odometry_pose("a").T, end)
     joined.save(tmp_path / "map")
-    assert [r.key for r in GlobalMap.load(tmp_path / "map").graph.records] == [r.key for r in joined.graph.records]
+    assert [r.key for r in GlobalMap.load(tmp_path / "map").estimate.graph.records] == [
+        r.key for r in joined.estimate.graph.records
+    ]
     refused = joined.add(replace(submaps[3], start_stamp_ns=-1))
     assert "session" in refused.reason
 

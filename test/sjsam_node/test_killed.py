@@ -27,7 +27,7 @@ def test_a_killed_node_goes_on_from_its_saved_map(rng: np.random.Generator, tmp_
     with running(f"map_path:={tmp_path / 'map'}"), neighbour() as probe:
         send(probe, submaps[:half], half * agent.steps + 1)
         assert call(probe, "save_map").success
-        assert len(GlobalMap.load(tmp_path / "map.autosave").graph.records) == half  # no less than was saved
+        assert len(GlobalMap.load(tmp_path / "map.autosave").estimate.graph.records) == half  # no less than was saved
         assert call(probe, "mark_here").success  # after saving: must be gone
     saved = GlobalMap.load(tmp_path / "map")
     assert not saved.marks.marks
@@ -41,9 +41,9 @@ def test_a_killed_node_goes_on_from_its_saved_map(rng: np.random.Generator, tmp_
     continued = GlobalMap.load(tmp_path / "map")
     join(submaps[half:], saved)
     saved.settle()  # as saving does
-    assert any(k.is_closure for k in continued.graph.links)
-    assert len(continued.graph.links) == len(saved.graph.links)
-    assert np.abs(continued.graph.poses - saved.graph.poses).max() < 1e-9
+    assert any(k.is_closure for k in continued.estimate.graph.links)
+    assert len(continued.estimate.graph.links) == len(saved.estimate.graph.links)
+    assert np.abs(continued.state.poses - saved.state.poses).max() < 1e-9
 
 
 def test_the_default_copy_is_found_from_any_folder_and_has_one_writer(

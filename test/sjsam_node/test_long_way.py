@@ -13,7 +13,7 @@ def test_covariances_of_all_poses_are_those_from_the_factor(rng: np.random.Gener
     agent = Agent(ring_world(18.0, rng, 12.0), circle(18.0, 0.95), rng, "a")
     joined, _ = join(agent.submaps()[:100])
     joined.settle()
-    assembled = joined.smoother.assembled(0)
+    assembled = joined.state.problem(0)
     marginals = assembled.problem.marginals(assembled.state)
     for node in range(1, len(assembled.nodes), 9):
         exact = assembled.problem.columns(assembled.state, np.array([node]))

@@ -103,7 +103,7 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
     ):
         bench.listen(topic, kind)
     bench.send(submaps)
-    assert bench.spin_until(lambda: len(bench.node.global_map.graph.records) == len(submaps))
+    assert bench.spin_until(lambda: len(bench.node.global_map.estimate.graph.records) == len(submaps))
     wanted = len(submaps) * agent.steps + 1
     assert bench.spin_until(lambda: any(len(m.poses) == wanted for m in bench.received["map/path"]))
     offline, _ = join(submaps)
@@ -125,9 +125,9 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
     click.publish(bench.types.PointStamped(header=bench.types.Header(frame_id="map"), point=bench.types.Point(x=1.0)))
     assert bench.spin_until(lambda: len(bench.node.global_map.marks.marks) == 2, 5.0)
     assert bench.call("reset").success
-    assert len(bench.node.global_map.graph.records) == 0
+    assert len(bench.node.global_map.estimate.graph.records) == 0
     assert bench.call("load_map").success
-    assert len(bench.node.global_map.graph.records) == len(submaps)
+    assert len(bench.node.global_map.estimate.graph.records) == len(submaps)
 
 
 def test_map_to_odom_leads_from_odometry_to_where_the_rig_is_in_the_map(bench: Bench, submaps: list[Submap]) -> None:
@@ -162,7 +162,7 @@ def test_a_submap_that_did_not_arrive_is_asked_for_again_and_then_told(bench: Be
                 publisher.publish(message)
 
     def joined() -> list[int]:
-        return [record.submap.index for record in bench.node.global_map.graph.records]
+        return [record.submap.index for record in bench.node.global_map.estimate.graph.records]
 
     counters = bench.node.health.counters
     send(0, 1, 3, 4)
@@ -222,7 +222,7 @@ def test_everything_is_answered_while_a_submap_is_being_joined(
     slow.may_go_on.set()
     assert bench.spin_until(lambda: saved.done() and finished.done())
     assert f"{len(submaps)} submaps joined" in finished.result().message
-    assert len(GlobalMap.load(tmp_path / "map").graph.records) == 3, "the map is saved as soon as it can be"
+    assert len(GlobalMap.load(tmp_path / "map").estimate.graph.records) == 3, "the map is saved as soon as it can be"
     counters = bench.counters
     assert (counters["submaps joined"], counters["submaps waiting"]) == (len(submaps), 0)
 
@@ -239,7 +239,7 @@ def test_reset_leaves_out_what_waits_and_what_is_being_joined(
     assert bench.spin_until(lambda: bench.counters["submaps received"] == len(submaps))
     slow.may_go_on.set()
     assert bench.call("finish").success
-    assert [r.submap.index for r in bench.node.global_map.graph.records] == [submaps[-1].index]
+    assert [r.submap.index for r in bench.node.global_map.estimate.graph.records] == [submaps[-1].index]
     assert bench.counters["submaps joined"] == 3
 
 
@@ -251,4 +251,4 @@ def test_what_waits_when_the_node_is_told_to_end_is_in_the_copy(
     assert bench.spin_until(lambda: bench.counters["submaps received"] == len(submaps) and slow.is_held.is_set())
     slow.may_go_on.set()
     bench.node.on_close()
-    assert len(GlobalMap.load(tmp_path / "map.autosave.ended").graph.records) == len(submaps)
+    assert len(GlobalMap.load(tmp_path / "map.autosave.ended").estimate.graph.records) == len(submaps)

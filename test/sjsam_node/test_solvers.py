@@ -15,8 +15,7 @@ from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
 from sjsam_node.linear_slam.text_joining import TextJoiningConfig, TextJoiningResult, join_text_maps
 from sjsam_node.loop_closure.association import METHODS, AssociationConfig
 from sjsam_node.loop_closure.verification import ClosureConfig
-from sjsam_node.smoothing.estimator import EstimatorConfig
-from sjsam_node.smoothing.smoother import SmootherConfig
+from sjsam_node.smoothing.solver import EstimatorConfig, SmootherConfig
 from slam_core.linear_algebra.sparse_cholesky import BACKENDS
 
 LIBRARIES = [name for name in BACKENDS if name != "auto"]

@@ -33,9 +33,9 @@ def test_a_map_comes_back_to_the_last_bit(agent: Agent, tmp_path: Path) -> None:
     said = joined.trajectory("a")
     joined.save(tmp_path / "map")
     loaded = GlobalMap.load(tmp_path / "map")
-    assert np.array_equal(loaded.graph.poses, joined.graph.poses)
-    assert np.array_equal(loaded.graph.points, joined.graph.points)
-    assert np.array_equal(loaded.graph.landmark_of, joined.graph.landmark_of)
+    assert np.array_equal(loaded.state.poses, joined.state.poses)
+    assert np.array_equal(loaded.state.points, joined.state.points)
+    assert np.array_equal(loaded.estimate.graph.landmark_of, joined.estimate.graph.landmark_of)
     for p, q in zip(loaded.trajectory("a"), said, strict=True):
         assert p.stamp_ns == q.stamp_ns
         assert np.array_equal(p.T, q.T)
@@ -46,18 +46,18 @@ def test_a_map_comes_back_to_the_last_bit(agent: Agent, tmp_path: Path) -> None:
 def test_saved_killed_loaded_and_continued_gives_the_same_map(stop: int, agent: Agent, tmp_path: Path) -> None:
     submaps = agent.submaps()
     whole, _ = join(submaps[:stop])
-    whole.marks.add(whole.graph.poses, np.array([1.0, 2.0, 0.5]), "a find")
+    whole.marks.add(whole.state.poses, np.array([1.0, 2.0, 0.5]), "a find")
     whole.save(tmp_path / "map")
     continued, reports = join(submaps[stop:], GlobalMap.load(tmp_path / "map"))
     _, expected = join(submaps[stop:], whole)
     assert [r.closures for r in reports] == [r.closures for r in expected]
-    assert np.array_equal(continued.graph.landmark_of, whole.graph.landmark_of)
-    assert np.abs(continued.graph.points - whole.graph.points).max() < 1e-9
+    assert np.array_equal(continued.estimate.graph.landmark_of, whole.estimate.graph.landmark_of)
+    assert np.abs(continued.state.points - whole.state.points).max() < 1e-9
     for p, q in zip(continued.trajectory("a"), whole.trajectory("a"), strict=True):
         assert np.abs(boxminus(p.T, q.T)).max() < 1e-9
         assert np.allclose(p.covariance, q.covariance, rtol=1e-6, atol=1e-12)
     assert np.allclose(
-        continued.marks.positions(continued.graph.poses), whole.marks.positions(whole.graph.poses), atol=1e-9
+        continued.marks.positions(continued.state.poses), whole.marks.positions(whole.state.poses), atol=1e-9
     )
     assert [m.name for m in continued.marks.marks] == ["a find"]
 
@@ -198,7 +198,7 @@ def visitor(agent: Agent, rng: np.random.Generator) -> tuple[Agent, list[Submap]
 
 def test_a_visitor_is_located_by_looks_and_the_map_does_not_change(agent: Agent, rng: np.random.Generator) -> None:
     joined, _ = join(agent.submaps())
-    before = joined.graph.poses.copy()
+    before = joined.state.poses.copy()
     again, submaps = visitor(agent, rng)
     localizer = Localizer(joined)
     results = [localizer.process(submap) for submap in submaps]
@@ -208,8 +208,8 @@ def test_a_visitor_is_located_by_looks_and_the_map_does_not_change(agent: Agent,
         if result.pose is not None:
             assert np.linalg.norm((T @ again.true_start(k + 1) - result.pose.T)[:3, 3]) < 0.5
     assert results[-1].pose is not None
-    assert np.array_equal(joined.graph.poses, before)
-    assert len(joined.graph.records) == len(agent.seen)
+    assert np.array_equal(joined.state.poses, before)
+    assert len(joined.estimate.graph.records) == len(agent.seen)
 
 
 def test_an_initial_pose_is_enough_to_start(agent: Agent, rng: np.random.Generator) -> None:
@@ -239,7 +239,7 @@ def test_a_full_disk_leaves_the_old_map_and_nothing_beside_it(
 ) -> None:
     joined = GlobalMap.load(small_map)
     before = sorted(p.name for p in small_map.iterdir())
-    joined.marks.add(joined.graph.poses, np.zeros(3))
+    joined.marks.add(joined.state.poses, np.zeros(3))
     for folder in (small_map, tmp_path / "new"):
         with full_disk(), pytest.raises(OSError, match=str(folder)):
             joined.save(folder)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sjsam_node.graph.map_graph import MapGraph, Record
+from sjsam_node.smoothing.estimate import MapEstimate
 from slam_core.geometry import compose_covariance
 from slam_core.linear_algebra.block_pattern import IntArray
 from slam_core.types import PoseEstimate, Submap
@@ -18,12 +18,12 @@ Key = tuple[str, int, int]
 
 @dataclass
 class Agents:
-    """Records of a graph by agent, session and index; ``window``: how long a chain of them is asked for.
+    """Records of a map by agent, session and index; ``window``: how long a chain of them is asked for.
 
     chained (n, 2): each record with those of its chain, the earlier one first.
     """
 
-    graph: MapGraph
+    estimate: MapEstimate
     window: int
     chained: IntArray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
     _lookup: dict[Key, int] = field(default_factory=dict)
@@ -34,18 +34,17 @@ class Agents:
         """Number of a record, or None."""
         return self._lookup.get((agent, session, index))
 
-    def newest(self, agent: str) -> Record | None:
-        """The record that came last of an agent, or None."""
-        number = self._newest.get(agent)
-        return None if number is None else self.graph.records[number]
+    def newest(self, agent: str) -> int | None:
+        """Number of the record that came last of an agent, or None."""
+        return self._newest.get(agent)
 
     def chain(self, new: int) -> list[int]:
         """The records before ``new`` along its agent's odometry, newest first, as many as it may be linked to."""
-        chain, (agent, session, index) = [new], self.graph.records[new].key
+        chain, (agent, session, index) = [new], self.estimate.graph.records[new].key
         while (
             len(chain) <= self.window
             and (previous := self.record(agent, session, index - 1)) is not None
-            and self.graph.records[previous].end == self.graph.records[chain[-1]].start
+            and self.estimate.graph.records[previous].end == self.estimate.graph.records[chain[-1]].start
         ):
             chain.append(previous)
             index -= 1
@@ -60,11 +59,11 @@ class Agents:
 
         Anew where the record begins a session or does not come in its turn.
         """
-        record = self.graph.records[new]
+        record = self.estimate.graph.records[new]
         agent, session, index = record.key
         before, chain, known = self.newest(agent), [record.submap], self.odometry(agent)
-        if before is None or before.key != (agent, session, index - 1):
-            own = [r.submap for r in self.graph.records if r.key[:2] == (agent, session)]
+        if before is None or self.estimate.graph.records[before].key != (agent, session, index - 1):
+            own = [r.submap for r in self.estimate.graph.records if r.key[:2] == (agent, session)]
             chain, known = sorted(own, key=lambda s: s.index), PoseEstimate(0, np.eye(4), np.zeros((6, 6)))
         for s in chain:
             covariance = compose_covariance(known.T, known.covariance, s.end_pose, s.covariance[:6, :6])

@@ -6,8 +6,8 @@
         report = global_map.add(submap)
 
 :meth:`GlobalMap.add` reads as Algorithm 4 does: place the submap, associate, join; and beyond it: look for closures and
-keep those that the map can live with. Only ``add``, ``settle``, ``save`` and ``reset`` write; what is read is as fresh
-as the last of them and changes nothing.
+keep those that the map can live with. Only ``add``, ``settle``, ``save`` and ``reset`` change the map; what is read
+comes from a :class:`~sjsam_node.smoothing.map_snapshot.MapSnapshot`, which stays as it is.
 """
 
 from __future__ import annotations
@@ -20,15 +20,17 @@ import numpy as np
 
 from sjsam_node import storage
 from sjsam_node.agents import Agents, in_order
+from sjsam_node.closure_joining import ClosureJoiner
 from sjsam_node.graph.links import Link, Status
-from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.graph.offload import Offload
-from sjsam_node.loop_closure.consistency import Consistency, ConsistencyConfig, Verdict
+from sjsam_node.loop_closure.consistency import ConsistencyConfig, Verdict
 from sjsam_node.loop_closure.detector import LoopDetector
 from sjsam_node.loop_closure.verification import ClosureConfig
-from sjsam_node.map_view import MapLandmarks, MapView
 from sjsam_node.marks import Marks
-from sjsam_node.smoothing.smoother import Smoother, SmootherConfig
+from sjsam_node.smoothing.estimate import MapEstimate
+from sjsam_node.smoothing.map_snapshot import InnerPaths, MapLandmarks, MapSnapshot
+from sjsam_node.smoothing.solver import SmootherConfig
+from sjsam_node.smoothing.state import EstimateState
 from sjsam_node.storage import StoredMap
 from slam_core.calibration_error import CalibrationErrorConfig
 from slam_core.config import Config, group, parameter
@@ -104,12 +106,10 @@ class JoinReport:
 class GlobalMap:
     """Joins submaps of one or several agents, each as it comes."""
 
-    graph: MapGraph
+    estimate: MapEstimate
     agents: Agents
-    smoother: Smoother
     detector: LoopDetector
-    consistency: Consistency
-    view: MapView
+    closures: ClosureJoiner
     marks: Marks
 
     def __init__(self, config: GlobalMapConfig | None = None) -> None:
@@ -119,20 +119,29 @@ class GlobalMap:
 
     def reset(self) -> None:
         """Forget everything."""
-        self._take(MapGraph())
+        self._take(EstimateState())
         self.marks = Marks()
         self._offload = Offload()
         self._has_moved = False
-        self._is_settled = True
+        self._is_settled, self._was_settled_before = True, False
 
-    def _take(self, graph: MapGraph) -> None:
-        """Work on a graph."""
-        self.graph = graph
-        self.agents = Agents(graph, self.config.closure.window)
-        self.smoother = Smoother(graph, self.config.smoothing)
-        self.detector = LoopDetector(self.smoother, self.config.closure)
-        self.consistency = Consistency(self.smoother, self.config.consistency, self.config.closure)
-        self.view = MapView(self.smoother, self.config.unlinked_sigma, self.config.calibration)
+    def _take(self, state: EstimateState) -> None:
+        """Go on from a state."""
+        self.estimate = MapEstimate(self.config.smoothing, state)
+        self.agents = Agents(self.estimate, self.config.closure.window)
+        self.detector = LoopDetector(self.estimate, self.config.closure)
+        self.closures = ClosureJoiner(self.estimate, self.config.consistency, self.config.closure)
+        self._inner_paths = InnerPaths()
+
+    @property
+    def state(self) -> EstimateState:
+        """The state of the estimate."""
+        return self.estimate.state
+
+    def snapshot(self) -> MapSnapshot:
+        """The map as it is now, for those who read it."""
+        marks = Marks(list(self.marks.marks))
+        return MapSnapshot(self.state, self.config.unlinked_sigma, self.config.calibration, marks, self._inner_paths)
 
     def add(self, submap: Submap) -> JoinReport:
         """Join one submap; a faulty one is refused with the reason, counted, and changes nothing."""
@@ -140,38 +149,39 @@ class GlobalMap:
         if reason:
             self.counters.add(f"refused: {reason}")
             return JoinReport(False, reason)
-        new = self._place(submap)
+        self._was_settled_before |= self._is_settled and bool(self.estimate.graph.records)
         self._is_settled = False
+        new = self._place(submap)
         chain = self.agents.chain(new)
-        for link in self.detector.sequential(chain, new):
-            self.graph.add_link(link)
-        matched = self._matched(new)
-        self.smoother.condense(new, chain)
+        self.estimate.add_links(self.detector.sequential(chain, new))
+        matched = self.estimate.graph.shared_by(new)
+        self.estimate.condense(new, chain)
         found = self.detector.closures(chain, new)
         if self._has_moved:
             found += self.detector.missed(self.agents.chained, self.config.compared_at_once)
         self._judge_redundancy(new, found)
-        result, verdict = self.consistency.update(found, new)
+        verdict = self.closures.join_closures(found, new)
         self._account(verdict, len(found))
         surprising = any(k.status is not Status.CONSISTENT for k in found) and bool(verdict.accepted)
         self._has_moved = surprising or bool(verdict.removed) or (self._has_moved and bool(found))
-        if not self.graph.redundant[new]:
+        is_redundant = bool(self.state.is_redundant(new))
+        if not is_redundant:
             self.detector.index.add(new, submap.descriptors)
-        self._put_away(new - self.config.closure.window)
+        self._page_out(new - self.config.closure.window)
+        result, shared = self.state.result(self.state.component(new)), self.estimate.graph.shared_by(new)
         return JoinReport(
-            True, "", matched, len(submap.landmarks) - self._matched(new), self._named(verdict.accepted),
-            verdict.dropped, self.components, result.cost, result.variance_factor, result.iterations, result.converged,
-            result.solver, bool(self.graph.redundant[new]),
-            result.variance_factor > self.config.consistency.max_variance_factor,
+            True, "", matched, len(submap.landmarks) - shared, self._named(verdict.accepted), verdict.dropped,
+            self.components, result.cost, result.variance_factor, result.iterations, result.converged, result.solver,
+            is_redundant, result.variance_factor > self.config.consistency.max_variance_factor,
         )  # fmt: skip
 
     def _judge_redundancy(self, new: int, found: list[Link]) -> None:
         """A submap of a place that the map knows well adds few unknowns, and nothing is compared with it later."""
         known = [k.pairs[:, 1] for k in found if k.second == new and k.status is Status.CONSISTENT]
         count = len(np.unique(np.concatenate(known))) if known else 0
-        share = self.config.redundant_share * len(self.graph.records[new].observations)
+        share = self.config.redundant_share * len(self.estimate.graph.records[new].observations)
         if count > max(share, self.config.redundant_matches):
-            self.graph.redundant[new] = True
+            self.estimate.mark_redundant(new)
 
     def _account(self, verdict: Verdict, found: int) -> None:
         """Count what became of closures, and compare anew what they let go."""
@@ -185,24 +195,25 @@ class GlobalMap:
         self.detector.near.forget({i for k in verdict.removed for i in k.ends})
 
     def _named(self, links: tuple[Link, ...]) -> tuple[tuple[str, int], ...]:
-        older = [self.graph.records[link.first].submap for link in links]
+        older = [self.estimate.graph.records[link.first].submap for link in links]
         return tuple((submap.agent, submap.index) for submap in older)
 
-    def _put_away(self, old: int) -> None:
+    def _page_out(self, old: int) -> None:
         """Keep the large arrays of a submap on disk from here on."""
         if old >= 0:
-            submap, put = self.graph.records[old].submap, self._offload.put
+            record, put = self.estimate.graph.records[old], self._offload.put
+            submap = record.submap
             on_the_way = put(np.array([p.covariance for p in submap.path]))
             path = tuple(replace(p, covariance=c) for p, c in zip(submap.path, on_the_way, strict=True))
             small = replace(submap, covariance=put(submap.covariance), descriptors=put(submap.descriptors), path=path)
-            self.graph.records[old] = replace(self.graph.records[old], submap=small)
+            self.estimate.replace_record(old, replace(record, submap=small))
             self.detector.index.move(old, small.descriptors)
             self._offload.forget()
 
     @property
     def components(self) -> int:
         """Parts of the map that nothing ties together yet."""
-        return len(np.unique(self.graph.component_of))
+        return len(self.state.components())
 
     def _fault(self, submap: Submap) -> str:
         """Reason for which a submap cannot be joined; empty if it can."""
@@ -218,33 +229,28 @@ class GlobalMap:
             np.linalg.cholesky(submap.covariance)
         except np.linalg.LinAlgError:
             return "covariance is not positive definite"
-        known = self.graph.records[0].submap.descriptors.shape[1] if self.graph.records else None
+        known = self.estimate.graph.records[0].submap.descriptors.shape[1] if self.estimate.graph.records else None
         if known is not None and submap.descriptors.shape[1] != known and len(submap.landmarks):
             return f"descriptors of {submap.descriptors.shape[1]} columns in a map of {known}"
         held = self.agents.record(submap.agent, submap.session, submap.index)
         if held is None:
             return ""
-        same = self.graph.records[held].submap.start_stamp_ns == submap.start_stamp_ns
+        same = self.estimate.graph.records[held].submap.start_stamp_ns == submap.start_stamp_ns
         return ALREADY_JOINED if same else "another submap of this agent, session and index is in the map"
 
     def _place(self, submap: Submap) -> int:
         """Add a record at the end of its predecessor, or as a component of its own where the agent was last seen."""
         previous = self.agents.record(submap.agent, submap.session, submap.index - 1)
         follows = submap.follows_previous and previous is not None
-        start = self.graph.records[previous].end if follows and previous is not None else None
-        self.graph.append(submap, start, self.last_pose(submap.agent), self.config.ties)
-        new = len(self.graph.records) - 1
+        start = self.estimate.graph.records[previous].end if follows and previous is not None else None
+        new = self.estimate.add_submap(submap, start, self.last_pose(submap.agent), self.config.ties)
         self.agents.add(new)
         return new
 
     def last_pose(self, agent: str) -> FloatArray:
         """Last pose of an agent, (4, 4); the origin for one not seen before."""
         newest = self.agents.newest(agent)
-        return np.eye(4) if newest is None else self.graph.poses[newest.end]
-
-    def _matched(self, new: int) -> int:
-        """Landmarks of a record that another record sees too."""
-        return int(self.graph.shared()[self.graph.records[new].observations].sum())
+        return np.eye(4) if newest is None else self.state.end(newest)
 
     @overload
     def trajectory(self) -> dict[str, list[PoseEstimate]]: ...
@@ -253,20 +259,20 @@ class GlobalMap:
     def trajectory(self, agent: str) -> list[PoseEstimate]: ...
 
     def trajectory(self, agent: str | None = None) -> dict[str, list[PoseEstimate]] | list[PoseEstimate]:
-        """Rig poses in the map frame with covariances (see :meth:`sjsam_node.map_view.MapView.trajectory`).
+        """Rig poses in the map frame with covariances (see :meth:`MapSnapshot.trajectory`).
 
         Of every agent by name, or of one.
         """
-        trajectories = self.view.trajectory()
+        trajectories = self.snapshot().trajectory()
         return trajectories if agent is None else trajectories.get(agent, [])
 
     def path(self) -> dict[str, list[PoseEstimate]]:
         """The same poses by agent, with no more covariance than inside their submaps; costs little."""
-        return self.view.path()
+        return self.snapshot().path()
 
     def landmarks(self) -> MapLandmarks:
         """Every landmark once, with covariance, descriptor and id."""
-        return self.view.landmarks()
+        return self.snapshot().landmarks()
 
     def settle(self) -> None:
         """Do now what was put off: compare what has come near, let go what does not fit, and join in batch.
@@ -275,58 +281,60 @@ class GlobalMap:
         """
         if self._is_settled:
             return
-        newest = len(self.graph.records) - 1
+        newest = len(self.estimate.graph.records) - 1
         for _ in range(_PASSES):
             missed = self.detector.missed(
-                self.agents.chained, self.config.compared_at_settling * len(self.graph.records)
+                self.agents.chained, self.config.compared_at_settling * len(self.estimate.graph.records)
             )
             for found in _grouped(missed, self.config.joined_at_once):
-                self._account(self.consistency.update(found, newest)[1], len(found))
+                self._account(self.closures.join_closures(found, newest), len(found))
             if not missed:
                 break
         for _ in range(_PASSES):
-            self.smoother.settle(coarse=True)
-            verdict = self.consistency.settle(newest)
+            self.estimate.optimize_full(coarse=True)
+            verdict = self.closures.remove_contradicted(newest)
             self._account(verdict, 0)
             if not verdict.removed and not verdict.dropped:
                 break
-        self.smoother.settle()
-        self._account(self.consistency.relieve(), 0)
-        self.smoother.resume()  # from here on it says the same as one that is saved and loaded
+        self.estimate.optimize_full()
+        self._account(self.closures.resolve_overconfidence(), 0)
+        self.estimate.relinearize()  # from here on it says the same as one that is saved and loaded
         self._offload.forget()
         self._has_moved, self._is_settled = False, True
 
     @property
-    def doubt(self) -> str:
-        """Warning if submaps contradict each other (see ``Consistency.relieve``); empty if they do not."""
-        strained = np.nonzero(self.graph.doubt > 1.0)[0]
-        if not len(strained):
+    def overconfidence(self) -> str:
+        """Warning if submaps contradict each other; empty if they do not."""
+        state = self.state
+        factor, over = state.most_overconfident()
+        if not over:
             return ""
-        tied = {i for k in self.graph.links if not k.is_closure for i in k.ends}
-        alone = sum(i not in tied for i in strained.tolist())
-        return (f"submaps contradict each other {self.graph.doubt.max():.0f} times more than they claim: "
-                f"{alone} of {len(self.graph.records)} are chained as the filter made them. {ADVICE}")  # fmt: skip
+        linked = {i for k in state.graph.links if not k.is_closure for i in k.ends}
+        alone = sum(i not in linked for i in over)
+        return (f"submaps contradict each other {factor:.0f} times more than they claim: "
+                f"{alone} of {len(state.graph.records)} are chained as the filter made them. {ADVICE}")  # fmt: skip
 
-    def centrally(self) -> GlobalMap:
+    def rebuilt_in_time_order(self) -> GlobalMap:
         """The settled map that does not depend on who came first: all submaps joined in the order of their stamps.
 
-        The map itself where they came in that order; otherwise they are joined anew.
+        The map itself where they came in that order, and nothing was settled on the way; otherwise all are joined anew.
         """
-        submaps, central = [r.submap for r in self.graph.records], self
-        if (ordered := in_order(submaps)) != submaps:
-            central = GlobalMap(self.config)
+        submaps, rebuilt = [r.submap for r in self.estimate.graph.records], self
+        ordered = in_order(submaps)
+        if self._was_settled_before or ordered != submaps:
+            rebuilt = GlobalMap(self.config)
             for submap in ordered:
-                central.add(submap)
-            central.counters = self.counters
-            central.marks = self._marks_in(central)
-        central.settle()
-        return central
+                rebuilt.add(submap)
+            rebuilt.counters = self.counters
+            rebuilt.marks = self.marks_in(rebuilt)
+        rebuilt.settle()
+        return rebuilt
 
-    def _marks_in(self, other: GlobalMap) -> Marks:
+    def marks_in(self, other: GlobalMap) -> Marks:
         """The marks of this map, on the nodes of another one of the same submaps."""
         node = {}
-        for record in self.graph.records:
-            twin = other.graph.records[other.agents.record(*record.key) or 0]
+        for record in self.estimate.graph.records:
+            twin = other.estimate.graph.records[other.agents.record(*record.key) or 0]
             node[record.start], node[record.end] = twin.start, twin.end
         return Marks([replace(mark, node=node[mark.node]) for mark in self.marks.marks])
 
@@ -340,15 +348,12 @@ class GlobalMap:
 
     def start_pose(self, record: int) -> PoseEstimate:
         """Start pose of a record in the map frame, with covariance."""
-        r = self.graph.records[record]
-        return PoseEstimate(r.submap.start_stamp_ns, self.graph.poses[r.start], self.view.node(r.start))
+        return self.snapshot().start(record)
 
     def end_pose(self, agent: str) -> PoseEstimate | None:
         """End of an agent's newest submap in the map frame; None for an agent not heard of."""
-        r = self.agents.newest(agent)
-        if r is None:
-            return None
-        return PoseEstimate(r.submap.end_stamp_ns, self.graph.poses[r.end], self.view.node(r.end))
+        newest = self.agents.newest(agent)
+        return None if newest is None else self.snapshot().end(newest)
 
     def save(self, path: Path | str, *, is_last: bool = False) -> None:
         """Write the map to a folder (see :mod:`sjsam_node.storage`), and go on from it as a map that is loaded does.
@@ -357,7 +362,7 @@ class GlobalMap:
         """
         self.settle()
         if is_last:
-            self.smoother.forget()
+            self.estimate.release_factors()
         storage.write(Path(path), self.stored())
         if is_last:
             self._offload.forget()
@@ -365,25 +370,25 @@ class GlobalMap:
     def stored(self) -> StoredMap:
         """The map as it is, to be written; nothing is settled."""
         return StoredMap(
-            self.graph, self.detector.pending, self.consistency.refused, self.detector.near.compared, self.marks
+            self.state, self.detector.pending, self.closures.refused, self.detector.near.compared, self.marks
         )
 
     @classmethod
     def load(cls, path: Path | str, config: GlobalMapConfig | None = None) -> GlobalMap:
         """The map that :meth:`save` wrote; ``ValueError`` if the folder is no such map."""
         stored = storage.read(Path(path))
-        loaded, graph = cls(config), stored.graph
-        loaded._take(graph)
+        loaded, graph = cls(config), stored.state.graph
+        loaded._take(stored.state)
         loaded._is_settled = not graph.records
         loaded.marks = stored.marks
-        loaded.consistency.refused = stored.refused
+        loaded.closures.refused = stored.refused
         loaded.detector.pending, loaded.detector.near.compared = stored.pending, stored.compared
         for i, record in enumerate(graph.records):
             loaded.agents.add(i)
-            if not graph.redundant[i]:
+            if not stored.state.is_redundant(i):
                 loaded.detector.index.add(i, record.submap.descriptors)
-            loaded._put_away(i)
-        loaded.smoother.resume()
+            loaded._page_out(i)
+        loaded.estimate.relinearize()
         return loaded
 
 

@@ -58,9 +58,9 @@ class JoinerStage:
         """Do something as soon as the submap at hand is joined, however many wait."""
         return self._put(_REQUEST, task)
 
-    def when_idle(self) -> Future[None]:
-        """A future that is done when nothing waits any more."""
-        return self._put(_LATER, lambda: None)
+    def when_idle(self, task: Callable[[], None] = lambda: None) -> Future[None]:
+        """A future that is done when nothing waits any more and a last task is done."""
+        return self._put(_LATER, task)
 
     def close(self) -> None:
         """Do all that waits and end the thread."""

@@ -3,7 +3,7 @@
 
     live = LiveMap(config, Autosave(path, 10.0))
     live.add(submap).add_done_callback(...)     # a future of Joined
-    live.mark(point), live.poses                # at once, however many submaps wait
+    live.mark(point), live.snapshot                # at once, however many submaps wait
 
 The writer's thread alone touches the map. Methods whose description begins with "Writer:" run there.
 """
@@ -51,14 +51,15 @@ class LiveMap:
     ----------
     global_map
         The map, which the writer changes.
-    poses
-        Poses (n, 4, 4) of its nodes as of the last submap joined.
+    snapshot
+        The map as of the last submap joined.
     copy_is_old
         Whether the map has changed since the autosave had it.
     """
 
-    def __init__(self, config: GlobalMapConfig, autosave: Autosave) -> None:
-        self._config, self._autosave = config, autosave
+    def __init__(self, config: GlobalMapConfig, autosave: Autosave, *, keeps_map: bool = False) -> None:
+        self._config, self._autosave, self._keeps_map = config, autosave, keeps_map
+        self._was_loaded = False
         self._lock, self._resets = threading.Lock(), 0
         self._localizers: dict[str, Localizer] = {}
         self._take(GlobalMap(config))
@@ -69,7 +70,7 @@ class LiveMap:
     def _take(self, other: GlobalMap) -> None:
         """Go on with another map."""
         with self._lock:
-            self.global_map, self.poses, self._localizers = other, other.graph.poses.copy(), {}
+            self.global_map, self.snapshot, self._localizers = other, other.snapshot(), {}
             self.copy_is_old = True
 
     # -- submaps -------------------------------------------------------------------------------------------------------
@@ -109,7 +110,7 @@ class LiveMap:
             if growing is not self.global_map:
                 return None
             if report.accepted:
-                self.poses, self.copy_is_old = growing.graph.poses.copy(), True
+                self.snapshot, self.copy_is_old = growing.snapshot(), True
         in_odom, counts = growing.odometry_pose(submap.agent), dict(growing.counters.counts)
         return Joined(report, end, in_odom, counts, time.perf_counter() - began)
 
@@ -125,7 +126,7 @@ class LiveMap:
     def mark(self, point: FloatArray) -> Mark:
         """Mark a point (3,) of the map frame, m, at once; ValueError in an empty map."""
         with self._lock:
-            mark = self.global_map.marks.add(self.poses, point)
+            mark = self.global_map.marks.add(self.snapshot.poses, point)
             self.copy_is_old = True
         return mark
 
@@ -134,7 +135,7 @@ class LiveMap:
         self._resets += 1
         if forget:
             self._take(GlobalMap(self._config))
-            self.copy_is_old = False
+            self.copy_is_old = self._was_loaded = False
             self._joiner.ask(self._autosave.put_away)
         else:
             self._localizers = {}
@@ -145,7 +146,7 @@ class LiveMap:
 
     def _save(self, path: Path) -> None:
         """Writer: save the map."""
-        if not self.global_map.graph.records and path.exists():
+        if not len(self.global_map.snapshot()) and path.exists():
             raise ValueError(f"the map is empty: {path} is left as it is")
         self.global_map.save(path)
         self._copy_now()  # a node that is killed from now on goes on from no less
@@ -162,6 +163,7 @@ class LiveMap:
         loaded = GlobalMap.load(path, self._config)
         seen = view(loaded)
         self._take(loaded)
+        self._was_loaded = True
         return seen
 
     # -- copies --------------------------------------------------------------------------------------------------------
@@ -184,12 +186,26 @@ class LiveMap:
             self._autosave.save(self.global_map.stored(), time.monotonic())
 
     def finish(self) -> Future[None]:
-        """A future that is done when all submaps are joined."""
-        return self._joiner.when_idle()
+        """Join all submaps that wait and settle the map; a new one ends up the same whoever came first."""
+        return self._joiner.when_idle(self._finish)
+
+    def _finish(self) -> None:
+        """Writer: settle the map; one that was loaded keeps its frame."""
+        if self._keeps_map:
+            return
+        settled = self.global_map
+        if self._was_loaded:
+            settled.settle()
+        else:
+            settled = settled.rebuilt_in_time_order()
+        with self._lock:
+            if settled is not self.global_map:  # somebody may have marked something meanwhile
+                settled.marks = self.global_map.marks_in(settled)
+            self.global_map, self.snapshot, self.copy_is_old = settled, settled.snapshot(), True
 
     def close(self) -> None:
         """Join what waits, write what no copy has, and put the copy away: nobody needs to go on from it."""
-        joined = self.finish()
+        joined = self._joiner.when_idle()
         while wait([joined], 1.0).not_done:
             self.save_copy()
         self._joiner.close()

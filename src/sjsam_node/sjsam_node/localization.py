@@ -61,7 +61,7 @@ class Localizer:
         best, most = self._pose, 0
         verifier = self._map.detector.verifier
         for record in self._candidates(submap):
-            known = at_start(self._map.graph.records[record])
+            known = at_start(self._map.estimate.graph.records[record])
             link, status = verifier.verify(known, seen, self._prior(record), 0.0, record)
             if link is None or len(link.pairs) <= most:
                 continue
@@ -72,7 +72,7 @@ class Localizer:
         return best, most
 
     def _candidates(self, submap: Submap) -> list[int]:
-        detector, graph = self._map.detector, self._map.graph
+        detector, graph = self._map.detector, self._map.estimate.graph
         if self._pose is None:
             return detector.index.query(submap.descriptors, set())
         middle = self._pose.T[:3, :3] @ np.median(submap.landmarks, axis=0) + self._pose.T[:3, 3]

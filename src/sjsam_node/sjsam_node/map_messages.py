@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sjsam_node.global_map import GlobalMap
-from sjsam_node.map_view import MapLandmarks
+from sjsam_node.smoothing.map_snapshot import MapLandmarks, MapSnapshot
 from slam_core.geometry import FloatArray
 from slam_core.messages import ellipsoid_markers, landmark_cloud, path_marker, points_message
 from slam_core.messages.base import Message, MessageTypes
@@ -37,15 +36,9 @@ def ellipsoids_message(types: MessageTypes, header: Message, landmarks: MapLandm
     )
 
 
-def graph_message(types: MessageTypes, header: Message, global_map: GlobalMap) -> Message:
+def graph_message(types: MessageTypes, header: Message, snapshot: MapSnapshot) -> Message:
     """``map/graph``: the skeleton as lines, one per submap, and the believed closures in another colour."""
-    graph = global_map.graph
-    skeleton = [graph.poses[[r.start, r.end], :3, 3] for r in graph.records]
-    closures = [
-        graph.poses[[graph.records[k.first].start, graph.records[k.second].start], :3, 3]
-        for k in graph.links
-        if k.is_closure
-    ]
+    skeleton, closures = list(snapshot.skeleton_lines()), list(snapshot.closure_lines())
     lines = [_points(types, header, "skeleton", _LINE_LIST, skeleton, _SKELETON)]
     return types.MarkerArray(markers=[*lines, _points(types, header, "closures", _LINE_LIST, closures, _CLOSURE)])
 

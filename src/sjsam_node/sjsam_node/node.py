@@ -71,14 +71,14 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def __init__(self) -> None:
         super().__init__("sjsam", SjsamNodeConfig)
-        self.map = LiveMap(self.config, self._make_autosave())
+        self.map = LiveMap(self.config, self._make_autosave(), keeps_map=self.config.localize_only)
         self._stamp_ns = 0
-        self._drawn = self.map.poses
-        self._picture: Future[Any] = self.map.finish()
+        self._drawn = self.map.snapshot
+        self._picture: Future[Any] = self.map.read(lambda _: None)
         self._advertise_outputs()
         self._start_trackers()
         self._go_on_from_last_time()
-        self._order = SubmapOrder[tuple[str, Submap]](r.key for r in self.global_map.graph.records)
+        self._order = SubmapOrder[tuple[str, Submap]](self.map.snapshot.keys)
         self._heard_at_s: dict[str, float] = {}
         for agent in self.config.agents:
             self._listen_to(agent)
@@ -117,7 +117,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         if initial and (self.config.localize_only or self.map.killed() is None):
             path = Path(initial).expanduser()
             self._show_loaded(*self.map.load(path, self._seen).result())
-            self.get_logger().info(f"{len(self.global_map.graph.records)} submaps read from {path}")
+            self.get_logger().info(f"{len(self.map.snapshot)} submaps read from {path}")
         elif (copy := self.map.killed()) is not None:
             try:
                 self._show_loaded(*self.map.load(copy, self._seen).result())
@@ -125,7 +125,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
                 self.get_logger().error(f"the autosaved map cannot be used, a new one begins: {error}")
                 self.map.reset(forget=True)
                 return
-            count, written = len(self.global_map.graph.records), time.ctime((copy / "manifest.json").stat().st_mtime)
+            count, written = len(self.map.snapshot), time.ctime((copy / "manifest.json").stat().st_mtime)
             self.get_logger().warning(
                 f"a node was killed: going on from {count} submaps of {written} in {copy} (~/reset forgets them)"
             )
@@ -245,10 +245,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._publish_map()
 
     async def on_finish(self) -> str:
-        """Wait until all submaps that have come are joined."""
+        """Join all submaps that have come and settle the map: saved now, it is that of ``slam run``."""
         await self._done(self.map.finish())
         self.finish_work()
-        return f"{len(self.global_map.graph.records)} submaps joined"
+        return f"{len(self.map.snapshot)} submaps joined"
 
     def on_close(self) -> None:
         """Join what waits: no submap that has come is lost."""
@@ -296,13 +296,13 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def _seen(self, loaded: GlobalMap) -> tuple[dict[str, Message], dict[str, FloatArray]]:
         """Messages of a loaded map and the last poses of its agents."""
-        self._stamp_ns = max((r.submap.end_stamp_ns for r in loaded.graph.records), default=self._stamp_ns)
+        self._stamp_ns = max((s.end_stamp_ns for s in loaded.snapshot().submaps), default=self._stamp_ns)
         return self._map_messages(loaded), {agent: loaded.last_pose(agent) for agent in self.config.agents}
 
     def _show_loaded(self, outputs: dict[str, Message], last: dict[str, FloatArray]) -> None:
         self._start_trackers(last)
         self._publish_all(outputs)
-        self._drawn = self.map.poses
+        self._drawn = self.map.snapshot
 
     async def export_ply(self) -> str:
         """Write the landmarks to ``ply_path``; a file that is no PLY is not replaced."""
@@ -315,16 +315,18 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     async def mark_here(self) -> str:
         """Mark where the agent that was heard last is."""
-        return self._mark(self.map.poses[-1:, :3, 3].sum(axis=0))
+        return self._mark(self.map.snapshot.poses[-1:, :3, 3].sum(axis=0))
 
     def _mark(self, point: FloatArray) -> str:
         mark = self.map.mark(point)
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
-        self.publish("map/marks", marks_message(self.types, header, self.global_map.marks.positions(self.map.poses)))
+        self.publish(
+            "map/marks", marks_message(self.types, header, self.global_map.marks.positions(self.map.snapshot.poses))
+        )
         return mark.name
 
     def _size(self, done: str) -> str:
-        return f"{len(self.global_map.graph.records)} submaps {done} {self.map_path}"
+        return f"{len(self.map.snapshot)} submaps {done} {self.map_path}"
 
     async def _done(self, future: Future[T]) -> T:
         """Result of another thread; until it is there the node does all else."""
@@ -339,7 +341,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
                 self.health.count("submaps missed", len(indices))
                 self.get_logger().warning(gap_text(agent, indices))
             self._join(self._order.give_up())
-        if self._drawn is not self.map.poses and self._picture.done():
+        if self._drawn is not self.map.snapshot and self._picture.done():
             self._publish_map()
         copy = self.map.save_copy()
         if copy is not None:  # what went wrong with the one before shows
@@ -351,7 +353,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._picture.add_done_callback(lambda done: self.do_later("map", lambda: self._publish_all(done.result())))
 
     def _draw(self, global_map: GlobalMap) -> dict[str, Message]:
-        self._drawn = self.map.poses
+        self._drawn = self.map.snapshot
         return self._map_messages(global_map)
 
     def _publish_all(self, messages: dict[str, Message]) -> None:
@@ -361,12 +363,13 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def _map_messages(self, global_map: GlobalMap) -> dict[str, Message]:
         """Messages that show a map, by topic; on the thread that may read it."""
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
-        landmarks, paths = global_map.landmarks(), global_map.path()
+        snapshot = global_map.snapshot()
+        landmarks, paths = snapshot.landmarks(), snapshot.path()
         messages = {
             "map/landmarks": landmarks_message(self.types, header, landmarks),
             "map/cloud": cloud_message(self.types, header, landmarks),
-            "map/graph": graph_message(self.types, header, global_map),
-            "map/marks": marks_message(self.types, header, global_map.marks.positions(global_map.graph.poses)),
+            "map/graph": graph_message(self.types, header, snapshot),
+            "map/marks": marks_message(self.types, header, snapshot.mark_positions()),
         }
         if self.has_listeners("map/ellipsoids"):
             messages["map/ellipsoids"] = ellipsoids_message(self.types, header, landmarks)

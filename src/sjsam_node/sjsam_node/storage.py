@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,11 @@ from typing import Any
 import numpy as np
 
 from sjsam_node.graph.links import Link
-from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.near_pairs import Compared
 from sjsam_node.map_validation import arrays_of, check_arrays, check_manifest
 from sjsam_node.marks import Mark, Marks
+from sjsam_node.smoothing.state import EstimateState
+from sjsam_node.smoothing.stored import estimate_arrays, stored_state
 from slam_core.files import MOST_BYTES, atomic_path, digest, naming, read_bytes, read_json, remove
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
@@ -44,7 +46,7 @@ class StoredMap:
     pairs of submaps compared where they were near (see :mod:`sjsam_node.loop_closure.near_pairs`).
     """
 
-    graph: MapGraph
+    state: EstimateState
     pending: list[Link]
     refused: list[Link]
     compared: Compared
@@ -66,8 +68,8 @@ def write(folder: Path, stored: StoredMap) -> None:
 
 def pack(stored: StoredMap) -> PackedMap:
     """A copy of a map, to be written by another thread while the map goes on."""
-    graph = stored.graph
-    arrays = {name: value.copy() for name, value in _graph_arrays(graph).items()}
+    graph = stored.state.graph
+    arrays = estimate_arrays(stored.state)
     arrays.update(_link_arrays("links", graph.links))
     arrays.update(_link_arrays("pending", stored.pending))
     arrays.update(_link_arrays("refused", stored.refused))
@@ -154,11 +156,11 @@ def read(folder: Path) -> StoredMap:
 
 
 def _stored(manifest: dict[str, Any], arrays: Arrays) -> StoredMap:
-    graph = _graph(manifest["records"], arrays)
+    state = stored_state(_submaps(manifest["records"], arrays), _links("links", arrays), arrays)
     marks = Marks([Mark(name, node, np.array(point, dtype=np.float64)) for name, node, *point in manifest["marks"]])
     pending, refused = _links("pending", arrays), _links("refused", arrays)
     compared = Compared.of(arrays["compared/pairs"], arrays["compared/middles"])
-    return StoredMap(graph, pending, refused, compared, marks)
+    return StoredMap(state, pending, refused, compared, marks)
 
 
 def _digest(manifest: dict[str, Any]) -> str:
@@ -195,14 +197,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def _graph_arrays(graph: MapGraph) -> Arrays:
-    return {
-        "poses": graph.poses, "points": graph.points, "component_of": graph.component_of, "ties": graph.ties,
-        "redundant": graph.redundant, "doubt": graph.doubt,
-    }  # fmt: skip
-
-
-def _link_arrays(name: str, links: list[Link]) -> Arrays:
+def _link_arrays(name: str, links: Sequence[Link]) -> Arrays:
     pairs = [link.pairs for link in links]
     return {
         f"{name}/ends": np.array(
@@ -252,16 +247,9 @@ def _submap(agent: str, index: int, session: int, follows: bool, arrays: Arrays)
     )  # fmt: skip
 
 
-def _graph(records: list[list[Any]], arrays: Arrays) -> MapGraph:
-    """Replays the submaps and links, then lays the stored estimate over them."""
-    graph = MapGraph()
+def _submaps(records: list[list[Any]], arrays: Arrays) -> Iterator[tuple[int, Submap]]:
+    """Yield every submap with the node that it starts at."""
     for i, (agent, index, session, start, follows) in enumerate(records):
         prefix = f"submap_{i}/"
         own = {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}
-        submap = _submap(agent, index, session, follows, own)
-        graph.append(submap, start if start < len(graph.poses) else None, np.eye(4))
-    graph.component_of = arrays["component_of"]
-    graph.poses, graph.points = arrays["poses"], arrays["points"]
-    graph.ties, graph.redundant, graph.doubt = arrays["ties"], arrays["redundant"], arrays["doubt"]
-    graph.replace_links(_links("links", arrays))
-    return graph
+        yield start, _submap(agent, index, session, follows, own)

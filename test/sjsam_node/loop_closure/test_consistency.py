@@ -15,10 +15,11 @@ from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.graph.links import Link, Prior, Status
 from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.association import match
-from sjsam_node.loop_closure.consistency import Consistency, Verdict
+from sjsam_node.loop_closure.consistency import Verdict
+from sjsam_node.loop_closure.pairwise import PairwiseConsistency
 from sjsam_node.loop_closure.point_sets import at_start
 from sjsam_node.loop_closure.verification import ClosureConfig
-from sjsam_node.smoothing.smoother import Smoother, UpdateResult
+from sjsam_node.smoothing.solver import updated
 from slam_core.geometry import boxminus, invert_transform
 from slam_core.types import Submap
 
@@ -39,7 +40,7 @@ def look_alike_rooms(rng: np.random.Generator) -> Agent:
 
 def false_link(joined: GlobalMap, agent: Agent) -> Link:
     """The closure that looks best of those between the two rooms, 14 m off."""
-    graph, best = joined.graph, None
+    graph, best = joined.estimate.graph, None
     for first in (i for i in range(len(graph.records)) if agent.true_start(i)[0, 3] < 2.0):
         for second in (i for i in range(len(graph.records)) if agent.true_start(i)[0, 3] > 12.0):
             shift = agent.true_start(second).copy()
@@ -70,16 +71,16 @@ def test_a_false_closure_that_was_believed_is_taken_back_when_true_ones_contradi
     joined, _ = join(submaps[: arrival + 1])
     false = false_link(joined, agent)
     assert len(false.pairs) >= 10
-    joined.smoother.update(arrival, [false])
+    joined.estimate.accept(updated(joined.state, arrival, [false], [], joined.config.smoothing))
     assert ate(errors(joined, agent)[0]) > 1.0
     gone = None
     for k, submap in enumerate(submaps[arrival + 1 :]):
         joined.add(submap)
-        if gone is None and not any(link.ends == false.ends for link in joined.graph.links):
+        if gone is None and not any(link.ends == false.ends for link in joined.estimate.graph.links):
             gone = k
     assert gone is not None  # as it is contradicted, not when the map settles
     joined.settle()
-    assert not any(link.ends == false.ends for link in joined.graph.links)
+    assert not any(link.ends == false.ends for link in joined.estimate.graph.links)
     assert joined.counters.counts["closures let go"] >= 1
     assert ate(errors(joined, agent)[0]) < 1.5 * ate(errors(honest, agent)[0])
 
@@ -89,25 +90,25 @@ def test_a_false_closure_on_trial_is_refused_and_leaves_no_trace(agent: Agent) -
     arrival = next(k for k in range(len(submaps)) if agent.true_start(k)[0, 3] > 14.0)
     joined, _ = join(submaps[: arrival + 1])
     joined.settle()
-    before, links = joined.graph.poses.copy(), len(joined.graph.links)
-    _, verdict = joined.consistency.update([false_link(joined, agent)], arrival)
+    before, links = joined.state.poses, len(joined.estimate.graph.links)
+    verdict = joined.closures.join_closures([false_link(joined, agent)], arrival)
     assert not verdict.accepted
-    assert len(joined.graph.links) == links
+    assert len(joined.estimate.graph.links) == links
     joined.settle()
-    assert np.abs(boxminus(joined.graph.poses[-1], before[-1])).max() < 1e-6
+    assert np.abs(boxminus(joined.state.poses[-1], before[-1])).max() < 1e-6
 
 
 def test_a_false_closure_that_odometry_does_not_rule_out_is_refused_by_the_map(agent: Agent) -> None:
     """With so much drift to expect, odometry lets it pass: what refuses it is that chi2 of the map rises."""
     submaps = agent.submaps()
     joined, _ = join(submaps, GlobalMap(GlobalMapConfig(closure=ClosureConfig(drift=0.05, drift_angle=0.05))))
-    before, links = joined.graph.poses.copy(), len(joined.graph.links)
+    state = joined.state
     false = false_link(joined, agent)
-    assert not joined.consistency._are_against_odometry([false]).any()
-    _, verdict = joined.consistency.update([false], len(submaps) - 1)
+    assert not joined.closures.pairwise.against_odometry(state.graph, [false]).any()
+    verdict = joined.closures.join_closures([false], len(submaps) - 1)
     assert not verdict.accepted
-    assert len(joined.graph.links) == links
-    assert np.abs(boxminus(joined.graph.poses[-1], before[-1])).max() < 1e-5
+    assert joined.state.graph is state.graph
+    assert np.abs(boxminus(joined.state.poses[-1], state.poses[-1])).max() < 1e-5
 
 
 def test_agents_joined_by_rooms_that_look_alike_are_told_apart_by_what_they_see_later(agent: Agent) -> None:
@@ -138,15 +139,15 @@ def test_closures_found_when_the_map_settles_are_judged_in_groups_consistent_one
 ) -> None:
     """So that a false one takes few true ones with it."""
     joined, _ = join(agent.submaps()[:3], GlobalMap(GlobalMapConfig(joined_at_once=2)))
-    link, offered = joined.graph.links[0], []
+    link, offered = joined.estimate.graph.links[0], []
 
-    def update(found: list[Link], newest: int) -> tuple[UpdateResult, Verdict]:
+    def join_closures(found: list[Link], newest: int) -> Verdict:
         offered.append([k.status for k in found])
-        return joined.smoother.update(newest), Verdict()
+        return Verdict()
 
     missed = [link.with_status(Status.INCONSISTENT), *[link.with_status(Status.CONSISTENT)] * 3]
     monkeypatch.setattr(joined.detector, "missed", lambda *_: [missed.pop(0) for _ in range(len(missed))])
-    monkeypatch.setattr(joined.consistency, "update", update)
+    monkeypatch.setattr(joined.closures, "join_closures", join_closures)
     joined.settle()
     assert offered == [[Status.CONSISTENT] * 2, [Status.CONSISTENT], [Status.INCONSISTENT]]
 
@@ -178,10 +179,10 @@ def test_joining_submaps_that_contradict_each_other_is_not_worse_than_their_chai
     joined.save(tmp_path / "map")
     assert ate(e) < 1.05 * chain_ate(agent, submaps)
     assert nees.mean() / 6.0 < 2.0, "and says so"
-    assert f"{len(submaps)} of {len(submaps)} are chained" in joined.doubt
-    assert "slam calibrate refine" in joined.doubt, "and says what to do"
+    assert f"{len(submaps)} of {len(submaps)} are chained" in joined.overconfidence
+    assert "slam calibrate refine" in joined.overconfidence, "and says what to do"
     loaded = GlobalMap.load(tmp_path / "map")
-    assert loaded.doubt == joined.doubt
+    assert loaded.overconfidence == joined.overconfidence
     assert np.array_equal(errors(loaded, agent)[1], nees)
 
 
@@ -189,7 +190,7 @@ def test_honest_submaps_with_few_landmarks_are_joined_and_kept() -> None:
     agent, submaps = few_landmarks(1, 1.0)
     joined, _ = join(submaps)
     joined.settle()
-    assert not joined.doubt
+    assert not joined.overconfidence
     assert ate(errors(joined, agent)[0]) < 0.5 * chain_ate(agent, submaps)
 
 
@@ -201,10 +202,12 @@ def test_a_closure_that_waits_takes_nothing_with_it_that_a_new_one_does_not_cont
     rival, true = link(1, 8), link(4, 21)
     contradicts = {(found.ends, rival.ends), (same.ends, rival.ends), (false.ends, true.ends)}
     monkeypatch.setattr(
-        Consistency, "_excluded", lambda _, one, others: np.array([(one.ends, k.ends) in contradicts for k in others])
+        PairwiseConsistency,
+        "excluded",
+        lambda _, graph, one, others: np.array([(one.ends, k.ends) in contradicts for k in others]),
     )
-    consistency = Consistency(Smoother(MapGraph()))
-    group, rivals = consistency._with_rivals([found, same, false], [rival, true], {found.ends})
+    pairwise, graph = PairwiseConsistency(), MapGraph()
+    group, rivals = pairwise.with_rivals(graph, [found, same, false], [rival, true], {found.ends})
     assert group == [found, same]
     assert rivals == [rival]
-    assert consistency._with_rivals([found, false], [], {found.ends}) == ([found, false], [])
+    assert pairwise.with_rivals(graph, [found, false], [], {found.ends}) == ([found, false], [])

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -16,6 +17,7 @@ from sjsam_node.graph.links import Prior, Status
 from sjsam_node.loop_closure.association import match
 from sjsam_node.loop_closure.near_pairs import Compared
 from sjsam_node.loop_closure.point_sets import at_start
+from sjsam_node.smoothing.state import with_exactly
 from slam_core.geometry import boxminus, boxplus, invert_transform
 from slam_core.types import Submap
 
@@ -28,13 +30,17 @@ def agent(rng: np.random.Generator) -> Agent:
 
 
 def believed_pairs(joined: GlobalMap) -> set[tuple[object, ...]]:
-    records = joined.graph.records
-    return {tuple(sorted((records[k.first].key, records[k.second].key))) for k in joined.graph.links if k.is_closure}
+    records = joined.estimate.graph.records
+    return {
+        tuple(sorted((records[k.first].key, records[k.second].key)))
+        for k in joined.estimate.graph.links
+        if k.is_closure
+    }
 
 
 def same_landmarks(joined: GlobalMap) -> set[frozenset[tuple[object, ...]]]:
     """Every two observations that the map takes for one landmark."""
-    graph = joined.graph
+    graph = joined.estimate.graph
     seen: dict[int, list[tuple[object, ...]]] = {}
     for record in graph.records:
         for k, landmark in enumerate(graph.landmark_of[record.observations].tolist()):
@@ -44,19 +50,20 @@ def same_landmarks(joined: GlobalMap) -> set[frozenset[tuple[object, ...]]]:
 
 def test_pairs_are_compared_once_and_again_when_they_have_moved(agent: Agent) -> None:
     joined, _ = join(agent.submaps())
-    graph, near = joined.graph, joined.detector.near
+    graph, near = joined.estimate.graph, joined.detector.near
     missed = {(k.first, k.second) for k in graph.links if k.is_closure}
-    graph.replace_links([k for k in graph.links if not k.is_closure])
+    state = with_exactly(joined.state, [k for k in graph.links if not k.is_closure])
     near.compared = Compared()
-    due = near.due(graph, joined.agents.chained)
+    due = near.due(state, joined.agents.chained)
     assert len(missed & set(due)) > 10
-    assert not any((k.first, k.second) in due for k in graph.links)
+    assert not any((k.first, k.second) in due for k in state.graph.links)
     for first, second in due:
-        near.note(graph, second, first)
-    assert not near.due(graph, joined.agents.chained)
+        near.note(state, second, first)
+    assert not near.due(state, joined.agents.chained)
     first, second = due[0]
-    graph.poses[graph.records[second].start] = boxplus(graph.poses[graph.records[second].start], STEP)
-    assert (first, second) in near.due(graph, joined.agents.chained)
+    poses, moved = state.poses.copy(), graph.records[second].start
+    poses[moved] = boxplus(poses[moved], STEP)
+    assert (first, second) in near.due(replace(state, poses=poses), joined.agents.chained)
 
 
 def test_compared_pairs_are_kept_like_a_dictionary_of_them(rng: np.random.Generator) -> None:
@@ -82,16 +89,16 @@ def test_parts_without_a_tie_have_no_near_pairs(rng: np.random.Generator) -> Non
     a = Agent(ring_world(3.0, rng, 12.0), circle(3.0, 0.2), rng, "a")
     b = Agent(ring_world(3.0, rng, 12.0), circle(3.0, 0.2), rng, "b")
     joined, _ = join(a.submaps() + b.submaps())
-    agents = [record.submap.agent for record in joined.graph.records]
+    agents = [record.submap.agent for record in joined.estimate.graph.records]
     assert all(
-        agents[i] == agents[k] for i, k in joined.detector.near.due(joined.graph, np.empty((0, 2), dtype=np.int64))
+        agents[i] == agents[k] for i, k in joined.detector.near.due(joined.state, np.empty((0, 2), dtype=np.int64))
     )
 
 
 def test_a_prior_too_sure_of_itself_does_not_hide_matches(agent: Agent) -> None:
     joined, _ = join(agent.submaps())
-    link = max((k for k in joined.graph.links if k.is_closure), key=lambda k: len(k.pairs))
-    first, second = (at_start(joined.graph.records[i]) for i in (link.first, link.second))
+    link = max((k for k in joined.estimate.graph.links if k.is_closure), key=lambda k: len(k.pairs))
+    first, second = (at_start(joined.estimate.graph.records[i]) for i in (link.first, link.second))
     T = invert_transform(agent.true_start(link.first)) @ agent.true_start(link.second)
     wrong = Prior(boxplus(T, STEP), np.diag([0.01**2] * 3 + [0.003**2] * 3))
     config = joined.config.closure.association
@@ -135,7 +142,7 @@ def test_the_central_map_does_not_depend_on_who_comes_first(
 ) -> None:
     for a, b in two_agents:
         one, other = join(in_order(a + b))[0], join([*b[:3], *a[::-1], *b[3:]])[0]
-        mark = other.marks.add(other.graph.poses, other.graph.poses[other.graph.records[9].start][:3, 3])
+        mark = other.marks.add(other.state.poses, other.state.poses[other.estimate.graph.records[9].start][:3, 3])
         assert one.centrally() is one
         central = other.centrally()
         assert same_landmarks(one) == same_landmarks(central)

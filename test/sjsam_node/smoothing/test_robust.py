@@ -20,10 +20,10 @@ from sjsam_node.linear_slam.text_joining import (
     join_text_maps,
 )
 from sjsam_node.linear_slam.text_maps import TextMap
-from sjsam_node.smoothing.estimator import Estimator, EstimatorConfig
 from sjsam_node.smoothing.joining import JoiningProblem
 from sjsam_node.smoothing.problem import LocalMap, flatten
 from sjsam_node.smoothing.robust import LOSSES, RobustConfig, closing_rows, normalized_error, predicted, weight, widened
+from sjsam_node.smoothing.solver import Estimator, EstimatorConfig
 from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import boxminus
 

@@ -114,7 +114,7 @@ def test_a_run_in_an_old_map_is_in_its_frame(again):
 def test_the_old_map_is_read_and_never_changed(again, outputs):
     folder, old, goes_on = again
     assert (old / "map" / "manifest.json").read_bytes() == (outputs[1] / "map" / "manifest.json").read_bytes()
-    sessions = {r.submap.session for r in GlobalMap.load(folder / "map").graph.records}
+    sessions = {s.session for s in GlobalMap.load(folder / "map").snapshot().submaps}
     assert sessions == ({0, 1} if goes_on else {0})
 
 

@@ -130,7 +130,7 @@ def test_every_choice_of_method_maps(tmp_path, values, numbers):
     asked = iter(range(1000))
     config = choose(load_system_config(file), "stereo", "sjsam", "none")
     result, mapping = run_bag(DEMO, config, stopped=lambda: next(asked) >= 36)
-    records = mapping.global_map.graph.records
+    records = mapping.global_map.estimate.graph.records
     assert len(records) >= 2
     assert {record.submap.descriptors.shape[1] for record in records} == {numbers}
     evaluation = result.agents[0].evaluation()

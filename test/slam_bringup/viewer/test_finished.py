@@ -35,7 +35,7 @@ def test_a_run_is_read_back_with_its_covariances_model_and_plan(folder):
     trajectory = run.trajectories[""]
     assert trajectory.covariances is not None
     assert len(trajectory) > 10
-    assert len(run.global_map.landmarks().positions) == run.summary["landmarks"]
+    assert len(run.map.landmarks().positions) == run.summary["landmarks"]
     first, last = run.span_ns
     assert last > first
     assert len(run.submap_lines()) == run.summary["submaps"]

@@ -17,7 +17,7 @@ from numba import njit
 from slam_core.linear_algebra.block_pattern import IntArray
 
 
-def _none() -> IntArray:
+def _no_pairs() -> IntArray:
     return np.empty((0, 2), dtype=np.int64)
 
 
@@ -28,9 +28,9 @@ class LinkedPairs:
     pairs (k, 2) of observations, ptr (n + 1,) where those of each link start, ends (n, 2): the records it links.
     """
 
-    pairs: IntArray = field(default_factory=_none)
+    pairs: IntArray = field(default_factory=_no_pairs)
     ptr: IntArray = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
-    ends: IntArray = field(default_factory=_none)
+    ends: IntArray = field(default_factory=_no_pairs)
 
     def followed_by(self, later: LinkedPairs) -> LinkedPairs:
         """These and others."""

@@ -21,11 +21,12 @@ from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.association import Alignment, match
 from sjsam_node.loop_closure.cycles import Hop, cycles_through
 from sjsam_node.loop_closure.near_pairs import NearPairs
-from sjsam_node.loop_closure.novelty import Novelty
 from sjsam_node.loop_closure.place_recognition import PlaceIndex
 from sjsam_node.loop_closure.point_sets import at_end, at_start
+from sjsam_node.loop_closure.redundancy import RedundancyCheck
 from sjsam_node.loop_closure.verification import ClosureConfig, Verifier, largest_sigma
-from sjsam_node.smoothing.smoother import Smoother
+from sjsam_node.smoothing.estimate import MapEstimate
+from sjsam_node.smoothing.state import EstimateState
 from slam_core.geometry import FloatArray, compose_covariance
 from slam_core.linear_algebra.block_pattern import IntArray
 
@@ -34,7 +35,7 @@ from slam_core.linear_algebra.block_pattern import IntArray
 class LoopDetector:
     """Finds and verifies the links of a new record; ``pending`` closures wait for others to close a cycle with."""
 
-    smoother: Smoother
+    estimate: MapEstimate
     config: ClosureConfig = field(default_factory=ClosureConfig)
     verifier: Verifier = field(init=False)
     index: PlaceIndex = field(init=False)
@@ -51,7 +52,7 @@ class LoopDetector:
     @property
     def graph(self) -> MapGraph:
         """Graph in which links are looked for."""
-        return self.smoother.graph
+        return self.estimate.graph
 
     def sequential(self, chain: list[int], new: int) -> list[Link]:
         """Links of record ``new`` to the records ``chain`` before it, newest first, by their odometry.
@@ -66,14 +67,14 @@ class LoopDetector:
             end, end_covariance = record.submap.end_pose, record.submap.covariance[:6, :6]
             points = at_start(graph.records[new]).at(left)
             alike = (record.submap.descriptors @ points.descriptors.T >= threshold).any(axis=1)
-            there = np.nonzero(alike & ~np.isin(graph.landmark_of[record.observations], taken))[0]
+            there = np.nonzero(alike & ~np.isin(graph.landmarks_of(previous), taken))[0]
             found = match(at_end(record, there), points, Prior(T, covariance if k else None), self.config.association)
             if len(found.pairs):
                 pairs = np.stack([there[found.pairs[:, 0]], left[found.pairs[:, 1]]], axis=1)
                 links.append(Link(previous, new, pairs, end @ found.T,
                                   compose_covariance(end, end_covariance, found.T, found.covariance)))  # fmt: skip
                 left = np.setdiff1d(left, pairs[:, 1])
-                taken = np.append(taken, graph.landmark_of[record.observations[pairs[:, 0]]])
+                taken = np.append(taken, graph.landmarks_of(previous)[pairs[:, 0]])
             covariance = compose_covariance(end, end_covariance, T, covariance)
             T = end @ T
         return links
@@ -82,7 +83,7 @@ class LoopDetector:
         """Verified links of record ``new`` beyond its chain, consistent or inconsistent with the map; others wait."""
         graph, recent = self.graph, {*range(new, len(self.graph.records)), *chain[: self.config.window]}
         near = self._near(new, recent)
-        known = self._novelty()
+        known = self._redundancy_check()
         found = self._around(near, new, known)
         if known.is_known(new):  # the map knows where it is: looks would tell nothing more
             return found
@@ -91,7 +92,7 @@ class LoopDetector:
         alike = [old for old in looks if self.verifier.is_alike(at_start(graph.records[old]), second)]
         return found + self._verified([(old, new) for old in alike[: self.config.alike_candidates]], known)
 
-    def _around(self, near: list[int], new: int, known: Novelty) -> list[Link]:
+    def _around(self, near: list[int], new: int, known: RedundancyCheck) -> list[Link]:
         """Links of record ``new`` to those near it, as long as they tell of landmarks that none has told of yet."""
         found: list[Link] = []
         count, left = (
@@ -115,38 +116,38 @@ class LoopDetector:
         far as they are believed by now.
         """
         waited = self.reconsidered()
-        return waited + self._verified(self.near.due(self.graph, chained)[:most], self._novelty())
+        return waited + self._verified(self.near.due(self.estimate.state, chained)[:most], self._redundancy_check())
 
     def around(self, middle: FloatArray, records: Iterable[int], excluded: set[int]) -> list[int]:
         """Those of ``records`` whose landmarks are around a point (3,) of the map, nearest first."""
-        graph = self.graph
-        candidates = np.array([i for i in records if i not in excluded and not graph.redundant[i]], dtype=np.int64)
-        distance = np.linalg.norm(graph.middles(candidates) - middle, axis=1)
+        state = self.estimate.state
+        candidates = np.array([i for i in records if i not in excluded and not state.is_redundant(i)], dtype=np.int64)
+        distance = np.linalg.norm(state.middles(candidates) - middle, axis=1)
         ranked = sorted((d, i) for d, i in zip(distance.tolist(), candidates.tolist(), strict=True)
                         if d < self.config.proximity)  # fmt: skip
         return [i for _, i in ranked[: self.config.near_candidates]]
 
     def _near(self, new: int, recent: set[int]) -> list[int]:
         """Older records of the same component whose landmarks are around those of ``new``, nearest first."""
-        graph = self.graph
-        return self.around(_middle(graph, new), graph.records_of(graph.component(new)), recent)
+        state = self.estimate.state
+        return self.around(_middle(state, new), state.records_in(state.component(new)), recent)
 
-    def _novelty(self) -> Novelty:
+    def _redundancy_check(self) -> RedundancyCheck:
         config = self.config
-        return Novelty(
-            self.graph, config.min_near_inliers, config.association.descriptor_threshold, config.ransac_distance
+        return RedundancyCheck(
+            self.estimate.state, config.min_near_inliers, config.association.descriptor_threshold, config.ransac_distance
         )  # fmt: skip
 
-    def _verified(self, pairs: list[tuple[int, int]], known: Novelty, *, by_looks: bool = True) -> list[Link]:
+    def _verified(self, pairs: list[tuple[int, int]], known: RedundancyCheck, *, by_looks: bool = True) -> list[Link]:
         """Links between pairs of records that geometry and the map support; none that tell nothing new."""
         out: list[Link] = []
         for old, new in pairs:
             if known.is_all_known(old, new):
-                self.near.note(self.graph, old, new)
+                self.near.note(self.estimate.state, old, new)
                 continue
-            prior = self.smoother.relative_pose(old, new)
+            prior = self.estimate.relative_pose(old, new)
             if prior is not None:
-                self.near.note(self.graph, old, new)
+                self.near.note(self.estimate.state, old, new)
             link = self._compared(old, new, prior, by_looks)
             if link is None:
                 continue
@@ -161,7 +162,7 @@ class LoopDetector:
         if not by_looks and prior is not None:
             found, status = self.verifier.verify_near(first, second, prior), Status.CONSISTENT
         else:
-            way = self.graph.way_between(old, new)
+            way = self.graph.path_length_between(old, new)
             found, status = self.verifier.verify(first, second, prior, way, old, new)
         if found is None:
             return None
@@ -182,10 +183,10 @@ class LoopDetector:
         """Links that waited and are believed now, or that the map can judge now that it ties their submaps."""
         out: list[Link] = []
         for link in self.pending[:]:
-            prior = self.smoother.relative_pose(*link.ends)
+            prior = self.estimate.relative_pose(*link.ends)
             if prior is not None and self._can_judge(link, prior):
                 self.pending = [k for k in self.pending if k is not link]
-                self.near.note(self.graph, *link.ends)
+                self.near.note(self.estimate.state, *link.ends)
                 again = self._compared(*link.ends, prior, True)
                 out += [again] if again is not None and again.status is not Status.UNINFORMATIVE else []
         hop = cache(self._hop)
@@ -198,7 +199,7 @@ class LoopDetector:
         """True if the map, which could not tell, can tell now."""
         found = Alignment(link.pairs, link.T, link.covariance, 0.0, 0)
         is_sure = largest_sigma(prior.covariance) < self.config.informative_sigma
-        return is_sure or self.verifier.is_against(found, prior, self.graph.way_between(*link.ends))
+        return is_sure or self.verifier.is_against(found, prior, self.graph.path_length_between(*link.ends))
 
     def _believed(self, links: tuple[Link, ...]) -> list[Link]:
         """The links of ``pending`` between the same records, which wait no longer."""
@@ -223,7 +224,7 @@ class LoopDetector:
         """T_first_second by the map, with the drift to expect; None where nothing ties the two."""
         if first == second:
             return Prior(np.eye(4), None)
-        prior, way = self.smoother.relative_pose(first, second), self.graph.way_between(first, second)
+        prior, way = self.estimate.relative_pose(first, second), self.graph.path_length_between(first, second)
         if prior is None or prior.covariance is None:
             return prior
         return Prior(prior.T, prior.covariance + self.verifier.drift(way))
@@ -242,5 +243,5 @@ class LoopDetector:
         return float(np.median(np.linalg.norm(self.graph.records[record].submap.landmarks, axis=1)))
 
 
-def _middle(graph: MapGraph, record: int) -> FloatArray:
-    return np.asarray(graph.middles(np.array([record]))[0])
+def _middle(state: EstimateState, record: int) -> FloatArray:
+    return np.asarray(state.middles(np.array([record]))[0])

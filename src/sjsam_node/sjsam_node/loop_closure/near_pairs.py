@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.smoothing.state import EstimateState
 from slam_core.geometry import FloatArray
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
@@ -79,35 +79,35 @@ class NearPairs:
     moved: float
     compared: Compared = field(default_factory=Compared)
 
-    def note(self, graph: MapGraph, first: int, second: int) -> None:
+    def note(self, state: EstimateState, first: int, second: int) -> None:
         """Remember that two records are compared now."""
         pair = np.sort(np.array([[first, second]], dtype=np.int64))
-        self.compared.note(pair, _seen_from(graph, pair[:, 0], pair[:, 1]))
+        self.compared.note(pair, _seen_from(state, pair[:, 0], pair[:, 1]))
 
     def forget(self, records: set[int]) -> None:
         """These records are to be compared anew: what was believed of them is no longer."""
         if records:
             self.compared.forget(records)
 
-    def due(self, graph: MapGraph, chained: IntArray) -> list[tuple[int, int]]:
+    def due(self, state: EstimateState, chained: IntArray) -> list[tuple[int, int]]:
         """Pairs without a link, near in the map, that were not compared yet or lay elsewhere when they were.
 
         Nearest first; none of those ``chained`` (n, 2) along the odometry of an agent.
         """
-        near = self._near(graph)
-        tied = np.sort(np.concatenate([graph.linked, chained]), axis=1)
+        near = self._near(state)
+        tied = np.sort(np.concatenate([state.graph.linked, chained]), axis=1)
         near = near[~np.isin(_codes(near), _codes(tied))]
-        gap = _seen_from(graph, near[:, 0], near[:, 1]) - self.compared.where(near)
+        gap = _seen_from(state, near[:, 0], near[:, 1]) - self.compared.where(near)
         due = near[np.linalg.norm(gap, axis=1) >= self.moved]
         return [(first, second) for first, second in due.tolist()]
 
-    def _near(self, graph: MapGraph) -> IntArray:
+    def _near(self, state: EstimateState) -> IntArray:
         """Every record with its nearest ones of the same component, (k, 2), the nearest pair first."""
         pairs, distances = [np.empty((0, 2), dtype=np.int64)], [np.empty(0)]
-        for component in np.unique(graph.component_of).tolist():
-            records = np.array(graph.records_of(component), dtype=np.int64)
-            records = records[~graph.redundant[records]]
-            middles = graph.middles(records)
+        for component in state.components():
+            records = np.array(state.records_in(component), dtype=np.int64)
+            records = records[~state.is_redundant(records)]
+            middles = state.middles(records)
             count = [*range(2, min(len(records), self.neighbours + 1) + 1)]  # the first is the record itself
             if not count:
                 continue
@@ -121,8 +121,8 @@ class NearPairs:
         return np.asarray(ends[first][np.argsort(gap[first], kind="stable")])
 
 
-def _seen_from(graph: MapGraph, first: IntArray, second: IntArray) -> FloatArray:
+def _seen_from(state: EstimateState, first: IntArray, second: IntArray) -> FloatArray:
     """Middles of the second records' landmarks in the first ones' start frames, (k, 3)."""
-    T_map_first = graph.poses[graph.starts[first]]
-    shift = graph.middles(second) - T_map_first[:, :3, 3]
+    T_map_first = state.start_poses(first)
+    shift = state.middles(second) - T_map_first[:, :3, 3]
     return np.asarray((np.swapaxes(T_map_first[:, :3, :3], 1, 2) @ shift[..., None])[..., 0])

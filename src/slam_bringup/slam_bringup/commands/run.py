@@ -93,6 +93,6 @@ def _saved_if_given_up(growth: MapGrowth, path: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        if growth.global_map.graph.records and not path.exists():
+        if len(growth.global_map.snapshot()) and not path.exists():
             growth.save(path)
         raise

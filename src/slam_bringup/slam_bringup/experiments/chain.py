@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_bringup.experiments.job import EVERYTHING, Job, Kept
 from slam_bringup.experiments.rendering import rendered
 from slam_bringup.pipeline.configuration import choose, load_system_config
@@ -40,14 +40,13 @@ def map_bag(folder: Path, before: list[Path], mode: str, mapper: str, odometry: 
     """Map the bag that the job before has rendered."""
     config = choose(load_system_config(None), mode, mapper, odometry)
     began = time.process_time()
-    result, growth = run_bag(before[0] / "bag", config, mapper=mapper, odometry=odometry)
+    result, _ = run_bag(before[0] / "bag", config, mapper=mapper, odometry=odometry)
     processor_s = time.process_time() - began
-    graph = growth.global_map.graph
     arrays: dict[str, npt.NDArray[Any]] = {
         "landmarks": result.landmarks.positions,
         "landmark_covariances": result.landmarks.covariances,
         "dense_points": result.dense.points[:: max(1, len(result.dense) // 100_000)],
-        **_submap_arrays(graph),
+        **_submap_arrays(result.map),
         **{f"ms {name}": np.array(ms) for name, ms in result.stage_ms.items()},
     }
     for k, agent in enumerate(result.agents):
@@ -89,25 +88,25 @@ def _agent_arrays(agent: AgentResult, prefix: str) -> dict[str, npt.NDArray[Any]
     return arrays
 
 
-def _submap_arrays(graph: MapGraph) -> dict[str, npt.NDArray[Any]]:
+def _submap_arrays(snapshot: MapSnapshot) -> dict[str, npt.NDArray[Any]]:
     """Landmarks of the submaps as the filter chained them and as they are joined, their submap and landmark numbers.
 
     The last two give the pattern of the measurement matrix (Fig. 9.23): a row per observation of a submap.
     """
-    if not graph.records:
+    if not len(snapshot):
         return {}
-    chained, T, run = [], np.eye(4), graph.records[0].key[:2]
-    for record in graph.records:
-        if record.key[:2] != run:
-            run, T = record.key[:2], np.eye(4)
-        chained.append(transform_points(T, record.submap.landmarks))
-        T = T @ record.submap.end_pose
+    chained, T, run = [], np.eye(4), snapshot.keys[0][:2]
+    for submap, key in zip(snapshot.submaps, snapshot.keys, strict=True):
+        if key[:2] != run:
+            run, T = key[:2], np.eye(4)
+        chained.append(transform_points(T, submap.landmarks))
+        T = T @ submap.end_pose
     return {
-        "submap_of": graph.record_of,
-        "landmark_of": graph.landmark_of,
+        "submap_of": snapshot.submap_of,
+        "landmark_of": snapshot.landmark_of,
         "chained": np.concatenate(chained),
-        "joined": graph.points,
-        "start poses": graph.poses[graph.starts],
+        "joined": snapshot.points,
+        "start poses": snapshot.poses[snapshot.nodes[:, 0]],
     }
 
 

@@ -63,7 +63,7 @@ def map_growth(config: GlobalMapConfig, old: Path | None = None, *, localize_onl
     if folder is None:
         return Joining(GlobalMap(config))
     loaded = GlobalMap.load(folder, config)
-    if not loaded.graph.records:
+    if not len(loaded.snapshot()):
         raise ValueError(f"the map in {old} is empty: nothing can be found again in it")
     return Locating(loaded) if localize_only else Joining(loaded)
 
@@ -88,7 +88,7 @@ class Joining:
         self.global_map = global_map
         self.closures = 0
         self.solver = ""
-        self._known = len(global_map.graph.records)
+        self._known = len(global_map.snapshot())
         self._sessions = _sessions(global_map)
 
     def session(self, agent: str) -> int:
@@ -113,19 +113,19 @@ class Joining:
     def finish(self) -> list[str]:
         """Settle the map; a new one ends up the same whoever came first."""
         if not self._known:
-            self.global_map = self.global_map.centrally()
+            self.global_map = self.global_map.rebuilt_in_time_order()
         self.global_map.settle()
-        return [*self._apart(), *filter(None, [self.global_map.doubt])]
+        return [*self._apart(), *filter(None, [self.global_map.overconfidence])]
 
     def _apart(self) -> list[str]:
         """Tell of new submaps whose place in the map nothing knows: in the old one, or beside the first agent's."""
-        graph = self.global_map.graph
-        new = graph.records[self._known :]
-        loose = Counter(r.key[0] for r in new if graph.component_of[r.start] != graph.component(0))
+        snapshot = self.global_map.snapshot()
+        new = [key[0] for key in snapshot.keys[self._known :]]
+        loose = Counter(a for a, is_tied in zip(new, snapshot.is_tied[self._known :], strict=True) if not is_tied)
         if self._known and loose:
             count = loose.total()
             return [f"{count} of {len(new)} submaps are not tied to the old map: no place of it was recognised"]
-        every = Counter(r.key[0] for r in new)
+        every = Counter(new)
         return [
             f"{count} of {every[agent]} submaps of {agent or 'the rig'} are not tied to the rest of the map: no place "
             "was recognised, and where they are beside it is not known"
@@ -134,7 +134,7 @@ class Joining:
 
     def trajectories(self) -> Mapping[str, Sequence[PoseEstimate]]:
         """Smoothed poses of this run, without those that were in the map before."""
-        return self.global_map.view.trajectory(self._known)
+        return self.global_map.snapshot().trajectory(self._known)
 
     def save(self, folder: Path) -> None:
         """Write the map, the old one and what is new."""
@@ -194,7 +194,6 @@ class Locating:
 def _sessions(global_map: GlobalMap) -> dict[str, int]:
     """The last session of every agent in a map."""
     last: dict[str, int] = {}
-    for record in global_map.graph.records:
-        agent, session, _ = record.key
+    for agent, session, _ in global_map.snapshot().keys:
         last[agent] = max(session, last.get(agent, -1))
     return last

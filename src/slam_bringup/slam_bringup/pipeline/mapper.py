@@ -109,9 +109,11 @@ class Mapper:
 
     def record(self, wall_s: float, dropped: Mapping[str, int], failure: str) -> RunRecord:
         """Record of the run, after :meth:`finish`."""
+        snapshot = self.growth.global_map.snapshot()
         return RunRecord(
             agents={agent: diary.record() for agent, diary in self._diaries.items()},
-            global_map=self.growth.global_map,
+            map=snapshot.structure(),
+            landmarks=snapshot.landmarks(),
             trajectories=self.growth.trajectories(),
             submaps=self._submaps,
             loop_closures=self.growth.closures,

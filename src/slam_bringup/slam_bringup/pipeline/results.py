@@ -14,6 +14,7 @@ import numpy.typing as npt
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from sjsam_node.global_map import GlobalMap
+from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_core.evaluation import Evaluation, evaluate
 from slam_core.geometry import FloatArray
@@ -95,7 +96,7 @@ class RunResult:
     sensor_s: float
     wall_s: float
     stage_ms: Mapping[str, list[float]]
-    global_map: GlobalMap = field(default_factory=GlobalMap)
+    map: MapSnapshot = field(default_factory=lambda: GlobalMap().snapshot())
     events: tuple[str, ...] = ()
     solver: str = ""
     failure: str = ""

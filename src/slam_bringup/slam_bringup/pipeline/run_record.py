@@ -12,7 +12,7 @@ import numpy as np
 
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
-from sjsam_node.global_map import GlobalMap
+from sjsam_node.smoothing.map_snapshot import MapLandmarks, MapSnapshot
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.dense_run import dense_model
@@ -88,7 +88,8 @@ class RunRecord:
     """All agents' records, the map, and their ``trajectories`` in it by agent. ``events`` belong to no agent."""
 
     agents: Mapping[str, AgentRecord]
-    global_map: GlobalMap
+    map: MapSnapshot
+    landmarks: MapLandmarks
     trajectories: Mapping[str, Sequence[PoseEstimate]]
     submaps: int
     loop_closures: int
@@ -141,7 +142,7 @@ def run_result(
         _agent_result(bag, config, agent, odometry, record.trajectories.get(agent, []), of_agent)
         for agent, of_agent in record.agents.items()
     )
-    landmarks = record.global_map.landmarks()
+    landmarks = record.landmarks
     stamps = [agent.filtered.stamps_ns for agent in agents if len(agent.filtered)]
     mapped = RunResult(
         bag=bag.reader.path.name,
@@ -149,7 +150,7 @@ def run_result(
         mapper=mapper,
         odometry=odometry,
         agents=agents,
-        global_map=record.global_map,
+        map=record.map,
         landmarks=LandmarkMap(landmarks.positions, landmarks.covariances, landmarks.sightings),
         dense=Surface.empty(),
         floor_plans=(),

@@ -42,6 +42,7 @@ _DONE = ("submaps joined", "localized", "not recognised", "rejected")
 """Counts of submaps that ``sjsam`` has done with."""
 _SJSAM = "/sjsam"
 _SAVE_MAP = f"{_SJSAM}/save_map"
+_FINISH_MAP = f"{_SJSAM}/finish"
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +217,7 @@ class _Choreography:
         }
         player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
         self._supervisor.count_submaps(f"{name.rpartition('/')[0]}/submap/info" for name in self._graph.filters)
-        self._supervisor.prepare((*(f"{name}/finish" for name in self._graph.finishers), _SAVE_MAP))
+        self._supervisor.prepare((*(f"{name}/finish" for name in self._graph.finishers), _FINISH_MAP, _SAVE_MAP))
         self._wait_until_ready(from_outside=())
         heard = self._supervisor.progress.total
         self._supervisor.call("/bag_player/start", has_effect=lambda: heard() > 0 or not player.is_running)
@@ -253,6 +254,7 @@ class _Choreography:
                 self._patiently(partial(self._supervisor.call, f"{name}/finish"))
             self._supervisor.wait_until_quiet(self._limit_s)
         self._patiently(partial(self._supervisor.wait, self._all_joined, what="joining of the last submap"))
+        self._patiently(partial(self._supervisor.call, _FINISH_MAP))
         self._supervisor.call(_SAVE_MAP, _SERVICE_TIMEOUT_S)
 
     def save_at_once(self) -> None:

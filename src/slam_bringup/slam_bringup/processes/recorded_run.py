@@ -94,10 +94,11 @@ def collect(
     with SensorBag(bag, names) as opened:
         record = RunRecord(
             agents={agent: recording.of_agent(agent) for agent in opened.agents},
-            global_map=global_map,
+            map=global_map.snapshot(),
+            landmarks=global_map.landmarks(),
             trajectories={agent: recording.located(agent) for agent in opened.agents}
             if is_localized
-            else global_map.view.trajectory(start_map.submaps if start_map else 0),
+            else global_map.snapshot().trajectory(start_map.submaps if start_map else 0),
             submaps=recording.submaps,
             loop_closures=int(joiner.get("localized" if is_localized else "closures", "0")),
             wall_s=run.wall_s,

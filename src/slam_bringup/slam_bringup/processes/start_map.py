@@ -26,8 +26,8 @@ class StartMap:
         folder = map_folder(old, localize_only=localize_only)
         if folder is None:
             return None
-        records = map_growth(config.sjsam, folder, localize_only=localize_only).global_map.graph.records
-        return cls(folder, localize_only, len(records), 1 + max(record.key[1] for record in records))
+        keys = map_growth(config.sjsam, folder, localize_only=localize_only).global_map.snapshot().keys
+        return cls(folder, localize_only, len(keys), 1 + max(session for _, session, _ in keys))
 
     @property
     def parameters(self) -> dict[str, dict[str, Any]]:

@@ -46,11 +46,10 @@ class Charts:
 
 def draw_charts(result: RunResult) -> Charts:
     """The charts of a page, without the map's picture."""
-    graph = result.global_map.graph
     return Charts(
         _embedded(side_view(result)),
-        _embedded(submaps_figure(graph)),
-        _embedded(sparsity_figure(graph)),
+        _embedded(submaps_figure(result.map)),
+        _embedded(sparsity_figure(result.map)),
         [{name: _embedded(figure(agent)) for name, figure in _AGENT_CHARTS.items()} for agent in result.agents],
     )
 

@@ -162,10 +162,9 @@ def _lasting_messages(result: RunResult, stamp: int) -> Iterator[_Stamped]:
     yield stamp, "/map/landmarks", landmark_cloud(_TYPES, header, *known, landmarks.sightings.astype(np.int32))
     yield stamp, "/map/ellipsoids", ellipsoid_markers(_TYPES, header, *known)
     yield stamp, "/map/dense_cloud", cloud_message(_TYPES, header, cloud_of(result.dense))
-    yield stamp, "/map/graph", graph_message(_TYPES, header, result.global_map)
-    marks = result.global_map.marks
-    if marks.marks:
-        yield stamp, "/map/marks", marks_message(_TYPES, header, marks.positions(result.global_map.graph.poses))
+    yield stamp, "/map/graph", graph_message(_TYPES, header, result.map)
+    if result.map.marks.marks:
+        yield stamp, "/map/marks", marks_message(_TYPES, header, result.map.mark_positions())
     for number, plan in enumerate(result.floor_plans):
         topic = f"/map/occupancy_{number}" if number else "/map/occupancy"
         yield stamp, topic, occupancy_message(_TYPES, header, plan.cells, plan.resolution, plan.T_map_plan)

@@ -45,7 +45,7 @@ class FinishedView:
 
     def _show_map(self) -> None:
         page, run = self.page, self.run
-        landmarks = run.global_map.landmarks()
+        landmarks = run.map.landmarks()
         page.show_headline(str(run.summary.get("bag", run.path.name)), _headline(run))
         page.show_mesh(run.surface)
         page.show_points(run.surface.points, run.surface.colours)
@@ -53,8 +53,8 @@ class FinishedView:
             page.show_plan(plan, number)
         known = landmarks.linked
         page.show_landmarks(landmarks.positions[known], landmarks.covariances[known], landmarks.sightings[known])
-        marks = run.global_map.marks
-        page.show_marks([m.name for m in marks.marks], marks.positions(run.global_map.graph.poses))
+        marks = run.map.marks
+        page.show_marks([m.name for m in marks.marks], run.map.mark_positions())
         borders = unseen(run.plans)
         page.show_frontiers(np.array([f.point for f in borders]).reshape(-1, 3), [f.length for f in borders])
         ways = [t.poses[:, :3, 3] for t in run.trajectories.values() if len(t)]

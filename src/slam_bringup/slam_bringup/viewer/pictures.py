@@ -83,7 +83,7 @@ class BagPictures(StampedPictures):
 
     def __init__(self, run: RunFolder, bag: Path) -> None:
         super().__init__()
-        landmarks = run.global_map.landmarks()
+        landmarks = run.map.landmarks()
         self._points, self._sightings = landmarks.positions[landmarks.linked], landmarks.sightings[landmarks.linked]
         with SensorBag(bag) as opened:
             every = {a: max(1, len(t) // _MOST) for a, t in run.trajectories.items()}

@@ -14,8 +14,10 @@ from dense_mapping.plan_io import read_plan
 from dense_mapping.surface import Surface
 from dense_mapping.surface_io import read_mesh
 from sjsam_node.global_map import GlobalMap
+from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_core.files import read_json
 from slam_core.geometry import FloatArray
+from slam_core.linear_algebra.block_pattern import IntArray
 from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajectory
 
 
@@ -26,7 +28,7 @@ class RunFolder:
     path: Path
     summary: dict[str, Any]
     trajectories: dict[str, Trajectory]
-    global_map: GlobalMap
+    map: MapSnapshot
     surface: Surface
     plans: tuple[FloorPlan, ...]
     note: str = ""
@@ -47,12 +49,12 @@ class RunFolder:
         except ValueError as error:
             raise ValueError(f"{path / 'summary.json'} is damaged: {error}") from error
         mesh = path / "mesh.ply"
-        global_map, note = _map(path / "map")
+        snapshot, note = _map(path / "map")
         return cls(
             path=path,
             summary=summary,
             trajectories=_trajectories(path),
-            global_map=global_map,
+            map=snapshot,
             surface=read_mesh(mesh) if mesh.is_file() else Surface.empty(),
             plans=tuple(read_plan(file) for file in sorted(path.glob("floor_plan*.yaml"))),
             note=note,
@@ -66,28 +68,26 @@ class RunFolder:
 
     def submap_lines(self, until_ns: int | None = None) -> FloatArray:
         """Start and end (n, 2, 3) m of the submaps that were finished by a stamp."""
-        graph = self.global_map.graph
-        records = [r for r in graph.records if until_ns is None or r.submap.end_stamp_ns <= until_ns]
-        return np.array([graph.poses[[r.start, r.end], :3, 3] for r in records]).reshape(-1, 2, 3)
+        ended = self._ends_ns <= (np.inf if until_ns is None else until_ns)
+        return self.map.skeleton_lines()[ended]
 
     def closure_lines(self, until_ns: int | None = None) -> FloatArray:
         """Ends (n, 2, 3) m of the closures between submaps that were finished by a stamp."""
-        graph = self.global_map.graph
-        pairs = [(graph.records[k.first], graph.records[k.second]) for k in graph.links if k.is_closure]
-        lines = [
-            graph.poses[[a.start, b.start], :3, 3]
-            for a, b in pairs
-            if until_ns is None or max(a.submap.end_stamp_ns, b.submap.end_stamp_ns) <= until_ns
-        ]
-        return np.array(lines).reshape(-1, 2, 3)
+        ended = self._ends_ns <= (np.inf if until_ns is None else until_ns)
+        return self.map.closure_lines()[ended[self.map.closures].all(axis=1)]
+
+    @property
+    def _ends_ns(self) -> IntArray:
+        """Stamps at which the submaps were finished, (n,)."""
+        return np.array([submap.end_stamp_ns for submap in self.map.submaps], dtype=np.int64)
 
 
-def _map(path: Path) -> tuple[GlobalMap, str]:
+def _map(path: Path) -> tuple[MapSnapshot, str]:
     """The map, or an empty one and why: a run of another version still has all its other files to show."""
     try:
-        return GlobalMap.load(path), ""
+        return GlobalMap.load(path).snapshot(), ""
     except ValueError as error:
-        return GlobalMap(), f"landmarks and submaps are not shown: {error}"
+        return GlobalMap().snapshot(), f"landmarks and submaps are not shown: {error}"
 
 
 def _trajectories(path: Path) -> dict[str, Trajectory]:

@@ -9,9 +9,8 @@ from judging import ate, errors, join
 from submap_world import Agent, circle, ring_world
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
-from sjsam_node.smoothing.estimator import EstimatorConfig
-from sjsam_node.smoothing.regions import RegionConfig
-from sjsam_node.smoothing.smoother import SmootherConfig
+from sjsam_node.smoothing.condensing import RegionConfig
+from sjsam_node.smoothing.solver import EstimatorConfig, SmootherConfig
 from slam_core.geometry import boxminus
 from slam_core.types import Submap
 
@@ -34,43 +33,47 @@ def laps(submaps: list[Submap]) -> tuple[GlobalMap, list[int]]:
     joined, unknowns = GlobalMap(GlobalMapConfig(redundant_share=0.3, redundant_matches=12, ties=12)), []
     for submap in submaps:
         joined.add(submap)
-        unknowns.append(joined.smoother.assembled(0).problem.layout.pattern.n)
+        unknowns.append(joined.state.problem(0).problem.layout.pattern.n)
     return joined, unknowns
 
 
 def test_laps_add_no_unknowns(laps: tuple[GlobalMap, list[int]]) -> None:
     joined, unknowns = laps
     lap = len(unknowns) // 4
-    assert len(joined.smoother.parked) > lap
+    assert len(joined.state.frozen) > lap
     assert max(unknowns[-lap:]) < 1.5 * max(unknowns[: 2 * lap])
 
 
-def test_parked_submaps_stay_where_they_are_and_claim_no_more_than_they_know(
+def test_frozen_submaps_stay_where_they_are_and_claim_no_more_than_they_know(
     laps: tuple[GlobalMap, list[int]], agent: Agent
 ) -> None:
     joined, _ = laps
-    marginals = joined.smoother.marginals(0)
+    marginals = joined.state.marginals(0)
     e, nees = errors(joined, agent)
     assert ate(e) < 0.1
     assert nees.mean() / 6.0 < 2.0
-    one_by_one = [marginals._hung([n]) for n in joined.graph.starts.tolist()]
-    assert np.allclose(marginals._hung_alone(joined.graph.starts), one_by_one, rtol=1e-9, atol=1e-15)
-    before = {r.key: joined.graph.poses[r.start].copy() for r in joined.graph.records}
-    parked = joined.smoother.parked.records.tolist()
+    one_by_one = [marginals._dependent_covariance([n]) for n in joined.estimate.graph.starts.tolist()]
+    assert np.allclose(
+        marginals._dependent_covariances(joined.estimate.graph.starts), one_by_one, rtol=1e-9, atol=1e-15
+    )
+    before = {r.key: joined.state.poses[r.start].copy() for r in joined.estimate.graph.records}
+    frozen = joined.state.frozen.records.tolist()
     joined.settle()
-    assert len(joined.smoother.parked) == 0
-    assert len(joined.smoother.assembled(0).records) == len(joined.graph.records)
-    for i in parked:
-        gap = boxminus(before[joined.graph.records[i].key], joined.graph.poses[joined.graph.records[i].start])
+    assert len(joined.state.frozen) == 0
+    assert len(joined.state.problem(0).records) == len(joined.estimate.graph.records)
+    for i in frozen:
+        gap = boxminus(
+            before[joined.estimate.graph.records[i].key], joined.state.poses[joined.estimate.graph.records[i].start]
+        )
         assert np.linalg.norm(gap[:3]) < 0.05
 
 
 def test_a_condensed_map_is_within_one_sigma_of_the_uncondensed_one(submaps: list[Submap]) -> None:
-    """With few ties and parked submaps; before anything is settled."""
+    """With few ties and frozen submaps; before anything is settled."""
     condensed, _ = join(submaps, GlobalMap(GlobalMapConfig(redundant_share=0.3, redundant_matches=12)))
     whole = SmootherConfig(region=RegionConfig(open=10_000), estimator=EstimatorConfig(live_tolerance=1e-9))
     every, _ = join(submaps, GlobalMap(GlobalMapConfig(redundant_share=2.0, ties=1000, smoothing=whole)))
-    assert len(condensed.smoother.parked)
+    assert len(condensed.state.frozen)
     gaps = [boxminus(p.T, q.T) for p, q in zip(condensed.trajectory("a")[1:], every.trajectory("a")[1:], strict=True)]
     known = [p.covariance for p in condensed.trajectory("a")[1:]]
     distance = [gap @ np.linalg.solve(P, gap) / 6.0 for gap, P in zip(gaps, known, strict=True)]
@@ -78,6 +81,6 @@ def test_a_condensed_map_is_within_one_sigma_of_the_uncondensed_one(submaps: lis
     assert np.percentile(distance, 95.0) < 1.0
 
 
-def test_a_node_that_is_not_parked_has_no_reference(agent: Agent) -> None:
+def test_a_node_that_is_not_frozen_has_no_reference(agent: Agent) -> None:
     joined, _ = join(agent.submaps()[:3])
-    assert joined.smoother.parked.node(0) is None
+    assert joined.state.frozen.node(0) is None

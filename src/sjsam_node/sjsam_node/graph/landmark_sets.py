@@ -19,44 +19,43 @@ from slam_core.linear_algebra.sparse_cholesky import IntArray
 BoolArray = npt.NDArray[np.bool_]
 
 
-def _none() -> IntArray:
+def no_indices() -> IntArray:
+    """No numbers, (0,)."""
     return np.empty(0, dtype=np.int64)
 
 
-@dataclass
-class Fusion:
+@dataclass(frozen=True, eq=False)
+class LandmarkSets:
     """Landmark of every observation (n,), named after its oldest one.
 
     The next observation of the same landmark, in a ring; and the submap that each observation belongs to.
     """
 
-    landmark_of: IntArray = field(default_factory=_none)
-    following: IntArray = field(default_factory=_none)
-    record_of: IntArray = field(default_factory=_none)
+    landmark_of: IntArray = field(default_factory=no_indices)
+    following: IntArray = field(default_factory=no_indices)
+    record_of: IntArray = field(default_factory=no_indices)
 
-    def append(self, count: int, record: int) -> None:
-        """Observations of one more submap, each a landmark of its own."""
+    def with_submap(self, count: int, record: int) -> LandmarkSets:
+        """The same and the observations of one more submap, each a landmark of its own."""
         alone = np.arange(len(self.landmark_of), len(self.landmark_of) + count)
-        self.landmark_of = np.concatenate([self.landmark_of, alone])
-        self.following = np.concatenate([self.following, alone])
-        self.record_of = np.concatenate([self.record_of, np.full(count, record, dtype=np.int64)])
+        return LandmarkSets(
+            np.concatenate([self.landmark_of, alone]),
+            np.concatenate([self.following, alone]),
+            np.concatenate([self.record_of, np.full(count, record, dtype=np.int64)]),
+        )
 
-    def unite(self, pairs: IntArray) -> int:
-        """Fuse pairs (k, 2) of observations in order, but for those that would let a submap see a landmark twice.
+    def united(self, pairs: IntArray) -> LandmarkSets:
+        """Pairs (k, 2) of observations fused in order, but for those that would let a submap see a landmark twice."""
+        landmark_of, following = self.landmark_of.copy(), self.following.copy()
+        _unite(pairs, landmark_of, following, self.record_of)
+        return LandmarkSets(landmark_of, following, self.record_of)
 
-        The number of pairs that are one landmark now.
-        """
-        return int(_unite(pairs, self.landmark_of, self.following, self.record_of))
-
-    def separate(self) -> None:
+    def separated(self) -> LandmarkSets:
         """Every observation a landmark of its own again."""
-        self.landmark_of = np.arange(len(self.landmark_of))
-        self.following = self.landmark_of.copy()
+        alone = np.arange(len(self.landmark_of))
+        return LandmarkSets(alone, alone, self.record_of)
 
-    def copy(self) -> Fusion:
-        """The same, to come back to; submaps do not change."""
-        return Fusion(self.landmark_of.copy(), self.following.copy(), self.record_of)
-
+    @property
     def is_shared(self) -> BoolArray:
         """Mask (n,) of observations whose landmark another submap sees too."""
         return np.asarray(self.following != np.arange(len(self.following)))
@@ -65,12 +64,10 @@ class Fusion:
 @njit(cache=True, nogil=True)
 def _unite(pairs, landmark_of, following, record_of):
     seen = np.full(record_of[-1] + 1 if len(record_of) else 0, -1)
-    united = 0
     for k in range(len(pairs)):
         a, b = landmark_of[pairs[k, 0]], landmark_of[pairs[k, 1]]
         keep, gone = min(a, b), max(a, b)
         if keep == gone:
-            united += 1
             continue
         at = keep
         while True:
@@ -92,5 +89,3 @@ def _unite(pairs, landmark_of, following, record_of):
             if at == gone:
                 break
         following[keep], following[gone] = following[gone], following[keep]
-        united += 1
-    return united

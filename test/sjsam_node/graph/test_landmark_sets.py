@@ -6,16 +6,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sjsam_node.graph.fusion import Fusion
+from sjsam_node.graph.landmark_sets import LandmarkSets
 
 SIZES = (30, 20, 40, 30, 25)
 
 
-def fused() -> Fusion:
-    fusion = Fusion()
+def alone() -> LandmarkSets:
+    sets = LandmarkSets()
     for record, size in enumerate(SIZES):
-        fusion.append(size, record)
-    return fusion
+        sets = sets.with_submap(size, record)
+    return sets
 
 
 def random_pairs(rng: np.random.Generator) -> np.ndarray:
@@ -25,41 +25,36 @@ def random_pairs(rng: np.random.Generator) -> np.ndarray:
     return np.asarray(pairs[alike | (rng.random(len(pairs)) < 0.1)])
 
 
-def as_sets(pairs: np.ndarray) -> tuple[np.ndarray, int]:
+def as_sets(pairs: np.ndarray) -> np.ndarray:
     record_of = np.repeat(np.arange(len(SIZES)), SIZES)
     landmarks = [{i} for i in range(sum(SIZES))]
-    count = 0
     for a, b in pairs.tolist():
         one, other = landmarks[a], landmarks[b]
         if one is not other and not {record_of[i] for i in one} & {record_of[i] for i in other}:
             one |= other
             for i in other:
                 landmarks[i] = one
-        count += landmarks[a] is landmarks[b]
-    return np.array([min(s) for s in landmarks]), count
+    return np.array([min(s) for s in landmarks])
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_landmarks_are_those_of_plain_sets(seed: int) -> None:
     pairs = random_pairs(np.random.default_rng(seed))
-    expected, count = as_sets(pairs)
-    fusion = fused()
-    assert fusion.unite(pairs) == count
-    assert np.array_equal(fusion.landmark_of, expected)
+    expected = as_sets(pairs)
+    sets = alone().united(pairs)
+    assert np.array_equal(sets.landmark_of, expected)
     sizes = np.bincount(expected, minlength=len(expected))
-    assert np.array_equal(fusion.is_shared(), sizes[expected] > 1)
+    assert np.array_equal(sets.is_shared, sizes[expected] > 1)
     assert len(np.unique(expected)) < len(expected) - 20
 
 
-def test_a_copy_stays_as_it_was(rng: np.random.Generator) -> None:
-    fusion, pairs = fused(), random_pairs(rng)
-    fusion.unite(pairs[:40])
-    before = fusion.copy()
-    kept = before.landmark_of.copy()
-    fusion.unite(pairs[40:])
-    assert not np.array_equal(fusion.landmark_of, kept)
-    assert np.array_equal(before.landmark_of, kept)
-    before.unite(pairs[40:])
-    assert np.array_equal(before.landmark_of, fusion.landmark_of)
-    before.separate()
-    assert not before.is_shared().any()
+def test_sets_stay_as_they_were_when_others_are_made_of_them(rng: np.random.Generator) -> None:
+    pairs = random_pairs(rng)
+    before = alone().united(pairs[:40])
+    kept = before.landmark_of.copy(), before.following.copy()
+    after = before.united(pairs[40:])
+    assert not np.array_equal(after.landmark_of, kept[0])
+    assert np.array_equal(before.landmark_of, kept[0])
+    assert np.array_equal(before.following, kept[1])
+    assert np.array_equal(after.landmark_of, alone().united(pairs).landmark_of)
+    assert not after.separated().is_shared.any()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The joined map as others want it: paths, trajectories and landmarks with marginal covariances.
+"""A snapshot of the joined map for those who read it: structure, paths, trajectories, landmarks, with covariances.
 
 The poses inside a submap hang on the joined skeleton: what joining changed at the submap's end moves each pose by the
 gain with which the end, once known better, corrects it (a Rauch-Tung-Striebel step with the submap's own covariances).
@@ -13,13 +13,14 @@ by, common to all submaps, is added to what goes out and nowhere else (:mod:`sla
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sjsam_node.graph.map_graph import BoolArray, MapGraph, Record
+from sjsam_node.marks import Marks
 from sjsam_node.smoothing.marginals import ComponentMarginals
-from sjsam_node.smoothing.smoother import Smoother
+from sjsam_node.smoothing.state import EstimateState
 from slam_core.calibration_error import (
     CalibrationErrorConfig,
     covariance_of_calibration,
@@ -74,32 +75,141 @@ class _Stacked:
         return _Stacked([*self.count, len(kept)], [*self.inside, *kept], poses, gains)
 
 
-@dataclass
-class MapView:
-    """Pictures of the estimate as of the last update; looking changes nothing."""
+class InnerPaths:
+    """What does not change of the poses inside submaps, kept from one snapshot to the next."""
 
-    smoother: Smoother
+    def __init__(self) -> None:
+        self._stacked = _Stacked([], [], np.empty((0, 4, 4)), np.empty((0, 6, 6)))
+
+    def of(self, records: Sequence[Record]) -> _Stacked:
+        """That of the first records so far, and more."""
+        stacked = self._stacked
+        for record in records[len(stacked.count) :]:
+            stacked = stacked.with_one(record.submap)
+        self._stacked = stacked
+        return stacked
+
+
+@dataclass(frozen=True)
+class MapSnapshot:
+    """The map as of one update; it stays as it is while the map goes on.
+
+    Attributes
+    ----------
+    unlinked_sigma, calibration
+        What is added to covariances: in parts that nothing ties to the map (m), and for the cameras' calibration.
+    marks
+        The marks so far.
+    """
+
+    _state: EstimateState
     unlinked_sigma: float
     calibration: CalibrationErrorConfig = field(default_factory=CalibrationErrorConfig)
-    _stacked: _Stacked = field(default_factory=lambda: _Stacked([], [], np.empty((0, 4, 4)), np.empty((0, 6, 6))))
+    marks: Marks = field(default_factory=Marks)
+    _inner_paths: InnerPaths = field(default_factory=InnerPaths)
+
+    # -- structure -----------------------------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self._state.graph.records)
 
     @property
-    def graph(self) -> MapGraph:
-        """Graph that is pictured."""
-        return self.smoother.graph
+    def submaps(self) -> tuple[Submap, ...]:
+        """All submaps, in the order in which they were joined."""
+        return tuple(r.submap for r in self._state.graph.records)
+
+    @property
+    def keys(self) -> list[tuple[str, int, int]]:
+        """Agent, session and index of every submap."""
+        return [r.key for r in self._state.graph.records]
+
+    @property
+    def poses(self) -> FloatArray:
+        """T_map_node of all nodes of the skeleton, (nodes, 4, 4)."""
+        return self._state.poses
+
+    @property
+    def nodes(self) -> IntArray:
+        """Nodes at which the submaps start and end, (submaps, 2)."""
+        return np.stack([self._state.graph.starts, self._state.graph.ends], axis=1)
+
+    @property
+    def closures(self) -> IntArray:
+        """The two submaps of every closure, (closures, 2)."""
+        ends = [k.ends for k in self._state.graph.links if k.is_closure]
+        return np.array(ends, dtype=np.int64).reshape(-1, 2)
+
+    @property
+    def points(self) -> FloatArray:
+        """Where every landmark of every submap is in the map, (observations, 3) m, one submap after the other."""
+        return self._state.points
+
+    @property
+    def submap_of(self) -> IntArray:
+        """Submap of each of these observations, (observations,)."""
+        return self._state.graph.record_of
+
+    @property
+    def landmark_of(self) -> IntArray:
+        """Landmark of each of them, named after its oldest observation, (observations,)."""
+        return self._state.graph.landmark_of
+
+    @property
+    def is_shared(self) -> BoolArray:
+        """Mask (observations,) of those whose landmark more than one submap sees."""
+        return self._state.graph.sets.is_shared
+
+    @property
+    def is_tied(self) -> BoolArray:
+        """Mask (submaps,) of those that hang together with the first one."""
+        state = self._state
+        own = state.component_of[state.graph.starts]
+        return np.asarray(own == own[:1])
+
+    @property
+    def components(self) -> int:
+        """Parts of the map that nothing ties together yet."""
+        return len(self._state.components())
+
+    def structure(self) -> MapSnapshot:
+        """The same without the factors that covariances come from, which are as large as the map."""
+        return replace(self, _state=replace(self._state, solved={}, reduced={}, recovered={}))
+
+    def skeleton_lines(self) -> FloatArray:
+        """Start and end (submaps, 2, 3) m of every submap."""
+        return np.asarray(self.poses[self.nodes][:, :, :3, 3])
+
+    def closure_lines(self) -> FloatArray:
+        """Starts (closures, 2, 3) m of the two submaps of every closure."""
+        return np.asarray(self.poses[self.nodes[self.closures, 0]][:, :, :3, 3])
+
+    def mark_positions(self) -> FloatArray:
+        """Marks in the map frame, (n, 3) m."""
+        return self.marks.positions(self.poses)
+
+    def start(self, record: int) -> PoseEstimate:
+        """Start of a submap in the map frame, with covariance."""
+        r = self._state.graph.records[record]
+        return PoseEstimate(r.submap.start_stamp_ns, self.poses[r.start], self._covariance(r.start))
+
+    def end(self, record: int) -> PoseEstimate:
+        """End of a submap in the map frame, with covariance."""
+        r = self._state.graph.records[record]
+        return PoseEstimate(r.submap.end_stamp_ns, self.poses[r.end], self._covariance(r.end))
+
+    # -- poses and landmarks -------------------------------------------------------------------------------------------
 
     def path(self) -> dict[str, list[PoseEstimate]]:
         """Poses of every agent in the order of their stamps, with no more covariance than inside their submaps.
 
         Of an agent that stands still there are few: a path through them is nowhere off by more than ``STILL``.
         """
-        records, stacked = self.graph.records, self._stacked
-        for i in range(len(stacked.count), len(records)):
-            stacked = self._stacked = stacked.with_one(records[i].submap)
+        records = self._state.graph.records
         if not records:
             return {}
+        stacked = self._inner_paths.of(records)
         of = np.repeat(np.arange(len(records)), stacked.count)
-        poses = _on_skeleton(self.graph, records, of, stacked.poses, stacked.gains)
+        poses = _on_skeleton(self.poses, records, of, stacked.poses, stacked.gains)
         parts: dict[str, list[PoseEstimate]] = {}
         agents = [r.submap.agent for r, n in zip(records, stacked.count, strict=True) for _ in range(n)]
         for agent, p, T in zip(agents, stacked.inside, poses, strict=True):
@@ -114,12 +224,12 @@ class MapView:
         frame.
         """
         out: dict[str, list[PoseEstimate]] = {}
-        for component in np.unique(self.graph.component_of).tolist():
-            marginals, widening = self.smoother.marginals(component), self._widening(component)
+        for component in self._state.components():
+            marginals, widening = self._state.marginals(component), self._widening(component)
             for i in (i for i in marginals.records if i >= since):
-                record = self.graph.records[i]
+                record = self._state.graph.records[i]
                 poses, covariances = _with_covariances(
-                    self.graph, marginals, i, *_smoothing(record.submap, record.submap.path)
+                    self.poses, record, marginals, i, *_smoothing(record.submap, record.submap.path)
                 )
                 covariances += np.array([covariance_of_calibration(T, self.calibration) for T in poses])
                 own = record.submap.path
@@ -128,41 +238,41 @@ class MapView:
                 )
         return {agent: _unique_stamps(poses) for agent, poses in sorted(out.items())}
 
-    def node(self, node: int) -> FloatArray:
+    def _covariance(self, node: int) -> FloatArray:
         """Covariance (6, 6) of a node in the map frame."""
-        component = int(self.graph.component_of[node])
-        common = covariance_of_calibration(self.graph.poses[node], self.calibration)
-        return self.smoother.marginals(component).node(node) + common + self._widening(component)
+        component = int(self._state.component_of[node])
+        common = covariance_of_calibration(self.poses[node], self.calibration)
+        return self._state.marginals(component).node(node) + common + self._widening(component)
 
     def landmarks(self) -> MapLandmarks:
         """Every landmark once; what one submap alone saw counts only if that submap showed something new."""
-        graph = self.graph
+        state, graph = self._state, self._state.graph
         ids, counts = np.unique(graph.landmark_of, return_counts=True)
-        kept = (counts > 1) | ~graph.redundant[graph.record_of[ids]]
+        kept = (counts > 1) | ~state.redundant[graph.record_of[ids]]
         ids, counts = ids[kept], counts[kept]
         rows = _estimated(graph)[ids]
-        component = graph.component_of[graph.starts[graph.record_of[rows]]]
+        component = state.component_of[graph.starts[graph.record_of[rows]]]
         covariances = np.empty((len(ids), 3, 3))
         for c in np.unique(component).tolist():
             own = component == c
-            covariances[own] = self.smoother.marginals(c).landmarks(rows[own]) + self._widening(c)[:3, :3]
-        points = graph.points[rows]
+            covariances[own] = state.marginals(c).landmarks(rows[own]) + self._widening(c)[:3, :3]
+        points = state.points[rows]
         covariances += point_covariances_of_calibration(points, self.calibration)
-        main = graph.component(0) if graph.records else 0
+        main = state.component(0) if graph.records else 0
         return MapLandmarks(ids, points, covariances, _descriptors(graph, rows), counts, component == main)
 
     def _widening(self, component: int) -> FloatArray:
         """Covariance (6, 6) that is added in a component whose frame nothing ties to the map's."""
-        if component == self.graph.component(0):
+        if component == self._state.component(0):
             return np.asarray(ORIGIN_SIGMA**2 * np.eye(6))
         return np.diag(np.square([*[self.unlinked_sigma] * 3, np.pi, np.pi, np.pi]))
 
 
 def _estimated(graph: MapGraph) -> IntArray:
     """For every landmark, at its name, the observation whose point is the best known."""
-    rows = np.arange(len(graph.points))
-    tying = np.nonzero(graph.tying())[0]
-    rows[graph.landmark_of[tying]] = graph.variable_of[tying]
+    rows = np.arange(len(graph.record_of))
+    connecting = np.nonzero(graph.is_connecting)[0]
+    rows[graph.landmark_of[connecting]] = graph.variable_of[connecting]
     return rows
 
 
@@ -184,10 +294,10 @@ def _unique_stamps(poses: list[PoseEstimate]) -> list[PoseEstimate]:
 
 
 def _on_skeleton(
-    graph: MapGraph, records: Sequence[Record], of: IntArray, inside: FloatArray, gains: FloatArray
+    nodes: FloatArray, records: Sequence[Record], of: IntArray, inside: FloatArray, gains: FloatArray
 ) -> FloatArray:
     """Poses inside submaps, on the joined skeleton, (n, 4, 4); ``of`` which of the records each is in."""
-    T_start, T_end = (graph.poses[[getattr(r, end) for r in records]] for end in ("start", "end"))
+    T_start, T_end = (nodes[[getattr(r, end) for r in records]] for end in ("start", "end"))
     end_poses = np.array([r.submap.end_pose for r in records])
     correction = boxminus(np.linalg.inv(T_start) @ T_end, end_poses)
     T = boxplus(inside, (gains @ correction[of][..., None])[..., 0])
@@ -195,13 +305,12 @@ def _on_skeleton(
 
 
 def _with_covariances(
-    graph: MapGraph, marginals: ComponentMarginals, i: int, gains: FloatArray, remaining: FloatArray
+    nodes: FloatArray, record: Record, marginals: ComponentMarginals, i: int, gains: FloatArray, remaining: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """The poses inside record ``i`` with their covariances (n, 6, 6)."""
-    record, joint = graph.records[i], marginals.ends(i)
-    T_start, T_end = graph.poses[record.start], graph.poses[record.end]
+    joint, T_start, T_end = marginals.ends(i), nodes[record.start], nodes[record.end]
     inside, T_inverse = np.array([p.T for p in record.submap.path]), invert_transform(T_start)
-    poses = _on_skeleton(graph, [record], np.zeros(len(inside), dtype=np.int64), inside, gains)
+    poses = _on_skeleton(nodes, [record], np.zeros(len(inside), dtype=np.int64), inside, gains)
     J_inverse, J_end = compose_jacobians(T_inverse, T_end)
     D = np.concatenate([J_inverse @ inverse_jacobian(T_start), J_end], axis=1)
     J_start, J_pose = compose_jacobians(np.broadcast_to(T_start, poses.shape), T_inverse @ poses)

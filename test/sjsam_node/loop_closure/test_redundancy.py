@@ -10,8 +10,9 @@ from submap_world import Agent, circle, ring_world
 
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.graph.links import Link
-from sjsam_node.loop_closure.novelty import Novelty
+from sjsam_node.loop_closure.redundancy import RedundancyCheck
 from sjsam_node.loop_closure.verification import ClosureConfig
+from sjsam_node.smoothing.state import with_exactly
 
 
 @pytest.fixture
@@ -20,26 +21,26 @@ def joined(rng: np.random.Generator) -> GlobalMap:
     return join(Agent(ring_world(2.5, rng, 12.0), circle(2.5, 3.0), rng, "a").submaps())[0]
 
 
-def novelty(joined: GlobalMap) -> Novelty:
+def check(joined: GlobalMap) -> RedundancyCheck:
     config = ClosureConfig()
-    return Novelty(joined.graph, config.min_near_inliers, config.association.descriptor_threshold, 0.15)
+    return RedundancyCheck(joined.state, config.min_near_inliers, config.association.descriptor_threshold, 0.15)
 
 
 def closure(joined: GlobalMap) -> Link:
-    return max((k for k in joined.graph.links if k.is_closure), key=lambda k: len(k.pairs))
+    return max((k for k in joined.estimate.graph.links if k.is_closure), key=lambda k: len(k.pairs))
 
 
 def test_submaps_whose_landmarks_are_one_already_are_not_compared_again(joined: GlobalMap) -> None:
-    link, known = closure(joined), novelty(joined)
+    link, known = closure(joined), check(joined)
     assert known.is_all_known(link.first, link.second)
     assert not known.is_known(link.second)
 
 
 def test_a_landmark_that_may_be_another_ones_calls_for_a_comparison(joined: GlobalMap) -> None:
     link = closure(joined)
-    joined.graph.replace_links([])
+    joined.estimate.accept(with_exactly(joined.state, []))
     for other in ({5}, set(range(len(link.pairs)))):
-        known, left = novelty(joined), [k for k in range(len(link.pairs)) if k not in other]
+        known, left = check(joined), [k for k in range(len(link.pairs)) if k not in other]
         known.note(Link(link.first, link.second, link.pairs[left], link.T, link.covariance, True))
         assert known.is_known(link.second)
         assert not known.is_all_known(link.first, link.second)
@@ -49,7 +50,7 @@ def test_a_landmark_that_may_be_another_ones_calls_for_a_comparison(joined: Glob
 
 def test_links_found_tie_to_all_that_see_the_same_landmarks(joined: GlobalMap) -> None:
     """A new submap linked to one of the first lap is known to those of the second."""
-    graph, known = joined.graph, novelty(joined)
+    graph = joined.estimate.graph
     link = closure(joined)
     ends = (link.first, link.second)
     third = max(
@@ -59,7 +60,8 @@ def test_links_found_tie_to_all_that_see_the_same_landmarks(joined: GlobalMap) -
         ).sum(),
     )
     others = [k for k in graph.links if link.second not in (k.first, k.second)]
-    graph.replace_links(others)
+    joined.estimate.accept(with_exactly(joined.state, others))
+    known = check(joined)
     assert not known.is_all_known(third, link.second)
     known.note(link)
     before = len(np.intersect1d(known._seen(third), known._seen(link.second)))
@@ -68,5 +70,5 @@ def test_links_found_tie_to_all_that_see_the_same_landmarks(joined: GlobalMap) -
 
 def test_many_laps_need_few_links(joined: GlobalMap) -> None:
     """Measured 1.0 closures a submap; one to each of the old ones around it would be about ten."""
-    closures = sum(k.is_closure for k in joined.graph.links)
-    assert 0.3 * len(joined.graph.records) < closures < 3.0 * len(joined.graph.records)
+    closures = sum(k.is_closure for k in joined.estimate.graph.links)
+    assert 0.3 * len(joined.estimate.graph.records) < closures < 3.0 * len(joined.estimate.graph.records)

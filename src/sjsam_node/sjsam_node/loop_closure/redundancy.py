@@ -13,20 +13,20 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sjsam_node.graph.links import Link
-from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.smoothing.state import EstimateState
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 
 @dataclass
-class Novelty:
+class RedundancyCheck:
     """Landmarks that submaps see by the map and by the links found so far, not in the map yet.
 
     enough: landmarks in common that tie two submaps. threshold: least scalar product of descriptors, and reach (m):
     largest distance, of two landmarks that may be the same.
     """
 
-    graph: MapGraph
+    state: EstimateState
     enough: int
     threshold: float
     reach: float
@@ -50,7 +50,7 @@ class Novelty:
         old, new = ~np.isin(one, other), ~np.isin(other, one)
         if len(new) - int(np.count_nonzero(new)) < self.enough:
             return False
-        a, b = self.graph.records[first].submap, self.graph.records[second].submap
+        a, b = self.state.graph.records[first].submap, self.state.graph.records[second].submap
         i, j = np.nonzero(a.descriptors[old] @ b.descriptors[new].T >= self.threshold)
         T = invert_transform(self._pose(first)) @ self._pose(second)
         gap = a.landmarks[old][i] - transform_points(T, b.landmarks[new])[j]
@@ -58,8 +58,8 @@ class Novelty:
 
     def _seen(self, record: int) -> IntArray:
         known = self._landmarks.get(record)
-        return self.graph.landmark_of[self.graph.records[record].observations] if known is None else known
+        return self.state.graph.landmarks_of(record) if known is None else known
 
     def _pose(self, record: int) -> FloatArray:
         known = self._poses.get(record)
-        return self.graph.poses[self.graph.records[record].start] if known is None else known
+        return self.state.start(record) if known is None else known
