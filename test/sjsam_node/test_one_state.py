@@ -28,10 +28,17 @@ ARRAYS = {
 FILES = [p for p in SRC.rglob("*.py") if p.name != "setup.py"]
 
 
-def is_map(node: ast.expr) -> bool:
+def names_of_maps(tree: ast.AST) -> set[str]:
+    """The names by which a module calls a graph or a state: the usual ones, and arguments declared as such."""
+    arguments = (node for node in ast.walk(tree) if isinstance(node, ast.arg) and node.annotation is not None)
+    declared = {a.arg for a in arguments if ast.unparse(a.annotation) in ("MapGraph", "EstimateState")}
+    return {"graph", "state", "_state", *declared}
+
+
+def is_map(node: ast.expr, names: set[str]) -> bool:
     """Whether an expression names a graph or a state: by its own name or its last attribute."""
     name = node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else ""
-    return name in ("graph", "state", "_state", "before", "after")
+    return name in names
 
 
 def assignments(tree: ast.AST) -> Iterator[ast.Attribute]:
@@ -47,17 +54,19 @@ def assignments(tree: ast.AST) -> Iterator[ast.Attribute]:
 
 def writes(tree: ast.AST) -> list[str]:
     """Assignments to the state that holds, and to anything in a graph or a state."""
+    names = names_of_maps(tree)
     return [
         ast.unparse(target)
         for target in assignments(tree)
-        if target.attr == "_state" or (is_map(target.value) and target.attr in STATE | FACTS)
+        if target.attr == "_state" or (is_map(target.value, names) and target.attr in STATE | FACTS)
     ]
 
 
 def accesses(tree: ast.AST) -> list[str]:
     """Accesses to the arrays of a graph or a state."""
+    names = names_of_maps(tree)
     found = (node for node in ast.walk(tree) if isinstance(node, ast.Attribute))
-    return [ast.unparse(node) for node in found if node.attr in ARRAYS and is_map(node.value)]
+    return [ast.unparse(node) for node in found if node.attr in ARRAYS and is_map(node.value, names)]
 
 
 def map_files() -> list[Path]:
@@ -88,6 +97,7 @@ def test_a_write_is_found(code: str) -> None:
 
 def test_an_access_is_found() -> None:
     assert accesses(ast.parse("x = result.global_map.graph.poses[0]")) == ["result.global_map.graph.poses"]
+    assert accesses(ast.parse("def f(one: MapGraph): return one.starts")) == ["one.starts"]
 
 
 def test_the_arrays_of_a_state_cannot_be_written_to(rng: np.random.Generator) -> None:

@@ -133,10 +133,9 @@ class LoopDetector:
         return self.around(_middle(state, new), state.records_in(state.component(new)), recent)
 
     def _redundancy_check(self) -> RedundancyCheck:
-        config = self.config
-        return RedundancyCheck(
-            self.estimate.state, config.min_near_inliers, config.association.descriptor_threshold, config.ransac_distance
-        )  # fmt: skip
+        config, state = self.config, self.estimate.state
+        threshold = config.association.descriptor_threshold
+        return RedundancyCheck(state, config.min_near_inliers, threshold, config.ransac_distance)
 
     def _verified(self, pairs: list[tuple[int, int]], known: RedundancyCheck, *, by_looks: bool = True) -> list[Link]:
         """Links between pairs of records that geometry and the map support; none that tell nothing new."""
