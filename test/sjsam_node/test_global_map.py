@@ -66,7 +66,7 @@ def read_all(joined: GlobalMap) -> None:
     for agent in "ab":
         joined.end_pose(agent)
         joined.map_to_odom(agent)
-    joined.start_pose(len(joined.estimate.graph.records) // 2)
+    joined.snapshot().start(len(joined.estimate.graph.records) // 2)
     joined.estimate.relative_pose(0, len(joined.estimate.graph.records) - 1)
     joined.marks.positions(joined.state.poses)
 

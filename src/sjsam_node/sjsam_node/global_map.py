@@ -346,10 +346,6 @@ class GlobalMap:
         """End pose of an agent's newest submap in its own odometry frame."""
         return self.agents.odometry(agent)
 
-    def start_pose(self, record: int) -> PoseEstimate:
-        """Start pose of a record in the map frame, with covariance."""
-        return self.snapshot().start(record)
-
     def end_pose(self, agent: str) -> PoseEstimate | None:
         """End of an agent's newest submap in the map frame; None for an agent not heard of."""
         newest = self.agents.newest(agent)

@@ -66,7 +66,7 @@ class Localizer:
             if link is None or len(link.pairs) <= most:
                 continue
             if status is Status.CONSISTENT or (self._pose is None and verifier.is_evident(known, seen, link)):
-                anchor = self._map.start_pose(record)
+                anchor = self._map.snapshot().start(record)
                 covariance = compose_covariance(anchor.T, anchor.covariance, link.T, link.covariance)
                 best, most = PoseEstimate(submap.start_stamp_ns, anchor.T @ link.T, covariance), len(link.pairs)
         return best, most
@@ -81,7 +81,7 @@ class Localizer:
     def _prior(self, record: int) -> Prior | None:
         if self._pose is None:
             return None
-        anchor = self._map.start_pose(record)
+        anchor = self._map.snapshot().start(record)
         T = invert_transform(anchor.T)
         J = inverse_jacobian(anchor.T)
         covariance = compose_covariance(T, J @ anchor.covariance @ J.T, self._pose.T, self._pose.covariance)

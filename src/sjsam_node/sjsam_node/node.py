@@ -125,10 +125,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
                 self.get_logger().error(f"the autosaved map cannot be used, a new one begins: {error}")
                 self.map.reset(forget=True)
                 return
-            count, written = len(self.map.snapshot), time.ctime((copy / "manifest.json").stat().st_mtime)
-            self.get_logger().warning(
-                f"a node was killed: going on from {count} submaps of {written} in {copy} (~/reset forgets them)"
+            known = (
+                f"{len(self.map.snapshot)} submaps of {time.ctime((copy / 'manifest.json').stat().st_mtime)} in {copy}"
             )
+            self.get_logger().warning(f"a node was killed: going on from {known} (~/reset forgets them)")
 
     def _start_trackers(self, last: Mapping[str, FloatArray] = MappingProxyType({})) -> None:
         """Follow every agent from where it was ``last``, else from the origin; one to be located from nowhere yet."""

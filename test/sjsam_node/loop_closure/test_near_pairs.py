@@ -143,13 +143,15 @@ def test_the_central_map_does_not_depend_on_who_comes_first(
     for a, b in two_agents:
         one, other = join(in_order(a + b))[0], join([*b[:3], *a[::-1], *b[3:]])[0]
         mark = other.marks.add(other.state.poses, other.state.poses[other.estimate.graph.records[9].start][:3, 3])
-        assert one.centrally() is one
-        central = other.centrally()
+        assert one.rebuilt_in_time_order() is one
+        central = other.rebuilt_in_time_order()
         assert same_landmarks(one) == same_landmarks(central)
         for name in "ab":
             gap = [boxminus(p.T, q.T) for p, q in zip(one.trajectory(name), central.trajectory(name), strict=True)]
             assert np.abs(gap).max() < 1e-9
-        marked = [[r.key for r in m.graph.records if m.marks.marks[0].node == r.start] for m in (other, central)]
+        marked = [
+            [r.key for r in m.estimate.graph.records if m.marks.marks[0].node == r.start] for m in (other, central)
+        ]
         assert marked[0] == marked[1]
         assert len(marked[0]) == 1
         assert np.array_equal(central.marks.marks[0].point, mark.point)
