@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,41 @@ def test_small_step_is_associated_rightly(world: PointWorld, rng: np.random.Gene
     # The noise of a far depth exceeds any gate in metres that tells neighbours apart: Algorithm 1 finds fewer.
     assert right.mean() > (0.9 if method == "nearest" else 0.99)
     assert right.sum() > (0.3 if method == "nearest" else 0.95) * common
+
+
+def test_followed_features_are_paired_by_their_tracks_where_descriptors_say_nothing(
+    world: PointWorld, rng: np.random.Generator
+) -> None:
+    candidates, first, now, second = two_views(world, SMALL_STEP, rng)
+    wrong = rng.permutation(len(now))[:5]
+    tracks = 1 + second
+    tracks[wrong] = tracks[np.roll(wrong, 1)]
+    blank = np.ones_like(now.descriptors) / np.sqrt(now.descriptors.shape[1])
+    candidates = replace(candidates, tracks=1 + first, descriptors=blank[: len(candidates)])
+    prior = motion_prior(np.zeros(6), np.zeros((6, 6)), np.repeat([6.0, 6.0], 3), 0.1)
+    now = replace(now, tracks=tracks, descriptors=blank)
+    link = Linker(FeatureAssociationConfig(), T_RIG_OPTICAL).link(candidates, now, prior)
+    assert link is not None
+    followed = candidates.tracks[link.rows] == now.tracks[link.columns]
+    assert followed.sum() > 0.85 * len(np.intersect1d(first, second))
+    assert not np.isin(link.columns[followed], wrong).any()
+    error = boxminus(link.T, SMALL_STEP)
+    assert error @ np.linalg.solve(link.covariance, error) < 25.0
+
+
+def test_features_without_a_track_pair_by_their_places(world: PointWorld, rng: np.random.Generator) -> None:
+    candidates, first, now, second = two_views(world, SMALL_STEP, rng)
+    lost = rng.random(len(now)) < 0.3
+    candidates = replace(candidates, tracks=1 + first)
+    now = replace(now, tracks=np.where(lost, 0, 1 + second))
+    prior = motion_prior(np.zeros(6), np.zeros((6, 6)), np.repeat([6.0, 6.0], 3), 0.1)
+    link = Linker(FeatureAssociationConfig(), T_RIG_OPTICAL).link(
+        candidates, now, MotionPrior(SMALL_STEP, prior.covariance)
+    )
+    assert link is not None
+    again = lost[link.columns]
+    assert (first[link.rows] == second[link.columns])[again].mean() > 0.95
+    assert again.sum() > 0.8 * np.isin(second[lost], first).sum()
 
 
 def test_descriptors_are_needed_where_the_prediction_is_vague(world: PointWorld, rng: np.random.Generator) -> None:

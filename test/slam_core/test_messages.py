@@ -265,6 +265,7 @@ def make_features(rng: np.random.Generator, n: int) -> Features:
     return Features(
         STAMP, floats(n, 3), floats(n, 2), floats(n), floats(n, 2), floats(n), floats(n),
         rng.integers(0, 3, n).astype(np.uint8), floats(n, 128), CAMERA, "left",
+        rng.integers(0, 2**24, n, dtype=np.int32, endpoint=True),
     )  # fmt: skip
 
 
@@ -273,14 +274,26 @@ def test_features_survive(rng: np.random.Generator, n: int) -> None:
     features = make_features(rng, n)
     sent = m.features_messages(TYPES, features)
     assert [f.name for f in sent.cloud.fields] == (
-        ["x", "y", "z", "u", "v", "depth", "sigma_u", "sigma_v", "sigma_depth", "response", "source"]
+        ["x", "y", "z", "u", "v", "depth", "sigma_u", "sigma_v", "sigma_depth", "response", "source", "track"]
     )
     assert {(f.datatype, f.count) for f in sent.cloud.fields} == {(7, 1)}
     back = m.features_from_messages(*map(over_the_wire, sent))
-    for name in ("xyz", "uv", "depth", "sigma_uv", "sigma_depth", "response", "source", "descriptors"):
+    for name in ("xyz", "uv", "depth", "sigma_uv", "sigma_depth", "response", "source", "descriptors", "track_ids"):
         np.testing.assert_array_equal(getattr(back, name), getattr(features, name))
         assert getattr(back, name).flags.c_contiguous, "sums over another layout round otherwise"
     assert (back.stamp_ns, back.camera, back.frame_id) == (STAMP, CAMERA, "left")
+
+
+def test_features_of_a_bag_without_tracks_have_none(rng: np.random.Generator) -> None:
+    cloud, descriptors, info = m.features_messages(TYPES, make_features(rng, 5))
+    points = m.cloud_from_message(cloud)
+    old = points[[name for name in points.dtype.names if name != "track"]]
+    packed = np.zeros(5, [(name, "<f4") for name in old.dtype.names])
+    for name in old.dtype.names:
+        packed[name] = old[name]
+    back = m.features_from_messages(m.cloud_message(TYPES, header(), packed), descriptors, info)
+    np.testing.assert_array_equal(back.track_ids, np.zeros(5))
+    np.testing.assert_array_equal(back.uv[:, 0], points["u"])
 
 
 def test_features_refuse_wrong_descriptors_and_nan(rng: np.random.Generator) -> None:

@@ -225,7 +225,6 @@ class Frontend:
         def detect() -> tuple[Keypoints, DepthEstimate, Float32Array]:
             self.counters.add("key_frames")
             left, right = self._extract(images)
-            left = left.select(tracker.is_free(left.uv))
             left, estimate = self._measured(images, left, right, depth, T_left_tof)
             return left, estimate, self._noise.sigma(left.size)
 
