@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every real recording in one table: accuracy and honesty, alone, with scan odometry, with and without the IMU.
 
-    python benchmarks/chain/recordings.py [NAME ...] [--json FILE] [--keep FOLDER] [--no-peers]
+    python benchmarks/chain/recordings.py [NAME ...] [--json FILE] [--keep FOLDER] [--no-peers] [--config FILE]
 
 NAME: mh01, v101, kitti1, kitti2, hololens, redkitchen (default: those whose data are there). A row is one run of
 ``slam run``'s pipeline: ATE (rigidly aligned) and end error mm, scale of the path, claimed position sigma over ATE,
@@ -99,13 +99,14 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the rows there too")
     parser.add_argument("--keep", type=Path, help="folder for bags and results")
     parser.add_argument("--no-peers", action="store_true", help="only our own runs")
+    parser.add_argument("--config", type=Path, help="parameters of all nodes, as slam run takes them")
     arguments = parser.parse_args()
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = arguments.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         for name in arguments.names:
-            for row in _rows(name, folder, not arguments.no_peers):
+            for row in _rows(name, folder, not arguments.no_peers, arguments.config):
                 rows.append(row)
                 print(_line(row), file=sys.stderr, flush=True)
     Console(width=150).print(_table(rows))
@@ -113,13 +114,13 @@ def main() -> None:
         arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
 
 
-def _rows(name: str, folder: Path, peers: bool) -> Iterator[Row]:
+def _rows(name: str, folder: Path, peers: bool, config: Path | None = None) -> Iterator[Row]:
     recording = RECORDINGS[name]
     bag = folder / f"{name}.mcap"
     if not bag.exists():
         slam(["convert", *map(str, recording.source), "-o", str(bag)], standalone_mode=False)
     for run in recording.runs:
-        yield from _own(name, bag, recording, run, folder / f"{name}_{run}")
+        yield from _own(name, bag, recording, run, folder / f"{name}_{run}", config)
     if peers:
         yield _pnp(name, bag, recording)
         if recording.mode == "tof":
@@ -127,9 +128,9 @@ def _rows(name: str, folder: Path, peers: bool) -> Iterator[Row]:
 
 
 # ---- our own runs
-def _own(name: str, bag: Path, recording: Recording, run: str, output: Path) -> Iterator[Row]:
+def _own(name: str, bag: Path, recording: Recording, run: str, output: Path, config: Path | None) -> Iterator[Row]:
     odometry = "ndt" if run == "ndt" else "none"
-    system = choose(load_system_config(None), recording.mode, "sjsam", odometry, "on" if run == "imu" else "off")
+    system = choose(load_system_config(config), recording.mode, "sjsam", odometry, "on" if run == "imu" else "off")
     start = time.process_time()
     result, mapping = run_bag(bag, system, odometry=odometry)
     ms = 1e3 * (time.process_time() - start) / max(result.frames, 1)

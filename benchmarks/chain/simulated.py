@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thesis's experiments on simulated bags (chapter 9): render, map offline, compare with the truth.
 
-    python benchmarks/chain/simulated.py [SCENARIO[/EVERY][:MODE] ...] [--keep FOLDER] [--profile ideal|real]
+    python benchmarks/chain/simulated.py [SCENARIO[/EVERY][:MODE] ...] [--keep FOLDER] [--profile ideal|real] [--config FILE]
 
 EVERY keeps each n-th frame, MODE is stereo, tof, replace or fuse; the scale error is positive for a map that is too
 large. Bags are kept in FOLDER and used again. The second
@@ -56,6 +56,7 @@ def main() -> None:
     parser.add_argument("runs", nargs="*", default=DEFAULT, metavar="RUN")
     parser.add_argument("--keep", type=Path, help="folder for the bags")
     parser.add_argument("--profile", choices=PROFILES, default="ideal", help="how hard the rendering is")
+    parser.add_argument("--config", type=Path, help="parameters of all nodes, as slam run takes them")
     arguments = parser.parse_args()
     table, agents = Table(title="simulated experiments, against the truth"), Table(title="several agents in one map")
     for heading in HEADINGS:
@@ -66,7 +67,9 @@ def main() -> None:
         for run in track(arguments.runs, description="mapping", console=Console(stderr=True)):
             name, _, mode = run.partition(":")
             bag = bag_of(name, arguments.keep or Path(scratch), arguments.profile)
-            result, mapping = run_bag(bag, choose(load_system_config(None, bag), mode or "stereo", "sjsam", "none"))
+            result, mapping = run_bag(
+                bag, choose(load_system_config(arguments.config, bag), mode or "stereo", "sjsam", "none")
+            )
             submaps = list(mapping.global_map.snapshot().submaps)
             table.add_row(run, *row(result, submaps))
             if len(result.agents) > 1:
