@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thesis's experiments on simulated bags (chapter 9): render, map offline, compare with the truth.
 
-    python benchmarks/chain/simulated.py [SCENARIO[/EVERY][:MODE] ...] [--keep FOLDER] [--profile ideal|real] [--config FILE]
+    python benchmarks/chain/simulated.py [SCENARIO[/EVERY][:MODE] ...] [--keep FOLDER] [--profile ideal|real]
+        [--config FILE]
 
 EVERY keeps each n-th frame, MODE is stereo, tof, replace or fuse; the scale error is positive for a map that is too
 large. Bags are kept in FOLDER and used again. The second
