@@ -122,8 +122,19 @@ class Features:
 
     def joined(self, others: Features) -> Features:
         """These and others of the same instant."""
-        names = ("xyz", "uv", "depth", "sigma_uv", "sigma_depth", "response", "source", "descriptors", "track_ids")
-        return replace(self, **{n: np.concatenate([getattr(self, n), getattr(others, n)]) for n in names})
+        f, g = self, others
+        return replace(
+            self,
+            xyz=np.concatenate([f.xyz, g.xyz]),
+            uv=np.concatenate([f.uv, g.uv]),
+            depth=np.concatenate([f.depth, g.depth]),
+            sigma_uv=np.concatenate([f.sigma_uv, g.sigma_uv]),
+            sigma_depth=np.concatenate([f.sigma_depth, g.sigma_depth]),
+            response=np.concatenate([f.response, g.response]),
+            source=np.concatenate([f.source, g.source]),
+            descriptors=np.concatenate([f.descriptors, g.descriptors]),
+            track_ids=np.concatenate([f.track_ids, g.track_ids]),
+        )
 
     def select(self, index: AnyArray) -> Features:
         """The features at ``index`` (mask or indices)."""
