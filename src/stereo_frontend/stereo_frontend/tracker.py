@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ import numpy.typing as npt
 
 from slam_core.camera import Camera
 from slam_core.geometry import FloatArray, transform_points
-from slam_core.types import ByteArray, Float32Array
+from slam_core.types import AnyArray, ByteArray, Float32Array
 from stereo_frontend.frame_motion import facing_warp, fit_motion, scaled_motion
 from stereo_frontend.keypoints import Keypoints, spread_over_grid
 from stereo_frontend.track_alignment import OUTPUTS, align_to_references
@@ -256,7 +257,7 @@ def _in_sight(points: FloatArray, uv: FloatArray, camera: Camera) -> npt.NDArray
         return np.asarray(inside & ~(points[:, 2] <= 0.05))
 
 
-def _projected(T: FloatArray, points: FloatArray, camera: Camera, otherwise: npt.NDArray[np.floating]) -> FloatArray:
+def _projected(T: FloatArray, points: FloatArray, camera: Camera, otherwise: AnyArray) -> FloatArray:
     """Pixels (n, 2) of moved points (n, 3), ``otherwise`` (n, 2) of those without depth or behind the camera."""
     pixels = camera.project(transform_points(T, points))
     return np.asarray(np.where(np.isfinite(pixels), pixels, otherwise))
@@ -268,11 +269,13 @@ def _composed(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray((A @ B).reshape(-1, 4))
 
 
-def _selected(values: object, index: npt.NDArray[np.generic]) -> object:
-    return values.select(index) if isinstance(values, Keypoints) else values[index]  # type: ignore[index]
+def _selected(values: Any, index: npt.NDArray[np.generic]) -> Any:
+    """Rows ``index`` of an array or of keypoints."""
+    return values.select(index) if isinstance(values, Keypoints) else values[index]
 
 
-def _joined(first: object, second: object) -> object:
+def _joined(first: Any, second: Any) -> Any:
+    """Rows of two arrays, or of two sets of keypoints, one after the other."""
     if isinstance(first, Keypoints):
-        return Keypoints(*(_joined(getattr(first, f.name), getattr(second, f.name)) for f in dataclasses.fields(first)))  # type: ignore[arg-type]
-    return np.concatenate([first, second])  # type: ignore[list-item]
+        return Keypoints(*(_joined(getattr(first, f.name), getattr(second, f.name)) for f in dataclasses.fields(first)))
+    return np.concatenate([first, second])

@@ -39,7 +39,9 @@ def features_messages(types: MessageTypes, features: Features) -> FeatureMessage
     f = features
     columns = [f.xyz, f.uv, f.depth, f.sigma_uv, f.sigma_depth, f.response, f.source, f.track_ids]
     table = (
-        np.column_stack([np.asarray(c, dtype="<f4") for c in columns]) if len(f) else np.empty((0, len(_DTYPE)), "<f4")
+        np.column_stack([np.asarray(c, dtype="<f4") for c in columns])
+        if len(f)
+        else np.empty((0, len(FEATURE_FIELDS) + 1), "<f4")
     )
     header = header_message(types, f.stamp_ns, f.frame_id)
     return FeatureMessages(
