@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from slam_bringup.experiments import plots
+from slam_bringup.experiments import plots, thesis
 from slam_bringup.experiments.chain import mapped
 from slam_bringup.experiments.filtering import frames
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
@@ -49,7 +49,7 @@ def _experiment() -> Experiment:
         beyond = 100.0 * float(np.mean(arrays["distance"] > 0.1))
         row = [str(len(arrays["distance"])), *(f"{q:.1f}" for q in quantiles), f"{beyond:.2f}"]
         return Findings(
-            [Comparison("distance of the model's points from the true surfaces, median", "a figure",
+            [Comparison("distance of the model's points from the true surfaces, median", thesis.MODEL,
                         f"{quantiles[0]:.1f} mm", f"<= {1e3 * _MARK_M:.0f} mm", bool(quantiles[0] <= 1e3 * _MARK_M))],
             [Table(f"Points within {_NEAR_M:g} m of the way", ("points", "median mm", "90 % mm", "95 % mm",
                                                                "beyond 10 cm %"), [row])],

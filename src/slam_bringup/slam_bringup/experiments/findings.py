@@ -11,15 +11,16 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from slam_bringup.experiments.job import Job, JobResult
+from slam_bringup.experiments.thesis import Claim
 from slam_bringup.report.figures import save_png
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One quantity beside the thesis's: both as text, the mark it must reach, and whether it does (None: no mark)."""
+    """One quantity beside the thesis's: both in short, the mark it must reach, and whether it does (None: no mark)."""
 
     quantity: str
-    thesis: str
+    thesis: Claim | str
     ours: str
     mark: str = ""
     met: bool | None = None
@@ -72,7 +73,9 @@ def as_json(experiment: Experiment, findings: Findings, folder: Path, *, quick: 
         save_png(folder / file, picture.figure, dpi=110)
         pictures.append({"file": file, "number": picture.number, "caption": picture.caption})
     comparisons = [
-        asdict(c) | {"met": None if quick or c.met is None else bool(c.met)}  # NumPy's bool is none of JSON's
+        asdict(c)
+        | {"thesis": str(c.thesis), "quote": c.thesis.quote if isinstance(c.thesis, Claim) else ""}
+        | {"met": None if quick or c.met is None else bool(c.met)}  # NumPy's bool is none of JSON's
         for c in findings.comparisons
     ]
     return {

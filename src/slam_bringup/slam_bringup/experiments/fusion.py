@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from slam_bringup.experiments import plots
+from slam_bringup.experiments import plots, thesis
 from slam_bringup.experiments.chain import mapped
 from slam_bringup.experiments.features import tof_picture
 from slam_bringup.experiments.filtering import ACCURACY_HEADER, accuracy_row, bounds_comparison, frames
@@ -57,8 +57,8 @@ def _modes() -> Experiment:
         results = {name: result for name, result in results.items() if name != _PIXELS}
         ate = {name: 1e3 * r.values["agents"][0]["joined_ate_m"] for name, r in results.items()}
         best = min(MODES, key=lambda mode: ate[mode])
-        comparisons = [Comparison(f"ATE, {mode}", "missing from our copy", f"{ate[mode]:.1f} mm") for mode in MODES] + [
-            Comparison("best of the four", "missing from our copy", best, "fuse", best == "fuse"),
+        comparisons = [Comparison(f"ATE, {mode}", thesis.CH11_ABSENT, f"{ate[mode]:.1f} mm") for mode in MODES] + [
+            Comparison("best of the four", thesis.CH11_ABSENT, best, "fuse", best == "fuse"),
             bounds_comparison("small_room", results["fuse"]),
         ]
         return Findings(
@@ -93,7 +93,7 @@ def _firemen() -> Experiment:
             comparisons.append(
                 Comparison(
                     f"{len(agents)} firemen in one map, largest ATE",
-                    "only imagined",
+                    thesis.FIREMEN,
                     f"{1e3 * worst:.1f} mm",
                     "<= 60 mm, as of one agent",
                     worst <= 0.06,

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from slam_bringup.experiments import plots
+from slam_bringup.experiments import plots, thesis
 from slam_bringup.experiments.chain import mapped
 from slam_bringup.experiments.filtering import (
     ACCURACY_HEADER,
@@ -20,6 +20,7 @@ from slam_bringup.experiments.filtering import (
 )
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
 from slam_bringup.experiments.job import Job, JobResult
+from slam_bringup.experiments.thesis import Claim
 
 
 def _one_filter() -> Experiment:
@@ -34,12 +35,12 @@ def _one_filter() -> Experiment:
         last = np.median(one.arrays["ms ekf"][-50:]), np.median(joined.arrays["ms ekf"][-50:])
         return Findings(
             comparisons=[
-                landmarks_comparison(one, "818"),
-                Comparison("one filter: heading at the end", "sigma far too small, the map bends",
+                landmarks_comparison(one, thesis.ONE_FILTER_LANDMARKS),
+                Comparison("one filter: heading at the end", thesis.ONE_FILTER_HEADING,
                            f"claims {heading:.2f} deg, errs {error:.2f} deg"),
-                Comparison("ANEES, one filter and joined submaps", "not measured", f"{anees[0]:.2f}, {anees[1]:.2f}",
+                Comparison("ANEES, one filter and joined submaps", thesis.ABSENT, f"{anees[0]:.2f}, {anees[1]:.2f}",
                            "submaps more consistent", abs(np.log(anees[1])) <= abs(np.log(anees[0]))),
-                Comparison("time per frame at the end", "10 min in all", f"{last[0]:.0f} ms, with submaps "
+                Comparison("time per frame at the end", thesis.ONE_FILTER_TIME, f"{last[0]:.0f} ms, with submaps "
                            f"{last[1]:.0f} ms", "submaps cheaper", bool(last[1] < last[0])),
                 bounds_comparison("two_rooms", joined),
             ],
@@ -57,7 +58,12 @@ def _one_filter() -> Experiment:
 
 
 def _joined(
-    name: str, sections: str, title: str, thesis: Mapping[str, str], mark_m: float | None, numbers: Mapping[str, str]
+    name: str,
+    sections: str,
+    title: str,
+    claims: Mapping[str, Claim | str],
+    mark_m: float | None,
+    numbers: Mapping[str, str],
 ) -> Experiment:
     def jobs(quick: bool) -> Mapping[str, Job]:
         return {"run": mapped(name, frames=frames(quick))}
@@ -65,7 +71,7 @@ def _joined(
     def report(results: Mapping[str, JobResult]) -> Findings:
         run = results["run"]
         return Findings(
-            _comparisons(name, run, thesis, mark_m),
+            _comparisons(name, run, claims, mark_m),
             [Table("Accuracy", ACCURACY_HEADER, [accuracy_row(name, run)])],
             [
                 Picture(plots.submaps(run.arrays, "chained"), numbers["before"], "Submaps before joining."),
@@ -80,29 +86,31 @@ def _joined(
     return Experiment(name, sections, title, jobs, report)
 
 
-def _comparisons(name: str, run: JobResult, thesis: Mapping[str, str], mark_m: float | None) -> list[Comparison]:
+def _comparisons(
+    name: str, run: JobResult, claims: Mapping[str, Claim | str], mark_m: float | None
+) -> list[Comparison]:
     summary, agent = run.values["summary"], run.values["agents"][0]
     merge = run.arrays["ms sjsam"]
     half = max(1, len(merge) // 2)
     comparisons = [
-        landmarks_comparison(run, thesis["landmarks"]),
-        Comparison("submaps", thesis["submaps"], str(summary["submaps"])),
-        speed_comparison(run, thesis["time"]),
-        Comparison("joining, s", thesis["joining"], f"{merge.sum() / 1e3:.1f} in all"),
+        landmarks_comparison(run, claims["landmarks"]),
+        Comparison("submaps", claims["submaps"], str(summary["submaps"])),
+        speed_comparison(run, claims["time"]),
+        Comparison("joining, s", claims["joining"], f"{merge.sum() / 1e3:.1f} in all"),
         Comparison(
             "joining, ms a submap, first and second half",
-            "spikes at closures",
+            thesis.CLOSURES_COST,
             f"{np.mean(merge[:half]):.0f}, {np.mean(merge[-half:]):.0f}",
         ),
     ]
     if mark_m is not None:
-        comparisons.append(end_comparison(run, thesis["end"], mark_m))
+        comparisons.append(end_comparison(run, claims["end"], mark_m))
     else:
         closed = summary["loop_closures"] > 0 and agent["joined_end_m"] < 0.01 * agent["path_m"]
         comparisons.append(
             Comparison(
                 "loop",
-                thesis["end"],
+                claims["end"],
                 f"{summary['loop_closures']} closures, end error {1e3 * agent['joined_end_m']:.1f} mm",
                 "closed, end error < 1 % of the way",
                 closed,
@@ -110,7 +118,7 @@ def _comparisons(name: str, run: JobResult, thesis: Mapping[str, str], mark_m: f
         )
     comparisons.append(bounds_comparison(name, run))
     drift = np.ptp(run.arrays["0 filter poses"][:, 2, 3])
-    comparisons.append(Comparison("range of height before joining", thesis["height"], f"{drift:.2f} m"))
+    comparisons.append(Comparison("range of height before joining", claims["height"], f"{drift:.2f} m"))
     return comparisons
 
 
@@ -123,8 +131,8 @@ def _workshop() -> Experiment:
         before = run.values["agents"][0]["filter_end_m"]
         return Findings(
             comparisons=[
-                Comparison("end error before joining", "30 cm (?)", f"{1e3 * before:.1f} mm"),
-                end_comparison(run, "2 cm", 0.02),
+                Comparison("end error before joining", thesis.WORKSHOP_BEFORE, f"{1e3 * before:.1f} mm"),
+                end_comparison(run, thesis.WORKSHOP_END, 0.02),
             ],
             pictures=[
                 Picture(plots.submaps(run.arrays, "chained"), "9.26", "Submaps of the workshop."),
@@ -139,15 +147,15 @@ EXPERIMENTS = (
     _one_filter(),
     _joined(
         "figure_eight", "9.2.1-9.2.3", "Two rooms in a figure eight",
-        {"landmarks": "1275", "submaps": "34", "time": "155 s without features", "joining": "21", "end": "6 cm",
-         "height": "not given"},
+        {"landmarks": thesis.EIGHT_LANDMARKS, "submaps": thesis.EIGHT_SUBMAPS, "time": thesis.EIGHT_TIME,
+         "joining": thesis.EIGHT_JOINING, "end": thesis.EIGHT_END, "height": thesis.ABSENT},
         0.06,
         {"before": "9.19", "after": "9.22", "matrix": "9.23", "sigma": "9.24", "times": "9.25"},
     ),
     _joined(
         "five_rooms", "9.2.1", "Five rooms, a loop of 70 m",
-        {"landmarks": "not given", "submaps": "70 (?)", "time": "not given", "joining": "failed",
-         "end": "never closed", "height": "2 m"},
+        {"landmarks": thesis.ABSENT, "submaps": thesis.ABSENT, "time": thesis.ROOMS_TIME,
+         "joining": thesis.ROOMS_LOOP, "end": thesis.ROOMS_LOOP, "height": thesis.ROOMS_HEIGHT},
         None,
         {"before": "9.21", "after": "", "matrix": "", "sigma": "", "times": ""},
     ),

@@ -53,6 +53,7 @@ def write_markdown(path: Path, findings: Sequence[Mapping[str, Any]]) -> None:
         lines += _markdown_table(("quantity", "thesis", "ours", "mark", ""), rows)
         for table in entry["tables"]:
             lines += [f"{table['title']}:", "", *_markdown_table(table["header"], table["rows"])]
+    lines += _claims(findings)
     atomic_text(path, "\n".join(lines).rstrip() + "\n")
 
 
@@ -63,10 +64,26 @@ def _summary(findings: Sequence[Mapping[str, Any]]) -> list[str]:
     lines = []
     if marks:
         met = len(marks) - len(missed)
-        lines += [f"{met} of {len(marks)} marks are met. Not met: {'; '.join(missed) or 'none'}.", ""]
+        lines += [
+            f"{met} of {len(marks)} marks are met. Not met: {'; '.join(missed) or 'none'}. The marks are ours, and so"
+            " are the rooms: scenarios of profile `ideal`, without much of what makes real recordings hard.",
+            "",
+        ]
     if absent := [name for name in EXPERIMENTS if name not in {entry["name"] for entry in findings}]:
         lines += [f"Not part of this run: {', '.join(absent)}.", ""]
     return lines
+
+
+def _claims(findings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Every claim of the thesis with its words and what stands against it; sections stand behind the claims."""
+    rows = [
+        [c["thesis"], f'"{c["quote"]}"', c["quantity"], c["ours"], f"`slam experiment {entry['name']} -o OUT`"]
+        for entry in findings
+        for c in entry["comparisons"]
+        if c["quote"]
+    ]
+    table = _markdown_table(("claim (section)", "quote", "quantity", "ours", "command"), rows)
+    return ["## Claims of the thesis", "", *table] if rows else []
 
 
 def _markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from ekf_slam_node.planar import PlanarConfig, PlanarEkf, wrap
 from ekf_slam_node.planar_sam import PlanarGraph, PlanarMap, cost, smooth
-from slam_bringup.experiments import plots
+from slam_bringup.experiments import plots, thesis
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
 from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_core.evaluation import anees_bounds, nees
@@ -139,7 +139,7 @@ def _report(results: Mapping[str, JobResult]) -> Findings:
         comparisons.append(
             Comparison(
                 f"NEES of the last pose, {name}",
-                "not measured",
+                thesis.ABSENT,
                 f"{mean:.2f}",
                 f"{low:.2f} to {high:.2f}",
                 low <= mean <= high,
@@ -149,7 +149,7 @@ def _report(results: Mapping[str, JobResult]) -> Findings:
     comparisons.append(
         Comparison(
             "SAM's cost below the filter's",
-            "SAM smooths the whole path",
+            thesis.SMOOTHS,
             "in every run" if below else "not in every run",
             "in every run",
             below,
