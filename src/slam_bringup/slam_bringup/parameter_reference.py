@@ -41,6 +41,10 @@ def reference() -> str:
     """The page as Markdown; it needs ROS, whose nodes have parameters of their own."""
     system = {f.name: getattr(SystemConfig(), f.name) for f in fields(SystemConfig)}
     sections = [_node_section(name, system.get(name), *where) for name, where in (NODE_CONFIGS | _TOOLS).items()]
+    judged = [_row(*entry) for entry in iterate_parameters(system["run"])]
+    sections.append(
+        _section("run (no node: by this `slam run`, `slam nodes` and `slam demo` judge a finished run)", judged)
+    )
     every = [_row(*entry) for entry in iterate_parameters(InputConfig(), "input.")]
     sections.append(_section("Every node (`--ros-args -p input.policy:=all`)", every))
     return "\n".join([_PREAMBLE, *sections])

@@ -29,10 +29,12 @@ def copy(target: Path, change: Callable[[str, int, Any], list[Any]]) -> Path:
     return target
 
 
-def run(bag: Path, out: Path) -> dict[str, Any]:
+def run(bag: Path, out: Path, code: int = 0, said: str = "") -> dict[str, Any]:
     command = [sys.executable, "-m", "slam_bringup.cli", "-q", "run", str(bag), "-o", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == code, done.stderr
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == bool(code), done.stderr
     summary: dict[str, Any] = json.loads((out / "summary.json").read_text())
     return summary
 
@@ -70,15 +72,29 @@ def test_every_frame_twice_is_a_duplicate_and_mapped_once(tmp_path: Path) -> Non
     }
 
 
-@pytest.mark.slow
-def test_frames_under_another_calibration_are_left_out_and_told(tmp_path: Path) -> None:
-    def refocused(topic: str, number: int, message: Any) -> list[Any]:
-        if number >= 40 and "stereo" in topic and "camera_info" in topic:
+def refocused(first: int) -> Callable[[str, int, Any], list[Any]]:
+    """Focal length x 1.3 from a frame on."""
+
+    def change(topic: str, number: int, message: Any) -> list[Any]:
+        if number >= first and "stereo" in topic and "camera_info" in topic:
             message.k = message.k * [1.3, 1, 1, 1, 1.3, 1, 1, 1, 1]
             message.p = message.p * [1.3, 1, 1, 1.3, 1, 1.3, 1, 1, 1, 1, 1, 1]
         return [message]
 
-    summary = run(copy(tmp_path / "bag", refocused), tmp_path / "out")
+    return change
+
+
+@pytest.mark.slow
+def test_frames_under_another_calibration_are_left_out_and_told(tmp_path: Path) -> None:
+    summary = run(copy(tmp_path / "bag", refocused(40)), tmp_path / "out")
     assert summary["frames"] == 40
     assert sum(n for reason, n in summary["dropped_by_reason"].items() if "another calibration" in reason) == 12
     assert any("has changed (fx" in event for event in summary["events"])
+    assert (summary["state"], summary["degraded"]) == ("OK", [])
+
+
+@pytest.mark.slow
+def test_a_run_that_lost_most_frames_says_so_in_one_line_and_ends_with_a_code_of_its_own(tmp_path: Path) -> None:
+    summary = run(copy(tmp_path / "bag", refocused(10)), tmp_path / "out", code=3, said="DEGRADED: 81% of the messages")
+    assert summary["state"] == "DEGRADED"
+    assert "another calibration" in summary["degraded"][0]

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import socket
-import sys
 from pathlib import Path
 
 import click
@@ -18,10 +17,11 @@ from slam_bringup.commands.mapping_options import (
     mode_for,
     require_map,
 )
+from slam_bringup.commands.run_end import end_run
 from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, overrides_for, system_config, with_files
 from slam_bringup.pipeline.overrides import Overrides, read_overrides
-from slam_bringup.processes.interrupt import INTERRUPTED, MAP, Interrupt, giving_up
+from slam_bringup.processes.interrupt import MAP, Interrupt, giving_up
 from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.start_map import StartMap
 from slam_bringup.report.summary_table import summary_table
@@ -74,8 +74,7 @@ def command(
         summary = write_results(folder, result, pictures=not run.stopped)
         transcript.write(folder / LOGS / LOG_NAME, summary_table(summary, output))
     show(summary_table(summary, output))
-    if run.stopped:
-        sys.exit(INTERRUPTED)
+    end_run(summary, output, stopped=run.stopped)
 
 
 def _page(view: bool) -> int:

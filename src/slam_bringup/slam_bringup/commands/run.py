@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,18 +16,16 @@ from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, parse_topics
 from slam_bringup.commands.console import LOG_NAME, Transcript, is_quiet, progress_bar, show
 from slam_bringup.commands.mapping_options import mapping_options, mode_for, require_map
+from slam_bringup.commands.run_end import end_run
 from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.map_growth import MapGrowth, map_growth
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.processes.interrupt import INTERRUPTED, MAP, STOPPED, Interrupt, giving_up
+from slam_bringup.processes.interrupt import MAP, STOPPED, Interrupt, giving_up
 from slam_bringup.report.early_output import EarlyOutput
 from slam_bringup.report.summary_table import summary_table
 from slam_bringup.version import VERSION
 from slam_core.output_folder import LOGS, OutputFolder
-
-FAILED = 1
-"""Exit code of a run that an error has ended; its results are written."""
 
 
 @click.command()
@@ -41,7 +38,7 @@ def command(
     """Map BAG without ROS: same classes as the nodes, no drops, the same bytes every time.
 
     BAG is a folder or file of ROS 2 (mcap, db3) or a .bag of ROS 1. Ctrl-C ends it early and writes what is mapped; an
-    error on the way does too, is named, and makes the exit code 1.
+    error on the way does too, is named, and makes the exit code 1. A run that lost most of its way ends with 3.
 
     With --map all results are in the frame of that map; OUT gets a map of its own, the old one is only read.
     """
@@ -80,11 +77,7 @@ def command(
             summary = early.write_rest(result, pictures=not interrupt.asked)
             transcript.write(folder / LOGS / LOG_NAME, summary_table(summary, output))
     show(summary_table(summary, output))
-    if result.failure:
-        click.echo(f"slam: {result.failure}; {output} holds what was mapped until then", err=True)
-        sys.exit(FAILED)
-    if interrupt.asked:
-        sys.exit(INTERRUPTED)
+    end_run(summary, output, stopped=interrupt.asked)
 
 
 @contextmanager

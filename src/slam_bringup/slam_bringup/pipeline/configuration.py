@@ -25,6 +25,7 @@ from slam_bringup.pipeline.overrides import (
     require_known_nodes,
     require_known_parameters,
 )
+from slam_bringup.pipeline.verdict import RunConfig
 from slam_core.config import Config, from_mapping, group, is_fixed_now, iterate_parameters
 from stereo_frontend.frontend import FrontendConfig
 from tof_driver.depth import DepthConfig
@@ -35,7 +36,7 @@ ODOMETRIES = ("none", "ndt", "icp")
 
 @dataclass(frozen=True)
 class SystemConfig(Config):
-    """Configurations of all nodes, named after them."""
+    """Configurations of all nodes, named after them, and ``run``: what a finished run is judged by."""
 
     tof_driver: DepthConfig = group(DepthConfig)
     feature_extractor: FrontendConfig = group(FrontendConfig)
@@ -43,6 +44,7 @@ class SystemConfig(Config):
     ekf_slam: FilterConfig = group(FilterConfig)
     sjsam: GlobalMapConfig = group(GlobalMapConfig)
     dense_mapper: DenseConfig = group(DenseConfig)
+    run: RunConfig = group(RunConfig)
 
 
 def load_system_config(path: Path | None, bag: Path | None = None, known: Iterable[Path] = ()) -> SystemConfig:

@@ -16,6 +16,7 @@ from dense_mapping.surface import Surface
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_bringup.pipeline.frame_log import LoggedFrame
+from slam_bringup.pipeline.verdict import RunConfig, faults_of_run
 from slam_core.evaluation import Evaluation, evaluate
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
@@ -103,6 +104,8 @@ class RunResult:
     backlog: Mapping[str, int] = field(default_factory=dict)
     changed: Mapping[str, Any] = field(default_factory=dict)
     """Parameters that are not at their defaults."""
+    limits: RunConfig = field(default_factory=RunConfig)
+    """What it is judged by."""
     is_localized: bool = False
     """True if the agents were located in a map of an earlier run, and nothing was mapped."""
 
@@ -142,7 +145,9 @@ def summarise(result: RunResult) -> dict[str, Any]:
     }
     if result.is_localized:
         summary["localization"] = {agent.name: _located(agent) for agent in result.agents}
-    return summary | _only_some_have(result, first)
+    faults = faults_of_run(summary, result.limits)
+    verdict = {"state": "DEGRADED" if faults else "OK", "degraded": faults}
+    return summary | verdict | _only_some_have(result, first)
 
 
 def _located(agent: AgentResult) -> dict[str, float | None]:

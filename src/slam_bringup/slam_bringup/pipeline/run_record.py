@@ -165,6 +165,7 @@ def run_result(
         solver=record.solver,
         backlog=record.backlog,
         changed=_changed(config),
+        limits=config.run,
     )
     on_mapped(mapped)
     surface, plans, failure = _dense(bag, config, record, agents, on_reading, stopped)

@@ -23,6 +23,8 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
     for name, sensors in summary["sensors"].items():
         if sensors:
             table.add_row(f"sensors {name}".strip(), ", ".join(sensors))
+    if summary["degraded"]:
+        table.add_row("state", "\n".join([summary["state"], *summary["degraded"]]))
     table.add_row("frames", f"{summary['frames']}, {_lost(summary)}")
     for reason, count in summary["dropped_by_reason"].items():
         table.add_row("dropped", f"{count} x {reason}")
