@@ -162,10 +162,10 @@ def test_a_live_node_leaves_out_what_comes_too_fast_and_says_so(node: EarNode) -
         pass
     assert node.heard == [START + 900 * MS]
     assert len(progress) == 10  # a player need not wait for those left out
-    status = node._diagnostic_message("").status[0]
+    status = node._diagnostic_message().status[0]
     assert {v.key: v.value for v in status.values}["skipped"] == "9"
     assert "9 frames left out" in status.message
-    assert "left out" not in node._diagnostic_message("").status[0].message
+    assert "left out" not in node._diagnostic_message().status[0].message
 
 
 class RelayNode(SlamNode[EarConfig]):
@@ -243,7 +243,7 @@ def test_another_publisher_of_what_a_node_alone_should_say_is_reported(node: Ear
 
 def test_gaps_of_the_stamps_are_counted(node: EarNode) -> None:
     send(node, "frames", *(START + k * 100 * MS for k in (0, 1, 2, 3, 4, 7, 8)))
-    values = {v.key: v.value for v in node._diagnostic_message("").status[0].values}
+    values = {v.key: v.value for v in node._diagnostic_message().status[0].values}
     assert values["missing"] == "2"
 
 

@@ -5,6 +5,7 @@ end.
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -22,6 +23,7 @@ rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 from sensor_msgs.msg import CameraInfo as InfoMessage  # noqa: E402
 from sensor_msgs.msg import Image, PointCloud2  # noqa: E402
 from sensor_msgs.srv import SetCameraInfo  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
 
 from ros_probe import Probe  # noqa: E402
 from slam_core.camera import Camera, CameraInfo  # noqa: E402
@@ -49,11 +51,13 @@ SIDES = ("left", "right")
 class PairProbe(Probe):
     """Sends raw pairs."""
 
-    def send_pair(self, stamp: int, pair: StereoImages, encoding: str = "mono8", infos: bool = True) -> None:
+    def send_pair(
+        self, stamp: int, pair: StereoImages, encoding: str = "mono8", infos: dict[str, CameraInfo] = INFOS
+    ) -> None:
         for side, image in zip(SIDES, (pair.left, pair.right), strict=True):
             header = header_message(self.types, stamp, f"stereo_{side}_optical_frame")
             if infos:
-                self.send(f"stereo/{side}/camera_info", camera_info_message(self.types, header, INFOS[side]))
+                self.send(f"stereo/{side}/camera_info", camera_info_message(self.types, header, infos[side]))
             message = image_message(self.types, header, image)
             message.encoding = encoding
             self.send(f"stereo/{side}/image_raw", message)
@@ -165,6 +169,36 @@ def test_a_new_calibration_is_written_and_used(probe, start, tmp_path: Path):
     probe.wait(future.done, "no answer")
     assert future.result().success, future.result().status_message
     assert read_camera_info(paths["left"]).info.camera.fx == 190.0
+
+
+def test_pairs_under_another_calibration_are_rejected_until_the_node_is_reset(probe, start, stereo_pair):
+    probe.listen("stereo/left/image_rect", Image)
+    process, pair = start("driver_node"), stereo_pair()
+    rectified, stamps = probe.received["stereo/left/image_rect"], itertools.count(10_000_000_000, 100_000_000)
+    for _ in range(10):
+        if not rectified:
+            probe.send_pair(next(stamps), pair)
+            probe.spin(0.5)
+    rectified.clear()
+    refocused = Camera(320, 240, 1.3 * LENS.fx, 1.3 * LENS.fy, LENS.cx, LENS.cy, "plumb_bob", LENS.distortion)
+    new = {side: CameraInfo(refocused, P=info.P) for side, info in INFOS.items()}
+    probe.send_pair(next(stamps), pair, infos=new)  # its images may overtake the infos
+    probe.spin(1.0)
+    rectified.clear()
+    for _ in range(2):
+        probe.send_pair(next(stamps), pair, infos=new)
+    probe.spin(2.0)
+    assert not rectified
+    client = probe.node.create_client(Trigger, "stereo_driver/reset")
+    probe.wait(client.service_is_ready, "no reset service")
+    future = client.call_async(Trigger.Request())
+    probe.wait(future.done, "no answer")
+    probe.send_pair(next(stamps), pair, infos=new)
+    probe.wait(lambda: bool(rectified), "nothing after the reset")
+    expected = StereoRectifier(new["left"], new["right"])(0, pair.left, pair.right).left
+    np.testing.assert_array_equal(image_from_message(rectified[0]), expected)
+    process.send_signal(signal.SIGINT)
+    assert "has changed (fx 198 to 257.4 px)" in process.communicate(timeout=30)[1]
 
 
 def test_a_source_without_calibration_does_not_start(start, tmp_path: Path):

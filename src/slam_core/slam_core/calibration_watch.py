@@ -6,6 +6,8 @@ A map is made of one calibration. A focal length that changes on the way would b
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from slam_core.camera import CameraInfo
@@ -29,9 +31,21 @@ class CalibrationWatch:
         changed = [_change(name, self._used[name], info) for name, info in self._newest.items()]
         return "; ".join(filter(None, changed))
 
-    def restart(self) -> None:
-        """Use the newest calibrations."""
+    def require_unchanged(self) -> None:
+        """Refuse images while a node that is not reset hears another calibration.
+
+        Raises
+        ------
+        ValueError
+            With the camera, and what has changed.
+        """
+        if complaint := self.complaint:
+            raise ValueError(f"{complaint}; reset the node (~/reset) to use the new one")
+
+    def restart(self) -> Mapping[str, CameraInfo]:
+        """Use the newest calibrations, which are returned by camera."""
         self._used = dict(self._newest)
+        return self._used
 
 
 def same_calibration(a: CameraInfo, b: CameraInfo) -> bool:

@@ -19,6 +19,7 @@ from typing import Any
 from sensor_msgs.srv import SetCameraInfo
 
 from slam_core.base_node import SlamNode
+from slam_core.calibration_watch import CalibrationWatch
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.config import Config, parameter
@@ -68,6 +69,7 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
     def __init__(self) -> None:
         super().__init__("stereo_driver", StereoDriverConfig)
         self.stage = StereoStage()
+        self.calibrations = CalibrationWatch()
         self.files = {"left": self.config.left_info, "right": self.config.right_info}
         self.right_frame = self.config.right_frame
         self._open_files()
@@ -84,7 +86,13 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
             self._start_source(self.source.rate)
 
     def on_reset(self) -> None:
-        """Forget what waits."""
+        """Forget what waits, and use the newest calibration."""
+        self.stage.reset()
+        for side, info in self.calibrations.restart().items():
+            self.stage.set_info(side, info)
+
+    def on_new_session(self) -> None:
+        """Forget what waits; the map goes on, with its calibration."""
         self.stage.reset()
 
     def on_close(self) -> None:
@@ -102,10 +110,13 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
         self.listen_together({f"stereo/{side}/image_raw{ending}": kind for side in SIDES}, self._on_pair)
 
     def _on_info(self, side: str, message: Message) -> None:
-        self.stage.set_info(side, camera_info_from_message(message))
+        info = camera_info_from_message(message)
+        if self.calibrations.hear(side, info):
+            self.stage.set_info(side, info)
         self._publish_rectified()
 
     def _on_pair(self, left: Message, right: Message) -> None:
+        self.calibrations.require_unchanged()
         self.right_frame = right.header.frame_id
         grey, colour = grey_and_colour_from_message(left)
         self.stage.add(RawPair(stamp_ns(left), grey, grey_from_message(right), left.header.frame_id, colour))
@@ -202,7 +213,7 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
             )
         CameraInfoFile(info, side).write(Path(self.files[side]).expanduser())
         self.stage.set_info(side, info)
-        return f"written to {self.files[side]} and in use"
+        return f"written to {self.files[side]} and in use; begin a new map, and reset feature_extractor (~/reset)"
 
 
 def main() -> None:

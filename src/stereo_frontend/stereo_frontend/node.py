@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from functools import partial
 
+from slam_core.calibration_watch import CalibrationWatch
 from slam_core.health import State
 from slam_core.messages import (
     FEATURE_TOPICS,
@@ -44,6 +45,7 @@ class FeatureNode(StageNode[FrontendConfig]):
     def __init__(self) -> None:
         super().__init__("feature_extractor", FrontendConfig)
         self.pairs = StereoStage(rectified=True)
+        self.calibrations, self.depth_calibration = CalibrationWatch(), CalibrationWatch()
         self.stage: FeatureStage = FeatureStage(self.config, self.frames)
         for topic, kind in (*FEATURE_TOPICS.items(), ("features/image", "Image")):
             self.advertise(topic, kind)
@@ -53,7 +55,14 @@ class FeatureNode(StageNode[FrontendConfig]):
             self._listen_to_depth()
 
     def on_reset(self) -> None:
-        """Forget thresholds, noise and queues; the calibration stays."""
+        """Forget thresholds, noise and queues, and use the newest calibration."""
+        self.on_new_session()
+        self.depth_calibration.restart()
+        for side, info in self.calibrations.restart().items():
+            self.pairs.set_info(side, info)
+
+    def on_new_session(self) -> None:
+        """Forget thresholds, noise and queues; the map goes on, with its calibration."""
         self.stage.reset()
         self.pairs.reset()
 
@@ -87,15 +96,20 @@ class FeatureNode(StageNode[FrontendConfig]):
         return "amplitude"
 
     def _on_info(self, side: str, message: Message) -> None:
-        self.pairs.set_info(side, camera_info_from_message(message))
+        info = camera_info_from_message(message)
+        if self.calibrations.hear(side, info):
+            self.pairs.set_info(side, info)
         self.publish_ready()
 
     def _on_pair(self, left: Message, right: Message) -> None:
+        self.calibrations.require_unchanged()
         grey, colour = grey_and_colour_from_message(left)
         self.pairs.add(RawPair(stamp_ns(left), grey, grey_from_message(right), left.header.frame_id, colour))
         self.publish_ready()
 
     def _on_depth(self, depth: Message, noise: Message, info: Message, picture: Message | None = None) -> None:
+        self.depth_calibration.hear("tof", camera_info_from_message(info))
+        self.depth_calibration.require_unchanged()
         pictures = {} if picture is None else {self._tof_picture(): picture}
         self.stage.add_depth(depth_from_messages(depth, noise, info, **pictures))
         self.publish_ready()

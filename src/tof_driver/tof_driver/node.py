@@ -22,6 +22,7 @@ from typing import Any
 from sensor_msgs.srv import SetCameraInfo
 
 from slam_core.base_node import SlamNode
+from slam_core.calibration_watch import CalibrationWatch
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.config import parameter
@@ -69,6 +70,7 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
     def __init__(self) -> None:
         super().__init__("tof_driver", TofDriverConfig)
         self.stage = DepthStage(depth_config(self.config))
+        self.calibrations = CalibrationWatch()
         self._pictures = self._picture_names()
         if self.config.info:
             self.stage.set_info(_read(self.config.info))
@@ -77,7 +79,13 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
         self.create_service(SetCameraInfo, "tof/set_camera_info", self._on_set_info)
 
     def on_reset(self) -> None:
-        """Forget what waits; the calibration stays."""
+        """Forget what waits, and use the newest calibration."""
+        self.stage.reset()
+        for info in self.calibrations.restart().values():
+            self.stage.set_info(info)
+
+    def on_new_session(self) -> None:
+        """Forget what waits; the map goes on, with its calibration."""
         self.stage.reset()
 
     # -- topics --------------------------------------------------------------------------------------------------------
@@ -114,10 +122,13 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
     # -- inputs --------------------------------------------------------------------------------------------------------
 
     def _on_info(self, message: Message) -> None:
-        self.stage.set_info(camera_info_from_message(message))
+        info = camera_info_from_message(message)
+        if self.calibrations.hear("tof", info):
+            self.stage.set_info(info)
         self._publish_ready()
 
     def _on_images(self, *messages: Message) -> None:
+        self.calibrations.require_unchanged()
         pictures = dict(zip(self._roles(), map(picture_from_message, messages[1:]), strict=True))
         header = messages[0].header
         image = picture_from_message(messages[0])
@@ -164,7 +175,7 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
             )
         CameraInfoFile(info, "tof").write(Path(self.config.info).expanduser())
         self.stage.set_info(info)
-        return f"written to {self.config.info} and in use"
+        return f"written to {self.config.info} and in use; begin a new map, and reset feature_extractor (~/reset)"
 
 
 def depth_config(config: TofDriverConfig) -> DepthConfig:

@@ -123,6 +123,25 @@ def test_bags_without_cameras_or_calibration_are_refused(tmp_path: Path) -> None
         SensorBag(tmp_path / "bag").__enter__()
 
 
+def test_an_image_topic_without_messages_is_told_as_that(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        for side in ("left", "right"):
+            bag.declare(f"/stereo/{side}/image_raw", "sensor_msgs/msg/Image")
+        SensorWriter(bag).ground_truth(1, np.eye(4))
+    with pytest.raises(ValueError, match=r"no message on /stereo/left/image_raw: .* /ground_truth/pose 1"):
+        SensorBag(tmp_path / "bag").__enter__()
+
+
+def test_a_second_stereo_camera_is_told_of_and_other_images_of_a_used_one_are_not(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        write_agent(bag)
+        for topic in ("tof/infra/image_rect_raw", "stereo_rear/left/image_raw", "stereo_rear/right/image_raw"):
+            SensorWriter(bag).picture(topic, 100, LEFT_FRAME, picture(1))
+    with SensorBag(tmp_path / "bag") as opened:
+        warnings = " ".join(opened.warnings)
+    assert "of other cameras: /stereo_rear/left/image_raw, /stereo_rear/right/image_raw (--topic)" in warnings
+
+
 def test_a_laser_is_used_where_there_is_no_depth_camera():
     left, tof = ("/stereo/left/image_raw", "/stereo/right/image_raw", "/scan"), "/tof/depth/image_raw"
     assert topics_of("", left, {})["scan"] == "/scan"

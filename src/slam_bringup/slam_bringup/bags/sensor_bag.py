@@ -49,7 +49,7 @@ from slam_bringup.bags.readings import (
     StereoReading,
 )
 from slam_bringup.bags.rig_calibration import RigCalibration
-from slam_bringup.bags.sensor_topics import BagNames, find_agents, is_rectified, join, topics_of
+from slam_bringup.bags.sensor_topics import BagNames, find_agents, is_rectified, join, other_cameras, topics_of
 from slam_core.calibration_watch import CalibrationWatch
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
@@ -102,6 +102,9 @@ class SensorBag:
         try:
             self.agents = self._find_agents()
             self.sensors = self._find_sensors()
+            used = {topic for sensors in self.sensors.values() for topic in sensors.topics.values()}
+            if unused := other_cameras(used, {name: info.type_name for name, info in self.reader.topics.items()}):
+                self._warnings.append(f"images that are not used, of other cameras: {', '.join(unused)} (--topic)")
         except BaseException:
             self.reader.__exit__()
             raise
@@ -303,6 +306,11 @@ class SensorBag:
             return given, self._frame_of((topic, topics[role]))
         for _, _, message in self.reader.messages([topic]):
             return _as_recorded(camera_info_from_message(message), role, topics[role]), message.header.frame_id
+        if self.reader.is_indexed and not self.reader.topics[topics[role]].count:
+            raise ValueError(
+                f"{self.reader.path} has no message on {topics[role]}: was the driver running? The messages that there "
+                f"are: {', '.join(f'{name} {info.count}' for name, info in self.reader.topics.items())}"
+            )
         raise ValueError(
             f"{self.reader.path} has images but no camera info on {topic}: record it (slam calibrate makes one), or "
             f"say where it is: --topic {info_role}=/..."

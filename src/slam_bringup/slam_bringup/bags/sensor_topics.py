@@ -137,6 +137,18 @@ def join(agent: str, name: str) -> str:
     return f"/{agent}/{name}" if agent else f"/{name}"
 
 
+def other_cameras(used: Collection[str], types: Mapping[str, str]) -> list[str]:
+    """Image topics (of topics with their ``types``) of cameras of which no topic is used; not what nodes publish."""
+    images = [topic for topic, kind in types.items() if kind.rpartition("/")[2] in ("Image", "CompressedImage")]
+    known = {_camera(topic) for topic in used} | {_camera(_camera(topic)) for topic in used} - {""}
+    raw = [t for t in images if _without_transport(t).rpartition("/")[2].startswith("image_r")]
+    return sorted({_without_transport(t) for t in raw if _camera(t) not in known and _camera(_camera(t)) not in known})
+
+
+def _camera(image_topic: str) -> str:
+    return _without_transport(image_topic).rpartition("/")[0]
+
+
 def _infos_beside(image_topic: str) -> list[str]:
     """A ToF camera has several images and one info, a level higher."""
     camera, _, _ = _without_transport(image_topic).rpartition("/")
