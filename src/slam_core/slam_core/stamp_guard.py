@@ -11,8 +11,7 @@ is *held* together with its message until others have shown what it is:
 Only frames begin sessions; what accompanies them (IMU, motions) follows. The other streams join a session when their
 stamps are near its own; stragglers of the session before are rejected, and so is a stamp that comes twice in a row.
 
-The nodes judge what they receive by it, ``slam run`` what it reads from a bag, ``slam doctor`` a recording and ``slam
-convert`` the stamps of a data set.
+The nodes judge what they receive by it, ``slam run`` what it reads from a bag, and ``slam doctor`` a recording.
 """
 
 from __future__ import annotations

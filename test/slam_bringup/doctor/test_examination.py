@@ -11,10 +11,12 @@ import json
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
+from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.cli import slam
 from slam_bringup.doctor.examination import examine, require_stereo
 
@@ -83,6 +85,43 @@ def test_the_command_ends_with_one_where_something_is_wrong(bench: ModuleType, t
     assert (text.exit_code, as_json.exit_code) == (1, 1)
     assert text.output.startswith("1. missing transforms: ")
     assert json.loads(as_json.output)[0]["check"] == "missing transforms"
+    assert "--base-frame stereo_left_optical_frame" in text.output
     good = CliRunner().invoke(slam, ["doctor", str(DEMO)])
     assert (good.exit_code, "nothing wrong" in good.output) == (0, True)
     assert isinstance(CliRunner().invoke(slam, ["doctor"]).exception, ValueError)
+
+
+def test_a_bag_that_is_mapped_in_the_cameras_own_axes_lacks_no_transform_of_that_camera(
+    bench: ModuleType, tmp_path: Path
+) -> None:
+    bag = bench.copy(DEMO, tmp_path / "bag", bench.FAULTS["static transforms missing"][1])
+    own = examine(bag, BagNames(base_frame="stereo_left_optical_frame"))
+    assert [f.what for f in own if f.check == "missing transforms"] == [
+        "there are no static transforms (/tf_static) to tof_optical_frame"
+    ]
+    assert not any("--base-frame" in f.advice for f in own)
+    other = examine(DEMO, BagNames(base_frame="turret"))
+    assert "to turret" in next(f.what for f in other if f.check == "missing transforms")
+
+
+def test_odd_stamps_are_judged_as_a_run_judges_them(bench: ModuleType, tmp_path: Path) -> None:
+    """One image an hour ahead, one twice: each is told, and nothing of what follows."""
+
+    def change(item: Any, number: int) -> Any:
+        if item.topic == "/stereo/left/image_raw":
+            item.message.header.stamp.sec += 3600 * (number == 5)
+            return [item] * (1 + (number == 10))
+        return item
+
+    found = {f.check: f.what for f in examine(bench.copy(DEMO, tmp_path / "bag", change))}
+    assert found["odd stamps"].startswith("1 messages on /stereo/left/image_raw are left out: its stamp is 36")
+    assert found["same stamp twice"].startswith("1 messages on /stereo/left/image_raw")
+    assert "time goes back" not in found
+
+
+def test_a_clock_that_jumps_back_is_told(bench: ModuleType, tmp_path: Path) -> None:
+    def change(item: Any, number: int) -> Any:
+        return item.moved(-2.0) if item.is_of("stereo/", "tof/") and number > 8 else item
+
+    found = {f.check: f.what for f in examine(bench.copy(DEMO, tmp_path / "bag", change))}
+    assert found["time goes back"].startswith("time jumped back by ")

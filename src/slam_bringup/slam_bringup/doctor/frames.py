@@ -20,11 +20,7 @@ def check_frames(evidence: Evidence) -> Iterator[Finding]:
     """Missing transforms, frames that nobody knows, optical frames without their turn, mountings out of reach."""
     roles = [r for r in ("left", evidence.depth_role) if r and r in evidence.calibrations]
     if not evidence.frames.frames:
-        yield Finding(
-            "missing transforms",
-            "there are no static transforms (/tf_static)",
-            "record /tf_static, or publish them with static_transform_publisher",
-        )
+        yield from _no_transforms(evidence, roles)
         return
     for role in roles:
         yield from _mounting(evidence, role, evidence.calibrations[role].frame)
@@ -34,8 +30,25 @@ def check_frames(evidence: Evidence) -> Iterator[Finding]:
     yield from _right_camera(evidence)
 
 
+def _no_transforms(evidence: Evidence, roles: list[str]) -> Iterator[Finding]:
+    """Sensors that nothing joins to the rig's frame; a camera that is the rig's frame itself needs no transform."""
+    frames = [evidence.calibrations[role].frame for role in roles]
+    frames += [frame for role, frame in evidence.image_frames.items() if role == "imu"]
+    unknown = sorted({frame for frame in frames if frame != evidence.base_frame})
+    if not unknown:
+        return
+    own = f", or map in a camera's own axes: --base-frame {unknown[0]}" if not evidence.base_frame else ""
+    yield Finding(
+        "missing transforms",
+        f"there are no static transforms (/tf_static) to {', '.join(unknown)}",
+        f"record /tf_static, publish them with static_transform_publisher{own}",
+    )
+
+
 def _mounting(evidence: Evidence, role: str, frame: str) -> Iterator[Finding]:
     """A camera's frame in base_link; without base_link the camera's own axes are taken, which is said elsewhere."""
+    if frame == evidence.base_frame:
+        return
     if frame not in evidence.frames:
         known = ", ".join(evidence.frames.frames)
         yield Finding(
@@ -46,9 +59,14 @@ def _mounting(evidence: Evidence, role: str, frame: str) -> Iterator[Finding]:
         return
     T = _lookup(evidence, evidence.base_frame, frame) if evidence.base_frame else None
     if T is None:
+        if evidence.base_frame:
+            yield Finding(
+                "missing transforms",
+                f"no static transforms join '{frame}' of {evidence.name(role)} to {evidence.base_frame}",
+                "record them, or name another frame of the rig: --base-frame",
+            )
         return
-    is_base = frame == evidence.base_frame
-    if role != "imu" and not is_base and np.allclose(T[:3, :3], np.eye(3), atol=1e-3):
+    if role != "imu" and np.allclose(T[:3, :3], np.eye(3), atol=1e-3):
         yield Finding(
             "optical frame",
             f"'{frame}' has the axes of {evidence.base_frame}, an optical frame has x right, y down, z forward",

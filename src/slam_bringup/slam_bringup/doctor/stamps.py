@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from slam_bringup.doctor.evidence import Evidence, Stamps, Stream
 from slam_bringup.doctor.finding import Finding
 from slam_core.geometry import FloatArray
+from slam_core.stamp_guard import StampDecision, StampFault, StampGuard
 from slam_core.synchronizer import PAIRING_TOLERANCE_S
 from stereo_frontend.depth_fusion import FusionConfig
 
@@ -20,39 +23,83 @@ _ON_GRID, _GRID_TOLERANCE = 0.8, 0.15
 _RATE_SPREAD = 1.5
 _CLOCKS_APART_S = 0.5
 _FEWEST = 8
+_CHECK = {
+    StampFault.DUPLICATE: "same stamp twice",
+    StampFault.LATE: "time goes back",
+    StampFault.ODD: "odd stamps",
+}
+_ADVICE = {
+    StampFault.DUPLICATE: "does the driver publish twice?",
+    StampFault.LATE: "does the driver publish from several threads?",
+    StampFault.ODD: "was the clock set while recording (NTP, a restarted camera)?",
+}
 
 
 def check_stamps(evidence: Evidence) -> Iterator[Finding]:
     """Order, rate, losses and clocks of each stream, then the time between streams."""
+    yield from _order(evidence)
     for role, stream in evidence.streams.items():
-        yield from _order(stream)
         if role in ("left", "right", "depth", "range") and len(stream.stamps) >= _FEWEST:
             yield from _rate(stream)
     yield from _clocks(evidence)
     yield from _pairing(evidence)
 
 
-def _order(stream: Stream) -> Iterator[Finding]:
-    steps = np.diff(stream.stamps)
-    if zeros := int((stream.stamps == 0).sum()):
-        yield Finding(
-            "no stamp",
-            f"{zeros} of {len(stream.stamps)} messages on {stream.topic} have the stamp 0",
-            "make the driver fill header.stamp",
-            zeros == len(stream.stamps),
-        )
-    elif back := int((steps < 0).sum()):
-        yield Finding(
-            "time goes back",
-            f"stamps on {stream.topic} go back {back} times, by up to {-steps.min() / 1e9:.3f} s",
-            "were two recordings joined, or the clock set while recording?",
-        )
-    elif twice := int((steps == 0).sum()):
-        yield Finding(
-            "same stamp twice",
-            f"{twice} messages on {stream.topic} repeat the stamp before",
-            "does the driver publish twice?",
-        )
+def _order(evidence: Evidence) -> Iterator[Finding]:
+    """Stamps that ``slam run`` and the nodes leave out, by the same guard, in the order of the recording."""
+    guard, judged = StampGuard[None](), {role: _Judged() for role in evidence.streams}
+    for role, stamp in _as_recorded(evidence.streams):
+        judged[role].take(guard.add(role, stamp, None, starts_sessions=role != "imu"))
+    for role, decision in guard.finish():
+        judged[role].take(decision)
+    for role, stream in evidence.streams.items():
+        zeros = int((stream.stamps == 0).sum())
+        if zeros:
+            yield Finding(
+                "no stamp",
+                f"{zeros} of {len(stream.stamps)} messages on {stream.topic} have the stamp 0",
+                "make the driver fill header.stamp",
+                zeros == len(stream.stamps),
+            )
+        else:
+            yield from judged[role].findings(stream.topic)
+
+
+@dataclass
+class _Judged:
+    """Faults of a stream's stamps: how many of each kind, and the first one in words."""
+
+    number: Counter[StampFault] = field(default_factory=Counter)
+    reason: dict[StampFault, str] = field(default_factory=dict)
+    jumps: list[str] = field(default_factory=list)
+
+    def take(self, decision: StampDecision[None]) -> None:
+        if decision.fault is not None:
+            self.number[decision.fault] += len(decision.rejected)
+            self.reason.setdefault(decision.fault, decision.reason)
+        self.jumps += [decision.reason] * decision.new_session
+
+    def findings(self, topic: str) -> Iterator[Finding]:
+        for jump in self.jumps[:1]:
+            yield Finding(
+                "time goes back",
+                f"{jump} on {topic}, {len(self.jumps)} times in all",
+                "were two recordings joined, or the clock set while recording?",
+            )
+        for fault, number in self.number.items():
+            yield Finding(
+                _CHECK[fault], f"{number} messages on {topic} are left out: {self.reason[fault]}", _ADVICE[fault]
+            )
+
+
+def _as_recorded(streams: Mapping[str, Stream]) -> list[tuple[str, int]]:
+    """Role and stamp of every message, in the order of the recording."""
+    rows = [
+        (time, role, stamp)
+        for role, stream in streams.items()
+        for time, stamp in zip(stream.times.tolist(), stream.stamps.tolist(), strict=True)
+    ]
+    return [(role, stamp) for _, role, stamp in sorted(rows, key=lambda row: row[0])]
 
 
 def _rate(stream: Stream) -> Iterator[Finding]:

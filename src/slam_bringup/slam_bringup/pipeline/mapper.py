@@ -80,7 +80,8 @@ class Mapper:
         last: list[Submap] = []
         for agent, stage in self._filters.items():
             self._process_waiting(agent)
-            self._events += [stage.finding] if stage.finding else []
+            if stage.finding:
+                self._events.append(f"{agent}: {stage.finding}" if agent else stage.finding)
             last += stage.start_session()  # which no frame begins: the filter forgets its state
         give_back()
         self._join(in_order(last))

@@ -198,7 +198,7 @@ class _Choreography:
         topics = [t for t in self._graph.recorded_topics if self._supervisor.publishes(t)]
         recorded = self._supervisor.subscribers
         self._supervisor.wait(
-            lambda: all("recorder" in recorded(topic) for topic in topics), START_TIMEOUT_S, "start of the recorder"
+            lambda: all("/recorder" in recorded(topic) for topic in topics), START_TIMEOUT_S, "start of the recorder"
         )
 
     def play(self, bag: Path, rate: float, on_progress: Callable[[int], None]) -> None:

@@ -136,8 +136,9 @@ class Supervisor:
         return self._connections.obstacles(names, from_outside)
 
     def subscribers(self, topic: str) -> set[str]:
-        """Names of the nodes that subscribe to a topic."""
-        return {info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)}
+        """Full names of the nodes that subscribe to a topic."""
+        known = self._node.get_subscriptions_info_by_topic(topic)
+        return {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in known}
 
     def publishes(self, topic: str) -> bool:
         """True if anybody publishes a topic."""
