@@ -288,9 +288,10 @@ class SensorBag:
             return self._names.base_frame or usual[0]
         if camera_frame not in tree:
             own = f", or map in the camera's own axes (x right, y down, z forward): --base-frame {camera_frame}"
+            others = f", and those of all agents ({', '.join(self.agents)})"
             raise ValueError(
                 f"{self.reader.path} has no transform between base_link and '{camera_frame}' on /tf_static: record "
-                f"it{own if len(self.agents) == 1 else f', and those of all agents ({', '.join(self.agents)})'}"
+                f"it{own if len(self.agents) == 1 else others}"
             )
         root = tree.root(camera_frame)
         self._warnings.append(f"no base_link on /tf_static: poses are those of {root}, another frame: --base-frame")
