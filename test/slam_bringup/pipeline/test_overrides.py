@@ -80,7 +80,7 @@ def test_parameters_of_the_nodes_alone_do_not_disturb_the_offline_run(tmp_path: 
             "my.yaml: ekf_slam: parameter 'submap.max_distance' must be at least",
         ),
         ("ekf_slam: [1]", "my.yaml: the parameters of ekf_slam must be a mapping"),
-        ("ekf_slam: {a: 1", "my.yaml is not YAML"),
+        ("ekf_slam: {a: 1", "my.yaml: not YAML"),
         ("- 1", "my.yaml must hold one mapping per node"),
     ],
 )
