@@ -17,7 +17,6 @@ from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.dense_run import dense_model
 from slam_bringup.pipeline.frame_log import LoggedFrame
-from slam_bringup.pipeline.map_parts import parts_in_words
 from slam_bringup.pipeline.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
 from slam_core.config import iterate_parameters
 from slam_core.geometry import FloatArray
@@ -171,7 +170,7 @@ def run_result(
     on_mapped(mapped)
     surface, plans, failure = _dense(bag, config, record, agents, on_reading, stopped)
     doubt = (_ONE_FILTER,) * (mapper == "ekf")
-    told_first = (*(failure,) * bool(failure), *doubt, *_parts(record.global_map))
+    told_first = (*(failure,) * bool(failure), *doubt)
     events = _logged((*told_first, *bag.warnings, *record.events, *_events(record.agents)))
     return replace(mapped, dense=surface, floor_plans=plans, events=events, failure=failure)
 
@@ -252,17 +251,6 @@ def _mounts(bag: SensorBag, agent: str) -> dict[str, FloatArray]:
     """T_base_frame of the agent's own frames; those of others hang together with it only through the map."""
     sensors = bag.sensors[agent]
     return sensors.frames.below(sensors.base_frame)
-
-
-def _parts(global_map: GlobalMap) -> list[str]:
-    graph = global_map.graph
-    keys = [(record.submap.agent, record.submap.index) for record in graph.records]
-    of = [int(graph.component_of[record.start]) for record in graph.records]
-    parts = parts_in_words((part, *key) for part, key in zip(of, keys, strict=True))
-    number = len(set(of))
-    return [f"the map is in {number} separate parts, whose places relative to each other are unknown: {parts}"] * (
-        number > 1
-    )
 
 
 def _events(agents: Mapping[str, AgentRecord]) -> list[str]:
