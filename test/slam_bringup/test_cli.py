@@ -45,6 +45,13 @@ def test_the_shell_completes_commands_and_options() -> None:
     assert "complete" in source.stdout
 
 
+def test_a_misspelt_command_comes_with_the_one_that_was_meant() -> None:
+    result = CliRunner().invoke(slam, ["rnu"])
+    assert result.exit_code == 2
+    assert "No such command 'rnu'. Did you mean run?" in result.output
+    assert "Did you mean" not in CliRunner().invoke(slam, ["xyzzy"]).output
+
+
 @click.command()
 def talkative() -> None:
     logging.getLogger("slam_bringup.x").debug("everything")

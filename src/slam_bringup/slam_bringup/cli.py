@@ -6,6 +6,7 @@ from __future__ import annotations
 import gc
 import importlib
 import sys
+from difflib import get_close_matches
 from typing import Any
 
 import click
@@ -49,6 +50,15 @@ class _LazyGroup(click.Group):
             return None
         module = importlib.import_module(f"slam_bringup.commands.{cmd_name}")
         return with_verbosity(module.command)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0]
+        if name not in COMMANDS and not name.startswith("-") and not ctx.resilient_parsing:
+            close = get_close_matches(name, COMMANDS)
+            ctx.fail(f"No such command '{name}'." + (f" Did you mean {' or '.join(close)}?" if close else ""))
+        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:

@@ -31,9 +31,14 @@ def test_every_experiment_says_what_it_needs():
         assert {j.digest for j in experiment.jobs(True).values()} != {j.digest for j in experiment.jobs(False).values()}
 
 
-def test_an_unknown_name_lists_those_there_are():
-    with pytest.raises(ValueError, match=r"no experiment nonsense; there are: all, planar"):
-        chosen(("planar", "nonsense"))
+def test_no_name_and_an_unknown_one_list_the_experiments_with_their_titles():
+    lines = [rf"{e.name} +{re.escape(e.title)}" for e in EXPERIMENTS.values()]
+    for names, said in (((), "name experiments"), (("planar", "nonsense"), "no experiment nonsense")):
+        with pytest.raises(ValueError, match="(?s)" + ".*".join([said, *lines])):
+            chosen(names)
+    with pytest.raises(ValueError, match=lines[0]):
+        CliRunner().invoke(slam, ["experiment"], catch_exceptions=False)
+    assert re.search("(?s)" + ".*".join(lines), CliRunner().invoke(slam, ["experiment", "--help"]).output)
     assert [e.name for e in chosen(("all",))] == list(EXPERIMENTS)
     assert [e.name for e in chosen(("planar", "planar"))] == ["planar"]
 

@@ -16,7 +16,7 @@ import click
 from slam_bringup.bags.rig_calibration import read_rig_calibration
 from slam_bringup.bags.sensor_topics import ROLES, BagNames, parse_topics
 from slam_bringup.commands.paths import UserPath, calibration_option
-from slam_bringup.doctor.examination import CHECKS, examine
+from slam_bringup.doctor.examination import GROUPS, examine
 from slam_bringup.doctor.finding import Finding
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand, NodeProcess
@@ -28,7 +28,7 @@ _START_S = 60.0
 """Longest that the recorder may take to start, and to complete its bag."""
 
 
-@click.command()
+@click.command(epilog=f"Groups of checks: {', '.join(GROUPS)}.")
 @click.argument("bag", required=False, type=UserPath(exists=True))
 @click.option("--live", is_flag=True, help="look at the topics of the running ROS graph instead of a bag")
 @click.option(
@@ -53,7 +53,7 @@ def command(
     base_frame: str,
     as_json: bool,
 ) -> None:
-    """Check the topics, stamps, calibration, frames and images of BAG, or of what is published now (--live).
+    """Check BAG, or what is published now (--live).
 
     Ends with exit code 1 if anything is wrong.
     """
@@ -99,5 +99,5 @@ def _wait_until_ready(recorder: NodeProcess) -> None:
 
 def _text(findings: list[Finding]) -> str:
     if not findings:
-        return f"nothing wrong found ({len(CHECKS)} groups of checks)"
+        return f"nothing wrong found in: {', '.join(GROUPS)}"
     return "\n".join(f"{number}. {finding}" for number, finding in enumerate(findings, start=1))

@@ -13,8 +13,8 @@ from rich.table import Table
 
 from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
-from slam_bringup.experiments.catalogue import EXPERIMENTS, chosen
-from slam_bringup.experiments.findings import as_json
+from slam_bringup.experiments.catalogue import chosen, listing
+from slam_bringup.experiments.findings import Experiment, as_json
 from slam_bringup.experiments.job import in_order
 from slam_bringup.experiments.page import write_markdown, write_page
 from slam_bringup.experiments.runner import run_jobs
@@ -22,22 +22,21 @@ from slam_core.files import atomic_text
 from slam_core.output_folder import OutputFolder
 
 
-@click.command(epilog="\b\nExperiments:\n" + "\n".join(f"  {e.name:18}{e.title}" for e in EXPERIMENTS.values()))
-@click.argument("names", nargs=-1, required=True, metavar="NAME...|all")
+@click.command(epilog=f"\b\nExperiments:\n{listing()}")
+@click.argument("experiments", nargs=-1, metavar="NAME...|all", callback=lambda ctx, parameter, names: chosen(names))
 @click.option("-o", "--output", metavar="OUT", required=True, type=UserPath(file_okay=False), help="folder to write")
 @click.option("--quick", is_flag=True, help="short runs that show that everything works; held to no mark")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="processes on this machine")
 @click.option("--scheduler", help="address of a Dask scheduler, tcp://HOST:8786; its workers must see OUT")
 @overwrite_option("results that were changed since they were written")
 def command(
-    names: tuple[str, ...], output: Path, quick: bool, workers: int, scheduler: str | None, overwrite: bool
+    experiments: list[Experiment], output: Path, quick: bool, workers: int, scheduler: str | None, overwrite: bool
 ) -> None:
     """Run the experiments NAME of the thesis, or all of them.
 
     OUT holds experiments.html, .md and .json, the figures, and in OUT/cache what was computed: a second run redoes
     only what depends on changed code.
     """
-    experiments = chosen(names)
     folder = OutputFolder(output, "experiment", overwrite=overwrite, last="experiments.json")
     wanted = {e.name: e.jobs(quick) for e in experiments}
     jobs = list({job.digest: job for needed in wanted.values() for job in needed.values()}.values())

@@ -21,6 +21,8 @@ from slam_bringup.doctor.topics import check_topics
 CHECKS: tuple[Callable[[Evidence], Iterator[Finding]], ...] = (
     check_topics, check_stamps, check_frames, check_calibration, check_stereo_images, check_depth_images, check_imu,
 )  # fmt: skip
+GROUPS = tuple(check.__name__.removeprefix("check_").replace("_", " ") for check in CHECKS)
+"""Names of the checks, in their order."""
 _FIRST_MESSAGES = 120
 
 

@@ -16,6 +16,7 @@ from matplotlib.ticker import NullFormatter
 from dense_mapping.floor_plan import FREE, OCCUPIED, FloorPlan
 from dense_mapping.navigation import frontiers
 from slam_bringup.pipeline.results import AgentResult, RunResult
+from slam_bringup.plural import plural
 from slam_bringup.report.canvas import blank, draw_to_scale
 from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.evaluation import align, associate
@@ -56,8 +57,8 @@ def map_figure(result: RunResult) -> Figure:
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.set_title(
-        f"{len(result.landmarks.positions)} landmarks (99.5 % ellipses), {result.submaps} submaps, "
-        f"{result.loop_closures} loop closures"
+        f"{plural(len(result.landmarks.positions), 'landmark')} (99.5 % ellipses), "
+        f"{plural(result.submaps, 'submap')}, {plural(result.loop_closures, 'loop closure')}"
     )
     axes.grid(color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
