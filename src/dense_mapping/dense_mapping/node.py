@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 from dense_mapping.colours import NO_PICTURE
 from dense_mapping.dense_model import DenseConfig
 from dense_mapping.dense_stage import DenseStage
-from dense_mapping.plan_io import write_plan
+from dense_mapping.plan_io import plan_names, write_plan
 from dense_mapping.surface_cloud import cloud_of
 from dense_mapping.surface_io import write_mesh
 from slam_core.base_node import SlamNode
@@ -196,8 +196,8 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         try:
             write_mesh(folder / "mesh.ply", surface)
             plans = self.mapper.floor_plans(surface)
-            for number, plan in enumerate(plans):
-                write_plan(folder / (f"floor_plan_{number}.yaml" if len(plans) > 1 else "floor_plan.yaml"), plan)
+            for name, plan in zip(plan_names(len(plans)), plans, strict=True):
+                write_plan(folder / name, plan)
             response.success, response.message = True, f"{len(surface)} points, {len(plans)} storeys in {folder}"
         except (ValueError, OSError) as error:
             response.success, response.message = False, str(error)

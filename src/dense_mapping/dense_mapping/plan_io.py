@@ -22,6 +22,11 @@ _PIXELS = {FREE: 254, OCCUPIED: 0, UNKNOWN: 205}
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 
 
+def plan_names(count: int) -> list[str]:
+    """Names of the files of so many storeys, from the lowest: ``floor_plan.yaml``, or ``floor_plan_0.yaml`` ..."""
+    return [f"floor_plan_{number}.yaml" for number in range(count)] if count > 1 else ["floor_plan.yaml"][:count]
+
+
 def write_plan(path: Path, plan: FloorPlan) -> None:
     """Write ``path`` (YAML) and beside it the image, ``path`` with the suffix .pgm.
 

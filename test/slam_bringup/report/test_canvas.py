@@ -3,12 +3,12 @@
 
 import pytest
 
-from slam_bringup.report.canvas import blank, draw_to_scale
+from slam_bringup.report.canvas import WIDTH, blank, draw_to_scale
 
 
 @pytest.mark.parametrize(("high", "is_lower"), [(1.0, True), (5.0, True), (40.0, False)])
 def test_a_figure_to_scale_has_no_empty_rim(high, is_lower):
-    figure, ((axes,),) = blank(10.0, 8.0)
+    figure, ((axes,),) = blank(8.0)
     axes.set_xlim(0.0, 10.0)
     axes.set_ylim(0.0, high)
     draw_to_scale(figure, axes)
@@ -16,5 +16,5 @@ def test_a_figure_to_scale_has_no_empty_rim(high, is_lower):
     assert (height < 8.0) == is_lower
     inches = axes.get_position(original=True).height * height
     if high == 5.0:
-        assert inches == pytest.approx(0.5 * axes.get_position(original=True).width * 10.0, rel=1e-6)
+        assert inches == pytest.approx(0.5 * axes.get_position(original=True).width * WIDTH, rel=1e-6)
     assert inches >= 1.5 - 1e-9

@@ -3,21 +3,23 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from slam_bringup.commands.console import show
 from slam_bringup.pipeline.results import AgentResult, LandmarkMap, RunResult, summarise
 from slam_bringup.report.agent_figures import motion_figure, side_view, sigma_figure
-from slam_bringup.report.figures import map_figure, png
+from slam_bringup.report.figures import floor_plan_figure, map_figure, png
 from slam_bringup.report.report import draw_charts, verdict, write_report
 from slam_bringup.report.summary_table import summary_table
 from slam_core.evaluation import evaluate
-from slam_core.geometry import boxplus
+from slam_core.geometry import boxplus, make_transform
 from slam_core.trajectory import Trajectory
 
 N, RATE, RADIUS = 100, 10.0, 2.0
@@ -86,3 +88,40 @@ def test_hostile_names_and_reasons_are_plain_text_in_the_report_and_on_the_termi
     assert html.count("&lt;img src=x onerror=&#39;alert(1)&#39;&gt; [/b] $") >= 9
     show(summary_table(summary, Path(hostile)))
     assert "[/b]" in capsys.readouterr().out
+
+
+def test_the_truth_is_drawn_thinly_on_the_way_that_would_hide_it(circle):
+    (axes,) = map_figure(_result(AgentResult("", circle, truth=circle))).axes
+    lines = {line.get_label(): line for line in axes.get_lines()}
+    assert lines["ground truth"].get_zorder() > lines["trajectory"].get_zorder()
+    assert lines["ground truth"].get_linewidth() < 0.5 * lines["trajectory"].get_linewidth()
+
+
+def test_plan_and_map_have_one_origin(circle):
+    plan = FloorPlan(np.zeros((40, 60), dtype=np.int8), 0.1, make_transform(np.eye(3), np.array([-2.0, -1.0, 0.3])))
+    result = _result(AgentResult("", circle), (plan,))
+    (axes,) = floor_plan_figure(result, plan).axes
+    assert axes.get_images()[0].get_extent() == pytest.approx([-2.0, 4.0, -1.0, 3.0])
+    (way,) = (line for line in axes.get_lines() if line.get_label() == "trajectory")
+    assert np.allclose(way.get_xydata(), circle.poses[:, :2, 3])
+
+
+def test_the_report_names_its_plans_and_dims_its_charts_in_the_dark(circle, tmp_path):
+    plan = FloorPlan(np.zeros((4, 6), dtype=np.int8), 0.1, np.eye(4))
+    result = _result(AgentResult("", circle), (plan, plan))
+    summary = summarise(result) | {"version": "1", "command": "slam", "date": "today", "total_s": 1.0}
+    write_report(tmp_path / "report.html", result, summary, png(map_figure(result), 50), draw_charts(result))
+    html = (tmp_path / "report.html").read_text()
+    assert re.findall(r"<code>(floor_plan.*?)</code>", html) == ["floor_plan_0.yaml", "floor_plan_1.yaml"]
+    assert "<b>1</b><span>loop closure</span>" in html
+    charts = re.findall(r'<img ([^>]*?)src="data:image/png', html)
+    assert len(charts) >= 6
+    assert set(charts) == {'class="plot" ', 'class="plan" '}
+
+
+def _result(agent: AgentResult, plans: tuple[FloorPlan, ...] = ()) -> RunResult:
+    return RunResult(
+        bag="a", mode="stereo", mapper="sjsam", odometry="none", agents=(agent,), landmarks=LandmarkMap.empty(),
+        dense=Surface.empty(), floor_plans=plans, submaps=1, loop_closures=1, frames=3, dropped={}, rejections={},
+        sensor_s=1.0, wall_s=1.0, stage_ms={}, events=(), solver="", changed={},
+    )  # fmt: skip

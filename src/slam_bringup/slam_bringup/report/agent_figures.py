@@ -23,7 +23,7 @@ def side_view(result: RunResult) -> Figure | None:
         return None
     path = np.concatenate(paths)
     along = int(np.argmax(np.ptp(path[:, :2], axis=0)))
-    figure, ((axes,),) = blank(10.0, 3.2)
+    figure, ((axes,),) = blank(3.0)
     axes.grid(color="0.92")
     points = result.landmarks.positions
     if len(points):
@@ -46,7 +46,7 @@ def sigma_figure(agent: AgentResult) -> Figure | None:
     if covariances is None or len(agent.trajectory) < 2:
         return None
     sigma = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0))
-    figure, ((position, rotation),) = blank(10, 2.8, 1, 2)
+    figure, ((position, rotation),) = blank(2.6, 1, 2)
     for k, name in enumerate(_AXES):
         position.plot(_seconds(agent), 1e3 * sigma[:, k], linewidth=1.0, label=name)
         rotation.plot(_seconds(agent), np.degrees(sigma[:, 3 + k]), linewidth=1.0, label=f"about {name}")
@@ -61,7 +61,7 @@ def motion_figure(agent: AgentResult) -> Figure | None:
         return None
     poses, time = agent.trajectory.poses, _seconds(agent)
     angles = np.unwrap(Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX"), axis=0)
-    figure, ((attitude, speed),) = blank(10, 2.8, 1, 2)
+    figure, ((attitude, speed),) = blank(2.6, 1, 2)
     for k, name in enumerate(("yaw", "pitch", "roll")):
         attitude.plot(time, np.degrees(angles[:, k]), linewidth=1.0, label=name)
     velocity = np.linalg.norm(np.gradient(poses[:, :3, 3], time, axis=0), axis=1)

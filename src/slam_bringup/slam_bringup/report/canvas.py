@@ -8,6 +8,8 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+WIDTH = 7.5
+"""Inches: text of ten points is then as large as the report's own where the page is wide."""
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.75, 0.15, 0.5, 0.35
 """Room (inches) for labels and titles around the axes."""
 _LOWEST = 1.5
@@ -20,11 +22,11 @@ _TICKS = 6
 
 
 def blank(
-    width: float, height: float, rows: int = 1, columns: int = 1, *, sharex: bool = True
+    height: float, rows: int = 1, columns: int = 1, *, sharex: bool = True
 ) -> tuple[Figure, npt.NDArray[np.object_]]:
-    """A figure (inches) and its axes (rows, columns), which share their x axis unless not wanted."""
-    figure = Figure(figsize=(width, height))
-    across = (width - _LEFT - _RIGHT - (columns - 1) * _BETWEEN[0]) / columns
+    """A figure, :data:`WIDTH` by ``height`` inches, and its axes (rows, columns), which share x unless not wanted."""
+    figure = Figure(figsize=(WIDTH, height))
+    across = (WIDTH - _LEFT - _RIGHT - (columns - 1) * _BETWEEN[0]) / columns
     along = (height - _BOTTOM - _TOP - (rows - 1) * _BETWEEN[1]) / rows
     axes = figure.subplots(
         rows,
@@ -32,8 +34,8 @@ def blank(
         sharex=sharex,
         squeeze=False,
         gridspec_kw={
-            "left": _LEFT / width,
-            "right": 1.0 - _RIGHT / width,
+            "left": _LEFT / WIDTH,
+            "right": 1.0 - _RIGHT / WIDTH,
             "bottom": _BOTTOM / height,
             "top": 1.0 - _TOP / height,
             "wspace": _BETWEEN[0] / across,

@@ -21,7 +21,7 @@ from slam_bringup.report.canvas import blank, draw_to_scale
 from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.evaluation import align, associate
 from slam_core.files import atomic_path
-from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
+from slam_core.geometry import FloatArray, boxminus, invert_transform
 
 matplotlib.use("Agg")
 matplotlib.rcParams["text.parse_math"] = False  # names come from recordings: a dollar sign in one begins no formula
@@ -49,7 +49,7 @@ def png(figure: Figure, dpi: int) -> bytes:
 
 def map_figure(result: RunResult) -> Figure:
     """The map from above: dense points, landmarks with 99.5 % ellipses, trajectories, ground truth (Fig. 9.2)."""
-    figure, ((axes,),) = blank(10, 8)
+    figure, ((axes,),) = blank(6.0)
     _draw_dense(axes, result)
     _draw_landmarks(axes, result)
     for agent, colour in zip(result.agents, COLOURS * len(result.agents), strict=False):
@@ -109,13 +109,13 @@ def _draw_agent(axes: Axes, agent: AgentResult, colour: str) -> None:
     if not len(agent.trajectory):
         return
     xy = agent.trajectory.poses[:, :2, 3]
-    axes.plot(*xy.T, color=colour, linewidth=1.6, label=agent.name or "trajectory", zorder=5)
+    axes.plot(*xy.T, color=colour, linewidth=2.4, label=agent.name or "trajectory", zorder=5)
     axes.plot(*xy[0], "o", color=colour, markersize=6, zorder=6)
     axes.plot(*xy[-1], "s", color=colour, markersize=6, zorder=6)
     pair = matched_poses(agent)
     if pair is not None:
         truth = pair[1]
-        axes.plot(truth[:, 0, 3], truth[:, 1, 3], "--", color=_TRUTH, linewidth=1.0, label="ground truth", zorder=4)
+        axes.plot(truth[:, 0, 3], truth[:, 1, 3], "--", color=_TRUTH, linewidth=0.8, label="ground truth", zorder=5.5)
 
 
 def _limit_to_content(axes: Axes, result: RunResult) -> None:
@@ -133,23 +133,24 @@ def _limit_to_content(axes: Axes, result: RunResult) -> None:
 
 
 def floor_plan_figure(result: RunResult, plan: FloorPlan) -> Figure:
-    """A storey from above with the trajectories, and where nobody has looked yet (frontiers)."""
-    figure, ((axes,),) = blank(10, 8)
+    """A storey from above with the trajectories, and where nobody has looked yet (frontiers); origin as in the map."""
+    figure, ((axes,),) = blank(6.0)
     rows, columns = plan.cells.shape
     shades = np.select([plan.cells == FREE, plan.cells == OCCUPIED], [255, 30], 200).astype(np.uint8)
-    extent = (0.0, columns * plan.resolution, 0.0, rows * plan.resolution)
-    axes.imshow(shades, cmap="gray", vmin=0, vmax=255, origin="lower", extent=extent, interpolation="nearest")
     T_plan_map = invert_transform(plan.T_map_plan)
+    x0, y0, _ = T_plan_map[:3, 3]
+    extent = (-x0, columns * plan.resolution - x0, -y0, rows * plan.resolution - y0)
+    axes.imshow(shades, cmap="gray", vmin=0, vmax=255, origin="lower", extent=extent, interpolation="nearest")
     for agent, colour in zip(result.agents, COLOURS * len(result.agents), strict=False):
         if len(agent.trajectory):
-            path = transform_points(T_plan_map, agent.trajectory.poses[:, :3, 3])
+            path = agent.trajectory.poses[:, :3, 3] @ T_plan_map[:3, :3].T
             axes.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.4, label=agent.name or "trajectory")
     borders = [f.point for f in frontiers(plan)]
     if borders:
-        x, y, _ = transform_points(T_plan_map, np.stack(borders)).T
+        x, y, _ = T_plan_map[:3, :3] @ np.stack(borders).T
         axes.scatter(x, y, s=22, c=COLOURS[0], marker="o", label="not yet seen behind", zorder=4)
-    axes.set_xlabel("x of the plan [m]")
-    axes.set_ylabel("y of the plan [m]")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
     axes.set_title(f"{plan.free_m2:.1f} m² seen free, cells of {100 * plan.resolution:.0f} cm")
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="upper right", framealpha=0.9)
@@ -187,7 +188,7 @@ def error_figure(agent: AgentResult) -> Figure | None:
     sigma = np.sqrt(np.diagonal(matched.covariances, axis1=1, axis2=2)).copy()
     sigma[:, 3:] = np.degrees(sigma[:, 3:])
     bound = float(np.sqrt(chi_square_bound(ELLIPSE_PROBABILITY, 1)))
-    figure, grid = blank(10, 5, 2, 3)
+    figure, grid = blank(4.2, 2, 3)
     for i, (axes, name) in enumerate(
         zip(grid.ravel(), ("x m", "y m", "z m", "rx deg", "ry deg", "rz deg"), strict=True)
     ):
@@ -202,7 +203,7 @@ def error_figure(agent: AgentResult) -> Figure | None:
 
 def timing_figure(result: RunResult) -> Figure:
     """Milliseconds of every stage over the run (thesis Fig. 9.20, time per sample)."""
-    figure, ((axes,),) = blank(10, 3.2)
+    figure, ((axes,),) = blank(2.8)
     for name, times in result.stage_ms.items():
         if times:
             axes.plot(np.linspace(0, 1, len(times)), times, linewidth=0.9, label=f"{name} ({np.median(times):.1f} ms)")
@@ -221,7 +222,7 @@ def features_figure(agent: AgentResult) -> Figure | None:
     """Number of features with depth in each frame; None without frames."""
     if not len(agent.feature_counts):
         return None
-    figure, ((axes,),) = blank(10, 2.4)
+    figure, ((axes,),) = blank(2.1)
     axes.plot(agent.feature_counts, color=COLOURS[1], linewidth=1.0)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("frame")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.plan_io import write_plan
+from dense_mapping.plan_io import plan_names, write_plan
 from dense_mapping.surface_io import write_glb, write_mesh, write_points
 from slam_bringup.pipeline.results import RunResult, summarise
 from slam_bringup.report.figures import map_figure, save_png
@@ -58,7 +58,7 @@ def write_results(
         write_layout(out / "foxglove_layout.json", out / "result.mcap")
     summary = summarise(result) | _made()
     if pictures:
-        save_png(out / "map.png", map_figure(result))
+        save_png(out / "map.png", map_figure(result), dpi=170)
         map_png = (out / "map.png").read_bytes()  # drawn once: it is the dearest of the figures
         give_back()
         write_report(out / "report.html", result, summary | _in_all(result), map_png, charts or draw_charts(result))
@@ -80,6 +80,6 @@ def _in_all(result: RunResult) -> dict[str, float]:
 
 
 def _write_plans(out: Path, plans: tuple[FloorPlan, ...]) -> None:
-    """``floor_plan.yaml`` and its image; of several storeys one each, from the lowest: ``floor_plan_0.yaml`` ..."""
-    for number, plan in enumerate(plans):
-        write_plan(out / (f"floor_plan_{number}.yaml" if len(plans) > 1 else "floor_plan.yaml"), plan)
+    """A ``.yaml`` and its image of each storey."""
+    for name, plan in zip(plan_names(len(plans)), plans, strict=True):
+        write_plan(out / name, plan)

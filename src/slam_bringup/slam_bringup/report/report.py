@@ -14,6 +14,7 @@ import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 
+from dense_mapping.plan_io import plan_names
 from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_bringup.pipeline.results import AgentResult, RunResult
 from slam_bringup.report.agent_figures import motion_figure, side_view, sigma_figure
@@ -80,7 +81,10 @@ def write_report(path: Path, result: RunResult, summary: dict[str, Any], map_png
         submaps=charts.submaps,
         sparsity=charts.sparsity,
         timing=_embedded(timing_figure(result)),
-        plans=[_embedded(floor_plan_figure(result, plan)) for plan in result.floor_plans],
+        plans=[
+            (name, _embedded(floor_plan_figure(result, plan)))
+            for name, plan in zip(plan_names(len(result.floor_plans)), result.floor_plans, strict=True)
+        ],
     )
     atomic_text(path, html)
 
@@ -113,7 +117,7 @@ def verdict(evaluation: Evaluation | None) -> str:
 def _embedded(figure: Figure | None) -> str | None:
     if figure is None:
         return None
-    return _as_url(png(figure, 110))
+    return _as_url(png(figure, 150))
 
 
 def _as_url(image: bytes, kind: str = "png") -> str:

@@ -19,7 +19,7 @@ def submaps_figure(snapshot: MapSnapshot) -> Figure | None:
     """Submaps and their landmarks from above, chained by odometry alone and joined, with the closures (Fig. 9.3)."""
     if len(snapshot) < 2:
         return None
-    figure, ((before, after),) = blank(10, 4.6, 1, 2, sharex=False)
+    figure, ((before, after),) = blank(3.9, 1, 2, sharex=False)
     joined = snapshot.poses[snapshot.nodes[:, 0]]
     for axes, starts, title in (
         (before, _chained(snapshot), "before: by odometry alone"),
@@ -65,7 +65,7 @@ def sparsity_figure(snapshot: MapSnapshot) -> Figure | None:
         return None
     rows, columns = _entries(snapshot)
     unknowns = len(snapshot.poses) + len(np.unique(columns[columns >= len(snapshot.poses)]))
-    figure, ((axes,),) = blank(10, 4.2)
+    figure, ((axes,),) = blank(3.6)
     shown = slice(None, None, 1 + len(rows) // _MOST_ENTRIES)
     axes.plot(columns[shown], rows[shown], ".", color=COLOURS[1], markersize=1.2, rasterized=True)
     axes.axvline(len(snapshot.poses) - 0.5, color="0.6", linewidth=0.8)
