@@ -115,7 +115,15 @@ def _draw_agent(axes: Axes, agent: AgentResult, colour: str) -> None:
     pair = matched_poses(agent)
     if pair is not None:
         truth = pair[1]
-        axes.plot(truth[:, 0, 3], truth[:, 1, 3], "--", color=_TRUTH, linewidth=0.8, label="ground truth", zorder=5.5)
+        axes.plot(
+            truth[:, 0, 3],
+            truth[:, 1, 3],
+            linestyle=(0, (6, 6)),
+            color=_TRUTH,
+            linewidth=0.9,
+            label="ground truth",
+            zorder=5.5,
+        )
 
 
 def _limit_to_content(axes: Axes, result: RunResult) -> None:

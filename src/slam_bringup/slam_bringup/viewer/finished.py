@@ -38,7 +38,8 @@ class FinishedView:
         self._show_map()
         first, last = run.span_ns
         with page.overview:
-            duration = np.ceil(max((last - first) / 1e9, 0.1) / _STEP_S) * _STEP_S
+            # Rounded: the box has as many digits as the number, and room for few.
+            duration = round(float(np.ceil(max((last - first) / 1e9, 0.1) / _STEP_S)) * _STEP_S, 2)
             self.slider = page.server.gui.add_slider("time [s]", 0.0, duration, _STEP_S, duration)
         self.slider.on_update(lambda _: self.show_until(first + round(self.slider.value * 1e9)))
         self.show_until(last)

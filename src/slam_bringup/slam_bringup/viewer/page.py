@@ -31,6 +31,8 @@ from slam_core.types import ByteArray, Float32Array
 COLOURS = ((214, 39, 40), (31, 119, 180), (44, 160, 44), (148, 103, 189), (255, 127, 14), (23, 190, 207))
 """One for each agent, in their order."""
 
+_BACKGROUND = (158, 167, 178)
+"""Darker than what a lit mesh of white walls is."""
 _LARGEST_ELLIPSOID_M = 1.5
 """An ellipsoid as large as a room says only that the landmark is far away, and hides the room."""
 _MOST_ELLIPSOIDS = 4000
@@ -82,6 +84,7 @@ class ViewerPage:
         self.port = self.server.get_port()
         self.server.gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False)
         self.server.scene.set_up_direction("+z")
+        self.server.scene.set_background_image(np.full((2, 2, 3), _BACKGROUND, dtype=np.uint8), format="png")
         self.server.gui.set_panel_label(title)
         tabs = self.server.gui.add_tab_group()
         self.overview, self.layers, self.camera = (tabs.add_tab(name) for name in ("Overview", "Layers", "Image"))
@@ -184,7 +187,7 @@ class ViewerPage:
         wxyz, position = _wxyz(T_map_base[:3, :3]), T_map_base[:3, 3]
         self.server.scene.add_frame(name, axes_length=0.35, axes_radius=0.018, wxyz=wxyz, position=position)
         self.server.scene.add_icosphere(f"{name}/body", radius=0.09, color=colour)
-        self.server.scene.add_label(f"{name}/name", agent or "rig", position=(0, 0, 0.3))
+        self.server.scene.add_label(f"{name}/name", agent or "rig", position=(0, 0, 0.12), anchor="bottom-center")
 
     def show_landmarks(
         self, positions: FloatArray, covariances: FloatArray, sightings: npt.NDArray[np.int64] | None = None
@@ -235,14 +238,14 @@ class ViewerPage:
         self._lines(name, np.stack([raised[:-1], raised[1:]], axis=1), COLOURS[index % len(COLOURS)], 0.08)
         if len(points):
             middle = raised[len(points) // 2] + np.array([0, 0, 0.2])
-            self.server.scene.add_label(f"{name}/note", note, position=middle)
+            self.server.scene.add_label(f"{name}/note", note, position=middle, anchor="bottom-center")
 
     def show_marks(self, names: Sequence[str], positions: FloatArray) -> None:
         """Marked finds, (n, 3) m."""
         self._remove("/marks")
         for k, (name, position) in enumerate(zip(names, positions, strict=True)):
             self.server.scene.add_icosphere(f"/marks/{k}", radius=0.12, color=_MARKS, position=position)
-            self.server.scene.add_label(f"/marks/{k}/name", name, position=(0, 0, 0.25))
+            self.server.scene.add_label(f"/marks/{k}/name", name, position=(0, 0, 0.15), anchor="bottom-center")
 
     def show_camera(self, T_map_base: FloatArray, picture: ByteArray, fov: float = 1.2) -> None:
         """A picture (h, w, 3) uint8 where the camera is that took it, looking along the rig's X axis."""
