@@ -83,6 +83,7 @@ def test_the_page_loads_draws_and_asks_no_other_machine(page):
             if is_red.sum() > 5000:
                 break
         assert is_red.sum() > 5000, "the red hill is not on the canvas"
+        assert red[-20, 20].max() < 210, "pale walls are not seen on white"
         text = browser.evaluate("document.body.textContent")
         assert "LOST" in text
         assert "the wall is white" in text
