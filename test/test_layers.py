@@ -15,6 +15,7 @@ SRC = Path(__file__).resolve().parent.parent / "src"
 LAYER = {
     "slam_core": 0,
     "slam_calibration": 1,
+    "slam_radio": 1,
     "stereo_frontend": 1,
     "tof_driver": 1,
     "ndt_registration": 1,

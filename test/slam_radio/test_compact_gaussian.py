@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A compact Gaussian is close to its covariance and never surer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slam_radio.compact_gaussian import compact_gaussian
+
+
+def largest_share(inner, outer) -> float:
+    """Largest variance of ``inner`` over that of ``outer`` in any direction."""
+    L = np.linalg.inv(np.linalg.cholesky(outer))
+    return float(np.linalg.eigvalsh(L @ inner @ L.T)[-1])
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("rank", [1, 4, 8, 40])
+def test_it_is_never_surer_in_any_direction(make_submap, rank, seed):
+    S = make_submap(30, seed, common=6).covariance
+    assert largest_share(S, compact_gaussian(S, rank).covariance()) <= 1.0
+
+
+def test_few_common_directions_are_found_and_little_is_lost(make_submap):
+    S = make_submap(40, common=5).covariance
+    found = compact_gaussian(S, 8).covariance()
+    assert np.median(np.sqrt(np.diag(found) / np.diag(S))) < 1.1
+    # A diagonal of blocks says nothing of what unknowns have in common: it has to grow by much more.
+    blocks = compact_gaussian(S, 1).covariance()
+    assert np.median(np.sqrt(np.diag(blocks) / np.diag(S))) > 1.3
+
+
+def test_rounding_of_positions_is_in_the_variances(make_submap):
+    S = make_submap(5).covariance
+    fine, coarse = (compact_gaussian(S, 4, rounding).covariance() for rounding in (0.0, 0.1))
+    assert (np.diag(coarse)[6:] > np.diag(S)[6:] + 0.009).all()
+    assert (np.diag(fine)[6:] < np.diag(S)[6:] + 0.009).all()
+
+
+def test_a_covariance_that_is_none_or_too_large_is_refused(make_submap):
+    S = make_submap(5).covariance
+    with pytest.raises(ValueError, match="positive definite"):
+        compact_gaussian(-S, 4)
+    with pytest.raises(ValueError, match="too large"):
+        compact_gaussian(1e8 * S, 4)
+
+
+def test_a_submap_without_landmarks_has_its_pose(make_submap):
+    S = make_submap(4).covariance[:6, :6]
+    found = compact_gaussian(S, 8).covariance()
+    assert found.shape == (6, 6)
+    assert largest_share(S, found) <= 1.0
+    np.testing.assert_allclose(found, S, rtol=0.2, atol=0.05 * np.abs(S).max())

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A submap for the air comes out as it went in but for what is left out; a damaged one is refused."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+
+from slam_core.geometry import boxminus
+from slam_radio.descriptor_code import DIRECTIONS, basis, decode, encode
+from slam_radio.landmark_choice import choose_landmarks
+from slam_radio.light_submap import LightConfig, pack, unpack
+
+
+def test_what_is_sent_comes_out(make_submap):
+    submap = make_submap(60)
+    light = unpack(pack(submap, LightConfig(landmarks=60)))
+    order = np.argsort(submap.landmark_ids)
+    for name in ("agent", "index", "session", "start_stamp_ns", "end_stamp_ns", "follows_previous"):
+        assert getattr(light, name) == getattr(submap, name)
+    np.testing.assert_array_equal(light.landmark_ids, submap.landmark_ids[order])
+    np.testing.assert_allclose(light.landmarks, submap.landmarks[order], atol=8.0 / 65535)
+    np.testing.assert_array_equal(light.sightings, np.minimum(submap.sightings[order], 255))
+    np.testing.assert_allclose(boxminus(light.end_pose, submap.end_pose), 0.0, atol=1e-6)
+    assert np.einsum("nd,nd->n", light.descriptors, submap.descriptors[order]).min() > 0.99  # random: sent whole
+
+
+def test_it_is_not_surer_than_the_submap(make_submap):
+    submap = make_submap(80, common=9)
+    light = unpack(pack(submap, LightConfig(landmarks=40, rank=4)))
+    rows = np.array([int(np.nonzero(submap.landmark_ids == i)[0][0]) for i in light.landmark_ids])
+    unknowns = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).ravel()])
+    L = np.linalg.inv(np.linalg.cholesky(light.covariance))
+    assert np.linalg.eigvalsh(L @ submap.covariance[np.ix_(unknowns, unknowns)] @ L.T)[-1] <= 1.0
+    for own, sent in zip(submap.path, light.path, strict=True):
+        assert own.stamp_ns == sent.stamp_ns
+        assert np.linalg.eigvalsh(sent.covariance - own.covariance)[0] > -1e-12
+
+
+def test_same_submap_same_bytes_of_the_promised_size(make_submap):
+    submap = make_submap(200)
+    data = pack(submap, LightConfig(landmarks=96))
+    assert data == pack(submap, LightConfig(landmarks=96))
+    codes = 96 * (128 - DIRECTIONS)  # random descriptors go out whole
+    assert len(data) - codes < 6500
+
+
+def test_descriptors_of_the_basis_take_its_bytes_and_keep_their_likeness(rng):
+    inside = rng.normal(size=(50, DIRECTIONS)) @ basis().T
+    inside = (inside / np.linalg.norm(inside, axis=1, keepdims=True)).astype(np.float32)
+    codes = encode(inside)
+    assert codes.shape == (50, DIRECTIONS)
+    np.testing.assert_allclose(decode(codes, 128) @ decode(codes, 128).T, inside @ inside.T, atol=0.02)
+    other = rng.normal(size=(50, 128)).astype(np.float32)
+    assert encode(other / np.linalg.norm(other, axis=1, keepdims=True)).shape == (50, 128)
+    assert encode(np.eye(64, dtype=np.float32)).shape == (64, 64)
+
+
+def test_the_basis_is_orthonormal():
+    np.testing.assert_allclose(basis().T @ basis(), np.eye(DIRECTIONS), atol=1e-5)
+
+
+def test_landmarks_that_were_sent_before_come_first(make_submap):
+    submap = make_submap(100)
+    known = submap.landmark_ids[:20]
+    rows = choose_landmarks(submap, 50, known)
+    assert np.isin(known, submap.landmark_ids[rows]).all()
+    assert len(rows) == len(np.unique(rows)) == 50
+    assert (np.diff(submap.landmark_ids[rows]) > 0).all()
+    few = choose_landmarks(submap, 20, submap.landmark_ids)
+    assert len(few) == 20
+
+
+def test_landmarks_are_spread(make_submap):
+    submap = make_submap(200)
+    spread, first = (submap.landmarks[rows] for rows in (choose_landmarks(submap, 30), np.arange(30)))
+
+    def nearest(points):
+        return np.partition(np.linalg.norm(points[:, None] - points, axis=2), 1, axis=1)[:, 1]
+
+    assert np.median(nearest(spread)) > np.median(nearest(first))
+
+
+def test_damaged_messages_are_refused(make_submap, rng):
+    data = pack(make_submap(30), LightConfig(landmarks=30))
+    for _ in range(500):
+        damaged = bytearray(data)
+        damaged[rng.integers(len(data))] ^= int(rng.integers(1, 256))
+        with pytest.raises(ValueError, match=r"."):
+            unpack(bytes(damaged))
+    for length in rng.integers(0, len(data), 50).tolist():
+        with pytest.raises(ValueError, match=r"."):
+            unpack(data[:length])
+
+
+def test_forged_messages_with_a_good_checksum_are_refused_or_a_submap(make_submap, rng):
+    rest = zlib.decompress(pack(make_submap(12), LightConfig(landmarks=12))[9:])
+    refused = 0
+    for _ in range(500):
+        forged = bytearray(rest)
+        forged[rng.integers(len(forged))] = int(rng.integers(256))
+        forged[rng.integers(90)] = int(rng.integers(256))  # among counts, stamps, end pose and box
+        body = zlib.compress(bytes(forged))
+        try:
+            light = unpack(struct.pack("<2sBIH", b"SL", 1, zlib.crc32(body), len(forged)) + body)
+        except ValueError:
+            refused += 1
+        else:
+            np.linalg.cholesky(light.covariance)
+            assert np.isfinite(light.landmarks).all()
+    assert 100 < refused < 500
+
+
+def test_a_message_that_inflates_to_more_than_it_says_is_refused():
+    body = zlib.compress(bytes(10**7))
+    with pytest.raises(ValueError, match="must inflate to 1000 bytes"):
+        unpack(struct.pack("<2sBIH", b"SL", 1, zlib.crc32(body), 1000) + body)
