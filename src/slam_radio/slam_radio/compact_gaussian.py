@@ -35,7 +35,7 @@ _MARGIN = 1.0 + 1e-6
 
 @dataclass(frozen=True, eq=False)
 class CompactGaussian:
-    """What is sent of a covariance: ``blocks`` (21 + 6n,) of B in mm and mrad, ``common`` (6 + 3n, r) of U, ``inflation`` t."""
+    """A covariance as it is sent: ``blocks`` (21 + 6n,) of B in mm and mrad, ``common`` (6 + 3n, r) of U, and t."""
 
     blocks: Float16Array
     common: Int8Array

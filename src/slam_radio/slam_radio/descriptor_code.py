@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Descriptors in 24 bytes: their coordinates along the directions in which SURF-128 descriptors differ.
 
-SURF-128 descriptors fill few of their 128 dimensions: 24 principal directions hold 92 % of their squares. The directions
-were found on simulated rooms (``benchmarks/radio/descriptor_basis.py``) and are part of the format. Descriptors of
-another kind, whose likeness this would spoil, go out whole, a byte a number.
+SURF-128 descriptors fill few of their 128 dimensions: 24 principal directions hold 92 % of their squares. The
+directions were found on simulated rooms (``benchmarks/radio/descriptor_basis.py``) and are part of the format.
+Descriptors of another kind, whose likeness this would spoil, go out whole, a byte a number.
 """
 
 from __future__ import annotations
