@@ -14,7 +14,7 @@ import pytest
 
 SRC = Path(__file__).resolve().parent.parent / "src"
 PACKAGES = sorted(path.name for path in SRC.iterdir() if (path / "setup.py").exists())
-PIP_NAME = {"cv2": "opencv-python-headless", "yaml": "PyYAML", "jinja2": "Jinja2"}
+PIP_NAME = {"cv2": "opencv-python-headless", "yaml": "PyYAML", "jinja2": "Jinja2", "zenoh": "eclipse-zenoh"}
 ROSDEP_KEY = {
     **{name: f"python3-{name}" for name in ("numpy", "scipy", "numba", "click", "rich", "jinja2", "yaml")},
     "matplotlib": "python3-matplotlib",

@@ -27,6 +27,7 @@ setup(
         "sjsam_node",
         "slam_calibration",
         "slam_core",
+        "slam_radio",
         "slam_simulation",
         "stereo_frontend",
         "tof_driver",

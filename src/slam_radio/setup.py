@@ -17,6 +17,7 @@ setup(
     install_requires=[
         "setuptools",
         "slam_core",
+        "eclipse-zenoh",
         "numpy",
         "scipy",
     ],
@@ -25,4 +26,9 @@ setup(
     maintainer_email="maintainers@indoor-slam.org",
     description="Submaps for thin radio links: a few kilobytes each, never surer than the submap itself.",
     license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "radio_link = slam_radio.radio_link_node:main",
+        ]
+    },
 )

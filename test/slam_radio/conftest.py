@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +13,10 @@ import pytest
 from slam_core.geometry import boxplus
 from slam_core.types import PoseEstimate, Submap
 
+sys.path.insert(0, str(Path(__file__).parent))  # radio_world
 
-def made(n: int, seed: int = 1, common: int = 5, dimension: int = 128, agent: str = "one") -> Submap:
+
+def made(n: int, seed: int = 1, common: int = 5, dimension: int = 128, agent: str = "one", index: int = 3) -> Submap:
     """A submap of n landmarks with ``common`` shared directions of error."""
     rng = np.random.default_rng(seed)
     m = 6 + 3 * n
@@ -32,7 +36,7 @@ def made(n: int, seed: int = 1, common: int = 5, dimension: int = 128, agent: st
     descriptors = rng.normal(size=(n, dimension)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     return Submap(
-        agent=agent, index=3, start_stamp_ns=0, end_stamp_ns=2 * 10**9, end_pose=end,
+        agent=agent, index=index, start_stamp_ns=0, end_stamp_ns=2 * 10**9, end_pose=end,
         landmarks=rng.uniform(-4.0, 4.0, size=(n, 3)), covariance=covariance,
         landmark_ids=rng.permutation(5 * n)[:n].astype(np.int64), sightings=rng.integers(3, 400, n).astype(np.int32),
         descriptors=descriptors, path=path, follows_previous=True, session=2,

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from sjsam_node.global_map import GlobalMapConfig
 from slam_core.config import parameter
+from slam_core.files import state_folder
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,5 @@ class SjsamNodeConfig(GlobalMapConfig):
 
 
 def copy_path(config: SjsamNodeConfig, namespace: str) -> Path:
-    """Folder of the copy that a killed node goes on from: the same wherever the node is started.
-
-    A relative path is one below ``$XDG_STATE_HOME/indoor_slam`` (``~/.local/state/indoor_slam``) and the namespace.
-    """
-    path = Path(config.autosave_path or f"{config.map_path}.autosave").expanduser()
-    state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    return path if path.is_absolute() else state / "indoor_slam" / namespace.strip("/") / path
+    """Folder of the copy that a killed node goes on from."""
+    return state_folder(config.autosave_path or f"{config.map_path}.autosave", namespace)

@@ -70,6 +70,16 @@ def name_file(error: BaseException, path: Path) -> None:
         error.filename = error.filename or str(path)
 
 
+def state_folder(path: str, namespace: str) -> Path:
+    """Folder of what a node keeps from start to start: the same wherever the node is started.
+
+    A relative path is one below ``$XDG_STATE_HOME/indoor_slam`` (``~/.local/state/indoor_slam``) and the namespace.
+    """
+    given = Path(path).expanduser()
+    state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    return given if given.is_absolute() else state / "indoor_slam" / namespace.strip("/") / given
+
+
 def atomic_text(path: Path, text: str) -> None:
     """Write ``text`` as UTF-8 with Unix line ends, whole or not at all."""
     with atomic_path(path) as temporary:

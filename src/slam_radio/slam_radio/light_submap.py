@@ -54,6 +54,8 @@ from slam_radio.descriptor_code import decode, encode
 from slam_radio.landmark_choice import choose_landmarks
 
 MAGIC, VERSION = b"SL", 1
+MOST_BYTES = 2**17
+"""Largest message: 65535 bytes that deflate did not make smaller, and their envelope."""
 _ENVELOPE = struct.Struct("<2sBIH")
 _COUNTS = struct.Struct("<HBHHB")
 _CELLS = 65535

@@ -37,6 +37,7 @@ NODE_CONFIGS = {
     "ekf_slam": ("ekf_slam_node.node", "EkfNodeConfig"),
     "sjsam": ("sjsam_node.node_config", "SjsamNodeConfig"),
     "dense_mapper": ("dense_mapping.node", "DenseNodeConfig"),
+    "radio_link": ("slam_radio.radio_config", "RadioConfig"),
 }
 """Module and class of each node's own configuration; the modules need ROS."""
 

@@ -28,6 +28,7 @@ _MODULES = {
     ("slam_bringup", "recorder"): "slam_bringup.bags.recorder_node",
     ("slam_bringup", "viewer"): "slam_bringup.viewer.viewer_node",
     ("dense_mapping", "dense_mapper"): "dense_mapping.node",
+    ("slam_radio", "radio_link"): "slam_radio.radio_link_node",
 }
 """Module of each executable's ``main``, for a workspace that has not been built."""
 

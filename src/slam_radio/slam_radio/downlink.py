@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command post's side of the link: what agents have sent, what they are told, and which of them are silent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from slam_core.geometry import FloatArray, boxminus
+from slam_core.health import State
+from slam_core.types import PoseEstimate, Submap
+from slam_radio.byte_budget import ByteBudget
+from slam_radio.inbox import Inbox
+from slam_radio.index_ranges import Key
+from slam_radio.link_state import Hearing, LinkState
+from slam_radio.radio_messages import pack_acknowledgement, pack_correction, unpack_pose
+from slam_radio.uplink import OVERHEAD
+
+_BEACON_PERIOD_S = 3.0
+"""An acknowledgement goes out so often even if there is no news: agents learn from it that the post is there."""
+_LEAST_PERIOD_S = 0.25
+_CORRECTION_PERIOD_S = 1.0
+_REMINDER_PERIOD_S = 10.0
+_LEAST_CHANGE = np.repeat([1e-3, 2e-4], 3)
+"""A correction that has changed by less, m and rad, is sent as a reminder only."""
+
+
+class Message(NamedTuple):
+    """A message for an agent, ``kind`` being ``ack`` or ``correction``."""
+
+    agent: str
+    kind: str
+    data: bytes
+
+
+class _Agent:
+    """The post's record of one agent."""
+
+    def __init__(self, inbox: Inbox, silent_after_s: float) -> None:
+        self.inbox = inbox
+        self.hearing = Hearing(silent_after_s)
+        self.has_news = False
+        self.told_at_s = float("-inf")
+        self.correction: tuple[int, FloatArray] | None = None
+        self.corrected_by: FloatArray | None = None
+        self.corrected_at_s = float("-inf")
+
+    def correction_is_due(self, now_s: float) -> bool:
+        """True if there is a correction that the agent does not have, or has not had for long."""
+        if self.correction is None:
+            return False
+        gone_s = now_s - self.corrected_at_s
+        if self.corrected_by is None or (np.abs(boxminus(self.correction[1], self.corrected_by)) > _LEAST_CHANGE).any():
+            return gone_s >= _CORRECTION_PERIOD_S
+        return gone_s >= _REMINDER_PERIOD_S
+
+
+class Downlink:
+    """Takes messages of agents, and decides what they are told. Times are those of any steady clock, s."""
+
+    def __init__(self, inboxes: Iterable[Inbox], bytes_per_second: float, silent_after_s: float = 10.0) -> None:
+        self._agents = {inbox.agent: _Agent(inbox, silent_after_s) for inbox in inboxes}
+        self._budget = ByteBudget(bytes_per_second)
+
+    @property
+    def inboxes(self) -> list[Inbox]:
+        """What each agent has sent."""
+        return [agent.inbox for agent in self._agents.values()]
+
+    def on_submap(self, name: str, key: Key, data: bytes, now_s: float) -> list[Submap]:
+        """Take a submap; returns what may be passed on. Raises as :meth:`Inbox.take`."""
+        agent = self._agents[name]
+        agent.hearing.heard(now_s)
+        submaps = agent.inbox.take(key, data)
+        agent.has_news = True
+        return submaps
+
+    def on_pose(self, name: str, data: bytes, now_s: float) -> PoseEstimate:
+        """Take a pose; ValueError if it is damaged."""
+        agent = self._agents[name]
+        pose = unpack_pose(data)
+        agent.has_news |= not agent.hearing.is_up(now_s)
+        agent.hearing.heard(now_s)
+        return pose
+
+    def set_correction(self, name: str, stamp_ns: int, T_map_odom: FloatArray) -> None:
+        """The map knows where an agent's odometry is."""
+        self._agents[name].correction = stamp_ns, T_map_odom
+
+    def due(self, now_s: float) -> list[Message]:
+        """Messages to send now."""
+        out = []
+        for name, agent in self._agents.items():
+            pause_s = now_s - agent.told_at_s
+            if pause_s >= (_LEAST_PERIOD_S if agent.has_news else _BEACON_PERIOD_S):
+                data = pack_acknowledgement(agent.inbox.acknowledgement())
+                if self._take_budget(data, now_s):
+                    agent.told_at_s, agent.has_news = now_s, False
+                    out.append(Message(name, "ack", data))
+            if agent.correction_is_due(now_s) and agent.hearing.is_up(now_s):
+                data = pack_correction(*agent.correction)  # type: ignore[misc]
+                if self._take_budget(data, now_s):
+                    agent.corrected_at_s, agent.corrected_by = now_s, agent.correction[1]  # type: ignore[index]
+                    out.append(Message(name, "correction", data))
+        return out
+
+    def state(self, now_s: float) -> LinkState:
+        """All agents up, or which of them are silent."""
+        silent = [text for name, a in self._agents.items() if (text := a.hearing.text(name, now_s))]
+        held = sum(agent.inbox.held for agent in self._agents.values())
+        return LinkState(State.DEGRADED if silent else State.OK, "; ".join(silent) or "all agents heard", held, 0.0)
+
+    def _take_budget(self, data: bytes, now_s: float) -> bool:
+        size = len(data) + OVERHEAD
+        if not self._budget.allows(size, now_s):
+            return False
+        self._budget.spend(size)
+        return True

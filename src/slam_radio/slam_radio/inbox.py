@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Submaps that have come over the link: kept on disk before they are acknowledged, passed on in order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from slam_core.types import Submap
+from slam_radio.index_ranges import IndexRanges, Key, Range, read_ranges, write_ranges
+from slam_radio.light_submap import unpack
+from slam_radio.radio_messages import MOST_RANGES, unpack_submap
+from slam_radio.submap_folder import SubmapFolder
+
+
+class Inbox:
+    """What one agent has sent. A submap behind a gap waits until its agent has filled it or has nothing to fill it.
+
+    A restart finds what has come, and passes all of it on again.
+    """
+
+    def __init__(self, agent: str, path: Path) -> None:
+        self.agent = agent
+        self._folder = SubmapFolder(path)
+        self.received = IndexRanges((session, index, index + 1) for session, index in self._folder.sizes)
+        self._held = set(self._folder.sizes)
+        self._floors_file = path / "floors.json"
+        self._floors = {session: end for session, _, end in read_ranges(self._floors_file)}
+        self._next: dict[int, int] = {}
+        for session, index in sorted(self._held, reverse=True):
+            self._next[session] = index
+        self.repeated = 0
+        self._newest: Key | None = None
+
+    def take(self, key: Key, data: bytes) -> list[Submap]:
+        """Keep the submap of a message; returns what may be passed on now.
+
+        Raises
+        ------
+        ValueError
+            If the message is damaged, or of another agent or submap than its key says.
+        OSError
+            If it cannot be written; it is then not acknowledged.
+        """
+        floor, light = unpack_submap(data)
+        submap = unpack(light)
+        if (submap.agent, submap.session, submap.index) != (self.agent, *key) or floor > key[1]:
+            raise ValueError(f"submap {submap.agent} {submap.session}/{submap.index} came as {self.agent} {key}")
+        if key in self.received:
+            self.repeated += 1
+        else:
+            self._folder.add(key, light)
+            self.received.add(key)
+            self._held.add(key)
+        self._newest = key
+        if floor > self._next.setdefault(key[0], 0) and floor > self._floors.get(key[0], 0):
+            self._floors[key[0]] = floor
+            write_ranges(self._floors_file, [(s, 0, end) for s, end in sorted(self._floors.items())])
+        return self.release()
+
+    def release(self) -> list[Submap]:
+        """Submaps that may be passed on, in order: what is held and needs to wait for none before it."""
+        released = []
+        for key in sorted(self._held):
+            if key[1] <= max(self._next[key[0]], self._floors.get(key[0], 0)):
+                self._held.remove(key)
+                self._next[key[0]] = max(self._next[key[0]], key[1] + 1)
+                released.append(unpack(self._folder.read(key)))
+        return released
+
+    @property
+    def held(self) -> int:
+        """Submaps that wait for one before them."""
+        return len(self._held)
+
+    def acknowledgement(self) -> list[Range]:
+        """Ranges of what has come, that of the newest message first, then those of the newest sessions."""
+        newest = self.received.around(self._newest) if self._newest else None
+        others = [entry for entry in reversed(list(self.received)) if entry != newest]
+        return [*([newest] if newest else []), *others][:MOST_RANGES]
+
+    def forget(self) -> None:
+        """Remove what has come from disk; it stays acknowledged while this process lives."""
+        for key in list(self._folder.sizes):
+            self._folder.remove(key)
+        self._held.clear()
+
+    def close(self) -> None:
+        """Let another process have the folder."""
+        self._folder.close()

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of submaps for the air, one file each, that survives its process."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from slam_core.files import PathLock, atomic_path, read_bytes
+from slam_radio.index_ranges import Key
+from slam_radio.light_submap import MOST_BYTES, unpack
+
+_NAME = re.compile(r"(\d{1,10})-(\d{1,10})\.submap")
+
+
+class SubmapFolder:
+    """The submaps of one agent on disk: ``sizes`` has their keys and bytes.
+
+    Files that it did not write, or that are damaged, are neither read nor removed; ``strangers`` counts them.
+
+    Raises
+    ------
+    ValueError
+        If another process keeps the folder, or it cannot be read or written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = PathLock(path)
+        self.sizes: dict[Key, int] = {}
+        self.strangers = 0
+        path.mkdir(parents=True, exist_ok=True)
+        for file in sorted(path.iterdir()):
+            match = _NAME.fullmatch(file.name)
+            if match and self._is_ours(file, (int(match[1]), int(match[2]))):
+                self.sizes[int(match[1]), int(match[2])] = file.stat().st_size
+            else:
+                self.strangers += match is not None
+
+    def add(self, key: Key, data: bytes) -> None:
+        """Write a submap, whole or not at all."""
+        file = self._file(key)
+        if file.exists() and key not in self.sizes:
+            raise ValueError(f"{file} is not a submap of this program: move it away")
+        with atomic_path(file) as temporary:
+            temporary.write_bytes(data)
+        self.sizes[key] = len(data)
+
+    def read(self, key: Key) -> bytes:
+        """The bytes of a submap; ValueError or OSError if somebody has taken or changed the file."""
+        return read_bytes(self._file(key), MOST_BYTES)
+
+    def remove(self, key: Key) -> None:
+        """Remove a submap that is there."""
+        del self.sizes[key]
+        self._file(key).unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Let others have the folder."""
+        self._lock.release()
+
+    def _file(self, key: Key) -> Path:
+        return self.path / f"{key[0]}-{key[1]}.submap"
+
+    @staticmethod
+    def _is_ours(file: Path, key: Key) -> bool:
+        try:
+            submap = unpack(read_bytes(file, MOST_BYTES))
+        except (ValueError, OSError):
+            return False
+        return (submap.session, submap.index) == key

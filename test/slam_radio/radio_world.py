@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An agent and a post on a made-up channel, in made-up time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from slam_core.types import PoseEstimate, Submap
+from slam_radio.downlink import Downlink
+from slam_radio.inbox import Inbox
+from slam_radio.light_submap import LightConfig, pack
+from slam_radio.outbox import Outbox
+from slam_radio.radio_messages import pack_pose, unpack_acknowledgement
+from slam_radio.uplink import OVERHEAD, Uplink
+
+SIZE = LightConfig(landmarks=5, rank=1)
+STEP_S = 0.1
+
+
+@dataclass
+class World:
+    """One agent, ``one``, and the post; ``arrives(to_post, now_s)`` says what the channel lets through."""
+
+    folder: Path
+    make: Callable[..., Submap]
+    arrives: Callable[[bool, float], bool] = lambda to_post, now_s: True
+    bytes_per_second: float = 2000.0
+    now_s: float = 0.0
+    passed_on: list[int] = field(default_factory=list)
+    sent: list[tuple[float, int]] = field(default_factory=list)
+    keys: list[int] = field(default_factory=list)
+    poses: list[tuple[float, int]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.start_agent()
+        self.start_post()
+
+    def start_agent(self) -> None:
+        if hasattr(self, "uplink"):
+            self.uplink.outbox.close()
+        self.uplink = Uplink(Outbox(self.folder / "out"), self.bytes_per_second)
+
+    def start_post(self) -> list[int]:
+        """Start the post anew; the indices that it passes on again."""
+        if hasattr(self, "downlink"):
+            self.inbox.close()
+        self.inbox = Inbox("one", self.folder / "in")
+        self.downlink = Downlink([self.inbox], 2000.0)
+        return [s.index for s in self.inbox.release()]
+
+    def submap(self, index: int) -> None:
+        self.uplink.add_submap((2, index), pack(self.make(5, seed=index, index=index), SIZE), self.now_s)
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP_S)):
+            self.now_s += STEP_S
+            self._step()
+
+    def _step(self) -> None:
+        now = self.now_s
+        if self.uplink.pose_is_due(now):
+            self.uplink.set_pose(pack_pose(PoseEstimate(round(now * 1e9), np.eye(4), 1e-4 * np.eye(6))))
+        for message in self.uplink.due(now):
+            self.sent.append((now, len(message.data) + OVERHEAD))
+            if message.key is not None:
+                self.keys.append(message.key[1])
+            if not self.arrives(True, now):
+                continue
+            if message.key is None:
+                self.poses.append((now, self.downlink.on_pose("one", message.data, now).stamp_ns))
+            else:
+                self.passed_on += [s.index for s in self.downlink.on_submap("one", message.key, message.data, now)]
+        for told in self.downlink.due(now):
+            if told.kind == "ack" and self.arrives(False, now):
+                self.uplink.on_acknowledgement(unpack_acknowledgement(told.data), now)
