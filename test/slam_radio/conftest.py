@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parent))  # radio_world
 def made(n: int, seed: int = 1, common: int = 5, dimension: int = 128, agent: str = "one", index: int = 3) -> Submap:
     """A submap of n landmarks with ``common`` shared directions of error."""
     rng = np.random.default_rng(seed)
-    m = 6 + 3 * n
+    m, start = 6 + 3 * n, 2 * 10**9 * index
     scale = np.concatenate([[0.01] * 3, [0.003] * 3, np.full(3 * n, 0.02)])
     shared = rng.normal(size=(m, common)) * scale[:, None]
     own = np.zeros((m, m))
@@ -30,13 +30,13 @@ def made(n: int, seed: int = 1, common: int = 5, dimension: int = 128, agent: st
     end = boxplus(np.eye(4), np.array([1.0, 0.2, -0.1, 0.05, -0.02, 0.3]))
     halfway = boxplus(np.eye(4), np.array([0.5, 0.1, -0.05, 0.02, -0.01, 0.15]))
     path = tuple(
-        PoseEstimate(10**9 * k, T, (1e-9 + 0.25 * k**2) * covariance[:6, :6] / (1.0 + 1e-9))
+        PoseEstimate(start + 10**9 * k, T, (1e-9 + 0.25 * k**2) * covariance[:6, :6] / (1.0 + 1e-9))
         for k, T in enumerate((np.eye(4), halfway, end))
     )
     descriptors = rng.normal(size=(n, dimension)).astype(np.float32)
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     return Submap(
-        agent=agent, index=index, start_stamp_ns=0, end_stamp_ns=2 * 10**9, end_pose=end,
+        agent=agent, index=index, start_stamp_ns=start, end_stamp_ns=start + 2 * 10**9, end_pose=end,
         landmarks=rng.uniform(-4.0, 4.0, size=(n, 3)), covariance=covariance,
         landmark_ids=rng.permutation(5 * n)[:n].astype(np.int64), sightings=rng.integers(3, 400, n).astype(np.int32),
         descriptors=descriptors, path=path, follows_previous=True, session=2,

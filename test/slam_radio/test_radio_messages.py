@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -82,7 +84,7 @@ def test_ranges_join_and_are_kept(tmp_path, rng):
     assert {(s, i) for s in range(4) for i in range(40) if (s, i) in again} == wanted
     listed = list(again)
     assert listed == sorted(listed)
-    assert all(a[0] != b[0] or a[2] < b[1] for a, b in zip(listed, listed[1:], strict=False))
+    assert all(a[0] != b[0] or a[2] < b[1] for a, b in pairwise(listed))
     (tmp_path / "ranges.json").write_text("[1]")
     with pytest.raises(ValueError, match="move it away"):
         read_ranges(tmp_path / "ranges.json")

@@ -80,7 +80,7 @@ def _settings(
         "scouting/multicast/enabled": scouting,
         "scouting/gossip/enabled": scouting,
         "transport/shared_memory/enabled": False,  # segments that outlive a killed process
-        "connect/timeout_ms": 0,  # goes on without, and tries again
+        "connect/timeout_ms": -1,  # for ever, in the background
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 1000, "period_max_ms": 4000, "period_increase_factor": 2},
     }

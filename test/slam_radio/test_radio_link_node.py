@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two ``radio_link`` processes over loopback TCP: submaps and poses reach the post, also those of a silence."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("zenoh")
+pytestmark = pytest.mark.ros
+
+from ros_probe import Probe  # noqa: E402
+from slam_bringup.processes.node_arguments import ros_arguments  # noqa: E402
+from slam_bringup.processes.processes import PrivateDomain, find_executable, node_environment  # noqa: E402
+from slam_core.geometry import boxplus  # noqa: E402
+from slam_core.messages import (  # noqa: E402
+    SUBMAP_TOPICS,
+    odometry_message,
+    submap_from_messages,
+    submap_messages,
+    transform_from_message,
+    transform_message,
+)
+from slam_core.messages.submaps import SubmapMessages  # noqa: E402
+from slam_core.ros import sensor_qos  # noqa: E402
+from slam_core.types import PoseEstimate  # noqa: E402
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
+    with PrivateDomain() as domain:
+        yield node_environment(domain) | {"XDG_STATE_HOME": str(tmp_path / "state")}
+
+
+@pytest.fixture
+def probe(environment: dict[str, str]) -> Iterator[Probe]:
+    context = rclpy.Context()
+    before = {name: os.environ.get(name) for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
+    os.environ |= {name: environment[name] for name in before}
+    rclpy.init(context=context, domain_id=int(environment["ROS_DOMAIN_ID"]))
+    probe = Probe(context)
+    yield probe
+    probe.executor.shutdown()
+    probe.node.destroy_node()
+    context.try_shutdown()
+    for name, value in before.items():
+        os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+@contextmanager
+def radio_link(environment: dict[str, str], log: Path, namespace: str = "", **parameters: Any) -> Iterator[Any]:
+    command = [*find_executable("slam_radio", "radio_link", []), *ros_arguments(parameters, namespace)]
+    with log.open("ab") as output:
+        process = subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0, log.read_text()
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+def test_submaps_poses_and_corrections_cross_the_link_and_survive_its_silence(
+    environment: dict[str, str], probe: Probe, make_submap: Callable[..., Any], tmp_path: Path
+) -> None:
+    address = f"tcp/127.0.0.1:{free_port()}"
+    types = probe.types
+    for topic, kind in SUBMAP_TOPICS.items():
+        probe.listen(f"/anna/{topic}", getattr(types, kind), latched=True)
+    probe.listen("/anna/odom", types.Odometry)
+    probe.listen("/helmet/map_to_odom", types.TransformStamped, latched=True)
+    senders = {
+        topic: probe.node.create_publisher(getattr(types, kind), f"/helmet/{topic}", sensor_qos(100, True))
+        for topic, kind in SUBMAP_TOPICS.items()
+    }
+    submaps = [make_submap(40, seed=k, index=k, agent="") for k in range(5)]
+    T = boxplus(np.eye(4), np.array([1.0, 2.0, 0.0, 0.0, 0.0, 0.3]))
+
+    def publish(index: int) -> None:
+        for topic, message in zip(SUBMAP_TOPICS, submap_messages(types, submaps[index]), strict=True):
+            senders[topic].publish(message)
+
+    def received() -> list[Any]:
+        return list(zip(*(probe.received[f"/anna/{topic}"] for topic in SUBMAP_TOPICS), strict=False))
+
+    def wait_for(count: int) -> None:
+        try:
+            probe.wait(lambda: len(received()) >= count, "")
+        except AssertionError:
+            pytest.fail(f"{len(received())} of {count} submaps: {logs()}")
+
+    def logs() -> str:
+        return "\n".join(path.read_text(errors="replace") for path in tmp_path.glob("*.log"))
+
+    agent = {"agents": ("anna",), "connect": (address,), "light.landmarks": 20, "resend_after_s": 1.0}
+    post = {"role": "post", "agents": ("anna",), "listen": (address,)}
+    with radio_link(environment, tmp_path / "agent.log", "helmet", **agent):
+        with radio_link(environment, tmp_path / "post.log", **post):
+            publish(0)
+            publish(1)
+            wait_for(2)
+            odometry = odometry_message(types, "odom", "base_link", PoseEstimate(10**9, T, 1e-4 * np.eye(6)))
+            probe.send("/helmet/odom", odometry)
+            probe.wait(lambda: probe.received["/anna/odom"], "no pose at the post")
+            probe.send("/anna/map_to_odom", transform_message(types, 10**9, "map", "anna/odom", T))
+
+            def is_corrected() -> bool:
+                probe.send("/helmet/odom", odometry)
+                return bool(probe.received["/helmet/map_to_odom"])
+
+            probe.wait(is_corrected, f"no correction at the agent: {logs()}")
+            correction = probe.received["/helmet/map_to_odom"][-1]
+        publish(2)  # the post is away
+        publish(3)
+        waiting = tmp_path / "state" / "indoor_slam" / "helmet" / "radio" / "outbox" / "anna"
+        probe.wait(lambda: len(list(waiting.glob("*.submap"))) == 2, "nothing waits on disk")
+    for received_on in probe.received.values():
+        received_on.clear()
+    publish(4)
+    with (
+        radio_link(environment, tmp_path / "post.log", **post),
+        radio_link(environment, tmp_path / "agent.log", "helmet", **agent),
+    ):
+        wait_for(5)  # two of before once more, for a sjsam that was started anew too
+        probe.wait(lambda: not list(waiting.glob("*.submap")), "what was received still waits")
+    found = [submap_from_messages(SubmapMessages(*messages)) for messages in received()]
+    assert [s.index for s in found] == list(range(5))
+    for light, whole in zip(found, submaps, strict=True):
+        assert light.agent == "anna"
+        assert light.session == whole.session
+        assert len(light.landmarks) == 20
+        rows = [int(np.nonzero(whole.landmark_ids == i)[0][0]) for i in light.landmark_ids]
+        np.testing.assert_allclose(light.landmarks, whole.landmarks[rows], atol=1e-3)
+    parent, child, found_T = transform_from_message(correction)
+    assert (parent, child) == ("map", "odom")
+    np.testing.assert_allclose(found_T, T, atol=1e-6)
+    assert "Traceback" not in logs()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "text"),
+    [
+        ({"agents": ("anna",)}, "say where the other end is"),
+        ({"agents": ("anna", "bert"), "connect": ("tcp/127.0.0.1:1",)}, "an agent has one name"),
+        ({"agents": ("a/b",), "connect": ("tcp/127.0.0.1:1",)}, "must name the agents by letters"),
+        ({"agents": ("anna",), "connect": ("nonsense",)}, "the radio link does not open"),
+        ({"agents": ("anna",), "connect": ("tcp/127.0.0.1:1",), "user": "anna"}, "needs 'password_file'"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(
+    environment: dict[str, str], tmp_path: Path, parameters: dict[str, Any], text: str
+) -> None:
+    command = [*find_executable("slam_radio", "radio_link", []), *ros_arguments(parameters)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert text in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_without_zenoh_a_line_says_what_to_install(environment: dict[str, str]) -> None:
+    code = "import sys; sys.modules['zenoh'] = None; from slam_radio.radio_link_node import main; main()"
+    arguments = ros_arguments({"connect": ("tcp/127.0.0.1:1",)})
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 2
+    assert "pip install eclipse-zenoh" in done.stderr
