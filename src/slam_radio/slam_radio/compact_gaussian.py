@@ -14,6 +14,7 @@ can therefore only make the Gaussian less sure.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +26,7 @@ Float16Array = npt.NDArray[np.float16]
 
 UNIT = 1e-3
 """Blocks are sent in mm and mrad."""
-_ITERATIONS = 6
+_ITERATIONS = 2
 _LEAST_OWN = 2e-3
 """Least share of an unknown's variance that is taken as its own: keeps ``D`` invertible."""
 _STEPS = 127.0
@@ -43,8 +44,8 @@ class CompactGaussian:
 
     def covariance(self) -> FloatArray:
         """The covariance (6 + 3n, 6 + 3n), positive definite."""
-        B, U = _block_matrix(self.blocks, len(self.common)), self.common.astype(np.float64) / _STEPS
-        return np.asarray(B @ (U @ U.T + self.inflation * _own(U)) @ B.T)
+        U = self.common.astype(np.float64) / _STEPS
+        return _factors(self.blocks).between(_sum(U @ U.T, self.inflation, _own(U)))
 
 
 def compact_gaussian(covariance: FloatArray, rank: int, rounding: float = 0.0) -> CompactGaussian:
@@ -67,78 +68,82 @@ def compact_gaussian(covariance: FloatArray, rank: int, rounding: float = 0.0) -
     S = covariance.copy()
     rows = np.arange(6, len(S))
     S[rows, rows] += rounding**2
-    blocks = _blocks(S)
-    B = _block_matrix(blocks, len(S))
-    whitened = _whitened(B, S)
+    blocks = _rounded_factors(S)
+    whitened = _factors(blocks).inverse().between(S)
     U = _common_directions(whitened, min(rank, len(S) - 1))
     rounded = np.clip(np.rint(_STEPS * U), -_STEPS, _STEPS).astype(np.int8)
     U = rounded.astype(np.float64) / _STEPS
-    own = _block_cholesky(_own(U))
-    excess = _whitened(own, whitened - U @ U.T)
+    excess = _own(U).cholesky().inverse().between(whitened - U @ U.T)
     inflation = max(1.0, float(np.linalg.eigvalsh(excess)[-1]))
     return CompactGaussian(blocks, rounded, float(np.nextafter(np.float32(inflation * _MARGIN), np.float32(np.inf))))
 
 
-def _slices(m: int) -> list[slice]:
-    return [slice(0, 6), *(slice(k, k + 3) for k in range(6, m, 3))]
+class _Blocks(NamedTuple):
+    """A block-diagonal matrix: the pose's block (6, 6) and the landmarks' (n, 3, 3)."""
+
+    pose: FloatArray
+    landmarks: FloatArray
+
+    @classmethod
+    def of(cls, S: FloatArray) -> _Blocks:
+        """The blocks of a matrix (6 + 3n, 6 + 3n)."""
+        n = (len(S) - 6) // 3
+        return cls(S[:6, :6], S[6:, 6:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :])
+
+    def cholesky(self) -> _Blocks:
+        """Cholesky factors of the blocks."""
+        return _Blocks(np.linalg.cholesky(self.pose), np.linalg.cholesky(self.landmarks))
+
+    def inverse(self) -> _Blocks:
+        """Inverses of the blocks."""
+        return _Blocks(np.linalg.inv(self.pose), np.linalg.inv(self.landmarks))
+
+    def times(self, M: FloatArray) -> FloatArray:
+        """The product with a matrix (6 + 3n, k)."""
+        n, k = len(self.landmarks), M.shape[1]
+        return np.concatenate([self.pose @ M[:6], (self.landmarks @ M[6:].reshape(n, 3, k)).reshape(3 * n, k)])
+
+    def between(self, S: FloatArray) -> FloatArray:
+        """A S A' for this matrix A and a symmetric one (6 + 3n, 6 + 3n)."""
+        W = self.times(self.times(S).T)
+        return np.asarray(0.5 * (W + W.T))
 
 
-def _block_cholesky(S: FloatArray) -> FloatArray:
-    out = np.zeros_like(S)
-    out[:6, :6] = np.linalg.cholesky(S[:6, :6])
-    small = np.linalg.cholesky(_small_blocks(S))
-    for k, rows in enumerate(_slices(len(S))[1:]):
-        out[rows, rows] = small[k]
-    return out
+def _sum(S: FloatArray, factor: float, blocks: _Blocks) -> FloatArray:
+    """S + factor * blocks; S is changed."""
+    S[:6, :6] += factor * blocks.pose
+    for k, block in enumerate(blocks.landmarks):
+        S[6 + 3 * k : 9 + 3 * k, 6 + 3 * k : 9 + 3 * k] += factor * block
+    return S
 
 
-def _small_blocks(S: FloatArray) -> FloatArray:
-    """The landmarks' own blocks (n, 3, 3)."""
-    n = (len(S) - 6) // 3
-    return S[6:, 6:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
-
-
-def _blocks(S: FloatArray) -> Float16Array:
+def _rounded_factors(S: FloatArray) -> Float16Array:
     """Lower triangles of the blocks' Cholesky factors in mm and mrad, the pose's first."""
     try:
-        B = _block_cholesky(S)
+        B = _Blocks.of(S).cholesky()
     except np.linalg.LinAlgError as error:
         raise ValueError("a submap's covariance must be positive definite") from error
-    if not B.max(initial=0.0) / UNIT < np.finfo(np.float16).max:
-        raise ValueError(f"a standard deviation of {B.max():.3g} m is too large to be sent")
     rows, columns = np.tril_indices(3)
-    values = np.concatenate([B[:6, :6][np.tril_indices(6)], _small_blocks(B)[:, rows, columns].ravel()])
-    return np.asarray(values / UNIT, dtype=np.float16)
+    values = np.concatenate([B.pose[np.tril_indices(6)], B.landmarks[:, rows, columns].ravel()]) / UNIT
+    if not np.abs(values).max() < np.finfo(np.float16).max:
+        raise ValueError(f"a standard deviation of {UNIT * np.abs(values).max():.3g} m is too large to be sent")
+    return np.asarray(values, dtype=np.float16)
 
 
-def _block_matrix(blocks: Float16Array, m: int) -> FloatArray:
-    B, values = np.zeros((m, m)), UNIT * blocks.astype(np.float64)
-    B[:6, :6][np.tril_indices(6)] = values[:21]
-    small = values[21:].reshape(-1, 6)
+def _factors(blocks: Float16Array) -> _Blocks:
+    """Inverse of :func:`_rounded_factors`."""
+    values = UNIT * blocks.astype(np.float64)
+    B = _Blocks(np.zeros((6, 6)), np.zeros(((len(values) - 21) // 6, 3, 3)))
+    B.pose[np.tril_indices(6)] = values[:21]
     rows, columns = np.tril_indices(3)
-    first = 6 + 3 * np.arange(len(small))
-    B[first[:, None] + rows, first[:, None] + columns] = small
+    B.landmarks[:, rows, columns] = values[21:].reshape(-1, 6)
     return B
 
 
-def _whitened(B: FloatArray, S: FloatArray) -> FloatArray:
-    """B^-1 S B^-T for a block-diagonal B."""
-    inverse = np.zeros_like(B)
-    inverse[:6, :6] = np.linalg.inv(B[:6, :6])
-    for rows, block in zip(_slices(len(B))[1:], np.linalg.inv(_small_blocks(B)), strict=True):
-        inverse[rows, rows] = block
-    W = inverse @ S @ inverse.T
-    return np.asarray(0.5 * (W + W.T))
-
-
-def _own(U: FloatArray) -> FloatArray:
+def _own(U: FloatArray) -> _Blocks:
     """I less the blocks of U U', with eigenvalues of at least ``_LEAST_OWN``."""
-    D = np.zeros((len(U), len(U)))
-    D[:6, :6] = _floored(np.eye(6) - U[:6] @ U[:6].T)
     V = U[6:].reshape(-1, 3, U.shape[1])
-    for rows, block in zip(_slices(len(U))[1:], _floored(np.eye(3) - V @ V.transpose(0, 2, 1)), strict=True):
-        D[rows, rows] = block
-    return D
+    return _Blocks(_floored(np.eye(6) - U[:6] @ U[:6].T), _floored(np.eye(3) - V @ V.transpose(0, 2, 1)))
 
 
 def _floored(blocks: FloatArray) -> FloatArray:
@@ -150,11 +155,11 @@ def _common_directions(C: FloatArray, rank: int) -> FloatArray:
     """Factor analysis of a covariance with identity blocks: U (m, rank) by alternating between U and D."""
     from scipy.linalg import eigh  # its own half second, which receivers need not spend
 
-    m, U = len(C), np.zeros((len(C), rank))
-    D = 0.5 * np.eye(m)
+    m = len(C)
+    U, D = np.zeros((m, rank)), _Blocks(0.5 * np.eye(6), np.tile(0.5 * np.eye(3), ((m - 6) // 3, 1, 1)))
     for _ in range(_ITERATIONS):
-        L = _block_cholesky(D)
-        values, vectors = eigh(_whitened(L, C), subset_by_index=(m - rank, m - 1))
-        U = L @ (vectors * np.sqrt(np.maximum(values - 1.0, 0.0)))
+        L = D.cholesky()
+        values, vectors = eigh(L.inverse().between(C), subset_by_index=(m - rank, m - 1))
+        U = L.times(vectors * np.sqrt(np.maximum(values - 1.0, 0.0)))
         D = _own(U)
     return np.asarray(U)
