@@ -25,6 +25,7 @@ COMMANDS = {
     "nodes": "the same through the real ROS nodes: starts them, plays the bag, records",
     "demo": "the demo: the real nodes, in one process, on the bag that comes with the program",
     "live": "map live: all nodes in one process, on a camera or on topics",
+    "post": "a command post: joins what agents send over a radio link",
     "simulate": "render a scenario to a bag with ground truth",
     "convert": "a public data set (EuRoC, KITTI, RGB-D) to a bag",
     "view": "show a finished run, or the nodes at work, in the browser",

@@ -177,12 +177,7 @@ class PostEnd(_End):
                 f"{agent}/map_to_odom", "TransformStamped", correction,
                 latched=True, required=False, stamps=StampPolicy.ANY,
             )  # fmt: skip
-        for inbox in inboxes:
-            if submaps := inbox.release():
-                node.get_logger().info(
-                    f"{len(submaps)} submaps of {inbox.agent} from before are passed on again (~/reset forgets them)"
-                )
-            self._pass_on(inbox.agent, submaps)
+        self._begun = False
         for agent in config.agents:
             self.hear(f"slam/{agent}/pose", partial(self.on_pose, agent))
             self.hear(f"slam/{agent}/submap/*/*", partial(self.on_submap, agent))
@@ -202,8 +197,20 @@ class PostEnd(_End):
         """Keep the newest correction of an agent."""
         self.downlink.set_correction(agent, stamp_ns(message), transform_from_message(message)[2])
 
+    def _pass_on_again(self) -> None:
+        """What had come before this start: once all nodes of this process listen."""
+        self._begun = True
+        for inbox in self.downlink.inboxes:
+            if submaps := inbox.release():
+                self.node.get_logger().info(
+                    f"{len(submaps)} submaps of {inbox.agent} from before are passed on again (~/reset forgets them)"
+                )
+            self._pass_on(inbox.agent, submaps)
+
     def pump(self, now_s: float) -> None:
         """Send what is due."""
+        if not self._begun:
+            self._pass_on_again()
         for agent, kind, data in self.downlink.due(now_s):
             self.send(f"slam/{agent}/{kind}", data, urgent=True)
 

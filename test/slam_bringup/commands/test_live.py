@@ -24,7 +24,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Arguments by executable, and ``rest``: what every node is given; filled by the command."""
     found: dict[str, Any] = {}
 
-    def run_composed(commands: Sequence[NodeCommand], arguments: Sequence[str]) -> None:
+    def run_composed(commands: Sequence[NodeCommand], arguments: Sequence[str] = ()) -> None:
         found.update({c.executable: " ".join(c.arguments) for c in commands}, rest=list(arguments))
 
     module = ModuleType("composed_node")
@@ -62,3 +62,24 @@ def test_what_to_map_is_asked_for(started: dict[str, Any]) -> None:
     refused = CliRunner().invoke(slam, ["live", "--topics", "--localize-only"])
     assert "--map" in refused.output + str(refused.exception)
     assert not started
+
+
+def test_a_rig_with_a_name_speaks_to_a_command_post(started: dict[str, Any]) -> None:
+    words = ["live", "--topics", "--post", "tcp/10.0.0.1:7447"]
+    for names in ([], ["--agents", "anna,bert"]):
+        refused = CliRunner().invoke(slam, [*words, *names])
+        assert "--agents NAME" in refused.output + str(refused.exception)
+    assert CliRunner().invoke(slam, [*words, "--agents", "anna"]).exit_code == 0
+    assert 'connect:=["tcp/10.0.0.1:7447"]' in started["radio_link"]
+    assert 'agents:=["anna"]' in started["radio_link"]
+    assert "__ns:=/anna" in started["radio_link"]
+
+
+def test_a_command_post_has_link_map_and_page(started: dict[str, Any]) -> None:
+    result = CliRunner().invoke(slam, ["post", "--agents", "anna, bert", "--port", "0"])
+    assert result.exit_code == 0, result.output
+    assert started.keys() == {"radio_link", "sjsam", "viewer", "rest"}
+    assert all('agents:=["anna", "bert"]' in started[name] for name in ("radio_link", "sjsam", "viewer"))
+    assert 'role:="post"' in started["radio_link"]
+    assert 'listen:=["tcp/0.0.0.0:7447"]' in started["radio_link"]
+    assert "port:=0" in started["viewer"]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import click
 from slam_bringup.commands.mapping_options import rig_options
 from slam_bringup.pipeline.map_growth import map_folder
 from slam_bringup.processes.launch_plan import plan_launch
-from slam_bringup.processes.node_graph import NodeSpec
+from slam_bringup.processes.node_graph import NodeSpec, radio_node
 
 
 @click.command()
@@ -21,16 +22,20 @@ from slam_bringup.processes.node_graph import NodeSpec
 @click.option("--left-info", type=click.Path(exists=True, dir_okay=False), help="camera_info YAML of its left half")
 @click.option("--right-info", type=click.Path(exists=True, dir_okay=False), help="camera_info YAML of its right half")
 @click.option("--agents", default="", help="names of the agents, comma-separated [one rig]")
+@click.option(
+    "--post", multiple=True, help="address of a command post (slam post), as tcp/192.168.1.10:7447; several: all"
+)
 @rig_options
 def command(
     camera: str | None, by_topics: bool, left_info: str | None, right_info: str | None, agents: str, mode: str | None,
     odometry: str, config: Path | None, topics: tuple[str, ...], calibrations: tuple[Path, ...], base_frame: str,
-    old_map: Path | None, localize_only: bool,
+    old_map: Path | None, localize_only: bool, post: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Map live, until Ctrl-C: CAMERA is a side-by-side stereo camera (number or device), or --topics are there.
 
     The map is saved by the service ~/save_map of sjsam, as with separate nodes. With --map it goes on in the map of a
-    finished run, with --localize-only the rig is only located in it.
+    finished run, with --localize-only the rig is only located in it. With --post and the rig's name (--agents) its
+    submaps and poses go to a command post too.
     """
     if (by_topics or bool(topics)) == (camera is not None):
         raise ValueError("say what to map: a CAMERA, or --topics of the sensors' drivers")
@@ -44,12 +49,26 @@ def command(
     nodes = plan.nodes
     if camera is not None:
         nodes = tuple(_with_camera(spec, camera, left_info, right_info) for spec in nodes)
+    if post:
+        nodes = (*nodes, radio_node(_only(agents), post))
     remapped = [word for inner, outer in plan.remappings for word in ("-r", f"{inner}:={outer}")]
+    run_in_one_process(nodes, ["--ros-args", *remapped])
+
+
+def run_in_one_process(nodes: Iterable[NodeSpec], ros_arguments: Sequence[str] = ()) -> None:
+    """Run nodes until Ctrl-C; ValueError where there is no ROS."""
     try:
         composed = importlib.import_module("slam_bringup.processes.composed_node")
     except ImportError as error:
         raise ValueError(f"live mapping needs ROS 2 Jazzy ({error}): source an installation, or use ./slam") from error
-    composed.run_composed([spec.command for spec in nodes], ["--ros-args", *remapped])
+    composed.run_composed([spec.command for spec in nodes], ros_arguments)
+
+
+def _only(agents: str) -> str:
+    """The agent that a command post knows this rig by."""
+    if not agents or "," in agents:
+        raise ValueError("--post needs the rig's name, one, as the command post lists it: --agents NAME")
+    return agents.strip()
 
 
 def _with_camera(spec: NodeSpec, camera: str, left_info: str | None, right_info: str | None) -> NodeSpec:

@@ -41,7 +41,9 @@ _NODES = {
     "ndt_odometry": "ndt_registration.node:NdtNode",
     "feature_extractor": "stereo_frontend.node:FeatureNode",
     "ekf_slam": "ekf_slam_node.node:EkfNode",
+    "radio_link": "slam_radio.radio_link_node:RadioLinkNode",
     "sjsam": "sjsam_node.node:SjsamNode",
+    "viewer": "slam_bringup.viewer.viewer_node:ViewerNode",
 }
 """Module and class of the node of each executable."""
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -159,6 +159,24 @@ def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port
     model = _spec("dense_mapping", "dense_mapper", config.dense_mapper, "", {}, agents=agents)
     page = _spec("slam_bringup", "viewer", None, "", {}, agents=agents, port=port)
     return [model, page]
+
+
+def radio_node(agent: str, addresses: Sequence[str]) -> NodeSpec:
+    """The link of an agent, which has a map of its own, to the command post at ``addresses``."""
+    parameters = {
+        "agents": (agent,), "connect": tuple(addresses), "correction_topic": "post/map_to_odom", "broadcast_tf": False
+    }  # fmt: skip
+    return NodeSpec("slam_radio", "radio_link", agent, parameters)
+
+
+def post_nodes(agents: Sequence[str], addresses: Sequence[str], port: int, config: SystemConfig) -> list[NodeSpec]:
+    """The nodes of a command post that listens at ``addresses``, with a page at ``port``."""
+    link = {"role": "post", "agents": tuple(agents), "listen": tuple(addresses)}
+    return [
+        NodeSpec("slam_radio", "radio_link", "", link),
+        _spec("sjsam_node", "sjsam", config.sjsam, "", {}, agents=tuple(agents)),
+        NodeSpec("slam_bringup", "viewer", "", {"agents": tuple(agents), "port": port}),
+    ]
 
 
 def _bag_parameters(
