@@ -47,6 +47,7 @@ NOT_RUN = {
     r"\./slam nodes": "starts processes; test/integration/test_executables.py runs it",
     r"\./slam view": "serves a page until Ctrl-C; test/slam_bringup/viewer looks at it",
     r"\./slam live ": "needs a camera",
+    r"\./slam post ": "runs until Ctrl-C; test/slam_bringup/commands/test_live.py looks at what it starts",
     r"docker ": "needs a Docker daemon",
     r"source |rosdep |colcon |pip |ros2 bag ": "needs a ROS installation or the network",
     r"ros2 launch (realsense2_camera|depthai_ros_driver|zed_wrapper)|ros2 param ": "needs a vendor's driver and camera",

@@ -6,7 +6,7 @@
 RUN: the folder of a run with its ``map``. The submaps of its first agent are published as they ended, in real time,
 with odometry at 10 Hz; the post keeps what arrives. Columns: submaps published and arrived, kB on the wire (Ethernet
 frames, both directions, with TCP, Zenoh, acknowledgements and poses) in all and a metre of way, seconds from a submap's
-end to its arrival (median, 95 %, most), poses that arrived. Needs the workspace to be sourced, and ip and tc.
+end to its arrival (median, 95 %, most), seconds from the end of the silence until all of before had arrived. Needs the workspace to be sourced, and ip and tc.
 """
 
 from __future__ import annotations
@@ -93,11 +93,14 @@ def measure(submaps: list[Submap], arguments: argparse.Namespace) -> None:
             time.sleep(0.2)
         used = on_the_wire() - before
         took = {f.name: f.stat().st_mtime - ends[f.name] for f in inbox.glob("*.submap")}
+        silent = [f for f in took if arguments.silence and ends[f] < begun + arguments.silence[1]]
+        gone = max((ends[f] + took[f] for f in silent), default=0.0) - begun - (arguments.silence or [0.0, 0.0])[1]
     way = sum(float(np.linalg.norm(s.end_pose[:3, 3])) for s in submaps)
     waits = np.array(list(took.values()))
     shares = np.percentile(waits, (50, 95, 100)) if len(waits) else np.full(3, np.nan)
     print(f"submaps {len(took)} of {len(ends)}, {used / 1e3:.0f} kB on the wire, {used / way / 1e3:.1f} kB/m, "
-          f"arrival median {shares[0]:.1f} s, 95 % {shares[1]:.1f} s, most {shares[2]:.1f} s")  # fmt: skip
+          f"arrival median {shares[0]:.1f} s, 95 % {shares[1]:.1f} s, most {shares[2]:.1f} s"
+          + (f", backlog gone {gone:.1f} s after the silence" if silent else ""))  # fmt: skip
 
 
 def since(submaps: list[Submap], stamp_ns: int) -> float:

@@ -23,6 +23,7 @@ ESTIMATORS = (
 )
 TOOLS = (
     ("dense_mapping", "dense_mapper"),
+    ("slam_radio", "radio_link"),
     *(("slam_bringup", name) for name in ("bag_player", "recorder", "slam_composed", "viewer")),
 )
 RECORDED = ("/stereo/left/image_rect", "/tof/points", "/features", "/odom", "/ndt/odometry", "/diagnostics")
