@@ -4,9 +4,10 @@
     sudo python benchmarks/radio/shaped_link.py RUN [--rate 500kbit] [--silence 30 60] [--seconds 120]
 
 RUN: the folder of a run with its ``map``. The submaps of its first agent are published as they ended, in real time,
-with odometry at 10 Hz; the post keeps what arrives. Columns: submaps published and arrived, kB on the wire (Ethernet
-frames, both directions, with TCP, Zenoh, acknowledgements and poses) in all and a metre of way, seconds from a submap's
-end to its arrival (median, 95 %, most), seconds from the end of the silence until all of before had arrived. Needs the workspace to be sourced, and ip and tc.
+with odometry at 10 Hz; the post keeps what arrives. It prints the submaps that arrived of those published, kB on the
+wire (Ethernet frames, both directions, with TCP, Zenoh, acknowledgements and poses) in all and a metre of way, seconds
+from a submap's end to its arrival, and from the end of the silence until all of before had arrived. Needs the workspace
+to be sourced, and ip and tc; the silence is a rate of 80 bits a second.
 """
 
 from __future__ import annotations

@@ -13,8 +13,9 @@ can therefore only make the Gaussian less sure.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -92,11 +93,14 @@ class _Blocks(NamedTuple):
 
     def cholesky(self) -> _Blocks:
         """Cholesky factors of the blocks."""
-        return _Blocks(np.linalg.cholesky(self.pose), np.linalg.cholesky(self.landmarks))
+        return self._mapped(np.linalg.cholesky)
 
     def inverse(self) -> _Blocks:
         """Inverses of the blocks."""
-        return _Blocks(np.linalg.inv(self.pose), np.linalg.inv(self.landmarks))
+        return self._mapped(np.linalg.inv)
+
+    def _mapped(self, function: Callable[[FloatArray], Any]) -> _Blocks:
+        return _Blocks(function(self.pose), function(self.landmarks))
 
     def times(self, M: FloatArray) -> FloatArray:
         """The product with a matrix (6 + 3n, k)."""
