@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Submaps for the air beside whole ones: bytes, time, and the map that is joined from them.
 
-    python benchmarks/radio/light_submaps.py RUN ... [--landmarks 32 64 96 128] [--rank 8]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/radio/light_submaps.py RUN ... [--landmarks 32 64 96 128] [--rank 8]
 
 RUN: the folder of a run with its ``map``. Its submaps are packed and unpacked in order, and joined as whole ones are.
 Columns: kB a submap, kB a metre of way between the submaps' ends, processor ms to pack and unpack, closures, parts of

@@ -137,9 +137,9 @@ class ViewerNode(SlamNode[ViewerConfig]):
         # Markers have no stamp of their own, which the inputs of estimators need.
         for topic, show in (("map/graph", self._on_graph), ("map/marks", self._on_marks)):
             take = partial(self._take_markers, topic, show)
-            self.create_subscription(self.types.MarkerArray, topic, take, sensor_qos(1, latched=True))
+            self.create_subscription(self._ros_types.MarkerArray, topic, take, sensor_qos(1, latched=True))
         # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
-        self.create_subscription(self.types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
+        self.create_subscription(self._ros_types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
         self.listen(
             "map/dense_cloud", "PointCloud2", self._on_dense_cloud, latched=True, required=False, stamps=StampPolicy.ANY
         )
