@@ -23,10 +23,9 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 from self_calibration import scale_error_percent
-from sjsam_node.smoothing.estimator import EstimatorConfig
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
-from sjsam_node.smoothing.solver import SmootherConfig
+from sjsam_node.smoothing.solver import EstimatorConfig, SmootherConfig
 from slam_bringup.bags.bag_types import BagTypes, typestore
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.configuration import choose, load_system_config

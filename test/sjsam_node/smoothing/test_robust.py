@@ -11,7 +11,6 @@ from submap_world import Agent, circle, ring_world
 from text_world import city, park
 
 from sjsam_node.graph.links import Link
-from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.linear_slam.text_joining import (
     TextIndex,
     TextJoiner,
@@ -20,10 +19,11 @@ from sjsam_node.linear_slam.text_joining import (
     join_text_maps,
 )
 from sjsam_node.linear_slam.text_maps import TextMap
+from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.smoothing.joining import JoiningProblem
 from sjsam_node.smoothing.problem import LocalMap, flatten
 from sjsam_node.smoothing.robust import LOSSES, RobustConfig, closing_rows, normalized_error, predicted, weight, widened
-from sjsam_node.smoothing.solver import Estimator, EstimatorConfig
+from sjsam_node.smoothing.solver import EstimatorConfig, SmootherConfig
 from slam_core.chi_square import chi_square_bound
 from slam_core.geometry import boxminus
 
@@ -149,18 +149,18 @@ def test_true_maps_are_left_as_they_are() -> None:
     assert robust.chi2 == pytest.approx(plain.chi2, rel=1e-9)
 
 
-def ring_graph(seed: int) -> tuple[MapGraph, Agent]:
+def ring_map(seed: int, loss: str) -> tuple[MapEstimate, Agent]:
     """One lap and a bit around a ring, linked by the true association."""
     rng = np.random.default_rng(seed)
-    agent, graph = Agent(ring_world(4.0, rng), circle(4.0, 1.2), rng), MapGraph()
-    submaps = agent.submaps()
-    for k, submap in enumerate(submaps):
-        graph.append(submap, graph.records[-1].end if k else None, np.eye(4))
+    agent = Agent(ring_world(4.0, rng), circle(4.0, 1.2), rng)
+    estimate = MapEstimate(SmootherConfig(estimator=EstimatorConfig(robust=RobustConfig(loss))))
+    for k, submap in enumerate(agent.submaps()):
+        estimate.add_submap(submap, estimate.graph.records[-1].end if k else None, np.eye(4))
         for older in range(k):
             _, i, j = np.intersect1d(agent.seen[older], agent.seen[k], return_indices=True)
             if len(i):
-                graph.add_link(link(older, k, np.stack([i, j], axis=1)))
-    return graph, agent
+                estimate.add_links([link(older, k, np.stack([i, j], axis=1))])
+    return estimate, agent
 
 
 def link(first: int, second: int, pairs: np.ndarray) -> Link:
@@ -169,15 +169,16 @@ def link(first: int, second: int, pairs: np.ndarray) -> Link:
 
 def optimized(seed: int, loss: str, *, spoilt: bool) -> tuple[float, float]:
     """Largest error of a pose in m, and the joint squared normalised error of three poses (18 degrees of freedom)."""
-    graph, agent = ring_graph(seed)
+    estimate, agent = ring_map(seed, loss)
     if spoilt:
-        graph.add_link(link(3, 12, np.stack([np.arange(10), np.arange(10)], axis=1)))
-    assembled, _ = Estimator(EstimatorConfig(robust=RobustConfig(loss))).optimize(graph, 0)
-    truth = np.array([agent.true_start(k) for k in range(len(graph.poses))])
+        estimate.add_links([link(3, 12, np.stack([np.arange(10), np.arange(10)], axis=1))])
+    estimate.optimize_full()
+    poses = estimate.state.poses
+    truth = np.array([agent.true_start(k) for k in range(len(poses))])
     some = [5, 12, 18]
-    error = np.concatenate([boxminus(truth[k], graph.poses[k]) for k in some])
-    nees = error @ np.linalg.solve(assembled.covariance(some), error)
-    return float(np.linalg.norm(graph.poses[:, :3, 3] - truth[:, :3, 3], axis=1).max()), float(nees)
+    error = np.concatenate([boxminus(truth[k], poses[k]) for k in some])
+    nees = error @ np.linalg.solve(estimate.state.problem(0).covariance(some), error)
+    return float(np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1).max()), float(nees)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
