@@ -14,8 +14,8 @@ def test_covariances_of_all_poses_are_those_from_the_factor(rng: np.random.Gener
     joined, _ = join(agent.submaps()[:100])
     joined.settle()
     assembled = joined.state.problem(0)
-    marginals = assembled.problem.marginals(assembled.state)
+    marginals = assembled.problem.marginals(assembled.optimum)
     for node in range(1, len(assembled.nodes), 9):
-        exact = assembled.problem.columns(assembled.state, np.array([node]))
+        exact = assembled.problem.columns(assembled.optimum, np.array([node]))
         assert np.abs(marginals.covariance([node]) - exact).max() < 1e-9 * np.abs(exact).max()
     assert len(assembled.nodes) == 101

@@ -96,5 +96,5 @@ def test_faults_are_named_with_the_file(change: dict[str, object], message: str,
 def test_no_camera_info_at_all(text: str, tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(text)
-    with pytest.raises(ValueError, match="not a camera_info YAML"):
+    with pytest.raises(ValueError, match=r"not (a camera_info )?YAML"):
         read_camera_info(path)

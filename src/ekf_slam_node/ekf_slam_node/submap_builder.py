@@ -72,7 +72,7 @@ class SubmapBuilder:
         Landmarks ``shared`` with the next submap hold the two together: with too few of them the end is put off, up to
         twice the limits. The first after a loss is old soon: the map may recognise its place.
         """
-        is_lost = not self._follows_previous and (self.index > 0 or self._session > 0)
+        is_lost = self.index > 0 and not self._follows_previous
         age = 1e-9 * (self._path[-1].stamp_ns - self._start_stamp_ns)
         size = max(
             float(np.linalg.norm(ekf.T[:3, 3])) / config.max_distance,

@@ -44,7 +44,7 @@ ADVICE = (
     "Poses are as much less certain. Most often the calibration does not fit: slam doctor BAG tells; slam calibrate "
     "refine BAG corrects that of a stereo pair, --odometry ndt helps a depth camera"
 )
-"""What a user can do whose submaps contradict each other."""
+"""Advice to a user whose submaps contradict each other."""
 
 _PASSES = 2
 """Times that settling looks for closures, and lets go what the map contradicts: one finding lets another follow."""

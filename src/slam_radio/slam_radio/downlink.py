@@ -66,7 +66,7 @@ class Downlink:
 
     @property
     def inboxes(self) -> list[Inbox]:
-        """What each agent has sent."""
+        """Submaps that each agent has sent."""
         return [agent.inbox for agent in self._agents.values()]
 
     def on_submap(self, name: str, key: Key, data: bytes, now_s: float) -> list[Submap]:

@@ -13,7 +13,9 @@ from slam_radio.submap_folder import SubmapFolder
 
 
 class Inbox:
-    """What one agent has sent. A submap behind a gap waits until its agent has filled it or has nothing to fill it.
+    """Submaps that one agent has sent.
+
+    A submap behind a gap waits until its agent has filled it or has nothing to fill it.
 
     A restart finds what has come, and passes all of it on again.
     """

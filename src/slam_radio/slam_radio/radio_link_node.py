@@ -131,7 +131,7 @@ class AgentEnd(_End):
         self.uplink.on_acknowledgement(unpack_acknowledgement(data), time.monotonic())
 
     def on_correction(self, _: str, data: bytes) -> None:
-        """Where this agent's odometry is in the post's map."""
+        """Publish where this agent's odometry is in the post's map."""
         self._T_map_odom = unpack_correction(data)[1]
         self.uplink.on_heard(time.monotonic())
         self.node.health.count("corrections")
@@ -198,7 +198,7 @@ class PostEnd(_End):
         self.downlink.set_correction(agent, stamp_ns(message), transform_from_message(message)[2])
 
     def _pass_on_again(self) -> None:
-        """What had come before this start: once all nodes of this process listen."""
+        """Pass on what had come before this start, once all nodes of this process listen."""
         self._begun = True
         for inbox in self.downlink.inboxes:
             if submaps := inbox.release():

@@ -33,7 +33,7 @@ def follow_or_detect(
     measure: Callable[[Followed], DepthEstimate],
     detect: Callable[[], tuple[Keypoints, DepthEstimate, Float32Array]],
 ) -> list[MeasuredKeypoints]:
-    """What was followed into a picture, and where that is too little, what is new in it.
+    """Features that were followed into a picture, and where that is too little, what is new in it.
 
     ``measure`` gives the depth of what was followed, ``detect`` keypoints with depth and standard deviations (n,) px.
     """

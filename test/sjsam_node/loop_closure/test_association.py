@@ -8,9 +8,9 @@ import pytest
 from submap_world import Agent, circle, ring_world, two_views, unit
 
 from sjsam_node.graph.links import Prior
-from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.association import AssociationConfig, PointSet, match, mutual_best, variance_factor
 from sjsam_node.loop_closure.point_sets import at_end
+from sjsam_node.smoothing.estimate import MapEstimate
 from slam_core.geometry import boxminus, boxplus, invert_transform, transform_points
 
 
@@ -75,8 +75,8 @@ def test_variance_factor_is_one_for_honest_errors_and_measures_dishonest_ones(rn
 def test_landmarks_seen_from_the_end_have_its_error_too(rng: np.random.Generator) -> None:
     """The covariance is that of central differences of ``end^-1 p``."""
     submap = Agent(ring_world(3.0, rng, 12.0), circle(3.0, 0.2), rng, "").submaps()[0]
-    graph = MapGraph()
-    graph.append(submap, None, np.eye(4))
+    estimate = MapEstimate()
+    estimate.add_submap(submap, None, np.eye(4))
 
     def seen(error: np.ndarray) -> np.ndarray:
         end = boxplus(submap.end_pose, error[:6])
@@ -84,7 +84,7 @@ def test_landmarks_seen_from_the_end_have_its_error_too(rng: np.random.Generator
 
     steps = 1e-6 * np.eye(len(submap.covariance))
     J = np.stack([(seen(e) - seen(-e)) / 2e-6 for e in steps], axis=1)
-    points = at_end(graph.records[0])
+    points = at_end(estimate.graph.records[0])
     np.testing.assert_allclose(points.points.ravel(), seen(np.zeros(len(J.T))), atol=1e-12)
     expected, some = J @ submap.covariance @ J.T, np.array([3, 7, 1])
     rows = (3 * some[:, None] + np.arange(3)).ravel()

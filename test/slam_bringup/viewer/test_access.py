@@ -124,7 +124,7 @@ def test_hostile_names_states_and_marks_are_read_as_plain_text(page):
     """A finished run whose summary, agent, marks and map say what an attacker likes; then what the nodes would show."""
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = [0.0, 1.0, 2.0]
-    world = GlobalMap()
+    world = GlobalMap().snapshot()
     run = RunFolder(
         Path(HOSTILE), {"bag": HOSTILE}, {HOSTILE: Trajectory(np.arange(3) * 10**9, poses)}, world, Surface.empty(), (),
         HOSTILE,

@@ -47,7 +47,7 @@ class MapTest:
     config: ConsistencyConfig = field(default_factory=ConsistencyConfig)
 
     def contradictions(self, state: EstimateState, newest: int) -> Contradictions:
-        """What the component of record ``newest`` contradicts."""
+        """Closures and matches that the component of record ``newest`` contradicts."""
         graph, nis = state.graph, nis_of(state, state.component(newest))
         gate = self._gate(nis)
         beyond = np.nonzero(np.nan_to_num(nis) > gate)[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which closures can be true together: those that agree with the odometry and with each other.
+"""Closures that can be true together: those that agree with the odometry and with each other.
 
 Two closures over the same stretches of way are compared by the odometry between them (pairwise consistency, Mangelson
 et al. 2018): of those that exclude each other the set that more landmarks speak for is selected.

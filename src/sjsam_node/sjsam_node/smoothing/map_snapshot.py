@@ -76,7 +76,7 @@ class _Stacked:
 
 
 class InnerPaths:
-    """What does not change of the poses inside submaps, kept from one snapshot to the next."""
+    """Constant parts of the poses inside submaps, kept from one snapshot to the next."""
 
     def __init__(self) -> None:
         self._stacked = _Stacked([], [], np.empty((0, 4, 4)), np.empty((0, 6, 6)))
@@ -141,7 +141,7 @@ class MapSnapshot:
 
     @property
     def points(self) -> FloatArray:
-        """Where every landmark of every submap is in the map, (observations, 3) m, one submap after the other."""
+        """Positions of every landmark of every submap in the map, (observations, 3) m, one submap after the other."""
         return self._state.points
 
     @property

@@ -62,7 +62,7 @@ class EstimatorConfig(Config):
         return self.robust.loss == "none" and self.iterations > 1
 
     def optimizer(self, *, coarse: bool) -> LevenbergMarquardtConfig:
-        """When to stop; ``coarse``: where a step promises less than ``live_tolerance``."""
+        """Criteria to stop; ``coarse``: where a step promises less than ``live_tolerance``."""
         if coarse:
             return LevenbergMarquardtConfig(min(self.iterations, self.live_iterations), self.live_tolerance)
         return LevenbergMarquardtConfig(self.iterations, self.relative_tolerance)

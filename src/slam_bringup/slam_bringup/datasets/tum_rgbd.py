@@ -94,7 +94,7 @@ def _in_order(folder: Path, colour: _Rows, depth: _Rows, rate: float) -> tuple[l
 
 
 def _fault(name: str, rows: _Rows) -> str:
-    """What is wrong with the stamps of a list, in words; "" if nothing is."""
+    """Fault of the stamps of a list, in words; "" if nothing is."""
     steps = np.diff([stamp for stamp, _ in rows])
     if (back := np.flatnonzero(steps <= 0)).size:
         return f"the stamps of {name} do not ascend ({rows[back[0] + 1][1].name} after {rows[back[0]][1].name})"

@@ -24,7 +24,7 @@ class Claim:
 
 
 ABSENT = "not given"
-"""Where the thesis says nothing of a quantity."""
+"""Text for a quantity of which the thesis says nothing."""
 
 SMOOTHS = Claim(
     "SAM estimates the full trajectory", "6.5", "an estimate of the full trajectory is updated in each sample"

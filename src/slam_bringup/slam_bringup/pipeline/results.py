@@ -105,7 +105,7 @@ class RunResult:
     changed: Mapping[str, Any] = field(default_factory=dict)
     """Parameters that are not at their defaults."""
     limits: RunConfig = field(default_factory=RunConfig)
-    """What it is judged by."""
+    """Thresholds that it is judged by."""
     is_localized: bool = False
     """True if the agents were located in a map of an earlier run, and nothing was mapped."""
 

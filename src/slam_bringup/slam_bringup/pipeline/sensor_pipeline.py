@@ -103,7 +103,7 @@ class SensorPipeline:
         return self._features.report()
 
     def _on_session(self, start: SessionStart) -> Iterator[AgentItem]:
-        """What waits belongs to the session before; the calibration and what is known of the camera stay."""
+        """Begin a new session, after what waits of the one before; calibration and knowledge of the camera stay."""
         yield from self.finish()
         self._stereo.reset()
         self._depth.reset()

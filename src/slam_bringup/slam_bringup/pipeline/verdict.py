@@ -29,7 +29,7 @@ class RunConfig(Config):
 
 
 def faults_of_run(summary: Mapping[str, Any], limits: RunConfig) -> list[str]:
-    """What makes the run of a ``summary.json`` DEGRADED, in words; empty if nothing does."""
+    """Reasons that make the run of a ``summary.json`` DEGRADED, in words; empty if nothing does."""
     faults = [
         f"{_named(agent)}lost in {share:.0%} of the frames (run.max_lost_share: {limits.max_lost_share:.0%})"
         for agent, share in summary["lost_share"].items()
