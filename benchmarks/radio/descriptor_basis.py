@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("map", type=Path)
     parser.add_argument("-o", "--output", type=Path)
     arguments = parser.parse_args()
-    records = storage.read(arguments.map).graph.records
+    records = storage.read(arguments.map).state.graph.records
     descriptors = np.concatenate([r.submap.descriptors for r in records]).astype(np.float64)
     values, vectors = np.linalg.eigh(descriptors.T @ descriptors)
     basis = vectors[:, ::-1][:, :DIRECTIONS]

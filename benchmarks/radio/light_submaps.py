@@ -49,7 +49,7 @@ def main() -> None:
     arguments = parser.parse_args()
     table = Table(*_COLUMNS)
     for run in arguments.runs:
-        submaps = [r.submap for r in storage.read(run / "map").graph.records]
+        submaps = [r.submap for r in storage.read(run / "map").state.graph.records]
         whole = joined(submaps)
         table.add_row(run.name, "all", "", "", "", str(whole.closures), str(whole.parts), "", "", "")
         for landmarks in arguments.landmarks:

@@ -56,7 +56,7 @@ def main() -> None:
 
 def first_agent(run: Path, seconds: float) -> list[Submap]:
     """Submaps of a run's first agent that ended in the first seconds."""
-    submaps = [r.submap for r in storage.read(run / "map").graph.records]
+    submaps = [r.submap for r in storage.read(run / "map").state.graph.records]
     own = [s for s in submaps if s.agent == submaps[0].agent]
     return [s for s in own if s.end_stamp_ns - own[0].start_stamp_ns <= 1e9 * seconds]
 
