@@ -82,10 +82,10 @@ def joined(submaps: Sequence[Submap]) -> Joined:
     joined_map = GlobalMap()
     closures = sum(len(joined_map.add(submap).closures) for submap in submaps)
     joined_map.settle()
-    graph = joined_map.graph
-    ends = np.array([graph.poses[r.end][:3, 3] for r in graph.records])
-    sigma = np.array([np.sqrt(np.trace(joined_map.view.node(r.end)[:3, :3])) for r in graph.records])
-    return Joined(ends, sigma, closures, len(np.unique(graph.component_of)))
+    state = joined_map.state
+    ends = np.array([state.poses[r.end][:3, 3] for r in state.graph.records])
+    sigma = np.array([np.sqrt(np.trace(joined_map.snapshot().node(r.end)[:3, :3])) for r in state.graph.records])
+    return Joined(ends, sigma, closures, len(np.unique(state.component_of)))
 
 
 if __name__ == "__main__":
