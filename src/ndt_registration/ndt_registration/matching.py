@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from ndt_registration.block_table import Int32Array
 from ndt_registration.lanes import FAR, LANES, bell, exponent_in_cell, gather, groups_of, no_neighbours, sum_over_cells
 from ndt_registration.ndt import Layer
 from ndt_registration.voxel_grid import SPURIOUS, NormalGrid
@@ -175,17 +176,20 @@ def _distance(grid, cell, px, py, pz, t):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def block_gradients(layer: Layer, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Gradient (b, 6) of the cost of one layer at a pose, summed over each of the grid's blocks, half a cell's edge."""
+def block_gradients(layer: Layer, R: FloatArray, t: FloatArray) -> tuple[FloatArray, Int32Array]:
+    """Gradients (b, 6) of a layer's cost at a pose, each of one of the grid's blocks, half a cell's edge.
+
+    And the integer places (b, 3) of these blocks.
+    """
     blocks = layer.grid.cells.shape[0]
-    gradients, touched = np.zeros((blocks, 6)), np.zeros(blocks, np.bool_)
-    _add_gradients(layer, R, t, no_neighbours(1), gradients, touched)
-    return gradients[touched]
+    gradients, places, touched = np.zeros((blocks, 6)), np.empty((blocks, 3), np.int32), np.zeros(blocks, np.bool_)
+    _add_gradients(layer, R, t, no_neighbours(1), gradients, places, touched)
+    return gradients[touched], places[touched]
 
 
 @in_place()
-def _add_gradients(layer, R, t, at, gradients, touched):  # type: ignore[no-untyped-def]
-    """Add to the gradients (b, 6) of all blocks, and mark those that hold points."""
+def _add_gradients(layer, R, t, at, gradients, places, touched):  # type: ignore[no-untyped-def]
+    """Add to the gradients (b, 6) of all blocks, and mark those that hold points, with their places (b, 3)."""
     factor, sums = 0.125 * layer.factor, at.sums
     for group in range(groups_of(layer.points.shape[0])):
         count = gather(layer.points, group, layer.grid, R, t, at, -group)
@@ -197,6 +201,7 @@ def _add_gradients(layer, R, t, at, gradients, touched):  # type: ignore[no-unty
             px, py, pz = at.turned[j], at.turned[LANES + j], at.turned[2 * LANES + j]
             vx, vy, vz = factor * sums[LANES + j], factor * sums[2 * LANES + j], factor * sums[3 * LANES + j]
             touched[row] = True
+            places[row, 0], places[row, 1], places[row, 2] = at.block[j, 0], at.block[j, 1], at.block[j, 2]
             gradients[row, 0] += vx
             gradients[row, 1] += vy
             gradients[row, 2] += vz

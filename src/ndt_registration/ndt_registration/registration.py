@@ -19,7 +19,7 @@ from ndt_registration.cloud import Cloud, finite_points, is_planar, largest_exte
 from ndt_registration.descent import COARSE_POINTS, Answer, descend, orthonormal_pose, searched_minima
 from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
 from ndt_registration.matching import block_gradients, fit_to_grid
-from ndt_registration.ndt import NdtOptimum, ndt_align
+from ndt_registration.ndt import Layer, NdtOptimum, ndt_align
 from ndt_registration.pyramid import GridConfig, Pyramid
 from ndt_registration.score_loss import ScoreLoss
 from ndt_registration.search import Candidate, SearchConfig, Views, judge, planar_constraint
@@ -275,10 +275,9 @@ def _result(
     wider, limit = grids[min(1, len(grids) - 1)], 3.0 * grids[0].block_size
     fit = fit_to_grid(source.points, optimum.rotation, optimum.translation, grids[0], wider, limit)
     layers = target.pyramid.layers(source, 0, len(source), config.rim_share)
-    gradients = [block_gradients(layer, optimum.rotation, optimum.translation) for layer in layers]
     uncertainty = sandwich(
         Curvature(optimum.hessian, optimum.majorant, fit.spurious_hessian, fit.spurious_majorant),
-        gradient_scatter(gradients, len(source) / len(target.cloud)),
+        _scatter(layers, optimum, scale, len(source) / len(target.cloud)),
         Extent(fit.centre, max(fit.radius, _LEAST_RADIUS * scale)),
         ScoreLoss(
             target.pyramid.layers(source, 0, COARSE_POINTS, config.rim_share),
@@ -307,6 +306,20 @@ def _result(
     )
 
 
+def _scatter(layers: tuple[Layer, Layer], optimum: NdtOptimum, scale: float, density_ratio: float) -> FloatArray:
+    """Covariance of the cost's gradient; blocks of both layers in cubes of one size and place."""
+    (surfaces, places), (rims, rim_places) = (
+        block_gradients(layer, optimum.rotation, optimum.translation) for layer in layers
+    )
+    size = layers[0].grid.block_size
+    wide = round(layers[1].grid.block_size / size)
+    all_places = np.concatenate([places, wide * rim_places])
+    width = max(round(_SHARED_ERRORS * scale / size), 1)
+    return gradient_scatter(np.concatenate([surfaces, rims]), all_places, width, density_ratio)
+
+
+_SHARED_ERRORS = 1 / 8
+"""Edge of the cubes whose points share errors of a depth camera, over the scale."""
 _UNITS_APART = 100.0
 """Clouds of one place differ less in scale than so many times, unless their units do."""
 _LEAST_RADIUS = 0.05

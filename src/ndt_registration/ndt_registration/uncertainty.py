@@ -6,13 +6,14 @@ Covariance from the scatter of the blocks' gradients, and directions left free.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from ndt_registration.block_table import Int32Array
 from slam_core.config import Config
 from slam_core.geometry import FloatArray, skew
 
@@ -130,21 +131,47 @@ def clear_loss(config: UncertaintyConfig) -> float:
     return _SPURIOUS_FACTOR * config.least_loss + _LOSS_OF_FEW
 
 
-def gradient_scatter(block_gradients: Iterable[FloatArray], density_ratio: float) -> FloatArray:
-    """Covariance (6, 6) of the cost's gradient from those (b, 6) of the small blocks of each layer.
+def gradient_scatter(gradients: FloatArray, places: Int32Array, width: int, density_ratio: float) -> FloatArray:
+    """Covariance (6, 6) of the cost's gradient from those (b, 6) of small blocks at integer places (b, 3).
 
     They vanish in sum at the optimum; their scatter contains the noise of the source's points, discretisation and
-    wrong matches alike. Points of one block share much of their errors (neighbouring pixels, one and the same edge),
-    blocks of half a cell little. The target's points err as much as the source's and move the optimum as far, but
-    alike for all blocks that meet one plane, so that little of it shows in the scatter: it is counted as the source's,
-    times ``density_ratio``, the source's number of points over the target's.
+    wrong matches alike. Blocks near each other share errors: pixels of one edge do, and a real depth camera is off by
+    the same over a whole wall or table. So the gradients are summed over cubes of ``width`` blocks first (the
+    cluster-robust covariance of Liang and Zeger 1986), over smaller ones where that would leave too few. The target's
+    points err as much as the source's and move the optimum as far, but alike for all blocks that meet one plane, so
+    that little of it shows in the scatter: it is counted as the source's, times ``density_ratio``, the source's number
+    of points over the target's.
 
     What is the same in every pair of scans from two places, because the two views show rims and edges from other sides,
-    is seen only as far as blocks disagree about it: a fifth to a third more than the noise is claimed, too little where
-    one small thing holds a direction (``covariance.py`` among the benchmarks).
+    is seen only as far as cubes disagree about it (``covariance.py`` among the benchmarks).
     """
-    each = np.vstack(tuple(block_gradients))
-    return np.asarray((1.0 + density_ratio) * len(each) / max(len(each) - 6, 1) * (each.T @ each))
+    each = _scatter_of(gradients)
+    while width > 1:
+        cubes = np.unique(places // width, axis=0, return_inverse=True)[1].ravel()
+        sums = np.zeros((int(cubes.max(initial=-1)) + 1, 6))
+        np.add.at(sums, cubes, gradients)
+        if len(sums) >= _FEWEST_CUBES:
+            return (1.0 + density_ratio) * _at_least(each, _scatter_of(sums))
+        width //= 2
+    return (1.0 + density_ratio) * each
+
+
+def _scatter_of(gradients: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of the sum of gradients (b, 6) that err independently."""
+    return np.asarray(len(gradients) / max(len(gradients) - 6, 1) * (gradients.T @ gradients))
+
+
+def _at_least(least: FloatArray, covariance: FloatArray) -> FloatArray:
+    """The covariance, in no direction less than another one: that of few cubes is too small by chance in some."""
+    root = np.linalg.cholesky(least + _SUMS_ROUNDING * (np.trace(least) + 1e-300) * np.eye(6))
+    whitened = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
+    values, vectors = np.linalg.eigh(0.5 * (whitened + whitened.T))
+    back = root @ vectors
+    return np.asarray(back * np.maximum(values, 1.0) @ back.T)
+
+
+_FEWEST_CUBES = 30
+"""Fewest cubes whose scatter says something of six directions."""
 
 
 def _inverse(hessian: FloatArray, majorant: FloatArray) -> FloatArray:
