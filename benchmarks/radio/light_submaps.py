@@ -82,10 +82,10 @@ def joined(submaps: Sequence[Submap]) -> Joined:
     joined_map = GlobalMap()
     closures = sum(len(joined_map.add(submap).closures) for submap in submaps)
     joined_map.settle()
-    state = joined_map.state
-    ends = np.array([state.poses[r.end][:3, 3] for r in state.graph.records])
-    sigma = np.array([np.sqrt(np.trace(joined_map.snapshot().node(r.end)[:3, :3])) for r in state.graph.records])
-    return Joined(ends, sigma, closures, len(np.unique(state.component_of)))
+    snapshot = joined_map.snapshot()
+    ends = [snapshot.end(record) for record in range(len(snapshot))]
+    sigma = np.array([np.sqrt(np.trace(end.covariance[:3, :3])) for end in ends])
+    return Joined(np.array([end.T[:3, 3] for end in ends]), sigma, closures, snapshot.components)
 
 
 if __name__ == "__main__":
