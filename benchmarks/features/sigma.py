@@ -19,7 +19,8 @@ from slam_bringup.experiments.true_frames import TrueFrame, simulated_frames, sp
 from slam_core.geometry import FloatArray
 from slam_core.types import Features, FeatureSource
 from stereo_frontend.depth_fusion import map_depth
-from stereo_frontend.frontend import Frontend, FrontendConfig
+from stereo_frontend.frontend import Frontend
+from stereo_frontend.frontend_config import FrontendConfig
 
 LIMIT = 5.0
 

@@ -12,7 +12,8 @@ from slam_core.camera import Camera
 from slam_core.config import from_mapping
 from slam_core.types import DepthImage, FeatureSource, StereoImages
 from stereo_frontend.features import FeatureConfig, FeatureExtractor
-from stereo_frontend.frontend import Frontend, FrontendConfig
+from stereo_frontend.frontend import Frontend
+from stereo_frontend.frontend_config import FrontendConfig
 
 DEPTH = 200.0 * 0.12 / 12.3
 FIELDS = ("xyz", "uv", "depth", "sigma_uv", "sigma_depth", "response", "source", "descriptors")

@@ -13,7 +13,8 @@ from slam_core.config import from_mapping
 from slam_core.geometry import make_transform, so3_exp, so3_log
 from slam_core.types import StereoImages
 from stereo_frontend.corrected_info import corrected_right
-from stereo_frontend.frontend import Frontend, FrontendConfig
+from stereo_frontend.frontend import Frontend
+from stereo_frontend.frontend_config import FrontendConfig
 from stereo_frontend.rectification_error import NAMES, RectificationError
 from stereo_frontend.rectify import rectification_map
 from stereo_frontend.self_calibration import SelfCalibrationConfig, StereoSelfCalibration

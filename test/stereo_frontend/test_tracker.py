@@ -11,7 +11,8 @@ import pytest
 from slam_core.config import from_mapping
 from slam_core.types import DepthImage, StereoImages
 from stereo_frontend.frame_motion import facing_warp, fit_motion
-from stereo_frontend.frontend import Frontend, FrontendConfig
+from stereo_frontend.frontend import Frontend
+from stereo_frontend.frontend_config import FrontendConfig
 
 STEP_NS = 100_000_000
 FLOW = np.array([4.3, -2.2])

@@ -38,7 +38,7 @@ from slam_core.messages import (
     stamp_ns,
 )
 from slam_core.messages.base import Message
-from slam_core.ros import run_node, sensor_qos
+from slam_core.ros import below, run_node, sensor_qos
 from slam_core.stamp_guard import StampPolicy
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
@@ -96,31 +96,31 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
     # -- inputs --------------------------------------------------------------------------------------------------------
 
     def _listen_to(self, agent: str) -> None:
-        below = partial(_below, agent)
-        self.listen(below("odom"), "Odometry", partial(self._on_odometry, agent))
-        self.listen(below("map/path"), "Path", partial(self._on_path, agent), latched=True, stamps=StampPolicy.ANY)
-        self.listen(below("imu"), "Imu", partial(self._on_imu, agent), required=False)
+        own = partial(below, agent)
+        self.listen(own("odom"), "Odometry", partial(self._on_odometry, agent))
+        self.listen(own("map/path"), "Path", partial(self._on_path, agent), latched=True, stamps=StampPolicy.ANY)
+        self.listen(own("imu"), "Imu", partial(self._on_imu, agent), required=False)
         if self.config.use_tof:
             topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
-            topics = {below(topic): kind for topic, kind in topics.items()}
+            topics = {own(topic): kind for topic, kind in topics.items()}
             self.listen_together(topics, partial(self._on_depth, agent), required=False)
-            self.listen(below("tof/color/image"), "Image", partial(self._on_colour, agent, "tof"), required=False)
+            self.listen(own("tof/color/image"), "Image", partial(self._on_colour, agent, "tof"), required=False)
         if self.config.use_stereo:
             for side in SIDES:
-                topic = below(f"stereo/{side}/camera_info")
+                topic = own(f"stereo/{side}/camera_info")
                 self.listen(topic, "CameraInfo", partial(self._on_info, agent, side), required=False)
-            pairs = {below(f"stereo/{side}/image_rect"): "Image" for side in SIDES}
+            pairs = {own(f"stereo/{side}/image_rect"): "Image" for side in SIDES}
             self.listen_together(pairs, partial(self._on_pair, agent), required=False)
             # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
             self.create_subscription(self.types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
-            colours = below("stereo/left/image_rect_color")
+            colours = own("stereo/left/image_rect_color")
             self.listen(colours, "Image", partial(self._on_colour, agent, "stereo"), required=False)
 
     def _on_odometry(self, agent: str, message: Message) -> None:
         self.mapper.add_odometry(agent, pose_from_message(message.pose.pose))
 
     def _on_depth(self, agent: str, depth: Message, noise: Message, info: Message) -> None:
-        T_base_camera = self.lookup(_below(agent, self.config.base_frame), depth.header.frame_id)
+        T_base_camera = self.lookup(below(agent, self.config.base_frame), depth.header.frame_id)
         if self.mapper.wants(agent, "tof", stamp_ns(depth), T_base_camera):
             self.mapper.add(agent, "tof", T_base_camera, depth_from_messages(depth, noise, info), NO_PICTURE)
 
@@ -131,21 +131,21 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         self._pairs[agent].set_info(side, camera_info_from_message(message))
 
     def _on_pair(self, agent: str, left: Message, right: Message) -> None:
-        T_base_camera = self.lookup(_below(agent, self.config.base_frame), left.header.frame_id)
+        T_base_camera = self.lookup(below(agent, self.config.base_frame), left.header.frame_id)
         grey, colour = grey_and_colour_from_message(left)
         pair = RawPair(stamp_ns(left), grey, grey_from_message(right), left.header.frame_id, colour)
         self.mapper.add_pair(agent, T_base_camera, pair, self._pairs[agent])
 
     def _on_imu(self, agent: str, message: Message) -> None:
         sample = imu_from_message(message)
-        R_base_imu = self.lookup(_below(agent, self.config.base_frame), sample.frame_id)[:3, :3]
+        R_base_imu = self.lookup(below(agent, self.config.base_frame), sample.frame_id)[:3, :3]
         self.mapper.add_force(agent, sample.stamp_ns, R_base_imu @ sample.linear_acceleration)
 
     def _on_diagnostics(self, message: Message) -> None:
         """Rectify as the front end has found out that one should."""
         for status in message.status:
             for agent, stage in self._pairs.items():
-                if status.name != f"/{_below(agent, 'feature_extractor')}" or stage.infos is None:
+                if status.name != f"/{below(agent, 'feature_extractor')}" or stage.infos is None:
                     continue
                 text = next((entry.value for entry in status.values if entry.key == "correction"), "")
                 if text != self._corrections.get(agent, ""):
@@ -206,11 +206,6 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
 
 def _storey_topic(number: int) -> str:
     return f"map/occupancy_{number}" if number else "map/occupancy"
-
-
-def _below(agent: str, name: str) -> str:
-    """A topic or frame below an agent's namespace."""
-    return f"{agent}/{name}" if agent else name
 
 
 def main() -> None:

@@ -143,6 +143,8 @@ def same_tracks(
     tracks: npt.NDArray[np.integer], frame_tracks: npt.NDArray[np.integer]
 ) -> tuple[IndexArray, IndexArray]:
     """Rows and columns of equal tracks, 0 being none, in the order of the columns."""
+    if not frame_tracks.any():  # a front end that does not follow
+        return np.empty(0, np.intp), np.empty(0, np.intp)
     _, rows, columns = np.intersect1d(tracks, frame_tracks, return_indices=True)
     named = tracks[rows] > 0
     order = np.argsort(columns[named], kind="stable")

@@ -12,6 +12,7 @@ from numba import njit
 from ekf_slam_node.pair_kernels import gated, normal_equations, pair_errors
 from slam_core.camera import MIN_DEPTH
 from slam_core.in_place import in_place
+from slam_core.linear_algebra.small_kernels import rotate_columns
 
 _MEDIAN_CHI2 = 0.4549
 """Median of chi-square with one degree of freedom."""
@@ -234,18 +235,6 @@ def _move(T, covariance, gradient):  # type: ignore[no-untyped-def]
     for i in range(6):
         for j in range(6):
             delta[i] += covariance[i, j] * gradient[j]
-    x, y, z = delta[3], delta[4], delta[5]
-    square = x * x + y * y + z * z
-    angle = np.sqrt(square)
-    a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
-    if angle > 1e-4:
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
-    for j in range(3):
-        p, q, r = T[0, j], T[1, j], T[2, j]
-        # Rodrigues: v + a (phi x v) + b phi x (phi x v).
-        u, v, w = y * r - z * q, z * p - x * r, x * q - y * p
-        T[0, j] = p + a * u + b * (y * w - z * v)
-        T[1, j] = q + a * v + b * (z * u - x * w)
-        T[2, j] = r + a * w + b * (x * v - y * u)
+    rotate_columns(T, delta[3], delta[4], delta[5], 3)
     for i in range(3):
         T[i, 3] += delta[i]

@@ -41,7 +41,7 @@ from slam_core.types import Counters, PoseEstimate, Submap
 ALREADY_JOINED = "already joined"
 
 ADVICE = (
-    "Poses are as much less certain. Most often the calibration does not fit: slam doctor BAG tells; slam calibrate "
+    "Poses are as much less certain. The calibration may not fit: slam doctor BAG tells; slam calibrate "
     "refine BAG corrects that of a stereo pair, --odometry ndt helps a depth camera"
 )
 """Advice to a user whose submaps contradict each other."""

@@ -48,7 +48,7 @@ from slam_core.messages import (
 from slam_core.messages.base import Message
 from slam_core.messages.submaps import SubmapMessages
 from slam_core.point_cloud import is_ply, write_ply
-from slam_core.ros import run_node
+from slam_core.ros import below, run_node
 from slam_core.stamp_guard import StampPolicy
 from slam_core.types import PoseEstimate, Submap
 
@@ -143,15 +143,15 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         for name in ("map/ellipsoids", "map/graph", "map/marks"):
             self.advertise(name, "MarkerArray", latched=True, depth=1)
         for agent in self.config.agents:
-            self.advertise(_below(agent, "map/path"), "Path", latched=True, depth=1)
-            self.advertise(_below(agent, "pose"), "PoseWithCovarianceStamped")
-            self.advertise(_below(agent, "map_to_odom"), "TransformStamped", latched=True, depth=1)
+            self.advertise(below(agent, "map/path"), "Path", latched=True, depth=1)
+            self.advertise(below(agent, "pose"), "PoseWithCovarianceStamped")
+            self.advertise(below(agent, "map_to_odom"), "TransformStamped", latched=True, depth=1)
 
     def _listen_to(self, agent: str) -> None:
-        topics = {_below(agent, topic): kind for topic, kind in SUBMAP_TOPICS.items()}
+        topics = {below(agent, topic): kind for topic, kind in SUBMAP_TOPICS.items()}
         on_odometry = partial(self.on_odometry, agent)
         self.listen_together(topics, partial(self.on_submap, agent), latched=True, stamps=StampPolicy.ANY)
-        self.listen(_below(agent, "odom"), "Odometry", on_odometry, required=False, stamps=StampPolicy.ANY)
+        self.listen(below(agent, "odom"), "Odometry", on_odometry, required=False, stamps=StampPolicy.ANY)
 
     def _serve(self, name: str, action: Callable[[], Awaitable[str]]) -> None:
         async def answer(_: Any, response: Any) -> Any:
@@ -175,7 +175,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             return self._hand_over(agent, submap, self.map.locate(agent, submap))
         self._join(self._order.add((submap.agent, submap.session, submap.index), (agent, submap)))
         if self._order.should_ask(time.monotonic()):
-            self.ask_again(_below(agent, topic) for topic in SUBMAP_TOPICS)
+            self.ask_again(below(agent, topic) for topic in SUBMAP_TOPICS)
 
     def _join(self, submaps: list[tuple[str, Submap]]) -> None:
         for agent, submap in submaps:
@@ -224,7 +224,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         """Publish the pose of an agent in the map at a pose of its odometry."""
         self._heard_at_s[agent] = time.monotonic()
         for pose in self.trackers[agent].add_odometry(estimate_from_message(message)):
-            self.publish(_below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, pose))
+            self.publish(below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, pose))
 
     def on_clicked_point(self, message: Message) -> None:
         """Mark a find at a point of the map frame."""
@@ -263,7 +263,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         tracker = self.trackers[agent]
         if tracker.newest_ns is None:  # no odometry is heard: the ends of submaps are all that is known
             self._heard_at_s[agent] = time.monotonic()
-            self.publish(_below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, end))
+            self.publish(below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, end))
         if tracker.has_heard(end.stamp_ns):
             tracker.add_submap(end)
         elif in_odom is not None:
@@ -375,7 +375,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             messages["map/ellipsoids"] = ellipsoids_message(self.types, header, landmarks)
         for agent in self.config.agents:
             poses = paths.get(agent, [])
-            messages[_below(agent, "map/path")] = path_message(self.types, self._stamp_ns, self.config.map_frame, poses)
+            messages[below(agent, "map/path")] = path_message(self.types, self._stamp_ns, self.config.map_frame, poses)
         return messages
 
     def _publish_transforms(self) -> None:
@@ -387,15 +387,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             stamp = self.trackers[agent].newest_ns or self._stamp_ns
             gone_s = min(time.monotonic() - heard_at_s, _LONGEST_SILENCE_S)
             ahead = stamp + round(1e9 * (gone_s + self.config.transform_tolerance_s))
-            odom = _below(agent, self.config.odom_frame)
+            odom = below(agent, self.config.odom_frame)
             message = transform_message(self.types, ahead, self.config.map_frame, odom, T_map_odom)
-            self.publish(_below(agent, "map_to_odom"), message)
+            self.publish(below(agent, "map_to_odom"), message)
             self.broadcast(message)
-
-
-def _below(agent: str, name: str) -> str:
-    """A topic or frame below an agent's namespace."""
-    return f"{agent}/{name}" if agent else name
 
 
 def main() -> None:

@@ -282,3 +282,8 @@ def run_node(
             node.on_close()
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+def below(agent: str, name: str) -> str:
+    """A topic or frame below an agent's namespace."""
+    return f"{agent}/{name}" if agent else name

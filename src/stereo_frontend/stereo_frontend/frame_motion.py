@@ -13,6 +13,7 @@ from numba import njit
 from slam_core.camera import Camera
 from slam_core.geometry import FloatArray, make_transform, so3_exp, so3_log
 from slam_core.least_squares import MAD_TO_SIGMA
+from slam_core.linear_algebra.small_kernels import rotate_columns
 from stereo_frontend.patch_alignment import factorise, substitute
 
 _LEAST_POINTS = 8
@@ -84,17 +85,7 @@ def _fit(points, xy, T, least_spread, residual):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _move(T, step):  # type: ignore[no-untyped-def]
     """``T <- (exp of the step's rotation, its translation) T``."""
-    x, y, z = step[3], step[4], step[5]
-    angle = np.sqrt(x * x + y * y + z * z)
-    a, b = 1.0, 0.5
-    if angle > 1e-6:
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2
-    for j in range(4):
-        p, q, r = T[0, j], T[1, j], T[2, j]
-        u, v, w = y * r - z * q, z * p - x * r, x * q - y * p
-        T[0, j] = p + a * u + b * (y * w - z * v)
-        T[1, j] = q + a * v + b * (z * u - x * w)
-        T[2, j] = r + a * w + b * (x * v - y * u)
+    rotate_columns(T, step[3], step[4], step[5], 4)
     for i in range(3):
         T[i, 3] += step[i]
 

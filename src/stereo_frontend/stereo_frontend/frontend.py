@@ -9,36 +9,32 @@ sees them (11.2). ``fuse``: both depths weighted by their variances (11.4).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from slam_core.camera import StereoCamera
-from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray
 from slam_core.types import Counters, DepthImage, Features, FeatureSource, Float32Array, StereoImages
 from stereo_frontend.assembly import DepthEstimate, make_features
-from stereo_frontend.depth_fusion import FusionConfig, MappedDepth, fuse_depth, map_depth
-from stereo_frontend.disparity import DisparityConfig, RefinedDisparity, refine_disparity
+from stereo_frontend.depth_fusion import MappedDepth, fuse_depth, map_depth
+from stereo_frontend.disparity import RefinedDisparity, refine_disparity
 from stereo_frontend.features import FeatureConfig, FeatureExtractor
+from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.matching import (
     Matches,
-    MatchingConfig,
     disparity_bounds,
     has_consistent_neighbour,
     is_distinct,
     match_stereo,
     swapped_share,
 )
-from stereo_frontend.pixel_noise import PixelNoise, PixelNoiseConfig
-from stereo_frontend.range_self_calibration import RangeDifferences, RangeSelfCalibration, RangeSelfCalibrationConfig
-from stereo_frontend.rectification_error import RectificationError
-from stereo_frontend.self_calibration import SelfCalibrationConfig, StereoSelfCalibration
-from stereo_frontend.tof_features import TofFeatureConfig, TofFeatures
+from stereo_frontend.pixel_noise import PixelNoise
+from stereo_frontend.range_self_calibration import RangeDifferences, RangeSelfCalibration
+from stereo_frontend.self_calibration import StereoSelfCalibration
+from stereo_frontend.tof_features import TofFeatures
 from stereo_frontend.tracked_features import follow_or_detect
 from stereo_frontend.tracker import Followed, Tracker
 from stereo_frontend.two_view_consistency import StereoView
@@ -54,42 +50,10 @@ _MOST_ALIKE = 0.97
 """Greatest scalar product of the descriptors of two features of an image. Stereo partners are found by another
 descriptor; features that this one confuses, like the corners of a tile, would be taken for one another later."""
 
-MODES = ("stereo", "tof", "replace", "fuse")
 _FEW_TRUSTED = 0.1
 """Share of keypoints with a trusted disparity below which the sign of the disparities is questioned."""
 _SWAPPED_SHARE = 0.6
 _SWAPPED_MATCHES = 30
-
-
-@dataclass(frozen=True)
-class FrontendConfig(Config):
-    """Everything between rectified images and features."""
-
-    mode: str = parameter("stereo", "where depth comes from", choices=MODES)
-    features: FeatureConfig = group(FeatureConfig)
-    matching: MatchingConfig = group(MatchingConfig)
-    disparity: DisparityConfig = group(DisparityConfig)
-    noise: PixelNoiseConfig = group(PixelNoiseConfig)
-    self_calibration: SelfCalibrationConfig = group(SelfCalibrationConfig)
-    fusion: FusionConfig = group(FusionConfig)
-    range_calibration: RangeSelfCalibrationConfig = group(RangeSelfCalibrationConfig)
-    tof: TofFeatureConfig = group(TofFeatureConfig)
-
-
-@dataclass(frozen=True)
-class FrontendReport:
-    """Findings of the front end about its images.
-
-    rectification: figures of the stereo pair; ranges: of the depth camera beside it; advice: to the user, a sentence
-    each; picture: what features are searched in: "stereo", "amplitude", "intensity", "range" or "" before the first
-    image; correction: what the right image's rectification is wrong by, where disparities are corrected for it.
-    """
-
-    rectification: Mapping[str, float | str] = field(default_factory=dict)
-    advice: tuple[str, ...] = ()
-    picture: str = ""
-    correction: RectificationError | None = None
-    ranges: Mapping[str, float | str] = field(default_factory=dict)
 
 
 def _more(config: FeatureConfig, factor: float) -> FeatureConfig:

@@ -27,7 +27,7 @@ from slam_core.stage_node import StageNode
 from slam_core.types import ByteArray, Features
 from stereo_frontend.annotate import annotated_image
 from stereo_frontend.calibrated_pairs import SIDES
-from stereo_frontend.frontend import FrontendConfig
+from stereo_frontend.frontend_config import FrontendConfig
 from stereo_frontend.sources import RawPair
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
 from stereo_frontend.tof_features import CLIP, GAMMA, normalised_picture

@@ -17,7 +17,8 @@ from slam_core.types import DepthImage, Features, StereoImages
 from stereo_frontend.calibrated_pairs import CalibratedPairs
 from stereo_frontend.corrected_info import corrected_right
 from stereo_frontend.depth_pairing import DepthPairing
-from stereo_frontend.frontend import Frontend, FrontendConfig, FrontendReport
+from stereo_frontend.frontend import Frontend
+from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.rectify import StereoRectifier

@@ -14,7 +14,7 @@ from slam_bringup.bags.sensor_topics import ROLES
 from slam_bringup.commands.paths import UserPath, calibration_option, overwrite_option
 from slam_bringup.pipeline.configuration import MAPPERS, ODOMETRIES
 from slam_bringup.pipeline.results import RunResult
-from stereo_frontend.frontend import MODES
+from stereo_frontend.frontend_config import MODES
 
 # fmt: off
 _BAG_OPTIONS = (

@@ -28,7 +28,7 @@ from slam_core.camera_info import CameraInfoFile
 from slam_core.files import atomic_text
 from slam_core.types import Features
 from stereo_frontend.corrected_info import corrected_right
-from stereo_frontend.frontend import FrontendReport
+from stereo_frontend.frontend_config import FrontendReport
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from slam_bringup.pipeline.overrides import (
 )
 from slam_bringup.pipeline.verdict import RunConfig
 from slam_core.config import Config, from_mapping, group, is_fixed_now, iterate_parameters
-from stereo_frontend.frontend import FrontendConfig
+from stereo_frontend.frontend_config import FrontendConfig
 from tof_driver.depth import DepthConfig
 
 MAPPERS = ("ekf", "sjsam")

@@ -20,7 +20,7 @@ from slam_bringup.pipeline.verdict import RunConfig, faults_of_run
 from slam_core.evaluation import Evaluation, evaluate
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
-from stereo_frontend.frontend import FrontendReport
+from stereo_frontend.frontend_config import FrontendReport
 
 EMPTY_TRAJECTORY = Trajectory.from_estimates([])
 

@@ -23,7 +23,7 @@ from slam_core.geometry import FloatArray
 from slam_core.memory import give_back
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
-from stereo_frontend.frontend import FrontendReport
+from stereo_frontend.frontend_config import FrontendReport
 
 _LOG = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.frame_log import FrameLog
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.types import Features, ImuSample
-from stereo_frontend.frontend import FrontendReport
+from stereo_frontend.frontend_config import FrontendReport
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
 from tof_driver.stage import DepthStage
 

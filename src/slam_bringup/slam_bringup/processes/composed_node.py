@@ -33,7 +33,7 @@ from slam_core.exchange import Exchange
 from slam_core.memory import search_less_garbage, share_one_heap
 from slam_core.process_life import end_with_parent, on_request_to_end
 from slam_core.ros import spin, use_fast_dds_profile
-from stereo_frontend.frontend import MODES
+from stereo_frontend.frontend_config import MODES
 
 _NODES = {
     "stereo_driver": "stereo_frontend.driver_node:StereoDriverNode",

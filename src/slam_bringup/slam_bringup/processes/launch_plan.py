@@ -22,7 +22,7 @@ from slam_bringup.pipeline.configuration import ODOMETRIES, choose, overrides_fo
 from slam_bringup.pipeline.overrides import Overrides, overrides_of, parse_assignments, read_overrides
 from slam_bringup.processes.node_graph import NodeGraph, NodeSpec, live_nodes, plan_nodes
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC
-from stereo_frontend.frontend import MODES
+from stereo_frontend.frontend_config import MODES
 
 AUTO = "auto"
 _BOOLEANS = ("true", "false")

@@ -31,7 +31,7 @@ from slam_core.messages import (
     transform_from_message,
 )
 from slam_core.messages.base import Message
-from slam_core.ros import run_node, sensor_qos
+from slam_core.ros import below, run_node, sensor_qos
 from slam_core.stamp_guard import StampPolicy
 from slam_core.types import ByteArray, PoseEstimate
 
@@ -99,12 +99,12 @@ class ViewerNode(SlamNode[ViewerConfig]):
         self.page.stop()
 
     def _listen_to(self, index: int, agent: str) -> None:
-        below = partial(_below, agent)
+        own = partial(below, agent)
         self.listen(
-            below("odom"), "Odometry", partial(self._on_odometry, index, agent), required=False, stamps=StampPolicy.ANY
+            own("odom"), "Odometry", partial(self._on_odometry, index, agent), required=False, stamps=StampPolicy.ANY
         )
         self.listen(
-            below("map_to_odom"),
+            own("map_to_odom"),
             "TransformStamped",
             partial(self._on_map_to_odom, agent),
             latched=True,
@@ -112,14 +112,14 @@ class ViewerNode(SlamNode[ViewerConfig]):
             stamps=StampPolicy.ANY,
         )
         self.listen(
-            below("pose"),
+            own("pose"),
             "PoseWithCovarianceStamped",
             partial(self._on_pose, agent),
             required=False,
             stamps=StampPolicy.ANY,
         )
         self.listen(
-            below("map/path"),
+            own("map/path"),
             "Path",
             partial(self._on_path, index, agent),
             latched=True,
@@ -127,7 +127,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
             stamps=StampPolicy.ANY,
         )
         self.listen(
-            below("features/image"), "Image", partial(self._on_picture, agent), required=False, stamps=StampPolicy.ANY
+            own("features/image"), "Image", partial(self._on_picture, agent), required=False, stamps=StampPolicy.ANY
         )
 
     def _listen_to_map(self) -> None:
@@ -190,7 +190,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
     def _on_diagnostics(self, message: Message) -> None:
         for status in message.status:
             for agent, own in self._agents.items():
-                if status.name == f"/{_below(agent, 'ekf_slam')}":
+                if status.name == f"/{below(agent, 'ekf_slam')}":
                     level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
                     own.state, own.reason = _STATES[min(level, 2)], str(status.message)
 
@@ -300,11 +300,6 @@ def _rgb(message: Message) -> ByteArray:
     if picture.ndim == 2:
         return np.repeat(picture[..., None], 3, axis=2).astype(np.uint8)
     return np.ascontiguousarray(picture[..., ::-1] if message.encoding == "bgr8" else picture)
-
-
-def _below(agent: str, name: str) -> str:
-    """A topic below an agent's namespace."""
-    return f"{agent}/{name}" if agent else name
 
 
 def main() -> None:

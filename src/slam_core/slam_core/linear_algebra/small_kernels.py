@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel for matrices with a few rows, for which a call of LAPACK costs more than the work."""
+"""Kernels for small matrices and poses, for which a call of LAPACK or NumPy costs more than the work."""
 
 from __future__ import annotations
 
@@ -28,3 +28,19 @@ def solved_square(A: FloatArray, x: FloatArray) -> tuple[float, float]:
         x[i] /= A[i, i]
         total += x[i] * x[i]
     return total, log_det
+
+
+@in_place()
+def rotate_columns(T: FloatArray, x: float, y: float, z: float, columns: int) -> None:
+    """Rotate the first ``columns`` of the upper rows of T (4, 4) by the rotation vector x, y, z (rad; Rodrigues)."""
+    square = x * x + y * y + z * z
+    angle = np.sqrt(square)
+    a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
+    if angle > 1e-4:
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
+    for j in range(columns):
+        p, q, r = T[0, j], T[1, j], T[2, j]
+        u, v, w = y * r - z * q, z * p - x * r, x * q - y * p
+        T[0, j] = p + a * u + b * (y * w - z * v)
+        T[1, j] = q + a * v + b * (z * u - x * w)
+        T[2, j] = r + a * w + b * (x * v - y * u)

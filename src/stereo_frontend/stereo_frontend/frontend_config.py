@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the front end, and what it reports of its images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from slam_core.config import Config, group, parameter
+from stereo_frontend.depth_fusion import FusionConfig
+from stereo_frontend.disparity import DisparityConfig
+from stereo_frontend.features import FeatureConfig
+from stereo_frontend.matching import MatchingConfig
+from stereo_frontend.pixel_noise import PixelNoiseConfig
+from stereo_frontend.range_self_calibration import RangeSelfCalibrationConfig
+from stereo_frontend.rectification_error import RectificationError
+from stereo_frontend.self_calibration import SelfCalibrationConfig
+from stereo_frontend.tof_features import TofFeatureConfig
+
+MODES = ("stereo", "tof", "replace", "fuse")
+
+
+@dataclass(frozen=True)
+class FrontendConfig(Config):
+    """Everything between rectified images and features."""
+
+    mode: str = parameter("stereo", "where depth comes from", choices=MODES)
+    features: FeatureConfig = group(FeatureConfig)
+    matching: MatchingConfig = group(MatchingConfig)
+    disparity: DisparityConfig = group(DisparityConfig)
+    noise: PixelNoiseConfig = group(PixelNoiseConfig)
+    self_calibration: SelfCalibrationConfig = group(SelfCalibrationConfig)
+    fusion: FusionConfig = group(FusionConfig)
+    range_calibration: RangeSelfCalibrationConfig = group(RangeSelfCalibrationConfig)
+    tof: TofFeatureConfig = group(TofFeatureConfig)
+
+
+@dataclass(frozen=True)
+class FrontendReport:
+    """Findings of the front end about its images.
+
+    rectification: figures of the stereo pair; ranges: of the depth camera beside it; advice: to the user, a sentence
+    each; picture: what features are searched in: "stereo", "amplitude", "intensity", "range" or "" before the first
+    image; correction: what the right image's rectification is wrong by, where disparities are corrected for it.
+    """
+
+    rectification: Mapping[str, float | str] = field(default_factory=dict)
+    advice: tuple[str, ...] = ()
+    picture: str = ""
+    correction: RectificationError | None = None
+    ranges: Mapping[str, float | str] = field(default_factory=dict)
