@@ -43,14 +43,17 @@ def domain_environment(workspace: dict[str, str], monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture(scope="session")
 def small_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five frames of noise from a stereo and a depth camera: nothing to map, but every topic."""
+    """Three seconds of noise from a stereo and a depth camera: nothing to map, but every topic.
+
+    Long enough to be played in a loop: where half the frames are lost, each time round still has three that agree.
+    """
     rng = np.random.default_rng(7)
     camera = Camera(160, 120, 100.0, 100.0, 79.5, 59.5)
     path = tmp_path_factory.mktemp("bags") / "small"
     with BagWriter(path) as bag:
         writer = SensorWriter(bag)
         writer.extrinsics(10**9, {LEFT_FRAME: T_BASE_OPTICAL, TOF_FRAME: T_BASE_OPTICAL})
-        for i in range(5):
+        for i in range(30):
             stamp = 10**9 + i * 10**8
             left, right = rng.integers(0, 256, (2, 120, 160), dtype=np.uint8)
             writer.stereo(stamp, left, right, (rectified_info(camera), rectified_info(camera, 0.1)))

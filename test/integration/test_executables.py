@@ -42,7 +42,7 @@ def test_every_node_starts_publishes_and_stops_on_sigint(
     from slam_bringup.processes.supervisor_node import Supervisor
 
     recording = tmp_path / "recording"
-    parameters = ros_arguments({"bag": str(small_bag), "rate": 2.0, "loop": True})
+    parameters = ros_arguments({"bag": str(small_bag), "loop": True})
     player = NodeCommand("slam_bringup", "bag_player", tuple(parameters))
     recorder = NodeCommand("slam_bringup", "recorder", tuple(ros_arguments({"bag": str(recording)})))
     with (
