@@ -29,13 +29,13 @@ def test_the_pose_is_moved_by_turns_about_each_place_of_the_camera(rng: np.rando
     np.testing.assert_allclose(found, covariance / np.outer(scale, scale), atol=0.04)
 
 
-def pose_and_end(shared_px: float) -> tuple[FloatArray, FloatArray]:
+def pose_and_end(shared_px: float, drift: bool = False) -> tuple[FloatArray, FloatArray]:
     """Covariances (6, 6) of the last pose given out and of the submap's end, after a walk in a single submap.
 
     Every frame bends its picture smoothly, another way each time.
     """
     rng = np.random.default_rng(3)
-    without_end = EkfSlamConfig(submap=SubmapConfig(max_distance=100.0, max_landmarks=10**6))
+    without_end = EkfSlamConfig(submap=SubmapConfig(max_distance=100.0, max_landmarks=10**6, drift=drift))
     world, slam = room(rng), EkfSlam(without_end)
     for k, T in enumerate(loop(40)):
         features, _ = world.features(T, k * 100_000_000, rng)
@@ -54,6 +54,11 @@ def test_poses_know_of_the_drift_and_submaps_do_not() -> None:
     pose, end = pose_and_end(0.6)
     assert np.linalg.eigvalsh(pose - end).min() > 0.0
     assert np.trace(pose[3:, 3:]) > 2.0 * np.trace(end[3:, 3:])
+
+
+def test_a_submap_of_one_filter_alone_ends_as_uncertain_as_the_pose() -> None:
+    pose, end = pose_and_end(0.6, drift=True)
+    np.testing.assert_allclose(end, pose, rtol=1e-9, atol=2e-12)
 
 
 def test_exact_cameras_do_not_drift() -> None:

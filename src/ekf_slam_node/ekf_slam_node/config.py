@@ -152,6 +152,7 @@ class SubmapConfig(Config):
     max_distance: float = parameter(1.0, "a submap ends this far from its start", unit="m", minimum=0.05)
     max_landmarks: int = parameter(400, "a submap ends at this number of landmarks", minimum=10)
     max_frames: int = parameter(300, "a submap ends after this number of frames", minimum=2)
+    drift: bool = parameter(False, "poses of a submap are as uncertain as the filter drifts; for one filter alone")
     compact: bool = parameter(
         False, "send submaps rounded, in half the bytes: 32-bit factor of the covariance, 8-bit descriptors"
     )

@@ -45,11 +45,10 @@ class SubmapBuilder:
         self._standing = 0
         self._bridged: list[PoseEstimate] = []
 
-    def add_pose(self, stamp_ns: int, ekf: Ekf, standing: bool = False) -> None:
+    def add_pose(self, pose: PoseEstimate, standing: bool = False) -> None:
         """Add the filter's present pose to the path; one of a rig that stands does not make the submap older."""
         self._standing += standing
-        pose = PoseEstimate(stamp_ns, ekf.T.copy(), ekf.pose_covariance())
-        if self._bridged and self._bridged[-1].stamp_ns == stamp_ns:
+        if self._bridged and self._bridged[-1].stamp_ns == pose.stamp_ns:
             self._path += smoothed(self._path[-1].stamp_ns, self._bridged, pose)
         self._bridged = []
         self._path.append(pose)
@@ -94,9 +93,11 @@ class SubmapBuilder:
         return next(sound)
 
     def close(self, ekf: Ekf, table: LandmarkTable) -> Submap:
-        """The submap as it is now: its end pose is the last pose added."""
+        """The submap as it is now: its end pose is the last pose added, with the covariance that it was added with."""
         keep = np.concatenate([np.arange(6), np.arange(CORE_DIM, ekf.covariance.size)])
-        covariance = _positive_definite(ekf.covariance.dense(keep))
+        covariance = ekf.covariance.dense(keep)
+        covariance[:6, :6] = self._path[-1].covariance
+        covariance = _positive_definite(covariance)
         end = self._path[-1]
         return Submap(
             agent=self._agent, index=self.index, start_stamp_ns=self._start_stamp_ns, end_stamp_ns=end.stamp_ns,

@@ -112,7 +112,9 @@ class SubmapChain:
     # ------------------------------------------------------------------------------------------------------ extending
     def add_pose(self, stamp_ns: int, standing: bool = False) -> None:
         """Add the filter's pose to the submap's path."""
-        self._builder.add_pose(stamp_ns, self.local.ekf, standing)
+        local = self.local
+        covariance = local.pose_covariance() if self._config.submap.drift else local.ekf.pose_covariance()
+        self._builder.add_pose(PoseEstimate(stamp_ns, local.ekf.T.copy(), covariance), standing)
         self.stamp_ns = stamp_ns
 
     @property

@@ -111,7 +111,7 @@ def choose(config: SystemConfig, mode: str, mapper: str, odometry: str, imu: str
     motion = config.ekf_slam.motion
     submap = config.ekf_slam.submap
     if mapper == "ekf":
-        submap = replace(submap, max_distance=1e6, max_landmarks=10**9, max_frames=10**9)
+        submap = replace(submap, max_distance=1e6, max_landmarks=10**9, max_frames=10**9, drift=True)
     registration = config.ndt_odometry.registration
     if odometry != "none":
         registration = replace(registration, method=_method(odometry, registration.method))
