@@ -72,8 +72,11 @@ class EstimatorConfig(Config):
 class SmootherConfig(Config):
     """Parameters of keeping the estimate."""
 
-    settled_work: float = 3e7
-    """Entries of the submaps' information matrices up to which a map settles with more than the selected landmarks."""
+    settled_work: float = 4e6
+    """Entries of the submaps' information matrices up to which a map settles with more than the selected landmarks.
+
+    They are in memory four times: reduced, in the problem, in its normal equations and in their factor, 32 MB each.
+    """
     settled_ties: int = 24
     """Landmarks by which two submaps are tied together then, at least, where all that they share are too many."""
     estimator: EstimatorConfig = group(EstimatorConfig)
