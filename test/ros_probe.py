@@ -48,6 +48,11 @@ class Probe:
             assert time.monotonic() < end, why
             self.executor.spin_once(timeout_sec=0.05)
 
+    def spin(self, seconds: float) -> None:
+        """Listen for a while."""
+        end = time.monotonic() + seconds
+        self.wait(lambda: time.monotonic() > end, "the clock stands still")
+
     def _let_others_find_us(self) -> None:
         """Only this side's matches can be seen; a node that has been found may need a moment more to find us, and what
         is said before is lost.

@@ -10,7 +10,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -62,10 +61,6 @@ class PairProbe(Probe):
             message = image_message(self.types, header, image)
             message.encoding = encoding
             self.send(f"stereo/{side}/image_raw", message)
-
-    def spin(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        self.wait(lambda: time.monotonic() > end, "the clock stands still")
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from sensor_msgs.srv import SetCameraInfo  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
 
 from ros_probe import Probe  # noqa: E402
 from slam_core.camera import Camera  # noqa: E402
@@ -147,3 +148,42 @@ def test_a_missing_calibration_file_refuses_to_start(start: Callable[..., subpro
     _, errors = process.communicate(timeout=30.0)
     assert process.returncode == 2
     assert b"/nowhere/tof.yaml" in errors
+
+
+def test_frames_under_another_calibration_are_rejected_until_the_node_is_reset(
+    probe: DriverProbe, start: Callable[..., subprocess.Popen[bytes]]
+) -> None:
+    probe.listen("tof/depth/image", Image)
+    process = start()
+    refocused = Camera(64, 48, 1.3 * LENS.fx, 1.3 * LENS.fy, LENS.cx, LENS.cy, "plumb_bob", LENS.distortion)
+    depths, stamps = probe.received["tof/depth/image"], iter(range(10_000_000_000, 20_000_000_000, 100_000_000))
+
+    def play(camera: Camera, until: Callable[[], bool], failure: str) -> None:
+        """A frame and its calibration every half a second; what comes out of the first two may overtake the change."""
+        for _ in range(20):
+            stamp = next(stamps)
+            header = header_message(probe.types, stamp, "tof_optical_frame")
+            probe.send("tof/camera_info", camera_info_message(probe.types, header, Calibration(camera)))
+            probe.send_frame(stamp, **scene(1))
+            probe.spin(0.5)
+            if until():
+                return
+        raise AssertionError(failure)
+
+    play(LENS, lambda: bool(depths), "nothing under the first calibration")
+    sent = iter(range(2))
+    play(refocused, lambda: next(sent, None) is None, "")
+    depths.clear()
+    sent = iter(range(3))
+    play(refocused, lambda: next(sent, None) is None, "")
+    assert not depths
+    client = probe.node.create_client(Trigger, "tof_driver/reset")
+    probe.wait(client.service_is_ready, "no reset service")
+    future = client.call_async(Trigger.Request())
+    probe.wait(future.done, "no answer")
+    play(refocused, lambda: bool(depths), "nothing after the reset")
+    raw = scene(1)
+    expected = DepthProcessor(DepthConfig(), refocused).process(1, raw["distance"], raw["amplitude"], raw["intensity"])
+    np.testing.assert_array_equal(image_from_message(depths[-1]), expected.depth)
+    process.send_signal(signal.SIGINT)
+    assert "has changed (fx 90 to 117 px)" in process.communicate(timeout=30)[1].decode()
