@@ -38,6 +38,16 @@ def state_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 @pytest.fixture
+def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A ROS domain that no other test or program on this machine uses; nodes started meanwhile are in it."""
+    from slam_bringup.processes.processes import PrivateDomain
+
+    with PrivateDomain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        yield number
+
+
+@pytest.fixture
 def full_disk() -> Callable[[], AbstractContextManager[None]]:
     """A context in which the system refuses to make any file larger than 16 KiB, as a full disk does."""
 

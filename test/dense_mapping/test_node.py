@@ -38,7 +38,7 @@ TYPES = RosTypes()
 
 
 @pytest.fixture
-def node():
+def node(domain: int):
     rclpy.init(args=["--ros-args", "-p", "keyframe.distance:=0.1"])
     made = DenseMapperNode()
     sent: dict[str, list] = {}

@@ -70,9 +70,7 @@ class FeatureProbe(Probe):
 
 
 @pytest.fixture
-def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[FeatureProbe]:
-    domain = 90 + os.getpid() % 60
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+def probe(domain: int) -> Iterator[FeatureProbe]:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     probe = FeatureProbe(context)

@@ -37,11 +37,6 @@ LEAST_VARIANCE = 1e-9
 UNKNOWN_VARIANCE = 1e6
 
 
-@pytest.fixture
-def domain() -> int:
-    return 10 + os.getpid() % 60
-
-
 def check_odometry(messages: list[Any], known_twist: int) -> None:
     """By the rules above; all but ``known_twist`` messages may say that they do not know the velocity."""
     stamps = [stamp_of(message) for message in messages]
@@ -112,7 +107,7 @@ def laser(domain: int) -> Iterator[Probe]:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     probe = Probe(context)
-    environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     command = [sys.executable, "-c", "from ndt_registration.node import main; main()",
                "--ros-args", "-p", "input.policy:=all"]  # fmt: skip
     process = subprocess.Popen(command, env=environment)

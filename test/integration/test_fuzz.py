@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
@@ -17,10 +16,10 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks" / "ros"))
 MESSAGES = 1500
 
 
-def test_random_messages_end_no_node_and_change_no_map(tmp_path: Path) -> None:
+def test_random_messages_end_no_node_and_change_no_map(tmp_path: Path, domain: int) -> None:
     import fuzz
 
-    outcome, same = fuzz.run(MESSAGES, 1 + os.getpid() % 100, tmp_path)
+    outcome, same = fuzz.run(MESSAGES, domain, tmp_path)
     assert same
     for name, o in outcome.items():
         assert o.alive, (tmp_path / f"{name}.log").read_text()[-3000:]

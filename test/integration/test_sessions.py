@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,8 +22,7 @@ from sjsam_node.storage import is_map  # noqa: E402
 
 
 @pytest.fixture
-def chain(tmp_path: Path) -> Iterator[Chain]:
-    domain = 10 + os.getpid() % 60
+def chain(tmp_path: Path, domain: int) -> Iterator[Chain]:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain)
     chain = Chain(context, domain, tmp_path)

@@ -28,11 +28,10 @@ STEP = 0.1
 
 
 @pytest.fixture
-def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[Probe]:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(30 + os.getpid() % 60))
+def probe(domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Probe]:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
+    rclpy.init(context=context, domain_id=domain)
     probe = Probe(context)
     arguments = ["--ros-args", "-p", "input.policy:=all", "-p", "base_frame:=laser"]
     process = subprocess.Popen([sys.executable, "-c", START, *arguments], stderr=subprocess.PIPE)

@@ -20,14 +20,12 @@ rclpy = pytest.importorskip("rclpy")
 
 from std_srvs.srv import Trigger  # noqa: E402
 
-DOMAIN = 97
-
 
 @contextmanager
 def neighbour() -> Iterator[Probe]:
     """A new one for each process: an old one would wait for the killed one's answer."""
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
+    rclpy.init(context=context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
     probe = Probe(context)
     probe.listen("map/path", probe.types.Path, latched=True)
     yield probe
@@ -41,7 +39,7 @@ def start(*parameters: str, **options: Any) -> subprocess.Popen[str]:
     given = [word for parameter in parameters for word in ("-p", parameter)]
     return subprocess.Popen(
         [sys.executable, "-c", "from sjsam_node.node import main; main()", "--ros-args", *given],
-        env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "PYTHONPATH": os.pathsep.join(sys.path)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         **options,
     )
 

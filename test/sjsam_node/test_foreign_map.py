@@ -15,7 +15,7 @@ from judging import join
 from submap_world import Agent, circle, ring_world
 
 pytest.importorskip("rclpy")
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("domain")]
 
 from joiner_process import call, neighbour, running  # noqa: E402
 

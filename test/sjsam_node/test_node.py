@@ -78,8 +78,7 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setenv("ROS_DOMAIN_ID", "93")
+def bench(tmp_path: Path, domain: int) -> Any:
     arguments = [f"map_path:={tmp_path / 'map'}", f"ply_path:={tmp_path / 'map.ply'}"]
     rclpy.init(args=["--ros-args", *(word for a in arguments for word in ("-p", a))])
     bench = Bench(SjsamNode())

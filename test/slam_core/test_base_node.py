@@ -69,8 +69,7 @@ class EarNode(SlamNode[EarConfig]):
 
 
 @pytest.fixture
-def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[EarNode]:
-    monkeypatch.setenv("ROS_DOMAIN_ID", "94")
+def node(domain: int) -> Iterator[EarNode]:
     rclpy.init()
     node = EarNode()
     yield node

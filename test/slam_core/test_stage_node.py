@@ -46,9 +46,8 @@ class WaitingNode(StageNode[Config]):
 
 
 @pytest.fixture
-def node(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[WaitingNode]:
+def node(request: pytest.FixtureRequest, domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[WaitingNode]:
     """A node with the policy that the test names, by default that of live nodes."""
-    monkeypatch.setenv("ROS_DOMAIN_ID", "94")
     rclpy.init(args=["--ros-args", "-p", f"input.policy:={getattr(request, 'param', 'newest')}"])
     node = WaitingNode()
     monkeypatch.setattr("slam_core.stage_node.time.monotonic", lambda: node.now)

@@ -64,10 +64,9 @@ class PairProbe(Probe):
 
 
 @pytest.fixture
-def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[PairProbe]:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(90 + os.getpid() % 60))
+def probe(domain: int) -> Iterator[PairProbe]:
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
+    rclpy.init(context=context, domain_id=domain)
     probe = PairProbe(context)
     yield probe
     probe.executor.shutdown()

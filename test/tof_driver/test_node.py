@@ -49,10 +49,9 @@ class DriverProbe(Probe):
 
 
 @pytest.fixture
-def probe(monkeypatch: pytest.MonkeyPatch) -> Iterator[DriverProbe]:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(30 + os.getpid() % 60))
+def probe(domain: int) -> Iterator[DriverProbe]:
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
+    rclpy.init(context=context, domain_id=domain)
     probe = DriverProbe(context)
     yield probe
     probe.executor.shutdown(timeout_sec=2.0)
