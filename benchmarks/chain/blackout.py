@@ -98,7 +98,7 @@ def row(bag: Path, imu: str, start: float, end: float) -> list[str]:
     """One run of ``slam run``'s pipeline, without a dense model."""
     config = choose(load_system_config(None), "stereo", "sjsam", "none", imu)
     config = replace(config, dense_mapper=replace(config.dense_mapper, use_stereo=False, use_tof=False))
-    result, mapping = run_bag(bag, config)
+    result, session = run_bag(bag, config)
     agent = result.agents[0]
     e = agent.evaluation()
     assert e is not None
@@ -108,7 +108,7 @@ def row(bag: Path, imu: str, start: float, end: float) -> list[str]:
         "" if np.isinf(start) else f"{start:g} to {end:g} s", imu,
         *(", ".join(f"{1e3 * value(errors, start, end):.0f}" for errors in (filtered, joined)) if np.isfinite(start)
           else "" for value in (_in_the_dark, _after)),
-        f"{1e3 * e.ate.rmse:.1f}, {e.anees or np.nan:.2f}", str(mapping.global_map.components),
+        f"{1e3 * e.ate.rmse:.1f}, {e.anees or np.nan:.2f}", str(session.snapshot.components),
         f"{counts.get('frames_bridged', 0)}, {counts.get('frames_lost', 0)}", filtered.tilts(), joined.tilts(),
     ]  # fmt: skip
 

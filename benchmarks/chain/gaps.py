@@ -80,12 +80,12 @@ def row(bag: Path, mode: str, odometry: str, imu: str) -> list[str]:
     """One run of ``slam run``'s pipeline, without a dense model."""
     config = choose(load_system_config(None), mode, "sjsam", odometry, imu)
     config = replace(config, dense_mapper=replace(config.dense_mapper, use_stereo=False, use_tof=False))
-    result, mapping = run_bag(bag, config, odometry=odometry)
+    result, session = run_bag(bag, config, odometry=odometry)
     e = result.agents[0].evaluation()
     assert e is not None
     counts = result.rejections
     return [
-        str(result.frames), f"{1e3 * e.ate.rmse:.1f}", f"{e.anees or np.nan:.2f}", str(mapping.global_map.components),
+        str(result.frames), f"{1e3 * e.ate.rmse:.1f}", f"{e.anees or np.nan:.2f}", str(session.snapshot.components),
         str(counts.get("gaps_bridged", 0)), str(counts.get("frames_lost", 0)),
     ]  # fmt: skip
 

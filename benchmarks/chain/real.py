@@ -62,8 +62,8 @@ def main() -> None:
 def row(name: str, folder: Path) -> list[str]:
     mode, odometry = RUNS[name]
     system = choose(load_system_config(None), mode, "sjsam", odometry)
-    result, mapping = run_bag(bag_of(name, folder), system, odometry=odometry)
-    write_results(folder / name, result, mapping.global_map.save)
+    result, session = run_bag(bag_of(name, folder), system, odometry=odometry)
+    write_results(folder / name, result, lambda path: session.save(path).result())
     summary, agent = summarise(result), result.agents[0]
     lost = sum("LOST" in event for event in result.events)
     counts = [summary["frames"], summary["submaps"], summary["loop_closures"], lost]

@@ -132,9 +132,9 @@ def _own(name: str, bag: Path, recording: Recording, run: str, output: Path, con
     odometry = "ndt" if run == "ndt" else "none"
     system = choose(load_system_config(config), recording.mode, "sjsam", odometry, "on" if run == "imu" else "off")
     start = time.process_time()
-    result, mapping = run_bag(bag, system, odometry=odometry)
+    result, session = run_bag(bag, system, odometry=odometry)
     ms = 1e3 * (time.process_time() - start) / max(result.frames, 1)
-    write_results(output, result, mapping.global_map.save)
+    write_results(output, result, lambda path: session.save(path).result())
     agent = result.agents[0]
     lost = result.rejections.get("frames_lost", 0)
     yield row_of(name, run, agent.trajectory, agent.truth, recording.truth, lost, ms)

@@ -30,11 +30,11 @@ from rich.console import Console
 from rich.table import Table
 
 from ndt_registration.stage import ScanEstimate
+from sjsam_node.map_session import MapSession
 from slam_bringup.bags.readings import AgentSensors
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.configuration import SystemConfig, choose, load_system_config
-from slam_bringup.pipeline.map_growth import map_growth
 from slam_bringup.pipeline.mapper import Mapper
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
@@ -144,11 +144,11 @@ def map_of(take: Take, system: SystemConfig, variant: str, name: str, run: str, 
         association = replace(system.ekf_slam.association, probability=float(variant.split()[1]))
         system = replace(system, ekf_slam=replace(system.ekf_slam, association=association))
     backwards = variant == "backwards"
-    mapping = Mapper(system, {"": take.sensors}, StageTimes(), map_growth(system.sjsam))
+    session = MapSession(system.sjsam)
+    mapping = Mapper(system, {"": take.sensors}, StageTimes(), session)
     for item in _backwards(take.items) if backwards else _fewer(take.items, variant):
         mapping.process(replace(item, agent=""))
     mapping.finish()
-    mapping.stop()
     record = mapping.record(0.0, {}, "")
     truth = _mirrored(take.truth, take.items) if backwards else take.truth
     lost = record.rejections.get("frames_lost", 0)
@@ -157,7 +157,7 @@ def map_of(take: Take, system: SystemConfig, variant: str, name: str, run: str, 
     return Outcome(
         row_of(name, f"{run}, {variant}", joined, truth, known, lost, None),
         row_of(name, f"{run}, {variant}, filter", filtered, truth, known, lost, None),
-        mapping.growth.global_map.overconfidence != "",
+        session.snapshot.overconfidence != "",
     )
 
 

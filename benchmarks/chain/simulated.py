@@ -67,10 +67,10 @@ def main() -> None:
         for run in track(arguments.runs, description="mapping", console=Console(stderr=True)):
             name, _, mode = run.partition(":")
             bag = bag_of(name, arguments.keep or Path(scratch), arguments.profile)
-            result, mapping = run_bag(
+            result, session = run_bag(
                 bag, choose(load_system_config(arguments.config, bag), mode or "stereo", "sjsam", "none")
             )
-            submaps = list(mapping.global_map.snapshot().submaps)
+            submaps = list(session.snapshot.submaps)
             table.add_row(run, *row(result, submaps))
             if len(result.agents) > 1:
                 for cells in agent_rows(result, submaps):

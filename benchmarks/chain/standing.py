@@ -42,13 +42,13 @@ def main() -> None:
         repeat(arguments.bag, standing, arguments.pair, frames, arguments.rate, arguments.noise)
         config = choose(load_system_config(None), "stereo", "sjsam", "none", "off")
         config = replace(config, dense_mapper=replace(config.dense_mapper, use_stereo=False, use_tof=False))
-        result, mapping = run_bag(standing, config)
+        result, _ = run_bag(standing, config)
     agent = result.agents[0]
     table = Table(title=f"pair {arguments.pair} of {arguments.bag.name}, {frames} times")
     for heading in ("filter moves mm, deg", "map moves mm, deg", "submaps", "landmarks", "frames seen standing"):
         table.add_column(heading)
     moves = [_largest_move(trajectory.poses) for trajectory in (agent.filtered, agent.trajectory)]
-    landmarks = len(mapping.global_map.landmarks().positions)
+    landmarks = len(result.landmarks.positions)
     table.add_row(*moves, str(result.submaps), str(landmarks), str(result.rejections.get("frames_standing", 0)))
     Console(width=120).print(table)
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from calibration_folder import write_calibrations
+from sjsam_node.map_session import MapSession, Mode
 from slam_bringup.bags.bag import BagReader, BagWriter
 from slam_bringup.bags.rig_calibration import read_rig_calibration
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.bags.sensor_writer import IMU_FRAME, SensorWriter
 from slam_bringup.pipeline.configuration import choose, load_system_config
-from slam_bringup.pipeline.map_growth import map_growth
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.pipeline.results import summarise
 from slam_bringup.processes.online_run import run_nodes
@@ -68,6 +68,11 @@ def turn_rates(start_ns: int) -> deque[ImuSample]:
     return deque(ImuSample(int(t), rate, np.array([0.0, 0.0, 9.8])) for t, rate in zip(stamps, rates, strict=True))
 
 
+def files(folder: Path) -> dict[str, bytes]:
+    """The files of a map, whose arrays are named after their digest."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
 @pytest.mark.parametrize(
     ("mode", "odometry", "composed", "calibrated"),
     [
@@ -106,15 +111,16 @@ def test_a_rig_is_located_in_a_map_through_the_nodes_as_offline(
 ) -> None:
     config = choose(load_system_config(None), "fuse", "sjsam", "none")
     _, grown = run_bag(short_bag, config)
-    grown.save(tmp_path / "map")
-    start = StartMap.read(config, tmp_path, localize_only=True)
+    grown.save(tmp_path / "map").result()
+    start = StartMap.read(config, tmp_path / "map", localize_only=True)
     assert start is not None
-    before = {path.name: path.read_bytes() for path in (tmp_path / "map").iterdir()}
+    before = files(tmp_path / "map")
     run = run_nodes(short_bag, config, tmp_path / "out", odometry=False, composed=True, start_map=start)
     online, _ = collect(short_bag, config, run, mapper="sjsam", odometry="none", start_map=start)
-    located = map_growth(config.sjsam, tmp_path, localize_only=True)
-    offline, _ = run_bag(short_bag, config, growth=located)
-    assert {path.name: path.read_bytes() for path in (tmp_path / "map").iterdir()} == before
+    with MapSession(config.sjsam, Mode.LOCALISE) as session:
+        session.load(tmp_path / "map", len).result()
+        offline, _ = run_bag(short_bag, config, session=session)
+    assert files(tmp_path / "map") == files(run.map_folder) == before
     assert online.loop_closures == offline.loop_closures > 0
     told = summarise(online)["localization"][""]
     assert 0.0 < told["located_share"] < 1.0, "live, a place is known after the submap in which it was recognised"

@@ -21,11 +21,13 @@ pytestmark = pytest.mark.ros
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from sjsam_node.agents import in_order  # noqa: E402
 from sjsam_node.global_map import GlobalMap, JoinReport  # noqa: E402
+from sjsam_node.map_session import MapSession  # noqa: E402
 from sjsam_node.node import SjsamNode  # noqa: E402
 from slam_core.geometry import boxminus, make_transform, rotation_from_euler, transform_from_pose7  # noqa: E402
 from slam_core.messages import SUBMAP_TOPICS, odometry_message, path_from_message, submap_messages  # noqa: E402
-from slam_core.ros import RosTypes, sensor_qos  # noqa: E402
+from slam_core.ros import RosTypes, below, sensor_qos  # noqa: E402
 from slam_core.types import PoseEstimate, Submap  # noqa: E402
 
 
@@ -39,7 +41,7 @@ class Bench:
         for member in (node, self.neighbour):
             self.executor.add_node(member)
         self.received: dict[str, list[Any]] = {}
-        self.submap_publishers: list[Any] = []
+        self.submap_publishers: dict[str, list[Any]] = {}
 
     def listen(self, topic: str, kind: str) -> None:
         self.received[topic] = []
@@ -66,10 +68,12 @@ class Bench:
         return future.result()
 
     def send(self, submaps: list[Submap]) -> None:
-        if not self.submap_publishers:
-            self.submap_publishers = [self.publisher(topic, kind) for topic, kind in SUBMAP_TOPICS.items()]
         for submap in submaps:
-            for publisher, message in zip(self.submap_publishers, submap_messages(self.types, submap), strict=True):
+            if submap.agent not in self.submap_publishers:
+                topics = {below(submap.agent, topic): kind for topic, kind in SUBMAP_TOPICS.items()}
+                self.submap_publishers[submap.agent] = [self.publisher(topic, kind) for topic, kind in topics.items()]
+            messages = submap_messages(self.types, submap)
+            for publisher, message in zip(self.submap_publishers[submap.agent], messages, strict=True):
                 publisher.publish(message)
 
     @property
@@ -77,9 +81,9 @@ class Bench:
         return self.node.health.counters
 
 
-@pytest.fixture
-def bench(tmp_path: Path, domain: int) -> Any:
-    arguments = [f"map_path:={tmp_path / 'map'}", f"ply_path:={tmp_path / 'map.ply'}"]
+@pytest.fixture(params=["agents:=['']"])
+def bench(request: pytest.FixtureRequest, tmp_path: Path, domain: int) -> Any:
+    arguments = [f"map_path:={tmp_path / 'map'}", f"ply_path:={tmp_path / 'map.ply'}", request.param]
     rclpy.init(args=["--ros-args", *(word for a in arguments for word in ("-p", a))])
     bench = Bench(SjsamNode())
     yield bench
@@ -102,7 +106,7 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
     ):
         bench.listen(topic, kind)
     bench.send(submaps)
-    assert bench.spin_until(lambda: len(bench.node.global_map.estimate.graph.records) == len(submaps))
+    assert bench.spin_until(lambda: len(bench.node.map.snapshot) == len(submaps))
     wanted = len(submaps) * agent.steps + 1
     assert bench.spin_until(lambda: any(len(m.poses) == wanted for m in bench.received["map/path"]))
     offline, _ = join(submaps)
@@ -122,11 +126,11 @@ def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator,
     assert bench.call("mark_here").success
     click = bench.publisher("clicked_point", "PointStamped")
     click.publish(bench.types.PointStamped(header=bench.types.Header(frame_id="map"), point=bench.types.Point(x=1.0)))
-    assert bench.spin_until(lambda: len(bench.node.global_map.marks.marks) == 2, 5.0)
+    assert bench.spin_until(lambda: len(bench.node.map.snapshot.marks.marks) == 2, 5.0)
     assert bench.call("reset").success
-    assert len(bench.node.global_map.estimate.graph.records) == 0
+    assert len(bench.node.map.snapshot) == 0
     assert bench.call("load_map").success
-    assert len(bench.node.global_map.estimate.graph.records) == len(submaps)
+    assert len(bench.node.map.snapshot) == len(submaps)
 
 
 def test_map_to_odom_leads_from_odometry_to_where_the_rig_is_in_the_map(bench: Bench, submaps: list[Submap]) -> None:
@@ -161,7 +165,7 @@ def test_a_submap_that_did_not_arrive_is_asked_for_again_and_then_told(bench: Be
                 publisher.publish(message)
 
     def joined() -> list[int]:
-        return [record.submap.index for record in bench.node.global_map.estimate.graph.records]
+        return [submap.index for submap in bench.node.map.snapshot.submaps]
 
     counters = bench.node.health.counters
     send(0, 1, 3, 4)
@@ -170,10 +174,30 @@ def test_a_submap_that_did_not_arrive_is_asked_for_again_and_then_told(bench: Be
     send(2)
     assert bench.spin_until(lambda: len(joined()) == 5)
     assert joined() == [0, 1, 2, 3, 4]
-    assert bench.node.global_map.components == 1
+    assert bench.node.map.snapshot.components == 1
     send(6)
     assert bench.spin_until(lambda: counters.get("submaps missed", 0) == 1)
     assert bench.spin_until(lambda: joined() == [0, 1, 2, 3, 4, 6])
+
+
+@pytest.mark.parametrize("bench", ["agents:=['a','b']"], indirect=True)
+def test_the_finished_map_of_two_agents_is_that_of_a_session_offline_to_the_byte(
+    bench: Bench, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    world, path = ring_world(4.0, rng, 12.0), circle(4.0, 1.0)
+    A = Agent(world, path[:61], rng, "a").submaps()
+    B = Agent(world, path[45:], rng, "b", stamp_ns=2_000_000_000).submaps()
+    bench.send(B + A)
+    assert bench.spin_until(lambda: bench.counters["submaps received"] == len(A + B))
+    assert bench.call("finish").success
+    assert bench.call("save_map").success
+    with MapSession(bench.node.config) as session:
+        for submap in in_order(A + B):
+            session.add(submap)
+        session.finish().result()
+        session.save(tmp_path / "offline").result()
+    online, offline = ({p.name: p.read_bytes() for p in (tmp_path / n).iterdir()} for n in ("map", "offline"))
+    assert online == offline
 
 
 def test_services_answer_on_an_empty_map(bench: Bench) -> None:
@@ -238,7 +262,7 @@ def test_reset_leaves_out_what_waits_and_what_is_being_joined(
     assert bench.spin_until(lambda: bench.counters["submaps received"] == len(submaps))
     slow.may_go_on.set()
     assert bench.call("finish").success
-    assert [r.submap.index for r in bench.node.global_map.estimate.graph.records] == [submaps[-1].index]
+    assert [submap.index for submap in bench.node.map.snapshot.submaps] == [submaps[-1].index]
     assert bench.counters["submaps joined"] == 3
 
 

@@ -36,27 +36,22 @@ class Autosave:
         self.path = path
         self.ended = path.with_name(f"{path.name}.ended")
         self._period_s = period_s
-        self._lock = _lock(path) if self.is_on else None
+        self._lock = _lock(path)
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="autosave")
         self._job: Future[float] | None = None
         self._due_s = 0.0
         self._began_s = 0.0
 
-    @property
-    def is_on(self) -> bool:
-        """True if copies are written at all."""
-        return self._period_s > 0.0
-
     def found(self) -> Path | None:
         """The copy of a node that was killed, or None."""
-        return self.path if self.is_on and storage.is_map(self.path) else None
+        return self.path if storage.is_map(self.path) else None
 
     def is_due(self, now_s: float) -> bool:
         """True if the map is to be handed over now; raises what went wrong with the copy before."""
         if self._job is not None and self._job.done():
             job, self._job = self._job, None
             self._due_s = max(self._due_s, self._began_s + _SHARE * job.result())
-        return self.is_on and self._job is None and now_s >= self._due_s
+        return self._job is None and now_s >= self._due_s
 
     def save(self, stored: StoredMap, now_s: float) -> None:
         """Write a copy of the map as it is now."""
@@ -85,8 +80,7 @@ class Autosave:
     def close(self) -> None:
         """End the writer's thread and give up the path."""
         self._writer.shutdown()
-        if self._lock is not None:
-            self._lock.release()
+        self._lock.release()
 
 
 def _lock(path: Path) -> PathLock:

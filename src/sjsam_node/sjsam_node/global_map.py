@@ -40,12 +40,6 @@ from slam_core.types import Counters, PoseEstimate, Submap
 
 ALREADY_JOINED = "already joined"
 
-ADVICE = (
-    "Poses are as much less certain. The calibration may not fit: slam doctor BAG tells; slam calibrate "
-    "refine BAG corrects that of a stereo pair, --odometry ndt helps a depth camera"
-)
-"""Advice to a user whose submaps contradict each other."""
-
 _PASSES = 2
 """Times that settling looks for closures, and lets go what the map contradicts: one finding lets another follow."""
 
@@ -301,18 +295,6 @@ class GlobalMap:
         self.estimate.relinearize()  # from here on it says the same as one that is saved and loaded
         self._offload.forget()
         self._has_moved, self._is_settled = False, True
-
-    @property
-    def overconfidence(self) -> str:
-        """Warning if submaps contradict each other; empty if they do not."""
-        state = self.state
-        factor, over = state.most_overconfident()
-        if not over:
-            return ""
-        linked = {i for k in state.graph.links if not k.is_closure for i in k.ends}
-        alone = sum(i not in linked for i in over)
-        return (f"submaps contradict each other {factor:.0f} times more than they claim: "
-                f"{alone} of {len(state.graph.records)} are chained as the filter made them. {ADVICE}")  # fmt: skip
 
     def rebuilt_in_time_order(self) -> GlobalMap:
         """The settled map that does not depend on who came first: all submaps joined in the order of their stamps.

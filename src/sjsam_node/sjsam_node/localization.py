@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Localization:
-    """Poses at the end and at the start of a submap in the map frame, None while unknown.
+    """Poses at the end of a submap and inside it in the map frame; None and empty while unknown.
 
-    Matched: landmarks of the map that were recognised.
+    matched: landmarks of the map that were recognised.
     """
 
     pose: PoseEstimate | None
     matched: int
-    start: PoseEstimate | None = None
+    path: tuple[PoseEstimate, ...] = ()
 
 
 class Localizer:
@@ -52,8 +52,11 @@ class Localizer:
         if not submap.follows_previous:
             self._pose = None
         start, matched = self._fix(submap)
-        self._pose = None if start is None else _moved(start, submap)
-        return Localization(self._pose, matched, start)
+        if start is None:
+            self._pose = None
+            return Localization(None, matched)
+        self._pose = _moved(start, PoseEstimate(submap.end_stamp_ns, submap.end_pose, submap.covariance[:6, :6]))
+        return Localization(self._pose, matched, tuple(_moved(start, pose) for pose in submap.path))
 
     def _fix(self, submap: Submap) -> tuple[PoseEstimate | None, int]:
         """Pose of the submap's start from the stored submap that matches best; the prediction where none does."""
@@ -88,6 +91,6 @@ class Localizer:
         return prior_of_pair(T @ self._pose.T, covariance)
 
 
-def _moved(start: PoseEstimate, submap: Submap) -> PoseEstimate:
-    covariance: FloatArray = compose_covariance(start.T, start.covariance, submap.end_pose, submap.covariance[:6, :6])
-    return PoseEstimate(submap.end_stamp_ns, start.T @ submap.end_pose, covariance)
+def _moved(start: PoseEstimate, pose: PoseEstimate) -> PoseEstimate:
+    covariance: FloatArray = compose_covariance(start.T, start.covariance, pose.T, pose.covariance)
+    return PoseEstimate(pose.stamp_ns, start.T @ pose.T, covariance)

@@ -7,11 +7,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable, Mapping
+import types
+from collections.abc import Awaitable, Callable, Generator
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,10 +19,7 @@ from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
 from sjsam_node.autosave import Autosave
-from sjsam_node.global_map import ADVICE, ALREADY_JOINED, GlobalMap
-from sjsam_node.joiner_stage import result_of
-from sjsam_node.live_map import Joined, LiveMap
-from sjsam_node.localization import Localization
+from sjsam_node.global_map import ALREADY_JOINED, JoinReport
 from sjsam_node.map_messages import (
     cloud_message,
     ellipsoids_message,
@@ -30,8 +27,10 @@ from sjsam_node.map_messages import (
     landmarks_message,
     marks_message,
 )  # fmt: skip
+from sjsam_node.map_session import MapSession, Mode, Outcome
 from sjsam_node.node_config import SjsamNodeConfig, copy_path
 from sjsam_node.pose_tracker import PoseTracker
+from sjsam_node.smoothing.map_snapshot import ADVICE, MapSnapshot
 from sjsam_node.submap_order import SubmapOrder, gap_text
 from slam_core.base_node import SlamNode
 from slam_core.geometry import FloatArray
@@ -63,7 +62,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     """Publishes each agent's pose, ``map_to_odom`` and the map.
 
     ``pose`` comes with every odometry message, ``map_to_odom`` twenty times a second, and the map, which costs the more
-    the larger it is, once a second at most. Submaps are joined on another thread (:mod:`sjsam_node.live_map`), so that
+    the larger it is, once a second at most. Submaps are joined on a thread of :mod:`sjsam_node.map_session`, so that
     all else goes on meanwhile, from the last estimate.
     """
 
@@ -71,7 +70,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def __init__(self) -> None:
         super().__init__("sjsam", SjsamNodeConfig)
-        self.map = LiveMap(self.config, self._make_autosave(), keeps_map=self.config.localize_only)
+        mode = Mode.LOCALISE if self.config.localize_only else Mode.MAP
+        self.map = MapSession(self.config, mode, self._make_autosave())
         self._stamp_ns = 0
         self._drawn = self.map.snapshot
         self._picture: Future[Any] = self.map.read(lambda _: None)
@@ -102,36 +102,35 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         """File of the exported landmarks."""
         return Path(self.config.ply_path).expanduser()
 
-    @property
-    def global_map(self) -> GlobalMap:
-        """The map, which another thread changes."""
-        return self.map.global_map
-
-    def _make_autosave(self) -> Autosave:
-        path = copy_path(self.config, self.get_namespace())
-        return Autosave(path, 0.0 if self.config.localize_only else self.config.autosave_period_s)
+    def _make_autosave(self) -> Autosave | None:
+        period_s = self.config.autosave_period_s
+        is_on = period_s > 0.0 and not self.config.localize_only
+        return Autosave(copy_path(self.config, self.get_namespace()), period_s) if is_on else None
 
     def _go_on_from_last_time(self) -> None:
         """The map of a node that was killed, or the one to begin with or to localise in."""
         initial = self.config.initial_map or (self.config.map_path if self.config.localize_only else "")
-        if initial and (self.config.localize_only or self.map.killed() is None):
+        copy = self.map.crash_recovery_path()
+        if copy is None and initial:
             path = Path(initial).expanduser()
-            self._show_loaded(*self.map.load(path, self._seen).result())
+            self._show_loaded(self.map.load(path, self._seen).result())
             self.get_logger().info(f"{len(self.map.snapshot)} submaps read from {path}")
-        elif (copy := self.map.killed()) is not None:
+        elif copy is not None:
             try:
-                self._show_loaded(*self.map.load(copy, self._seen).result())
+                self._show_loaded(self.map.load(copy, self._seen).result())
             except ValueError as error:
                 self.get_logger().error(f"the autosaved map cannot be used, a new one begins: {error}")
-                self.map.reset(forget=True)
+                self.map.reset()
                 return
             known = (
                 f"{len(self.map.snapshot)} submaps of {time.ctime((copy / 'manifest.json').stat().st_mtime)} in {copy}"
             )
             self.get_logger().warning(f"a node was killed: going on from {known} (~/reset forgets them)")
 
-    def _start_trackers(self, last: Mapping[str, FloatArray] = MappingProxyType({})) -> None:
-        """Follow every agent from where it was ``last``, else from the origin; one to be located from nowhere yet."""
+    def _start_trackers(self) -> None:
+        """Follow every agent from its end in the map, else from the origin; one to be located from nowhere yet."""
+        shown = self.map.snapshot
+        last = dict(zip([agent for agent, _, _ in shown.keys], shown.poses[shown.nodes[:, 1]], strict=True))
         self.trackers = {
             agent: PoseTracker(None if self.config.localize_only else last.get(agent, np.eye(4)))
             for agent in self.config.agents
@@ -171,51 +170,49 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         submap = submap_from_messages(SubmapMessages(*messages))
         self._stamp_ns = max(self._stamp_ns, submap.end_stamp_ns)
         self.health.count("submaps received")
-        if self.config.localize_only:
-            return self._hand_over(agent, submap, self.map.locate(agent, submap))
-        self._join(self._order.add((submap.agent, submap.session, submap.index), (agent, submap)))
+        key, item = (submap.agent, submap.session, submap.index), (agent, submap)
+        self._hand_over([item] if self.config.localize_only else self._order.add(key, item))
         if self._order.should_ask(time.monotonic()):
             self.ask_again(below(agent, topic) for topic in SUBMAP_TOPICS)
 
-    def _join(self, submaps: list[tuple[str, Submap]]) -> None:
+    def _hand_over(self, submaps: list[tuple[str, Submap]]) -> None:
+        """Have the session do its part, and go on from there."""
         for agent, submap in submaps:
-            self._hand_over(agent, submap, self.map.add(submap))
+            self.map.add(submap).add_done_callback(partial(self._take_later, agent, submap))
+            self._show_waiting()
 
-    def _hand_over(self, agent: str, submap: Submap, done: Future[Any]) -> None:
-        """Have another thread do its part, and go on from there."""
-        self._show_waiting()
+    def _take_later(self, agent: str, submap: Submap, done: Future[Outcome | None]) -> None:
         take = partial(self._take, agent, submap, done)
-        done.add_done_callback(
-            lambda _: self.do_later("submap", partial(self._process, "submap", 0, take, announce=False))
-        )
+        self.do_later("submap", partial(self._process, "submap", 0, take, announce=False))
 
-    def _take(self, agent: str, submap: Submap, done: Future[Any]) -> None:
+    def _take(self, agent: str, submap: Submap, done: Future[Outcome | None]) -> None:
         """Go on from what has become of a submap; nothing has where the node was reset meanwhile."""
         self._show_waiting()
-        found = done.result()
-        if isinstance(found, Joined):
-            self._take_joined(agent, submap, found)
-        elif isinstance(found, Localization):
-            self._take_located(agent, found)
+        outcome = done.result()
+        if outcome is not None and outcome.report is not None:
+            self._take_joined(agent, submap, outcome, outcome.report)
+        elif outcome is not None:
+            self._take_located(agent, outcome)
         self.report_now()
 
-    def _take_joined(self, agent: str, submap: Submap, joined: Joined) -> None:
-        if joined.report.reason == ALREADY_JOINED:  # sent again to a node that was started again
+    def _take_joined(self, agent: str, submap: Submap, joined: Outcome, report: JoinReport) -> None:
+        if report.reason == ALREADY_JOINED:  # sent again to a node that was started again
             self.health.count("submaps sent again")
             return
         if joined.end is None:
-            raise ValueError(f"submap {submap.frame_id}: {joined.report.reason}")
+            raise ValueError(f"submap {submap.frame_id}: {report.reason}")
         self.health.processed(joined.duration_s, is_frame=False)
-        self._count(joined)
+        self._count(report)
         self._follow(agent, joined.end, joined.in_odom)
 
-    def _take_located(self, agent: str, found: Localization) -> None:
-        self.health.count("localized" if found.matched else "not recognised")
-        if found.pose is None:
+    def _take_located(self, agent: str, located: Outcome) -> None:
+        self.health.count("localized" if located.closures else "not recognised")
+        if located.end is None:
             self.health.set(State.LOST, "the place is not recognised in the map")
             return
-        self.health.set(State.OK if found.matched else State.DEGRADED, "" if found.matched else "by odometry alone")
-        self._follow(agent, found.pose)
+        is_seen = located.closures > 0
+        self.health.set(State.OK if is_seen else State.DEGRADED, "" if is_seen else "by odometry alone")
+        self._follow(agent, located.end)
 
     def _show_waiting(self) -> None:
         self.health.take({"submaps waiting": self.map.waiting, "submaps waiting at most": self.map.waiting_at_most})
@@ -240,7 +237,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def on_reset(self) -> None:
         """Forget the map; in a loaded map only where the agents are."""
-        self.map.reset(forget=not self.config.localize_only)
+        self.map.reset()
         self._start_trackers()
         self._publish_map()
 
@@ -253,7 +250,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def on_close(self) -> None:
         """Join what waits: no submap that has come is lost."""
         self.finish_work()
-        self._join(self._order.give_up())
+        self._hand_over(self._order.give_up())
         if self.map.waiting:
             self.get_logger().info(f"joining {self.map.waiting} submaps before the end")
         self.map.close()
@@ -269,11 +266,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         elif in_odom is not None:
             tracker.add_submap(end, in_odom)
 
-    def _count(self, joined: Joined) -> None:
-        report = joined.report
+    def _count(self, report: JoinReport) -> None:
         self.health.count("submaps joined")
         self.health.count("closures", len(report.closures))
-        self.health.take(joined.counts | {"components": report.components})
+        self.health.take(self.map.counts | {"components": report.components})
         reasons = [f"{report.components} separate parts"] if report.components > 1 else []
         if report.is_strained:
             reasons.append(f"submaps contradict each other {report.variance_factor:.0f} times more than they claim")
@@ -291,16 +287,16 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     async def load_map(self) -> str:
         """Replace the map by the one in ``map_path``; where that cannot be used the map stays as it is."""
-        self._show_loaded(*await self._done(self.map.load(self.map_path, self._seen)))
+        self._show_loaded(await self._done(self.map.load(self.map_path, self._seen)))
         return self._size("read from")
 
-    def _seen(self, loaded: GlobalMap) -> tuple[dict[str, Message], dict[str, FloatArray]]:
-        """Messages of a loaded map and the last poses of its agents."""
-        self._stamp_ns = max((s.end_stamp_ns for s in loaded.snapshot().submaps), default=self._stamp_ns)
-        return self._map_messages(loaded), {agent: loaded.last_pose(agent) for agent in self.config.agents}
+    def _seen(self, loaded: MapSnapshot) -> dict[str, Message]:
+        """Messages of a loaded map."""
+        self._stamp_ns = max(s.end_stamp_ns for s in loaded.submaps)
+        return self._map_messages(loaded)
 
-    def _show_loaded(self, outputs: dict[str, Message], last: dict[str, FloatArray]) -> None:
-        self._start_trackers(last)
+    def _show_loaded(self, outputs: dict[str, Message]) -> None:
+        self._start_trackers()
         self._publish_all(outputs)
         self._drawn = self.map.snapshot
 
@@ -309,7 +305,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         path = self.ply_path
         if path.exists() and not is_ply(path):
             raise ValueError(f"{path} is there and no PLY file: it is left as it is, choose another ply_path")
-        landmarks = await self._done(self.map.read(GlobalMap.landmarks))
+        landmarks = await self._done(self.map.read(MapSnapshot.landmarks))
         write_ply(path, landmarks.positions.astype(np.float32))
         return f"{len(landmarks.positions)} landmarks written to {path}"
 
@@ -320,9 +316,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def _mark(self, point: FloatArray) -> str:
         mark = self.map.mark(point)
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
-        self.publish(
-            "map/marks", marks_message(self.types, header, self.global_map.marks.positions(self.map.snapshot.poses))
-        )
+        self.publish("map/marks", marks_message(self.types, header, self.map.snapshot.mark_positions()))
         return mark.name
 
     def _size(self, done: str) -> str:
@@ -331,7 +325,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     async def _done(self, future: Future[T]) -> T:
         """Result of another thread; until it is there the node does all else."""
         future.add_done_callback(lambda _: self._wake.trigger())
-        return await result_of(future)
+        await _until(future.done)
+        return future.result()
 
     # -- outputs -------------------------------------------------------------------------------------------------------
 
@@ -340,7 +335,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             for (agent, _), indices in missing.items():
                 self.health.count("submaps missed", len(indices))
                 self.get_logger().warning(gap_text(agent, indices))
-            self._join(self._order.give_up())
+            self._hand_over(self._order.give_up())
         if self._drawn is not self.map.snapshot and self._picture.done():
             self._publish_map()
         copy = self.map.save_copy()
@@ -352,18 +347,17 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._picture = self.map.read(self._draw)
         self._picture.add_done_callback(lambda done: self.do_later("map", lambda: self._publish_all(done.result())))
 
-    def _draw(self, global_map: GlobalMap) -> dict[str, Message]:
+    def _draw(self, snapshot: MapSnapshot) -> dict[str, Message]:
         self._drawn = self.map.snapshot
-        return self._map_messages(global_map)
+        return self._map_messages(snapshot)
 
     def _publish_all(self, messages: dict[str, Message]) -> None:
         for topic, message in messages.items():
             self.publish(topic, message)
 
-    def _map_messages(self, global_map: GlobalMap) -> dict[str, Message]:
-        """Messages that show a map, by topic; on the thread that may read it."""
+    def _map_messages(self, snapshot: MapSnapshot) -> dict[str, Message]:
+        """Messages that show a map, by topic; on the thread that may read its covariances."""
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
-        snapshot = global_map.snapshot()
         landmarks, paths = snapshot.landmarks(), snapshot.path()
         messages = {
             "map/landmarks": landmarks_message(self.types, header, landmarks),
@@ -391,6 +385,13 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             message = transform_message(self.types, ahead, self.config.map_frame, odom, T_map_odom)
             self.publish(below(agent, "map_to_odom"), message)
             self.broadcast(message)
+
+
+@types.coroutine
+def _until(condition: Callable[[], bool]) -> Generator[None, None, None]:
+    """Await what another thread does in a callback of rclpy, whose executor goes on with all else."""
+    while not condition():
+        yield
 
 
 def main() -> None:

@@ -129,10 +129,10 @@ def test_every_choice_of_method_maps(tmp_path, values, numbers):
     file.write_text(yaml.safe_dump({node: {"ros__parameters": group} for node, group in values.items()}))
     asked = iter(range(1000))
     config = choose(load_system_config(file), "stereo", "sjsam", "none")
-    result, mapping = run_bag(DEMO, config, stopped=lambda: next(asked) >= 36)
-    records = mapping.global_map.estimate.graph.records
-    assert len(records) >= 2
-    assert {record.submap.descriptors.shape[1] for record in records} == {numbers}
+    result, session = run_bag(DEMO, config, stopped=lambda: next(asked) >= 36)
+    submaps = session.snapshot.submaps
+    assert len(submaps) >= 2
+    assert {submap.descriptors.shape[1] for submap in submaps} == {numbers}
     evaluation = result.agents[0].evaluation()
     assert evaluation is not None
     assert evaluation.ate.rmse < 0.02

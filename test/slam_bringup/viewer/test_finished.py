@@ -25,8 +25,8 @@ def folder(tmp_path_factory) -> Path:
     asked = iter(range(10_000))
     config = choose(load_system_config(None), "stereo", "sjsam", "none")
     out = tmp_path_factory.mktemp("run")
-    result, mapping = run_bag(DEMO, config, stopped=lambda: next(asked) == 60)
-    write_results(out, result, mapping.global_map.save)
+    result, session = run_bag(DEMO, config, stopped=lambda: next(asked) == 60)
+    write_results(out, result, lambda path: session.save(path).result())
     return out
 
 

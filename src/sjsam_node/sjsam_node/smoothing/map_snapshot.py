@@ -38,6 +38,12 @@ from slam_core.geometry import (
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 from slam_core.types import ORIGIN_SIGMA, Float32Array, PoseEstimate, Submap
 
+ADVICE = (
+    "Poses are as much less certain. The calibration may not fit: slam doctor BAG tells; slam calibrate "
+    "refine BAG corrects that of a stereo pair, --odometry ndt helps a depth camera"
+)
+"""Advice to a user whose submaps contradict each other."""
+
 STILL = 0.003, 0.001
 """Movement (m, rad) that a path need not show."""
 
@@ -170,6 +176,17 @@ class MapSnapshot:
     def components(self) -> int:
         """Parts of the map that nothing ties together yet."""
         return len(self._state.components())
+
+    @property
+    def overconfidence(self) -> str:
+        """Warning if submaps contradict each other; empty if they do not."""
+        factor, over = self._state.most_overconfident()
+        if not over:
+            return ""
+        linked = {i for k in self._state.graph.links if not k.is_closure for i in k.ends}
+        alone = sum(i not in linked for i in over)
+        return (f"submaps contradict each other {factor:.0f} times more than they claim: "
+                f"{alone} of {len(self)} are chained as the filter made them. {ADVICE}")  # fmt: skip
 
     def structure(self) -> MapSnapshot:
         """The same without the factors that covariances come from, which are as large as the map."""

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import click
 
-from slam_bringup.commands.mapping_options import rig_options
-from slam_bringup.pipeline.map_growth import map_folder
+from slam_bringup.commands.mapping_options import map_folder, rig_options
 from slam_bringup.processes.launch_plan import plan_launch
 from slam_bringup.processes.node_graph import NodeSpec, radio_node
 

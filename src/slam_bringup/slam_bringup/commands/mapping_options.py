@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import reduce
+from pathlib import Path
 from typing import Any
 
 import click
@@ -61,6 +62,19 @@ def rig_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def mapping_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the argument BAG and the options of mapping one."""
     return reduce(lambda decorated, option: option(decorated), reversed(_BAG_OPTIONS), rig_options(command))
+
+
+def map_folder(old: Path | None, *, localize_only: bool) -> Path | None:
+    """Folder of the map that ``--map`` names: OUT/map of a run's folder OUT, else itself; None without one.
+
+    Raises
+    ------
+    ValueError
+        If there is none to locate in.
+    """
+    if old is None and localize_only:
+        raise ValueError("--localize-only needs a map to locate in: name the folder of a finished run with --map")
+    return old / "map" if old is not None and (old / "map").is_dir() else old
 
 
 def mode_for(bag: SensorBag, mode: str | None) -> str:

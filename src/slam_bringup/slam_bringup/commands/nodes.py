@@ -13,6 +13,7 @@ from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, parse_topics
 from slam_bringup.commands.console import LOG_NAME, Transcript, progress_bar, show
 from slam_bringup.commands.mapping_options import (
+    map_folder,
     mapping_options,
     mode_for,
     require_map,
@@ -50,7 +51,7 @@ def command(
     own = read_overrides(config) if config is not None else Overrides()
     overrides = overrides_for(bag, with_files(own, names.calibration.parameters))
     system = choose(system_config(overrides), mode, mapper, odometry, imu)
-    start = StartMap.read(system, old_map, localize_only=localize_only)
+    start = StartMap.read(system, map_folder(old_map, localize_only=localize_only), localize_only=localize_only)
     if mode != "tof":
         require_stereo(bag, names)
     port = _page(view)

@@ -6,20 +6,21 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import click
 from rich.console import Console
 
+from sjsam_node.map_session import MapSession, Mode
 from slam_bringup.bags.rig_calibration import read_rig_calibration
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames, parse_topics
 from slam_bringup.commands.console import LOG_NAME, Transcript, is_quiet, progress_bar, show
-from slam_bringup.commands.mapping_options import mapping_options, mode_for, require_map
+from slam_bringup.commands.mapping_options import map_folder, mapping_options, mode_for, require_map
 from slam_bringup.commands.run_end import end_run
 from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, load_system_config
-from slam_bringup.pipeline.map_growth import MapGrowth, map_growth
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.interrupt import MAP, STOPPED, Interrupt, giving_up
 from slam_bringup.report.early_output import EarlyOutput
@@ -47,24 +48,26 @@ def command(
         readings = sum(opened.count(agent, role) for agent in opened.agents for role in ("left", "depth", "imu"))
         mode = mode_for(opened, mode)
     system = choose(load_system_config(config, bag, names.calibration.parameters), mode, mapper, odometry, imu)
-    growth = map_growth(system.sjsam, old_map, localize_only=localize_only)
+    session = MapSession(system.sjsam, Mode.LOCALISE if localize_only else Mode.MAP)
+    if (old := map_folder(old_map, localize_only=localize_only)) is not None:
+        session.load(old, len).result()
     if mode != "tof":
         require_stereo(bag, names)
     results, transcript = OutputFolder(output, "run", bag, overwrite=overwrite), Transcript(VERSION)
     staged = results.staged(rescue=MAP)
     with (
-        results, transcript, giving_up(results), staged as folder, _saved_if_given_up(growth, folder / MAP),
-        EarlyOutput(folder, growth.save) as early,
+        session, results, transcript, giving_up(results), staged as folder,
+        _saved_if_given_up(session, folder / MAP), EarlyOutput(folder, partial(_save, session)) as early,
     ):  # fmt: skip
         with Interrupt() as interrupt, progress_bar() as progress:
             task = progress.add_task(f"mapping {bag.name}", total=2 * readings)
-            result, growth = run_bag(
+            result, _ = run_bag(
                 bag,
                 system,
                 mapper=mapper,
                 odometry=odometry,
                 names=names,
-                growth=growth,
+                session=session,
                 on_reading=lambda: progress.advance(task),
                 stopped=lambda: interrupt.asked,
                 on_mapped=early.start,
@@ -80,12 +83,16 @@ def command(
     end_run(summary, output, stopped=interrupt.asked)
 
 
+def _save(session: MapSession, path: Path) -> None:
+    session.save(path, is_last=True).result()
+
+
 @contextmanager
-def _saved_if_given_up(growth: MapGrowth, path: Path) -> Iterator[None]:
+def _saved_if_given_up(session: MapSession, path: Path) -> Iterator[None]:
     """A user who does not want to wait for the rest keeps the map."""
     try:
         yield
     except KeyboardInterrupt:
-        if len(growth.global_map.snapshot()) and not path.exists():
-            growth.save(path)
+        if len(session.snapshot) and not path.exists():
+            _save(session, path)
         raise

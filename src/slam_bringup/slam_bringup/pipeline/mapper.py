@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The filters of all agents and the one map that their submaps are joined into.
+"""The filters of all agents and the session of the one map that their submaps go to.
 
-Joining runs on a thread of its own (:mod:`sjsam_node.joiner_stage`). Where the nodes would send compact submaps, their
+The session has a thread of its own (:mod:`sjsam_node.map_session`). Where the nodes would send compact submaps, their
 rounding is in the map here too.
 """
 
@@ -10,15 +10,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future
-from functools import partial
 
 from ekf_slam_node.stage import FilterStage, FrameResult
 from ndt_registration.stage import ScanEstimate
 from sjsam_node.agents import in_order
-from sjsam_node.joiner_stage import JoinerStage
+from sjsam_node.map_session import MapSession, Mode, Outcome
+from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_bringup.bags.readings import AgentSensors, SessionStart
 from slam_bringup.pipeline.configuration import SystemConfig, filter_config
-from slam_bringup.pipeline.map_growth import MapGrowth
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges
 from slam_bringup.pipeline.sensor_pipeline import AgentItem
 from slam_bringup.pipeline.stage_times import StageTimes
@@ -31,30 +30,27 @@ _LOADED = 1, 4
 
 
 class Mapper:
-    """Takes the inputs of all filters in order, and hands every submap that one of them finishes to the map.
+    """Takes the inputs of all filters in order, and hands every submap that one of them finishes to the session.
 
     Parameters
     ----------
     sensors
         What each agent carries, by name.
-    growth
-        What becomes of the submaps.
     """
 
     def __init__(
-        self, config: SystemConfig, sensors: Mapping[str, AgentSensors], times: StageTimes, growth: MapGrowth
+        self, config: SystemConfig, sensors: Mapping[str, AgentSensors], times: StageTimes, session: MapSession
     ) -> None:
         self._times = times
-        self.growth = growth
+        self.session = session
         self._compact = config.ekf_slam.submap.compact
         self._filters = {
-            agent: FilterStage(filter_config(config.ekf_slam, s), s.frames, s.base_frame, growth.session(agent))
+            agent: FilterStage(filter_config(config.ekf_slam, s), s.frames, s.base_frame, session.next_session(agent))
             for agent, s in sensors.items()
         }
         self._diaries = {agent: _Diary() for agent in sensors}
-        self._joiner = JoinerStage()
-        self._joins: list[Future[None]] = []
-        self._submaps = 0
+        self._futures: list[Future[Outcome | None]] = []
+        self._outcomes: list[Outcome] = []
         self._events: list[str] = []
 
     def process(self, item: AgentItem) -> None:
@@ -69,7 +65,7 @@ class Mapper:
             stage.add_features(value)
         elif isinstance(value, SessionStart):
             self._process_waiting(item.agent)
-            self._join(stage.start_session())
+            self._hand_over(stage.start_session())
         self._take_results(item.agent)
 
     def finish(self) -> None:
@@ -84,14 +80,15 @@ class Mapper:
                 self._events.append(f"{agent}: {stage.finding}" if agent else stage.finding)
             last += stage.start_session()  # which no frame begins: the filter forgets its state
         give_back()
-        self._join(in_order(last))
-        for join in self._joins:
-            error = join.exception()
-            if error is None:
-                self._submaps += 1
-            else:
+        self._hand_over(in_order(last))
+        self.session.finish().result()
+        for future in self._futures:
+            if (error := future.exception()) is not None:
                 self._events.append(f"a submap could not be joined: {error!r}")
-        self._events += self.growth.finish()
+            elif (outcome := future.result()) is not None:
+                self._outcomes.append(outcome)
+                self._times.ms["sjsam"].append(1e3 * outcome.duration_s)
+        self._events += self._warnings()
         give_back()
 
     def _process_waiting(self, agent: str) -> None:
@@ -99,9 +96,14 @@ class Mapper:
         self._filters[agent].give_up()
         self._take_results(agent)
 
-    def stop(self) -> None:
-        """End the thread that joins, at the latest after the submap it is at."""
-        self._joiner.stop()
+    def _warnings(self) -> list[str]:
+        """Lines that tell of submaps whose place is not known, and of those that contradict each other."""
+        if self.session.mode is Mode.LOCALISE:
+            lost = sum(not outcome.path for outcome in self._outcomes)
+            text = f"{lost} of {len(self._outcomes)} submaps were not found in the map: their poses are left out"
+            return [text] * bool(lost)
+        shown = self.session.snapshot
+        return [*_loose(shown, self.session.known), *filter(None, [shown.overconfidence])]
 
     @property
     def has_frames(self) -> bool:
@@ -110,34 +112,45 @@ class Mapper:
 
     def record(self, wall_s: float, dropped: Mapping[str, int], failure: str) -> RunRecord:
         """Record of the run, after :meth:`finish`."""
-        snapshot = self.growth.global_map.snapshot()
+        known, is_located = self.session.known, self.session.mode is Mode.LOCALISE
+        shown, landmarks, mapped = self.session.read(
+            lambda now: (now.structure(), now.landmarks(), now.trajectory(known))
+        ).result()
         return RunRecord(
             agents={agent: diary.record() for agent, diary in self._diaries.items()},
-            map=snapshot.structure(),
-            landmarks=snapshot.landmarks(),
-            trajectories=self.growth.trajectories(),
-            submaps=self._submaps,
-            loop_closures=self.growth.closures,
+            map=shown,
+            landmarks=landmarks,
+            trajectories=self._located() if is_located else mapped,
+            submaps=len(self._outcomes),
+            loop_closures=sum(outcome.closures for outcome in self._outcomes),
             wall_s=wall_s,
             dropped=dropped,
             stage_ms=self._times.ms,
             rejections=self.rejections(),
             events=tuple(self._events),
             failure=failure,
-            solver=self.growth.solver,
+            solver=next((o.report.solver for o in reversed(self._outcomes) if o.report and o.report.solver), ""),
             backlog=self._backlog(),
         )
 
+    def _located(self) -> dict[str, list[PoseEstimate]]:
+        """Poses in a map that stays as it is, by agent: from the first submap of each that was recognised."""
+        poses: dict[str, dict[int, PoseEstimate]] = {}
+        for outcome in self._outcomes:
+            if outcome.path:
+                poses.setdefault(outcome.agent, {}).update((pose.stamp_ns, pose) for pose in outcome.path)
+        return {agent: [own[stamp] for stamp in sorted(own)] for agent, own in sorted(poses.items())}
+
     def _backlog(self) -> dict[str, int]:
-        joiner = self._joiner
-        counts = joiner.received, self._submaps, joiner.waiting, joiner.waiting_at_most
+        session = self.session
+        counts = len(self._futures), len(self._outcomes), session.waiting, session.waiting_at_most
         return dict(zip(BACKLOG, counts, strict=True))
 
     def rejections(self) -> dict[str, int]:
         """Counts of what all filters and the map rejected, by reason."""
         total: Counter[str] = Counter()
-        for counters in (*(stage.counters for stage in self._filters.values()), self.growth.global_map.counters):
-            total.update(counters.counts)
+        for counts in (*(stage.counters.counts for stage in self._filters.values()), self.session.counts):
+            total.update(counts)
         return dict(sorted(total.items()))
 
     def _take_results(self, agent: str) -> None:
@@ -145,14 +158,24 @@ class Mapper:
             self._diaries[agent].add(frame)
             if len(self._diaries[agent].poses) in _LOADED:
                 leave_libraries()
-            self._join(frame.estimate.submaps)
+            self._hand_over(frame.estimate.submaps)
 
-    def _join(self, submaps: Iterable[Submap]) -> None:
-        self._joins += [self._joiner.join(partial(self._add, submap)) for submap in submaps]
+    def _hand_over(self, submaps: Iterable[Submap]) -> None:
+        self._futures += [self.session.add(rounded(submap) if self._compact else submap) for submap in submaps]
 
-    def _add(self, submap: Submap) -> None:
-        with self._times.measure("sjsam"):
-            self.growth.add(rounded(submap) if self._compact else submap)
+
+def _loose(shown: MapSnapshot, known: int) -> list[str]:
+    """Lines that tell of new submaps whose place nothing knows: in the old map, or beside the first agent's."""
+    new = [agent for agent, _, _ in shown.keys[known:]]
+    loose = Counter(agent for agent, is_tied in zip(new, shown.is_tied[known:], strict=True) if not is_tied)
+    if known and loose:
+        return [f"{loose.total()} of {len(new)} submaps are not tied to the old map: no place of it was recognised"]
+    every = Counter(new)
+    return [
+        f"{count} of {every[agent]} submaps of {agent or 'the rig'} are not tied to the rest of the map: no place "
+        "was recognised, and where they are beside it is not known"
+        for agent, count in sorted(loose.items())
+    ]
 
 
 class _Diary:

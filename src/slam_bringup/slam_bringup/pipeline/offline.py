@@ -18,12 +18,12 @@ from pathlib import Path
 
 import cv2
 
+from sjsam_node.map_session import MapSession
 from slam_bringup.bags.readings import ImuReading, Reading
 from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.bags.sensor_topics import BagNames
 from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.map_growth import MapGrowth, map_growth
 from slam_bringup.pipeline.mapper import Mapper
 from slam_bringup.pipeline.results import RunResult
 from slam_bringup.pipeline.run_record import run_result, told
@@ -42,12 +42,12 @@ def run_bag(
     mapper: str = "sjsam",
     odometry: str = "none",
     names: BagNames | None = None,
-    growth: MapGrowth | None = None,
+    session: MapSession | None = None,
     on_reading: Callable[[], None] = lambda: None,
     stopped: Callable[[], bool] = lambda: False,
     on_mapped: Callable[[RunResult], None] = lambda result: None,
-) -> tuple[RunResult, MapGrowth]:
-    """The result of mapping a bag, offline and as fast as it goes, and the map.
+) -> tuple[RunResult, MapSession]:
+    """The result of mapping a bag, offline and as fast as it goes, and the session of its map.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def run_bag(
         Named in the result; ``odometry`` other than "none" runs scan odometry as well.
     names
         Topics and frames of the bag that are not named like the nodes' own.
-    growth
+    session
         What becomes of the submaps; by default they are joined into a new map.
     on_reading
         Called after every reading of the bag, and again when the dense model has seen it, for a progress bar.
@@ -81,7 +81,7 @@ def run_bag(
     start = time.perf_counter()
     with SensorBag(path, names) as bag:
         pipelines = {a: SensorPipeline(config, bag.sensors[a], odometry != "none", times) for a in bag.agents}
-        mapping = Mapper(config, bag.sensors, times, growth or map_growth(config.sjsam))
+        mapping = Mapper(config, bag.sensors, times, session or MapSession(config.sjsam))
         failure = _map(mapping, _measured(bag, pipelines, on_reading, stopped))
         record = mapping.record(time.perf_counter() - start, dict(bag.left_out), failure)
         record = record.with_front_ends(
@@ -89,7 +89,7 @@ def run_bag(
             {agent: pipeline.log.frames for agent, pipeline in pipelines.items()},
         )
         _LOG.info("mapped %d submaps in %.1f s; the dense model is next", record.submaps, record.wall_s)
-        grown = mapping.growth
+        session = mapping.session
         del pipelines, mapping  # with their images and filters
         keep_little()
         give_back()
@@ -104,23 +104,20 @@ def run_bag(
                 stopped=stopped,
                 on_mapped=on_mapped,
             )
-    return result, grown
+    return result, session
 
 
 def _map(mapping: Mapper, items: Generator[AgentItem, None, None]) -> str:
     """Map all items; the reason is returned if an error ended the run early, and raised before the first frame."""
     failure = ""
     try:
-        try:
-            for item in ahead(items, _is_of_an_image):
-                mapping.process(item)
-        except Exception as error:
-            if not mapping.has_frames:
-                raise
-            failure = told(error, "the run ended early")
-        mapping.finish()
-    finally:
-        mapping.stop()
+        for item in ahead(items, _is_of_an_image):
+            mapping.process(item)
+    except Exception as error:
+        if not mapping.has_frames:
+            raise
+        failure = told(error, "the run ended early")
+    mapping.finish()
     return failure
 
 

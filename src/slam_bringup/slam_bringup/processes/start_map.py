@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sjsam_node.map_session import MapSession
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.map_growth import map_folder, map_growth
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,12 @@ class StartMap:
     session: int
 
     @classmethod
-    def read(cls, config: SystemConfig, old: Path | None, *, localize_only: bool) -> StartMap | None:
-        """The map of a run's folder ``old``, None without one; ValueError if it holds no map, or an empty one."""
-        folder = map_folder(old, localize_only=localize_only)
+    def read(cls, config: SystemConfig, folder: Path | None, *, localize_only: bool) -> StartMap | None:
+        """The map in ``folder``, None without one; ValueError if it holds no map, or an empty one."""
         if folder is None:
             return None
-        keys = map_growth(config.sjsam, folder, localize_only=localize_only).global_map.snapshot().keys
+        with MapSession(config.sjsam) as session:
+            keys = session.load(folder, lambda loaded: loaded.keys).result()
         return cls(folder, localize_only, len(keys), 1 + max(session for _, session, _ in keys))
 
     @property
