@@ -4,8 +4,8 @@
 Every detector runs the same way: it returns all keypoints above a threshold; a grid keeps the strongest of each cell,
 so that features cover the image (thesis section 3.2); the threshold follows the number found from frame to frame
 (thesis ch. 9), so that a second pass over the image is the exception. Detectors: ``surf``
-(:mod:`stereo_frontend.surf`), ``censure`` (:mod:`stereo_frontend.censure`), and ``sift``, ``rootsift``, ``orb`` from
-OpenCV (:mod:`stereo_frontend.opencv_detectors`).
+(:mod:`stereo_frontend.surf`), ``censure`` (:mod:`stereo_frontend.censure`), ``fast`` (:mod:`stereo_frontend.fast`), and
+``sift``, ``rootsift``, ``orb`` from OpenCV (:mod:`stereo_frontend.opencv_detectors`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy.typing as npt
 from slam_core.config import Config, group, parameter
 from slam_core.types import ByteArray, Float32Array
 from stereo_frontend.censure import CensureDetector
+from stereo_frontend.fast import FastDetector
 from stereo_frontend.keypoints import Detector, Keypoints, spread_over_grid
 from stereo_frontend.opencv_detectors import OpenCvDetector
 from stereo_frontend.surf import SurfConfig, SurfDetector
@@ -31,7 +32,7 @@ _SURPLUS = 1.5
 _ADAPTATION = 0.7
 """Rate at which the threshold follows the number of candidates; 0 keeps it fixed."""
 
-DETECTORS = ("surf", "sift", "rootsift", "orb", "censure")
+DETECTORS = ("surf", "sift", "rootsift", "orb", "censure", "fast")
 _THRESHOLD_RANGE = (0.02, 20.0)
 _FIRST_THRESHOLD = 0.3
 """Of the customary one: the first image rather gives too many candidates than too few."""
@@ -55,6 +56,8 @@ def make_detector(config: FeatureConfig, *, for_pairs: bool = False) -> Detector
     """The configured detector; ``for_pairs``: its descriptors need do for matching within a stereo pair only."""
     if config.detector == "surf":
         return SurfDetector(config.surf, for_pairs=for_pairs)
+    if config.detector == "fast":
+        return FastDetector(config.surf)
     return CensureDetector(config.surf) if config.detector == "censure" else OpenCvDetector(config.detector)
 
 

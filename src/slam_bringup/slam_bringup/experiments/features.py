@@ -30,6 +30,11 @@ _SIZES = ((320, 240), (640, 480), (1024, 768))
 _DETECTORS = {name: FeatureConfig(detector=name) for name in DETECTORS} | {
     "surf-64": FeatureConfig(surf=SurfConfig(extended=False))
 }
+_NOT_BUILT = {
+    "star": "not in opencv-python-headless; as censure, with two squares for an octagon",
+    "susure": "not built: sparse sampling of censure's responses saved no time (docs/history/tried.md)",
+}
+"""Rows of detectors that are only told of."""
 _KINDS = ("amplitude", "range", "intensity")
 _SAME_PX = 2.0
 """Two keypoints this near show the same point."""
@@ -171,7 +176,7 @@ def _detectors() -> Experiment:
                 f"{v['spread_px']:.2f}",
             ]
             for name, v in values.items()
-        ]
+        ] + [[name, why, *[""] * 6] for name, why in _NOT_BUILT.items()]
         header = ("detector", *(f"{w} x {h}" for w, h in _SIZES), "repeatability", "right matches", "precision",
                   "spread px")  # fmt: skip
         return Findings(
