@@ -16,7 +16,8 @@ from ekf_slam_node.candidates import Candidates, MotionPrior
 from ekf_slam_node.config import NEAREST_ASSOCIATE, FeatureAssociationConfig
 from ekf_slam_node.models import Frame, frame_from_features, rig_points
 from slam_bringup.experiments import thesis
-from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Table
+from slam_bringup.experiments.filter_maps import map_figure, maps
+from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
 from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_core.geometry import FloatArray, invert_transform
 from slam_simulation import Scenario
@@ -53,6 +54,9 @@ METHODS = {
 }
 _JOINT = {"mahalanobis": associate_mahalanobis, "jcbb": associate_jcbb, "ccda": associate_ccda}
 _RATES = (10, 5, 2)
+_MAPS = {"nearest": ("4.5", "One filter with the shortest distance"),
+         "mahalanobis": ("4.9", "One filter with Mahalanobis distance")}  # fmt: skip
+"""Figure and caption of the map by an association."""
 _SIGMA_MOTION = np.repeat([3.0, 4.0], 3)
 """Accelerations of the constant-velocity model, m/s2 and rad/s2."""
 _UNKNOWN = MotionPrior(np.eye(4), np.diag(np.repeat([10.0, 3.0], 3) ** 2))
@@ -113,7 +117,7 @@ def _experiment() -> Experiment:
             )
             for method in METHODS
             for rate in _RATES
-        }
+        } | maps(tuple(_MAPS), 20 if quick else 330)
 
     def report(results: Mapping[str, JobResult]) -> Findings:
         rows = [
@@ -129,7 +133,7 @@ def _experiment() -> Experiment:
         ]
         f = {
             name: 2 * v["precision"] * v["recall"] / max(v["precision"] + v["recall"], 1e-9)
-            for name, v in ((name, r.values) for name, r in results.items())
+            for name, v in ((name, r.values) for name, r in results.items() if not name.startswith("map, "))
         }
         nearest, mahalanobis = f["Algorithm 1: nearest, 10 Hz"], f["Algorithm 2: Mahalanobis, 10 Hz"]
         header = ("method", *(f"{key}, {rate} Hz" for rate in _RATES for key in ("precision", "recall")))
@@ -138,6 +142,12 @@ def _experiment() -> Experiment:
                         thesis.MAHALANOBIS, f"{nearest:.3f}, {mahalanobis:.3f}",
                         "Mahalanobis higher", mahalanobis > nearest)],
             [Table("Frame to frame, against the true association", header, rows)],
+            [
+                Picture(map_figure(run.arrays), number, f"{caption}: {len(run.arrays['landmarks'])} landmarks, RMSE of "
+                        f"the path {1e3 * run.values['rmse_m']:.1f} mm.")
+                for method, (number, caption) in _MAPS.items()
+                for run in (results[f"map, {method}"],)
+            ],
         )  # fmt: skip
 
     return Experiment("association", "4.2-4.5", "Nearest neighbour against Mahalanobis distance", jobs, report)

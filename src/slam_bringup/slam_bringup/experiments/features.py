@@ -10,9 +10,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.figure import Figure
 
-from slam_bringup.experiments import plots, thesis
+from slam_bringup.experiments import thesis
+from slam_bringup.experiments.feature_figures import (
+    derivative_figure,
+    keypoint_figure,
+    match_figure,
+    matched_pair,
+    tof_figure,
+)
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
 from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_bringup.experiments.true_frames import TrueFrame, simulated_frames, spread, transfer
@@ -49,7 +55,8 @@ def compare_detectors(folder: Path, before: list[Path], frames: int, repeats: in
         extractor = FeatureExtractor(replace(config, target=600))
         found = [extractor(view.images.left) for view in views]
         values[name] = {"times": _times(config, views[0].images.left, repeats), **_found_again(views, found)}
-    return values, {"picture": views[0].images.left}
+    images = views[0].images
+    return values, {"left": images.left, "right": images.right, "matches": matched_pair(images)}
 
 
 def _times(config: FeatureConfig, picture: ByteArray, repeats: int) -> list[tuple[float, int]]:
@@ -163,7 +170,7 @@ def _detectors() -> Experiment:
         return {"table": Job(f"{MODULE}:compare_detectors", arguments, _PACKAGES)}
 
     def report(results: Mapping[str, JobResult]) -> Findings:
-        values = results["table"].values
+        values, arrays = results["table"].values, results["table"].arrays
         times = {name: v["times"] for name, v in values.items()}
         ratio = times["surf"][1][0] / times["sift"][1][0]
         rows = [
@@ -186,21 +193,17 @@ def _detectors() -> Experiment:
             ]
             + [Comparison("SURF's time over SIFT's", thesis.SURF_FASTER, f"{ratio:.2f}", "< 1", ratio < 1)],
             [Table("Table 3.1: time of one thread and number of features; matching three frames later", header, rows)],
-            [Picture(_keypoint_figure(results["table"].arrays["picture"]), "3.1, 3.2", "Keypoints of SURF and SIFT.")],
+            [
+                Picture(keypoint_figure(arrays["left"]), "3.1, 3.2", "Keypoints of SURF and SIFT."),
+                Picture(
+                    match_figure(arrays["left"], arrays["right"], arrays["matches"]),
+                    "3.3",
+                    f"{len(arrays['matches'])} SURF features matched in a stereo pair.",
+                ),
+            ],
         )
 
     return Experiment("detectors", "3.2", "SIFT against SURF", jobs, report)
-
-
-def _keypoint_figure(picture: ByteArray) -> Figure:
-    figure, axes = plots.new_figure(7, 5.3)
-    axes.imshow(picture, cmap="gray")
-    for name, colour, marker in (("surf", "#d62728", "o"), ("sift", "#1f77b4", "+")):
-        uv = FeatureExtractor(FeatureConfig(detector=name, target=300))(picture).uv
-        axes.plot(*uv.T, marker, color=colour, markersize=4, mfc="none", linestyle="", label=name.upper())
-    axes.set_axis_off()
-    axes.legend(loc="lower right")
-    return figure
 
 
 _RANGE_CONTRADICTED = (
@@ -218,14 +221,6 @@ def _tof_features() -> Experiment:
         verdict = {"amplitude": thesis.AMPLITUDE, "range": thesis.RANGE, "intensity": thesis.INTENSITY}
         formats = {"features": ".0f", "repeatability": ".2f", "right": ".0f", "precision": ".2f"}
         rows = [[kind, *(f"{v[key]:{form}}" for key, form in formats.items())] for kind, v in values.items()]
-        figure = Figure(figsize=(9, 3.2), layout="constrained")
-        for axes, kind in zip(figure.subplots(1, 3), _KINDS, strict=True):
-            axes.imshow(arrays[kind], cmap="gray")
-            axes.plot(
-                *FeatureExtractor(FeatureConfig(target=150))(arrays[kind]).uv.T, "*", color="#d62728", markersize=4
-            )
-            axes.set_title(kind, fontsize=9)
-            axes.set_axis_off()
         return Findings(
             [
                 Comparison(f"repeatability on {kind}", verdict[kind], f"{values[kind]['repeatability']:.2f}")
@@ -238,7 +233,14 @@ def _tof_features() -> Experiment:
                     rows,
                 )
             ],
-            [Picture(figure, "3.4", "Features in the pictures of the laser camera.")],
+            [
+                Picture(tof_figure(arrays), "3.4", "Features in the pictures of the laser camera."),
+                Picture(
+                    derivative_figure({kind: arrays[kind] for kind in ("amplitude", "intensity")}),
+                    "3.5",
+                    "Features of amplitude and intensity lie near edges: the pictures differentiated.",
+                ),
+            ],
             _RANGE_CONTRADICTED.format(**values["range"]),
         )
 

@@ -31,6 +31,10 @@ SMOOTHS = Claim(
 )
 EKF_GROWTH = Claim("EKF O(n^2)", "6.6", "EKF O(n 2 ) O(n 2 ) O(n 2 )")
 
+HEADING_VARIANCE = Claim(
+    "an unknown heading becomes known", "6.2", "as can be seen in the figure, this value is decreasing"
+)  # fmt: skip
+
 SPECIFIED = Claim("close to the specified values", "2.4", "All values are close to the specified values")
 CAMCUBE = Claim(
     "no specifications; distortion not to be relied on", "2.4", "For CamCube there are no specifications available."
