@@ -21,6 +21,7 @@ ROSDEP_KEY = {
     "cv2": "python3-opencv",
     "cvxopt": "python3-cvxopt",
     "rosbags": "python3-rosbags-pip",
+    "filterpy": "python3-filterpy-pip",
 }
 """Of the others there is no key in rosdep."""
 

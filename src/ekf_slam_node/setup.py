@@ -17,6 +17,7 @@ setup(
     install_requires=[
         "setuptools",
         "slam_core",
+        "filterpy",
         "numba",
         "numpy",
         "scipy",

@@ -33,6 +33,7 @@ setup(
         "tof_driver",
         "click",
         "distributed",
+        "filterpy",
         "Jinja2",
         "matplotlib",
         "numpy",

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from ekf_slam_node.planar import PlanarEkf
 from slam_bringup.cli import slam
 from slam_bringup.planar.log import PlanarLog, RobotLog
 from slam_bringup.planar.mapping import accuracy, dead_reckoning, map_log
@@ -120,6 +121,28 @@ def test_the_command_maps_a_gtsam_file(tmp_path):
     moved = run.poses[:, :2] - run.poses[0, :2]
     assert np.abs(np.hypot(path["x_m"], path["y_m"]) - np.linalg.norm(moved, axis=1)).max() < 0.3
     assert (out / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_filterpys_filter_is_chosen_and_has_our_standard_filters_path(tmp_path):
+    run = simulate_planar(WORLD, np.random.default_rng(5))
+    (tmp_path / "log.txt").write_text(gtsam_text(run))
+    command = ["plane", str(tmp_path / "log.txt"), "--filter", "filterpy", "-o", str(tmp_path / "out")]
+    result = CliRunner().invoke(slam, [*command, "--method", "ekf"])
+    assert result.exit_code == 0, result.output
+    path = np.genfromtxt(tmp_path / "out" / "path_robot.csv", delimiter=",", names=True)
+    read = read_log(tmp_path / "log.txt")
+    standard = map_log(read, "ekf", make_filter=StandardEkf).paths[0].poses
+    np.testing.assert_allclose(np.column_stack([path["x_m"], path["y_m"]]), standard[:, :2], atol=2e-4)
+    assert np.abs(map_log(read, "ekf").paths[0].poses - standard).max() > 1e-3  # the default is another error state
+    with pytest.raises(ValueError, match="--method ekf"):
+        CliRunner().invoke(slam, command, catch_exceptions=False)
+
+
+class StandardEkf(PlanarEkf):
+    """Our filter in filterpy's error state."""
+
+    def __init__(self, config, pose, pose_covariance):
+        super().__init__(replace(config, error="standard"), pose, pose_covariance)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from ekf_slam_node.planar import PlanarEkf
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.planar.log import PlanarLog
 from slam_bringup.planar.mapping import ASSOCIATIONS, METHODS, map_log
@@ -37,9 +38,19 @@ from slam_core.output_folder import OutputFolder
     show_default=True,
     help="known: by the log's own names of the landmarks; else searched",
 )
+@click.option(
+    "--filter",
+    "implementation",
+    type=click.Choice(("own", "filterpy")),
+    default="own",
+    show_default=True,
+    help="with --method ekf: our filter, or as a check of it filterpy's, in the standard error state and slower",
+)
 @click.option("--robot", metavar="NAME", help="one robot of a log of several")
 @overwrite_option("results of another log, or results that were changed since")
-def command(log: Path, output: Path, method: str, association: str, robot: str | None, overwrite: bool) -> None:
+def command(
+    log: Path, output: Path, method: str, association: str, implementation: str, robot: str | None, overwrite: bool
+) -> None:
     """Map the range-bearing LOG of one or several robots.
 
     LOG is a folder of UTIAS MRCLAM, Lost in the Woods (dataset2.mat), or a text file of GTSAM (victoria_park.txt).
@@ -49,14 +60,24 @@ def command(log: Path, output: Path, method: str, association: str, robot: str |
     read = _only(read_log(log), robot)
     if method == "submaps" and association != "known":
         raise ValueError("--method submaps joins by the log's names of the landmarks: leave --association at known")
+    if implementation == "filterpy" and method != "ekf":
+        raise ValueError("--filter filterpy takes the place of the filter of --method ekf: give that too")
     with results:
-        result = map_log(read, method, association)
+        result = map_log(read, method, association, _filter_of(implementation))
         summary = summarise(read, result, method, association)
         with results.staged() as folder:
             write_tables(folder, read, result)
             draw(folder / "map.png", read, result)
             atomic_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     Console().print(_table(summary))
+
+
+def _filter_of(implementation: str) -> type[PlanarEkf]:
+    if implementation == "own":
+        return PlanarEkf
+    from ekf_slam_node.planar_filterpy import FilterpyPlanarEkf  # a third of a second to import, and needed here alone
+
+    return FilterpyPlanarEkf
 
 
 def _only(log: PlanarLog, name: str | None) -> PlanarLog:

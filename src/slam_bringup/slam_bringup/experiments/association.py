@@ -64,16 +64,19 @@ _UNKNOWN = MotionPrior(np.eye(4), np.diag(np.repeat([10.0, 3.0], 3) ** 2))
 
 def associate(folder: Path, before: list[Path], method: str, every: int, frames: int) -> Kept:
     """Precision and recall of one method on a scenario's feature-level simulation, every n-th frame."""
+    from filterpy.common import Q_discrete_white_noise  # a third of a second to import, and needed here alone
+
     variant = METHODS[method]
     simulator = FeatureSimulator(Scenario.load("workshop_handheld"))
     views = [simulator.frame(k * every) for k in range(frames)]
     dt = every / simulator.scenario.rate
+    position_variance = Q_discrete_white_noise(2, dt)[0, 0]  # of an acceleration of 1 m/s2
     right = paired = common = 0
     for k in range(2, frames):
         first, second = views[k - 1], views[k]
         if variant.predicted:  # constant velocity
             step = invert_transform(views[k - 2].T_world_rig) @ first.T_world_rig
-            prior = MotionPrior(step, np.diag((0.5 * dt**2 * _SIGMA_MOTION) ** 2))
+            prior = MotionPrior(step, np.diag(position_variance * _SIGMA_MOTION**2))
         else:
             prior = _UNKNOWN
         rows, columns = _pairs(first, second, prior, simulator.T_rig_left, variant.config())

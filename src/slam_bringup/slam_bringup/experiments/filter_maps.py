@@ -113,7 +113,7 @@ def map_figure(arrays: plots.Arrays) -> Figure:
     axes.plot(*poses[::3, :2, 3].T, ".", color="black", markersize=3, label="trajectory")
     ahead = poses[-1, :2, 3] + np.outer([0.0, 0.6], poses[-1, :2, 0])
     axes.plot(*ahead.T, color="blue", linewidth=2, label="direction at the end")
-    low, high = plots.box_of(points)
+    low, high = plots.box_of(np.concatenate([points, poses[:, :3, 3]]))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="box")
     figure.legend(fontsize=8, loc="outside lower center", ncols=4)
@@ -132,5 +132,5 @@ def variances_figure(results: Mapping[str, JobResult]) -> Figure:
         axes.set(xlabel="sample", title=f"{error} error state")
         axes.grid(color="0.92")
     panels[0].set(ylabel="variance", yscale="log", ylim=(1e-7, 10.0))
-    panels[0].legend(fontsize=8)
+    figure.legend(*panels[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
     return figure

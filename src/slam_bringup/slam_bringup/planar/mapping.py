@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -86,8 +87,10 @@ class _Drive:
         return sum(int((rows < 0).sum()) for rows in self.rows)
 
 
-def map_log(log: PlanarLog, method: str, association: str = "known") -> PlanarResult:
-    """Map all robots of a log.
+def map_log(
+    log: PlanarLog, method: str, association: str = "known", make_filter: type[PlanarEkf] = PlanarEkf
+) -> PlanarResult:
+    """Map all robots of a log; ``make_filter``: the filter of method ``ekf``.
 
     Raises
     ------
@@ -105,7 +108,7 @@ def map_log(log: PlanarLog, method: str, association: str = "known") -> PlanarRe
             f"{len(log.robots)} robots are joined by --method sam with known association; choose one with --robot"
         )
     began = time.process_time()
-    drive = _joined if known and method != "ekf" else _filtered
+    drive = _joined if known and method != "ekf" else partial(_filtered, make_filter=make_filter)
     drives = [drive(robot, config, known) for robot in log.robots]
     paths = tuple(
         RobotPath(r.name, d.poses, np.arange(len(d.covariances)), d.covariances)
@@ -124,9 +127,9 @@ def _start(robot: RobotLog) -> FloatArray:
     return np.zeros(3) if robot.truth is None else robot.truth[0]
 
 
-def _filtered(robot: RobotLog, config: PlanarConfig, known: bool) -> _Drive:
+def _filtered(robot: RobotLog, config: PlanarConfig, known: bool, make_filter: type[PlanarEkf]) -> _Drive:
     """One filter over the whole drive."""
-    ekf = PlanarEkf(config, _start(robot), 1e-12 * np.eye(3))
+    ekf = make_filter(config, _start(robot), 1e-12 * np.eye(3))
     poses, covariances, slots = [], [], []
     for k, (z, ids) in enumerate(zip(robot.observations, robot.ids, strict=True)):
         if k:
