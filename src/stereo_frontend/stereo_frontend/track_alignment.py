@@ -18,7 +18,7 @@ from stereo_frontend.patch_alignment import REORDER, diagonal_of_inverse, factor
 UNKNOWNS = 6
 OUTPUTS = 9
 _MOST_ITERATIONS = 15
-_CONVERGED = 0.02
+_CONVERGED = 0.05
 """Step at which an alignment ends, px."""
 _LEAST_ENERGY = 4.0
 """Variance of the grey values of a patch that shows something."""

@@ -27,8 +27,9 @@ from stereo_frontend.track_alignment import OUTPUTS, align_to_references
 IdArray = npt.NDArray[np.int32]
 _RADIUS = 7
 """Half width of a track's patch, px."""
-_WINDOW, _LEVELS = (15, 15), 3
-"""Patch and levels of the first guess."""
+_WINDOW, _LEVELS = (11, 11), 2
+"""Patch and levels beyond the first of the guess, which is made in pictures of half the size."""
+_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.1)
 _MAX_SHIFT = 4.0
 """Most distance of the patch from its guess, px."""
 _MIN_CORRELATION = 0.8
@@ -103,22 +104,23 @@ class Tracker:
         self._tracks: Tracks | None = None
         self._next_id = 0
         self._begun = 0
-        self._picture: ByteArray | None = None
+        self._half: ByteArray | None = None
         self._motion: tuple[FloatArray, float] | None = None
         self._stamp_ns = 0
 
     # ---- one picture, in order
     def follow(self, picture: ByteArray, camera: Camera, stamp_ns: int) -> Followed | None:
         """Tracks found in a picture; None while there are none."""
-        before, tracks = self._picture, self._tracks
+        before, tracks = self._half, self._tracks
         dt = 1e-9 * (stamp_ns - self._stamp_ns)
-        self._picture, self._stamp_ns = picture, stamp_ns
+        half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        self._half, self._stamp_ns = half, stamp_ns
         if tracks is None or before is None or len(tracks) == 0:
             return None
         expected = (
             np.eye(4) if self._motion is None or dt <= 0.0 else scaled_motion(self._motion[0], dt / self._motion[1])
         )
-        start, T = self._guess(before, picture, tracks, camera, expected)
+        start, T = _guess(before, half, tracks, camera, expected)
         self._motion = None if T is None or dt <= 0.0 else (T, dt)
         T = expected if T is None else T
         warp = np.where(
@@ -173,9 +175,9 @@ class Tracker:
         """Mask (n,) of the pixels (n, 2) that are far enough from all tracks."""
         if self._tracks is None or len(self._tracks) == 0:
             return np.ones(len(uv), bool)
-        occupied = self._tracks.keypoints.uv
-        squares = np.sum((uv[:, None] - occupied[None]) ** 2, axis=2)
-        return np.asarray(squares.min(axis=1, initial=np.inf) > _APART**2)
+        new, old = uv.astype(np.float64), self._tracks.keypoints.uv.astype(np.float64)
+        least = np.min(np.sum(old**2, axis=1) - 2.0 * new @ old.T, axis=1)
+        return np.asarray(least + np.sum(new**2, axis=1) > _APART**2)
 
     def begin(self, picture: ByteArray, keypoints: Keypoints, depth: FloatArray, camera: Camera) -> IdArray:
         """Begin tracks at keypoints of a key frame with depth (n,) m; returns their ids (n,), 0 for those not followed.
@@ -195,26 +197,6 @@ class Tracker:
         return ids
 
     # ---- parts
-    def _guess(
-        self, before: ByteArray, picture: ByteArray, tracks: Tracks, camera: Camera, expected: FloatArray
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Pixels (n, 2) at which the tracks are looked for, and the camera's motion, None if they show none."""
-        uv = tracks.keypoints.uv
-        predicted = _projected(expected, tracks.points, camera, uv)
-        flow, status, _ = cv2.calcOpticalFlowPyrLK(
-            before, picture, uv, predicted.astype(np.float32), winSize=_WINDOW, maxLevel=_LEVELS,
-            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.05), flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )  # fmt: skip
-        flow = flow.astype(np.float64)
-        seen = (status.ravel() > 0) & (tracks.missed == 0)
-        known = seen & np.isfinite(tracks.points[:, 2])
-        T = fit_motion(tracks.points[known], flow[known], camera, expected)
-        if T is None:
-            return np.where(seen[:, None], flow, np.nan), None
-        projected = _projected(T, tracks.points, camera, flow)
-        agrees = seen & (np.linalg.norm(flow - projected, axis=1) < 0.5 * _MAX_SHIFT)
-        return np.where(agrees[:, None], flow, projected), T
-
     def _spread(self, keypoints: Keypoints, shape: tuple[int, ...]) -> npt.NDArray[np.intp]:
         """Keypoints to begin tracks at: as many as are wanted, where there are none."""
         tracks = self._tracks
@@ -242,6 +224,30 @@ class Tracker:
             camera.unproject(uv, depth),
             np.zeros(n, np.int32),
         )
+
+
+def _guess(
+    before: ByteArray, now: ByteArray, tracks: Tracks, camera: Camera, expected: FloatArray
+) -> tuple[FloatArray, FloatArray | None]:
+    """Pixels (n, 2) at which the tracks are looked for, and the camera's motion, None if they show none.
+
+    ``before`` and ``now`` are pictures of half the size.
+    """
+    uv = tracks.keypoints.uv
+    predicted = _projected(expected, tracks.points, camera, uv)
+    flow, status, _ = cv2.calcOpticalFlowPyrLK(
+        before, now, 0.5 * uv - np.float32(0.25), (0.5 * predicted - 0.25).astype(np.float32),
+        winSize=_WINDOW, maxLevel=_LEVELS, criteria=_STEPS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+    flow = 2.0 * flow.astype(np.float64) + 0.5
+    seen = (status.ravel() > 0) & (tracks.missed == 0)
+    known = seen & np.isfinite(tracks.points[:, 2])
+    T = fit_motion(tracks.points[known], flow[known], camera, expected)
+    if T is None:
+        return np.where(seen[:, None], flow, np.nan), None
+    projected = _projected(T, tracks.points, camera, flow)
+    agrees = seen & (np.linalg.norm(flow - projected, axis=1) < 0.5 * _MAX_SHIFT)
+    return np.where(agrees[:, None], flow, projected), T
 
 
 def _is_sound(found: FloatArray) -> npt.NDArray[np.bool_]:
