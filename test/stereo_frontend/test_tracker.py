@@ -10,9 +10,10 @@ import pytest
 
 from slam_core.config import from_mapping
 from slam_core.types import DepthImage, StereoImages
+from stereo_frontend.features import TRACKING
 from stereo_frontend.frame_motion import facing_warp, fit_motion
 from stereo_frontend.frontend import Frontend
-from stereo_frontend.frontend_config import FrontendConfig
+from stereo_frontend.frontend_config import MODES, FrontendConfig
 
 STEP_NS = 100_000_000
 FLOW = np.array([4.3, -2.2])
@@ -20,7 +21,7 @@ FLOW = np.array([4.3, -2.2])
 
 
 def tracking_frontend(mode: str = "stereo") -> Frontend:
-    return Frontend(from_mapping(FrontendConfig, {"mode": mode, "features.target": 300, "features.tracking": True}))
+    return Frontend(from_mapping(FrontendConfig, {"mode": mode, "features.target": 300, "features.tracking": "always"}))
 
 
 def moved(pair: StereoImages, frames: int) -> StereoImages:
@@ -115,3 +116,22 @@ def test_the_warp_of_a_patch_that_faces_the_camera_is_the_derivative_of_its_plac
     xy, h = point[0, :2] / 2.0, 1e-6
     columns = [(place(xy + h * e) - place(xy - h * e)) / (2.0 * h) for e in np.eye(2)]
     assert facing_warp(T, point)[0] == pytest.approx(np.column_stack(columns).ravel(), abs=1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_stereo_is_tracked_by_itself_and_the_others_where_asked_for(mode):
+    def tracks(tracking: str) -> bool:
+        return from_mapping(FrontendConfig, {"mode": mode, "features.tracking": tracking}).tracks
+
+    assert [tracks(t) for t in TRACKING] == [mode == "stereo", True, False]
+
+
+def test_new_tracks_begin_where_there_are_none(stereo_pair, rng):
+    frontend = tracking_frontend()
+    frontend.process(stereo_pair())
+    tracker = frontend._tracker
+    occupied = tracker._tracks.keypoints.uv
+    assert not tracker.is_free(occupied + np.float32(3.0)).any()
+    places = rng.uniform(0.0, 400.0, (500, 2)).astype(np.float32)
+    nearest = np.linalg.norm(places[:, None].astype(float) - occupied[None], axis=2).min(axis=1)
+    np.testing.assert_array_equal(tracker.is_free(places), nearest > 8.0)

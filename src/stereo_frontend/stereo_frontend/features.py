@@ -32,6 +32,8 @@ _SURPLUS = 1.5
 _ADAPTATION = 0.7
 """Rate at which the threshold follows the number of candidates; 0 keeps it fixed."""
 
+TRACKING = ("auto", "always", "never")
+"""Words that YAML does not take for true and false."""
 DETECTORS = ("surf", "sift", "rootsift", "orb", "censure", "fast")
 _THRESHOLD_RANGE = (0.02, 20.0)
 _FIRST_THRESHOLD = 0.3
@@ -45,8 +47,11 @@ class FeatureConfig(Config):
 
     detector: str = parameter("surf", "keypoint detector and descriptor", choices=DETECTORS)
     target: int = parameter(600, "number of features wanted per image", minimum=10, maximum=20000)
-    tracking: bool = parameter(
-        False, "follow features from frame to frame by their patches, and detect new ones only where these are few"
+    tracking: str = parameter(
+        "auto",
+        "follow features from frame to frame by their patches, and detect new ones only where these are few; "
+        "auto: in mode stereo",
+        choices=TRACKING,
     )
     max_tracks: int = parameter(150, "most features followed at a time", minimum=20, maximum=2000)
     surf: SurfConfig = group(SurfConfig)

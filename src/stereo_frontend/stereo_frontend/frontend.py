@@ -76,8 +76,8 @@ class Frontend:
         self.self_calibration = StereoSelfCalibration(self.config.self_calibration)
         self.range_calibration = RangeSelfCalibration(self.config.range_calibration)
         self._wide = self.self_calibration.widened(self.config.matching)
-        self._tof = TofFeatures(self.config.tof, self.config.features, self.config.noise)
-        self._tracker = Tracker(self.config.features.max_tracks) if self.config.features.tracking else None
+        self._tracker = Tracker(self.config.features.max_tracks) if self.config.tracks else None
+        self._tof = TofFeatures(self.config.tof, self.config.features, self.config.noise, self._tracker)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="second_core")
 
     def process(

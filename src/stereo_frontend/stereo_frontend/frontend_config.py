@@ -18,6 +18,8 @@ from stereo_frontend.self_calibration import SelfCalibrationConfig
 from stereo_frontend.tof_features import TofFeatureConfig
 
 MODES = ("stereo", "tof", "replace", "fuse")
+_TRACKED = ("stereo",)
+"""Modes in which features are followed by default."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,12 @@ class FrontendConfig(Config):
     fusion: FusionConfig = group(FusionConfig)
     range_calibration: RangeSelfCalibrationConfig = group(RangeSelfCalibrationConfig)
     tof: TofFeatureConfig = group(TofFeatureConfig)
+
+    @property
+    def tracks(self) -> bool:
+        """True if features are followed: where asked for, and by itself in the modes in which maps gain by it."""
+        wanted = self.features.tracking
+        return wanted == "always" or (wanted == "auto" and self.mode in _TRACKED)
 
 
 @dataclass(frozen=True)

@@ -43,13 +43,15 @@ class TofFeatureConfig(Config):
 
 
 class TofFeatures:
-    """Extracts features with depth from depth images of one camera."""
+    """Extracts features with depth from depth images of one camera, by a tracker where there is one."""
 
-    def __init__(self, config: TofFeatureConfig, features: FeatureConfig, noise: PixelNoiseConfig) -> None:
+    def __init__(
+        self, config: TofFeatureConfig, features: FeatureConfig, noise: PixelNoiseConfig, tracker: Tracker | None
+    ) -> None:
         self.config = config
         self._extractors = {name: FeatureExtractor(features) for name in ("amplitude", "intensity", "range")}
         self._noise = PixelNoise(noise)
-        self._tracker = Tracker(features.max_tracks) if features.tracking else None
+        self._tracker = tracker
         self.used: tuple[str, ...] = ()
         """Names of the images that the newest features come from."""
 
@@ -91,8 +93,6 @@ class TofFeatures:
         """Forget the detector thresholds."""
         for extractor in self._extractors.values():
             extractor.reset()
-        if self._tracker is not None:
-            self._tracker.reset()
         self.used = ()
 
     def advice(self) -> str:
