@@ -200,6 +200,15 @@ def test_the_finished_map_of_two_agents_is_that_of_a_session_offline_to_the_byte
     assert online == offline
 
 
+@pytest.mark.parametrize("bench", ["agents:=['a','b']"], indirect=True)
+def test_parts_of_the_map_are_named_by_their_agents(bench: Bench, rng: np.random.Generator) -> None:
+    path = circle(4.0, 0.2)
+    A, B = (Agent(ring_world(4.0, rng, 12.0), path, rng, name).submaps() for name in "ab")
+    bench.send(A + B)
+    assert bench.spin_until(lambda: bench.counters["submaps joined"] == len(A + B))
+    assert bench.spin_until(lambda: bench.node.health.reason == "2 separate parts: a; b", 5.0)
+
+
 def test_services_answer_on_an_empty_map(bench: Bench) -> None:
     assert not bench.call("load_map").success
     assert not bench.call("mark_here").success

@@ -178,6 +178,16 @@ class MapSnapshot:
         return len(self._state.components())
 
     @property
+    def parts(self) -> tuple[tuple[str, ...], ...]:
+        """Names of the agents in each of these parts, that of the first submap first."""
+        state = self._state
+        own = state.component_of[state.graph.starts].tolist()
+        agents: dict[int, set[str]] = {}
+        for part, record in zip(own, state.graph.records, strict=True):
+            agents.setdefault(part, set()).add(record.submap.agent)
+        return tuple(tuple(sorted(names)) for names in agents.values())
+
+    @property
     def overconfidence(self) -> str:
         """Warning if submaps contradict each other; empty if they do not."""
         factor, over = self._state.most_overconfident()
