@@ -59,6 +59,7 @@ class EarNode(SlamNode[EarConfig]):
         self.sessions = self.resets = 0
         self.listen("frames", "PointCloud2", lambda m: self.heard.append(stamp_ns(m)))
         self.listen("click", "PointStamped", lambda m: self.heard.append(-stamp_ns(m)))
+        self.listen("other/frames", "PointCloud2", lambda m: self.heard.append(stamp_ns(m)), clock="other")
         self.create_service(Trigger, "~/break", lambda request, response: 1 / 0)
 
     def on_new_session(self) -> None:
@@ -79,7 +80,7 @@ def node(domain: int) -> Iterator[EarNode]:
 
 def send(node: EarNode, topic: str, *stamps: int) -> None:
     entry = node._inputs[topic]
-    kind = {"frames": node.types.PointCloud2, "click": node.types.PointStamped}[topic]
+    kind = node.types.PointStamped if topic == "click" else node.types.PointCloud2
     for stamp in stamps:
         node._receive(entry, kind(header=header_message(node.types, stamp, "")))
         while node.work():
@@ -97,6 +98,16 @@ def test_odd_stamps_are_rejected_and_only_a_lasting_jump_begins_a_session(node: 
     send(node, "frames", *again)
     assert node.heard == good + again
     assert (node.sessions, node.resets) == (1, 0)
+
+
+def test_rigs_whose_clocks_differ_by_hours_are_heard_side_by_side(node: EarNode) -> None:
+    sent = []
+    for k in range(5):
+        for topic, stamp in (("frames", START), ("other/frames", START - 5 * 3600 * 1000 * MS)):
+            sent.append(stamp + k * 100 * MS)
+            send(node, topic, sent[-1])
+    assert node.heard == sent
+    assert node.health.counters["rejected"] == node.sessions == 0
 
 
 def test_messages_without_end_do_not_keep_a_node_from_its_work(node: EarNode) -> None:

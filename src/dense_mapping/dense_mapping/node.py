@@ -97,24 +97,25 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
 
     def _listen_to(self, agent: str) -> None:
         own = partial(below, agent)
-        self.listen(own("odom"), "Odometry", partial(self._on_odometry, agent))
-        self.listen(own("map/path"), "Path", partial(self._on_path, agent), latched=True, stamps=StampPolicy.ANY)
-        self.listen(own("imu"), "Imu", partial(self._on_imu, agent), required=False)
+        listen, listen_together = partial(self.listen, clock=agent), partial(self.listen_together, clock=agent)
+        listen(own("odom"), "Odometry", partial(self._on_odometry, agent))
+        listen(own("map/path"), "Path", partial(self._on_path, agent), latched=True, stamps=StampPolicy.ANY)
+        listen(own("imu"), "Imu", partial(self._on_imu, agent), required=False)
         if self.config.use_tof:
             topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
             topics = {own(topic): kind for topic, kind in topics.items()}
-            self.listen_together(topics, partial(self._on_depth, agent), required=False)
-            self.listen(own("tof/color/image"), "Image", partial(self._on_colour, agent, "tof"), required=False)
+            listen_together(topics, partial(self._on_depth, agent), required=False)
+            listen(own("tof/color/image"), "Image", partial(self._on_colour, agent, "tof"), required=False)
         if self.config.use_stereo:
             for side in SIDES:
                 topic = own(f"stereo/{side}/camera_info")
-                self.listen(topic, "CameraInfo", partial(self._on_info, agent, side), required=False)
+                listen(topic, "CameraInfo", partial(self._on_info, agent, side), required=False)
             pairs = {own(f"stereo/{side}/image_rect"): "Image" for side in SIDES}
-            self.listen_together(pairs, partial(self._on_pair, agent), required=False)
+            listen_together(pairs, partial(self._on_pair, agent), required=False)
             # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
             self.create_subscription(self.types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
             colours = own("stereo/left/image_rect_color")
-            self.listen(colours, "Image", partial(self._on_colour, agent, "stereo"), required=False)
+            listen(colours, "Image", partial(self._on_colour, agent, "stereo"), required=False)
 
     def _on_odometry(self, agent: str, message: Message) -> None:
         self.mapper.add_odometry(agent, pose_from_message(message.pose.pose))

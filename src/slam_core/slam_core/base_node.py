@@ -28,7 +28,9 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections import defaultdict
 from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
@@ -68,7 +70,7 @@ class SlamNode(TransformNode, Generic[C]):
         self.config: C = declare_config(self, config_type, ignore=("input.",), changeable=self.CHANGEABLE)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.types: MessageTypes = self._ros_types if self._exchange is None else SharedTypes(self._ros_types)
-        self._stamps = StampGuard[Message]()
+        self._stamps = defaultdict[str, StampGuard[Message]](StampGuard)
         self._synchronizers: list[StampSynchronizer[Message]] = []
         self._outputs: dict[str, Any] = {}
         self._latched: set[str] = set()
@@ -101,10 +103,12 @@ class SlamNode(TransformNode, Generic[C]):
         latched: bool = False,
         required: bool = True,
         stamps: StampPolicy | None = None,
+        clock: str = "",
     ) -> None:
         """Subscribe. The silence of ``required`` inputs is reported. ``type_name`` as in MESSAGE_PACKAGES.
 
-        ``stamps`` says whether the topic's stamps must run in order, by default by its type.
+        ``stamps`` says whether the topic's stamps must run in order, by default by its type; ``clock`` whose they are,
+        where a node hears rigs whose clocks need not agree.
         """
         policy = stamps or _POLICIES.get(type_name, StampPolicy.FRAMES)
         announce = policy is StampPolicy.FRAMES
@@ -112,7 +116,7 @@ class SlamNode(TransformNode, Generic[C]):
         def handle(stamp: int, message: Message) -> None:
             self._enqueue(topic, stamp, callback, message, announce=announce, keep=latched)
 
-        self._add_input(topic, topic, type_name, handle, latched, required, policy)
+        self._add_input(topic, topic, type_name, handle, latched, required, policy, clock)
 
     def listen_together(
         self,
@@ -122,6 +126,7 @@ class SlamNode(TransformNode, Generic[C]):
         latched: bool = False,
         required: bool = True,
         stamps: StampPolicy = StampPolicy.FRAMES,
+        clock: str = "",
     ) -> None:
         """Subscribe to several topics (topic: type); ``callback`` gets the messages of one stamp in that order."""
         names, source = list(topics), " + ".join(topics)
@@ -135,9 +140,8 @@ class SlamNode(TransformNode, Generic[C]):
         pairs = StampSynchronizer[Message](names, on_set, tolerance_ns=tolerance_ns, depth=depth, companions=infos)
         self._synchronizers.append(pairs)
         for topic, type_name in topics.items():
-            self._add_input(
-                source, topic, type_name, lambda stamp, m, t=topic: pairs.add(t, stamp, m), latched, required, stamps
-            )
+            add = partial(pairs.add, topic)
+            self._add_input(source, topic, type_name, add, latched, required, stamps, clock)
 
     def advertise(
         self, topic: str, type_name: str, *, latched: bool = False, depth: int | None = None, alone: bool = False
@@ -208,9 +212,10 @@ class SlamNode(TransformNode, Generic[C]):
         latched: bool,
         required: bool,
         policy: StampPolicy,
+        clock: str,
     ) -> None:
-        kind = getattr(self._ros_types, type_name)
-        self._add_entry(topic, Input(self.resolve_topic_name(topic), kind, handler, latched, required, policy, source))
+        name, kind = self.resolve_topic_name(topic), getattr(self._ros_types, type_name)
+        self._add_entry(topic, Input(name, kind, handler, latched, required, policy, source, clock))
 
     def _receive(self, entry: Input, message: Message) -> None:
         entry.seen_at_s = time.monotonic()
@@ -223,7 +228,7 @@ class SlamNode(TransformNode, Generic[C]):
             entry.handler(stamp, message)
             return
         starts = entry.policy is StampPolicy.FRAMES
-        self._act_on(entry, self._stamps.add(entry.topic, stamp, message, starts_sessions=starts))
+        self._act_on(entry, self._stamps[entry.clock].add(entry.topic, stamp, message, starts_sessions=starts))
 
     def _act_on(self, entry: Input, decision: StampDecision[Message]) -> None:
         """Count what a decision rejects, and hand on what it releases."""
@@ -294,7 +299,8 @@ class SlamNode(TransformNode, Generic[C]):
         self.health.count("resets")
         self._flush()
         self._jobs.clear()
-        self._stamps.restart()
+        for guard in self._stamps.values():
+            guard.restart()
         self.on_reset()
         self.health.set(State.OK, f"reset: {why}")
 
@@ -317,8 +323,9 @@ class SlamNode(TransformNode, Generic[C]):
     async def _on_finish_service(self, _: Any, response: Any) -> Any:
         self.receive()  # what has come so far belongs to the input
         inputs = {entry.topic: entry for entry in self._inputs.values()}
-        for topic, decision in self._stamps.finish():
-            self._act_on(inputs[topic], decision)
+        for guard in self._stamps.values():
+            for topic, decision in guard.finish():
+                self._act_on(inputs[topic], decision)
         self._has_ended = True
         self.finish_work()
         try:

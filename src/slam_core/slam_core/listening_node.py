@@ -36,7 +36,7 @@ LATCHED_DEPTH = 1000
 class Input:
     """One subscription and what is known of its traffic; ``handler`` takes (stamp_ns, message).
 
-    ``source`` is that of the jobs made of it.
+    ``source`` is that of the jobs made of it, ``clock`` names the clock of its stamps.
     """
 
     topic: str
@@ -46,6 +46,7 @@ class Input:
     required: bool
     policy: StampPolicy = StampPolicy.FRAMES
     source: str = ""
+    clock: str = ""
     subscription: Any = None
     best_effort: bool = False
     volatile: bool = False
