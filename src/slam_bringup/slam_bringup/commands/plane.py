@@ -36,7 +36,8 @@ from slam_core.output_folder import OutputFolder
     type=click.Choice(ASSOCIATIONS),
     default="known",
     show_default=True,
-    help="known: by the log's own names of the landmarks; else searched",
+    help="known: by the log's own names of the landmarks; hypotheses: searched, several followed over the whole drive;"
+    " the others: searched step by step",
 )
 @click.option(
     "--filter",
@@ -58,8 +59,8 @@ def command(
     """
     results = OutputFolder(output, "plane", log, overwrite=overwrite)
     read = _only(read_log(log), robot)
-    if method == "submaps" and association != "known":
-        raise ValueError("--method submaps joins by the log's names of the landmarks: leave --association at known")
+    if method == "submaps" and association not in ("known", "hypotheses"):
+        raise ValueError("--method submaps joins by names of the landmarks: --association known or hypotheses")
     if implementation == "filterpy" and method != "ekf":
         raise ValueError("--filter filterpy takes the place of the filter of --method ekf: give that too")
     with results:

@@ -21,6 +21,7 @@ from ekf_slam_node.planar_sam import PlanarGraph, PlanarMap, pose_covariances, s
 from sjsam_node.linear_slam.text_joining import join_text_maps
 from sjsam_node.linear_slam.text_maps import TextMap
 from slam_bringup.planar.log import PlanarLog, RobotLog
+from slam_bringup.planar.naming import named
 from slam_core.chi_square import chi_square_bound
 from slam_core.evaluation import nees
 from slam_core.geometry import FloatArray
@@ -28,7 +29,7 @@ from slam_core.least_squares import LevenbergMarquardtConfig
 from slam_core.rigid_alignment import umeyama
 
 METHODS = ("ekf", "sam", "submaps")
-ASSOCIATIONS = ("known", "nearest", "mahalanobis", "jcbb", "ccda")
+ASSOCIATIONS = ("known", "hypotheses", "nearest", "mahalanobis", "jcbb", "ccda")
 _INLIER_PROBABILITY = 0.999999
 """Share of true sightings that lie within their gate; others are left out where the association is known."""
 _NARROWING_GATES = (2500.0, 400.0, 100.0, 36.0, 36.0, 36.0)
@@ -100,14 +101,16 @@ def map_log(
     config = PlanarConfig(
         sigma_range=log.sigma_range,
         sigma_bearing=log.sigma_bearing,
-        method="jcbb" if association == "known" else association,
+        method="jcbb" if association in ("known", "hypotheses") else association,
     )
-    known = association == "known"
-    if len(log.robots) > 1 and not (known and method == "sam"):
+    if len(log.robots) > 1 and not (association == "known" and method == "sam"):
         raise ValueError(
             f"{len(log.robots)} robots are joined by --method sam with known association; choose one with --robot"
         )
-    began = time.process_time()
+    began, sightings = time.process_time(), _sightings(log)
+    if association == "hypotheses":
+        log = replace(log, robots=tuple(named(robot, _start(robot), config) for robot in log.robots))
+    known = association in ("known", "hypotheses")
     drive = _joined if known and method != "ekf" else partial(_filtered, make_filter=make_filter)
     drives = [drive(robot, config, known) for robot in log.robots]
     paths = tuple(
@@ -120,7 +123,12 @@ def map_log(
     )
     if method == "sam":
         result = _smoothed(log, drives, config)
-    return replace(result, seconds=time.process_time() - began)
+    unnamed = sightings - _sightings(log)
+    return replace(result, rejected=result.rejected + unnamed, seconds=time.process_time() - began)
+
+
+def _sightings(log: PlanarLog) -> int:
+    return sum(len(z) for robot in log.robots for z in robot.observations)
 
 
 def _start(robot: RobotLog) -> FloatArray:
@@ -176,7 +184,7 @@ def _smoothed(log: PlanarLog, drives: list[_Drive], config: PlanarConfig) -> Pla
         paths.append(RobotPath(robot.name, smoothed.poses[first : first + count], chosen, covariances))
     equations = 3 * len(graph.motions) + 2 * len(graph.measured)
     freedom = equations - 3 * (len(smoothed.poses) - 1) - 2 * len(smoothed.landmarks)
-    rejected = sum(len(z) for robot in log.robots for z in robot.observations) - len(graph.measured)
+    rejected = _sightings(log) - len(graph.measured)
     return PlanarResult(tuple(paths), smoothed.landmarks, ids, rejected, chi2, freedom, 0.0)
 
 
