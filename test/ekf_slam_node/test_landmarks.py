@@ -107,6 +107,6 @@ def test_every_algorithm_pairs_what_is_the_same(rng):
         rows, columns = associate(candidates, now, np.eye(4), covariance, T_RIG_OPTICAL, config)
         assert (first[rows] == second[columns]).mean() > 0.99
         assert len(rows) >= share * common
-    rows, columns = associate_nearest(candidates, now, np.eye(4), T_RIG_OPTICAL, 0.15)
+    rows, columns = associate_nearest(candidates, now, np.eye(4), T_RIG_OPTICAL, config)
     assert (first[rows] == second[columns]).mean() > 0.8  # by distance alone
     assert len(rows) >= 0.3 * common

@@ -152,14 +152,49 @@ def same_tracks(
 
 
 def associate_nearest(
-    candidates: Candidates, frame: Frame, T_previous_now: FloatArray, T_rig_optical: FloatArray, gate: float
+    candidates: Candidates,
+    frame: Frame,
+    T_previous_now: FloatArray,
+    T_rig_optical: FloatArray,
+    config: FeatureAssociationConfig,
 ) -> tuple[IndexArray, IndexArray]:
-    """Algorithm 1: the nearest in space within ``gate`` (m), noise and descriptors left aside."""
-    points, _ = rig_points(frame, T_rig_optical)
-    moved = transform_points(T_previous_now, points)
-    distance = np.linalg.norm(candidates.points[:, None] - moved[None], axis=2)
-    rows, columns = np.nonzero(distance < gate)
+    """Algorithm 1: the nearest in space within g_A, noise and descriptors left aside.
+
+    A feature within g_R of a landmark pairs with no candidate that would become a new one.
+    """
+    distance = _distances(candidates, frame, T_previous_now, T_rig_optical)
+    possible = distance < config.nearest_associate
+    known = candidates.landmarks
+    possible[known:] &= (distance[:known] >= config.nearest_new).all(axis=0)
+    rows, columns = np.nonzero(possible)
     return pair_up(rows, columns, distance[rows, columns], distance.shape)
+
+
+def wrong_pair_variance(
+    candidates: Candidates,
+    frame: Frame,
+    T_previous_now: FloatArray,
+    T_rig_optical: FloatArray,
+    config: FeatureAssociationConfig,
+) -> FloatArray:
+    """Variance (n, 3) of u, v and inverse depth that nearest neighbours need beside the features' own.
+
+    Of k candidates within g_A of a feature one is the right one and none is told from the others: a share 1 - 1/k of
+    its pairs is wrong, by a point anywhere in the ball, whose variance is g_A^2 / 5 along each axis.
+    """
+    within = (_distances(candidates, frame, T_previous_now, T_rig_optical) < config.nearest_associate).sum(axis=0)
+    wrong = 1.0 - 1.0 / np.maximum(within, 1)
+    inverse = frame.z[:, 2]
+    scale = np.column_stack([frame.camera.fx * inverse, frame.camera.fy * inverse, inverse**2])
+    return np.asarray((wrong * config.nearest_associate**2 / 5.0)[:, None] * scale**2)
+
+
+def _distances(
+    candidates: Candidates, frame: Frame, T_previous_now: FloatArray, T_rig_optical: FloatArray
+) -> FloatArray:
+    """Distances (m, n) in space of candidates and features, m."""
+    moved = transform_points(T_previous_now, rig_points(frame, T_rig_optical)[0])
+    return np.asarray(np.linalg.norm(candidates.points[:, None] - moved[None], axis=2))
 
 
 def match_descriptors(similarity: Similarity, threshold: float, ratio: float) -> tuple[IndexArray, IndexArray]:

@@ -24,13 +24,15 @@ from slam_core.types import Float32Array
 class Candidates:
     """Points (n, 3) m in the previous rig frame, their covariances (n, 3, 3), descriptors (n, d).
 
-    tracks: (n,) of the front end, by which they were last seen; 0 without one.
+    tracks: (n,) of the front end, by which they were last seen; 0 without one. landmarks: how many of the first are
+    landmarks of the filter.
     """
 
     points: FloatArray
     covariances: FloatArray
     descriptors: Float32Array
     tracks: np.ndarray
+    landmarks: int = 0
 
     def __len__(self) -> int:
         return len(self.points)

@@ -12,9 +12,6 @@ from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray
 
-NEAREST_ASSOCIATE = 0.15
-"""Gate g_A of Algorithm 1."""
-
 
 @dataclass(frozen=True)
 class MotionConfig(Config):
@@ -118,8 +115,25 @@ class FeatureAssociationConfig(Config):
         "weight of 1 - cosine beside the normalised distance of Eq. 4.8; 0 is Algorithm 2 as published",
         minimum=0.0,
     )
+    nearest_associate: float = parameter(
+        0.15, "nearest: distance within which a feature is a landmark's, g_A of Algorithm 1", unit="m", minimum=1e-6
+    )
+    nearest_new: float = parameter(
+        0.2,
+        "nearest: distance from all landmarks beyond which a feature may become a new one, g_R of Algorithm 1",
+        unit="m",
+        minimum=1e-6,
+    )
     min_inliers: int = parameter(8, "associations below which the rig is lost", minimum=3)
     seed: int = parameter(0, "seed of the random samples", minimum=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.nearest_new < self.nearest_associate:
+            raise ValueError(
+                f"parameter 'nearest_new' ({self.nearest_new} m) is below 'nearest_associate'"
+                f" ({self.nearest_associate} m): what is near enough for a landmark would become another"
+            )
 
     @property
     def gate(self) -> float:

@@ -7,7 +7,7 @@ Association under the prediction, or under a motion guess where the prediction f
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,9 +19,10 @@ from ekf_slam_node.association import (
     associate_nearest,
     match_descriptors,
     same_tracks,
+    wrong_pair_variance,
 )
 from ekf_slam_node.candidates import Candidates, MotionPrior
-from ekf_slam_node.config import NEAREST_ASSOCIATE, FeatureAssociationConfig
+from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.models import Frame
 from ekf_slam_node.motion_guess import MotionGuess, guess_motion, refine_motion
 from slam_core.geometry import FloatArray
@@ -54,7 +55,8 @@ class FrameLink:
     """Pairs of candidates ``rows`` and features ``columns`` (k,), and the motion they agree on.
 
     T, covariance: (4, 4) T_previous_now from these pairs alone, with its covariance (6, 6). excess: (3,) by what
-    factors the pairs' errors exceed their claimed variances. error: (k, 3) measured less predicted of each pair.
+    factors the pairs' errors exceed their claimed variances. error: (k, 3) measured less predicted of each pair. wrong: (n, 3) variance of the frame's n features for the wrong
+    pairs among those, or None where the association lets hardly any through.
     """
 
     T: FloatArray
@@ -63,6 +65,7 @@ class FrameLink:
     rows: IndexArray
     columns: IndexArray
     error: FloatArray
+    wrong: FloatArray | None = None
 
 
 class Linker:
@@ -184,19 +187,19 @@ class Linker:
     def _associate(self, candidates: Candidates, frame: Frame, prior: MotionPrior) -> tuple[IndexArray, IndexArray]:
         config = self._config
         if config.method == "nearest":
-            return associate_nearest(candidates, frame, prior.T, self._T_rig_optical, NEAREST_ASSOCIATE)
+            return associate_nearest(candidates, frame, prior.T, self._T_rig_optical, config)
         return _METHODS[config.method](candidates, frame, prior.T, prior.covariance, self._T_rig_optical, config)
 
     def _settle(self, candidates: Candidates, frame: Frame, guess: MotionGuess, least: int) -> FrameLink | None:
         """Associate once more around the motion found, where the gates are as small as they can be."""
         if self._config.method == "nearest":
-            near = NEAREST_ASSOCIATE
-            rows, columns = associate_nearest(candidates, frame, guess.T, self._T_rig_optical, near)
-        else:
-            noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))
-            rows, columns = associate_mahalanobis(
-                candidates, noisier, guess.T, guess.covariance, self._T_rig_optical, self._config
-            )
+            by_distance = candidates, frame, guess.T, self._T_rig_optical, self._config
+            link = self._link_of(candidates, frame, guess.T, *associate_nearest(*by_distance), least)
+            return None if link is None else replace(link, wrong=wrong_pair_variance(*by_distance))
+        noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))
+        rows, columns = associate_mahalanobis(
+            candidates, noisier, guess.T, guess.covariance, self._T_rig_optical, self._config
+        )
         return self._link_of(candidates, frame, guess.T, rows, columns, least)
 
     def _link_of(

@@ -8,6 +8,8 @@ and a filter that believes them stays honest. Where the claims are true the fact
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from ekf_slam_node.models import Frame
@@ -19,6 +21,10 @@ _NOISE_TOLERANCE = 2.0
 """Variances of one frame are enlarged only if its errors exceed them by more than this factor."""
 _MAX_NOISE_FACTOR = 25.0
 """Largest factor on the claimed variances; 1 trusts every claim."""
+
+_WATCHED_FRAMES = 20
+_FEW_FRAMES = 3
+"""So many frames of these may have larger errors for a reason of their own, less one."""
 
 _CHANCE = 0.15
 """Logarithm of a factor that true claims may reach by chance."""
@@ -50,3 +56,25 @@ class NoiseMonitor:
         seen = applied + np.log(ratio)
         self._log_factor = np.clip(_NOISE_MEMORY * self._log_factor + (1.0 - _NOISE_MEMORY) * seen, -_CHANCE, limit)
         return frame.with_larger_noise(own)
+
+
+class InnovationWatch:
+    """Complains where innovations are again and again larger than their covariance says, after all that widens it."""
+
+    def __init__(self) -> None:
+        self._ratios = deque[float](maxlen=_WATCHED_FRAMES)
+
+    def add(self, ratio: float) -> None:
+        """Take by how much one frame's squared innovations exceed their covariance; 1 where it is true."""
+        self._ratios.append(ratio)
+
+    @property
+    def complaint(self) -> str:
+        """Complaint about the frames of late, or ""."""
+        high = [ratio for ratio in self._ratios if ratio > _NOISE_TOLERANCE]
+        if len(high) < _FEW_FRAMES:
+            return ""
+        return (
+            f"too sure: squared innovations are {np.mean(high):.1f} times their covariance in {len(high)} of the last"
+            f" {len(self._ratios)} frames; nearest neighbours pair wrongly, take association.method mahalanobis"
+        )

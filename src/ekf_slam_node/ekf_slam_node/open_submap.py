@@ -80,6 +80,7 @@ class OpenSubmap:
             np.concatenate([covariances, pending.covariances]),
             np.concatenate([self.table.descriptors, pending.descriptors]),
             np.concatenate([self.table.tracks, pending.tracks]),
+            len(self.table),
         )
 
     # ---------------------------------------------------------------------------------------------- one frame, in order

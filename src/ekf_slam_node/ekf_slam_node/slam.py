@@ -21,7 +21,7 @@ from ekf_slam_node.linking import FrameLink, Linker
 from ekf_slam_node.missed_frames import MissedFrames
 from ekf_slam_node.models import Frame, seconds_between
 from ekf_slam_node.motion_checks import StandingDetector, aided, explaining_sigma, is_known, is_surprising, widened
-from ekf_slam_node.noise_monitor import NoiseMonitor
+from ekf_slam_node.noise_monitor import InnovationWatch, NoiseMonitor
 from ekf_slam_node.open_submap import Sight, pending_of
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.rolling_shutter import RollingShutter
@@ -73,6 +73,7 @@ class EkfSlam:
     def _forget(self) -> None:
         self._aids = MotionAids(self.config.motion, self.config.inertial)
         self._noise = NoiseMonitor()
+        self._innovations = InnovationWatch()
         self._common = CommonError(self.config.measurement.common_error)
         self._chain = SubmapChain(self.config, self._T_rig_optical, self.session)
         self._next_id = 0
@@ -132,8 +133,8 @@ class EkfSlam:
 
     @property
     def complaint(self) -> str:
-        """Complaint about the IMU, or ""."""
-        return self._aids.inertial.complaint
+        """Complaint about the IMU or about the association, or ""."""
+        return self._aids.inertial.complaint or self._innovations.complaint
 
     @property
     def readout_s(self) -> tuple[float, float]:
@@ -188,6 +189,10 @@ class EkfSlam:
             return None
         measured = self._noise.learn(frame, link.excess)
         frame = self._shutter.corrected(measured, dt, link.T if known is None else known)
+        if link.wrong is not None:
+            wider = frame.variance + link.wrong
+            self._innovations.add(float(np.max(link.excess[:2] * (frame.variance / wider).mean(axis=0)[:2])))
+            frame = replace(frame, variance=wider)
         self._common.learn(frame.z[link.columns, :2], link.error[:, :2], frame.camera.width)
         surprising = is_surprising(link, expected, self.config.association.gate)
         common = self._common.sigma(frame)

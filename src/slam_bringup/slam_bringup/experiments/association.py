@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ekf_slam_node.association import associate_ccda, associate_jcbb, associate_mahalanobis, associate_nearest
 from ekf_slam_node.candidates import Candidates, MotionPrior
-from ekf_slam_node.config import NEAREST_ASSOCIATE, FeatureAssociationConfig
+from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.models import Frame, frame_from_features, rig_points
 from slam_bringup.experiments import thesis
 from slam_bringup.experiments.filter_maps import map_figure, maps
@@ -98,7 +98,7 @@ def _pairs(
     points, covariances = rig_points(before, T_rig_optical)
     candidates = Candidates(points, covariances, before.descriptors, np.zeros(len(points), dtype=np.int32))
     if config.method == "nearest":
-        rows, columns = associate_nearest(candidates, now, prior.T, T_rig_optical, NEAREST_ASSOCIATE)
+        rows, columns = associate_nearest(candidates, now, prior.T, T_rig_optical, config)
         similarity = np.einsum("nd,nd->n", candidates.descriptors[rows], now.descriptors[columns])
         alike = similarity >= config.descriptor_threshold
         return rows[alike], columns[alike]
