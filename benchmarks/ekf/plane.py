@@ -10,14 +10,19 @@ without truth (Victoria Park) is compared with its path smoothed with known asso
 from __future__ import annotations
 
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from ekf_slam_node.planar import PlanarConfig
 from slam_bringup.planar.log import PlanarLog
 from slam_bringup.planar.mapping import accuracy, map_log
+from slam_bringup.planar.naming import named
 from slam_bringup.planar.readers import read_log
 
-ASSOCIATIONS = {"known": "known", "steps": "jcbb", "hypotheses": "hypotheses"}
+COLUMNS = ("known", "steps", "hypotheses")
 
 
 def with_reference(log: PlanarLog) -> PlanarLog:
@@ -30,22 +35,27 @@ def with_reference(log: PlanarLog) -> PlanarLog:
 
 def row(log: PlanarLog) -> str:
     log = with_reference(log)
+    robot = log.robots[0]
+    config = PlanarConfig(sigma_range=log.sigma_range, sigma_bearing=log.sigma_bearing)
+    start = np.zeros(3) if robot.truth is None else robot.truth[0]
+    own_names = replace(log, robots=(named(robot, start, config),))
     cells = []
     for method in ("ekf", "sam"):
-        for association in ASSOCIATIONS.values():
-            result = map_log(log, method, association)
-            cells.append(f"{accuracy(log.robots[0], result.paths[0])['rmse_m']:12.3f}")
-        cells.append(f"{len(result.landmarks):6d}")
-    return f"{log.name + ' ' + log.robots[0].name:24}" + "".join(cells)
+        for asked, association in ((log, "known"), (log, "jcbb"), (own_names, "known")):
+            result = map_log(asked, method, association)
+            cells.append(f"{accuracy(robot, result.paths[0])['rmse_m']:12.3f}")
+    landmarks = len(np.unique(np.concatenate(robot.ids))), len(result.landmarks)
+    return f"{log.name + ' ' + robot.name:24}" + "".join(cells) + "{:12d}{:12d}".format(*landmarks)
 
 
 def main() -> None:
-    heading = "".join(f"{name:>12}" for name in ASSOCIATIONS) + "   map"
-    print(f"{'':24}{'EKF':^42}{'SAM':^42}\n{'':24}{heading}{heading}")
-    for path in sys.argv[1:]:
-        log = read_log(Path(path))
-        for robot in log.robots:
-            print(row(replace(log, robots=(robot,))), flush=True)
+    heading = "".join(f"{name:>12}" for name in COLUMNS)
+    print(f"{'':24}{'EKF':>12}{'SAM':>36}{'landmarks':>36}\n{'':24}{heading}{heading}{'true':>12}{'found':>12}")
+    logs = [read_log(Path(path)) for path in sys.argv[1:]]
+    alone = [replace(log, robots=(robot,)) for log in logs for robot in log.robots]
+    with ProcessPoolExecutor(len(alone)) as pool:
+        for line in pool.map(row, alone):
+            print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -30,15 +30,15 @@ def _frame(points: np.ndarray) -> Frame:
 
 def test_between_the_gates_a_feature_is_neither_known_nor_new():
     seen = np.array([[3.0, 0.0, 0.0], [3.0, 0.5, 0.0], [3.0, -0.8, 0.0]])
-    landmarks = seen[:2] + [[0.0, 0.05, 0.0], [0.0, 0.2, 0.0]]
-    candidates = _candidates(np.vstack([landmarks, seen + [0.0, 0.01, 0.0]]), 2)
+    landmarks = seen[:2] + np.array([[0.0, 0.05, 0.0], [0.0, 0.2, 0.0]])
+    candidates = _candidates(np.vstack([landmarks, seen + np.array([0.0, 0.01, 0.0])]), 2)
     rows, columns = associate_nearest(candidates, _frame(seen), np.eye(4), T_RIG_OPTICAL, CONFIG)
     assert sorted(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 0), (4, 2)]
 
 
 def test_more_candidates_within_the_gate_widen_the_covariance():
     seen = np.array([[2.0, 0.0, 0.0], [2.0, 0.6, 0.0]])
-    candidates = _candidates(np.vstack([seen, seen[:1] + [0.0, 0.0, 0.05]]), 3)
+    candidates = _candidates(np.vstack([seen, seen[:1] + np.array([0.0, 0.0, 0.05])]), 3)
     wider = wrong_pair_variance(candidates, _frame(seen), np.eye(4), T_RIG_OPTICAL, CONFIG)
     assert wider[0, 0] == pytest.approx(0.5 * (0.1 * CAMERA.fx / 2.0) ** 2 / 5.0)
     assert not wider[1].any()

@@ -55,8 +55,8 @@ class FrameLink:
     """Pairs of candidates ``rows`` and features ``columns`` (k,), and the motion they agree on.
 
     T, covariance: (4, 4) T_previous_now from these pairs alone, with its covariance (6, 6). excess: (3,) by what
-    factors the pairs' errors exceed their claimed variances. error: (k, 3) measured less predicted of each pair. wrong: (n, 3) variance of the frame's n features for the wrong
-    pairs among those, or None where the association lets hardly any through.
+    factors the pairs' errors exceed their claimed variances. error: (k, 3) measured less predicted of each pair. wrong:
+    (n, 3) variance of the frame's n features for wrong pairs, or None where the association lets hardly any through.
     """
 
     T: FloatArray
