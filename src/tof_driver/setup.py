@@ -21,6 +21,7 @@ setup(
         "numpy",
         "opencv-python-headless",
     ],
+    extras_require={"librealsense": ["pyrealsense2"]},
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",
     maintainer_email="maintainers@indoor-slam.org",

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -117,6 +118,48 @@ def test_online_is_offline_and_bad_messages_are_survived(
         np.testing.assert_array_equal(cloud_from_message(points)["sigma"], expected.sigma)
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=10.0) == 0
+
+
+def test_a_folder_is_played_with_its_calibration_and_broken_images_are_survived(
+    probe: DriverProbe, start: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
+) -> None:
+    CameraInfoFile(Calibration(LENS), "tof").write(tmp_path / "tof.yaml")
+    names = [f"10000000{k}0000000000.tiff" for k in range(3)]
+    for name in ("range", "amplitude", "intensity"):
+        (tmp_path / name).mkdir()
+        for k, file in enumerate(names):
+            image = scene(k)["distance" if name == "range" else name]
+            assert cv2.imwrite(str(tmp_path / name / file), image)
+    (tmp_path / "range" / names[1]).write_bytes(b"no image")
+    outputs = {"tof/depth/image": Image, "tof/range/image_raw": Image, "tof/camera_info": CameraInfo}
+    for topic, kind in outputs.items():
+        probe.listen(topic, kind)
+    start("source:=folder", f"path:={tmp_path}", f"info:={tmp_path / 'tof.yaml'}", "rate:=0.5")
+    probe.wait(lambda: all(len(m) == 2 for m in probe.received.values()), "two of three images should come out")
+    for index, k in enumerate((0, 2)):
+        raw = scene(k)
+        expected = DepthProcessor(DepthConfig(), LENS).process(0, raw["distance"], raw["amplitude"], raw["intensity"])
+        depth, unprocessed, _ = (probe.received[topic][index] for topic in outputs)
+        assert depth.header.stamp.sec == int(names[k][:-14])
+        np.testing.assert_array_equal(image_from_message(depth), expected.depth)
+        np.testing.assert_array_equal(image_from_message(unprocessed), raw["distance"])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "reason"),
+    [
+        (("source:=folder", "path:=."), b"needs the parameter info"),
+        (("source:=librealsense",), b"gives depth alone"),
+        (("source:=librealsense", "measurement:=depth"), b"librealsense"),
+    ],
+)
+def test_a_source_that_cannot_be_opened_is_refused(
+    start: Callable[..., subprocess.Popen[bytes]], parameters: tuple[str, ...], reason: bytes
+) -> None:
+    process = start(*parameters)
+    assert process.wait(timeout=60.0) != 0
+    assert process.stderr is not None
+    assert reason in process.stderr.read()
 
 
 def test_calibration_from_a_file_is_published_and_replaced(

@@ -23,6 +23,7 @@ from slam_core.calibration_watch import CalibrationWatch
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.config import Config, parameter
+from slam_core.frame_sources import SourceTimer
 from slam_core.messages import (
     camera_info_from_message,
     camera_info_message,
@@ -83,7 +84,7 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
         if self.source is None:
             self._listen_to_topics()
         else:
-            self._start_source(self.source.rate)
+            self._start_source(self.source)
 
     def on_reset(self) -> None:
         """Forget what waits, and use the newest calibration."""
@@ -142,23 +143,10 @@ class StereoDriverNode(SlamNode[StereoDriverConfig]):
         clock = (lambda: int(self.get_clock().now().nanoseconds)) if c.source == "camera" else None
         return SideBySideSource(c.path, clock, size)
 
-    def _start_source(self, rate: float) -> None:
+    def _start_source(self, source: SideBySideSource | FolderSource) -> None:
         for side in SIDES:
             self.advertise(f"stereo/{side}/image_raw", "Image")
-        self._timer = self.create_timer(1.0 / (self.config.rate or rate), self._on_timer)
-
-    def _on_timer(self) -> None:
-        assert self.source is not None
-        pair = self.source.read()
-        if pair is None:
-            self.get_logger().info(f"the {self.config.source} has ended")
-            self._timer.cancel()
-            return
-        try:
-            self._publish_pair(pair)
-        except ValueError as error:
-            self.health.count("rejected")
-            self.get_logger().warning(f"pair rejected: {error}", throttle_duration_sec=1.0)
+        self._player = SourceTimer(self, source, self.config.rate or source.rate, self._publish_pair)
 
     def _publish_pair(self, pair: RawPair) -> None:
         frames = self.config.left_frame, self.config.right_frame

@@ -7,7 +7,6 @@ folder holds the images of the left and right camera in two subfolders, or in on
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -16,9 +15,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from slam_core.frame_sources import FrameCapture, images_in, stamp_of_image
 from slam_core.types import AnyArray, ByteArray, MakeColour, no_colour
 
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 _SUBFOLDERS = (
     ("left", "right"),
     ("image_l", "image_r"),
@@ -70,16 +69,10 @@ class SideBySideSource:
     def __init__(
         self, device: str, clock: Callable[[], int] | None = None, size: tuple[int, int] | None = None
     ) -> None:
-        self.device = device
-        self._clock = clock
-        self._capture = cv2.VideoCapture(int(device) if device.isdecimal() else device)
-        if not self._capture.isOpened():
-            raise OSError(f"cannot open camera or video '{device}'")
+        self._capture = FrameCapture(device, clock)
         if size is not None:
-            self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
-            self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
-        self.rate = float(self._capture.get(cv2.CAP_PROP_FPS)) or 30.0
-        self._count = 0
+            self._capture.ask_for(*size)
+        self.rate = self._capture.rate
 
     def __iter__(self) -> Iterator[RawPair]:
         while (pair := self.read()) is not None:
@@ -87,16 +80,12 @@ class SideBySideSource:
 
     def read(self) -> RawPair | None:
         """The next pair, or None at the end of a file or when the camera has gone."""
-        ok, frame = self._capture.read()
-        if not ok:
-            return None
-        stamp = self._clock() if self._clock is not None else round(self._count / self.rate * 1e9)
-        self._count += 1
-        return split_side_by_side(stamp, frame)
+        frame = self._capture.read()
+        return None if frame is None else split_side_by_side(*frame)
 
     def close(self) -> None:
         """Let go of the camera."""
-        self._capture.release()
+        self._capture.close()
 
 
 class FolderSource:
@@ -124,8 +113,7 @@ class FolderSource:
         if self._next == len(self.pairs):
             return None
         left, right = self.pairs[self._next]
-        stamp = _stamp_in_name(left)
-        stamp = round(self._next / self.rate * 1e9) if stamp is None else stamp
+        stamp = stamp_of_image(left, self._next, self.rate)
         self._next += 1
         return RawPair(stamp, read_grey(left), read_grey(right), colour=partial(_read_colour, left))
 
@@ -159,11 +147,11 @@ def find_pairs(folder: Path) -> list[tuple[Path, Path]]:
     """
     for left_name, right_name in _SUBFOLDERS:
         right_folder = folder / right_name
-        pairs = [(p, right_folder / p.name) for p in _images(folder / left_name) if (right_folder / p.name).is_file()]
+        pairs = [(p, right_folder / p.name) for p in images_in(folder / left_name) if (right_folder / p.name).is_file()]
         if pairs:
             return pairs
     for left_end, right_end in _NAME_ENDS:
-        lefts = [p for p in _images(folder) if p.stem.endswith(left_end)]
+        lefts = [p for p in images_in(folder) if p.stem.endswith(left_end)]
         named = [(p, p.with_name(p.stem[: -len(left_end)] + right_end + p.suffix)) for p in lefts]
         if pairs := [(left, right) for left, right in named if right.is_file()]:
             return pairs
@@ -189,14 +177,3 @@ def _read_colour(path: Path) -> ByteArray | None:
 
 def _red_first(image: AnyArray) -> ByteArray:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
-
-
-def _images(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
-
-
-def _stamp_in_name(path: Path) -> int | None:
-    digits = re.search(r"\d{15,19}", path.stem)
-    return int(digits.group()) if digits else None

@@ -5,6 +5,8 @@
         -> tof/depth/image, tof/noise/image, tof/points, tof/{amplitude,intensity}/image
     tof/color/image_raw, in the pixels of the depth image -> tof/color/image
 
+With ``source`` folder, video or librealsense this node reads the raw images itself and publishes them too.
+
 One ``tof/camera_info`` serves raw and rectified images, as everywhere in ROS: K and D are those of the raw image, P of
 the rectified one. It comes from the camera's own driver; with the parameter ``info`` it comes from a YAML file and this
 node publishes it. ``tof/set_camera_info`` writes that file.
@@ -15,7 +17,7 @@ node publishes it. ``tof/set_camera_info`` writes that file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from slam_core.calibration_watch import CalibrationWatch
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.config import parameter
+from slam_core.frame_sources import SourceTimer
 from slam_core.health import State
 from slam_core.messages import (
     DEPTH_TOPICS,
@@ -44,13 +47,18 @@ from slam_core.ros import run_node
 from slam_core.types import DepthImage
 from tof_driver.depth import DepthConfig
 from tof_driver.points import depth_cloud
+from tof_driver.sources import DepthFolder, DepthVideo, RealSense
 from tof_driver.stage import DepthStage, RawDepth
 
 
 @dataclass(frozen=True)
 class TofDriverConfig(DepthConfig):
-    """Depth processing, and which topics the images come from."""
+    """Depth processing, and where the images come from."""
 
+    source: str = parameter("topics", "origin of the raw images", choices=("topics", "folder", "video", "librealsense"))
+    path: str = parameter("", "folder, video file, or serial number or recording for librealsense; empty: any camera")
+    frame: str = parameter("tof_optical_frame", "frame of the images of a source other than topics")
+    rate: float = parameter(0.0, "images per second of a folder or video; 0: as recorded", unit="Hz", minimum=0.0)
     pictures: str = parameter(
         "auto",
         "images beside range (color: as amplitude); auto: amplitude and intensity with measurement range, else none",
@@ -60,6 +68,7 @@ class TofDriverConfig(DepthConfig):
 
 
 _COLOUR = "tof/color/image"
+OwnSource = DepthFolder | DepthVideo | RealSense
 
 
 class TofDriverNode(SlamNode[TofDriverConfig]):
@@ -74,8 +83,12 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
         self._pictures = self._picture_names()
         if self.config.info:
             self.stage.set_info(_read(self.config.info))
+        self.source = None if self.config.source == "topics" else self._open_source()
         self._topics = self._advertise_outputs()
-        self._listen_to_inputs()
+        if self.source is None:
+            self._listen_to_inputs()
+        else:
+            self._start_source(self.source)
         self.create_service(SetCameraInfo, "tof/set_camera_info", self._on_set_info)
 
     def on_reset(self) -> None:
@@ -87,6 +100,11 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
     def on_new_session(self) -> None:
         """Forget what waits; the map goes on, with its calibration."""
         self.stage.reset()
+
+    def on_close(self) -> None:
+        """Let go of the camera."""
+        if self.source is not None:
+            self.source.close()
 
     # -- topics --------------------------------------------------------------------------------------------------------
 
@@ -103,7 +121,7 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
     def _advertise_outputs(self) -> tuple[str, ...]:
         """Offer the topics that this camera has; a camera info that comes from a topic is there already."""
         unused = {f"tof/{name}/image" for name in ("amplitude", "intensity") if name not in self._roles()}
-        if not self.config.info:
+        if not self.config.info and self.source is None:
             unused.add("tof/camera_info")
         self.advertise(_COLOUR, "Image")
         used = tuple(topic for topic in DEPTH_TOPICS if topic not in unused)
@@ -157,6 +175,43 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
         for topic, message in zip(DEPTH_TOPICS, outputs, strict=True):
             if topic in self._topics:
                 self.publish(topic, message)
+
+    # -- own sources ---------------------------------------------------------------------------------------------------
+
+    def _open_source(self) -> OwnSource:
+        if not self.config.info and self.config.source != "librealsense":
+            raise ValueError(f"source '{self.config.source}' needs the parameter info (a YAML file)")
+        try:
+            return self._make_source()
+        except OSError as error:
+            raise ValueError(str(error)) from error
+
+    def _make_source(self) -> OwnSource:
+        c, names = self.config, (self.config.measurement, *self._pictures)
+        if c.source == "folder":
+            return DepthFolder(Path(c.path).expanduser(), names, c.rate or 10.0)
+        if c.source == "video":
+            return DepthVideo(str(Path(c.path).expanduser()), names)
+        if names != ("depth",):
+            raise ValueError("source 'librealsense' gives depth alone: set measurement depth and pictures none")
+        source = RealSense(c.path, lambda: int(self.get_clock().now().nanoseconds))
+        if not c.info:
+            self.stage.set_info(source.info)
+        return source
+
+    def _start_source(self, source: OwnSource) -> None:
+        for name in (self.config.measurement, *self._pictures):
+            self.advertise(f"tof/{name}/image_raw", "Image")
+        self._player = SourceTimer(self, source, self.config.rate or source.rate, self._publish_raw)
+
+    def _publish_raw(self, raw: RawDepth) -> None:
+        header = header_message(self.types, raw.stamp_ns, self.config.frame)
+        roles = {self.config.measurement: raw.image}
+        roles |= {n: getattr(raw, role) for n, role in zip(self._pictures, self._roles(), strict=True)}
+        for name, image in roles.items():
+            self.publish(f"tof/{name}/image_raw", image_message(self.types, header, image))
+        self.stage.add(replace(raw, frame_id=self.config.frame))
+        self._publish_ready()
 
     # -- calibration ---------------------------------------------------------------------------------------------------
 
