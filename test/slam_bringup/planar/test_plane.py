@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from ekf_slam_node.planar import PlanarEkf
 from slam_bringup.cli import slam
 from slam_bringup.planar.log import PlanarLog, RobotLog
-from slam_bringup.planar.mapping import accuracy, dead_reckoning, map_log
+from slam_bringup.planar.mapping import METHODS, accuracy, dead_reckoning, map_log
 from slam_bringup.planar.output import landmark_error
 from slam_bringup.planar.readers import read_log
 from slam_simulation.planar import PlanarRun, PlanarWorldConfig, simulate_planar
@@ -54,6 +54,20 @@ def test_every_method_maps_and_beats_dead_reckoning(method):
         assert found["anees"] < 4.0
     if result.chi2 is not None:
         assert 0.8 < result.chi2 / result.degrees_of_freedom < 1.2
+
+
+def test_names_that_are_found_serve_every_method():
+    """Noise in which neighbours are mistaken step by step; the log's own names are not looked at."""
+    world = replace(WORLD, samples=100, landmarks=20, sigma_range=0.15, sigma_turn=0.05)
+    run = simulate_planar(world, np.random.default_rng(1))
+    log = PlanarLog("simulated", (robot_log(run),), world.sigma_range, world.sigma_bearing)
+    nameless = replace(log.robots[0], ids=tuple(np.zeros_like(ids) for ids in log.robots[0].ids))
+    for method in METHODS:
+        known, found = (
+            accuracy(log.robots[0], map_log(asked, method, association).paths[0])["rmse_m"]
+            for asked, association in ((log, "known"), (replace(log, robots=(nameless,)), "hypotheses"))
+        )
+        assert found < 1.5 * known
 
 
 def test_smoothing_is_better_than_filtering():
