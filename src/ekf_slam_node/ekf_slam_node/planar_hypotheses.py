@@ -112,7 +112,7 @@ class PlanarHypotheses:
         self._take(rows)
         self._weight = self._weight[rows]
         self._parents[-1], self._choices[-1] = self._parents[-1][rows], self._choices[-1][rows]
-        return taken[rows]
+        return np.asarray(taken[rows])
 
     @property
     def most_probable(self) -> tuple[FloatArray, FloatArray]:
