@@ -9,10 +9,10 @@ from dense_mapping.surface import Surface
 from slam_core.camera import Camera
 from slam_core.geometry import OPTICAL_FROM_RIG, make_transform, rotation_from_euler
 from slam_core.types import DepthImage
-from slam_simulation.raycaster import camera_rays, make_view, trace
+from slam_simulation.rendering.raycaster import camera_rays, make_view, trace
+from slam_simulation.rendering.surface_distance import distance_to_surfaces
 from slam_simulation.scenario import Scenario
-from slam_simulation.surface_distance import distance_to_surfaces
-from slam_simulation.surface_table import compile_world
+from slam_simulation.world.surface_table import compile_world
 
 CAMERA = Camera(160, 120, 90.0, 90.0, 79.5, 59.5)
 SIGMA = 0.01

@@ -33,10 +33,10 @@ from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_core.evaluation import associate, evaluate
 from slam_core.geometry import invert_transform
-from slam_core.memory import search_less_garbage, share_one_heap
+from slam_core.runtime.memory import search_less_garbage, share_one_heap
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate, StereoImages
-from stereo_frontend.rectify import StereoRectifier
+from stereo_frontend.stereo.rectify import StereoRectifier
 
 RUN = Path(__file__).with_name("orbslam3_run.py")
 """Run with -P: this file has the name of the package."""

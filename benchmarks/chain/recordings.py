@@ -202,7 +202,7 @@ def _points(reading: Reading, sensors: AgentSensors) -> tuple | None:
         camera, depth = sensors.tof.camera, _metres(reading)
         return uv, descriptors, camera.unproject(uv, depth[tuple(np.round(uv[:, ::-1]).astype(int).T)]), camera.K
     if isinstance(reading, StereoReading):
-        from stereo_frontend.rectify import StereoRectifier
+        from stereo_frontend.stereo.rectify import StereoRectifier
 
         pair = StereoRectifier(sensors.left, sensors.right)(reading.stamp_ns, reading.pair.left, reading.pair.right)
         from ground_truth import stereo_points

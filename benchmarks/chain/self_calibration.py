@@ -20,7 +20,7 @@ from rich.table import Table
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.pipeline.results import AgentResult
-from slam_core.rigid_alignment import umeyama
+from slam_core.estimation.rigid_alignment import umeyama
 
 
 def main() -> None:

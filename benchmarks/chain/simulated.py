@@ -35,7 +35,7 @@ from slam_core.evaluation import Evaluation
 from slam_core.messages import submap_messages
 from slam_core.trajectory import Trajectory
 from slam_core.types import Submap
-from slam_simulation.profiles import PROFILES
+from slam_simulation.sensors.profiles import PROFILES
 
 DEFAULT = (
     "workshop_rig", "workshop_handheld", "fireman_10hz", "fireman_5hz", "sweep", "conference", "two_rooms/2",

@@ -29,9 +29,9 @@ from slam_bringup.pipeline.dense_run import dense_model
 from slam_core.evaluation import align, associate
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory, read_trajectory
+from slam_simulation.rendering.surface_distance import count_sightings, distance_to_surfaces, sample_surfaces
 from slam_simulation.scenario import Scenario
-from slam_simulation.surface_distance import count_sightings, distance_to_surfaces, sample_surfaces
-from slam_simulation.surface_table import compile_world
+from slam_simulation.world.surface_table import compile_world
 
 NEAR_M = 3.0
 HEADINGS = (

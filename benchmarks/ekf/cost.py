@@ -15,8 +15,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from ekf_slam_node.ekf import Ekf
-from ekf_slam_node.models import CORE_DIM, observe
+from ekf_slam_node.filtering.ekf import Ekf
+from ekf_slam_node.filtering.models import CORE_DIM, observe
 from slam_core.camera import Camera
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, make_transform, transform_points
 

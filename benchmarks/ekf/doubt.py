@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_core.calibration_error import CalibrationErrorConfig, widened_by_calibration
+from slam_core.estimation.calibration_error import CalibrationErrorConfig, widened_by_calibration
 from slam_core.evaluation import TruthAccuracy
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ekf_slam_node.planar import PlanarConfig
+from ekf_slam_node.planar.planar import PlanarConfig
 from slam_bringup.planar.log import PlanarLog
 from slam_bringup.planar.mapping import accuracy, map_log
 from slam_bringup.planar.naming import named

@@ -14,7 +14,7 @@ import yaml
 from slam_core.camera import Camera, CameraInfo, StereoCamera
 from slam_core.geometry import invert_transform
 from slam_core.types import StereoImages
-from stereo_frontend.rectify import StereoRectifier
+from stereo_frontend.stereo.rectify import StereoRectifier
 
 DATA = Path(os.environ.get("INDOOR_SLAM_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 

@@ -20,11 +20,11 @@ from datasets import euroc_pairs, kitti_pairs
 
 from slam_bringup.experiments.true_frames import simulated_frames
 from slam_core.types import StereoImages
-from stereo_frontend.disparity import refine_disparity
-from stereo_frontend.features import FeatureExtractor
+from stereo_frontend.detection.features import FeatureExtractor
 from stereo_frontend.frontend import RIGHT_SURPLUS, Frontend
 from stereo_frontend.frontend_config import FrontendConfig
-from stereo_frontend.matching import disparity_bounds, match_stereo
+from stereo_frontend.stereo.disparity import refine_disparity
+from stereo_frontend.stereo.matching import disparity_bounds, match_stereo
 
 T = TypeVar("T")
 WARM_UP = 4

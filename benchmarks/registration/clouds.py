@@ -24,7 +24,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ndt_registration.cloud_io import read_cloud
+from ndt_registration.clouds.cloud_io import read_cloud
 from ndt_registration.registration import RegistrationConfig, RegistrationResult, register
 from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform, so3_log, transform_from_pose7
 

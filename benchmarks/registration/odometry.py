@@ -29,8 +29,8 @@ from slam_bringup.bags.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.sensor_pipeline import depth_stage
 from slam_core.config import from_mapping
+from slam_core.estimation.rigid_alignment import umeyama
 from slam_core.geometry import FloatArray, boxminus, invert_transform
-from slam_core.rigid_alignment import umeyama
 
 FOCAL_PX, CENTRE_PX = 585.0, (320.0, 240.0)
 PERIOD_NS = 33_333_333

@@ -10,8 +10,8 @@ import numpy as np
 
 from slam_bringup.experiments.tof_scans import TofRoom, rig_pose
 from slam_core.geometry import FloatArray
-from slam_simulation.building import STYLES
 from slam_simulation.scenario import Scenario
+from slam_simulation.world.building import STYLES
 
 KINDS = ("table", "chair", "pillar")
 EMPTY = {

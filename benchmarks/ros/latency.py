@@ -30,9 +30,9 @@ from slam_bringup.processes.node_graph import NodeGraph, plan_nodes
 from slam_bringup.processes.online_run import START_TIMEOUT_S
 from slam_bringup.processes.processes import NodeCommand, NodeGroup, NodeProcess, PrivateDomain, node_environment
 from slam_bringup.processes.supervisor_node import Supervisor
-from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.evaluation import evaluate
 from slam_core.messages import estimate_from_message, stamp_ns
+from slam_core.nodes.base_node import PROGRESS_TOPIC
 from slam_core.ros import RosTypes, sensor_qos
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate

@@ -27,7 +27,7 @@ import rclpy  # noqa: E402
 
 from feature_chain import START, STEP_NS, Chain, stamp_of  # noqa: E402
 from feature_world import loop  # noqa: E402
-from slam_core.base_node import PROGRESS_TOPIC  # noqa: E402
+from slam_core.nodes.base_node import PROGRESS_TOPIC  # noqa: E402
 from slam_core.ros import sensor_qos  # noqa: E402
 
 LAP, RATE = 200, 10.0

@@ -14,7 +14,7 @@ import numpy as np
 
 from slam_core.types import ByteArray
 from slam_simulation import Scenario, SimulatedFrame, Simulator
-from slam_simulation.surface_table import compile_world
+from slam_simulation.world.surface_table import compile_world
 
 WIDTH, HEIGHT, COLUMNS = 208, 156, 4
 SHARES = (0.05, 0.35, 0.6, 0.85)

@@ -35,8 +35,8 @@ from slam_core.camera import Camera
 from slam_core.geometry import FloatArray, invert_transform, make_transform, so3_log
 from slam_core.types import ByteArray
 from slam_simulation import Scenario
-from slam_simulation.profiles import PROFILES
-from stereo_frontend.rectify import StereoRectifier
+from slam_simulation.sensors.profiles import PROFILES
+from stereo_frontend.stereo.rectify import StereoRectifier
 
 RATIO = 0.8
 REPROJECTION_PX = 2.0

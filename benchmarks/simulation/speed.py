@@ -14,10 +14,10 @@ from statistics import median
 import numpy as np
 
 from slam_simulation import Scenario, Simulator
-from slam_simulation.raycaster import make_view, trace
-from slam_simulation.shading import render
-from slam_simulation.stereo_sensor import motion_blur
-from slam_simulation.surface_table import compile_world
+from slam_simulation.rendering.raycaster import make_view, trace
+from slam_simulation.rendering.shading import render
+from slam_simulation.sensors.stereo_sensor import motion_blur
+from slam_simulation.world.surface_table import compile_world
 
 FRAMES = 8
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_simulation.surface_table import SurfaceTable, compile_world
-from slam_simulation.tof_sensor import TofSensor, TofSensorConfig
-from slam_simulation.world import Material, Rectangle, World
+from slam_simulation.sensors.tof_sensor import TofSensor, TofSensorConfig
+from slam_simulation.world.surface_table import SurfaceTable, compile_world
+from slam_simulation.world.world import Material, Rectangle, World
 
 SCANS = 20
 MIDDLE = slice(82, 122)

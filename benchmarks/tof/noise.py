@@ -18,7 +18,7 @@ import numpy as np
 
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray
-from slam_simulation.raycaster import camera_rays, make_view, trace
+from slam_simulation.rendering.raycaster import camera_rays, make_view, trace
 from slam_simulation.scenario import Scenario
 from slam_simulation.simulator import Simulator
 from tof_driver.depth import DepthConfig, DepthProcessor

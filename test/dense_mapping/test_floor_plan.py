@@ -25,9 +25,9 @@ from dense_mapping.navigation import frontiers, way
 from slam_core.camera import Camera
 from slam_core.geometry import OPTICAL_FROM_RIG, boxplus, make_transform, rotation_from_euler, so3_exp
 from slam_core.types import DepthImage
-from slam_simulation.raycaster import camera_rays, make_view, trace
+from slam_simulation.rendering.raycaster import camera_rays, make_view, trace
 from slam_simulation.scenario import Scenario
-from slam_simulation.surface_table import compile_world
+from slam_simulation.world.surface_table import compile_world
 
 CAMERA = Camera(160, 120, 80.0, 80.0, 79.5, 59.5)
 FLAT = {

@@ -28,8 +28,8 @@ from slam_core.messages import (  # noqa: E402
 )
 from slam_core.ros import RosTypes  # noqa: E402
 from slam_core.types import DepthImage, ImuSample, PoseEstimate  # noqa: E402
-from stereo_frontend.rectification_error import NAMES, RectificationError  # noqa: E402
 from stereo_frontend.sources import RawPair  # noqa: E402
+from stereo_frontend.stereo.rectification_error import NAMES, RectificationError  # noqa: E402
 
 pytestmark = pytest.mark.ros
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ekf_slam_node.planar import PlanarConfig, PlanarEkf, move, range_bearing, wrap
+from ekf_slam_node.planar.planar import PlanarConfig, PlanarEkf, move, range_bearing, wrap
 from slam_core.evaluation import nees
 from slam_core.geometry import FloatArray
 

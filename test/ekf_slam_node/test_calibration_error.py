@@ -12,7 +12,7 @@ from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.slam import EkfSlam
 from feature_world import T_RIG_OPTICAL, loop, room
-from slam_core.calibration_error import CalibrationErrorConfig, pose_sensitivity
+from slam_core.estimation.calibration_error import CalibrationErrorConfig, pose_sensitivity
 from slam_core.evaluation import anees_bounds, nees
 from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, make_transform, so3_exp
 from slam_core.types import Submap

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ekf_slam_node.association import associate_nearest, wrong_pair_variance
-from ekf_slam_node.candidates import Candidates
+from ekf_slam_node.association.association import associate_nearest, wrong_pair_variance
 from ekf_slam_node.config import EkfSlamConfig, FeatureAssociationConfig
-from ekf_slam_node.models import Frame, observe
-from ekf_slam_node.noise_monitor import InnovationWatch
+from ekf_slam_node.filtering.candidates import Candidates
+from ekf_slam_node.filtering.models import Frame, observe
+from ekf_slam_node.filtering.noise_monitor import InnovationWatch
 from ekf_slam_node.slam import EkfSlam
 from feature_world import CAMERA, T_RIG_OPTICAL, loop, room
 from slam_core.config import from_mapping

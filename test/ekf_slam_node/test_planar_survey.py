@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from planar_monte_carlo import MOTION_COVARIANCE, drive, run_filter
 
-from ekf_slam_node import planar_independent
-from ekf_slam_node.planar import PlanarConfig, range_bearing
-from ekf_slam_node.planar_independent import IndependentSubmaps
-from ekf_slam_node.planar_seif import ACTIVE, PlanarSeif
+from ekf_slam_node.planar import planar_independent
+from ekf_slam_node.planar.planar import PlanarConfig, range_bearing
+from ekf_slam_node.planar.planar_independent import IndependentSubmaps
+from ekf_slam_node.planar.planar_seif import ACTIVE, PlanarSeif
 
 EXACT = PlanarConfig(error="standard", sigma_range=1e-3, sigma_bearing=1e-3)
 """So little noise that it does not matter where models are linearised."""

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ekf_slam_node.config import EkfSlamConfig
-from ekf_slam_node.ekf import Ekf
-from ekf_slam_node.models import Observation
+from ekf_slam_node.filtering.ekf import Ekf
+from ekf_slam_node.filtering.models import Observation
 from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.slam import EkfSlam
 from feature_world import PointWorld, loop, room

@@ -11,7 +11,7 @@ from slam_calibration.board import Chessboard
 from slam_calibration.bundle import LensState, Rig, adjust
 from slam_calibration.length_error import DISTANCE, PairError, pair_error, parameter_file
 from slam_calibration.simulated import beside, covering_view, example_camera, simulate_views
-from slam_core.calibration_error import CalibrationErrorConfig
+from slam_core.estimation.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, transform_points
 
 BOARD = Chessboard(9, 7, 0.04).points

@@ -12,8 +12,8 @@ import pytest
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray
 from slam_simulation import Scenario, SimulatedFrame, Simulator
-from slam_simulation.raycaster import make_view, trace
-from slam_simulation.surface_table import Look, compile_world
+from slam_simulation.rendering.raycaster import make_view, trace
+from slam_simulation.world.surface_table import Look, compile_world
 
 
 @pytest.fixture(scope="module")

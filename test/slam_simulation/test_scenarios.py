@@ -8,7 +8,7 @@ import pytest
 
 from slam_core.geometry import FloatArray
 from slam_simulation import Scenario
-from slam_simulation.world import Rectangle
+from slam_simulation.world.world import Rectangle
 
 FOLDER = Path(__file__).resolve().parents[2] / "bags" / "scenarios"
 FRAMES = {

@@ -9,21 +9,21 @@ import pytest
 from slam_core.camera import CameraInfo
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, invert_transform, make_transform, so3_exp, transform_points
 from slam_simulation import Simulator
-from slam_simulation.calibrated_pair import CalibratedPair, calibrated_pair
-from slam_simulation.imu import GRAVITY, ImuSensor, ImuSensorConfig, ideal_reading
-from slam_simulation.raycaster import camera_rays
+from slam_simulation.rendering.raycaster import camera_rays
 from slam_simulation.scenario import Scenario
-from slam_simulation.stereo_sensor import (
+from slam_simulation.sensors.calibrated_pair import CalibratedPair, calibrated_pair
+from slam_simulation.sensors.imu import GRAVITY, ImuSensor, ImuSensorConfig, ideal_reading
+from slam_simulation.sensors.stereo_sensor import (
     StereoSensor,
     StereoSensorConfig,
     camera_twist,
     expose,
     motion_blur,
 )
-from slam_simulation.surface_table import SurfaceTable, compile_world
-from slam_simulation.tof_sensor import TofSensor, TofSensorConfig
+from slam_simulation.sensors.tof_sensor import TofSensor, TofSensorConfig
 from slam_simulation.trajectory import StationPath, rig_twist
-from slam_simulation.world import Material, Rectangle, World
+from slam_simulation.world.surface_table import SurfaceTable, compile_world
+from slam_simulation.world.world import Material, Rectangle, World
 
 
 def wall_at(*distances: float) -> SurfaceTable:

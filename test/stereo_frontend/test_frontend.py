@@ -11,7 +11,7 @@ import pytest
 from slam_core.camera import Camera
 from slam_core.config import from_mapping
 from slam_core.types import DepthImage, FeatureSource, StereoImages
-from stereo_frontend.features import FeatureConfig, FeatureExtractor
+from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.frontend import Frontend
 from stereo_frontend.frontend_config import FrontendConfig
 

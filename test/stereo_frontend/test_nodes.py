@@ -38,7 +38,7 @@ from slam_core.messages import (  # noqa: E402
 from slam_core.types import StereoImages  # noqa: E402
 from stereo_frontend.frontend import Frontend  # noqa: E402
 from stereo_frontend.frontend_config import FrontendConfig  # noqa: E402
-from stereo_frontend.rectify import StereoRectifier  # noqa: E402
+from stereo_frontend.stereo.rectify import StereoRectifier  # noqa: E402
 
 pytestmark = pytest.mark.ros
 

@@ -14,9 +14,9 @@ import yaml
 from slam_core.camera import Camera, CameraInfo, StereoCamera
 from slam_core.geometry import invert_transform
 from slam_core.types import StereoImages
-from stereo_frontend.features import FeatureConfig, FeatureExtractor
+from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.frontend import Frontend
-from stereo_frontend.rectify import StereoRectifier
+from stereo_frontend.stereo.rectify import StereoRectifier
 
 pytestmark = pytest.mark.data
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_simulation.raycaster import camera_rays, make_view, trace
+from slam_simulation.rendering.raycaster import camera_rays, make_view, trace
 from slam_simulation.scenario import Scenario
 from slam_simulation.simulator import Simulator
 from tof_driver.depth import DepthConfig, DepthProcessor

@@ -32,7 +32,7 @@ from dense_mapping.keyframes import Keyframe, KeyframeSelector, make_keyframe, w
 from dense_mapping.stereo_depth import stereo_depth
 from dense_mapping.surface import Surface
 from slam_core.geometry import FloatArray
-from slam_core.memory import give_back, trim
+from slam_core.runtime.memory import give_back, trim
 from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray, DepthImage
 from stereo_frontend.sources import RawPair

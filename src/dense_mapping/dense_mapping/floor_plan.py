@@ -20,7 +20,7 @@ from dense_mapping.surface import Surface
 from slam_core.camera import MIN_DEPTH
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, make_transform, transform_points
-from slam_core.in_place import in_place
+from slam_core.runtime.in_place import in_place
 
 _CLEAR_BELOW = 0.6
 """Only rays lower than this above the floor make a cell free: a ray over a table does not."""

@@ -20,7 +20,6 @@ from dense_mapping.dense_stage import DenseStage
 from dense_mapping.plan_io import plan_names, write_plan
 from dense_mapping.surface_cloud import cloud_of
 from dense_mapping.surface_io import write_mesh
-from slam_core.base_node import SlamNode
 from slam_core.config import parameter
 from slam_core.health import State
 from slam_core.messages import (
@@ -38,14 +37,15 @@ from slam_core.messages import (
     stamp_ns,
 )
 from slam_core.messages.base import Message
+from slam_core.nodes.base_node import SlamNode
+from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.ros import below, run_node, sensor_qos
-from slam_core.stamp_guard import StampPolicy
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
-from stereo_frontend.calibrated_pairs import SIDES
-from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.sources import RawPair
 from stereo_frontend.stage import StereoStage
+from stereo_frontend.stereo.calibrated_pairs import SIDES
+from stereo_frontend.stereo.rectification_error import RectificationError
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import numpy as np
 import yaml
 
 from dense_mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
-from slam_core.files import atomic_path, atomic_text, read_yaml
 from slam_core.geometry import FloatArray, euler_from_rotation, make_transform, rotation_from_euler
+from slam_core.storage.files import atomic_path, atomic_text, read_yaml
 
 _PIXELS = {FREE: 254, OCCUPIED: 0, UNKNOWN: 205}
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196

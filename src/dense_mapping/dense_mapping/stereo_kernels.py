@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from slam_core.geometry import FloatArray
-from slam_core.in_place import in_place
+from slam_core.runtime.in_place import in_place
 from slam_core.types import ByteArray, Float32Array
 
 _SUMS = 6

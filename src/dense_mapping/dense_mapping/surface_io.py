@@ -11,7 +11,7 @@ import trimesh
 
 from dense_mapping.gltf import matt_glb
 from dense_mapping.surface import Surface
-from slam_core.files import atomic_path
+from slam_core.storage.files import atomic_path
 
 
 def write_points(path: Path, surface: Surface) -> None:

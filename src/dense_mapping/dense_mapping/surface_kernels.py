@@ -12,7 +12,7 @@ from numba import njit
 
 from dense_mapping.cube_triangles import Triangles
 from slam_core.geometry import FloatArray
-from slam_core.in_place import in_place
+from slam_core.runtime.in_place import in_place
 from slam_core.types import Float32Array
 
 Faces = npt.NDArray[np.int32]

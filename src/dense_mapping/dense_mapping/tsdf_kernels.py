@@ -12,7 +12,7 @@ from numba import njit
 
 from slam_core.camera import MIN_DEPTH
 from slam_core.geometry import FloatArray
-from slam_core.in_place import in_place
+from slam_core.runtime.in_place import in_place
 from slam_core.types import ByteArray, Float32Array
 
 BLOCK = 8

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_core.calibration_error import CalibrationErrorConfig
-from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, group, parameter
+from slam_core.estimation.calibration_error import CalibrationErrorConfig
+from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray
 
 

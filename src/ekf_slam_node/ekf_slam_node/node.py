@@ -29,8 +29,8 @@ from slam_core.messages import (
     transform_message,
 )
 from slam_core.messages.base import Message
+from slam_core.nodes.stage_node import StageNode
 from slam_core.ros import run_node
-from slam_core.stage_node import StageNode
 from slam_core.types import PoseEstimate, Submap
 
 _SUBMAPS_KEPT = 200

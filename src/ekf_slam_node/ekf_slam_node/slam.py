@@ -11,22 +11,29 @@ from functools import partial
 
 import numpy as np
 
-from ekf_slam_node.aids import AID_GATE, ALL, Aid, MotionAids, aid_error, contradicts
-from ekf_slam_node.candidates import motion_prior
-from ekf_slam_node.common_error import CommonError
+from ekf_slam_node.association.linking import FrameLink, Linker
 from ekf_slam_node.config import EkfSlamConfig
-from ekf_slam_node.ekf import TimeUpdate
-from ekf_slam_node.frame_input import frame_of_strongest, usable_features
-from ekf_slam_node.linking import FrameLink, Linker
-from ekf_slam_node.missed_frames import MissedFrames
-from ekf_slam_node.models import Frame, seconds_between
-from ekf_slam_node.motion_checks import StandingDetector, aided, explaining_sigma, is_known, is_surprising, widened
-from ekf_slam_node.noise_monitor import InnovationWatch, NoiseMonitor
-from ekf_slam_node.open_submap import Sight, pending_of
+from ekf_slam_node.filtering.candidates import motion_prior
+from ekf_slam_node.filtering.common_error import CommonError
+from ekf_slam_node.filtering.ekf import TimeUpdate
+from ekf_slam_node.filtering.models import Frame, seconds_between
+from ekf_slam_node.filtering.noise_monitor import InnovationWatch, NoiseMonitor
+from ekf_slam_node.odometry.aids import AID_GATE, ALL, Aid, MotionAids, aid_error, contradicts
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
-from ekf_slam_node.rolling_shutter import RollingShutter
-from ekf_slam_node.steps import LinkedFrame, UpdatedFrame
-from ekf_slam_node.submap_chain import SubmapChain
+from ekf_slam_node.submaps.frame_input import frame_of_strongest, usable_features
+from ekf_slam_node.submaps.missed_frames import MissedFrames
+from ekf_slam_node.submaps.motion_checks import (
+    StandingDetector,
+    aided,
+    explaining_sigma,
+    is_known,
+    is_surprising,
+    widened,
+)
+from ekf_slam_node.submaps.open_submap import Sight, pending_of
+from ekf_slam_node.submaps.rolling_shutter import RollingShutter
+from ekf_slam_node.submaps.steps import LinkedFrame, UpdatedFrame
+from ekf_slam_node.submaps.submap_chain import SubmapChain
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
 from slam_core.types import Counters, Features, ImuSample, PoseEstimate, RelativeMotion, Submap
 

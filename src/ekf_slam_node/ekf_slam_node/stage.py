@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.slam import EkfSlam
-from slam_core.awaited_streams import PATIENCE, AwaitedStreams
 from slam_core.config import parameter
 from slam_core.frame_tree import FrameTree
+from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams
 from slam_core.types import Counters, Features, ImuSample, RelativeMotion, Submap
 
 MOTION, IMU = "motion", "imu"

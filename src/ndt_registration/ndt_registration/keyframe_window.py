@@ -13,10 +13,10 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from ndt_registration.cloud import Cloud, evened, finite_points, is_planar, thinned
-from ndt_registration.pyramid import Pyramid
+from ndt_registration.clouds.cloud import Cloud, evened, finite_points, is_planar, thinned
+from ndt_registration.clouds.visibility import range_image
+from ndt_registration.methods.pyramid import Pyramid
 from ndt_registration.registration import IMAGE_SIZE, RegistrationConfig, Target, check_cloud
-from ndt_registration.visibility import range_image
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 
 

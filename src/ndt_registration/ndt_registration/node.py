@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ndt_registration.cloud import finite_points
+from ndt_registration.clouds.cloud import finite_points
 from ndt_registration.odometry import OdometryConfig, OdometryResult, OdometryStatus
 from ndt_registration.stage import Scan, ScanOdometryStage
 from slam_core.config import parameter
@@ -32,8 +32,8 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.motion import mean_twist
+from slam_core.nodes.stage_node import StageNode
 from slam_core.ros import run_node
-from slam_core.stage_node import StageNode
 from slam_core.types import AnyArray, PoseEstimate, RelativeMotion
 
 

@@ -18,8 +18,9 @@ import numpy.typing as npt
 
 from ndt_registration.gyro import Gyro, GyroConfig
 from ndt_registration.keyframe_window import KeyframeWindow, ScanPoints
+from ndt_registration.methods.pyramid import GridConfig
+from ndt_registration.methods.uncertainty import UncertaintyConfig
 from ndt_registration.motion_filter import MotionFilter, MotionFilterConfig, rotated
-from ndt_registration.pyramid import GridConfig
 from ndt_registration.registration import (
     DegenerateCloudError,
     RegistrationConfig,
@@ -29,7 +30,6 @@ from ndt_registration.registration import (
     for_dimension,
     register_cloud,
 )
-from ndt_registration.uncertainty import UncertaintyConfig
 from slam_core.config import Config, group
 from slam_core.geometry import FloatArray, boxminus, compose_jacobians, invert_transform
 from slam_core.types import RelativeMotion

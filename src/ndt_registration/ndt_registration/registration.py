@@ -3,8 +3,9 @@
 
 ``register(source, target) -> RegistrationResult``, one setting for every motion.
 
-Without an initial guess the pose is searched globally (:mod:`ndt_registration.search`), each promising pose is refined
-by NDT from coarse to fine, and the one that respects best what the target has seen, surfaces and free space, wins.
+Without an initial guess the pose is searched globally (:mod:`ndt_registration.methods.search`), each promising pose is
+refined by NDT from coarse to fine, and the one that respects best what the target has seen, surfaces and free space,
+wins.
 """
 
 from __future__ import annotations
@@ -14,16 +15,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from ndt_registration.ambiguity import ambiguity_reason, spread_of_neighbours
-from ndt_registration.cloud import Cloud, finite_points, is_planar, largest_extent, prepare, viewpoint
-from ndt_registration.descent import COARSE_POINTS, Answer, descend, orthonormal_pose, searched_minima
-from ndt_registration.icp import IcpConfig, IcpTarget, icp_align
-from ndt_registration.matching import block_gradients, fit_to_grid
-from ndt_registration.ndt import Layer, NdtOptimum, ndt_align
-from ndt_registration.pyramid import GridConfig, Pyramid
-from ndt_registration.score_loss import ScoreLoss
-from ndt_registration.search import Candidate, SearchConfig, Views, judge, planar_constraint
-from ndt_registration.uncertainty import (
+from ndt_registration.clouds.cloud import Cloud, finite_points, is_planar, largest_extent, prepare, viewpoint
+from ndt_registration.clouds.visibility import RangeImage, range_image
+from ndt_registration.methods.ambiguity import ambiguity_reason, spread_of_neighbours
+from ndt_registration.methods.descent import COARSE_POINTS, Answer, descend, orthonormal_pose, searched_minima
+from ndt_registration.methods.icp import IcpConfig, IcpTarget, icp_align
+from ndt_registration.methods.matching import block_gradients, fit_to_grid
+from ndt_registration.methods.ndt import Layer, NdtOptimum, ndt_align
+from ndt_registration.methods.pyramid import GridConfig, Pyramid
+from ndt_registration.methods.score_loss import ScoreLoss
+from ndt_registration.methods.search import Candidate, SearchConfig, Views, judge, planar_constraint
+from ndt_registration.methods.uncertainty import (
     Curvature,
     Extent,
     UncertaintyConfig,
@@ -33,7 +35,6 @@ from ndt_registration.uncertainty import (
     sandwich,
     unknown,
 )
-from ndt_registration.visibility import RangeImage, range_image
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import (
     FloatArray,

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from ndt_registration.odometry import OdometryConfig, OdometryResult, OdometryStatus, ScanOdometry
-from slam_core.awaited_streams import AwaitedStreams
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
 from slam_core.motion import motion_of_rig, pose_of_rig
+from slam_core.nodes.awaited_streams import AwaitedStreams
 from slam_core.types import AnyArray, Counters, ImuSample, PoseEstimate, RelativeMotion
 
 IMU = "imu"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from sjsam_node import storage
 from sjsam_node.storage import PackedMap, StoredMap
-from slam_core.files import PathLock, remove
+from slam_core.storage.files import PathLock, remove
 
 _SHARE = 20.0
 """Writing takes at most one part in so many of the time."""

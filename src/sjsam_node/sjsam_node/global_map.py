@@ -32,8 +32,8 @@ from sjsam_node.smoothing.map_snapshot import InnerPaths, MapLandmarks, MapSnaps
 from sjsam_node.smoothing.solver import SmootherConfig
 from sjsam_node.smoothing.state import EstimateState
 from sjsam_node.storage import StoredMap
-from slam_core.calibration_error import CalibrationErrorConfig
 from slam_core.config import Config, group, parameter
+from slam_core.estimation.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
 from slam_core.messages.poses import FARTHEST_M
 from slam_core.types import Counters, PoseEstimate, Submap

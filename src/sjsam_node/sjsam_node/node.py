@@ -32,7 +32,6 @@ from sjsam_node.node_config import SjsamNodeConfig, copy_path
 from sjsam_node.pose_tracker import PoseTracker
 from sjsam_node.smoothing.map_snapshot import ADVICE, MapSnapshot
 from sjsam_node.submap_order import SubmapOrder, gap_text
-from slam_core.base_node import SlamNode
 from slam_core.geometry import FloatArray
 from slam_core.health import State
 from slam_core.messages import (
@@ -46,9 +45,10 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.messages.submaps import SubmapMessages
+from slam_core.nodes.base_node import SlamNode
+from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.point_cloud import is_ply, write_ply
 from slam_core.ros import below, run_node
-from slam_core.stamp_guard import StampPolicy
 from slam_core.types import PoseEstimate, Submap
 
 T = TypeVar("T")

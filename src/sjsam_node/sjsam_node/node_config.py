@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sjsam_node.global_map import GlobalMapConfig
 from slam_core.config import parameter
-from slam_core.files import state_folder
+from slam_core.storage.files import state_folder
 
 
 @dataclass(frozen=True)

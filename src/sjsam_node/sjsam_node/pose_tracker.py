@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_core.geometry import FloatArray, compose_covariance, compose_jacobians, invert_transform
-from slam_core.stamp_guard import StampGuard
+from slam_core.nodes.stamp_guard import StampGuard
 from slam_core.types import PoseEstimate
 
 KEPT = 20000

@@ -26,7 +26,7 @@ from sjsam_node.map_validation import arrays_of, check_arrays, check_manifest
 from sjsam_node.marks import Mark, Marks
 from sjsam_node.smoothing.state import EstimateState
 from sjsam_node.smoothing.stored import estimate_arrays, stored_state
-from slam_core.files import MOST_BYTES, atomic_path, digest, naming, read_bytes, read_json, remove
+from slam_core.storage.files import MOST_BYTES, atomic_path, digest, naming, read_bytes, read_json, remove
 from slam_core.types import AnyArray, PoseEstimate, Submap
 
 FORMAT, VERSION = "indoor-slam-map", 6

@@ -14,8 +14,8 @@ import click
 import slam_core.process_life  # noqa: F401  # its clock starts with the program
 from slam_bringup.commands.console import log_to_terminal, with_verbosity
 from slam_bringup.version import VERSION
-from slam_core.blas_threads import use_one_blas_thread
-from slam_core.memory import search_less_garbage, share_one_heap
+from slam_core.runtime.blas_threads import use_one_blas_thread
+from slam_core.runtime.memory import search_less_garbage, share_one_heap
 
 # Before NumPy and SciPy are loaded, and for the programs that are started from here.
 use_one_blas_thread()

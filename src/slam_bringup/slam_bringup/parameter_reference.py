@@ -13,7 +13,7 @@ from typing import Any
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.overrides import NODE_CONFIGS
 from slam_core.config import Config, ParameterInfo, iterate_parameters
-from slam_core.input_config import InputConfig
+from slam_core.nodes.input_config import InputConfig
 
 _TOOLS = {
     "viewer": ("slam_bringup.viewer.viewer_node", "ViewerConfig"),

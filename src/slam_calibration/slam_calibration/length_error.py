@@ -17,7 +17,7 @@ import yaml
 
 from slam_calibration.bundle import POSE, LensState
 from slam_calibration.lens import project_with_jacobians
-from slam_core.calibration_error import CalibrationErrorConfig
+from slam_core.estimation.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, skew, transform_points
 
 DISTANCE = 3.0

@@ -15,8 +15,8 @@ import numpy as np
 import yaml
 
 from slam_core.camera import Camera, CameraInfo
-from slam_core.files import atomic_text, read_yaml
 from slam_core.geometry import FloatArray
+from slam_core.storage.files import atomic_text, read_yaml
 
 COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 """Number of distortion coefficients of each model that a ROS file may hold."""

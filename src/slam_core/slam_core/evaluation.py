@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_core.body_frame import body_offset
-from slam_core.chi_square import chi_square_bound
+from slam_core.estimation.body_frame import body_offset
+from slam_core.estimation.chi_square import chi_square_bound
+from slam_core.estimation.rigid_alignment import umeyama
 from slam_core.geometry import FloatArray, both_halves, boxminus, invert_transform, skew, so3_log
-from slam_core.rigid_alignment import umeyama
 from slam_core.trajectory import Trajectory
 
 ALIGNMENTS = ("se3", "origin", "none")

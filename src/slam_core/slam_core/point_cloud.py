@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import plyfile
 
-from slam_core.files import atomic_path
+from slam_core.storage.files import atomic_path
 from slam_core.types import Float32Array
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge to rclpy: message classes, parameters from a :class:`Config`, quality of service, and a node's life.
 
-The node base class is :class:`slam_core.base_node.SlamNode`.
+The node base class is :class:`slam_core.nodes.base_node.SlamNode`.
 """
 
 # rclpy is annotated in part only.
@@ -32,13 +32,13 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from slam_core.blas_threads import use_one_blas_thread
 from slam_core.config import Config, ParameterInfo, changed, from_mapping, iterate_parameters
 from slam_core.guarded_node import GuardedNode
-from slam_core.memory import search_less_garbage, share_one_heap
 from slam_core.messages import MessageTypes
 from slam_core.messages.base import Message
 from slam_core.process_life import INTERRUPTED, end_with_parent, on_request_to_end
+from slam_core.runtime.blas_threads import use_one_blas_thread
+from slam_core.runtime.memory import search_less_garbage, share_one_heap
 from slam_core.tf_message import tf_message_class
 from slam_core.types import AnyArray
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from slam_core.files import atomic_text, read_text
 from slam_core.geometry import (
     FloatArray,
     interpolate_transform,
@@ -19,6 +18,7 @@ from slam_core.geometry import (
     quaternion_from_rotation,
     transform_from_pose7,
 )
+from slam_core.storage.files import atomic_text, read_text
 from slam_core.types import PoseEstimate
 
 Stamps = npt.NDArray[np.int64]

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from slam_core.files import atomic_text, read_json
+from slam_core.storage.files import atomic_text, read_json
 
 Key = tuple[int, int]
 """Session and index of a submap of one agent."""

@@ -20,8 +20,6 @@ import numpy as np
 import numpy.typing as npt
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 
-from slam_core.base_node import SlamNode
-from slam_core.files import state_folder
 from slam_core.geometry import FloatArray
 from slam_core.messages import (
     SUBMAP_TOPICS,
@@ -35,8 +33,10 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.messages.submaps import SubmapMessages
+from slam_core.nodes.base_node import SlamNode
+from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.ros import run_node
-from slam_core.stamp_guard import StampPolicy
+from slam_core.storage.files import state_folder
 from slam_core.types import Submap
 from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from slam_core.files import PathLock, atomic_path, read_bytes
+from slam_core.storage.files import PathLock, atomic_path, read_bytes
 from slam_radio.index_ranges import Key
 from slam_radio.light_submap import MOST_BYTES, unpack
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from slam_core.files import read_text
+from slam_core.storage.files import read_text
 
 ADVICE = "the radio link needs Zenoh, which is not installed: pip install eclipse-zenoh"
 

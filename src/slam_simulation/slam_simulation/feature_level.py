@@ -22,7 +22,7 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import Features, FeatureSource, Float32Array
 from slam_simulation.scenario import Scenario
-from slam_simulation.stereo_sensor import StereoSensor
+from slam_simulation.sensors.stereo_sensor import StereoSensor
 
 DESCRIPTOR_SIZE = 128
 

@@ -27,16 +27,16 @@ from typing import Any
 import numpy as np
 
 from slam_core.config import Config, from_mapping, group, parameter
-from slam_core.files import read_yaml
-from slam_simulation.building import WALL_GAP, Doorway, Room, build_doorways, build_shell, room_walls
-from slam_simulation.furniture import Spot, chair, furnish_wall, pillar, table
-from slam_simulation.imu import ImuSensorConfig
-from slam_simulation.moving import add_moving
-from slam_simulation.profiles import PROFILES, REAL, REAL_STEREO, RealismConfig
-from slam_simulation.stereo_sensor import StereoSensorConfig
-from slam_simulation.tof_sensor import TofSensorConfig
+from slam_core.storage.files import read_yaml
+from slam_simulation.sensors.imu import ImuSensorConfig
+from slam_simulation.sensors.profiles import PROFILES, REAL, REAL_STEREO, RealismConfig
+from slam_simulation.sensors.stereo_sensor import StereoSensorConfig
+from slam_simulation.sensors.tof_sensor import TofSensorConfig
 from slam_simulation.trajectory import MOTION_STYLES, Path, SplinePath, StationPath, resolve_waypoints
-from slam_simulation.world import World
+from slam_simulation.world.building import WALL_GAP, Doorway, Room, build_doorways, build_shell, room_walls
+from slam_simulation.world.furniture import Spot, chair, furnish_wall, pillar, table
+from slam_simulation.world.moving import add_moving
+from slam_simulation.world.world import World
 
 SENSORS = ("stereo", "tof", "imu")
 _SUITE = (*SENSORS, "realism")
@@ -105,7 +105,7 @@ class Scenario:
     full_frames: int = 0
     """Frames of the whole motion, if ``frames`` has been cut."""
     profile: str = ""
-    """Profile, see :mod:`slam_simulation.profiles`; "" is ``ideal`` as long as nobody chooses."""
+    """Profile, see :mod:`slam_simulation.sensors.profiles`; "" is ``ideal`` as long as nobody chooses."""
 
     def __post_init__(self) -> None:
         if self.rate <= 0.0 or self.frames < 1:

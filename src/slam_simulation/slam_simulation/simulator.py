@@ -17,15 +17,15 @@ import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
 from slam_core.types import ByteArray, Float32Array, ImuSample
-from slam_simulation.finishes import finished
-from slam_simulation.imu import ImuSensor
-from slam_simulation.moving import MovingThings
-from slam_simulation.raycaster import Rays, camera_rays, make_view, trace
+from slam_simulation.rendering.raycaster import Rays, camera_rays, make_view, trace
 from slam_simulation.scenario import Scenario
-from slam_simulation.stereo_sensor import StereoSensor
-from slam_simulation.surface_table import SurfaceTable, compile_world
-from slam_simulation.tof_sensor import TofImages, TofSensor
+from slam_simulation.sensors.imu import ImuSensor
+from slam_simulation.sensors.stereo_sensor import StereoSensor
+from slam_simulation.sensors.tof_sensor import TofImages, TofSensor
 from slam_simulation.trajectory import rig_twist
+from slam_simulation.world.finishes import finished
+from slam_simulation.world.moving import MovingThings
+from slam_simulation.world.surface_table import SurfaceTable, compile_world
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,6 @@ from typing import Any
 
 from sensor_msgs.srv import SetCameraInfo
 
-from slam_core.base_node import SlamNode
-from slam_core.calibration_watch import CalibrationWatch
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.config import Config, parameter
@@ -34,10 +32,12 @@ from slam_core.messages import (
     stamp_ns,
 )
 from slam_core.messages.base import Message
+from slam_core.nodes.base_node import SlamNode
+from slam_core.nodes.calibration_watch import CalibrationWatch
 from slam_core.ros import run_node
-from stereo_frontend.calibrated_pairs import SIDES
 from stereo_frontend.sources import FolderSource, RawPair, SideBySideSource
 from stereo_frontend.stage import StereoStage
+from stereo_frontend.stereo.calibrated_pairs import SIDES
 
 _INFO_TOPIC = "stereo/{}/camera_info"
 _COLOUR_TOPIC = "stereo/left/image_rect_color"

@@ -18,12 +18,14 @@ from slam_core.camera import StereoCamera
 from slam_core.geometry import FloatArray
 from slam_core.types import Counters, DepthImage, Features, FeatureSource, Float32Array, StereoImages
 from stereo_frontend.assembly import DepthEstimate, make_features
-from stereo_frontend.depth_fusion import MappedDepth, fuse_depth, map_depth
-from stereo_frontend.disparity import RefinedDisparity, refine_disparity
-from stereo_frontend.features import FeatureConfig, FeatureExtractor
+from stereo_frontend.depth.depth_fusion import MappedDepth, fuse_depth, map_depth
+from stereo_frontend.depth.range_self_calibration import RangeDifferences, RangeSelfCalibration
+from stereo_frontend.depth.tof_features import TofFeatures
+from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
-from stereo_frontend.matching import (
+from stereo_frontend.stereo.disparity import RefinedDisparity, refine_disparity
+from stereo_frontend.stereo.matching import (
     Matches,
     disparity_bounds,
     has_consistent_neighbour,
@@ -31,13 +33,11 @@ from stereo_frontend.matching import (
     match_stereo,
     swapped_share,
 )
-from stereo_frontend.pixel_noise import PixelNoise
-from stereo_frontend.range_self_calibration import RangeDifferences, RangeSelfCalibration
-from stereo_frontend.self_calibration import StereoSelfCalibration
-from stereo_frontend.tof_features import TofFeatures
-from stereo_frontend.tracked_features import follow_or_detect
-from stereo_frontend.tracker import Followed, Tracker
-from stereo_frontend.two_view_consistency import StereoView
+from stereo_frontend.stereo.pixel_noise import PixelNoise
+from stereo_frontend.stereo.self_calibration import StereoSelfCalibration
+from stereo_frontend.stereo.two_view_consistency import StereoView
+from stereo_frontend.tracking.tracked_features import follow_or_detect
+from stereo_frontend.tracking.tracker import Followed, Tracker
 
 _MAX_RELATIVE_SIGMA = 0.35
 """Features whose depth sigma exceeds this share of their depth are dropped."""

@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from slam_core.config import Config, group, parameter
-from stereo_frontend.depth_fusion import FusionConfig
-from stereo_frontend.disparity import DisparityConfig
-from stereo_frontend.features import FeatureConfig
-from stereo_frontend.matching import MatchingConfig
-from stereo_frontend.pixel_noise import PixelNoiseConfig
-from stereo_frontend.range_self_calibration import RangeSelfCalibrationConfig
-from stereo_frontend.rectification_error import RectificationError
-from stereo_frontend.self_calibration import SelfCalibrationConfig
-from stereo_frontend.tof_features import TofFeatureConfig
+from stereo_frontend.depth.depth_fusion import FusionConfig
+from stereo_frontend.depth.range_self_calibration import RangeSelfCalibrationConfig
+from stereo_frontend.depth.tof_features import TofFeatureConfig
+from stereo_frontend.detection.features import FeatureConfig
+from stereo_frontend.stereo.disparity import DisparityConfig
+from stereo_frontend.stereo.matching import MatchingConfig
+from stereo_frontend.stereo.pixel_noise import PixelNoiseConfig
+from stereo_frontend.stereo.rectification_error import RectificationError
+from stereo_frontend.stereo.self_calibration import SelfCalibrationConfig
 
 MODES = ("stereo", "tof", "replace", "fuse")
 _TRACKED = ("stereo",)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from functools import partial
 
-from slam_core.calibration_watch import CalibrationWatch
 from slam_core.health import State
 from slam_core.messages import (
     FEATURE_TOPICS,
@@ -22,15 +21,16 @@ from slam_core.messages import (
     stamp_ns,
 )
 from slam_core.messages.base import Message
+from slam_core.nodes.calibration_watch import CalibrationWatch
+from slam_core.nodes.stage_node import StageNode
 from slam_core.ros import run_node
-from slam_core.stage_node import StageNode
 from slam_core.types import ByteArray, Features
-from stereo_frontend.annotate import annotated_image
-from stereo_frontend.calibrated_pairs import SIDES
+from stereo_frontend.depth.tof_features import CLIP, GAMMA, normalised_picture
+from stereo_frontend.detection.annotate import annotated_image
 from stereo_frontend.frontend_config import FrontendConfig
 from stereo_frontend.sources import RawPair
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
-from stereo_frontend.tof_features import CLIP, GAMMA, normalised_picture
+from stereo_frontend.stereo.calibrated_pairs import SIDES
 
 FEW_FEATURES = 20
 """Fewer features than this are reported as DEGRADED."""

@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.types import DepthImage, Features, StereoImages
-from stereo_frontend.calibrated_pairs import CalibratedPairs
-from stereo_frontend.corrected_info import corrected_right
-from stereo_frontend.depth_pairing import DepthPairing
+from stereo_frontend.depth.depth_pairing import DepthPairing
 from stereo_frontend.frontend import Frontend
 from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
-from stereo_frontend.rectification_error import RectificationError
-from stereo_frontend.rectify import StereoRectifier
 from stereo_frontend.sources import RawPair
+from stereo_frontend.stereo.calibrated_pairs import CalibratedPairs
+from stereo_frontend.stereo.corrected_info import corrected_right
+from stereo_frontend.stereo.rectification_error import RectificationError
+from stereo_frontend.stereo.rectify import StereoRectifier
 
 
 class StereoStage:

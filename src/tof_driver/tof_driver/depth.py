@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from slam_core.camera import Camera
 from slam_core.config import Config, group, parameter
-from slam_core.in_place import in_place
+from slam_core.runtime.in_place import in_place
 from slam_core.types import AnyArray, ByteArray, Counters, DepthImage, Float32Array
 from tof_driver.mask import (
     MAXIMUM_INCIDENCE_DEG,

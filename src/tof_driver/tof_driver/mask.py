@@ -13,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 
 from slam_core.config import Config, parameter
-from slam_core.in_place import in_place
+from slam_core.runtime.in_place import in_place
 from slam_core.types import ByteArray, Float32Array
 
 MAXIMUM_INCIDENCE_DEG = 75.0

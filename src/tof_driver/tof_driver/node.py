@@ -23,8 +23,6 @@ from typing import Any
 
 from sensor_msgs.srv import SetCameraInfo
 
-from slam_core.base_node import SlamNode
-from slam_core.calibration_watch import CalibrationWatch
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.config import parameter
@@ -43,6 +41,8 @@ from slam_core.messages import (
     stamp_ns,
 )
 from slam_core.messages.base import Message
+from slam_core.nodes.base_node import SlamNode
+from slam_core.nodes.calibration_watch import CalibrationWatch
 from slam_core.ros import run_node
 from slam_core.types import DepthImage
 from tof_driver.depth import DepthConfig

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from slam_core.camera import Camera
-from slam_core.in_place import in_place
+from slam_core.runtime.in_place import in_place
 from slam_core.types import ByteArray, Float32Array
 
 

@@ -10,7 +10,7 @@ from submap_world import Agent, circle, ring_world
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.smoothing.map_snapshot import STILL, _moving, _smoothing
-from slam_core.calibration_error import CalibrationErrorConfig
+from slam_core.estimation.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, make_transform
 from slam_core.types import PoseEstimate, Submap
 

@@ -24,7 +24,7 @@ from sjsam_node.smoothing.joining import JoiningProblem
 from sjsam_node.smoothing.problem import LocalMap, flatten
 from sjsam_node.smoothing.robust import LOSSES, RobustConfig, closing_rows, normalized_error, predicted, weight, widened
 from sjsam_node.smoothing.solver import EstimatorConfig, SmootherConfig
-from slam_core.chi_square import chi_square_bound
+from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import boxminus
 
 ROBUST = [loss for loss in LOSSES if loss != "none"]

@@ -22,8 +22,8 @@ from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import make_transform
 from slam_core.messages import compressed_image_message, header_message, image_message
 from slam_core.types import PoseEstimate
-from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.stage import StereoStage
+from stereo_frontend.stereo.rectification_error import RectificationError
 
 DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
 ORANGE = (240, 130, 20)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ekf_slam_node.planar import PlanarEkf
+from ekf_slam_node.planar.planar import PlanarEkf
 from slam_bringup.cli import slam
 from slam_bringup.planar.log import PlanarLog, RobotLog
 from slam_bringup.planar.mapping import METHODS, accuracy, dead_reckoning, map_log

@@ -20,8 +20,8 @@ from sjsam_node.smoothing.joining import JoiningProblem, map_residual
 from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten
 from sjsam_node.smoothing.robust import RobustConfig, RobustJoining, closing_rows
 from slam_core.config import Config, group, parameter
+from slam_core.estimation.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
 from slam_core.geometry import FloatArray, euler_from_rotation, rotation_from_euler
-from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
 from slam_core.linear_algebra.sparse_cholesky import BACKENDS, IntArray
 
 ROWS = ("joint", "block")

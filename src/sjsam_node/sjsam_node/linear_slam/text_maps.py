@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_core.files import read_text
 from slam_core.geometry import FloatArray
 from slam_core.linear_algebra.sparse_cholesky import IntArray
+from slam_core.storage.files import read_text
 
 
 @dataclass(frozen=True, eq=False)

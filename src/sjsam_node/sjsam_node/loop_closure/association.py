@@ -16,8 +16,8 @@ import numpy.typing as npt
 from numba import njit
 
 from sjsam_node.graph.links import Prior
-from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, parameter
+from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxplus, skew, transform_points
 from slam_core.linear_algebra import blas
 from slam_core.linear_algebra.small_kernels import solved_square

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from sjsam_node.graph.links import Link, Prior
-from slam_core.chi_square import chi_square_bound
+from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxminus, compose_covariance
 
 Hop = Callable[[int, int], Prior | None]

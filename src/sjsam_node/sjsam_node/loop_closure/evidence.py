@@ -29,7 +29,7 @@ from sjsam_node.loop_closure.association import (
     variance_factor,
     variances_seen,
 )
-from slam_core.chi_square import chi_square_bound
+from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import transform_points
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 

@@ -17,7 +17,7 @@ from sjsam_node.loop_closure.association import variance_factor
 from sjsam_node.loop_closure.consistency import ConsistencyConfig, Verdict
 from sjsam_node.loop_closure.pairwise import support_of
 from sjsam_node.smoothing.state import EstimateState
-from slam_core.chi_square import chi_square_bound
+from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 

@@ -16,7 +16,7 @@ from sjsam_node.graph.links import Link, Status
 from sjsam_node.graph.map_graph import BoolArray, MapGraph
 from sjsam_node.loop_closure.consistency import ConsistencyConfig, is_among
 from sjsam_node.loop_closure.verification import ClosureConfig
-from slam_core.chi_square import chi_square_bound
+from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxminus
 
 

@@ -24,11 +24,11 @@ from sjsam_node.loop_closure.association import (
 )  # fmt: skip
 from sjsam_node.loop_closure.evidence import evidence_of
 from sjsam_node.loop_closure.place_recognition import PlaceRecognitionConfig
-from slam_core.chi_square import chi_square_bound
 from slam_core.config import Config, group, parameter
+from slam_core.estimation.chi_square import chi_square_bound
+from slam_core.estimation.rigid_alignment import ransac_rigid_transform
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.linear_algebra.sparse_cholesky import IntArray
-from slam_core.rigid_alignment import ransac_rigid_transform
 
 
 @dataclass(frozen=True)

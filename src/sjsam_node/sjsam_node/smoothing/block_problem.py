@@ -19,8 +19,8 @@ from sjsam_node.smoothing.joining import solved_covariance, variable_scalars
 from sjsam_node.smoothing.layout import Layout, make_layout
 from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, flatten
 from sjsam_node.smoothing.sighting_kernels import KERNELS, counting_order, pair_positions, pose_pairs
+from slam_core.estimation.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
 from slam_core.geometry import FloatArray
-from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
 from slam_core.linear_algebra.block_pattern import IntArray, pointers
 from slam_core.linear_algebra.sparse_cholesky import SparseCholesky
 

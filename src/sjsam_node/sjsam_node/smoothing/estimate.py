@@ -21,7 +21,7 @@ from sjsam_node.smoothing.marginals import prior_of_pair, relative_pose, seen_fr
 from sjsam_node.smoothing.solver import SmootherConfig, optimize_full, relinearized, simplified
 from sjsam_node.smoothing.state import EstimateState, with_links, with_submap
 from slam_core.geometry import FloatArray, compose_covariance
-from slam_core.memory import trim
+from slam_core.runtime.memory import trim
 from slam_core.types import Submap
 
 

@@ -19,8 +19,8 @@ import numpy as np
 from sjsam_node.smoothing import kernels
 from sjsam_node.smoothing.layout import Layout, make_layout
 from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap
+from slam_core.estimation.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
 from slam_core.geometry import FloatArray
-from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
 from slam_core.linear_algebra.block_pattern import IntArray
 from slam_core.linear_algebra.multifrontal import InversePanels
 from slam_core.linear_algebra.sparse_cholesky import Entries, SparseCholesky

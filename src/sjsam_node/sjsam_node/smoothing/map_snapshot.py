@@ -7,7 +7,7 @@ gain with which the end, once known better, corrects it (a Rauch-Tung-Striebel s
 Submaps that contradict one another more than they claim possible are too sure of themselves, each as much as the
 others as far as the map can tell: every covariance that goes out is multiplied by the component's variance factor, chi2
 per degree of freedom (the "variance of unit weight"; Baarda 1968), never below one. What the cameras' calibration errs
-by, common to all submaps, is added to what goes out and nowhere else (:mod:`slam_core.calibration_error`).
+by, common to all submaps, is added to what goes out and nowhere else (:mod:`slam_core.estimation.calibration_error`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sjsam_node.graph.map_graph import BoolArray, MapGraph, Record
 from sjsam_node.marks import Marks
 from sjsam_node.smoothing.marginals import ComponentMarginals
 from sjsam_node.smoothing.state import EstimateState
-from slam_core.calibration_error import (
+from slam_core.estimation.calibration_error import (
     CalibrationErrorConfig,
     covariance_of_calibration,
     point_covariances_of_calibration,

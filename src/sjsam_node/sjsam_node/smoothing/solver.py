@@ -31,8 +31,8 @@ from sjsam_node.smoothing.reduction import RecoveredLandmarks, ReducedMap
 from sjsam_node.smoothing.robust import RobustConfig, RobustJoining, closing_rows, predicted
 from sjsam_node.smoothing.state import EstimateState, SolvedComponent, with_exactly, with_links, without
 from slam_core.config import Config, group, parameter
+from slam_core.estimation.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
 from slam_core.geometry import FloatArray, make_transform
-from slam_core.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
 from slam_core.linear_algebra.sparse_cholesky import BACKENDS
 
 _UNMOVED = 1e-4

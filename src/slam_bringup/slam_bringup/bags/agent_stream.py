@@ -12,8 +12,8 @@ from slam_bringup.bags.left_out import LeftOut
 from slam_bringup.bags.readings import AgentPairing, AgentSensors, Reading, SessionStart
 from slam_core.messages import stamp_ns
 from slam_core.messages.base import Message
-from slam_core.stamp_guard import StampDecision, StampGuard
-from slam_core.synchronizer import PAIRING_TOLERANCE_S
+from slam_core.nodes.stamp_guard import StampDecision, StampGuard
+from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S
 
 _UNPAIRED = f"images without a partner within {1000 * PAIRING_TOLERANCE_S:g} ms of their stamp"
 _FOLLOWING = ("imu",)

@@ -37,9 +37,9 @@ from slam_bringup.bags.bag_owner import OWNER, require_free
 from slam_bringup.bags.bag_salvage import is_whole_mcap, salvage_mcap
 from slam_bringup.bags.bag_types import typestore
 from slam_bringup.bags.ros1_bag import Ros1Reader
-from slam_core.files import atomic_text, name_file, naming, replace
 from slam_core.messages.base import Message
-from slam_core.output_folder import free_name
+from slam_core.storage.files import atomic_text, name_file, naming, replace
+from slam_core.storage.output_folder import free_name
 
 LATCHED_TOPICS = ("tf_static", "static_transforms", "robot_description")
 """Last parts of topics that are transient-local wherever they stand."""

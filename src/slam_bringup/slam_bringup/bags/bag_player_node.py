@@ -21,7 +21,6 @@ from std_srvs.srv import Trigger
 from slam_bringup.bags.bag import BagReader, RawMessage
 from slam_bringup.bags.extrinsics import StaticTransform
 from slam_bringup.bags.pacing import Connections, FlowControl, ReplayClock, RequiredSubscribers, header_stamp_ns
-from slam_core.base_node import PROGRESS_TOPIC
 from slam_core.config import Config, parameter
 from slam_core.messages import (
     STATIC_TRANSFORMS_TOPIC,
@@ -30,6 +29,7 @@ from slam_core.messages import (
     stamp_ns,
     time_message,
 )
+from slam_core.nodes.base_node import PROGRESS_TOPIC
 from slam_core.ros import RosTypes, declare_config, message_class, run_node, sensor_qos
 
 _DEPTH = 200

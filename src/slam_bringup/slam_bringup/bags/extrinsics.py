@@ -10,8 +10,8 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import yaml
 
-from slam_core.files import read_yaml
 from slam_core.geometry import FloatArray, pose7_from_transform, quaternion_from_rotation, transform_from_pose7
+from slam_core.storage.files import read_yaml
 
 EXTRINSICS, URDF = "extrinsics.yaml", "extrinsics.urdf"
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from slam_bringup.bags.readings import DepthReading, ImuReading, Reading, StereoReading
 from slam_core.geometry import FloatArray
-from slam_core.synchronizer import PAIRING_TOLERANCE_S
+from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S
 
 Stamps = npt.NDArray[np.int64]
 Span = tuple[int, int]

@@ -21,7 +21,7 @@ from slam_core.messages import (
     stamp_ns,
 )
 from slam_core.messages.base import Message
-from slam_core.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
+from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
 from slam_core.types import ByteArray, ImuSample
 from stereo_frontend.sources import RawPair
 from tof_driver.stage import RawDepth

@@ -50,7 +50,6 @@ from slam_bringup.bags.readings import (
 )
 from slam_bringup.bags.rig_calibration import RigCalibration
 from slam_bringup.bags.sensor_topics import BagNames, find_agents, is_rectified, join, other_cameras, topics_of
-from slam_core.calibration_watch import CalibrationWatch
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.messages import (
@@ -60,6 +59,7 @@ from slam_core.messages import (
     transform_from_message,
 )
 from slam_core.messages.base import Message
+from slam_core.nodes.calibration_watch import CalibrationWatch
 from slam_core.trajectory import Trajectory
 
 R = TypeVar("R", bound=Reading | InfoReading)

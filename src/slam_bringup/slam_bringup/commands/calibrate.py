@@ -33,9 +33,9 @@ from slam_calibration.report import (
 from slam_calibration.rig import calibrate
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
-from slam_core.files import atomic_text
 from slam_core.geometry import FloatArray, both_halves, make_transform
-from slam_core.output_folder import OutputFolder
+from slam_core.storage.files import atomic_text
+from slam_core.storage.output_folder import OutputFolder
 
 CAMERAS = {"mono": ("camera",), "stereo": ("left", "right"), "stereo-tof": ("left", "tof")}
 FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_frame", "tof": "tof_optical_frame"}

@@ -31,8 +31,8 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from slam_core.files import atomic_text
 from slam_core.process_life import STARTED_S
+from slam_core.storage.files import atomic_text
 
 LOG_NAME = "slam.log"
 """The log of a run, in the folder of logs beside its results."""

@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.table import Table
 
 from slam_bringup.commands.paths import UserPath, overwrite_option
-from slam_core.body_frame import describe
+from slam_core.estimation.body_frame import describe
 from slam_core.evaluation import ALIGNMENTS, ErrorStatistics, Evaluation, TruthAccuracy, evaluate
 from slam_core.geometry import FloatArray
-from slam_core.output_file import OutputFile
+from slam_core.storage.output_file import OutputFile
 from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajectory
 
 

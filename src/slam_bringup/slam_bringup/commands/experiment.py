@@ -18,8 +18,8 @@ from slam_bringup.experiments.findings import Experiment, as_json
 from slam_bringup.experiments.job import in_order
 from slam_bringup.experiments.page import write_markdown, write_page
 from slam_bringup.experiments.runner import run_jobs
-from slam_core.files import atomic_text
-from slam_core.output_folder import OutputFolder
+from slam_core.storage.files import atomic_text
+from slam_core.storage.output_folder import OutputFolder
 
 
 @click.command(epilog=f"\b\nExperiments:\n{listing()}")

@@ -18,8 +18,8 @@ from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.report.joined_map import draw_joined
 from slam_core.config import from_mapping
-from slam_core.files import atomic_text, read_yaml
-from slam_core.output_folder import OutputFolder
+from slam_core.storage.files import atomic_text, read_yaml
+from slam_core.storage.output_folder import OutputFolder
 
 
 @click.command("join")

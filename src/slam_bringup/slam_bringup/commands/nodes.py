@@ -27,7 +27,7 @@ from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.start_map import StartMap
 from slam_bringup.report.summary_table import summary_table
 from slam_bringup.version import VERSION
-from slam_core.output_folder import LOGS, OutputFolder
+from slam_core.storage.output_folder import LOGS, OutputFolder
 
 _PAGE_PORT = 8080
 """Port of the page, where it is free."""

@@ -11,14 +11,14 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from ekf_slam_node.planar import PlanarEkf
+from ekf_slam_node.planar.planar import PlanarEkf
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.planar.log import PlanarLog
 from slam_bringup.planar.mapping import ASSOCIATIONS, METHODS, map_log
 from slam_bringup.planar.output import draw, summarise, write_tables
 from slam_bringup.planar.readers import read_log
-from slam_core.files import atomic_text
-from slam_core.output_folder import OutputFolder
+from slam_core.storage.files import atomic_text
+from slam_core.storage.output_folder import OutputFolder
 
 
 @click.command("plane")
@@ -76,7 +76,9 @@ def command(
 def _filter_of(implementation: str) -> type[PlanarEkf]:
     if implementation == "own":
         return PlanarEkf
-    from ekf_slam_node.planar_filterpy import FilterpyPlanarEkf  # a third of a second to import, and needed here alone
+    from ekf_slam_node.planar.planar_filterpy import (
+        FilterpyPlanarEkf,  # a third of a second to import, and needed here alone
+    )
 
     return FilterpyPlanarEkf
 

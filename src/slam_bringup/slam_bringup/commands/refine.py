@@ -25,10 +25,10 @@ from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile
-from slam_core.files import atomic_text
+from slam_core.storage.files import atomic_text
 from slam_core.types import Features
-from stereo_frontend.corrected_info import corrected_right
 from stereo_frontend.frontend_config import FrontendReport
+from stereo_frontend.stereo.corrected_info import corrected_right
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ndt_registration.cloud import finite_points
-from ndt_registration.cloud_io import read_cloud
+from ndt_registration.clouds.cloud import finite_points
+from ndt_registration.clouds.cloud_io import read_cloud
 from ndt_registration.registration import RegistrationConfig, RegistrationResult, register
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_core.config import from_mapping
-from slam_core.files import atomic_text, read_text, read_yaml
 from slam_core.geometry import (
     FloatArray,
     make_transform,
@@ -27,7 +26,8 @@ from slam_core.geometry import (
     transform_from_pose7,
     transform_points,
 )
-from slam_core.output_folder import OutputFolder
+from slam_core.storage.files import atomic_text, read_text, read_yaml
+from slam_core.storage.output_folder import OutputFolder
 
 NOT_REGISTERED = 1
 """Exit code where the clouds could not be registered; the result is printed and written all the same."""

@@ -26,7 +26,7 @@ from slam_bringup.processes.interrupt import MAP, STOPPED, Interrupt, giving_up
 from slam_bringup.report.early_output import EarlyOutput
 from slam_bringup.report.summary_table import summary_table
 from slam_bringup.version import VERSION
-from slam_core.output_folder import LOGS, OutputFolder
+from slam_core.storage.output_folder import LOGS, OutputFolder
 
 
 @click.command()

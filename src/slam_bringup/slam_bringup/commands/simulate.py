@@ -35,10 +35,10 @@ from slam_core.geometry import FloatArray
 from slam_core.messages import compressed_image_message, header_message, transform_message
 from slam_core.types import ByteArray
 from slam_simulation import Scenario, SimulatedFrame, Simulator
-from slam_simulation.profiles import PROFILES
-from slam_simulation.stereo_sensor import SIDES
-from slam_simulation.surface_table import compile_world
-from slam_simulation.tof_sensor import TofImages
+from slam_simulation.sensors.profiles import PROFILES
+from slam_simulation.sensors.stereo_sensor import SIDES
+from slam_simulation.sensors.tof_sensor import TofImages
+from slam_simulation.world.surface_table import compile_world
 
 IMAGE_FORMATS = ("raw", "png", "jpeg")
 

@@ -26,8 +26,8 @@ import yaml
 from slam_bringup.bags.sensor_writer import IMU_FRAME, LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_bringup.datasets.files import StampedPair, existing, read_grey, refuse_rate
 from slam_core.camera import Camera, CameraInfo
-from slam_core.files import read_text
 from slam_core.geometry import FloatArray, invert_transform, make_transform
+from slam_core.storage.files import read_text
 from slam_core.trajectory import Trajectory, read_trajectory
 from slam_core.types import ImuSample
 

@@ -17,8 +17,8 @@ import numpy as np
 from slam_bringup.bags.sensor_writer import LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_bringup.datasets.files import START_NS, Clock, StampedPair, existing, read_grey, refuse_rate
 from slam_core.camera import Camera, CameraInfo
-from slam_core.files import read_text
 from slam_core.geometry import FloatArray, invert_transform, make_transform
+from slam_core.storage.files import read_text
 from slam_core.trajectory import read_trajectory
 
 _FOLDERS = (("image_0", "image_1"), ("image_l", "image_r"), ("image_2", "image_3"))

@@ -31,9 +31,9 @@ from slam_bringup.datasets.picture_registration import ColourCamera, register_pi
 from slam_bringup.datasets.tum_rgbd import camera_of, read_pairs
 from slam_core.camera import Camera, CameraInfo
 from slam_core.camera_info import read_camera_info
-from slam_core.files import read_text
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, invert_transform, make_transform, transform_from_pose7
 from slam_core.messages import rectified_info
+from slam_core.storage.files import read_text
 from slam_core.trajectory import read_trajectory
 from slam_core.types import AnyArray
 from tof_driver.depth import MILLIMETRES_INVALID

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_bringup.datasets.files import START_NS, StampedPair, existing, refuse_rate
-from slam_core.files import read_text
+from slam_core.storage.files import read_text
 
 LISTS = ("rgb.txt", "depth.txt")
 _PAIRING_NS = 20_000_000

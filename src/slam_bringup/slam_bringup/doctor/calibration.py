@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_bringup.doctor.evidence import Evidence
 from slam_bringup.doctor.finding import Finding
-from stereo_frontend.rectify import stereo_camera_from_infos
+from stereo_frontend.stereo.rectify import stereo_camera_from_infos
 
 _LARGEST_BASELINE_M, _SMALLEST_BASELINE_M = 3.0, 0.005
 _WIDEST_DEG, _NARROWEST_DEG = 175.0, 15.0

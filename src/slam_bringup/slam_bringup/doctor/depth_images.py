@@ -14,7 +14,7 @@ from slam_bringup.doctor.stereo_images import match_pairs
 from slam_core.camera import MIN_DEPTH, Camera
 from slam_core.geometry import FloatArray, transform_points
 from slam_core.types import AnyArray
-from stereo_frontend.rectify import stereo_camera_from_infos
+from stereo_frontend.stereo.rectify import stereo_camera_from_infos
 
 _FARTHEST_M, _NEAREST_M, _FEWEST_VALID = 40.0, MIN_DEPTH, 0.02
 _FEWEST, _SCALE, _SPREAD = 40, 0.1, 0.045

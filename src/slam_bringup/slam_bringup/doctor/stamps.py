@@ -12,9 +12,9 @@ import numpy as np
 from slam_bringup.doctor.evidence import Evidence, Stamps, Stream
 from slam_bringup.doctor.finding import Finding
 from slam_core.geometry import FloatArray
-from slam_core.stamp_guard import StampDecision, StampFault, StampGuard
-from slam_core.synchronizer import PAIRING_TOLERANCE_S
-from stereo_frontend.depth_fusion import FusionConfig
+from slam_core.nodes.stamp_guard import StampDecision, StampFault, StampGuard
+from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S
+from stereo_frontend.depth.depth_fusion import FusionConfig
 
 _LOST_SHARE = 0.03
 _KEY_FRAMES_SHARE = 0.6

@@ -14,7 +14,7 @@ from slam_bringup.doctor.evidence import BURST, Evidence
 from slam_bringup.doctor.finding import Finding
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray
-from stereo_frontend.rectify import StereoRectifier
+from stereo_frontend.stereo.rectify import StereoRectifier
 
 _PAIRS_PER_BURST = 3
 _MOST_PIXELS = 160_000

@@ -11,10 +11,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ekf_slam_node.association import associate_ccda, associate_jcbb, associate_mahalanobis, associate_nearest
-from ekf_slam_node.candidates import Candidates, MotionPrior
+from ekf_slam_node.association.association import (
+    associate_ccda,
+    associate_jcbb,
+    associate_mahalanobis,
+    associate_nearest,
+)
 from ekf_slam_node.config import FeatureAssociationConfig
-from ekf_slam_node.models import Frame, frame_from_features, rig_points
+from ekf_slam_node.filtering.candidates import Candidates, MotionPrior
+from ekf_slam_node.filtering.models import Frame, frame_from_features, rig_points
 from slam_bringup.experiments import thesis
 from slam_bringup.experiments.filter_maps import map_figure, maps
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table

@@ -17,7 +17,7 @@ from slam_bringup.experiments.findings import Comparison, Experiment, Findings, 
 from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept, load
 from slam_core.geometry import transform_points
 from slam_simulation import Scenario
-from slam_simulation.surface_distance import distance_to_surfaces
+from slam_simulation.rendering.surface_distance import distance_to_surfaces
 
 MODULE = "slam_bringup.experiments.dense"
 _SCENARIO = "workshop_rig"

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from slam_bringup.experiments import plots
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, ByteArray, StereoImages
-from stereo_frontend.features import FeatureConfig, FeatureExtractor
-from stereo_frontend.matching import MatchingConfig, disparity_bounds, match_stereo
+from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
+from stereo_frontend.stereo.matching import MatchingConfig, disparity_bounds, match_stereo
 
 _SHOWN_RATIO = 99.5
 """Percentile of a derivative's size that is drawn white or black."""

@@ -24,11 +24,11 @@ from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_bringup.experiments.true_frames import TrueFrame, simulated_frames, spread, transfer
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.types import ByteArray, DepthImage
-from stereo_frontend.depth_lookup import sample_depth
-from stereo_frontend.features import DETECTORS, FeatureConfig, FeatureExtractor
+from stereo_frontend.depth.depth_lookup import sample_depth
+from stereo_frontend.depth.tof_features import CLIP, GAMMA, normalised_picture
+from stereo_frontend.detection.features import DETECTORS, FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
-from stereo_frontend.surf import SurfConfig
-from stereo_frontend.tof_features import CLIP, GAMMA, normalised_picture
+from stereo_frontend.surf.surf import SurfConfig
 
 MODULE = "slam_bringup.experiments.features"
 _PACKAGES = (*RENDERING, "stereo_frontend", "tof_driver", "slam_bringup.experiments.true_frames")

@@ -15,12 +15,12 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from ekf_slam_node.config import EkfSlamConfig, FeatureAssociationConfig, MotionConfig
-from ekf_slam_node.ekf import Ekf
-from ekf_slam_node.models import CORE_DIM, Frame, frame_from_features, observe, rig_points, seconds_between
+from ekf_slam_node.filtering.ekf import Ekf
+from ekf_slam_node.filtering.models import CORE_DIM, Frame, frame_from_features, observe, rig_points, seconds_between
 from ekf_slam_node.slam import EkfSlam
 from slam_bringup.experiments import plots
 from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
-from slam_core.chi_square import chi_square_bound
+from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, invert_transform
 from slam_simulation import Scenario
 from slam_simulation.feature_level import FeatureFrame, FeatureLevelConfig, FeatureSimulator

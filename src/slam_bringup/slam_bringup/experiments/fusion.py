@@ -17,7 +17,7 @@ from slam_bringup.experiments.findings import Comparison, Experiment, Findings, 
 from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept
 from slam_bringup.experiments.true_frames import simulated_frames, true_depth
 from slam_core.geometry import invert_transform, transform_points
-from stereo_frontend.features import FeatureConfig, FeatureExtractor
+from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.frontend_config import MODES
 
 MODULE = "slam_bringup.experiments.fusion"

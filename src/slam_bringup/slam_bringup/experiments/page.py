@@ -13,7 +13,7 @@ import jinja2
 
 from slam_bringup.experiments.answers import answers
 from slam_bringup.experiments.catalogue import EXPERIMENTS
-from slam_core.files import atomic_text
+from slam_core.storage.files import atomic_text
 
 _PREAMBLE = """\
 # Experiments

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from ekf_slam_node.planar import PlanarConfig, PlanarEkf, wrap
-from ekf_slam_node.planar_sam import PlanarGraph, PlanarMap, cost, smooth
+from ekf_slam_node.planar.planar import PlanarConfig, PlanarEkf, wrap
+from ekf_slam_node.planar.planar_sam import PlanarGraph, PlanarMap, cost, smooth
 from slam_bringup.experiments import plots, thesis
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table
 from slam_bringup.experiments.job import RENDERING, Job, JobResult, Kept

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from ndt_registration.pyramid import GridConfig
+from ndt_registration.methods.pyramid import GridConfig
 from ndt_registration.registration import RegistrationConfig, register
 from slam_bringup.experiments import plots, thesis
 from slam_bringup.experiments.chain import mapped

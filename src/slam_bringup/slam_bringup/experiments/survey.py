@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ekf_slam_node.planar import PlanarConfig, PlanarEkf
-from ekf_slam_node.planar_independent import IndependentSubmaps
-from ekf_slam_node.planar_sam import smooth
-from ekf_slam_node.planar_seif import PlanarSeif
+from ekf_slam_node.planar.planar import PlanarConfig, PlanarEkf
+from ekf_slam_node.planar.planar_independent import IndependentSubmaps
+from ekf_slam_node.planar.planar_sam import smooth
+from ekf_slam_node.planar.planar_seif import PlanarSeif
 from sjsam_node.linear_slam.text_joining import join_text_maps
 from slam_bringup.experiments import thesis
 from slam_bringup.experiments.findings import Comparison, Experiment, Findings, Picture, Table

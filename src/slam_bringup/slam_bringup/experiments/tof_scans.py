@@ -7,8 +7,8 @@ import numpy as np
 
 from slam_core.geometry import FloatArray, invert_transform, make_transform, rotation_from_euler
 from slam_simulation.scenario import Scenario
-from slam_simulation.surface_table import compile_world
-from slam_simulation.tof_sensor import TofSensor
+from slam_simulation.sensors.tof_sensor import TofSensor
+from slam_simulation.world.surface_table import compile_world
 from tof_driver.depth import DepthConfig, DepthProcessor
 
 SCANS = 15

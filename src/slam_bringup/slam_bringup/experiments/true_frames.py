@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_core.estimation.least_squares import MAD_TO_SIGMA
 from slam_core.geometry import FloatArray, invert_transform, transform_points
-from slam_core.least_squares import MAD_TO_SIGMA
 from slam_core.types import DepthImage, StereoImages
 from slam_simulation import Scenario, Simulator
 from slam_simulation.simulator import DepthTruth
-from stereo_frontend.rectify import StereoRectifier
+from stereo_frontend.stereo.rectify import StereoRectifier
 from tof_driver.depth import DepthConfig, DepthProcessor
 
 

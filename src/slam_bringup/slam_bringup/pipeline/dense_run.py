@@ -20,8 +20,8 @@ from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray, DepthImage
-from stereo_frontend.rectification_error import RectificationError
 from stereo_frontend.stage import StereoStage
+from stereo_frontend.stereo.rectification_error import RectificationError
 from tof_driver.stage import DepthStage
 
 

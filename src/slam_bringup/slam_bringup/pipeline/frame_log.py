@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from slam_core.types import ByteArray, Features
-from stereo_frontend.annotate import annotated_image
+from stereo_frontend.depth.tof_features import normalised_picture
+from stereo_frontend.detection.annotate import annotated_image
 from stereo_frontend.stage import ExtractedFrame
-from stereo_frontend.tof_features import normalised_picture
 
 _MOST = 1500
 """Frames kept; beyond that every other one goes."""

@@ -21,8 +21,8 @@ from slam_bringup.pipeline.configuration import SystemConfig, filter_config
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges
 from slam_bringup.pipeline.sensor_pipeline import AgentItem
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_core.memory import give_back, leave_libraries
 from slam_core.messages import motion_as_received, rounded
+from slam_core.runtime.memory import give_back, leave_libraries
 from slam_core.types import Features, ImuSample, PoseEstimate, Submap
 
 _LOADED = 1, 4

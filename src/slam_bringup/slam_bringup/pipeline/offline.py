@@ -29,7 +29,7 @@ from slam_bringup.pipeline.results import RunResult
 from slam_bringup.pipeline.run_record import run_result, told
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_core.memory import give_back, keep_little
+from slam_core.runtime.memory import give_back, keep_little
 from slam_core.types import ImuSample
 
 _LOG = logging.getLogger(__name__)

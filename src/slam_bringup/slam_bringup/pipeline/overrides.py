@@ -27,7 +27,7 @@ from typing import Any
 import yaml
 
 from slam_core.config import Config, iterate_parameters
-from slam_core.files import read_yaml
+from slam_core.storage.files import read_yaml
 
 NODE_CONFIGS = {
     "stereo_driver": ("stereo_frontend.driver_node", "StereoDriverConfig"),
@@ -41,7 +41,7 @@ NODE_CONFIGS = {
 }
 """Module and class of each node's own configuration; the modules need ROS."""
 
-_BASE_CONFIG = ("slam_core.listening_node", "InputConfig", "input.")
+_BASE_CONFIG = ("slam_core.nodes.listening_node", "InputConfig", "input.")
 _EVERY_NODE = "/**"
 _ROS_LEVEL = "ros__parameters"
 _ROS_OWN = ("use_sim_time", "qos_overrides.", "start_type_description_service")

@@ -20,7 +20,7 @@ from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_bringup.pipeline.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
 from slam_core.config import iterate_parameters
 from slam_core.geometry import FloatArray
-from slam_core.memory import give_back
+from slam_core.runtime.memory import give_back
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
 from stereo_frontend.frontend_config import FrontendReport

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from slam_core.config import Config, parameter
-from slam_core.stamp_guard import StampFault
+from slam_core.nodes.stamp_guard import StampFault
 
 
 @dataclass(frozen=True)

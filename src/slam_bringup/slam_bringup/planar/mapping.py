@@ -16,17 +16,17 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from ekf_slam_node.planar import PlanarConfig, PlanarEkf, move, wrap
-from ekf_slam_node.planar_sam import PlanarGraph, PlanarMap, pose_covariances, sighting_nis, smooth
+from ekf_slam_node.planar.planar import PlanarConfig, PlanarEkf, move, wrap
+from ekf_slam_node.planar.planar_sam import PlanarGraph, PlanarMap, pose_covariances, sighting_nis, smooth
 from sjsam_node.linear_slam.text_joining import join_text_maps
 from sjsam_node.linear_slam.text_maps import TextMap
 from slam_bringup.planar.log import PlanarLog, RobotLog
 from slam_bringup.planar.naming import named
-from slam_core.chi_square import chi_square_bound
+from slam_core.estimation.chi_square import chi_square_bound
+from slam_core.estimation.least_squares import LevenbergMarquardtConfig
+from slam_core.estimation.rigid_alignment import umeyama
 from slam_core.evaluation import nees
 from slam_core.geometry import FloatArray
-from slam_core.least_squares import LevenbergMarquardtConfig
-from slam_core.rigid_alignment import umeyama
 
 METHODS = ("ekf", "sam", "submaps")
 ASSOCIATIONS = ("known", "hypotheses", "nearest", "mahalanobis", "jcbb", "ccda")

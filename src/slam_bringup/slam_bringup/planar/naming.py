@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ekf_slam_node.planar import PlanarConfig
-from ekf_slam_node.planar_hypotheses import HypothesesConfig, PlanarHypotheses
+from ekf_slam_node.planar.planar import PlanarConfig
+from ekf_slam_node.planar.planar_hypotheses import HypothesesConfig, PlanarHypotheses
 from slam_bringup.planar.log import RobotLog
 from slam_core.geometry import FloatArray
 

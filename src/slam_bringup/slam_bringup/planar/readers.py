@@ -10,10 +10,10 @@ import numpy.typing as npt
 import scipy.io
 from scipy.io.matlab import MatReadError
 
-from ekf_slam_node.planar import move, turn, wrap
+from ekf_slam_node.planar.planar import move, turn, wrap
 from slam_bringup.planar.log import PlanarLog, RobotLog
-from slam_core.files import read_text
 from slam_core.geometry import FloatArray
+from slam_core.storage.files import read_text
 
 _MRCLAM_SIGMA = (0.17, 0.015)
 """Range m and bearing rad; spread of the residuals of data set 6 against Vicon."""

@@ -28,11 +28,11 @@ from rclpy.signals import SignalHandlerOptions
 from slam_bringup.pipeline.configuration import ODOMETRIES, choose, load_system_config
 from slam_bringup.processes.node_graph import live_nodes
 from slam_bringup.processes.processes import NodeCommand
-from slam_core.blas_threads import use_one_blas_thread
-from slam_core.exchange import Exchange
-from slam_core.memory import search_less_garbage, share_one_heap
+from slam_core.nodes.exchange import Exchange
 from slam_core.process_life import end_with_parent, on_request_to_end
 from slam_core.ros import spin, use_fast_dds_profile
+from slam_core.runtime.blas_threads import use_one_blas_thread
+from slam_core.runtime.memory import search_less_garbage, share_one_heap
 from stereo_frontend.frontend_config import MODES
 
 _NODES = {

@@ -17,9 +17,9 @@ from typing import Any, Self
 
 import click
 
-from slam_core.output_folder import OutputFolder
 from slam_core.process_life import INTERRUPTED as INTERRUPTED
 from slam_core.process_life import on_request_to_end
+from slam_core.storage.output_folder import OutputFolder
 
 STOPPED = "stopped before the end: no dense model and no report"
 """Words of a result about a run that ended early."""

@@ -24,8 +24,8 @@ from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.node_graph import NodeGraph, plan_nodes, viewer_nodes
 from slam_bringup.processes.processes import NodeCommand, NodeGroup, PrivateDomain, node_environment
 from slam_bringup.processes.start_map import StartMap
-from slam_core.files import atomic_text
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC
+from slam_core.storage.files import atomic_text
 
 START_TIMEOUT_S = 180.0
 """A cold start compiles kernels."""

@@ -22,7 +22,7 @@ from slam_bringup.processes.start_map import StartMap
 from slam_core.messages import estimate_from_message
 from slam_core.types import PoseEstimate
 from stereo_frontend.frontend_config import FrontendReport
-from stereo_frontend.rectification_error import RectificationError
+from stereo_frontend.stereo.rectification_error import RectificationError
 
 _FIGURES = ("rectification_", "ranges_")
 _LOSSES = ("lost_by_transport", "rejected", "skipped", "unpaired")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from slam_bringup.pipeline.results import RunResult
 from slam_bringup.report.mapped_files import write_mapped
-from slam_core.memory import give_back, leave_libraries
+from slam_core.runtime.memory import give_back, leave_libraries
 
 if TYPE_CHECKING:
     from slam_bringup.report.report import Charts

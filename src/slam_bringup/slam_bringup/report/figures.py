@@ -18,10 +18,10 @@ from dense_mapping.navigation import frontiers
 from slam_bringup.pipeline.results import AgentResult, RunResult
 from slam_bringup.plural import plural
 from slam_bringup.report.canvas import blank, draw_to_scale
-from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
+from slam_core.estimation.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.evaluation import align, associate
-from slam_core.files import atomic_path
 from slam_core.geometry import FloatArray, boxminus, invert_transform
+from slam_core.storage.files import atomic_path
 
 matplotlib.use("Agg")
 matplotlib.rcParams["text.parse_math"] = False  # names come from recordings: a dollar sign in one begins no formula

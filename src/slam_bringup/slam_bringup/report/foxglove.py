@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from slam_bringup.bags.bag import BagReader
-from slam_core.files import atomic_text
+from slam_core.storage.files import atomic_text
 
 COLOURS = ("#d62728ff", "#1f77b4ff", "#2ca02cff", "#9467bdff", "#ff7f0eff", "#17becfff")
 _TRUTH = "#888888ff"

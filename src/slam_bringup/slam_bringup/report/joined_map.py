@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from sjsam_node.linear_slam.text_joining import TextJoiningResult
 from slam_bringup.report.figures import COLOURS, save_png
-from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
+from slam_core.estimation.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 
 _FEATURES = "#b36b00"
 

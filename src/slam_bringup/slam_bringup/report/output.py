@@ -25,9 +25,9 @@ from slam_bringup.report.foxglove import write_layout
 from slam_bringup.report.mapped_files import SaveMap, write_mapped
 from slam_bringup.report.report import Charts, draw_charts, write_report
 from slam_bringup.version import VERSION
-from slam_core.files import atomic_text
-from slam_core.memory import give_back
 from slam_core.process_life import STARTED_S
+from slam_core.runtime.memory import give_back
+from slam_core.storage.files import atomic_text
 
 
 def write_results(

@@ -22,7 +22,7 @@ from slam_bringup.report.figures import error_figure, features_figure, floor_pla
 from slam_bringup.report.scene3d import scene_page
 from slam_bringup.report.structure_figures import sparsity_figure, submaps_figure
 from slam_core.evaluation import Evaluation
-from slam_core.files import atomic_text
+from slam_core.storage.files import atomic_text
 
 _AGENT_CHARTS: dict[str, Callable[[AgentResult], Figure | None]] = {
     "errors": error_figure,

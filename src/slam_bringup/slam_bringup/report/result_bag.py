@@ -20,6 +20,7 @@ from slam_bringup.bags.bag import BagReader, BagWriter
 from slam_bringup.bags.bag_types import BagTypes, typestore
 from slam_bringup.pipeline.frame_log import LoggedFrame
 from slam_bringup.pipeline.results import AgentResult, RunResult
+from slam_core.estimation.rigid_alignment import umeyama
 from slam_core.evaluation import associate
 from slam_core.geometry import FloatArray, invert_transform
 from slam_core.messages import (
@@ -37,7 +38,6 @@ from slam_core.messages import (
     transform_message,
 )
 from slam_core.messages.base import Message
-from slam_core.rigid_alignment import umeyama
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.navigation import Frontier, Way, frontiers, walked, way
-from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
+from slam_core.estimation.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate
 

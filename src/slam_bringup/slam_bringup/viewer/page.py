@@ -24,7 +24,7 @@ from dense_mapping.surface import Surface
 from slam_bringup.viewer.access import Access
 from slam_bringup.viewer.panel import AgentRow, agent_table, headline, legend, ways_text
 from slam_bringup.viewer.picture_of_plan import plan_picture
-from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
+from slam_core.estimation.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, quaternion_from_rotation
 from slam_core.types import ByteArray, Float32Array
 

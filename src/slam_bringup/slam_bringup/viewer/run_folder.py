@@ -15,9 +15,9 @@ from dense_mapping.surface import Surface
 from dense_mapping.surface_io import read_mesh
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
-from slam_core.files import read_json
 from slam_core.geometry import FloatArray
 from slam_core.linear_algebra.block_pattern import IntArray
+from slam_core.storage.files import read_json
 from slam_core.trajectory import Trajectory, read_covariance_csv, read_trajectory
 
 

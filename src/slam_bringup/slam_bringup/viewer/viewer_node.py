@@ -17,7 +17,6 @@ from dense_mapping.floor_plan import FloorPlan
 from slam_bringup.viewer.command_post import position_radius, radius_text, unseen, ways_out
 from slam_bringup.viewer.page import ViewerPage
 from slam_bringup.viewer.panel import AgentRow
-from slam_core.base_node import SlamNode
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.messages import (
@@ -31,8 +30,9 @@ from slam_core.messages import (
     transform_from_message,
 )
 from slam_core.messages.base import Message
+from slam_core.nodes.base_node import SlamNode
+from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.ros import below, run_node, sensor_qos
-from slam_core.stamp_guard import StampPolicy
 from slam_core.types import ByteArray, PoseEstimate
 
 _SILENT_S = 3.0

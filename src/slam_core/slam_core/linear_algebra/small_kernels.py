@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from slam_core.geometry import FloatArray
-from slam_core.in_place import in_place
+from slam_core.runtime.in_place import in_place
 
 
 @in_place()

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from slam_core.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
+from slam_core.estimation.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import FloatArray, make_transform
 from slam_core.messages.base import Message, MessageTypes
 from slam_core.messages.poses import pose_message

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion from other sensors, an IMU above all, and the odometry frame."""

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion from elsewhere: scan registration between two frames, the turn rate of an IMU (thesis 9.4.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ekf_slam_node.config import InertialConfig, MotionConfig
+from ekf_slam_node.odometry.inertial import InertialFilter, at_place
+from ekf_slam_node.odometry.odometry import UpDirection
+from ekf_slam_node.odometry.preintegration import ImuReadings, Preintegral
+from slam_core.estimation.chi_square import chi_square_bound
+from slam_core.geometry import (
+    FloatArray,
+    both_halves,
+    boxminus,
+    compose_covariance,
+    interpolate_transform,
+    make_transform,
+    so3_log,
+)
+from slam_core.types import ImuSample, RelativeMotion
+
+_AID_STAMP_TOLERANCE = 0.005
+"""Largest difference of the stamps of a motion aid and of the frames it joins."""
+_SIGMA_TURN_RATE = 0.1
+"""By how much (rad/s) the turn rate of a moment may differ from that of a single reading."""
+_ELSEWHERE = np.repeat([0.3, np.radians(5.0)], 3)
+"""Places (m, rad) that look the same are at least so far apart."""
+AID_GATE = chi_square_bound(0.999, 6)
+"""Gate of a motion's six coordinates by two sensors, 99.9 % of true ones inside."""
+
+ALL = slice(0, 6)
+ROTATION = slice(3, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class Aid:
+    """A measured motion T = T_previous_now; ``rows`` of its error are known, with their covariance (k, k)."""
+
+    T: FloatArray
+    covariance: FloatArray
+    rows: slice
+
+
+class MotionAids:
+    """Collects what other sensors say of the motion and sums it up between two frames of the filter.
+
+    Scans need not have the frames' stamps: a scan's motion is taken as even, and the last one goes on for at most its
+    own length, with the noise of the constant-velocity model on top.
+    """
+
+    def __init__(self, config: MotionConfig, inertial: InertialConfig | None = None) -> None:
+        self._config = config
+        self._motions: list[RelativeMotion] = []
+        self._readings = ImuReadings()
+        self.inertial = InertialFilter(config, inertial or InertialConfig())
+        self._newest: tuple[int, int, Preintegral | None] = (0, 0, None)
+        self._reached_ns = self._doubted_ns = 0
+
+    def add_motion(self, motion: RelativeMotion) -> bool:
+        """Take a motion; False if it is not finite, not positive definite or not forward in time."""
+        if not _is_usable(motion):
+            return False
+        if self._motions and not self._is_same_time(self._motions[-1].end_stamp_ns, motion.start_stamp_ns):
+            self._motions = []
+        self._motions.append(motion)
+        return True
+
+    def add_imu(self, sample: ImuSample) -> bool:
+        """Take an IMU reading; False if it is not finite or not newer than the last."""
+        return self._readings.add(sample)
+
+    def between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+        """The best aid that covers the time between two stamps, or None."""
+        return self._motion_between(start_stamp_ns, end_stamp_ns) or self._rotation_between(
+            start_stamp_ns, end_stamp_ns
+        )
+
+    def bridge(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+        """The motion as the IMU alone tells it, from velocity and gravity at the start; None where it does not."""
+        if not self.inertial.can_bridge:
+            return None
+        pre = self._preintegral(start_stamp_ns, end_stamp_ns)
+        if pre is None:
+            return None
+        step = self.inertial.predict(pre)
+        covariance = self.inertial.motion_covariance(step)
+        return Aid(*at_place(step.T, covariance, -self._place()), ALL)
+
+    def moved(
+        self,
+        start_stamp_ns: int,
+        end_stamp_ns: int,
+        T_previous_now: FloatArray | None = None,
+        covariance: FloatArray | None = None,
+    ) -> bool:
+        """Tell the IMU's filter of the motion that the images alone show, or that they show none.
+
+        covariance: (6, 6) along the axes of the previous frame. False if the IMU contradicts it.
+        """
+        if self._readings.newest is None:
+            return True
+        pre = self._preintegral(start_stamp_ns, end_stamp_ns)
+        if pre is None or start_stamp_ns != self._reached_ns:
+            self.inertial.forget_motion()
+        self._newest, self._reached_ns = (0, 0, None), end_stamp_ns
+        if pre is None:
+            return True
+        self.inertial.watch(pre)
+        step = self.inertial.predict(pre)
+        if T_previous_now is None or covariance is None:
+            self.inertial.advance(step)
+            return True
+        return self.inertial.measure(step, *at_place(T_previous_now, covariance, self._place()))
+
+    def refute(
+        self, start_stamp_ns: int, end_stamp_ns: int, T_previous_now: FloatArray, covariance: FloatArray
+    ) -> bool:
+        """True if the IMU rules out a motion that rests on looks alone, with its covariance (6, 6).
+
+        Only by much: places that look the same are not next to each other. It counts against the IMU, too, which soon
+        refutes no more if it is the one that is wrong.
+        """
+        told = self.bridge(start_stamp_ns, end_stamp_ns) or self._rotation_between(start_stamp_ns, end_stamp_ns)
+        if told is None or not self.inertial.is_proven:
+            return False
+        error = np.abs(boxminus(told.T, T_previous_now))
+        is_far = (error > _ELSEWHERE)[told.rows].any()
+        if not is_far or not contradicts(told, T_previous_now, covariance, AID_GATE):
+            return False
+        if end_stamp_ns != self._doubted_ns:
+            self._doubted_ns = end_stamp_ns
+            self.inertial.doubt()
+        return True
+
+    @property
+    def newest_stamp_ns(self) -> int:
+        """Stamp of the newest IMU reading; -1 before the first."""
+        return -1 if self._readings.newest is None else self._readings.newest.stamp_ns
+
+    @property
+    def up(self) -> UpDirection | None:
+        """The direction against gravity at the newest linked frame, where an IMU knows it."""
+        return UpDirection(self.inertial.up, self.inertial.tilt_covariance) if self.inertial.can_bridge else None
+
+    def velocity(self) -> tuple[FloatArray, FloatArray]:
+        """Velocities (6,) of the rig as the IMU has them, with standard deviations (6,)."""
+        newest = self._readings.newest
+        rate = np.zeros(3) if newest is None else newest.angular_velocity - self.inertial.biases[:3]
+        velocity = np.concatenate([self.inertial.velocity - np.cross(rate, self._place()), rate])
+        return velocity, np.concatenate([self.inertial.sigma_velocity, np.full(3, _SIGMA_TURN_RATE)])
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop what lies before the frame the filter has reached; the last of it stays, it may go on."""
+        older = sum(motion.end_stamp_ns <= stamp_ns for motion in self._motions)
+        del self._motions[: max(older - 1, 0)]
+        self._readings.forget_before(stamp_ns)
+
+    # ---- scans
+    def _motion_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+        if not self._motions or not self._motions_cover(start_stamp_ns, end_stamp_ns):
+            return None
+        T, covariance = np.eye(4), np.zeros((6, 6))
+        for number, motion in enumerate(self._motions):
+            last = number == len(self._motions) - 1
+            begin = max(start_stamp_ns, motion.start_stamp_ns)
+            end = end_stamp_ns if last else min(end_stamp_ns, motion.end_stamp_ns)
+            if end > begin:
+                share = (end - begin) / (motion.end_stamp_ns - motion.start_stamp_ns)
+                beyond = max(end - motion.end_stamp_ns, 0) * 1e-9
+                part = self._part(motion, share, beyond)
+                T, covariance = T @ part.T, compose_covariance(T, covariance, part.T, part.covariance)
+        return Aid(T, covariance, ALL)
+
+    def _motions_cover(self, start_stamp_ns: int, end_stamp_ns: int) -> bool:
+        first, last = self._motions[0], self._motions[-1]
+        tolerance = _AID_STAMP_TOLERANCE * 1e9
+        reach = last.end_stamp_ns + max(tolerance, last.end_stamp_ns - last.start_stamp_ns)
+        return first.start_stamp_ns <= start_stamp_ns + tolerance and end_stamp_ns <= reach
+
+    def _part(self, motion: RelativeMotion, share: float, beyond: float) -> RelativeMotion:
+        T = interpolate_transform(np.eye(4), motion.T, np.array(share))
+        length = (motion.end_stamp_ns - motion.start_stamp_ns) * 1e-9
+        sigma = np.repeat([self._config.sigma_acceleration, self._config.sigma_angular_acceleration], 3)
+        noise = np.diag(np.square(sigma * beyond * (beyond + length)))
+        return replace(motion, T=T, covariance=motion.covariance * max(share, 1.0) ** 2 + noise)
+
+    # ---- turn rates
+    def _rotation_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+        pre = self._preintegral(start_stamp_ns, end_stamp_ns)
+        if pre is None or not self.inertial.uses_turns:
+            return None
+        variance = np.eye(3) * self._config.sigma_gyro**2 + self.inertial.gyro_bias_covariance
+        return Aid(make_transform(pre.R, np.zeros(3)), variance * pre.dt**2, ROTATION)
+
+    def _place(self) -> FloatArray:
+        return np.zeros(3) if self._readings.newest is None else self._readings.newest.position
+
+    def _preintegral(self, start_stamp_ns: int, end_stamp_ns: int) -> Preintegral | None:
+        """Preintegral with the present biases; the newest one is kept until they change."""
+        if self._newest[:2] != (start_stamp_ns, end_stamp_ns):
+            pre = self._readings.integrate(start_stamp_ns, end_stamp_ns, self.inertial.biases, self.inertial.noise)
+            self._newest = start_stamp_ns, end_stamp_ns, pre
+        return self._newest[2]
+
+    def _is_same_time(self, a: int, b: int) -> bool:
+        return abs(a - b) <= _AID_STAMP_TOLERANCE * 1e9
+
+
+def aid_error(aid: Aid, T_previous_now: FloatArray, rotation_map_previous: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Error (k,) of a motion as an aid sees it, along the map's axes, and its covariance (k, k)."""
+    error = np.concatenate([aid.T[:3, 3] - T_previous_now[:3, 3], so3_log(aid.T[:3, :3] @ T_previous_now[:3, :3].T)])
+    turn = both_halves(rotation_map_previous)
+    rows = turn[aid.rows, aid.rows]
+    return (turn @ error)[aid.rows], rows @ aid.covariance @ rows.T
+
+
+def contradicts(aid: Aid, T_previous_now: FloatArray, covariance: FloatArray, gate: float) -> bool:
+    """True if an aid lies beyond the gate of a motion found otherwise, with its covariance (6, 6).
+
+    Scan registration that has slid along a wall is as wrong as it is sure of itself, and only vision can tell.
+    """
+    error = boxminus(aid.T, T_previous_now)[aid.rows]
+    S = aid.covariance + covariance[aid.rows, aid.rows]
+    return not float(error @ np.linalg.solve(S, error)) < gate
+
+
+def _is_usable(motion: RelativeMotion) -> bool:
+    finite = np.isfinite(motion.T).all() and np.isfinite(motion.covariance).all()
+    return bool(
+        finite and motion.end_stamp_ns > motion.start_stamp_ns and np.linalg.eigvalsh(motion.covariance)[0] > 0.0
+    )

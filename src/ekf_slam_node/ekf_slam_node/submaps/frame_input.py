@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gate at the filter's door: features that cannot be measurements stay outside."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ekf_slam_node.filtering.models import Frame, frame_from_features
+from slam_core.camera import MIN_DEPTH
+from slam_core.runtime.in_place import in_place
+from slam_core.types import Features
+
+_MAX_RELATIVE_DEPTH_SIGMA = 0.3
+"""Features of a larger sigma of depth / depth are not used; a limit that cuts through many favours those whose noise
+makes them look near and biases the motion.
+"""
+_MIN_SIGMA_PX = 0.05
+"""Floor of the pixel noise, px."""
+_MIN_SIGMA_DEPTH = 1e-4
+"""Floor of the depth noise, m."""
+
+_FARTHEST_M, _LARGEST_PX, _SMALLEST_SIGMA = 1e5, 1e6, 1e-6
+"""Limits of what can be a feature: depth m, pixel, standard deviation px or m."""
+
+
+def usable_features(features: Features) -> np.ndarray:
+    """Mask (n,) of the features that are finite, within sensible limits and of a depth known well enough."""
+    usable = np.asarray(np.isfinite(features.descriptors).all(axis=1))
+    _keep_possible(features.uv, features.depth, features.sigma_uv, features.sigma_depth, usable)
+    return usable
+
+
+@in_place()
+def _keep_possible(uv, depth, sigma_uv, sigma_depth, usable):  # type: ignore[no-untyped-def]
+    """Clear the marks of features that cannot be measurements; NaN passes no comparison."""
+    for n in range(len(usable)):
+        usable[n] &= depth[n] > MIN_DEPTH and depth[n] < _FARTHEST_M
+        usable[n] &= abs(uv[n, 0]) < _LARGEST_PX and abs(uv[n, 1]) < _LARGEST_PX
+        usable[n] &= _SMALLEST_SIGMA < sigma_uv[n, 0] < np.inf and _SMALLEST_SIGMA < sigma_uv[n, 1] < np.inf
+        usable[n] &= _SMALLEST_SIGMA < sigma_depth[n] < _MAX_RELATIVE_DEPTH_SIGMA * depth[n]
+
+
+def frame_of_strongest(features: Features, usable: np.ndarray, most: int) -> Frame:
+    """At ``most`` so many of the usable features as a frame: the strongest, in their own order."""
+    index = np.flatnonzero(usable)
+    if len(index) > most:
+        index = np.sort(index[np.argsort(-features.response[index], kind="stable")[:most]])
+    return frame_from_features(features, index, _MIN_SIGMA_PX, _MIN_SIGMA_DEPTH)

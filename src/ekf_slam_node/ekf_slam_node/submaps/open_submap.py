@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map under construction: filter, table of landmarks and the last frame's other features, kept in step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ekf_slam_node.association.linking import FrameLink
+from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.filtering.candidates import Candidates, squared_distances
+from ekf_slam_node.filtering.covariance import IndexArray
+from ekf_slam_node.filtering.drift import Drift
+from ekf_slam_node.filtering.ekf import Ekf, UpdateReport
+from ekf_slam_node.filtering.landmarks import LandmarkTable, Pending, spread_choice
+from ekf_slam_node.filtering.models import Frame, observe, rig_points
+from slam_core.camera import MIN_DEPTH
+from slam_core.geometry import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Landmarks ``slots`` (k,) seen as features ``columns`` (k,) of a frame, to be measured."""
+
+    slots: IndexArray
+    columns: IndexArray
+
+    @classmethod
+    def of_nothing(cls) -> Sight:
+        """No landmark."""
+        return cls(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+    def __len__(self) -> int:
+        return len(self.slots)
+
+    def select(self, index: np.ndarray) -> Sight:
+        """The sightings at ``index``."""
+        return Sight(self.slots[index], self.columns[index])
+
+    def every_second(self) -> Sight:
+        """Half of the sightings."""
+        return self.select(np.arange(0, len(self), 2))
+
+
+class OpenSubmap:
+    """Landmarks around the start of one submap.
+
+    Parameters
+    ----------
+    ekf, table
+        The same landmarks in the same order.
+    pending
+        Features of the frame at which the map begins.
+    """
+
+    def __init__(
+        self, config: EkfSlamConfig, T_rig_optical: FloatArray, ekf: Ekf, table: LandmarkTable, pending: Pending
+    ) -> None:
+        self.ekf = ekf
+        self.table = table
+        self.pending = pending
+        self._drift = Drift()
+        self._config = config
+        self._T_rig_optical = T_rig_optical
+        self._frames = 0
+
+    @property
+    def descriptor_size(self) -> int:
+        """Columns of the descriptors, 0 while none is known."""
+        known = len(self.table) or len(self.pending.ids)
+        return int(self.pending.candidates.descriptors.shape[1]) if known else 0
+
+    def candidates(self) -> Candidates:
+        """Everything a frame can be linked to: landmarks first, then the pending features."""
+        points, covariances = self.ekf.landmarks_in_rig()
+        pending = self.pending.candidates
+        return Candidates(
+            np.concatenate([points, pending.points]),
+            np.concatenate([covariances, pending.covariances]),
+            np.concatenate([self.table.descriptors, pending.descriptors]),
+            np.concatenate([self.table.tracks, pending.tracks]),
+            len(self.table),
+        )
+
+    # ---------------------------------------------------------------------------------------------- one frame, in order
+    def confirm(self, frame: Frame, link: FrameLink, wanted: int, new_ids: IndexArray) -> Sight:
+        """Make landmarks of the pending features that the frame confirms, until ``wanted`` are in sight.
+
+        The rig must still be at the previous frame: a new landmark's place comes from that frame's measurement.
+        Features that belong to a landmark of the submap before (``ids``) come first.
+        """
+        known = np.flatnonzero(link.rows < len(self.table))
+        fresh = np.flatnonzero(link.rows >= len(self.table))
+        fresh = fresh[self.pending.free[link.rows[fresh] - len(self.table)]]
+        pixels = frame.z[link.columns, :2]
+        size = (frame.camera.width, frame.camera.height)
+        known = known[spread_choice(pixels[known], pixels[:0], self._config.measurement.max_observations, size)]
+        which = link.rows[fresh] - len(self.table)
+        inherited = self.pending.ids[which] >= 0
+        first = fresh[inherited]
+        others = fresh[~inherited]
+        room = max(wanted - len(known) - len(first), 0)
+        others = others[spread_choice(pixels[others], pixels[np.concatenate([known, first])], room, size)]
+        chosen = np.concatenate([first, others])
+        slots = self._add(link.rows[chosen] - len(self.table), new_ids)
+        return Sight(
+            np.concatenate([link.rows[known], slots]), np.concatenate([link.columns[known], link.columns[chosen]])
+        )
+
+    def _add(self, which: IndexArray, new_ids: IndexArray) -> IndexArray:
+        pending = self.pending
+        candidates = pending.candidates.select(which)
+        slots = self.ekf.augment(candidates.points, candidates.covariances)
+        ids = np.where(pending.ids[which] >= 0, pending.ids[which], new_ids[: len(which)])
+        self.table.add(ids, pending.sightings[which], candidates.descriptors, candidates.tracks, self._frames)
+        return slots
+
+    def measure(self, frame: Frame, sight: Sight, common: FloatArray) -> tuple[UpdateReport, Sight]:
+        """Measurement update with the sightings whose innovation is inside the gate; returns those.
+
+        ``common`` (6,): standard deviations of an error of the camera's pose that all of them share.
+        """
+        seen = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
+        z, claimed = frame.z[sight.columns], frame.variance[sight.columns]
+        variance = claimed * self._noise_factors(sight)
+        S = self.ekf.innovation_blocks(seen, sight.slots, variance, common)
+        innovation = self.ekf.innovation(z, seen, sight.slots)
+        distance = squared_distances(innovation, S)
+        good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > MIN_DEPTH))
+        report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good], common)
+        after = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
+        self.table.noise.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
+        return report, sight.select(good)
+
+    def drift_by(self, common: FloatArray) -> None:
+        """Take in what a frame's common error (6,) leaves behind, at the camera's present place."""
+        self._drift.add(common, (self.ekf.T @ self._T_rig_optical)[:3, 3])
+
+    def pose_covariance(self) -> FloatArray:
+        """Covariance (6, 6) of the rig's pose, drift included."""
+        return self.ekf.pose_covariance() + self._drift.covariance(self.ekf.T[:3, 3])
+
+    def _noise_factors(self, sight: Sight) -> FloatArray:
+        """Factors (k, 3) on the variances of u, v and inverse depth: a landmark's own share of the pixel noise."""
+        own = self.table.noise.factors(sight.slots)
+        return np.column_stack([own, own, np.ones(len(own))])
+
+    def remember(self, frame: Frame, sight: Sight, link: FrameLink, landmarks_before: int) -> None:
+        """Keep the features of a frame that measured nothing as the next frame's pending ones, with any names."""
+        named = np.flatnonzero(link.rows >= landmarks_before)
+        which = link.rows[named] - landmarks_before
+        pending = pending_of(frame, self._T_rig_optical)
+        pending.ids[link.columns[named]] = self.pending.ids[which]
+        pending.sightings[link.columns[named]] = self.pending.sightings[which] + 1
+        self.pending = pending.without(sight.columns)
+
+    def tidy(self, frame: Frame, sight: Sight) -> None:
+        """Count who was seen and who should have been, and remove landmarks that cannot be relied on."""
+        view = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks, frame.camera)
+        self.table.tracks[sight.slots] = frame.tracks[sight.columns]
+        self.table.count(sight.slots, frame.descriptors[sight.columns], view.in_image(frame.camera, margin_px=10.0))
+        self._frames += 1
+        for slot in self.table.unreliable(self._frames, self._config.landmark):
+            self.ekf.remove(slot)
+            self.table.remove(slot)
+
+
+def pending_of(frame: Frame, T_rig_optical: FloatArray) -> Pending:
+    """All features of a frame, nameless, as candidates for the next one."""
+    points, covariances = rig_points(frame, T_rig_optical)
+    n = len(frame)
+    return Pending(
+        Candidates(points, covariances, frame.descriptors, frame.tracks),
+        np.full(n, -1, dtype=np.int64),
+        np.ones(n, dtype=np.int32),
+        np.ones(n, dtype=bool),
+    )
+
+
+def inheriting(frame: Frame, T_rig_optical: FloatArray, sight: Sight, used: Sight, table: LandmarkTable) -> Pending:
+    """All features of a frame, those in ``sight`` with their landmarks' names: what an independent submap starts from.
+
+    Names and descriptors are inherited, no places: these come from this frame's measurements except the ``used`` ones,
+    which have gone into the submap before. So the two submaps share no information.
+    """
+    pending = pending_of(frame, T_rig_optical)
+    descriptors = pending.candidates.descriptors.copy()
+    descriptors[sight.columns] = table.descriptors[sight.slots]
+    pending.ids[sight.columns] = table.ids[sight.slots]
+    pending.sightings[sight.columns] = table.sightings[sight.slots] + 1
+    pending.free[used.columns] = False
+    candidates = replace(pending.candidates, descriptors=descriptors)
+    return replace(pending, candidates=candidates)

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records that the steps of Algorithm 3 hand on within one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ekf_slam_node.association.linking import FrameLink
+from ekf_slam_node.filtering.ekf import UpdateReport
+from ekf_slam_node.filtering.models import Frame
+from ekf_slam_node.odometry.aids import Aid
+from ekf_slam_node.results import TrackingState
+from ekf_slam_node.submaps.open_submap import Sight
+from slam_core.geometry import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class LinkedFrame:
+    """A frame that is associated with the map, its features moved to one instant; ``measured``: as they were seen.
+
+    dt: since the previous linked frame, s. aid: motion from other sensors, if any. common: (6,) standard deviations of
+    the pose error that all its features share. surprising: its motion contradicts constant velocity. landmarks: how
+    many there were to link to; rows of the link beyond them are features of the previous frame.
+    """
+
+    frame: Frame
+    measured: Frame
+    dt: float
+    link: FrameLink
+    aid: Aid | None
+    common: FloatArray
+    surprising: bool
+    landmarks: int
+
+    @property
+    def motion_covariance(self) -> FloatArray:
+        """Covariance (6, 6) of the motion that the pairs show, with the error that they share."""
+        return np.asarray(self.link.covariance + np.diag(self.common**2))
+
+
+@dataclass(frozen=True, eq=False)
+class UpdatedFrame:
+    """Outcome of a measurement update.
+
+    Landmarks ``measured``, whether the submap ``closes`` with this frame, and who was measured: ids (k,) of the
+    landmarks, index (k,) of the features.
+    """
+
+    report: UpdateReport
+    measured: Sight
+    closes: bool
+    ids: np.ndarray
+    index: np.ndarray
+
+    @property
+    def state(self) -> tuple[TrackingState, str]:
+        """State of the filter after the frame, and its reason."""
+        if self.report.applied:
+            return TrackingState.OK, ""
+        return TrackingState.DEGRADED, "no landmark could be measured, moved by the prediction alone"

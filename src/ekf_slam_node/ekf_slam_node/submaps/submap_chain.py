@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The open submap and its place behind those before it (section 7.1): started, extended, closed, followed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.filtering.ekf import Ekf
+from ekf_slam_node.filtering.landmarks import LandmarkTable, Pending
+from ekf_slam_node.filtering.models import CORE_DIM, Frame, relative_motion, seconds_between
+from ekf_slam_node.odometry.aids import Aid
+from ekf_slam_node.odometry.odometry import OdometryChain, UpDirection
+from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
+from ekf_slam_node.submaps.open_submap import OpenSubmap, Sight, inheriting, pending_of
+from ekf_slam_node.submaps.steps import UpdatedFrame
+from ekf_slam_node.submaps.submap_builder import SubmapBuilder, conditional_start
+from slam_core.estimation.calibration_error import widened_by_calibration
+from slam_core.geometry import FloatArray, compose_covariance
+from slam_core.types import PoseEstimate, Submap
+
+_COAST_TIME = 0.5
+"""A lost rig is assumed to stop after this time."""
+_RESTART_SIGMA_VELOCITY = 1.0
+"""Uncertainty of the speed at an independent start, m/s."""
+_RESTART_SIGMA_TURN_RATE = 1.0
+"""Uncertainty of the turn rate at an independent start, rad/s."""
+
+
+class SubmapChain:
+    """Holds the filter of the open submap, the submap's path, and ``T_odom_submap``.
+
+    Parameters
+    ----------
+    T_rig_optical
+        Mounting of the camera, (4, 4).
+    session
+        Number of the session, see :class:`slam_core.types.Submap`.
+    """
+
+    def __init__(self, config: EkfSlamConfig, T_rig_optical: FloatArray, session: int) -> None:
+        self._config = config
+        self._T_rig_optical = T_rig_optical
+        self._session = session
+        self._odometry = OdometryChain()
+        self._local: OpenSubmap | None = None
+        self._builder = SubmapBuilder(config.agent, 0, 0, False, session)
+        self._next_index = 0
+        self._is_finished = False
+        self.stamp_ns = 0
+        """Stamp of the frame that the filter has reached."""
+
+    @property
+    def has_begun(self) -> bool:
+        """True if there was a first frame."""
+        return self._local is not None
+
+    @property
+    def is_open(self) -> bool:
+        """True if frames can be added to a submap."""
+        return self.has_begun and not self._is_finished
+
+    @property
+    def local(self) -> OpenSubmap:
+        """The open submap, or the last one if none is open."""
+        assert self._local is not None
+        return self._local
+
+    # ------------------------------------------------------------------------------------------------------- opening
+    def start(self, frame: Frame, pose: PoseEstimate | None = None, up: UpDirection | None = None) -> OpenSubmap:
+        """Open a submap at a frame of which nothing is known before: position zero, velocity unknown.
+
+        ``pose``: T_odom_rig at the frame, or None to start where the chain has ended. ``up``: gravity there, if known.
+        """
+        if pose is None and self.has_begun:
+            pose = self.pose(self.stamp_ns)
+        if pose is not None:
+            self._odometry.advance(pose, up)
+        pending = pending_of(frame, self._T_rig_optical)
+        local = self._empty_map(frame, np.zeros(6), self._config.motion.initial_variance, pending)
+        return self._open(local, frame, follows=False)
+
+    def follow(self, frame: Frame, seen: Sight, measured: Sight, up: UpDirection | None = None) -> OpenSubmap:
+        """Open the submap that follows the one just closed, at the rig's pose in this frame, and gravity if known."""
+        local = self.local
+        self._odometry.advance(self.pose(frame.stamp_ns), up)
+        if self._config.submap.start == "independent":
+            pending = inheriting(frame, self._T_rig_optical, seen, measured, local.table)
+            # The velocity is a starting point with a variance so wide that it carries no information over.
+            wide = np.repeat([_RESTART_SIGMA_VELOCITY, _RESTART_SIGMA_TURN_RATE], 3) ** 2
+            return self._open(self._empty_map(frame, local.ekf.velocity, wide, pending), frame, follows=True)
+        ekf = conditional_start(local.ekf, measured.slots, self._config.error == "invariant")
+        pending = pending_of(frame, self._T_rig_optical).without(measured.columns)
+        table = local.table.select(measured.slots)
+        return self._open(OpenSubmap(self._config, self._T_rig_optical, ekf, table, pending), frame, follows=True)
+
+    def _empty_map(self, frame: Frame, velocity: FloatArray, variance: FloatArray, pending: Pending) -> OpenSubmap:
+        covariance = np.zeros((CORE_DIM, CORE_DIM))
+        covariance[6:, 6:] = np.diag(variance)
+        ekf = Ekf(velocity, covariance, self._config.error == "invariant")
+        return OpenSubmap(self._config, self._T_rig_optical, ekf, LandmarkTable(frame.descriptors.shape[1]), pending)
+
+    def _open(self, local: OpenSubmap, frame: Frame, follows: bool) -> OpenSubmap:
+        self._local = local
+        self._is_finished = False
+        self._builder = SubmapBuilder(self._config.agent, self._next_index, frame.stamp_ns, follows, self._session)
+        self.stamp_ns = frame.stamp_ns
+        return local
+
+    # ------------------------------------------------------------------------------------------------------ extending
+    def add_pose(self, stamp_ns: int, standing: bool = False) -> None:
+        """Add the filter's pose to the submap's path."""
+        local = self.local
+        covariance = local.pose_covariance() if self._config.submap.drift else local.ekf.pose_covariance()
+        self._builder.add_pose(PoseEstimate(stamp_ns, local.ekf.T.copy(), covariance), standing)
+        self.stamp_ns = stamp_ns
+
+    @property
+    def is_bridging(self) -> bool:
+        """True if poses that no image confirms wait for one that ends them."""
+        return self._builder.is_bridging
+
+    def add_bridged_pose(self, stamp_ns: int, motion: Aid) -> PoseEstimate:
+        """Add the pose after a motion from the filter's pose that no image confirms; returns it as T_odom_rig."""
+        ekf = self.local.ekf
+        covariance = compose_covariance(ekf.T, ekf.pose_covariance(), motion.T, motion.covariance)
+        pose = PoseEstimate(stamp_ns, ekf.T @ motion.T, covariance)
+        self._builder.add_bridged_pose(pose)
+        drifted = compose_covariance(ekf.T, self.local.pose_covariance(), motion.T, motion.covariance)
+        return self._odometry.pose(stamp_ns, pose.T, drifted)
+
+    def is_complete(self, shared: int) -> bool:
+        """True if the submap ends with this frame, in which the next one would share so many landmarks with it."""
+        return self._builder.is_complete(self.local.ekf, self._config.submap, shared)
+
+    # -------------------------------------------------------------------------------------------------------- closing
+    def close(self) -> tuple[Submap, ...]:
+        """The open submap as it is now; none if it has but one pose."""
+        if self._local is None or self._builder.is_empty:
+            return ()
+        self._next_index += 1
+        return (self._builder.close(self._local.ekf, self._local.table),)
+
+    def finish(self) -> tuple[Submap, ...]:
+        """Close the open submap; the next one does not follow it."""
+        if not self.is_open:
+            return ()
+        self._is_finished = True
+        return self.close()
+
+    # --------------------------------------------------------------------------------------------------------- output
+    def pose(self, stamp_ns: int) -> PoseEstimate:
+        """T_odom_rig at a stamp not before the filter's.
+
+        Beyond it the rig is assumed to go on for a while and then to stop.
+        """
+        ekf, covariance = self.local.ekf, self.local.pose_covariance()
+        dt = seconds_between(self.stamp_ns, stamp_ns)
+        if dt <= 0.0:
+            return self._odometry.pose(stamp_ns, ekf.T, covariance)
+        T = ekf.T @ relative_motion(ekf.velocity, min(dt, _COAST_TIME))
+        grown = ekf.time_update(dt, self._config.motion.sigma).head[:6, :6] - ekf.pose_covariance()
+        return self._odometry.pose(stamp_ns, T, covariance + grown)
+
+    def last_sound_pose(self, stamp_ns: int) -> PoseEstimate:
+        """The newest finite pose of the open submap's path as T_odom_rig, with another stamp."""
+        last = self._builder.last_sound_pose()
+        return self._odometry.pose(stamp_ns, last.T, last.covariance)
+
+    def result(
+        self,
+        stamp_ns: int,
+        state: TrackingState,
+        reason: str,
+        submaps: tuple[Submap, ...] = (),
+        updated: UpdatedFrame | None = None,
+        pose: PoseEstimate | None = None,
+    ) -> EkfResult:
+        """The estimate at a stamp, with the submaps that the frame finished and its measurement update, if any.
+
+        ``pose``: T_odom_rig where it is known otherwise than by :meth:`pose`.
+        """
+        ekf = self.local.ekf
+        pose = widened_by_calibration(self.pose(stamp_ns) if pose is None else pose, self._config.calibration)
+        result = EkfResult(stamp_ns, pose, ekf.velocity, ekf.velocity_covariance(), state, reason, submaps)
+        if updated is None:
+            return result
+        report = updated.report
+        return replace(
+            result, nis=report.nis, nis_dof=report.dof, landmark_ids=updated.ids, feature_index=updated.index
+        )
+
+    def landmark_view(self) -> LandmarkView:
+        """The landmarks of the open submap as they are now."""
+        ekf, table = self.local.ekf, self.local.table
+        blocks = ekf.covariance.blocks(CORE_DIM + 3 * np.arange(len(ekf.landmarks)))
+        positions, covariances = self._odometry.points(ekf.landmarks, blocks)
+        return LandmarkView(table.ids.copy(), positions, covariances, table.sightings.copy())

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Patches of key frames followed from picture to picture."""

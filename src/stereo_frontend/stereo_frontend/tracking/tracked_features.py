@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Features of one frame by tracking: those that were followed, and new ones in a key frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slam_core.camera import Camera
+from slam_core.types import ByteArray, Float32Array
+from stereo_frontend.assembly import DepthEstimate
+from stereo_frontend.keypoints import Keypoints
+from stereo_frontend.tracking.tracker import Followed, IdArray, Tracker
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredKeypoints:
+    """Keypoints (n) with their depth, sigma_uv (n, 2) px, and track_ids (n,), 0 of those that are not followed."""
+
+    keypoints: Keypoints
+    estimate: DepthEstimate
+    sigma_uv: Float32Array
+    track_ids: IdArray
+
+
+def follow_or_detect(
+    tracker: Tracker,
+    picture: ByteArray,
+    camera: Camera,
+    stamp_ns: int,
+    measure: Callable[[Followed], DepthEstimate],
+    detect: Callable[[], tuple[Keypoints, DepthEstimate, Float32Array]],
+) -> list[MeasuredKeypoints]:
+    """Features that were followed into a picture, and where that is too little, what is new in it.
+
+    ``measure`` gives the depth of what was followed, ``detect`` keypoints with depth and standard deviations (n,) px.
+    """
+    parts = []
+    number = 0
+    followed = tracker.follow(picture, camera, stamp_ns)
+    if followed is not None:
+        estimate = measure(followed)
+        tracker.measured(followed, estimate.depth, camera)
+        number = int(np.isfinite(estimate.depth).sum())
+        parts.append(MeasuredKeypoints(followed.keypoints, estimate, followed.sigma_uv, followed.ids))
+    if tracker.needs_key_frame(number):
+        keypoints, estimate, sigma = detect()
+        free = np.flatnonzero(tracker.is_free(keypoints.uv))
+        keypoints, estimate, sigma = keypoints.select(free), estimate.select(free), sigma[free]
+        ids = tracker.begin(picture, keypoints, estimate.depth, camera)
+        if not tracker.has_lost_sight(number):
+            estimate.depth[ids == 0] = np.nan
+        parts.append(MeasuredKeypoints(keypoints, estimate, np.repeat(sigma[:, None], 2, axis=1), ids))
+    return parts

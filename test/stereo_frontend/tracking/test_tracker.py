@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tracks of a camera that moves before a wall: where they are, how exactly, and when new ones are wanted."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from slam_core.config import from_mapping
+from slam_core.types import DepthImage, StereoImages
+from stereo_frontend.detection.features import TRACKING
+from stereo_frontend.frontend import Frontend
+from stereo_frontend.frontend_config import MODES, FrontendConfig
+from stereo_frontend.tracking.frame_motion import facing_warp, fit_motion
+
+STEP_NS = 100_000_000
+FLOW = np.array([4.3, -2.2])
+"""Motion of the picture from frame to frame, px."""
+
+
+def tracking_frontend(mode: str = "stereo") -> Frontend:
+    return Frontend(from_mapping(FrontendConfig, {"mode": mode, "features.target": 300, "features.tracking": "always"}))
+
+
+def moved(pair: StereoImages, frames: int) -> StereoImages:
+    """The pair after so many frames of a camera that goes along the wall; whole pixels, so that the truth is exact."""
+    shift = tuple(int(s) for s in np.round(FLOW * frames)[::-1])
+    return dataclasses.replace(
+        pair,
+        stamp_ns=pair.stamp_ns + frames * STEP_NS,
+        left=np.roll(pair.left, shift, (0, 1)),
+        right=np.roll(pair.right, shift, (0, 1)),
+    )
+
+
+def test_tracks_keep_their_ids_and_places(stereo_pair):
+    frontend, pair = tracking_frontend(), stereo_pair()
+    first = frontend.process(pair)
+    assert (first.track_ids > 0).sum() > 60
+    for k in range(1, 5):
+        now = frontend.process(moved(pair, k))
+        _, before, after = np.intersect1d(first.track_ids, now.track_ids, return_indices=True)
+        followed = first.track_ids[before] > 0
+        error = (now.uv[after] - first.uv[before])[followed] - np.round(FLOW * k)
+        assert followed.sum() > 0.7 * (first.track_ids > 0).sum()
+        # What lies over the seam of the rolled pictures jumps; the rest is found to a few hundredths of a pixel.
+        assert np.quantile(np.abs(error), 0.9) < 0.05
+        assert len(np.unique(now.track_ids)) == len(now)
+    assert frontend.counters.counts["key_frames"] == 1
+
+
+def test_a_frame_that_shows_something_else_becomes_a_key_frame(stereo_pair):
+    frontend = tracking_frontend()
+    first = frontend.process(stereo_pair(seed=1))
+    other = dataclasses.replace(stereo_pair(seed=2), stamp_ns=first.stamp_ns + STEP_NS)
+    now = frontend.process(other)
+    assert frontend.counters.counts["key_frames"] == 2
+    assert len(np.intersect1d(first.track_ids[first.track_ids > 0], now.track_ids)) < 10
+    assert len(now) > 60
+
+
+def test_the_same_frames_give_the_same_bytes(stereo_pair):
+    frames = [moved(stereo_pair(), k) for k in range(3)]
+    frontend = tracking_frontend()
+    once = [frontend.process(frame) for frame in frames]
+    frontend.reset()
+    again = [frontend.process(frame) for frame in frames]
+    for a, b in zip(once, again, strict=True):
+        for name in ("uv", "depth", "sigma_uv", "sigma_depth", "descriptors", "track_ids"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_a_depth_camera_is_tracked_too(stereo_pair):
+    frontend, pair = tracking_frontend("tof"), stereo_pair()
+    depth = np.full(pair.left.shape, 2.0, np.float32)
+    counts = []
+    for k in range(3):
+        frame = moved(pair, k)
+        image = DepthImage(
+            frame.stamp_ns, depth, np.full_like(depth, 0.004), pair.stereo.camera, frame.left.astype(np.float32)
+        )
+        counts.append(frontend.process(None, image))
+    common = np.intersect1d(counts[0].track_ids, counts[2].track_ids)
+    assert (common > 0).sum() > 60
+    np.testing.assert_allclose(counts[2].depth, 2.0, atol=0.01)
+
+
+def test_the_motion_of_points_is_found_among_outliers(rng):
+    from slam_core.camera import Camera
+    from slam_core.geometry import make_transform, so3_exp, transform_points
+
+    camera = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
+    points = camera.unproject(rng.uniform([0, 0], [640, 480], (100, 2)), rng.uniform(1.0, 6.0, 100))
+    T = make_transform(so3_exp(np.array([0.02, -0.05, 0.1])), np.array([0.05, 0.02, -0.1]))
+    uv = camera.project(transform_points(T, points)) + rng.normal(0.0, 0.1, (100, 2))
+    uv[:25] += rng.uniform(5.0, 60.0, (25, 2))
+    found = fit_motion(points, uv, camera, np.eye(4))
+    assert found is not None
+    np.testing.assert_allclose(found, T, atol=3e-3)
+    assert fit_motion(points, rng.uniform(0.0, 480.0, (100, 2)), camera, np.eye(4)) is None
+    assert fit_motion(points[:5], uv[:5], camera, np.eye(4)) is None
+
+
+def test_the_warp_of_a_patch_that_faces_the_camera_is_the_derivative_of_its_places(rng):
+    from slam_core.geometry import make_transform, so3_exp
+
+    T = make_transform(so3_exp(np.array([0.1, -0.2, 0.3])), np.array([0.2, 0.1, -0.3]))
+    point = np.array([[0.4, -0.3, 2.0]])
+
+    def place(xy: np.ndarray) -> np.ndarray:
+        moved_point = T[:3, :3] @ (2.0 * np.append(xy, 1.0)) + T[:3, 3]
+        return moved_point[:2] / moved_point[2]
+
+    xy, h = point[0, :2] / 2.0, 1e-6
+    columns = [(place(xy + h * e) - place(xy - h * e)) / (2.0 * h) for e in np.eye(2)]
+    assert facing_warp(T, point)[0] == pytest.approx(np.column_stack(columns).ravel(), abs=1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_stereo_is_tracked_by_itself_and_the_others_where_asked_for(mode):
+    def tracks(tracking: str) -> bool:
+        return from_mapping(FrontendConfig, {"mode": mode, "features.tracking": tracking}).tracks
+
+    assert [tracks(t) for t in TRACKING] == [mode == "stereo", True, False]
+
+
+def test_new_tracks_begin_where_there_are_none(stereo_pair, rng):
+    frontend = tracking_frontend()
+    frontend.process(stereo_pair())
+    tracker = frontend._tracker
+    occupied = tracker._tracks.keypoints.uv
+    assert not tracker.is_free(occupied + np.float32(3.0)).any()
+    places = rng.uniform(0.0, 400.0, (500, 2)).astype(np.float32)
+    nearest = np.linalg.norm(places[:, None].astype(float) - occupied[None], axis=2).min(axis=1)
+    np.testing.assert_array_equal(tracker.is_free(places), nearest > 8.0)
