@@ -92,7 +92,9 @@ def test_nodes_and_the_offline_pipeline_agree(
     out = tmp_path / "out"
     run = run_nodes(short_bag, config, out, odometry=odometry != "none", composed=composed, names=names)
     online, _ = collect(short_bag, config, run, mapper="sjsam", odometry=odometry, names=names)
-    offline, _ = run_bag(short_bag, config, odometry=odometry, names=names)
+    offline, session = run_bag(short_bag, config, odometry=odometry, names=names)
+    session.save(tmp_path / "offline").result()
+    assert files(run.map_folder) == files(tmp_path / "offline")
     assert set(run.exit_codes.values()) == {0}, run.exit_codes
     assert sum(online.dropped.values()) == 0, online.dropped
     assert (online.frames, online.submaps) == (offline.frames, offline.submaps)

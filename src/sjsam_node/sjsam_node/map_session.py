@@ -146,9 +146,10 @@ class MapSession:
         self._submaps = [future for future in self._submaps if not future.done()]
         return len(self._submaps)
 
-    def next_session(self, agent: str) -> int:
-        """Number after the last session of an agent in the map."""
-        return 1 + max((session for name, session, _ in self.snapshot.keys if name == agent), default=-1)
+    @property
+    def next_session(self) -> int:
+        """Number of a session that no agent in the map has had; -1 in a new one: the second of the first stamp."""
+        return 1 + max((session for _, session, _ in self.snapshot.keys), default=-2)
 
     def add(self, submap: Submap) -> Future[Outcome | None]:
         """Join a submap, or locate its agent by it, after those before it; None if all was reset meanwhile."""

@@ -15,6 +15,8 @@ from ekf_slam_node.slam import EkfSlam
 from sjsam_node.global_map import GlobalMap
 from slam_bringup.bags.bag import BagReader, BagWriter
 from slam_bringup.cli import slam
+from slam_bringup.pipeline.offline import run_bag
+from slam_bringup.processes.interrupt import INTERRUPTED
 from slam_core.geometry import boxminus
 from slam_core.trajectory import read_covariance_csv, read_trajectory
 
@@ -115,7 +117,22 @@ def test_the_old_map_is_read_and_never_changed(again, outputs):
     folder, old, goes_on = again
     assert (old / "map" / "manifest.json").read_bytes() == (outputs[1] / "map" / "manifest.json").read_bytes()
     sessions = {s.session for s in GlobalMap.load(folder / "map").snapshot().submaps}
-    assert sessions == ({0, 1} if goes_on else {0})
+    first = int(read_trajectory(old / "trajectory.tum").stamps_ns[0]) // 10**9
+    assert sessions == ({first, first + 1} if goes_on else {first})
+
+
+@pytest.mark.slow
+def test_who_gives_up_keeps_the_map(tmp_path, monkeypatch):
+    def given_up(bag, system, *, session, **_):
+        asked = itertools.count()
+        run_bag(bag, system, session=session, stopped=lambda: next(asked) >= 20)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("slam_bringup.commands.run.run_bag", given_up)
+    result = run(str(DEMO), "-o", str(tmp_path / "out"))
+    assert result.exit_code == INTERRUPTED
+    assert f"the map is in {tmp_path / 'out' / 'map'}" in result.output
+    assert len(GlobalMap.load(tmp_path / "out" / "map").snapshot())
 
 
 def test_localizing_needs_a_map(tmp_path):

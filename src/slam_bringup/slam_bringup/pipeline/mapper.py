@@ -45,7 +45,7 @@ class Mapper:
         self.session = session
         self._compact = config.ekf_slam.submap.compact
         self._filters = {
-            agent: FilterStage(filter_config(config.ekf_slam, s), s.frames, s.base_frame, session.next_session(agent))
+            agent: FilterStage(filter_config(config.ekf_slam, s), s.frames, s.base_frame, session.next_session)
             for agent, s in sensors.items()
         }
         self._diaries = {agent: _Diary() for agent in sensors}

@@ -26,8 +26,8 @@ class StartMap:
         if folder is None:
             return None
         with MapSession(config.sjsam) as session:
-            keys = session.load(folder, lambda loaded: loaded.keys).result()
-        return cls(folder, localize_only, len(keys), 1 + max(session for _, session, _ in keys))
+            session.load(folder, len).result()
+            return cls(folder, localize_only, session.known, session.next_session)
 
     @property
     def parameters(self) -> dict[str, dict[str, Any]]:
