@@ -301,9 +301,9 @@ def test_an_estimate_that_is_not_finite_costs_one_submap(
     slam, poses = EkfSlam(EkfSlamConfig()), loop(60)
     before = run(slam, world, poses[:30], rng)
     if spoil == "mean":
-        slam._chain.local.ekf.velocity[:] = np.nan
+        slam._chain.local._ekf.velocity[:] = np.nan
     else:
-        slam._chain.local.ekf.covariance.set_head(np.full((slam._chain.local.ekf.covariance.size, 12), np.inf))
+        slam._chain.local._ekf.covariance.set_head(np.full((slam._chain.local._ekf.covariance.size, 12), np.inf))
     after = [slam.process(world.features(poses[k], k * STEP_NS, rng)[0]) for k in range(30, 60)]
     assert slam.counters.counts["submaps_abandoned"] == 1
     assert after[0].state is TrackingState.LOST

@@ -15,10 +15,9 @@ from ekf_slam_node.association.linking import FrameLink, Linker
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.filtering.candidates import motion_prior
 from ekf_slam_node.filtering.common_error import CommonError
-from ekf_slam_node.filtering.ekf import TimeUpdate
 from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.filtering.noise_monitor import InnovationWatch, NoiseMonitor
-from ekf_slam_node.odometry.aids import AID_GATE, ALL, Aid, MotionAids, aid_error, contradicts
+from ekf_slam_node.odometry.aids import AID_GATE, ALL, Aid, MotionAids, contradicts
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.submaps.frame_input import frame_of_strongest, usable_features
 from ekf_slam_node.submaps.missed_frames import MissedFrames
@@ -30,15 +29,12 @@ from ekf_slam_node.submaps.motion_checks import (
     is_surprising,
     widened,
 )
-from ekf_slam_node.submaps.open_submap import Sight, pending_of
+from ekf_slam_node.submaps.open_submap import Sight
 from ekf_slam_node.submaps.rolling_shutter import RollingShutter
 from ekf_slam_node.submaps.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submaps.submap_chain import SubmapChain
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
 from slam_core.types import Counters, Features, ImuSample, PoseEstimate, RelativeMotion, Submap
-
-_STANDING_VELOCITY = np.repeat([0.02, np.radians(0.5)], 3)
-"""Standard deviations (m/s, rad/s) of the velocities of a rig that stands."""
 
 
 class EkfSlam:
@@ -109,7 +105,7 @@ class EkfSlam:
             result = self._advance(frame)
         except np.linalg.LinAlgError:
             return self._abandon(frame, "a matrix could not be factored")
-        if not self._chain.local.ekf.is_finite:
+        if not self._chain.local.is_finite:
             return self._abandon(frame, "the estimate was no longer finite", result)
         return result
 
@@ -187,7 +183,7 @@ class EkfSlam:
     def _link(self, frame: Frame, dt: float, aid: Aid | None) -> LinkedFrame | None:
         """Associate a frame with what is known, and learn its noise from the pairs; None if nothing fits."""
         local = self._chain.local
-        expected = motion_prior(local.ekf.velocity, local.ekf.velocity_covariance(), self.config.motion.sigma, dt)
+        expected = motion_prior(local.velocity, local.velocity_covariance(), self.config.motion.sigma, dt)
         prior = aided(expected, aid)
         known = None if aid is None else prior.T
         predicted = self._shutter.corrected(frame, dt, known)
@@ -222,23 +218,19 @@ class EkfSlam:
         self._next_id += len(new_ids)
         return self._chain.local.confirm(linked.frame, linked.link, wanted, new_ids)
 
-    def _predict(self, linked: LinkedFrame) -> TimeUpdate:
+    def _predict(self, linked: LinkedFrame) -> None:
         """Time update, linearised at the motion found, and measurement of the motion by other sensors.
 
         Over a large step the motion found and the predicted one are far apart.
         """
-        ekf, link, aid, sigma = self._chain.local.ekf, linked.link, linked.aid, self.config.motion.sigma
+        local, link, aid, sigma = self._chain.local, linked.link, linked.aid, self.config.motion.sigma
         if linked.surprising:
-            sigma = explaining_sigma(link.T, ekf.velocity, sigma, linked.dt)
-        step = ekf.time_update(linked.dt, sigma, link.T)
-        ekf.apply_time_update(step)
+            sigma = explaining_sigma(link.T, local.velocity, sigma, linked.dt)
+        step = local.predict(linked.dt, sigma, link.T)
         if aid is not None:
-            if contradicts(aid, link.T, linked.motion_covariance, AID_GATE):
-                self.counters.add("aids_rejected")
-            else:
-                self._use_aid(step, aid, link.T)
+            fits = not contradicts(aid, link.T, linked.motion_covariance, AID_GATE)
+            self._count_aid(fits and local.apply_motion(step, aid, link.T))
         self._tell_imu(linked)
-        return step
 
     def _tell_imu(self, linked: LinkedFrame) -> None:
         """Let the IMU's filter learn from the motion that the images alone show."""
@@ -248,14 +240,9 @@ class EkfSlam:
 
     def _update(self, linked: LinkedFrame, seen: Sight) -> UpdatedFrame:
         """Measurement update; in a submap's last frame with half of the landmarks, the others start the next one."""
-        local, common, chosen = self._chain.local, linked.common, seen
-        closes = self._chain.is_complete(len(seen))
-        if closes:
-            # The next submap starts at the camera's pose in this frame, its error included: so does this one end there.
-            local.ekf.add_pose_noise(common)
-            common = np.zeros(6)
-            chosen = seen.every_second() if self.config.submap.start == "independent" else seen
-        report, measured = local.measure(linked.frame, chosen, common)
+        local, closes = self._chain.local, self._chain.is_complete(len(seen))
+        chosen = seen.every_second() if closes and self.config.submap.start == "independent" else seen
+        report, measured = local.measure(linked.frame, chosen, linked.common, closes)
         if not report.applied:
             self.counters.add("updates_failed")
         local.drift_by(linked.common)
@@ -276,11 +263,7 @@ class EkfSlam:
         self._chain.follow(linked.frame, seen, updated.measured, self._aids.up)
         return submaps
 
-    def _use_aid(self, step: TimeUpdate, aid: Aid, T_previous_now: FloatArray) -> None:
-        """Measure the step just predicted, unless the aid contradicts the prediction."""
-        rotation = step.T[:3, :3] @ T_previous_now[:3, :3].T
-        error, covariance = aid_error(aid, T_previous_now, rotation)
-        applied = self._chain.local.ekf.update_increment(step, error, covariance, aid.rows, AID_GATE).applied
+    def _count_aid(self, applied: bool) -> None:
         self.counters.add("aids_used" if applied else "aids_rejected")
 
     def _arrive(self, frame: Frame, standing: bool = False) -> None:
@@ -299,7 +282,7 @@ class EkfSlam:
 
         If it creeps, the frames link to the landmarks at an ever larger motion, which ends the standing.
         """
-        self._chain.local.ekf.restart(np.zeros(6), _STANDING_VELOCITY)
+        self._chain.local.stand()
         self._tell_imu(linked)
         self.counters.add("frames_standing")
         self._arrive(linked.frame, standing=True)
@@ -314,14 +297,9 @@ class EkfSlam:
 
     def _go_with(self, frame: Frame, dt: float, aid: Aid) -> None:
         """Move the filter to a frame that is not linked by a motion that something else has measured."""
-        local = self._chain.local
-        step = local.ekf.time_update(dt, self.config.motion.sigma, aid.T)
-        local.ekf.apply_time_update(step)
-        self._use_aid(step, aid, aid.T)
-        local.ekf.move_to_mean()
+        self._count_aid(self._chain.local.move_without_link(frame, dt, aid))
         self._aids.moved(self._chain.stamp_ns, frame.stamp_ns)
         self._arrive(frame)
-        local.pending = pending_of(frame, self._T_rig_optical)
 
     def _miss(self, frame: Frame, bridge: Aid | None) -> EkfResult:
         """No link: nothing is mapped.
@@ -356,7 +334,7 @@ class EkfSlam:
         self._go_with(missed, seconds_between(start_ns, missed.stamp_ns), bridge)
         submaps = self._chain.close()
         self._chain.follow(missed, Sight.of_nothing(), Sight.of_nothing(), self._aids.up)
-        self._chain.local.ekf.restart(*self._aids.velocity())
+        self._chain.local.set_velocity(*self._aids.velocity())
         result = self._advance(frame)
         return replace(result, submaps=submaps + result.submaps)
 

@@ -17,7 +17,6 @@ from ekf_slam_node.filtering.ekf import Ekf
 from ekf_slam_node.filtering.landmarks import LandmarkTable, spread_choice
 from ekf_slam_node.filtering.models import CORE_DIM, frame_from_features, rig_points
 from ekf_slam_node.slam import EkfSlam
-from ekf_slam_node.submaps.submap_builder import conditional_start
 from feature_world import T_RIG_OPTICAL, loop, room
 from slam_core.geometry import make_transform, rotation_from_euler
 
@@ -94,7 +93,7 @@ def test_the_conditional_start_is_the_map_given_the_pose(rng):
     for k in range(len(slots)):
         at = slice(CORE_DIM - 6 + 3 * k, CORE_DIM - 6 + 3 * k + 3)
         turn[at, at] = R.T
-    start = conditional_start(ekf, slots, invariant=True)
+    start = ekf.given_pose(slots)
     np.testing.assert_allclose(start.covariance.dense()[6:, 6:], turn @ given @ turn.T, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(start.covariance.dense()[:6], 0.0, atol=1e-12)
     np.testing.assert_allclose(start.landmarks, (ekf.landmarks[slots] - ekf.T[:3, 3]) @ R)

@@ -267,6 +267,22 @@ class Ekf:
         self.landmarks = self.landmarks[:-1]
         self._offset = np.zeros(self.covariance.size)
 
+    def given_pose(self, slots: IndexArray) -> Ekf:
+        """Landmarks ``slots`` and velocity given the rig's pose, in the rig's frame (Eq. 7.1).
+
+        ``P_ll - P_lr P_rr^-1 P_rl`` is what would be known of them if the pose were known exactly.
+        """
+        R, t = self.T[:3, :3], self.T[:3, 3]
+        rows = np.concatenate([np.arange(6, CORE_DIM), (CORE_DIM + 3 * slots[:, None] + np.arange(3)).ravel()])
+        columns = self.covariance.columns(rows)
+        given = np.linalg.solve(self.pose_covariance(), columns[:6])
+        conditional = columns[rows] - columns[:6].T @ given
+        turn = np.kron(np.eye(len(slots) + 2), R.T)
+        turn[:6, :6] = np.eye(6)
+        start = np.zeros((6 + len(conditional),) * 2)
+        start[6:, 6:] = turn @ conditional @ turn.T
+        return Ekf(self.velocity, start, self._invariant, (self.landmarks[slots] - t) @ R)
+
     # ------------------------------------------------------------------------------------------------------- views
     def pose_covariance(self) -> FloatArray:
         """Covariance (6, 6) of the rig's pose."""

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map under construction: filter, table of landmarks and the last frame's other features, kept in step."""
+"""The map under construction: filter, table of landmarks and the last frame's other features, kept in step.
+
+:class:`OpenSubmap` alone holds the filter.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,16 @@ from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.filtering.candidates import Candidates, squared_distances
 from ekf_slam_node.filtering.covariance import IndexArray
 from ekf_slam_node.filtering.drift import Drift
-from ekf_slam_node.filtering.ekf import Ekf, UpdateReport
+from ekf_slam_node.filtering.ekf import Ekf, TimeUpdate, UpdateReport
 from ekf_slam_node.filtering.landmarks import LandmarkTable, Pending, spread_choice
-from ekf_slam_node.filtering.models import Frame, observe, rig_points
+from ekf_slam_node.filtering.models import CORE_DIM, Frame, observe, relative_motion, rig_points
+from ekf_slam_node.odometry.aids import AID_GATE, Aid, aid_error
 from slam_core.camera import MIN_DEPTH
 from slam_core.geometry import FloatArray
+from slam_core.types import PoseEstimate
+
+_STANDING_VELOCITY = np.repeat([0.02, np.radians(0.5)], 3)
+"""Standard deviations (m/s, rad/s) of the velocities of a rig that stands."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +65,79 @@ class OpenSubmap:
     def __init__(
         self, config: EkfSlamConfig, T_rig_optical: FloatArray, ekf: Ekf, table: LandmarkTable, pending: Pending
     ) -> None:
-        self.ekf = ekf
+        self._ekf = ekf
         self.table = table
         self.pending = pending
         self._drift = Drift()
         self._config = config
         self._T_rig_optical = T_rig_optical
         self._frames = 0
+
+    @classmethod
+    def empty(
+        cls, config: EkfSlamConfig, T_rig_optical: FloatArray, velocity: FloatArray, variance: FloatArray,
+        pending: Pending,
+    ) -> OpenSubmap:  # fmt: skip
+        """A map without landmarks, with a velocity (6,) of some variances (6,)."""
+        covariance = np.zeros((CORE_DIM, CORE_DIM))
+        covariance[6:, 6:] = np.diag(variance)
+        table = LandmarkTable(pending.candidates.descriptors.shape[1])
+        return cls(config, T_rig_optical, Ekf(velocity, covariance, config.error == "invariant"), table, pending)
+
+    def given_pose(self, slots: IndexArray, pending: Pending) -> OpenSubmap:
+        """The seed's start of the next map, in the rig's frame: landmarks ``slots`` and velocity given its pose.
+
+        What is known of them stays in this submap too, so that joining counts it twice: the joint NEES test shows it.
+        """
+        known = self._ekf.given_pose(slots)
+        return OpenSubmap(self._config, self._T_rig_optical, known, self.table.select(slots), pending)
+
+    # ----------------------------------------------------------------------------------------------- what is estimated
+    @property
+    def is_finite(self) -> bool:
+        """True if all that matters of the estimate are finite numbers."""
+        return self._ekf.is_finite
+
+    @property
+    def T(self) -> FloatArray:
+        """T_submap_rig (4, 4)."""
+        return self._ekf.T
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Body velocity (6,), linear and angular, m/s and rad/s."""
+        return self._ekf.velocity
+
+    def velocity_covariance(self) -> FloatArray:
+        """Covariance (6, 6) of the velocity."""
+        return self._ekf.velocity_covariance()
+
+    def filter_pose(self, stamp_ns: int) -> PoseEstimate:
+        """Pose of the rig as the filter has it; with drift only if ``submap.drift`` says so."""
+        covariance = self.pose_covariance() if self._config.submap.drift else self._ekf.pose_covariance()
+        return PoseEstimate(stamp_ns, self._ekf.T.copy(), covariance)
+
+    def pose_covariance(self) -> FloatArray:
+        """Covariance (6, 6) of the rig's pose, drift included."""
+        return self._ekf.pose_covariance() + self._drift.covariance(self._ekf.T[:3, 3])
+
+    def predicted_pose(self, dt: float, moving: float) -> tuple[FloatArray, FloatArray]:
+        """Pose (4, 4) and covariance (6, 6), drift included, in dt s, of which the rig is ``moving`` on, then stops."""
+        grown = self._ekf.time_update(dt, self._config.motion.sigma).head[:6, :6] - self._ekf.pose_covariance()
+        return self._ekf.T @ relative_motion(self._ekf.velocity, moving), self.pose_covariance() + grown
+
+    def landmarks(self) -> tuple[FloatArray, FloatArray]:
+        """Positions (m, 3) and covariances (m, 3, 3) of the landmarks in the frame of the submap."""
+        blocks = self._ekf.covariance.blocks(CORE_DIM + 3 * np.arange(len(self._ekf.landmarks)))
+        return self._ekf.landmarks, blocks
+
+    def close(self) -> tuple[FloatArray, FloatArray]:
+        """Landmarks (m, 3), and the joint covariance (6 + 3 m, 6 + 3 m) of the rig's pose and them."""
+        keep = np.concatenate([np.arange(6), np.arange(CORE_DIM, self._ekf.covariance.size)])
+        covariance = self._ekf.covariance.dense(keep)
+        if self._config.submap.drift:
+            covariance[:6, :6] = self.pose_covariance()
+        return self._ekf.landmarks.copy(), covariance
 
     @property
     def descriptor_size(self) -> int:
@@ -73,7 +147,7 @@ class OpenSubmap:
 
     def candidates(self) -> Candidates:
         """Everything a frame can be linked to: landmarks first, then the pending features."""
-        points, covariances = self.ekf.landmarks_in_rig()
+        points, covariances = self._ekf.landmarks_in_rig()
         pending = self.pending.candidates
         return Candidates(
             np.concatenate([points, pending.points]),
@@ -84,6 +158,33 @@ class OpenSubmap:
         )
 
     # ---------------------------------------------------------------------------------------------- one frame, in order
+    def predict(self, dt: float, sigma: FloatArray, T_previous_now: FloatArray) -> TimeUpdate:
+        """Time update by dt s with acceleration noise sigma (6,), linearised at a motion found; returns it."""
+        step = self._ekf.time_update(dt, sigma, T_previous_now)
+        self._ekf.apply_time_update(step)
+        return step
+
+    def apply_motion(self, step: TimeUpdate, aid: Aid, T_previous_now: FloatArray) -> bool:
+        """Measure the step just predicted by another sensor, unless that contradicts it; returns whether it was."""
+        rotation = step.T[:3, :3] @ T_previous_now[:3, :3].T
+        error, covariance = aid_error(aid, T_previous_now, rotation)
+        return self._ekf.update_increment(step, error, covariance, aid.rows, AID_GATE).applied
+
+    def move_without_link(self, frame: Frame, dt: float, aid: Aid) -> bool:
+        """Move to a frame that no image links, by a motion that something else has measured; whether it was used."""
+        applied = self.apply_motion(self.predict(dt, self._config.motion.sigma, aid.T), aid, aid.T)
+        self._ekf.move_to_mean()
+        self.pending = pending_of(frame, self._T_rig_optical)
+        return applied
+
+    def stand(self) -> None:
+        """The rig stands."""
+        self.set_velocity(np.zeros(6), _STANDING_VELOCITY)
+
+    def set_velocity(self, velocity: FloatArray, sigma: FloatArray) -> None:
+        """Replace what is known of the velocity by (6,) with standard deviations (6,)."""
+        self._ekf.restart(velocity, sigma)
+
     def confirm(self, frame: Frame, link: FrameLink, wanted: int, new_ids: IndexArray) -> Sight:
         """Make landmarks of the pending features that the frame confirms, until ``wanted`` are in sight.
 
@@ -111,35 +212,35 @@ class OpenSubmap:
     def _add(self, which: IndexArray, new_ids: IndexArray) -> IndexArray:
         pending = self.pending
         candidates = pending.candidates.select(which)
-        slots = self.ekf.augment(candidates.points, candidates.covariances)
+        slots = self._ekf.augment(candidates.points, candidates.covariances)
         ids = np.where(pending.ids[which] >= 0, pending.ids[which], new_ids[: len(which)])
         self.table.add(ids, pending.sightings[which], candidates.descriptors, candidates.tracks, self._frames)
         return slots
 
-    def measure(self, frame: Frame, sight: Sight, common: FloatArray) -> tuple[UpdateReport, Sight]:
+    def measure(self, frame: Frame, sight: Sight, common: FloatArray, closes: bool) -> tuple[UpdateReport, Sight]:
         """Measurement update with the sightings whose innovation is inside the gate; returns those.
 
-        ``common`` (6,): standard deviations of an error of the camera's pose that all of them share.
+        ``common`` (6,): standard deviations of an error of the camera's pose that all of them share. ``closes``: the
+        next submap starts at the camera's pose in this frame, its error included: so does this one end there.
         """
-        seen = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
+        if closes:
+            self._ekf.add_pose_noise(common)
+            common = np.zeros(6)
+        seen = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks[sight.slots], frame.camera)
         z, claimed = frame.z[sight.columns], frame.variance[sight.columns]
         variance = claimed * self._noise_factors(sight)
-        S = self.ekf.innovation_blocks(seen, sight.slots, variance, common)
-        innovation = self.ekf.innovation(z, seen, sight.slots)
+        S = self._ekf.innovation_blocks(seen, sight.slots, variance, common)
+        innovation = self._ekf.innovation(z, seen, sight.slots)
         distance = squared_distances(innovation, S)
         good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > MIN_DEPTH))
-        report = self.ekf.update(z[good], variance[good], seen.select(good), sight.slots[good], common)
-        after = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks[sight.slots], frame.camera)
+        report = self._ekf.update(z[good], variance[good], seen.select(good), sight.slots[good], common)
+        after = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks[sight.slots], frame.camera)
         self.table.noise.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
         return report, sight.select(good)
 
     def drift_by(self, common: FloatArray) -> None:
         """Take in what a frame's common error (6,) leaves behind, at the camera's present place."""
-        self._drift.add(common, (self.ekf.T @ self._T_rig_optical)[:3, 3])
-
-    def pose_covariance(self) -> FloatArray:
-        """Covariance (6, 6) of the rig's pose, drift included."""
-        return self.ekf.pose_covariance() + self._drift.covariance(self.ekf.T[:3, 3])
+        self._drift.add(common, (self._ekf.T @ self._T_rig_optical)[:3, 3])
 
     def _noise_factors(self, sight: Sight) -> FloatArray:
         """Factors (k, 3) on the variances of u, v and inverse depth: a landmark's own share of the pixel noise."""
@@ -157,12 +258,12 @@ class OpenSubmap:
 
     def tidy(self, frame: Frame, sight: Sight) -> None:
         """Count who was seen and who should have been, and remove landmarks that cannot be relied on."""
-        view = observe(self.ekf.T, self._T_rig_optical, self.ekf.landmarks, frame.camera)
+        view = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks, frame.camera)
         self.table.tracks[sight.slots] = frame.tracks[sight.columns]
         self.table.count(sight.slots, frame.descriptors[sight.columns], view.in_image(frame.camera, margin_px=10.0))
         self._frames += 1
         for slot in self.table.unreliable(self._frames, self._config.landmark):
-            self.ekf.remove(slot)
+            self._ekf.remove(slot)
             self.table.remove(slot)
 
 

@@ -6,10 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from ekf_slam_node.config import SubmapConfig
-from ekf_slam_node.filtering.covariance import IndexArray
-from ekf_slam_node.filtering.ekf import Ekf
-from ekf_slam_node.filtering.landmarks import LandmarkTable
-from ekf_slam_node.filtering.models import CORE_DIM
+from ekf_slam_node.submaps.open_submap import OpenSubmap
 from slam_core.geometry import FloatArray, boxminus, boxplus
 from slam_core.linear_algebra import blas
 from slam_core.types import ORIGIN_SIGMA, PoseEstimate, Submap
@@ -65,7 +62,7 @@ class SubmapBuilder:
         """
         self._bridged.append(pose)
 
-    def is_complete(self, ekf: Ekf, config: SubmapConfig, shared: int) -> bool:
+    def is_complete(self, local: OpenSubmap, config: SubmapConfig, shared: int) -> bool:
         """True if the rig is far enough from the start, or the submap large or old enough.
 
         Landmarks ``shared`` with the next submap hold the two together: with too few of them the end is put off, up to
@@ -74,8 +71,8 @@ class SubmapBuilder:
         is_lost = self.index > 0 and not self._follows_previous
         age = 1e-9 * (self._path[-1].stamp_ns - self._start_stamp_ns)
         size = max(
-            float(np.linalg.norm(ekf.T[:3, 3])) / config.max_distance,
-            len(ekf.landmarks) / config.max_landmarks,
+            float(np.linalg.norm(local.T[:3, 3])) / config.max_distance,
+            len(local.table) / config.max_landmarks,
             (len(self._path) - self._standing) / config.max_frames,
             age / _FOUND_AGAIN_S if is_lost else 0.0,
         )
@@ -92,16 +89,13 @@ class SubmapBuilder:
         sound = (p for p in reversed(self._path) if np.isfinite(p.T).all() and np.isfinite(p.covariance).all())
         return next(sound)
 
-    def close(self, ekf: Ekf, table: LandmarkTable) -> Submap:
-        """The submap as it is now: its end pose is the last pose added, with the covariance that it was added with."""
-        keep = np.concatenate([np.arange(6), np.arange(CORE_DIM, ekf.covariance.size)])
-        covariance = ekf.covariance.dense(keep)
-        covariance[:6, :6] = self._path[-1].covariance
-        covariance = _positive_definite(covariance)
-        end = self._path[-1]
+    def close(self, local: OpenSubmap) -> Submap:
+        """The submap as it is now: its end pose is the last pose added."""
+        landmarks, joint = local.close()
+        covariance, table, end = _positive_definite(joint), local.table, self._path[-1]
         return Submap(
             agent=self._agent, index=self.index, start_stamp_ns=self._start_stamp_ns, end_stamp_ns=end.stamp_ns,
-            end_pose=end.T, landmarks=ekf.landmarks.copy(), covariance=covariance, landmark_ids=table.ids.copy(),
+            end_pose=end.T, landmarks=landmarks, covariance=covariance, landmark_ids=table.ids.copy(),
             sightings=table.sightings.copy(), descriptors=table.descriptors.copy(), path=tuple(self._path),
             follows_previous=self._follows_previous, session=self._session,
         )  # fmt: skip
@@ -129,21 +123,3 @@ def _positive_definite(P: FloatArray) -> FloatArray:
         return P
     values, vectors = np.linalg.eigh(P)
     return np.asarray((vectors * np.maximum(values, _LEAST_EIGENVALUE * values[-1])) @ vectors.T)
-
-
-def conditional_start(ekf: Ekf, slots: IndexArray, invariant: bool) -> Ekf:
-    """The seed's start: landmarks ``slots`` and velocity given the rig's pose, in the rig's frame (Eq. 7.1).
-
-    ``P_ll - P_lr P_rr^-1 P_rl`` is what the old submap knows of the landmarks if its end pose were known exactly. That
-    knowledge stays in the old submap too, so that joining counts it twice: the joint NEES test shows it.
-    """
-    R, t = ekf.T[:3, :3], ekf.T[:3, 3]
-    rows = np.concatenate([np.arange(6, CORE_DIM), (CORE_DIM + 3 * slots[:, None] + np.arange(3)).ravel()])
-    columns = ekf.covariance.columns(rows)
-    given = np.linalg.solve(ekf.pose_covariance(), columns[:6])
-    conditional = columns[rows] - columns[:6].T @ given
-    turn = np.kron(np.eye(len(slots) + 2), R.T)
-    turn[:6, :6] = np.eye(6)
-    start = np.zeros((6 + len(conditional),) * 2)
-    start[6:, 6:] = turn @ conditional @ turn.T
-    return Ekf(ekf.velocity, start, invariant, (ekf.landmarks[slots] - t) @ R)

@@ -8,15 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from ekf_slam_node.config import EkfSlamConfig
-from ekf_slam_node.filtering.ekf import Ekf
-from ekf_slam_node.filtering.landmarks import LandmarkTable, Pending
-from ekf_slam_node.filtering.models import CORE_DIM, Frame, relative_motion, seconds_between
+from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.odometry.aids import Aid
 from ekf_slam_node.odometry.odometry import OdometryChain, UpDirection
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.submaps.open_submap import OpenSubmap, Sight, inheriting, pending_of
 from ekf_slam_node.submaps.steps import UpdatedFrame
-from ekf_slam_node.submaps.submap_builder import SubmapBuilder, conditional_start
+from ekf_slam_node.submaps.submap_builder import SubmapBuilder
 from slam_core.estimation.calibration_error import widened_by_calibration
 from slam_core.geometry import FloatArray, compose_covariance
 from slam_core.types import PoseEstimate, Submap
@@ -79,7 +77,8 @@ class SubmapChain:
         if pose is not None:
             self._odometry.advance(pose, up)
         pending = pending_of(frame, self._T_rig_optical)
-        local = self._empty_map(frame, np.zeros(6), self._config.motion.initial_variance, pending)
+        variance = self._config.motion.initial_variance
+        local = OpenSubmap.empty(self._config, self._T_rig_optical, np.zeros(6), variance, pending)
         return self._open(local, frame, follows=False)
 
     def follow(self, frame: Frame, seen: Sight, measured: Sight, up: UpDirection | None = None) -> OpenSubmap:
@@ -90,17 +89,10 @@ class SubmapChain:
             pending = inheriting(frame, self._T_rig_optical, seen, measured, local.table)
             # The velocity is a starting point with a variance so wide that it carries no information over.
             wide = np.repeat([_RESTART_SIGMA_VELOCITY, _RESTART_SIGMA_TURN_RATE], 3) ** 2
-            return self._open(self._empty_map(frame, local.ekf.velocity, wide, pending), frame, follows=True)
-        ekf = conditional_start(local.ekf, measured.slots, self._config.error == "invariant")
-        pending = pending_of(frame, self._T_rig_optical).without(measured.columns)
-        table = local.table.select(measured.slots)
-        return self._open(OpenSubmap(self._config, self._T_rig_optical, ekf, table, pending), frame, follows=True)
-
-    def _empty_map(self, frame: Frame, velocity: FloatArray, variance: FloatArray, pending: Pending) -> OpenSubmap:
-        covariance = np.zeros((CORE_DIM, CORE_DIM))
-        covariance[6:, 6:] = np.diag(variance)
-        ekf = Ekf(velocity, covariance, self._config.error == "invariant")
-        return OpenSubmap(self._config, self._T_rig_optical, ekf, LandmarkTable(frame.descriptors.shape[1]), pending)
+            new = OpenSubmap.empty(self._config, self._T_rig_optical, local.velocity, wide, pending)
+        else:
+            new = local.given_pose(measured.slots, pending_of(frame, self._T_rig_optical).without(measured.columns))
+        return self._open(new, frame, follows=True)
 
     def _open(self, local: OpenSubmap, frame: Frame, follows: bool) -> OpenSubmap:
         self._local = local
@@ -112,9 +104,7 @@ class SubmapChain:
     # ------------------------------------------------------------------------------------------------------ extending
     def add_pose(self, stamp_ns: int, standing: bool = False) -> None:
         """Add the filter's pose to the submap's path."""
-        local = self.local
-        covariance = local.pose_covariance() if self._config.submap.drift else local.ekf.pose_covariance()
-        self._builder.add_pose(PoseEstimate(stamp_ns, local.ekf.T.copy(), covariance), standing)
+        self._builder.add_pose(self.local.filter_pose(stamp_ns), standing)
         self.stamp_ns = stamp_ns
 
     @property
@@ -124,16 +114,16 @@ class SubmapChain:
 
     def add_bridged_pose(self, stamp_ns: int, motion: Aid) -> PoseEstimate:
         """Add the pose after a motion from the filter's pose that no image confirms; returns it as T_odom_rig."""
-        ekf = self.local.ekf
-        covariance = compose_covariance(ekf.T, ekf.pose_covariance(), motion.T, motion.covariance)
-        pose = PoseEstimate(stamp_ns, ekf.T @ motion.T, covariance)
+        before = self.local.filter_pose(self.stamp_ns)
+        covariance = compose_covariance(before.T, before.covariance, motion.T, motion.covariance)
+        pose = PoseEstimate(stamp_ns, before.T @ motion.T, covariance)
         self._builder.add_bridged_pose(pose)
-        drifted = compose_covariance(ekf.T, self.local.pose_covariance(), motion.T, motion.covariance)
+        drifted = compose_covariance(before.T, self.local.pose_covariance(), motion.T, motion.covariance)
         return self._odometry.pose(stamp_ns, pose.T, drifted)
 
     def is_complete(self, shared: int) -> bool:
         """True if the submap ends with this frame, in which the next one would share so many landmarks with it."""
-        return self._builder.is_complete(self.local.ekf, self._config.submap, shared)
+        return self._builder.is_complete(self.local, self._config.submap, shared)
 
     # -------------------------------------------------------------------------------------------------------- closing
     def close(self) -> tuple[Submap, ...]:
@@ -141,7 +131,7 @@ class SubmapChain:
         if self._local is None or self._builder.is_empty:
             return ()
         self._next_index += 1
-        return (self._builder.close(self._local.ekf, self._local.table),)
+        return (self._builder.close(self._local),)
 
     def finish(self) -> tuple[Submap, ...]:
         """Close the open submap; the next one does not follow it."""
@@ -156,13 +146,10 @@ class SubmapChain:
 
         Beyond it the rig is assumed to go on for a while and then to stop.
         """
-        ekf, covariance = self.local.ekf, self.local.pose_covariance()
         dt = seconds_between(self.stamp_ns, stamp_ns)
         if dt <= 0.0:
-            return self._odometry.pose(stamp_ns, ekf.T, covariance)
-        T = ekf.T @ relative_motion(ekf.velocity, min(dt, _COAST_TIME))
-        grown = ekf.time_update(dt, self._config.motion.sigma).head[:6, :6] - ekf.pose_covariance()
-        return self._odometry.pose(stamp_ns, T, covariance + grown)
+            return self._odometry.pose(stamp_ns, self.local.T, self.local.pose_covariance())
+        return self._odometry.pose(stamp_ns, *self.local.predicted_pose(dt, min(dt, _COAST_TIME)))
 
     def last_sound_pose(self, stamp_ns: int) -> PoseEstimate:
         """The newest finite pose of the open submap's path as T_odom_rig, with another stamp."""
@@ -182,9 +169,9 @@ class SubmapChain:
 
         ``pose``: T_odom_rig where it is known otherwise than by :meth:`pose`.
         """
-        ekf = self.local.ekf
+        local = self.local
         pose = widened_by_calibration(self.pose(stamp_ns) if pose is None else pose, self._config.calibration)
-        result = EkfResult(stamp_ns, pose, ekf.velocity, ekf.velocity_covariance(), state, reason, submaps)
+        result = EkfResult(stamp_ns, pose, local.velocity, local.velocity_covariance(), state, reason, submaps)
         if updated is None:
             return result
         report = updated.report
@@ -194,7 +181,6 @@ class SubmapChain:
 
     def landmark_view(self) -> LandmarkView:
         """The landmarks of the open submap as they are now."""
-        ekf, table = self.local.ekf, self.local.table
-        blocks = ekf.covariance.blocks(CORE_DIM + 3 * np.arange(len(ekf.landmarks)))
-        positions, covariances = self._odometry.points(ekf.landmarks, blocks)
+        table = self.local.table
+        positions, covariances = self._odometry.points(*self.local.landmarks())
         return LandmarkView(table.ids.copy(), positions, covariances, table.sightings.copy())
