@@ -186,13 +186,13 @@ class Frontend:
                 return stereo
             return self._with_tof(images, followed.keypoints, stereo, depth, T_left_tof)
 
-        def detect() -> tuple[Keypoints, DepthEstimate, Float32Array]:
+        def detect() -> tuple[Keypoints, DepthEstimate]:
             self.counters.add("key_frames")
-            left, right = self._extract(images)
-            left, estimate = self._measured(images, left, right, depth, T_left_tof)
-            return left, estimate, self._noise.sigma(left.size)
+            return self._measured(images, *self._extract(images), depth, T_left_tof)
 
-        parts = follow_or_detect(tracker, images.left, images.stereo.camera, images.stamp_ns, measure, detect)
+        parts = follow_or_detect(
+            tracker, images.left, images.stereo.camera, images.stamp_ns, measure, detect, self._noise.sigma
+        )
         features = [self._features(images, p.keypoints, p.estimate, p.sigma_uv, p.track_ids) for p in parts]
         return features[0] if len(features) == 1 else features[0].joined(features[1])
 

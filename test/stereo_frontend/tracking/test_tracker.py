@@ -135,3 +135,13 @@ def test_new_tracks_begin_where_there_are_none(stereo_pair, rng):
     places = rng.uniform(0.0, 400.0, (500, 2)).astype(np.float32)
     nearest = np.linalg.norm(places[:, None].astype(float) - occupied[None], axis=2).min(axis=1)
     np.testing.assert_array_equal(tracker.is_free(places), nearest > 8.0)
+
+
+def test_a_track_is_no_surer_than_a_share_of_its_keypoint(stereo_pair):
+    frontend, pair = tracking_frontend(), stereo_pair()
+    first, now = frontend.process(pair), frontend.process(moved(pair, 1))
+    _, before, after = np.intersect1d(first.track_ids, now.track_ids, return_indices=True)
+    followed = first.track_ids[before] > 0
+    ratio = (now.sigma_uv[after] / first.sigma_uv[before])[followed]
+    assert followed.sum() > 60
+    assert ratio.min() > 0.4

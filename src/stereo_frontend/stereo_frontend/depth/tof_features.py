@@ -83,11 +83,11 @@ class TofFeatures:
         def measure(followed: Followed) -> DepthEstimate:
             return _depth_at(image, followed.keypoints)
 
-        def detect() -> tuple[Keypoints, DepthEstimate, Float32Array]:
+        def detect() -> tuple[Keypoints, DepthEstimate]:
             keypoints = self._extractors[name](picture)
-            return keypoints, _depth_at(image, keypoints), self._noise.sigma(keypoints.size)
+            return keypoints, _depth_at(image, keypoints)
 
-        return follow_or_detect(tracker, picture, image.camera, image.stamp_ns, measure, detect)
+        return follow_or_detect(tracker, picture, image.camera, image.stamp_ns, measure, detect, self._noise.sigma)
 
     def reset(self) -> None:
         """Forget the detector thresholds."""
