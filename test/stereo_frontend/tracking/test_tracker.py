@@ -145,3 +145,13 @@ def test_a_track_is_no_surer_than_a_share_of_its_keypoint(stereo_pair):
     ratio = (now.sigma_uv[after] / first.sigma_uv[before])[followed]
     assert followed.sum() > 60
     assert ratio.min() > 0.4
+
+
+def test_tracks_of_another_camera_are_forgotten(stereo_pair):
+    frontend, pair = tracking_frontend(), moved(stereo_pair(), 1)
+    first = frontend.process(stereo_pair())
+    camera = dataclasses.replace(pair.stereo.camera, fx=210.0, fy=210.0)
+    other = frontend.process(dataclasses.replace(pair, stereo=dataclasses.replace(pair.stereo, camera=camera)))
+    assert frontend.counters.counts["key_frames"] == 2
+    assert (other.track_ids > 0).sum() > 60
+    assert len(np.intersect1d(first.track_ids[first.track_ids > 0], other.track_ids)) == 0

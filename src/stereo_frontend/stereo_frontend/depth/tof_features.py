@@ -66,7 +66,7 @@ class TofFeatures:
             ]
         else:
             if self.used != before:
-                self._tracker.reset()
+                self._tracker.forget()
             parts = self._followed(self._tracker, image, *pictures.popitem())
         features = [
             make_features(

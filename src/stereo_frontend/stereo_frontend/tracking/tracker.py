@@ -100,17 +100,25 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all tracks."""
-        self._tracks: Tracks | None = None
+        """Begin anew, as if nothing had been seen."""
         self._next_id = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all tracks; new ones get ids that none has had."""
+        self._tracks: Tracks | None = None
         self._begun = 0
         self._half: ByteArray | None = None
+        self._camera: Camera | None = None
         self._motion: tuple[FloatArray, float] | None = None
         self._stamp_ns = 0
 
     # ---- one picture, in order
     def follow(self, picture: ByteArray, camera: Camera, stamp_ns: int) -> Followed | None:
-        """Tracks found in a picture; None while there are none."""
+        """Tracks found in a picture; None while there are none. Those of another camera are forgotten."""
+        if camera != self._camera:
+            self.forget()
+            self._camera = camera
         before, tracks = self._half, self._tracks
         dt = 1e-9 * (stamp_ns - self._stamp_ns)
         half = np.asarray(cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
