@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The filter has one owner: only the open submap names it, so that only it can change it."""
+"""The filter has one owner: only the open submap names it, so that only it can change it.
+
+Experiments make filters of their own.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ def uses(code: str) -> list[str]:
 
 
 def test_the_open_submap_alone_holds_the_filter() -> None:
-    files = [p for p in SRC.rglob("*.py") if p.name != "setup.py"]
+    files = [p for p in SRC.rglob("*.py") if p.name != "setup.py" and "experiments" not in p.parts]
     assert {p.name for p in files if uses(p.read_text(encoding="utf-8"))} == {"ekf.py", "open_submap.py"}
 
 
