@@ -115,7 +115,7 @@ class DenseModel:
         return len(chosen)
 
     def surface(self) -> Surface:
-        """Mesh of all key frames. Of poses that are final it is made once: its field is forgotten."""
+        """Mesh of all key frames. Where poses are final it is made once: its field is forgotten."""
         return extract_surface(self.volume, self.config.surface, release=self._fixed)
 
     def floor_plans(self, surface: Surface, gravity_up: FloatArray | None = None) -> tuple[FloorPlan, ...]:

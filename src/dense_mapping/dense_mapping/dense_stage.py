@@ -239,7 +239,7 @@ class DenseStage:
         return self._put - before
 
     def _add_to_model(self, item: _Waiting, T_map_camera: FloatArray) -> None:
-        """Of a final model by a thread, so that the depth of the next key frame is measured meanwhile."""
+        """Add a key frame; to a final model by a thread, so that the next one's depth is measured meanwhile."""
         self._put += 1
         if self._pool is None:
             self.model.add_keyframe(item.camera, T_map_camera, item.keyframe)

@@ -261,7 +261,7 @@ class GlobalMap:
         return trajectories if agent is None else trajectories.get(agent, [])
 
     def path(self) -> dict[str, list[PoseEstimate]]:
-        """The same poses by agent, with no more covariance than inside their submaps; costs little."""
+        """Poses of the trajectory by agent, with no more covariance than inside their submaps; costs little."""
         return self.snapshot().path()
 
     def landmarks(self) -> MapLandmarks:

@@ -121,7 +121,7 @@ class Features:
         return len(self.uv)
 
     def joined(self, others: Features) -> Features:
-        """These and others of the same instant."""
+        """Features with others of the same instant after them."""
         f, g = self, others
         return replace(
             self,

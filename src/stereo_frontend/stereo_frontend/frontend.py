@@ -293,7 +293,7 @@ class Frontend:
         return StereoView(images.stereo, left.descriptors, *(np.asarray(v, np.float64) for v in measured))
 
     def _view_of_keypoints(self, images: StereoImages, left: Keypoints, right: Keypoints) -> StereoView:
-        """The same of keypoints alone, before any alignment of patches."""
+        """View by keypoints alone, before any alignment of patches."""
         difference, sigma = left.uv - right.uv, self._noise.sigma(left.size)
         unaligned = RefinedDisparity(difference[:, 0], sigma, np.ones_like(sigma), -difference[:, 1], sigma)
         return self._view(images, left, unaligned)

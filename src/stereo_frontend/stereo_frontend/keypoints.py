@@ -53,7 +53,7 @@ class Detector(Protocol):
         ...
 
     def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
-        """Those keypoints of ``image``, described for other moments' if they were so for a stereo partner's only."""
+        """Keypoints of ``image`` described for other moments', where they were so for a stereo partner's only."""
         ...
 
 

@@ -106,7 +106,7 @@ _ROOM = 4096
 
 @njit(cache=True, nogil=True)
 def _doubled(values, more):  # type: ignore[no-untyped-def]
-    """The same values with twice the room, and ``more``."""
+    """Copy of the values with twice the room, and ``more``."""
     out = np.empty(2 * len(values) + more, values.dtype)
     out[: len(values)] = values
     return out

@@ -240,7 +240,7 @@ class Ekf:
             self._change_coordinates(moved)
 
     def _change_coordinates(self, moved: FloatArray) -> None:
-        """Of points that an update has moved by (1 + m, 3), the rig's place first; see the module."""
+        """Error coordinates at points that an update has moved by (1 + m, 3), the rig's place first; see the module."""
         A = np.zeros((self.covariance.size, 3), order="F")
         crossed(moved[:1], A[:3])
         crossed(moved[1:], A[CORE_DIM:])

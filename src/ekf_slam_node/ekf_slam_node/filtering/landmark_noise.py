@@ -34,7 +34,7 @@ class LandmarkNoise:
 
     @classmethod
     def unknown(cls, landmarks: int) -> LandmarkNoise:
-        """Of landmarks never measured."""
+        """Noise of landmarks that were never measured."""
         return cls(np.zeros(landmarks), np.zeros(landmarks))
 
     def extended(self, landmarks: int) -> LandmarkNoise:

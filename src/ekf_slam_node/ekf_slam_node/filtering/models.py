@@ -87,7 +87,7 @@ class Frame:
         return len(self.z)
 
     def with_larger_noise(self, factor: FloatArray) -> Frame:
-        """The same measurements with their variances multiplied by (3,)."""
+        """Copy of the measurements with their variances multiplied by (3,)."""
         return replace(self, variance=self.variance * factor)
 
     def select(self, index: np.ndarray) -> Frame:

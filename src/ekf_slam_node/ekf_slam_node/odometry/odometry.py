@@ -90,7 +90,7 @@ class OdometryChain:
         self._levelled_ns = stamp_ns
 
     def _update(self, error: FloatArray, H: FloatArray, noise: FloatArray) -> None:
-        """Of the two directions across the vertical; along it nothing is measured."""
+        """Update of the two directions across the vertical; along it nothing is measured."""
         assert self._up is not None
         across = np.linalg.svd(self._up[None])[2][1:]
         H = across @ H

@@ -107,7 +107,7 @@ class PlanarHypotheses:
             self._P = np.pad(self._P, ((0, 0), (0, more), (0, more)))
 
     def _merge(self, taken: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """Of hypotheses whose poses agree, keep the most probable one; returns the rows of ``taken`` that stay."""
+        """Keep the most probable one of hypotheses whose poses agree; returns the rows of ``taken`` that stay."""
         rows = kernels.distinct(self._x, self._P, self._tree.same_pose)
         self._take(rows)
         self._weight = self._weight[rows]

@@ -70,7 +70,7 @@ def follow(x, P, used, choice, z, R):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def distinct(x, P, same):  # type: ignore[no-untyped-def]
-    """Of the hypotheses, the best first, those (k,) whose pose differs from that of all kept before them.
+    """Hypotheses (k,), the best first, whose pose differs from that of all kept before them.
 
     ``same``: squared Mahalanobis distance, by the covariance of the earlier one, below which two poses are the same.
     """

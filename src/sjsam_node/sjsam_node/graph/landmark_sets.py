@@ -36,7 +36,7 @@ class LandmarkSets:
     record_of: IntArray = field(default_factory=no_indices)
 
     def with_submap(self, count: int, record: int) -> LandmarkSets:
-        """The same and the observations of one more submap, each a landmark of its own."""
+        """Sets with the observations of one more submap, each a landmark of its own."""
         alone = np.arange(len(self.landmark_of), len(self.landmark_of) + count)
         return LandmarkSets(
             np.concatenate([self.landmark_of, alone]),

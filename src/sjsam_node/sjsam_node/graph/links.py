@@ -42,7 +42,7 @@ class Link:
         return self.first, self.second
 
     def inverted(self) -> Link:
-        """The same link from the second record to the first."""
+        """Link from the second record to the first."""
         T = invert_transform(self.T)
         J = inverse_jacobian(self.T)
         covariance = J @ self.covariance @ J.T
@@ -51,7 +51,7 @@ class Link:
         )
 
     def with_status(self, status: Status) -> Link:
-        """The same link with another status."""
+        """Link with another status."""
         return replace(self, status=status)
 
 

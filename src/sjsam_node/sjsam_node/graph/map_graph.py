@@ -63,7 +63,7 @@ class Odometry:
     path_length: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def with_node(self, origin: int, chained: FloatArray, path_length: float) -> Odometry:
-        """The same with one more node."""
+        """Odometry with one more node."""
         return Odometry(
             np.append(self.origin, origin), np.concatenate([self.chained, chained[None]]),
             np.append(self.path_length, path_length),

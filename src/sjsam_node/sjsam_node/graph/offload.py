@@ -47,7 +47,7 @@ class Offload:
             segment.madvise(mmap.MADV_DONTNEED)
 
     def put(self, array: AnyArray) -> AnyArray:
-        """The same array, on disk and read only."""
+        """Array with these values, on disk and read only."""
         if not array.size:
             return array
         if self._end + array.nbytes > self._first + len(self._segment):

@@ -33,7 +33,7 @@ class LinkedPairs:
     ends: IntArray = field(default_factory=_no_pairs)
 
     def followed_by(self, later: LinkedPairs) -> LinkedPairs:
-        """These and others."""
+        """Pairs of both, ``later`` last."""
         return LinkedPairs(
             np.concatenate([self.pairs, later.pairs]), np.append(self.ptr, self.ptr[-1] + later.ptr[1:]),
             np.concatenate([self.ends, later.ends]),

@@ -203,7 +203,7 @@ class TextJoiner:
         return problem.optimize(state, self.config.optimizer)
 
     def _optimize_maps(self, maps: list[LocalMap], state: JoiningState) -> tuple[JoiningState, LeastSquaresResult]:
-        """The same maps with other information matrices."""
+        """Maps with other information matrices."""
         problem = JoiningProblem(flatten(maps), state, np.array([0]), self.model, self.config.solver)
         return problem.optimize(state, self.config.optimizer)
 

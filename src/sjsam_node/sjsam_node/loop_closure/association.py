@@ -58,7 +58,7 @@ class PointSet:
         return PointSet(self.points[index], self.covariance[np.ix_(rows, rows)], self.descriptors[index])
 
     def at(self, index: IntArray) -> PointSet:
-        """The same, where all are meant without a copy."""
+        """Landmarks at ``index``; without a copy where all are meant."""
         return self if len(index) == len(self.points) else self.select(index)
 
     def variances(self) -> FloatArray:

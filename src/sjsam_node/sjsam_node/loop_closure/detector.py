@@ -119,7 +119,7 @@ class LoopDetector:
         return waited + self._verified(self.near.due(self.estimate.state, chained)[:most], self._redundancy_check())
 
     def around(self, middle: FloatArray, records: Iterable[int], excluded: set[int]) -> list[int]:
-        """Those of ``records`` whose landmarks are around a point (3,) of the map, nearest first."""
+        """Members of ``records`` whose landmarks are around a point (3,) of the map, nearest first."""
         state = self.estimate.state
         candidates = np.array([i for i in records if i not in excluded and not state.is_redundant(i)], dtype=np.int64)
         distance = np.linalg.norm(state.middles(candidates) - middle, axis=1)

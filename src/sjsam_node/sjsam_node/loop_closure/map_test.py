@@ -134,7 +134,7 @@ def median_nis(state: EstimateState, link: Link, nis: FloatArray) -> float:
 
 
 def worst_closures(state: EstimateState, closures: Sequence[Link], component: int, window: int) -> list[Link]:
-    """Of closures the one that its landmarks contradict most, and those of the same two stretches of way."""
+    """Closure that its landmarks contradict most, and others between the same two stretches of way."""
     if not closures:
         return []
     nis = nis_of(state, component)

@@ -85,7 +85,7 @@ class NearPairs:
         self.compared.note(pair, _seen_from(state, pair[:, 0], pair[:, 1]))
 
     def forget(self, records: set[int]) -> None:
-        """These records are to be compared anew: what was believed of them is no longer."""
+        """Compare these records anew: what was believed of them is no longer."""
         if records:
             self.compared.forget(records)
 

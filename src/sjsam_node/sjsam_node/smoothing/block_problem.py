@@ -77,7 +77,7 @@ class Sightings(NamedTuple):
 
 
 class BlockProblem:
-    """The same least squares as :class:`~sjsam_node.smoothing.joining.JoiningProblem` over maps of uncorrelated rows.
+    """Least squares of :class:`~sjsam_node.smoothing.joining.JoiningProblem` over maps of uncorrelated rows.
 
     Unknowns are ordered poses first, then landmarks; parameters as there.
     """

@@ -50,7 +50,7 @@ class RegionConfig(Config):
     """Turn of a separator since it was linearised beyond which the parts take part again (rad), up to ``size``."""
 
     def largest_turn(self, condensed: CondensedSubmap) -> float:
-        """The same for any number of submaps (rad): along a way turns add up like steps of a random walk."""
+        """``relinearize`` for any number of submaps (rad): along a way turns add up like steps of a random walk."""
         return self.relinearize * float(np.sqrt(max(len(condensed.records) / self.size, 1.0)))
 
 
@@ -158,7 +158,7 @@ def _condense_condensed(
 
 
 def _gathered(state: EstimateState, size: int, candidates: IntArray, first: int) -> IntArray:
-    """Of the candidates nearest to one, those that hang together with it."""
+    """Candidates nearest to one that hang together with it."""
     distance = np.linalg.norm(state.middles(candidates) - state.middles(np.array([first])), axis=1)
     nearest = np.sort(candidates[np.argsort(distance, kind="stable")[:size]])
     label = _connected(state.graph, nearest)

@@ -42,7 +42,7 @@ class FrozenSubmaps:
     def with_one(
         self, record: int, nodes: IntArray, reference: int, poses: FloatArray, covariances: FloatArray
     ) -> FrozenSubmaps:
-        """The same and another record whose two ``nodes`` stay where they are among the map's ``poses`` (n, 4, 4).
+        """Frozen submaps with another record whose two ``nodes`` stay where they are among the map's ``poses`` (n, 4, 4).
 
         ``covariances`` (2, 6, 6): of its nodes, seen from the reference.
         """
@@ -54,17 +54,17 @@ class FrozenSubmaps:
         )  # fmt: skip
 
     def at(self, index: IntArray) -> FrozenSubmaps:
-        """Some of them."""
+        """Frozen submaps at ``index``."""
         return FrozenSubmaps(
             self.records[index], self.reference[index], self.nodes[index], self.poses[index], self.covariances[index]
         )
 
     def of_component(self, component: int, component_of: IntArray) -> FrozenSubmaps:
-        """Those of a component."""
+        """Frozen submaps of a component."""
         return self.at(np.nonzero(component_of[self.nodes[:, 0]] == component)[0])
 
     def still_tied(self, component_of: IntArray) -> FrozenSubmaps:
-        """Those whose reference is in the same component as they are."""
+        """Frozen submaps whose reference is in the same component as they are."""
         return self.at(np.nonzero(component_of[self.nodes[:, 0]] == component_of[self.reference])[0])
 
     def node(self, node: int) -> tuple[int, FloatArray, FloatArray] | None:

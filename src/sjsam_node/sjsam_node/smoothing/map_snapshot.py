@@ -199,7 +199,7 @@ class MapSnapshot:
                 f"{alone} of {len(self)} are chained as the filter made them. {ADVICE}")  # fmt: skip
 
     def structure(self) -> MapSnapshot:
-        """The same without the factors that covariances come from, which are as large as the map."""
+        """Snapshot without the factors that covariances come from, which are as large as the map."""
         return replace(self, _state=replace(self._state, solved={}, reduced={}, recovered={}))
 
     def skeleton_lines(self) -> FloatArray:

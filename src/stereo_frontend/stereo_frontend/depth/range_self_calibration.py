@@ -79,7 +79,7 @@ class RangeDifferences:
 
     @classmethod
     def between(cls, uv: FloatArray, depths: FloatArray, sigmas: FloatArray, length: FloatArray) -> RangeDifferences:
-        """Of depths (n, 2) m, the depth camera's and stereo's; ``length``: (n,) of the ray with depth 1.
+        """Differences of depths (n, 2) m, the depth camera's and stereo's; ``length``: (n,) of the ray with depth 1.
 
         Disparities are compared, and the depth camera's range says what they are worth: stereo's own would weigh those
         that happen to be too short more than those that are too long.

@@ -58,7 +58,7 @@ class CensureDetector:
         return Keypoints(found[:, :2].copy(), found[:, 2].copy(), found[:, 3].copy(), descriptors)
 
     def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
-        """Those keypoints, which are described already."""
+        """Keypoints as they are: they are described already."""
         return keypoints
 
 

@@ -42,5 +42,5 @@ class FastDetector:
         return Keypoints(uv[kept], size[kept], response[kept], descriptors)
 
     def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
-        """Those keypoints, which are described already."""
+        """Keypoints as they are: they are described already."""
         return keypoints

@@ -43,7 +43,7 @@ class OpenCvDetector:
         return Keypoints(uv[kept], size[kept], response[kept], self._normalise(raw[kept]))
 
     def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
-        """Those keypoints, which are described already."""
+        """Keypoints as they are: they are described already."""
         return keypoints
 
 

@@ -123,10 +123,7 @@ def _limits(config: MatchingConfig, bounds: tuple[float, float]) -> FloatArray:
 def swapped_share(
     left: Keypoints, right: Keypoints, config: MatchingConfig, bounds: tuple[float, float]
 ) -> tuple[float, int]:
-    """Share of matches with the wrong sign of disparity (near one.
-
-    Left and right images are swapped), and of how many.
-    """
+    """Share of matches with the wrong sign of disparity, near one where the images are swapped, and of how many."""
     proper = len(match_stereo(left, right, config, bounds))
     mirrored = len(match_stereo(right, left, config, bounds))
     return mirrored / max(proper + mirrored, 1), proper + mirrored

@@ -131,7 +131,7 @@ class FixedPointMap:
         return out
 
     def colour(self, image: ByteArray) -> ByteArray:
-        """The same of a picture in colour."""
+        """A picture in colour, bilinear."""
         mapped = cv2.remap(image, self.corner, self.fraction, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         return np.asarray(mapped, np.uint8)
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SURF (Bay, Ess, Tuytelaars, Van Gool.
+"""SURF, the thesis's choice of feature (ch. 3).
 
-Speeded-Up Robust Features, CVIU 2008), the thesis's choice of feature (ch. 3).
+Bay, Ess, Tuytelaars, Van Gool: Speeded-Up Robust Features, CVIU 2008.
 
 Extended descriptor (SURF-128) by default, SURF-64 on request. Oriented by default: on rigs that stay level the upright
 one matches a sixth more, but where the camera rolls by 15 degrees and more it fails. On EuRoC's key frames, half of
@@ -80,7 +80,7 @@ class SurfDetector:
         return Keypoints(found[:, :2].copy(), _DIAMETER * found[:, 2], found[:, 3].copy(), descriptors)
 
     def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
-        """Those keypoints of ``image`` with the descriptors that tell moments apart."""
+        """Keypoints of ``image`` with the descriptors that tell moments apart."""
         places = np.column_stack([keypoints.uv, keypoints.size / _DIAMETER]).astype(np.float64)
         return replace(keypoints, descriptors=self._describe(image, places))
 

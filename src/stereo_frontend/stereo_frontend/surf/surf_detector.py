@@ -109,7 +109,7 @@ def find_maxima(image, doubled, threshold, found):  # type: ignore[no-untyped-de
 
 @in_place()
 def _find_in_rows(image, doubled, size, rows, threshold, sums, layers, marks, cube, offset, found):  # type: ignore[no-untyped-def]
-    """The same; what comes between ``size`` and ``found``, but for ``threshold``, is room."""
+    """Loop over the rows; what comes between ``size`` and ``found``, but for ``threshold``, is room."""
     (height, width), integral = size, rows[0]
     count = 0
     for newest in range(height + _AHEAD):

@@ -95,7 +95,7 @@ def _crossed(first, second, third, fourth, out):  # type: ignore[no-untyped-def]
 
 @in_place()
 def determinant_at(integral, x, y, size):  # type: ignore[no-untyped-def]
-    """The same at one pixel, for a filter of any of the sizes."""
+    """Determinant of the Hessian at one pixel, for a filter of any of the sizes."""
     x, y, lobe, half = _Index(x), _Index(y), _Index(size // 3), _Index(size // 2)
     middle = lobe // _Index(2)
     top, bottom = integral[_at(y - lobe + _ONE)], integral[_at(y + lobe)]

@@ -77,7 +77,7 @@ class Tracks:
         return Tracks(*(_selected(getattr(self, f.name), index) for f in dataclasses.fields(self)))
 
     def extended(self, others: Tracks) -> Tracks:
-        """These and the others."""
+        """Tracks with the others after them."""
         return Tracks(*(_joined(getattr(self, f.name), getattr(others, f.name)) for f in dataclasses.fields(self)))
 
 
