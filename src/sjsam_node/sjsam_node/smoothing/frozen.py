@@ -42,7 +42,7 @@ class FrozenSubmaps:
     def with_one(
         self, record: int, nodes: IntArray, reference: int, poses: FloatArray, covariances: FloatArray
     ) -> FrozenSubmaps:
-        """Frozen submaps with another record whose two ``nodes`` stay where they are among the map's ``poses`` (n, 4, 4).
+        """Frozen submaps with one more, whose two ``nodes`` stay where they are among the map's ``poses`` (n, 4, 4).
 
         ``covariances`` (2, 6, 6): of its nodes, seen from the reference.
         """
