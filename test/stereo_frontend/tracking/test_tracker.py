@@ -155,3 +155,11 @@ def test_tracks_of_another_camera_are_forgotten(stereo_pair):
     assert frontend.counters.counts["key_frames"] == 2
     assert (other.track_ids > 0).sum() > 60
     assert len(np.intersect1d(first.track_ids[first.track_ids > 0], other.track_ids)) == 0
+
+
+def test_pictures_far_apart_in_time_are_detected_anew(stereo_pair):
+    frontend, pair = tracking_frontend(), stereo_pair()
+    first = frontend.process(pair)
+    now = frontend.process(dataclasses.replace(moved(pair, 1), stamp_ns=pair.stamp_ns + 500_000_000))
+    assert len(np.intersect1d(first.track_ids, now.track_ids[now.track_ids > 0])) == 0
+    assert len(now) > 0.9 * len(first)

@@ -40,6 +40,8 @@ _SIGMA_SCALE, _SIGMA_FLOOR = 1.15, 0.04
 _MAX_SIGMA = 0.5
 _MAX_STRETCH = 2.0
 """Greatest change of a patch's size since its key frame."""
+_LONGEST_STEP_S = 0.3
+"""Time between pictures beyond which nothing is followed: what little is found again displaces what can be detected."""
 _MAX_MISSED = 5
 """Frames for which a track is looked for where the motion predicts it."""
 _FEW = 0.7
@@ -115,12 +117,15 @@ class Tracker:
 
     # ---- one picture, in order
     def follow(self, picture: ByteArray, camera: Camera, stamp_ns: int) -> Followed | None:
-        """Tracks found in a picture; None while there are none. Those of another camera are forgotten."""
-        if camera != self._camera:
+        """Tracks found in a picture; None while there are none.
+
+        Those of another camera, and of a picture too long ago, are forgotten.
+        """
+        dt = 1e-9 * (stamp_ns - self._stamp_ns)
+        if camera != self._camera or dt > _LONGEST_STEP_S:
             self.forget()
             self._camera = camera
         before, tracks = self._half, self._tracks
-        dt = 1e-9 * (stamp_ns - self._stamp_ns)
         half = np.asarray(cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         self._half, self._stamp_ns = half, stamp_ns
         if tracks is None or before is None or len(tracks) == 0:
