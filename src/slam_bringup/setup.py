@@ -36,6 +36,7 @@ setup(
         "filterpy",
         "Jinja2",
         "matplotlib",
+        "numba",
         "numpy",
         "opencv-python-headless",
         "PyYAML",

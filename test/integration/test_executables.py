@@ -57,6 +57,7 @@ def test_every_node_starts_publishes_and_stops_on_sigint(
         supervisor.wait(lambda: all(f"recording {t}" in log.read_text() for t in RECORDED), 60.0, "the recorder")
         before = supervisor.progress["/ekf_slam"]
         supervisor.wait(lambda: supervisor.progress["/ekf_slam"] > before, 60.0, "a frame through the whole chain")
+        supervisor.wait(lambda: int(heard["/ndt_odometry"].get("processed", 0)) > 3, 60.0, "scans registered")
         supervisor.listen(1.0)
         group.stop()
         failed = [node for node in nodes if group.exit_codes[node.command.full_name] != 0]

@@ -179,10 +179,10 @@ def test_joining_submaps_that_contradict_each_other_is_not_worse_than_their_chai
     joined.save(tmp_path / "map")
     assert ate(e) < 1.05 * chain_ate(agent, submaps)
     assert nees.mean() / 6.0 < 2.0, "and says so"
-    assert f"{len(submaps)} of {len(submaps)} are chained" in joined.overconfidence
-    assert "slam calibrate refine" in joined.overconfidence, "and says what to do"
+    assert f"{len(submaps)} of {len(submaps)} are chained" in joined.snapshot().overconfidence
+    assert "slam calibrate refine" in joined.snapshot().overconfidence, "and says what to do"
     loaded = GlobalMap.load(tmp_path / "map")
-    assert loaded.overconfidence == joined.overconfidence
+    assert loaded.snapshot().overconfidence == joined.snapshot().overconfidence
     assert np.array_equal(errors(loaded, agent)[1], nees)
 
 
@@ -190,7 +190,7 @@ def test_honest_submaps_with_few_landmarks_are_joined_and_kept() -> None:
     agent, submaps = few_landmarks(1, 1.0)
     joined, _ = join(submaps)
     joined.settle()
-    assert not joined.overconfidence
+    assert not joined.snapshot().overconfidence
     assert ate(errors(joined, agent)[0]) < 0.5 * chain_ate(agent, submaps)
 
 

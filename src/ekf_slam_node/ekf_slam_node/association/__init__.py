@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which features of a frame are which landmarks, and the motion that follows from it."""
+"""Pairs of features and landmarks, and the motion that follows from them."""

@@ -26,7 +26,7 @@ from slam_core.geometry import FloatArray
 
 @dataclass(frozen=True)
 class HypothesesConfig(Config):
-    """What a sighting may be, and how many hypotheses are followed."""
+    """Parameters of the hypotheses: what a sighting may be, and how many are followed."""
 
     most: int = parameter(100, "hypotheses that are followed", minimum=1)
     least_weight: float = parameter(

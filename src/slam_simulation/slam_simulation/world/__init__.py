@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is simulated: buildings, furniture, materials, light."""
+"""The simulated world: buildings, furniture, materials, light."""
