@@ -36,7 +36,6 @@ setup(
         "filterpy",
         "Jinja2",
         "matplotlib",
-        "numba",
         "numpy",
         "opencv-python-headless",
         "PyYAML",
