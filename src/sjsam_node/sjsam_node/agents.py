@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sjsam_node.smoothing.estimate import MapEstimate
+from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_core.geometry import compose_covariance
 from slam_core.linear_algebra.block_pattern import IntArray
 from slam_core.types import PoseEstimate, Submap
@@ -86,3 +87,12 @@ def in_order(submaps: Iterable[Submap]) -> list[Submap]:
         stamps = np.maximum.accumulate([s.end_stamp_ns for s in run]).tolist()
         turns += [(s is run[-1], stamp, agent, k, s) for k, (stamp, s) in enumerate(zip(stamps, run, strict=True))]
     return [turn[-1] for turn in sorted(turns, key=lambda turn: turn[:4])]
+
+
+def separate_parts(snapshot: MapSnapshot) -> str:
+    """Parts of the map that no recognised place ties together yet, with the names of the agents in each."""
+    agents: dict[int, set[str]] = {}
+    for part, (agent, _, _) in zip(snapshot.part_of.tolist(), snapshot.keys, strict=True):
+        agents.setdefault(part, set()).add(agent or "the rig")
+    names = [" and ".join(sorted(of_part)) for of_part in agents.values()]
+    return f"{len(names)} separate parts: {'; '.join(names)}"

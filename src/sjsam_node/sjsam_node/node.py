@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import types
-from collections.abc import Awaitable, Callable, Generator, Sequence
+from collections.abc import Awaitable, Callable, Generator
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ import numpy as np
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
+from sjsam_node.agents import separate_parts
 from sjsam_node.autosave import Autosave
 from sjsam_node.global_map import ALREADY_JOINED, JoinReport
 from sjsam_node.map_messages import (
@@ -270,7 +271,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self.health.count("submaps joined")
         self.health.count("closures", len(report.closures))
         self.health.take(self.map.counts | {"components": report.components})
-        reasons = [separate_parts(self.map.snapshot.parts)] if report.components > 1 else []
+        reasons = [separate_parts(self.map.snapshot)] if report.components > 1 else []
         if report.is_strained:
             reasons.append(f"submaps contradict each other {report.variance_factor:.0f} times more than they claim")
             self.get_logger().warning(f"{reasons[-1]}. {ADVICE}", once=True)
@@ -392,12 +393,6 @@ def _until(condition: Callable[[], bool]) -> Generator[None, None, None]:
     """Await what another thread does in a callback of rclpy, whose executor goes on with all else."""
     while not condition():
         yield
-
-
-def separate_parts(parts: Sequence[Sequence[str]]) -> str:
-    """Parts of the map that no recognised place ties together yet, with the names of the agents in each."""
-    names = [" and ".join(name or "the rig" for name in agents) for agents in parts]
-    return f"{len(parts)} separate parts: {'; '.join(names)}"
 
 
 def main() -> None:

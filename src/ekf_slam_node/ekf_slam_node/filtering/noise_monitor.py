@@ -24,7 +24,7 @@ _MAX_NOISE_FACTOR = 25.0
 
 _WATCHED_FRAMES = 20
 _FEW_FRAMES = 3
-"""So many frames of these may have larger errors for a reason of their own, less one."""
+"""Frames with larger errors, among those watched, from which on they are no accident."""
 
 _CHANCE = 0.15
 """Logarithm of a factor that true claims may reach by chance."""

@@ -166,26 +166,19 @@ class MapSnapshot:
         return self._state.graph.sets.is_shared
 
     @property
+    def part_of(self) -> IntArray:
+        """Part of the map that each submap is in, (submaps,): nothing ties two of them together yet."""
+        return self._state.component_of[self._state.graph.starts]
+
+    @property
     def is_tied(self) -> BoolArray:
         """Mask (submaps,) of those that hang together with the first one."""
-        state = self._state
-        own = state.component_of[state.graph.starts]
-        return np.asarray(own == own[:1])
+        return np.asarray(self.part_of == self.part_of[:1])
 
     @property
     def components(self) -> int:
         """Parts of the map that nothing ties together yet."""
         return len(self._state.components())
-
-    @property
-    def parts(self) -> tuple[tuple[str, ...], ...]:
-        """Names of the agents in each of these parts, that of the first submap first."""
-        state = self._state
-        own = state.component_of[state.graph.starts].tolist()
-        agents: dict[int, set[str]] = {}
-        for part, record in zip(own, state.graph.records, strict=True):
-            agents.setdefault(part, set()).add(record.submap.agent)
-        return tuple(tuple(sorted(names)) for names in agents.values())
 
     @property
     def overconfidence(self) -> str:
