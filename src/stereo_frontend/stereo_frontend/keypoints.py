@@ -57,6 +57,14 @@ class Detector(Protocol):
         ...
 
 
+class DescribesAtOnce:
+    """A detector whose keypoints come with descriptors for every purpose."""
+
+    def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
+        """Keypoints as they are: they are described already."""
+        return keypoints
+
+
 def spread_over_grid(
     uv: Float32Array, response: Float32Array, shape: tuple[int, int], grid: tuple[int, int], target: int
 ) -> npt.NDArray[np.intp]:

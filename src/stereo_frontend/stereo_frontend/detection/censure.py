@@ -13,7 +13,7 @@ from numba import njit
 
 from slam_core.runtime.in_place import in_place
 from slam_core.types import ByteArray
-from stereo_frontend.keypoints import MOST_KEYPOINTS, Keypoints, Selector
+from stereo_frontend.keypoints import MOST_KEYPOINTS, DescribesAtOnce, Keypoints, Selector
 from stereo_frontend.surf.surf import SurfConfig, describe
 from stereo_frontend.surf.surf_detector import MAX_PIXELS, vertex
 
@@ -30,7 +30,7 @@ _LINE_REACH = 4
 _SCALE_PER_SIZE = 1.2 / 9.0
 
 
-class CensureDetector:
+class CensureDetector(DescribesAtOnce):
     """Finds CenSurE keypoints and describes them as ``surf`` says, along the axes of the image."""
 
     def __init__(self, surf: SurfConfig | None = None) -> None:
@@ -56,10 +56,6 @@ class CensureDetector:
         places = np.column_stack([found[:, :2], _SCALE_PER_SIZE * found[:, 2]]).astype(np.float64)
         descriptors = describe(image, places, upright=True, extended=self._surf.extended)
         return Keypoints(found[:, :2].copy(), found[:, 2].copy(), found[:, 3].copy(), descriptors)
-
-    def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
-        """Keypoints as they are: they are described already."""
-        return keypoints
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_core.types import ByteArray
 from stereo_frontend.detection.opencv_detectors import FAST_THRESHOLD
-from stereo_frontend.keypoints import Keypoints, Selector
+from stereo_frontend.keypoints import DescribesAtOnce, Keypoints, Selector
 from stereo_frontend.surf.surf import SurfConfig, describe
 
 _SCALE = 2.0
@@ -23,7 +23,7 @@ _LEAST, _MOST = 2, 120
 """Thresholds, grey values, between which FAST is asked for corners."""
 
 
-class FastDetector:
+class FastDetector(DescribesAtOnce):
     """Finds FAST corners and describes them as ``surf`` says."""
 
     def __init__(self, surf: SurfConfig | None = None) -> None:
@@ -40,7 +40,3 @@ class FastDetector:
         places = np.column_stack([uv[kept], np.full(len(kept), _SCALE)]).astype(np.float64)
         descriptors = describe(image, places, upright=self._surf.upright, extended=self._surf.extended)
         return Keypoints(uv[kept], size[kept], response[kept], descriptors)
-
-    def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
-        """Keypoints as they are: they are described already."""
-        return keypoints

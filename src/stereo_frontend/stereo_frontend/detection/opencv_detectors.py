@@ -14,14 +14,14 @@ import cv2
 import numpy as np
 
 from slam_core.types import AnyArray, ByteArray, Float32Array
-from stereo_frontend.keypoints import MOST_KEYPOINTS, Keypoints, Selector
+from stereo_frontend.keypoints import MOST_KEYPOINTS, DescribesAtOnce, Keypoints, Selector
 
 SIFT_CONTRAST = 0.04
 """Contrast threshold of Lowe 2004 as OpenCV scales it."""
 FAST_THRESHOLD = 20.0
 
 
-class OpenCvDetector:
+class OpenCvDetector(DescribesAtOnce):
     """One of OpenCV's detectors with descriptors: ``sift``, ``rootsift`` or ``orb``.
 
     ``rootsift`` is the square root of the L1-normalised SIFT vector (Arandjelovic and Zisserman 2012).
@@ -41,10 +41,6 @@ class OpenCvDetector:
         size = np.array([k.size for k in found], np.float32)
         kept = _without_repeats(uv, select(uv, size, response))
         return Keypoints(uv[kept], size[kept], response[kept], self._normalise(raw[kept]))
-
-    def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
-        """Keypoints as they are: they are described already."""
-        return keypoints
 
 
 def unit_norm(vectors: AnyArray) -> Float32Array:
