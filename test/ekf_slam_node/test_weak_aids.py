@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.odometry.aids import MEAN_TURN_RATE_SIGMA
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.slam import EkfSlam
 from feature_world import loop, room
@@ -37,7 +38,7 @@ def test_a_weak_aid_does_not_move_the_point_of_linearisation(imu: bool) -> None:
         for k, T in enumerate(poses):
             if k and imu:
                 rate = so3_log(poses[k - 1][:3, :3].T @ T[:3, :3]) / (STEP_NS * 1e-9)
-                rate = rate + 0.3 * slam.config.motion.sigma_gyro * rng.standard_normal(3)
+                rate = rate + 0.3 * MEAN_TURN_RATE_SIGMA * rng.standard_normal(3)
                 for part in range(10):
                     slam.process_imu(ImuSample((k - 1) * STEP_NS + part * STEP_NS // 10 + 1, rate, np.zeros(3)))
             result = slam.process(world.features(T, k * STEP_NS, rng, max_features=150)[0])

@@ -61,7 +61,7 @@ def test_turns_that_no_steady_velocity_foretells_are_followed(
     scans = [room.scan(start @ T, rng, 60) for T in poses]
     outcomes = {}
     for enabled in (True, False):
-        odometry = ScanOdometry(OdometryConfig(gyro=GyroConfig(enabled=enabled)))
+        odometry = ScanOdometry(OdometryConfig(imu=GyroConfig(enabled=enabled)))
         results = []
         for k, scan in enumerate(scans):
             if k:

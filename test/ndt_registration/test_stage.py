@@ -22,7 +22,7 @@ def stage(*, gyro: bool = False) -> ScanOdometryStage:
     tree = FrameTree()
     tree.add("base_link", "tof_optical_frame", T_BASE_TOF)
     tree.add("base_link", "imu_link", np.eye(4))
-    return ScanOdometryStage(replace(OdometryConfig(), gyro=GyroConfig(enabled=gyro)), tree)
+    return ScanOdometryStage(replace(OdometryConfig(), imu=GyroConfig(enabled=gyro)), tree)
 
 
 @pytest.fixture

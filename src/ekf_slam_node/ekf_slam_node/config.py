@@ -11,6 +11,12 @@ from slam_core.config import Config, group, parameter
 from slam_core.estimation.calibration_error import CalibrationErrorConfig
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray
+from slam_core.imu_config import ImuConfig
+
+MAX_FRAME_FEATURES = 800
+"""The strongest features of a frame that are looked at."""
+MAX_UPDATE_LANDMARKS = 120
+"""Most landmarks of one update: further ones tell it little and cost the square of their number."""
 
 
 @dataclass(frozen=True)
@@ -25,20 +31,6 @@ class MotionConfig(Config):
     sigma_initial_turn_rate: float = parameter(2.0, "the same for its turn rate", unit="rad/s", minimum=0.0)
     standing_frames: int = 5
     """Frames without motion after which the rig counts as standing: nothing is mapped until it moves; 0: never."""
-    imu: str = parameter(
-        "auto",
-        "whether an IMU is used: where there is one, never, or always (a run without one is refused)",
-        choices=("auto", "off", "on"),
-    )
-    sigma_gyro: float = parameter(
-        0.02, "noise of the mean turn rate of an IMU between two frames", unit="rad/s", minimum=1e-6
-    )
-    sigma_gyro_bias: float = parameter(
-        0.02, "constant error of its turn rates, which is learnt", unit="rad/s", minimum=0.0
-    )
-    sigma_gyro_bias_walk: float = parameter(
-        1e-4, "change of that error within a second, growing with the root of the time", unit="rad/s", minimum=0.0
-    )
 
     @property
     def sigma(self) -> FloatArray:
@@ -52,9 +44,14 @@ class MotionConfig(Config):
 
 
 @dataclass(frozen=True)
-class InertialConfig(Config):
-    """An IMU with its noise as data sheets give it; the defaults suit consumer sensors."""
+class InertialConfig(ImuConfig):
+    """Whether an IMU is used, its clock and its noise."""
 
+    use: str = parameter(
+        "auto",
+        "whether an IMU is used: where there is one, never, or always (a run without one is refused)",
+        choices=("auto", "off", "on"),
+    )
     time_offset: float = parameter(
         0.0,
         "added to the IMU's stamps, so that they mean the same time as the images'",
@@ -62,28 +59,12 @@ class InertialConfig(Config):
         minimum=-1.0,
         maximum=1.0,
     )
-    gyro_noise: float = parameter(1e-3, "white noise of its turn rates", unit="rad/s/sqrt(Hz)", minimum=1e-6)
-    accelerometer_noise: float = parameter(
-        0.01, "white noise of its specific force", unit="m/s2/sqrt(Hz)", minimum=1e-6
-    )
-    sigma_accelerometer_bias: float = parameter(
-        0.15, "constant error of its specific force, which is learnt", unit="m/s2", minimum=0.0
-    )
 
 
 @dataclass(frozen=True)
 class MeasurementConfig(Config):
-    """Selection and noise of the features that are measured."""
+    """When the features of a picture were measured."""
 
-    common_error: float = parameter(
-        2.5,
-        "error of the camera's pose, new in every frame, in multiples of what the residuals of neighbouring features"
-        " share; 0 takes the noise of every feature as its own",
-        minimum=0.0,
-        maximum=20.0,
-    )
-    max_features: int = parameter(800, "the strongest features of a frame that are looked at", minimum=10)
-    max_observations: int = parameter(120, "largest number of landmarks used in one update", minimum=6)
     readout: float = parameter(
         0.0, "time from a picture's first row to its last, where known beforehand; negative from the last to the first",
         unit="s", minimum=-0.1, maximum=0.1,
@@ -183,7 +164,7 @@ class EkfSlamConfig(Config):
         choices=("invariant", "standard"),
     )
     motion: MotionConfig = group(MotionConfig)
-    inertial: InertialConfig = group(InertialConfig)
+    imu: InertialConfig = group(InertialConfig)
     measurement: MeasurementConfig = group(MeasurementConfig)
     association: FeatureAssociationConfig = group(FeatureAssociationConfig)
     landmark: LandmarkConfig = group(LandmarkConfig)

@@ -12,9 +12,9 @@ from functools import partial
 import numpy as np
 
 from ekf_slam_node.association.linking import FrameLink, Linker
-from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.config import MAX_FRAME_FEATURES, MAX_UPDATE_LANDMARKS, EkfSlamConfig
 from ekf_slam_node.filtering.candidates import motion_prior
-from ekf_slam_node.filtering.common_error import CommonError
+from ekf_slam_node.filtering.common_error import COMMON_ERROR_FACTOR, CommonError
 from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.filtering.noise_monitor import InnovationWatch, NoiseMonitor
 from ekf_slam_node.odometry.aids import AID_GATE, ALL, Aid, MotionAids, contradicts
@@ -74,10 +74,10 @@ class EkfSlam:
         return submaps
 
     def _forget(self) -> None:
-        self._aids = MotionAids(self.config.motion, self.config.inertial)
+        self._aids = MotionAids(self.config.motion, self.config.imu)
         self._noise = NoiseMonitor()
         self._innovations = InnovationWatch()
-        self._common = CommonError(self.config.measurement.common_error)
+        self._common = CommonError(COMMON_ERROR_FACTOR)
         self._chain = SubmapChain(self.config, self._T_rig_optical, self.session)
         self._next_id = 0
         self._newest_stamp_ns = 0
@@ -98,7 +98,7 @@ class EkfSlam:
         self._newest_stamp_ns = features.stamp_ns
         usable = usable_features(features)
         self.counters.add("features_unusable", int(len(features) - usable.sum()))
-        frame = self._noise.corrected(frame_of_strongest(features, usable, self.config.measurement.max_features))
+        frame = self._noise.corrected(frame_of_strongest(features, usable, MAX_FRAME_FEATURES))
         if not self._chain.is_open:
             return self._begin(frame)
         try:
@@ -129,7 +129,7 @@ class EkfSlam:
 
     def process_imu(self, sample: ImuSample) -> None:
         """A reading of an IMU, in the order of the stamps, before the frames that come after it."""
-        if self.config.motion.imu == "off":
+        if self.config.imu.use == "off":
             return
         if not self._aids.add_imu(sample):
             self.counters.add("imu_rejected")
@@ -213,7 +213,7 @@ class EkfSlam:
         """Add the landmarks that the frame confirms, at the previous pose; returns all landmarks that it sees."""
         # A surprising motion rests on these pairs alone: all of them are worth their cost.
         config = self.config
-        wanted = config.measurement.max_observations if linked.surprising else config.landmark.target_in_view
+        wanted = MAX_UPDATE_LANDMARKS if linked.surprising else config.landmark.target_in_view
         new_ids = np.arange(self._next_id, self._next_id + len(linked.link.rows))
         self._next_id += len(new_ids)
         return self._chain.local.confirm(linked.frame, linked.link, wanted, new_ids)

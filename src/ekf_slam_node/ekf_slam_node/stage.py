@@ -99,7 +99,7 @@ class FilterStage:
     def add_imu(self, sample: ImuSample) -> None:
         """Take an IMU's reading; ValueError if it is not known where the IMU sits."""
         T_base_imu = self._frames.lookup(self._base_frame, sample.frame_id)
-        seen = sample.seen_from(T_base_imu, self._base_frame, round(self._config.inertial.time_offset * 1e9))
+        seen = sample.seen_from(T_base_imu, self._base_frame, round(self._config.imu.time_offset * 1e9))
         self._samples.append(seen)
         self._awaited.heard(IMU, seen.stamp_ns)
 

@@ -8,20 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_core.config import Config, parameter
+from slam_core.config import parameter
 from slam_core.geometry import FloatArray, so3_exp
+from slam_core.imu_config import GyroscopeConfig
 from slam_core.types import LONGEST_IMU_STEP_S
 
 
 @dataclass(frozen=True)
-class GyroConfig(Config):
+class GyroConfig(GyroscopeConfig):
     """Gyroscope beside scan odometry."""
 
     enabled: bool = parameter(False, "predict the turn between scans from an IMU: for rigs that turn abruptly")
-    bias_sigma: float = parameter(
-        0.01, "error of its angular velocity, constant over a scan", unit="rad/s", minimum=0.0
-    )
-    noise: float = parameter(0.001, "white noise of its angular velocity", unit="rad/s/sqrt(Hz)", minimum=1e-6)
 
 
 class Gyro:
@@ -62,4 +59,5 @@ class Gyro:
 
     def sigma(self, seconds: float) -> float:
         """Standard deviation of a turn over ``seconds``, rad about each axis."""
-        return float(self._config.bias_sigma * seconds + self._config.noise * seconds**0.5)
+        config = self._config
+        return float(config.gyroscope_bias * seconds + config.gyroscope_noise_density * seconds**0.5)

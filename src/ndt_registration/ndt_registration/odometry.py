@@ -72,7 +72,7 @@ class OdometryConfig(Config):
     restart_after: int = 5
     """Failures after which the map starts anew."""
     motion: MotionFilterConfig = group(MotionFilterConfig)
-    gyro: GyroConfig = group(GyroConfig)
+    imu: GyroConfig = group(GyroConfig)
     registration: RegistrationConfig = field(default_factory=lambda: ODOMETRY_REGISTRATION)
 
 
@@ -108,7 +108,7 @@ class ScanOdometry:
         self._config = config or OdometryConfig()
         self._map = KeyframeWindow(self._config.keyframes)
         self._filter = MotionFilter(self._config.motion)
-        self._gyro = Gyro(self._config.gyro)
+        self._gyro = Gyro(self._config.imu)
         self.reset()
 
     def reset(self) -> None:

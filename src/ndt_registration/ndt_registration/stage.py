@@ -77,8 +77,8 @@ class ScanOdometryStage:
         self._awaited.frame(scan.stamp_ns)
 
     def add_imu(self, sample: ImuSample) -> None:
-        """Take an IMU's reading; without the parameter ``gyro.enabled`` nothing comes of it."""
-        if self._config.gyro.enabled:
+        """Take an IMU's reading; without the parameter ``imu.enabled`` nothing comes of it."""
+        if self._config.imu.enabled:
             self._samples.append(sample)
             self._awaited.heard(IMU, sample.stamp_ns)
 

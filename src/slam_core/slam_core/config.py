@@ -20,8 +20,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from slam_core.fixed_parameters import is_fixed
-
 C = TypeVar("C", bound="Config")
 
 
@@ -121,7 +119,7 @@ def from_mapping(config_type: type[C], values: Mapping[str, Any]) -> C:
     Raises
     ------
     ValueError
-        For an unknown name (with the nearest known one), one that is fixed now, a wrong type or a value out of range.
+        For an unknown name (with the nearest known one), a wrong type or a value out of range.
     """
     return changed(config_type(), values)
 
@@ -168,17 +166,8 @@ def _can_be_set(config: Config, name: str) -> bool:
     return "parameter" in info or isinstance(getattr(config, name), Config)
 
 
-def is_fixed_now(config: Config, name: str) -> bool:
-    """True if a dotted name was a parameter of a configuration once and is a constant now."""
-    head, _, rest = name.partition(".")
-    inner = getattr(config, head, None)
-    return is_fixed(type(config), head) or (isinstance(inner, Config) and bool(rest) and is_fixed_now(inner, rest))
-
-
 def _unknown(config: Config, name: str, prefix: str) -> str:
-    kind, known = type(config), [f.name for f in dataclasses.fields(config) if _can_be_set(config, f.name)]
-    if is_fixed(kind, name):
-        return f"parameter '{prefix}{name}' is fixed now: remove it"
+    known = [f.name for f in dataclasses.fields(config) if _can_be_set(config, f.name)]
     near = difflib.get_close_matches(name, known, 1)
     hint = (
         f"; did you mean '{prefix}{near[0]}'?" if near else f"; known: {', '.join(prefix + n for n in sorted(known))}"

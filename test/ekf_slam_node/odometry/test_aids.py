@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ekf_slam_node.config import EkfSlamConfig, MotionConfig
-from ekf_slam_node.odometry.aids import ALL, ROTATION, MotionAids
+from ekf_slam_node.config import EkfSlamConfig, InertialConfig, MotionConfig
+from ekf_slam_node.odometry.aids import ALL, MEAN_TURN_RATE_SIGMA, ROTATION, MotionAids
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.slam import EkfSlam
 from feature_world import loop, room
@@ -86,9 +86,9 @@ def test_constant_error_of_turn_rates_is_learnt() -> None:
     aid = aids.between(199 * STEP_NS, 200 * STEP_NS)
     assert aid is not None
     error = so3_log(aid.T[:3, :3]) / dt - turn
-    claimed = np.sqrt(aid.covariance.diagonal() / dt**2 - config.sigma_gyro**2)
+    claimed = np.sqrt(aid.covariance.diagonal() / dt**2 - MEAN_TURN_RATE_SIGMA**2)
     assert (np.abs(error) < 3.0 * claimed).all()
-    assert (claimed < 0.1 * config.sigma_gyro_bias).all()
+    assert (claimed < 0.1 * InertialConfig().gyroscope_bias).all()
 
 
 def test_biased_turn_rates_do_not_turn_the_map() -> None:
@@ -119,7 +119,7 @@ def run(aided: str, steps: int = 30) -> tuple[EkfSlam, list[float]]:
                 slam.process_motion(motion(poses, k, np.sqrt(np.diag(COVARIANCE)) * rng.standard_normal(6)))
             if k and aided == "imu":
                 step = so3_log(poses[k - 1][:3, :3].T @ T[:3, :3]) / 0.1
-                noisy = step + slam.config.motion.sigma_gyro * rng.standard_normal(3)
+                noisy = step + MEAN_TURN_RATE_SIGMA * rng.standard_normal(3)
                 for part in range(10):
                     slam.process_imu(ImuSample((k - 1) * STEP_NS + part * STEP_NS // 10 + 1, noisy, np.zeros(3)))
             result = slam.process(world.features(T, k * STEP_NS, rng, max_features=40)[0])

@@ -174,7 +174,7 @@ def through_darkness(imu: str) -> tuple[list[Submap], list[TrackingState], float
     rng = np.random.default_rng(7)
     world, samples = room(rng), iter(readings(12.0, rng))
     config = EkfSlamConfig()
-    slam, stamp = EkfSlam(replace(config, motion=replace(config.motion, imu=imu))), -1
+    slam, stamp = EkfSlam(replace(config, imu=replace(config.imu, use=imu))), -1
     states: list[TrackingState] = []
     submaps: list[Submap] = []
     for k in range(101):
@@ -220,7 +220,7 @@ def test_a_place_that_looks_like_another_is_told_from_it_by_the_imu(imu: str) ->
     rng = np.random.default_rng(7)
     world, samples = room(rng), iter(readings(9.0, rng))
     config = EkfSlamConfig()
-    slam, stamp = EkfSlam(replace(config, motion=replace(config.motion, imu=imu))), -1
+    slam, stamp = EkfSlam(replace(config, imu=replace(config.imu, use=imu))), -1
     for k in (*range(60), 80):
         while stamp < k * STEP_NS:
             sample = next(samples)

@@ -66,11 +66,6 @@ def test_parameters_of_the_nodes_alone_do_not_disturb_the_offline_run(tmp_path: 
         ("ekf_slm: {}", r"my.yaml: no node 'ekf_slm' \(did you mean 'ekf_slam'\?\)"),
         ("/one/ekf_slm: {}", "did you mean 'ekf_slam'"),
         ("/**: {ros__parameters: {input.depht: 3}}", "my.yaml: no node has a parameter 'input.depht'"),
-        ("/**: {closure.min_overlap: 0.2}", "my.yaml: parameter 'closure.min_overlap' is fixed now: remove it"),
-        (
-            "sjsam: {smoothing.region.open: 9}",
-            "my.yaml: sjsam: parameter 'smoothing.region.open' is fixed now: remove it",
-        ),
         (
             "ekf_slam: {submap: {max_distanc: 1}}",
             "my.yaml: ekf_slam: unknown parameter 'submap.max_distanc'.*'submap.max_distance'",

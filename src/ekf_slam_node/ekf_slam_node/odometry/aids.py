@@ -25,6 +25,8 @@ from slam_core.types import ImuSample, RelativeMotion
 
 _AID_STAMP_TOLERANCE = 0.005
 """Largest difference of the stamps of a motion aid and of the frames it joins."""
+MEAN_TURN_RATE_SIGMA = 0.02
+"""Noise (rad/s) of an IMU's mean turn rate between two frames, of clocks and mounting too."""
 _SIGMA_TURN_RATE = 0.1
 """By how much (rad/s) the turn rate of a moment may differ from that of a single reading."""
 _ELSEWHERE = np.repeat([0.3, np.radians(5.0)], 3)
@@ -193,7 +195,7 @@ class MotionAids:
         pre = self._preintegral(start_stamp_ns, end_stamp_ns)
         if pre is None or not self.inertial.uses_turns:
             return None
-        variance = np.eye(3) * self._config.sigma_gyro**2 + self.inertial.gyro_bias_covariance
+        variance = np.eye(3) * MEAN_TURN_RATE_SIGMA**2 + self.inertial.gyro_bias_covariance
         return Aid(make_transform(pre.R, np.zeros(3)), variance * pre.dt**2, ROTATION)
 
     def _place(self) -> FloatArray:

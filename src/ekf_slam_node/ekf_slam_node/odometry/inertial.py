@@ -32,6 +32,8 @@ from slam_core.types import GRAVITY
 _GATE = chi_square_bound(0.999, 3)
 _HAND_SHAKE = 2.0
 """By how much (m/s2) the first readings may differ from gravity, each axis."""
+_GYROSCOPE_BIAS_WALK = 1e-4
+"""Change (rad/s) of a gyroscope's bias within a second, growing with the root of the time."""
 _ACCELEROMETER_BIAS_WALK = 1e-3
 """Change (m/s2) of an accelerometer's bias within a second, growing with the root of the time."""
 _GRAVITY_SPREAD = 0.03
@@ -83,11 +85,14 @@ class InertialFilter:
     def __init__(self, motion: MotionConfig, config: InertialConfig) -> None:
         self._motion = motion
         self.noise = ImuNoise(
-            config.gyro_noise, config.accelerometer_noise, motion.sigma_initial_turn_rate, motion.sigma_acceleration
+            config.gyroscope_noise_density,
+            config.accelerometer_noise_density,
+            motion.sigma_initial_turn_rate,
+            motion.sigma_acceleration,
         )
         self.biases = np.zeros(6)
         self.covariance = np.zeros((12, 12))
-        sigma = np.repeat([motion.sigma_gyro_bias, config.sigma_accelerometer_bias], 3)
+        sigma = np.repeat([config.gyroscope_bias, config.accelerometer_bias], 3)
         self.covariance[B, B] = np.diag(sigma**2)
         self.uses_force, self.uses_turns, self.complaint = True, True, ""
         self._excess, self._turn_excess, self._judged = 1.0, 1.0, 0
@@ -157,7 +162,7 @@ class InertialFilter:
         covariance = F @ self.covariance @ F.T
         rows = np.array([3, 4, 5, 6, 7, 8, 0, 1, 2])
         covariance[np.ix_(rows, rows)] += pre.covariance
-        walk = np.repeat([self._motion.sigma_gyro_bias_walk, _ACCELEROMETER_BIAS_WALK], 3)
+        walk = np.repeat([_GYROSCOPE_BIAS_WALK, _ACCELEROMETER_BIAS_WALK], 3)
         covariance[12:, 12:] += np.diag(walk**2 * dt)
         p = self.velocity * dt + 0.5 * self.gravity * dt**2 + pre.p
         velocity = self.velocity + self.gravity * dt + pre.v

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ekf_slam_node.association.linking import FrameLink
-from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.config import MAX_UPDATE_LANDMARKS, EkfSlamConfig
 from ekf_slam_node.filtering.candidates import Candidates, squared_distances
 from ekf_slam_node.filtering.covariance import IndexArray
 from ekf_slam_node.filtering.drift import Drift
@@ -196,7 +196,7 @@ class OpenSubmap:
         fresh = fresh[self.pending.free[link.rows[fresh] - len(self.table)]]
         pixels = frame.z[link.columns, :2]
         size = (frame.camera.width, frame.camera.height)
-        known = known[spread_choice(pixels[known], pixels[:0], self._config.measurement.max_observations, size)]
+        known = known[spread_choice(pixels[known], pixels[:0], MAX_UPDATE_LANDMARKS, size)]
         which = link.rows[fresh] - len(self.table)
         inherited = self.pending.ids[which] >= 0
         first = fresh[inherited]

@@ -26,7 +26,7 @@ from slam_bringup.pipeline.overrides import (
     require_known_parameters,
 )
 from slam_bringup.pipeline.verdict import RunConfig
-from slam_core.config import Config, from_mapping, group, is_fixed_now, iterate_parameters
+from slam_core.config import Config, from_mapping, group, iterate_parameters
 from stereo_frontend.frontend_config import FrontendConfig
 from tof_driver.depth import DepthConfig
 
@@ -84,9 +84,7 @@ def system_config(overrides: Overrides) -> SystemConfig:
     known = {name: {parameter for parameter, _, _ in iterate_parameters(config)} for name, config in groups.items()}
     for name in overrides.of_all:
         if not any(name in k for k in known.values()) and not any(is_parameter_of(n, name) for n in NODE_CONFIGS):
-            is_old = any(is_fixed_now(config, name) for config in groups.values())
-            problem = f"parameter '{name}' is fixed now: remove it" if is_old else f"no node has a parameter '{name}'"
-            raise ValueError(f"{overrides.origin}: {problem}")
+            raise ValueError(f"{overrides.origin}: no node has a parameter '{name}'")
     for node in NODE_CONFIGS.keys() - groups.keys():
         require_known_parameters(overrides, node)
     parsed: dict[str, Any] = {name: _group(name, type(groups[name]), known[name], overrides) for name in groups}
@@ -108,7 +106,7 @@ def choose(config: SystemConfig, mode: str, mapper: str, odometry: str, imu: str
     Where depth comes from, submaps or one filter, scan odometry or none, and whether an IMU is used (None: as
     configured).
     """
-    motion = config.ekf_slam.motion
+    inertial = config.ekf_slam.imu
     submap = config.ekf_slam.submap
     if mapper == "ekf":
         submap = replace(submap, max_distance=1e6, max_landmarks=10**9, max_frames=10**9, drift=True)
@@ -121,7 +119,7 @@ def choose(config: SystemConfig, mode: str, mapper: str, odometry: str, imu: str
         ekf_slam=replace(
             config.ekf_slam,
             submap=submap,
-            motion=motion if imu is None else replace(motion, imu=imu),
+            imu=inertial if imu is None else replace(inertial, use=imu),
             wait_for=() if odometry == "none" else (MOTION,),
         ),
         ndt_odometry=replace(config.ndt_odometry, registration=registration),
@@ -136,9 +134,9 @@ def filter_config(config: FilterConfig, sensors: AgentSensors) -> FilterConfig:
     ValueError
         If an IMU is asked for and the agent has none.
     """
-    if config.motion.imu == "on" and "imu" not in sensors.topics:
+    if config.imu.use == "on" and "imu" not in sensors.topics:
         raise ValueError("an IMU is asked for (--imu on) and there is no topic imu: name it by --topic imu=/...")
-    imu = (IMU,) if "imu" in sensors.topics and config.motion.imu != "off" else ()
+    imu = (IMU,) if "imu" in sensors.topics and config.imu.use != "off" else ()
     return replace(config, agent=sensors.agent, wait_for=(*config.wait_for, *imu))
 
 

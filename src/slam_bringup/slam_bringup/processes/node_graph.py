@@ -135,7 +135,7 @@ def plan_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
         extra=extra, base_frames=base_frames,
         overrides=overrides,
-        with_imu=[a for a, s in sensors.items() if "imu" in s.topics and config.ekf_slam.motion.imu != "off"],
+        with_imu=[a for a, s in sensors.items() if "imu" in s.topics and config.ekf_slam.imu.use != "off"],
         with_laser=[a for a, s in sensors.items() if s.scanner == "scan"],
     )  # fmt: skip
     specs = [replace(spec, parameters=spec.parameters | _REPLAY) for spec in specs]
