@@ -12,7 +12,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from sjsam_node.graph.links import Link, Status
-from sjsam_node.loop_closure.consistency import ConsistencyConfig, Verdict, is_among, verdict_on
+from sjsam_node.loop_closure.consistency import (
+    RETRY_GROWTH,
+    SETTLING_ROUNDS,
+    ConsistencyConfig,
+    Verdict,
+    is_among,
+    verdict_on,
+)
 from sjsam_node.loop_closure.map_test import MapTest
 from sjsam_node.loop_closure.overconfidence import OverconfidenceTest, links_of, reduced_chi2
 from sjsam_node.loop_closure.pairwise import PairwiseConsistency, support_of
@@ -45,7 +52,7 @@ class ClosureJoiner:
         graph = self.estimate.graph
         against = self.pairwise.against_odometry(graph, found)
         found = [k for k, is_off in zip(found, against, strict=True) if not is_off]
-        least = self.config.retry * self._refused_support
+        least = RETRY_GROWTH * self._refused_support
         choice = self.pairwise.selected(graph, found, self.refused, least)
         added, removed = choice.added, choice.removed
         self.defer_closures(k for k in found if not is_among(k, added))
@@ -73,7 +80,7 @@ class ClosureJoiner:
         before = self.estimate.state
         if not any(k.is_closure for k in before.graph.links):
             return Verdict()
-        after, _ = self._without_contradictions(before, newest, self.config.settling_rounds)
+        after, _ = self._without_contradictions(before, newest, SETTLING_ROUNDS)
         self.estimate.accept(after)
         return verdict_on([], before.graph.links, after.graph.links)
 
@@ -91,7 +98,7 @@ class ClosureJoiner:
 
     def _remove_conflicting(self, record: int) -> None:
         """Remove what the submaps of a record's component contradict, closures or the matches between neighbours."""
-        for _ in range(self.config.settling_rounds):
+        for _ in range(SETTLING_ROUNDS):
             before, test = self.estimate.state, self.overconfidence
             if not test.is_overconfident(before, record):
                 return

@@ -46,6 +46,11 @@ _PASSES = 2
 SMALLEST_VARIANCE = 1e-15
 """Of a landmark (m2) or an end pose (m2, rad2); no camera is that sure of anything."""
 
+_COMPARED_AT_ONCE = 2
+"""Pairs of submaps that a closure has brought near each other, compared with each new submap."""
+_COMPARED_AT_SETTLING = 2
+"""Such pairs compared per submap when the map settles."""
+
 
 @dataclass(frozen=True)
 class GlobalMapConfig(Config):
@@ -53,10 +58,6 @@ class GlobalMapConfig(Config):
 
     unlinked_sigma: float = 100.0
     """Standard deviation given to poses of a stretch that nothing ties to the map yet (m)."""
-    compared_at_once: int = 2
-    """Pairs of submaps that a closure has brought near each other, compared with each new submap."""
-    compared_at_settling: int = 2
-    """The same per submap when the map settles."""
     joined_at_once: int = 12
     """Closures found when the map settles that are joined, and refused, together."""
     ties: int = parameter(8, "landmarks by which two submaps are tied together, at most", minimum=3)
@@ -152,7 +153,7 @@ class GlobalMap:
         self.estimate.condense(new, chain)
         found = self.detector.closures(chain, new)
         if self._has_moved:
-            found += self.detector.missed(self.agents.chained, self.config.compared_at_once)
+            found += self.detector.missed(self.agents.chained, _COMPARED_AT_ONCE)
         self._judge_redundancy(new, found)
         verdict = self.closures.join_closures(found, new)
         self._account(verdict, len(found))
@@ -277,9 +278,7 @@ class GlobalMap:
             return
         newest = len(self.estimate.graph.records) - 1
         for _ in range(_PASSES):
-            missed = self.detector.missed(
-                self.agents.chained, self.config.compared_at_settling * len(self.estimate.graph.records)
-            )
+            missed = self.detector.missed(self.agents.chained, _COMPARED_AT_SETTLING * len(self.estimate.graph.records))
             for found in _grouped(missed, self.config.joined_at_once):
                 self._account(self.closures.join_closures(found, newest), len(found))
             if not missed:

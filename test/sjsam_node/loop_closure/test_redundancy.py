@@ -11,7 +11,7 @@ from submap_world import Agent, circle, ring_world
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.graph.links import Link
 from sjsam_node.loop_closure.redundancy import RedundancyCheck
-from sjsam_node.loop_closure.verification import ClosureConfig
+from sjsam_node.loop_closure.verification import MIN_NEAR_INLIERS, ClosureConfig
 from sjsam_node.smoothing.state import with_exactly
 
 
@@ -23,7 +23,7 @@ def joined(rng: np.random.Generator) -> GlobalMap:
 
 def check(joined: GlobalMap) -> RedundancyCheck:
     config = ClosureConfig()
-    return RedundancyCheck(joined.state, config.min_near_inliers, config.association.descriptor_threshold, 0.15)
+    return RedundancyCheck(joined.state, MIN_NEAR_INLIERS, config.association.descriptor_threshold, 0.15)
 
 
 def closure(joined: GlobalMap) -> Link:

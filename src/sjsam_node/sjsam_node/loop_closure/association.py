@@ -25,6 +25,9 @@ from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 METHODS = ("nearest", "mahalanobis", "joint")
 
+_JOINT_PAIRS = 64
+"""Pairs that are tested together; where there are more, the others are tested against what these say."""
+
 
 @dataclass(frozen=True)
 class AssociationConfig(Config):
@@ -38,8 +41,6 @@ class AssociationConfig(Config):
     nearest_gate: float = parameter(0.3, "distance below which the nearest neighbour is taken", unit="m", minimum=0.0)
     max_variance_factor: float = 16.0
     """Submaps too sure of themselves by up to this factor are matched all the same."""
-    joint_pairs: int = 64
-    """Pairs that are tested together; where there are more, the others are tested against what these say."""
     position_noise: float = 0.005
     """Standard deviation added to each landmark when gating: submaps are linearised (m)."""
 
@@ -161,9 +162,9 @@ def jointly_compatible(
 
     Of many pairs a sample is tested so, and the others, one by one, against the alignment that it gives.
     """
-    if len(pairs) <= config.joint_pairs:
+    if len(pairs) <= _JOINT_PAIRS:
         return _compatible(first, second, pairs, prior, config)[0]
-    sample = np.linspace(0, len(pairs) - 1, config.joint_pairs).astype(np.int64)
+    sample = np.linspace(0, len(pairs) - 1, _JOINT_PAIRS).astype(np.int64)
     found, scale = _compatible(first, second, pairs[sample], prior, config)
     others = np.delete(pairs, sample, axis=0)
     nis = nis_one_by_one(first, second, others, Prior(found.T, found.covariance), config)

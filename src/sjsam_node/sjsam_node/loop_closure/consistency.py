@@ -14,30 +14,31 @@ from dataclasses import dataclass
 from sjsam_node.graph.links import Link
 from slam_core.config import Config, parameter
 
+OUTLIER_PROBABILITY = 0.99999
+"""Share of true matches that a joined map keeps."""
+OUTLIER_SHARE = 0.1
+"""Largest share of a submap's matches that are removed at once."""
+SETTLING_ROUNDS = 6
+"""Updates by which a map that settles may lose closures, at most."""
+CLOSURE_PROBABILITY = 0.9999
+"""Share of true closures whose rise of chi2 is accepted."""
+VIEW_CHANGE_FACTOR = 2.0
+"""Factor by which squared errors of matches from another view are larger than those in a whole map."""
+RETRY_GROWTH = 1.2
+"""Growth of the landmarks that speak for refused closures, from which these are tried again."""
+
 
 @dataclass(frozen=True)
 class ConsistencyConfig(Config):
     """Conditions on a joined map for a closure to be held."""
 
-    outlier_probability: float = 0.99999
-    """Share of true matches that a joined map keeps."""
-    outlier_share: float = 0.1
-    """Largest share of a submap's matches that are removed at once."""
     rounds: int = 1
     """Updates that a submap may cost beyond its first, to remove closures."""
-    settling_rounds: int = 6
-    """The same when the map settles."""
-    closure_probability: float = 0.9999
-    """Share of true closures whose rise of chi2 is accepted."""
-    view_change: float = 2.0
-    """Factor by which squared errors of matches from another view are larger than those in a whole map."""
     max_variance_factor: float = parameter(
         16.0,
         "a map whose submaps seem too sure of themselves by more than this factor holds false closures",
         minimum=1.0,
     )
-    retry: float = 1.2
-    """Growth of the landmarks that speak for refused closures, from which these are tried again."""
     waiting: int = 40
     """Refused closures that are remembered."""
 

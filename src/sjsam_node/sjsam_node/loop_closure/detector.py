@@ -24,7 +24,18 @@ from sjsam_node.loop_closure.near_pairs import NearPairs
 from sjsam_node.loop_closure.place_recognition import PlaceIndex
 from sjsam_node.loop_closure.point_sets import at_end, at_start
 from sjsam_node.loop_closure.redundancy import RedundancyCheck
-from sjsam_node.loop_closure.verification import ClosureConfig, Verifier, largest_sigma
+from sjsam_node.loop_closure.verification import (
+    ALIKE_CANDIDATES,
+    INFORMATIVE_SIGMA,
+    LEAST_NEWS_SHARE,
+    MAX_FALSE_ALARMS,
+    MIN_NEAR_INLIERS,
+    NEAR_CANDIDATES,
+    RANSAC_DISTANCE,
+    ClosureConfig,
+    Verifier,
+    largest_sigma,
+)
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.smoothing.state import EstimateState
 from slam_core.geometry import FloatArray, compose_covariance
@@ -47,7 +58,7 @@ class LoopDetector:
         self.verifier = Verifier(self.config)
         self.index = PlaceIndex(self.config.places)
         noise = self.config.association.position_noise
-        self.near = NearPairs(self.config.proximity, 4 * self.config.near_candidates, noise)
+        self.near = NearPairs(self.config.proximity, 4 * NEAR_CANDIDATES, noise)
 
     @property
     def graph(self) -> MapGraph:
@@ -90,7 +101,7 @@ class LoopDetector:
         looks = self.index.query(graph.records[new].submap.descriptors, recent | set(near))
         second = at_start(graph.records[new])
         alike = [old for old in looks if self.verifier.is_alike(at_start(graph.records[old]), second)]
-        return found + self._verified([(old, new) for old in alike[: self.config.alike_candidates]], known)
+        return found + self._verified([(old, new) for old in alike[:ALIKE_CANDIDATES]], known)
 
     def _around(self, near: list[int], new: int, known: RedundancyCheck) -> list[Link]:
         """Links of record ``new`` to those near it, as long as they tell of landmarks that none has told of yet."""
@@ -105,7 +116,7 @@ class LoopDetector:
             told = sum(int(left[k.pairs[:, 1]].sum()) for k in more)
             for k in more:
                 left[k.pairs[:, 1]] = False
-            if more and told < self.config.least_news * count:
+            if more and told < LEAST_NEWS_SHARE * count:
                 break
         return found
 
@@ -125,7 +136,7 @@ class LoopDetector:
         distance = np.linalg.norm(state.middles(candidates) - middle, axis=1)
         ranked = sorted((d, i) for d, i in zip(distance.tolist(), candidates.tolist(), strict=True)
                         if d < self.config.proximity)  # fmt: skip
-        return [i for _, i in ranked[: self.config.near_candidates]]
+        return [i for _, i in ranked[:NEAR_CANDIDATES]]
 
     def _near(self, new: int, recent: set[int]) -> list[int]:
         """Older records of the same component whose landmarks are around those of ``new``, nearest first."""
@@ -135,7 +146,7 @@ class LoopDetector:
     def _redundancy_check(self) -> RedundancyCheck:
         config, state = self.config, self.estimate.state
         threshold = config.association.descriptor_threshold
-        return RedundancyCheck(state, config.min_near_inliers, threshold, config.ransac_distance)
+        return RedundancyCheck(state, MIN_NEAR_INLIERS, threshold, RANSAC_DISTANCE)
 
     def _verified(self, pairs: list[tuple[int, int]], known: RedundancyCheck, *, by_looks: bool = True) -> list[Link]:
         """Links between pairs of records that geometry and the map support; none that tell nothing new."""
@@ -173,7 +184,7 @@ class LoopDetector:
         """The link if it is evident, or if a cycle with others that wait is, with these; otherwise it waits."""
         self.pending = [k for k in self.pending if k.ends != link.ends]
         self._alarms.pop(frozenset(link.ends), None)
-        if self._log10_false_alarms(link) <= np.log10(self.config.false_alarms):
+        if self._log10_false_alarms(link) <= np.log10(MAX_FALSE_ALARMS):
             return [link]
         self.pending = [*self.pending, link][-self.config.waiting :]
         return self._believed(self._evident_cycle(link, cache(self._hop)))
@@ -197,7 +208,7 @@ class LoopDetector:
     def _can_judge(self, link: Link, prior: Prior) -> bool:
         """True if the map, which could not tell, can tell now."""
         found = Alignment(link.pairs, link.T, link.covariance, 0.0, 0)
-        is_sure = largest_sigma(prior.covariance) < self.config.informative_sigma
+        is_sure = largest_sigma(prior.covariance) < INFORMATIVE_SIGMA
         return is_sure or self.verifier.is_against(found, prior, self.graph.path_length_between(*link.ends))
 
     def _believed(self, links: tuple[Link, ...]) -> list[Link]:
@@ -217,7 +228,7 @@ class LoopDetector:
                 chance = cycle.chance(self.config.probability, sum(map(self._reach, weakest[1])))
                 found.append((weakest[0] + np.log10(chance * len(cycles)), k))
         best = min(found, default=(np.inf, 0))
-        return cycles[best[1]].links if best[0] <= np.log10(self.config.false_alarms) else ()
+        return cycles[best[1]].links if best[0] <= np.log10(MAX_FALSE_ALARMS) else ()
 
     def _hop(self, first: int, second: int) -> Prior | None:
         """T_first_second by the map, with the drift to expect; None where nothing ties the two."""

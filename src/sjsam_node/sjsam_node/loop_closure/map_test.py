@@ -14,7 +14,14 @@ import numpy as np
 
 from sjsam_node.graph.links import Link
 from sjsam_node.loop_closure.association import variance_factor
-from sjsam_node.loop_closure.consistency import ConsistencyConfig, Verdict
+from sjsam_node.loop_closure.consistency import (
+    CLOSURE_PROBABILITY,
+    OUTLIER_PROBABILITY,
+    OUTLIER_SHARE,
+    VIEW_CHANGE_FACTOR,
+    ConsistencyConfig,
+    Verdict,
+)
 from sjsam_node.loop_closure.pairwise import support_of
 from sjsam_node.smoothing.state import EstimateState
 from slam_core.estimation.chi_square import chi_square_bound
@@ -67,7 +74,7 @@ class MapTest:
         record_of = graph.records_of(beyond)
         suspects = np.unique(record_of).tolist()
         for i in suspects:
-            allowed = max(1, int(self.config.outlier_share * np.isfinite(nis[graph.records[i].observations]).sum()))
+            allowed = max(1, int(OUTLIER_SHARE * np.isfinite(nis[graph.records[i].observations]).sum()))
             own = beyond[record_of == i]
             outliers.update(own[np.argsort(-nis[own], kind="stable")[:allowed]].tolist())
         if not outliers:
@@ -96,7 +103,7 @@ class MapTest:
         # Closures that contradict the covariances, but not the drift to expect, move the map once for all of them.
         known = max(k.error for k in verdict.accepted)
         outweighed = support_of(after.graph, verdict.removed) <= support_of(after.graph, verdict.accepted)
-        return outweighed and self._excess(after, (rise - known) / self.config.view_change, dof, newest) <= 0.0
+        return outweighed and self._excess(after, (rise - known) / VIEW_CHANGE_FACTOR, dof, newest) <= 0.0
 
     def _excess(self, state: EstimateState, rise: float, dof: int, newest: int) -> float:
         """Rise of chi2 above what true matches explain.
@@ -107,12 +114,12 @@ class MapTest:
         result = state.result(state.component(newest))
         factor = (result.cost - max(rise, 0.0)) / max(result.redundancy, 1)
         factor = min(max(1.0, factor), self.config.max_variance_factor)
-        return float(rise - factor * chi_square_bound(self.config.closure_probability, max(dof, 1)))
+        return float(rise - factor * chi_square_bound(CLOSURE_PROBABILITY, max(dof, 1)))
 
     def _gate(self, nis: FloatArray) -> float:
         """Squared error beyond which a match is none, in units of the map's own variance factor."""
         factor = min(variance_factor(nis[np.isfinite(nis)]), self.config.max_variance_factor)
-        return factor * chi_square_bound(self.config.outlier_probability, 3)
+        return factor * chi_square_bound(OUTLIER_PROBABILITY, 3)
 
 
 def nis_of(state: EstimateState, component: int) -> FloatArray:

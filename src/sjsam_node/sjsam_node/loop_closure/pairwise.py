@@ -14,7 +14,7 @@ import numpy as np
 
 from sjsam_node.graph.links import Link, Status
 from sjsam_node.graph.map_graph import BoolArray, MapGraph
-from sjsam_node.loop_closure.consistency import ConsistencyConfig, is_among
+from sjsam_node.loop_closure.consistency import CLOSURE_PROBABILITY, ConsistencyConfig, is_among
 from sjsam_node.loop_closure.verification import ClosureConfig
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxminus
@@ -110,7 +110,7 @@ class PairwiseConsistency:
         expected = covariance[known] + spread[:, :, None] * np.eye(6)
         nis = np.einsum("ni,ni->n", error, np.linalg.solve(expected, error[..., None])[..., 0])
         out = np.zeros(len(T), dtype=bool)
-        out[known] = nis > chi_square_bound(self.config.closure_probability, 6)
+        out[known] = nis > chi_square_bound(CLOSURE_PROBABILITY, 6)
         return out
 
 

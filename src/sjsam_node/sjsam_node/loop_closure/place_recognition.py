@@ -20,19 +20,20 @@ from slam_core.linear_algebra.sparse_cholesky import IntArray
 
 Descriptors = npt.NDArray[np.float32]
 
+_BRANCHING = 10
+"""Children of a node of the vocabulary tree."""
+_PROPOSALS_PER_CANDIDATE = 5
+"""Times as many places as are checked that the vocabulary proposes."""
+
 
 @dataclass(frozen=True)
 class PlaceRecognitionConfig(Config):
     """The vocabulary and how many places are looked at."""
 
-    branching: int = 10
-    """Children of a node of the vocabulary tree."""
     depth: int = 3
     """Levels of the vocabulary tree."""
     training_descriptors: int = 1500
     """Descriptors from which the tree is grown."""
-    proposals: int = 5
-    """Times as many places as are checked that the vocabulary proposes."""
     candidates: int = parameter(6, "best ranked submaps that are proposed", minimum=1)
 
 
@@ -40,7 +41,7 @@ class VocabularyTree:
     """Hierarchical k-means over unit descriptors; a word is a leaf."""
 
     def __init__(self, descriptors: Descriptors, config: PlaceRecognitionConfig) -> None:
-        self.branching, self.depth = config.branching, config.depth
+        self.branching, self.depth = _BRANCHING, config.depth
         self._centres: dict[int, Descriptors] = {}
         self._grow(0, np.asarray(descriptors, dtype=np.float32), 0)
 
@@ -140,7 +141,7 @@ class PlaceIndex:
         found = np.nonzero(total)[0]
         score = total[found] / np.sqrt(self._sizes[found])
         ranked = found[np.argsort(-score, kind="stable")]
-        return [int(place) for place in ranked[: self.config.proposals * self.config.candidates]]
+        return [int(place) for place in ranked[: _PROPOSALS_PER_CANDIDATE * self.config.candidates]]
 
 
 def _likeness(first: Descriptors, second: Descriptors) -> float:

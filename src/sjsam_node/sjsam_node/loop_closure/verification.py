@@ -30,6 +30,31 @@ from slam_core.estimation.rigid_alignment import ransac_rigid_transform
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
+NEAR_CANDIDATES = 3
+"""Near submaps tried per new one."""
+LEAST_NEWS_SHARE = 0.1
+"""Share of a submap's landmarks that a near one must tell of for the next to be tried."""
+ALIKE_CANDIDATES = 2
+"""Submaps that look alike tried per new one."""
+INFORMATIVE_SIGMA = 0.5
+"""Largest standard deviation of a relative position that can tell two places apart (m)."""
+_MAX_ANGLE_RATIO = 0.9
+"""Second best to best angle of descriptors, where no prior helps."""
+_MIN_ALIKE_SIMILARITY = 0.7
+"""Least scalar product of descriptors, where no prior helps."""
+RANSAC_DISTANCE = 0.15
+"""Largest distance of an inlier of the first alignment (m)."""
+MIN_NEAR_INLIERS = 5
+"""Least matches of a link to a near submap."""
+_MIN_ALIKE_PAIRS = 5
+"""Least pairs by descriptors alone that agree, for a submap found by its looks to be compared."""
+MAX_FALSE_ALARMS = 1e-6
+"""Closures like one found by its looks that chance makes in a comparison, at most, for it to be believed."""
+_MIN_SPREAD = 0.25
+"""Least second-largest standard deviation of the matched landmarks (m)."""
+_MIN_OVERLAP = 0.3
+"""Least share of the landmarks expected in both that match."""
+
 
 @dataclass(frozen=True)
 class ClosureConfig(Config):
@@ -40,34 +65,10 @@ class ClosureConfig(Config):
     proximity: float = parameter(
         3.0, "distance between the middles of submaps that are tried as near", unit="m", minimum=0.0
     )
-    near_candidates: int = 3
-    """Near submaps tried per new one."""
-    least_news: float = 0.1
-    """Share of a submap's landmarks that a near one must tell of for the next to be tried."""
-    alike_candidates: int = 2
-    """Submaps that look alike tried per new one."""
-    informative_sigma: float = 0.5
-    """Largest standard deviation of a relative position that can tell two places apart (m)."""
     drift: float = parameter(
         0.01, "drift of odometry to expect beyond its covariance, per metre of way, one sigma", unit="m/m", minimum=0.0
     )
     drift_angle: float = parameter(0.003, "the same for rotation", unit="rad/m", minimum=0.0)
-    ratio: float = 0.9
-    """Second best to best angle of descriptors, where no prior helps."""
-    place_threshold: float = 0.7
-    """Least scalar product of descriptors, where no prior helps."""
-    ransac_distance: float = 0.15
-    """Largest distance of an inlier of the first alignment (m)."""
-    min_near_inliers: int = 5
-    """Least matches of a link to a near submap."""
-    min_alike_pairs: int = 5
-    """Least pairs by descriptors alone that agree, for a submap found by its looks to be compared."""
-    false_alarms: float = 1e-6
-    """Closures like one found by its looks that chance makes in a comparison, at most, for it to be believed."""
-    min_spread: float = 0.25
-    """Least second-largest standard deviation of the matched landmarks (m)."""
-    min_overlap: float = 0.3
-    """Least share of the landmarks expected in both that match."""
     waiting: int = 20
     """Links that wait for others to close a cycle with, at most."""
     probability: float = 0.9999
@@ -100,10 +101,10 @@ class Verifier:
 
         None where it is not informative, or geometry does not support it.
         """
-        if prior is None or largest_sigma(prior.covariance) >= self.config.informative_sigma:
+        if prior is None or largest_sigma(prior.covariance) >= INFORMATIVE_SIGMA:
             return None
         found = self._around(first, second, prior)
-        enough = len(found.pairs) >= self.config.min_near_inliers and self._overlaps(first, second, found)
+        enough = len(found.pairs) >= MIN_NEAR_INLIERS and self._overlaps(first, second, found)
         return found if enough else None
 
     def verify_alike(
@@ -133,16 +134,16 @@ class Verifier:
     def _by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
         """Alignment from descriptors alone, refined with all landmarks around it."""
         pairs = self._distinct_pairs(first, second)
-        if len(pairs) < self.config.min_alike_pairs:
+        if len(pairs) < _MIN_ALIKE_PAIRS:
             return None
         rng = np.random.default_rng([self.config.seed, *key])
         coarse = ransac_rigid_transform(
-            second.points[pairs[:, 1]], first.points[pairs[:, 0]], self.config.ransac_distance, rng,
-            min_inliers=self.config.min_alike_pairs,
+            second.points[pairs[:, 1]], first.points[pairs[:, 0]], RANSAC_DISTANCE, rng,
+            min_inliers=_MIN_ALIKE_PAIRS,
         )  # fmt: skip
         if not coarse.success:
             return None
-        loose = np.diag([self.config.ransac_distance**2] * 3 + [0.05**2] * 3)
+        loose = np.diag([RANSAC_DISTANCE**2] * 3 + [0.05**2] * 3)
         found = match(first, second, Prior(coarse.T, loose), self.config.association)
         # The guess came from the same landmarks: without its weight the covariance is that of the landmarks alone.
         free = Prior(found.T, 1e4 * np.eye(6))
@@ -150,21 +151,21 @@ class Verifier:
 
     def is_alike(self, first: PointSet, second: PointSet) -> bool:
         """True if descriptors alone leave a chance; asked before anything dearer."""
-        return len(self._distinct_pairs(first, second)) >= self.config.min_alike_pairs
+        return len(self._distinct_pairs(first, second)) >= _MIN_ALIKE_PAIRS
 
     def _distinct_pairs(self, first: PointSet, second: PointSet) -> IntArray:
         """Mutually best descriptor pairs, clearly better than the second best."""
         S = similarity(first, second)
         if min(S.shape) < 2:
             return np.empty((0, 2), dtype=np.int64)
-        i, j = np.nonzero(self.config.place_threshold <= S)
+        i, j = np.nonzero(_MIN_ALIKE_SIMILARITY <= S)
         pairs = mutual_best(i, j, -S[i, j].astype(np.float64))
         angle = np.arccos(np.clip(np.partition(S[pairs[:, 0]], -2, axis=1)[:, -2:], -1.0, 1.0))
-        return pairs[angle[:, 1] <= self.config.ratio * angle[:, 0]]
+        return pairs[angle[:, 1] <= _MAX_ANGLE_RATIO * angle[:, 0]]
 
     def is_evident(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
         """True if an alignment by looks needs nothing else that speaks for it."""
-        return self.log10_false_alarms(first, second, found) <= float(np.log10(self.config.false_alarms))
+        return self.log10_false_alarms(first, second, found) <= float(np.log10(MAX_FALSE_ALARMS))
 
     def log10_false_alarms(self, first: PointSet, second: PointSet, found: Alignment) -> float:
         """log10 of how many alignments as good as this one chance would make of the descriptors' distinct pairs."""
@@ -173,18 +174,18 @@ class Verifier:
 
     def _is_supported(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
         """Fewer than one false alarm to expect of this comparison, and matches as spread and many as the overlap."""
-        enough = len(found.pairs) >= self.config.min_near_inliers and self._overlaps(first, second, found)
+        enough = len(found.pairs) >= MIN_NEAR_INLIERS and self._overlaps(first, second, found)
         return enough and self.log10_false_alarms(first, second, found) < 0.0
 
     def _overlaps(self, first: PointSet, second: PointSet, found: Alignment) -> bool:
         """Matches are spread, and most landmarks that lie among them on both sides are matched."""
         matched = first.points[found.pairs[:, 0]]
-        if np.sqrt(max(np.linalg.eigvalsh(np.cov(matched.T))[1], 0.0)) < self.config.min_spread:
+        if np.sqrt(max(np.linalg.eigvalsh(np.cov(matched.T))[1], 0.0)) < _MIN_SPREAD:
             return False
         low, high = matched.min(axis=0), matched.max(axis=0)
         moved = second.points @ found.T[:3, :3].T + found.T[:3, 3]
         expected = min(_inside(first.points, low, high), _inside(moved, low, high))
-        return len(matched) >= self.config.min_overlap * expected
+        return len(matched) >= _MIN_OVERLAP * expected
 
     def is_against(self, found: Alignment, prior: Prior, way: float) -> bool:
         """True if an alignment contradicts the prior, which has drifted along the ``way`` (m)."""

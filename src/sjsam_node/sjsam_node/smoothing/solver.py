@@ -38,6 +38,9 @@ from slam_core.linear_algebra.sparse_cholesky import BACKENDS
 _UNMOVED = 1e-4
 """Squared change of a submap's residual, in sigmas, below which its own landmarks stay where they were in it."""
 
+_LIVE_ITERATIONS = 6
+"""Iterations of an update while submaps come in, at most."""
+
 
 @dataclass(frozen=True)
 class EstimatorConfig(Config):
@@ -52,8 +55,6 @@ class EstimatorConfig(Config):
     """Stop when a step promises to lower chi2 by less than this share."""
     live_tolerance: float = 1e-4
     """The same while submaps come in; the map is brought to its optimum when it settles."""
-    live_iterations: int = 6
-    """Iterations of an update while submaps come in, at most."""
     robust: RobustConfig = group(RobustConfig)
 
     @property
@@ -64,8 +65,12 @@ class EstimatorConfig(Config):
     def optimizer(self, *, coarse: bool) -> LevenbergMarquardtConfig:
         """Criteria to stop; ``coarse``: where a step promises less than ``live_tolerance``."""
         if coarse:
-            return LevenbergMarquardtConfig(min(self.iterations, self.live_iterations), self.live_tolerance)
+            return LevenbergMarquardtConfig(min(self.iterations, _LIVE_ITERATIONS), self.live_tolerance)
         return LevenbergMarquardtConfig(self.iterations, self.relative_tolerance)
+
+
+_SETTLED_TIES = 24
+"""Landmarks that tie two submaps when a map settles, at least, where all that they share are too many."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +82,6 @@ class SmootherConfig(Config):
 
     They are in memory four times: reduced, in the problem, in its normal equations and in their factor, 32 MB each.
     """
-    settled_ties: int = 24
-    """Landmarks by which two submaps are tied together then, at least, where all that they share are too many."""
     estimator: EstimatorConfig = group(EstimatorConfig)
     region: RegionConfig = group(RegionConfig)
 
@@ -154,7 +157,7 @@ def relinearized(state: EstimateState, config: SmootherConfig) -> EstimateState:
 def _with_budget(state: EstimateState, config: SmootherConfig) -> EstimateState:
     contradicted = bool((state.overconfidence > 1.0).any())
     graph = state.graph
-    for least in (0,) if contradicted else (ALL, config.settled_ties, 0):
+    for least in (0,) if contradicted else (ALL, _SETTLED_TIES, 0):
         graph = graph.with_least_budget(least)
         connecting = np.bincount(graph.record_of[graph.is_connecting], minlength=len(graph.records))
         if float(np.square(6.0 + 3.0 * connecting).sum()) <= config.settled_work:
