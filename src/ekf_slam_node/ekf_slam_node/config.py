@@ -45,7 +45,7 @@ class MotionConfig(Config):
 
 @dataclass(frozen=True)
 class InertialConfig(ImuConfig):
-    """Whether an IMU is used, its clock and its noise."""
+    """An IMU: whether it is used, its clock and its noise."""
 
     use: str = parameter(
         "auto",
