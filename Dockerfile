@@ -19,7 +19,7 @@ RUN useradd --create-home slam && chmod a+rwx /home/slam && mkdir /opt/indoor_sl
 USER slam
 ENV HOME=/home/slam
 WORKDIR /opt/indoor_slam
-COPY --chown=slam slam requirements.txt requirements-ros.txt requirements-dev.txt pyproject.toml LICENSE README.md ./
+COPY --chown=slam slam requirements.txt requirements-experiments.txt requirements-ros.txt requirements-dev.txt pyproject.toml LICENSE README.md ./
 COPY --chown=slam bags bags
 COPY --chown=slam src src
 

@@ -23,8 +23,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam_bringup.bags.bag import BagReader, BagWriter
-from slam_bringup.bags.bag_types import BagTypes
+from slam_bags.storage.bag import BagReader, BagWriter
+from slam_bags.storage.bag_types import BagTypes
 from slam_bringup.doctor.examination import examine
 from slam_core.messages import grey_from_message, image_from_message, image_message
 

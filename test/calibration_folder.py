@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_bringup.bags.extrinsics import EXTRINSICS, extrinsics_text
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.extrinsics import EXTRINSICS, extrinsics_text
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_core.camera_info import CameraInfoFile
 from slam_core.geometry import make_transform
 

@@ -24,11 +24,11 @@ import pytest
 from click.testing import CliRunner
 
 from calibration_folder import write_calibrations
-from slam_bringup.bags.bag import BagReader, BagWriter
-from slam_bringup.bags.readings import DepthReading, StereoReading
-from slam_bringup.bags.sensor_bag import SensorBag
-from slam_bringup.bags.sensor_topics import is_rectified
-from slam_bringup.bags.sensor_writer import LEFT_FRAME, RIGHT_FRAME, TOF_FRAME, SensorWriter
+from slam_bags.reading.readings import DepthReading, StereoReading
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.reading.sensor_topics import is_rectified
+from slam_bags.storage.bag import BagReader, BagWriter
+from slam_bags.storage.sensor_writer import LEFT_FRAME, RIGHT_FRAME, TOF_FRAME, SensorWriter
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
@@ -45,7 +45,7 @@ FRAMES = 6
 NOT_RUN = {
     r"\./slam (demo|test|setup)": "makes the environment that runs this test; the demo runs in test/integration",
     r"\./slam nodes": "starts processes; test/integration/test_executables.py runs it",
-    r"\./slam view": "serves a page until Ctrl-C; test/slam_bringup/viewer looks at it",
+    r"\./slam view": "serves a page until Ctrl-C; test/slam_viewer/page looks at it",
     r"\./slam live ": "needs a camera",
     r"\./slam post ": "runs until Ctrl-C; test/slam_bringup/commands/test_live.py looks at what it starts",
     r"docker ": "needs a Docker daemon",

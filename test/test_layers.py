@@ -20,11 +20,16 @@ LAYER = {
     "tof_driver": 1,
     "ndt_registration": 1,
     "slam_simulation": 2,
+    "slam_bags": 2,
     "ekf_slam_node": 2,
     "sjsam_node": 2,
     "dense_mapping": 2,
-    "slam_bringup": 3,
+    "slam_viewer": 3,
+    "slam_bringup": 4,
+    "slam_experiments": 5,
 }
+NOT_SHIPPED = {"slam_simulation", "slam_experiments"}
+"""What a robot does not install: nothing else may import or require it."""
 ROS = re.compile(r"^(rclpy|tf2_ros|launch(_ros)?|ament_index_python|builtin_interfaces|std_srvs|[a-z0-9]+_msgs)$")
 MAY_IMPORT_ROS = re.compile(r"(^|/)(node|[a-z_]+_node|ros|[a-z_]+\.launch)\.py$")
 STRUCTURE = SRC.parent / "benchmarks" / "house" / "structure.py"
@@ -51,11 +56,19 @@ def test_imports_point_down_and_ros_stays_in_nodes(path):
         root = name.split(".")[0]
         if root in LAYER:
             assert root == package or LAYER[root] < LAYER[package], f"{path} imports {name}, not below it"
+            assert root not in NOT_SHIPPED or package in NOT_SHIPPED, f"{path} imports {name}, which is not shipped"
             # A node imports the algorithm, never the reverse.
             if not MAY_IMPORT_ROS.search(str(path)):
                 module = name.split(".")[-1]
                 assert module in LAYER or not re.fullmatch(r"node|\w+_node|ros", module), f"{path} imports a node"
         assert not ROS.match(root) or MAY_IMPORT_ROS.search(str(path)), f"{path}: ROS belongs in nodes"
+
+
+@pytest.mark.parametrize("package", sorted(LAYER.keys() - NOT_SHIPPED))
+@pytest.mark.parametrize("name", ["setup.py", "package.xml"])
+def test_what_is_shipped_requires_nothing_that_is_not(package, name):
+    text = (SRC / package / name).read_text(encoding="utf-8")
+    assert not [other for other in (*NOT_SHIPPED, "dask", "distributed") if re.search(rf"\b{other}\b", text)]
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ class Clone:
 
     def __init__(self, root: Path) -> None:
         self.root, self.venv = root, root / ".venv"
-        for name in ("slam", "requirements.txt", "requirements-ros.txt", "requirements-dev.txt"):
+        for name in ("slam", *(f"requirements{kind}.txt" for kind in ("", "-experiments", "-ros", "-dev"))):
             shutil.copy2(ROOT / name, root / name)
         package = root / "src" / "slam_bringup"
         for folder in ("launch", "config", "rviz"):

@@ -27,8 +27,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam_bringup.bags.bag import BagReader, BagWriter
-from slam_bringup.bags.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
+from slam_bags.storage.bag import BagReader, BagWriter
+from slam_bags.storage.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
 from slam_bringup.cli import slam
 from slam_core.camera import Camera
 from slam_core.messages import rectified_info

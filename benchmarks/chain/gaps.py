@@ -21,7 +21,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam_bringup.bags.bag import BagReader, BagWriter
+from slam_bags.storage.bag import BagReader, BagWriter
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 

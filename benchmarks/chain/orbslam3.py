@@ -26,8 +26,8 @@ from recordings import RECORDINGS, _scale
 from rich.console import Console
 from rich.table import Table
 
-from slam_bringup.bags.readings import StereoReading
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.readings import StereoReading
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag

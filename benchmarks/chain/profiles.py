@@ -19,8 +19,8 @@ from self_calibration import scale_error_percent
 
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.pipeline.results import AgentResult
 from slam_core.evaluation import Evaluation
+from slam_viewer.results import AgentResult
 
 DEFAULT = tuple(f"{name}{mode}" for mode in ("", ":fuse") for name in ("workshop_rig", "small_room", "conference"))
 HEADINGS = ("run", "ideal: ATE mm", "ANEES", "real: ATE mm", "ratio", "scale %", "ANEES", "filter: ATE mm", "ANEES")

@@ -22,10 +22,10 @@ from rich.table import Table
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.pipeline.results import AgentResult, summarise
-from slam_bringup.report.output import write_results
 from slam_core.evaluation import EXACT_TRUTH, evaluate
 from slam_core.trajectory import Trajectory
+from slam_viewer.report.output import write_results
+from slam_viewer.results import AgentResult, summarise
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "ekf"))
 from doubt import TRUTH, doubted

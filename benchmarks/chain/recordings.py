@@ -27,16 +27,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam_bringup.bags.readings import AgentSensors, DepthReading, Reading, StereoReading
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.readings import AgentSensors, DepthReading, Reading, StereoReading
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.report.output import write_results
 from slam_core.evaluation import EXACT_TRUTH, associate, evaluate
 from slam_core.geometry import FloatArray, invert_transform, make_transform
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
+from slam_viewer.report.output import write_results
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "ekf"))
 from doubt import TRUTH, doubted

@@ -31,8 +31,8 @@ from rich.table import Table
 
 from ndt_registration.stage import ScanEstimate
 from sjsam_node.map_session import MapSession
-from slam_bringup.bags.readings import AgentSensors
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.readings import AgentSensors
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.configuration import SystemConfig, choose, load_system_config
 from slam_bringup.pipeline.mapper import Mapper

@@ -19,8 +19,8 @@ from rich.table import Table
 
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.pipeline.results import AgentResult
 from slam_core.estimation.rigid_alignment import umeyama
+from slam_viewer.results import AgentResult
 
 
 def main() -> None:

@@ -26,16 +26,16 @@ from self_calibration import scale_error_percent
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.smoothing.solver import EstimatorConfig, SmootherConfig
-from slam_bringup.bags.bag_types import BagTypes, typestore
+from slam_bags.storage.bag_types import BagTypes, typestore
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.pipeline.results import RunResult, summarise
 from slam_core.evaluation import Evaluation
 from slam_core.messages import submap_messages
 from slam_core.trajectory import Trajectory
 from slam_core.types import Submap
 from slam_simulation.sensors.profiles import PROFILES
+from slam_viewer.results import RunResult, summarise
 
 DEFAULT = (
     "workshop_rig", "workshop_handheld", "fireman_10hz", "fireman_5hz", "sweep", "conference", "two_rooms/2",

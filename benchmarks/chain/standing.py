@@ -19,10 +19,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam_bringup.bags.bag import BagWriter
-from slam_bringup.bags.readings import StereoReading
-from slam_bringup.bags.sensor_bag import SensorBag
-from slam_bringup.bags.sensor_writer import LEFT_FRAME, RIGHT_FRAME, SensorWriter
+from slam_bags.reading.readings import StereoReading
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.storage.bag import BagWriter
+from slam_bags.storage.sensor_writer import LEFT_FRAME, RIGHT_FRAME, SensorWriter
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_core.types import ByteArray

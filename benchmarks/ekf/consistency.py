@@ -29,6 +29,7 @@ from slam_core.geometry import FloatArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test" / "ekf_slam_node"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "test" / "slam_experiments"))
 from monte_carlo import Run, mean_nis, seam_nees, simulate
 from planar_monte_carlo import planar_nees
 

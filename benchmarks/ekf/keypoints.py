@@ -20,7 +20,7 @@ import numpy as np
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.filtering.models import project, project_jacobian
 from ekf_slam_node.slam import EkfSlam
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes

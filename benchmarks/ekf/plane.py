@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ekf_slam_node.planar.planar import PlanarConfig
-from slam_bringup.planar.log import PlanarLog
-from slam_bringup.planar.mapping import accuracy, map_log
-from slam_bringup.planar.naming import named
-from slam_bringup.planar.readers import read_log
+from slam_experiments.planar.ekf import PlanarConfig
+from slam_experiments.planar.log import PlanarLog
+from slam_experiments.planar.mapping import accuracy, map_log
+from slam_experiments.planar.naming import named
+from slam_experiments.planar.readers import read_log
 
 COLUMNS = ("known", "steps", "hypotheses")
 

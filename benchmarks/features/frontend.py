@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from datasets import euroc_pairs, kitti_pairs
 
-from slam_bringup.experiments.true_frames import simulated_frames
 from slam_core.types import StereoImages
+from slam_experiments.simulated.true_frames import simulated_frames
 from stereo_frontend.detection.features import FeatureExtractor
 from stereo_frontend.frontend import RIGHT_SURPLUS, Frontend
 from stereo_frontend.frontend_config import FrontendConfig

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_bringup.experiments.true_frames import TrueFrame, simulated_frames, spread, transfer, true_depth
 from slam_core.geometry import FloatArray
 from slam_core.types import Features, FeatureSource
+from slam_experiments.simulated.true_frames import TrueFrame, simulated_frames, spread, transfer, true_depth
 from stereo_frontend.depth.depth_fusion import map_depth
 from stereo_frontend.frontend import Frontend
 from stereo_frontend.frontend_config import FrontendConfig

@@ -35,7 +35,7 @@ NODES = {
 KINDS = {
     "launch": ("src/*/launch/**/*", "src/*/config/**/*", "src/slam_bringup/slam_bringup/processes/*.py"),
     "code": ("src/**/*.py",),
-    "experiments": ("src/slam_bringup/slam_bringup/experiments/*.py", "bags/**/*"),
+    "experiments": ("src/slam_experiments/**/*.py", "bags/**/*"),
     "docs": ("docs/**/*.md", "README.md", "bags/README.md"),
     "benchmarks": ("benchmarks/**/*",),
     "tests": ("test/**/*.py",),

@@ -16,14 +16,14 @@ from pathlib import Path
 import problems
 from text_world import SETS, ring
 
-from sjsam_node.linear_slam.text_joining import (
+from slam_experiments.linear_slam.text_joining import (
     TextIndex,
     TextJoiner,
     TextJoiningConfig,
     TextJoiningResult,
     join_text_maps,
 )
-from sjsam_node.linear_slam.text_maps import TextMap, find_maps, read_maps
+from slam_experiments.linear_slam.text_maps import TextMap, find_maps, read_maps
 
 
 def row(

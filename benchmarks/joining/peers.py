@@ -37,11 +37,11 @@ import numpy as np
 from memory import PeakMemory
 from problems import KnownProblem, flattened, joining_problem, local_maps, ring
 
-from sjsam_node.smoothing.block_problem import BlockProblem
 from sjsam_node.smoothing.joining import JoiningProblem
 from sjsam_node.smoothing.problem import JoiningState, LocalMap
 from slam_core.estimation.least_squares import LevenbergMarquardtConfig
 from slam_core.geometry import so3_exp
+from slam_experiments.linear_slam.block_problem import BlockProblem
 
 STOP = LevenbergMarquardtConfig(relative_tolerance=1e-6)
 """GTSAM stops when the cost falls by less than 1e-5 of itself, Ceres at 1e-6; ours when a step promises less."""

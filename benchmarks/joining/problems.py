@@ -14,16 +14,17 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(p) for p in sorted((ROOT / "src").iterdir())] + [str(ROOT / "test" / "sjsam_node")]
+TESTS = [ROOT / "test" / "sjsam_node", ROOT / "test" / "slam_experiments"]
+sys.path[:0] = [str(p) for p in [*sorted((ROOT / "src").iterdir()), *TESTS]]
 
 from submap_world import Agent, circle, ring_world  # noqa: E402
 
 from sjsam_node.smoothing import kernels  # noqa: E402
-from sjsam_node.smoothing.block_problem import BlockProblem, FlatRows, flatten_rows  # noqa: E402
 from sjsam_node.smoothing.joining import JoiningProblem  # noqa: E402
 from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten  # noqa: E402
 from slam_core.geometry import so3_log  # noqa: E402
 from slam_core.types import Submap  # noqa: E402
+from slam_experiments.linear_slam.block_problem import BlockProblem, FlatRows, flatten_rows  # noqa: E402
 
 
 @dataclass(frozen=True)

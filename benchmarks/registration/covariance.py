@@ -18,8 +18,8 @@ from rooms import EMPTY, empty_room, random_room
 from scipy.stats import chi2
 
 from ndt_registration.registration import RegistrationResult, register
-from slam_bringup.experiments.tof_scans import THESIS_MOTIONS, Motion, TofRoom, rig_motion, rig_pose, thinned
 from slam_core.geometry import FloatArray, boxminus
+from slam_experiments.simulated.tof_scans import THESIS_MOTIONS, Motion, TofRoom, rig_motion, rig_pose, thinned
 
 MOTIONS = ("forward 25 cm", "sideways 25 cm", "(25, 25) cm", "yaw +10 deg")
 ROOMS = 20

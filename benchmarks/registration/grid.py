@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from ndt_registration.registration import RegistrationConfig, register
-from slam_bringup.experiments.tof_scans import (
+from slam_core.geometry import boxminus
+from slam_experiments.simulated.tof_scans import (
     HARDER_MOTIONS,
     SCANS,
     THESIS_MOTIONS,
@@ -22,7 +23,6 @@ from slam_bringup.experiments.tof_scans import (
     rig_pose,
     thinned,
 )
-from slam_core.geometry import boxminus
 
 ROOM = Path(__file__).parent / "room.yaml"
 

@@ -24,8 +24,8 @@ import numpy as np
 
 from ndt_registration.odometry import OdometryConfig, OdometryStatus, ScanOdometry
 from ndt_registration.registration import RegistrationConfig, register
-from slam_bringup.bags.readings import DepthReading
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.readings import DepthReading
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.sensor_pipeline import depth_stage
 from slam_core.config import from_mapping

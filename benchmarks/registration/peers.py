@@ -19,8 +19,8 @@ import numpy as np
 from grid import ROOM
 
 from ndt_registration.registration import register
-from slam_bringup.experiments.tof_scans import SCANS, THESIS_MOTIONS, TofRoom, rig_motion, rig_pose, thinned
 from slam_core.geometry import FloatArray, boxminus
+from slam_experiments.simulated.tof_scans import SCANS, THESIS_MOTIONS, TofRoom, rig_motion, rig_pose, thinned
 
 HERE = Path(__file__).parent
 Method = Callable[[FloatArray, FloatArray], tuple[FloatArray, float]]

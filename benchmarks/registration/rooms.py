@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_bringup.experiments.tof_scans import TofRoom, rig_pose
 from slam_core.geometry import FloatArray
+from slam_experiments.simulated.tof_scans import TofRoom, rig_pose
 from slam_simulation.scenario import Scenario
 from slam_simulation.world.building import STYLES
 

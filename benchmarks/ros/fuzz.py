@@ -53,7 +53,7 @@ NODES = {
     "ekf_slam": "ekf_slam_node.node",
     "sjsam": "sjsam_node.node",
     "dense_mapper": "dense_mapping.node",
-    "viewer": "slam_bringup.viewer.viewer_node",
+    "viewer": "slam_viewer.viewer_node",
 }
 OF_A_RIG = {
     "stereo_driver": "stereo_frontend",

@@ -28,8 +28,8 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from ros_probe import Probe  # noqa: E402
 from sjsam_node.global_map import GlobalMap  # noqa: E402
-from slam_bringup.bags.pacing import Connections  # noqa: E402
-from slam_bringup.bags.sensor_bag import SensorBag  # noqa: E402
+from slam_bags.nodes.pacing import Connections  # noqa: E402
+from slam_bags.reading.sensor_bag import SensorBag  # noqa: E402
 from slam_bringup.pipeline.configuration import choose, system_config  # noqa: E402
 from slam_bringup.pipeline.overrides import overrides_of, parse_assignments  # noqa: E402
 from slam_bringup.processes.node_arguments import ros_arguments  # noqa: E402
@@ -130,7 +130,7 @@ def player(graph: NodeGraph, names: list[str]) -> NodeCommand:
         "subscribers": tuple(f"{name}=1" for name in graph.played.values()),
         "wait_for_subscribers": 0.0,
     }
-    return NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters)))
+    return NodeCommand("slam_bags", "bag_player", tuple(ros_arguments(parameters)))
 
 
 def run(name: str, folder: Path) -> str:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from sjsam_node.global_map import GlobalMap
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.node_graph import NodeGraph, plan_nodes
@@ -137,7 +137,7 @@ def _player(graph: NodeGraph, given: argparse.Namespace) -> NodeCommand:
         "nodes": tuple(command.full_name for command in graph.commands),
         "subscribers": tuple(f"{name}=1" for name in graph.played.values()),
     }
-    return NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters)))
+    return NodeCommand("slam_bags", "bag_player", tuple(ros_arguments(parameters)))
 
 
 def report(watch: Stopwatch, supervisor: Supervisor, given: argparse.Namespace) -> None:

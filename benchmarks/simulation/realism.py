@@ -21,19 +21,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slam_bringup.bags.readings import DepthReading, StereoReading
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.datasets.euroc import EurocDataset
+from slam_bags.datasets.files import Dataset
+from slam_bags.datasets.kitti import KittiDataset
+from slam_bags.datasets.rgbd import RgbdDataset
+from slam_bags.reading.readings import DepthReading, StereoReading
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.commands.convert import convert
-from slam_bringup.commands.simulate import BagOptions, write_bag
-from slam_bringup.datasets.euroc import EurocDataset
-from slam_bringup.datasets.files import Dataset
-from slam_bringup.datasets.kitti import KittiDataset
-from slam_bringup.datasets.rgbd import RgbdDataset
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.sensor_pipeline import depth_stage
 from slam_core.camera import Camera
 from slam_core.geometry import FloatArray, invert_transform, make_transform, so3_log
 from slam_core.types import ByteArray
+from slam_experiments.simulated.simulated_bag import BagOptions, write_bag
 from slam_simulation import Scenario
 from slam_simulation.sensors.profiles import PROFILES
 from stereo_frontend.stereo.rectify import StereoRectifier

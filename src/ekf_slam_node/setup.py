@@ -17,7 +17,6 @@ setup(
     install_requires=[
         "setuptools",
         "slam_core",
-        "filterpy",
         "numba",
         "numpy",
         "scipy",

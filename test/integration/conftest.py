@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam_bringup.bags.bag import BagWriter
-from slam_bringup.bags.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
+from slam_bags.storage.bag import BagWriter
+from slam_bags.storage.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
 from slam_bringup.processes.processes import PrivateDomain, node_environment
 from slam_core.camera import Camera
 from slam_core.messages import rectified_info

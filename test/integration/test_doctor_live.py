@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from slam_bringup.bags.bag import BagReader, BagWriter
+from slam_bags.storage.bag import BagReader, BagWriter
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand, NodeGroup
 
@@ -22,7 +22,7 @@ def examined(bag: Path, environment: dict[str, str], folder: Path) -> subprocess
     """What the doctor says of a rig that publishes what is in a bag."""
     player = {"bag": str(bag), "rate": 0.5, "wait_for_subscribers": 60.0}
     with NodeGroup(environment, folder / "logs") as group:
-        group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(player))))
+        group.start(NodeCommand("slam_bags", "bag_player", tuple(ros_arguments(player))))
         command = [sys.executable, "-m", "slam_bringup.cli", "doctor", "--live", "--seconds", "8"]
         return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 

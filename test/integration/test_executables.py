@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from slam_bringup.bags.bag import BagReader
+from slam_bags.storage.bag import BagReader
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand, NodeGroup, NodeProcess, find_executable
 
@@ -43,8 +43,8 @@ def test_every_node_starts_publishes_and_stops_on_sigint(
 
     recording = tmp_path / "recording"
     parameters = ros_arguments({"bag": str(small_bag), "loop": True})
-    player = NodeCommand("slam_bringup", "bag_player", tuple(parameters))
-    recorder = NodeCommand("slam_bringup", "recorder", tuple(ros_arguments({"bag": str(recording)})))
+    player = NodeCommand("slam_bags", "bag_player", tuple(parameters))
+    recorder = NodeCommand("slam_bags", "recorder", tuple(ros_arguments({"bag": str(recording)})))
     with (
         NodeGroup(domain_environment, tmp_path / "logs") as group,
         Supervisor(domain_environment, group.check) as supervisor,

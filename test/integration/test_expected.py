@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from slam_bringup.commands.simulate import BagOptions, write_bag
-from slam_bringup.experiments.expected import expected, violations
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.pipeline.results import summarise
+from slam_experiments.simulated.expected import expected, violations
+from slam_experiments.simulated.simulated_bag import BagOptions, write_bag
 from slam_simulation import Scenario
+from slam_viewer.results import summarise
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 

@@ -13,19 +13,19 @@ import pytest
 
 from calibration_folder import write_calibrations
 from sjsam_node.map_session import MapSession, Mode
-from slam_bringup.bags.bag import BagReader, BagWriter
-from slam_bringup.bags.rig_calibration import read_rig_calibration
-from slam_bringup.bags.sensor_bag import SensorBag
-from slam_bringup.bags.sensor_topics import BagNames
-from slam_bringup.bags.sensor_writer import IMU_FRAME, SensorWriter
+from slam_bags.reading.rig_calibration import read_rig_calibration
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.reading.sensor_topics import BagNames
+from slam_bags.storage.bag import BagReader, BagWriter
+from slam_bags.storage.sensor_writer import IMU_FRAME, SensorWriter
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.pipeline.results import summarise
 from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.recorded_run import collect
 from slam_bringup.processes.start_map import StartMap
 from slam_core.geometry import make_transform, so3_exp, so3_log
 from slam_core.types import ImuSample
+from slam_viewer.results import summarise
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from judging import ate, chain_error, errors, join
 from submap_world import Agent, circle, ring_world
-from text_world import ring
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
-from sjsam_node.linear_slam.text_joining import TextJoiningConfig, TextJoiningResult, join_text_maps
 from sjsam_node.loop_closure.association import METHODS, AssociationConfig
 from sjsam_node.loop_closure.verification import ClosureConfig
 from sjsam_node.smoothing.solver import EstimatorConfig, SmootherConfig
@@ -59,20 +57,3 @@ def test_algorithm_4_as_written_closes_a_loop(method: str) -> None:
     assert max(r.iterations for r in reports) == 1
     assert any(r.closures for r in reports)
     assert ate(errors(joined, agent)[0]) < 0.5 * chain_error(lap(2), lap(2).submaps())
-
-
-@cache
-def text_reference(rows: str, dimension: int) -> TextJoiningResult:
-    return join_text_maps(ring(40, dimension), dimension, TextJoiningConfig(rows=rows))
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("rows", ROWS)
-@pytest.mark.parametrize("library", LIBRARIES)
-def test_text_submaps_end_at_the_same_optimum_with_every_library(library: str, rows: str, dimension: int) -> None:
-    result = join_text_maps(ring(40, dimension), dimension, TextJoiningConfig(rows=rows, solver=library))
-    best = text_reference(rows, dimension)
-    assert result.solver == library
-    assert best.solver == "multifrontal"
-    assert result.chi2 == pytest.approx(best.chi2, rel=1e-9)
-    assert np.allclose(result.poses, best.poses, atol=1e-5)

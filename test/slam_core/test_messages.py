@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from slam_bringup.bags.bag_types import BagTypes, typestore
+from slam_bags.storage.bag_types import BagTypes, typestore
 from slam_core import messages as m
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import boxplus

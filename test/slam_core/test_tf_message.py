@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam_bringup.bags.bag_types import BagTypes, typestore
+from slam_bags.storage.bag_types import BagTypes, typestore
 from slam_core.geometry import boxplus
 from slam_core.messages import transform_message
 from slam_core.tf_message import TYPE_HASH, tf_message_class, transforms_from_octets, transforms_to_octets

@@ -13,9 +13,10 @@ import click
 
 import slam_core.process_life  # noqa: F401  # its clock starts with the program
 from slam_bringup.commands.console import log_to_terminal, with_verbosity
-from slam_bringup.version import VERSION
+from slam_bringup.registered_commands import registered_commands
 from slam_core.runtime.blas_threads import use_one_blas_thread
 from slam_core.runtime.memory import search_less_garbage, share_one_heap
+from slam_core.version import VERSION
 
 # Before NumPy and SciPy are loaded, and for the programs that are started from here.
 use_one_blas_thread()
@@ -26,38 +27,40 @@ COMMANDS = {
     "demo": "the demo: the real nodes, in one process, on the bag that comes with the program",
     "live": "map live: all nodes in one process, on a camera or on topics",
     "post": "a command post: joins what agents send over a radio link",
-    "simulate": "render a scenario to a bag with ground truth",
     "convert": "a public data set (EuRoC, KITTI, RGB-D) to a bag",
     "view": "show a finished run, or the nodes at work, in the browser",
     "play": "publish a bag's topics over ROS",
     "record": "record ROS topics to a bag",
     "register": "align two point clouds (pcd, ply, vtk)",
-    "join": "join text submaps of the Linear SLAM format",
-    "plane": "2D SLAM on range-bearing logs of one or several robots",
     "evaluate": "ATE, RPE and NEES of a trajectory against ground truth",
-    "experiment": "the experiments of the thesis, beside its own figures",
     "doctor": "what is wrong with a recording or a running rig, and what to do",
     "warmup": "compile all kernels once (./slam setup does it)",
     "calibrate": "camera_info with uncertainties from pictures of a board",
 }
+_IN_EXPERIMENTS = ("simulate", "experiment", "plane", "join")
+"""Commands that the package slam_experiments registers, where it is installed."""
 
 
 class _LazyGroup(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
+        return [*COMMANDS, *registered_commands()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in COMMANDS:
-            return None
-        module = importlib.import_module(f"slam_bringup.commands.{cmd_name}")
-        return with_verbosity(module.command)
+        if cmd_name in COMMANDS:
+            module = f"slam_bringup.commands.{cmd_name}"
+        else:
+            module, _ = registered_commands().get(cmd_name, ("", ""))
+        return with_verbosity(importlib.import_module(module).command) if module else None
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         name = args[0]
-        if name not in COMMANDS and not name.startswith("-") and not ctx.resilient_parsing:
-            close = get_close_matches(name, COMMANDS)
+        known = COMMANDS if name in COMMANDS or name.startswith("-") else self.list_commands(ctx)
+        if name not in known and not name.startswith("-") and not ctx.resilient_parsing:
+            if name in _IN_EXPERIMENTS:
+                raise ValueError(f"{name} is a command of the package slam_experiments: install that as well")
+            close = get_close_matches(name, known)
             ctx.fail(f"No such command '{name}'." + (f" Did you mean {' or '.join(close)}?" if close else ""))
         return super().resolve_command(ctx, args)
 
@@ -72,7 +75,8 @@ class _LazyGroup(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            registered = {name: text for name, (_, text) in registered_commands().items()}
+            formatter.write_dl(list((COMMANDS | registered).items()))
 
 
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

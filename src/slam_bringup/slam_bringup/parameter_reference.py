@@ -16,9 +16,9 @@ from slam_core.config import Config, ParameterInfo, iterate_parameters
 from slam_core.nodes.input_config import InputConfig
 
 _TOOLS = {
-    "viewer": ("slam_bringup.viewer.viewer_node", "ViewerConfig"),
-    "bag_player": ("slam_bringup.bags.bag_player_node", "PlayerConfig"),
-    "recorder": ("slam_bringup.bags.recorder_node", "RecorderConfig"),
+    "viewer": ("slam_viewer.viewer_node", "ViewerConfig"),
+    "bag_player": ("slam_bags.nodes.bag_player_node", "PlayerConfig"),
+    "recorder": ("slam_bags.nodes.recorder_node", "RecorderConfig"),
 }
 """Nodes that are no estimators."""
 

@@ -5,49 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from random_joining import MODELS, measured_pose, perturbed, random_problem
 
 from sjsam_node.smoothing import kernels
-from sjsam_node.smoothing.block_problem import BlockProblem, flatten_rows
 from sjsam_node.smoothing.joining import JoiningProblem
 from sjsam_node.smoothing.problem import JoiningState, LocalMap, block_rows, flatten
-from slam_core.geometry import boxminus, euler_from_rotation, make_transform, rotation_from_euler, so3_exp
+from slam_core.geometry import boxminus, make_transform, rotation_from_euler, so3_exp
 from slam_core.linear_algebra.sparse_cholesky import BACKENDS
-
-MODELS = {"planar": kernels.PLANAR, "tangent": kernels.TANGENT, "euler": kernels.EULER}
-
-
-def random_problem(
-    model: int, rng: np.random.Generator, maps: int = 5, landmarks: int = 7
-) -> tuple[list[LocalMap], JoiningState]:
-    """A chain of noisy local maps, each seeing some of the landmarks; the last one also holds an older pose."""
-    d, a = (2, 1) if model == kernels.PLANAR else (3, 3)
-    P = maps + 1
-    v = np.zeros((P, 3))
-    v[:, 3 - a :] = rng.normal(0, 0.4, (P, a))
-    R = so3_exp(v)[:, :d, :d]
-    t, points = rng.normal(0, 2, (P, d)), rng.normal(0, 4, (landmarks, d))
-    out = []
-    for k in range(maps):
-        seen = np.sort(rng.choice(landmarks, 4, replace=False))
-        poses = np.array([k + 1]) if k < maps - 1 else np.array([k + 1, 0])
-        mean = np.concatenate(
-            [measured_pose(model, R[k], t[k], R[j], t[j]) for j in poses] + [((points[seen] - t[k]) @ R[k]).ravel()]
-        )
-        root = rng.normal(size=(len(mean),) * 2)
-        mean = mean + 0.02 * rng.normal(size=len(mean))
-        out.append(LocalMap(k, poses, seen, mean, 100.0 * (root @ root.T + 5.0 * np.eye(len(mean)))))
-    return out, JoiningState(np.ascontiguousarray(R), t, points)
-
-
-def measured_pose(model: int, Ri: np.ndarray, ti: np.ndarray, Rj: np.ndarray, tj: np.ndarray) -> np.ndarray:
-    relative = Ri.T @ Rj
-    if model == kernels.PLANAR:
-        angle = np.array([np.arctan2(relative[1, 0], relative[0, 0])])
-    elif model == kernels.EULER:
-        angle = euler_from_rotation(relative)
-    else:
-        angle = boxminus(make_transform(relative, np.zeros(3)), np.eye(4))[3:]
-    return np.concatenate([Ri.T @ (tj - ti), angle])
 
 
 def residual(model: int, m: LocalMap, s: JoiningState) -> np.ndarray:
@@ -93,10 +57,6 @@ def dense_normal_matrix(model: int, maps: list[LocalMap], problem: JoiningProble
 @pytest.fixture(params=list(MODELS))
 def model(request: pytest.FixtureRequest) -> int:
     return MODELS[request.param]
-
-
-def perturbed(problem: JoiningProblem, s: JoiningState, rng: np.random.Generator, size: float = 0.1) -> JoiningState:
-    return problem.retract(s, size * rng.normal(size=problem.layout.pattern.n))
 
 
 def test_cost_gradient_and_normal_matrix_agree_with_differences(model: int, rng: np.random.Generator) -> None:
@@ -163,46 +123,6 @@ def test_a_problem_that_hangs_on_nothing_is_refused() -> None:
         problem.marginals(s)
 
 
-def test_the_landmark_schur_complement_reaches_the_same_optimum_by_the_same_steps(
-    model: int, rng: np.random.Generator
-) -> None:
-    maps, s = random_problem(model, rng, maps=8, landmarks=12)
-    size, d = s.model_dimensions
-    uncorrelated = [block_rows(m, size, d) for m in maps]
-    whole = JoiningProblem(flatten(uncorrelated), s, np.array([0]), model)
-    reduced = BlockProblem(flatten_rows(uncorrelated, size, d), s, np.array([0]), model)
-    start = perturbed(whole, s, rng)
-    assert reduced.cost(start) == pytest.approx(whole.cost(start), rel=1e-12)
-    for damping in (0.0, 0.3):
-        whole.linearize(start)
-        reduced.linearize(start)
-        steps = whole.solve(damping), reduced.solve(damping)
-        assert steps[0] is not None
-        assert steps[1] is not None
-        a, b = whole.retract(start, steps[0]), reduced.retract(start, steps[1])
-        assert np.allclose(a.landmarks, b.landmarks, atol=1e-8)
-        assert np.allclose(a.translations, b.translations, atol=1e-8)
-        assert np.allclose(a.rotations, b.rotations, atol=1e-8)
-    assert reduced.optimize(start)[1].cost == pytest.approx(whole.optimize(start)[1].cost, rel=1e-10)
-    assert np.allclose(reduced.gradient(start)[: size * 8], reduced.linearize(start)[: size * 8], rtol=1e-9, atol=1e-6)
-    assert np.allclose(reduced.columns(start, np.array([3, 7])), whole.columns(start, np.array([3, 7])), rtol=1e-8)
-
-
-def test_a_step_with_the_last_factor_solves_for_the_new_gradient(model: int, rng: np.random.Generator) -> None:
-    maps, s = random_problem(model, rng)
-    uncorrelated = [block_rows(m, *s.model_dimensions) for m in maps]
-    whole = JoiningProblem(flatten(uncorrelated), s, np.array([0]), model)
-    here = perturbed(whole, s, rng)
-    reduced = BlockProblem(flatten_rows(uncorrelated, *s.model_dimensions), s, np.array([0]), model)
-    for problem in (whole, reduced):
-        problem.linearize(s)
-        step = problem.solve(0.0)
-        assert step is not None
-        assert np.allclose(problem.resolve(problem.gradient(s)), step, atol=1e-10)
-        gradient = problem.gradient(here)
-        assert np.allclose(problem.linearize(here), gradient, rtol=1e-9, atol=1e-6)
-
-
 @pytest.mark.parametrize("pitch", [1.5, 1.62, -1.7])
 def test_an_attitude_measured_beyond_a_pitch_of_90_degrees_is_the_attitude_it_says(
     pitch: float, rng: np.random.Generator
@@ -218,3 +138,15 @@ def test_an_attitude_measured_beyond_a_pitch_of_90_degrees_is_the_attitude_it_sa
     for i, step in enumerate(1e-6 * np.eye(6)):
         ahead, behind = (problem.cost(problem.retract(moved, sign * step)) for sign in (1.0, -1.0))
         assert gradient[i] == pytest.approx((ahead - behind) / 4e-6, rel=1e-5, abs=1e-5)
+
+
+def test_a_step_with_the_last_factor_solves_for_the_new_gradient(model: int, rng: np.random.Generator) -> None:
+    maps, s = random_problem(model, rng)
+    problem = JoiningProblem(flatten(maps), s, np.array([0]), model)
+    here = perturbed(problem, s, rng)
+    problem.linearize(s)
+    step = problem.solve(0.0)
+    assert step is not None
+    assert np.allclose(problem.resolve(problem.gradient(s)), step, atol=1e-10)
+    gradient = problem.gradient(here)
+    assert np.allclose(problem.linearize(here), gradient, rtol=1e-9, atol=1e-6)

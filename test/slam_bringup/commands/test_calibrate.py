@@ -11,7 +11,7 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
-from slam_bringup.bags.rig_calibration import read_rig_calibration
+from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bringup.cli import slam
 from slam_bringup.commands.calibrate import command
 from slam_bringup.pipeline.configuration import load_system_config

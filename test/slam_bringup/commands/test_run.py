@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from ekf_slam_node.slam import EkfSlam
 from sjsam_node.global_map import GlobalMap
-from slam_bringup.bags.bag import BagReader, BagWriter
+from slam_bags.storage.bag import BagReader, BagWriter
 from slam_bringup.cli import slam
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.interrupt import INTERRUPTED

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from slam_bringup.bags.sensor_topics import BagNames
+from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.cli import slam
 from slam_bringup.doctor.examination import examine, require_stereo
 

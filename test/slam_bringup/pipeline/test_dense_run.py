@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from slam_bringup.bags.bag import BagReader, BagWriter
-from slam_bringup.bags.bag_types import BagTypes
-from slam_bringup.bags.readings import ColourReading, DepthReading, StereoReading
-from slam_bringup.bags.sensor_bag import SensorBag
-from slam_bringup.bags.sensor_topics import BagNames
-from slam_bringup.bags.sensor_writer import LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
-from slam_bringup.datasets.rgbd import RgbdDataset
+from slam_bags.datasets.rgbd import RgbdDataset
+from slam_bags.reading.readings import ColourReading, DepthReading, StereoReading
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.reading.sensor_topics import BagNames
+from slam_bags.storage.bag import BagReader, BagWriter
+from slam_bags.storage.bag_types import BagTypes
+from slam_bags.storage.sensor_writer import LEFT_FRAME, RIGHT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_bringup.pipeline.configuration import load_system_config
 from slam_bringup.pipeline.dense_run import dense_model
 from slam_core.camera import Camera, CameraInfo

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam_bringup.bags.bag import BagReader, BagWriter
-from slam_bringup.bags.bag_types import BagTypes
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.storage.bag import BagReader, BagWriter
+from slam_bags.storage.bag_types import BagTypes
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.node_graph import plan_nodes

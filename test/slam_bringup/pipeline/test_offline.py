@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from slam_bringup.bags.readings import AgentSensors
+from slam_bags.reading.readings import AgentSensors
 from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag

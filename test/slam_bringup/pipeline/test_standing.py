@@ -10,8 +10,8 @@ import numpy as np
 
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.stage import FilterStage
-from slam_bringup.bags.readings import StereoReading
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.readings import StereoReading
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from slam_bringup.bags.readings import AgentSensors
+from slam_bags.reading.readings import AgentSensors
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.processes.node_graph import live_nodes, plan_nodes
 from slam_bringup.processes.start_map import StartMap

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slam_bringup.bags.bag_types import BagTypes
+from slam_bags.storage.bag_types import BagTypes
 from slam_core.messages import (
     ellipsoid_markers,
     grey_from_message,

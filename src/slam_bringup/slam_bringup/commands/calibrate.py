@@ -10,12 +10,11 @@ from pathlib import Path
 import click
 import numpy as np
 
-from slam_bringup.bags.bag_calibration import FILE_NAME
-from slam_bringup.bags.extrinsics import EXTRINSICS, URDF, extrinsics_text, extrinsics_urdf
+from slam_bags.reading.extrinsics import EXTRINSICS, URDF, extrinsics_text, extrinsics_urdf
+from slam_bags.storage.bag_calibration import FILE_NAME
 from slam_bringup.commands.console import progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.commands.refine import refine, write_refined
-from slam_bringup.report.figures import save_png
 from slam_calibration.board import Board, parse_board
 from slam_calibration.bundle import BundleResult
 from slam_calibration.length_error import pair_error, parameter_file
@@ -36,6 +35,7 @@ from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.geometry import FloatArray, both_halves, make_transform
 from slam_core.storage.files import atomic_text
 from slam_core.storage.output_folder import OutputFolder
+from slam_viewer.report.figures import save_png
 
 CAMERAS = {"mono": ("camera",), "stereo": ("left", "right"), "stereo-tof": ("left", "tof")}
 FRAMES = {"left": "stereo_left_optical_frame", "right": "stereo_right_optical_frame", "tof": "tof_optical_frame"}

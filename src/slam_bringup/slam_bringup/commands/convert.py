@@ -8,15 +8,15 @@ from pathlib import Path
 
 import click
 
-from slam_bringup.bags.bag import COMPRESSIONS, BagWriter
-from slam_bringup.bags.bag_owner import require_free
-from slam_bringup.bags.sensor_writer import SensorWriter
+from slam_bags.datasets.euroc import EurocDataset
+from slam_bags.datasets.files import Dataset
+from slam_bags.datasets.kitti import KittiDataset
+from slam_bags.datasets.rgbd import RgbdDataset
+from slam_bags.storage.bag import COMPRESSIONS, BagWriter
+from slam_bags.storage.bag_owner import require_free
+from slam_bags.storage.sensor_writer import SensorWriter
 from slam_bringup.commands.console import is_quiet, progress_bar
 from slam_bringup.commands.paths import UserPath, overwrite_option
-from slam_bringup.datasets.euroc import EurocDataset
-from slam_bringup.datasets.files import Dataset
-from slam_bringup.datasets.kitti import KittiDataset
-from slam_bringup.datasets.rgbd import RgbdDataset
 
 DATASETS: dict[str, Callable[[Path, Path | None, Path | None, float | None], Dataset]] = {
     "euroc": EurocDataset,

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import click
 
-from slam_bringup.bags.rig_calibration import read_rig_calibration
-from slam_bringup.bags.sensor_topics import ROLES, BagNames, parse_topics
+from slam_bags.reading.rig_calibration import read_rig_calibration
+from slam_bags.reading.sensor_topics import ROLES, BagNames, parse_topics
 from slam_bringup.commands.paths import UserPath, calibration_option
 from slam_bringup.doctor.examination import GROUPS, examine
 from slam_bringup.doctor.finding import Finding
@@ -75,7 +75,7 @@ def examine_live(seconds: float, names: BagNames) -> list[Finding]:
     """
     with tempfile.TemporaryDirectory(prefix="slam-doctor-") as folder:
         bag, log = Path(folder) / "live", Path(folder) / "recorder.log"
-        recorder = NodeCommand("slam_bringup", "recorder", tuple(ros_arguments({"bag": str(bag)})))
+        recorder = NodeCommand("slam_bags", "recorder", tuple(ros_arguments({"bag": str(bag)})))
         process = NodeProcess.start(recorder, log, os.environ)
         try:
             _wait_until_ready(process)

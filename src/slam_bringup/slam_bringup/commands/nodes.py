@@ -8,9 +8,9 @@ from pathlib import Path
 
 import click
 
-from slam_bringup.bags.rig_calibration import read_rig_calibration
-from slam_bringup.bags.sensor_bag import SensorBag
-from slam_bringup.bags.sensor_topics import BagNames, parse_topics
+from slam_bags.reading.rig_calibration import read_rig_calibration
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.reading.sensor_topics import BagNames, parse_topics
 from slam_bringup.commands.console import LOG_NAME, Transcript, progress_bar, show
 from slam_bringup.commands.mapping_options import (
     map_folder,
@@ -25,9 +25,9 @@ from slam_bringup.pipeline.overrides import Overrides, read_overrides
 from slam_bringup.processes.interrupt import MAP, Interrupt, giving_up
 from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.start_map import StartMap
-from slam_bringup.report.summary_table import summary_table
-from slam_bringup.version import VERSION
 from slam_core.storage.output_folder import LOGS, OutputFolder
+from slam_core.version import VERSION
+from slam_viewer.report.summary_table import summary_table
 
 _PAGE_PORT = 8080
 """Port of the page, where it is free."""
@@ -66,8 +66,8 @@ def command(
             )  # fmt: skip
         # What draws and writes is loaded now: the nodes have needed the processor.
         from slam_bringup.processes.recorded_run import collect
-        from slam_bringup.report.output import write_results
-        from slam_bringup.report.result_bag import complete_recording
+        from slam_viewer.report.output import write_results
+        from slam_viewer.report.result_bag import complete_recording
 
         result, _ = collect(bag, system, run, mapper=mapper, odometry=odometry, names=names, start_map=start)
         require_map(result)

@@ -21,4 +21,4 @@ from slam_bringup.processes.processes import become_node
 def command(bag: Path, rate: float, loop: bool, clock: bool, topics: tuple[str, ...]) -> None:
     """Publish the topics of BAG over ROS."""
     parameters = {"bag": str(bag), "rate": rate, "loop": loop, "clock": clock, "topics": topics}
-    become_node("slam_bringup", "bag_player", ros_arguments(parameters))
+    become_node("slam_bags", "bag_player", ros_arguments(parameters))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from slam_bringup.bags.bag_owner import require_free
+from slam_bags.storage.bag_owner import require_free
 from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import become_node
@@ -22,4 +22,4 @@ def command(output: Path, storage: str, overwrite: bool, topics: tuple[str, ...]
     """Record TOPICS (all by default) until Ctrl-C."""
     require_free(output, overwrite=overwrite)
     parameters = {"bag": str(output), "storage": storage, "topics": topics, "overwrite": overwrite}
-    become_node("slam_bringup", "recorder", ros_arguments(parameters))
+    become_node("slam_bags", "recorder", ros_arguments(parameters))

@@ -16,8 +16,8 @@ from typing import Any
 import yaml
 
 from ekf_slam_node.stage import FilterStage
-from slam_bringup.bags.bag_calibration import FILE_NAME, calibration_file
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.storage.bag_calibration import FILE_NAME, calibration_file
 from slam_bringup.commands.mapping_options import mode_for
 from slam_bringup.pipeline.configuration import choose, filter_config, load_system_config
 from slam_bringup.pipeline.overrides import read_overrides

@@ -15,7 +15,7 @@ FAILED = 1
 """Exit code of a run that an error has ended; its results are written."""
 
 DEGRADED = 3
-"""Exit code of a run that lost too much (:mod:`slam_bringup.pipeline.verdict`); its results are written."""
+"""Exit code of a run that lost too much (:mod:`slam_viewer.verdict`); its results are written."""
 
 
 def end_run(summary: dict[str, Any], out: Path, *, stopped: bool) -> None:

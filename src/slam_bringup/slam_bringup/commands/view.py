@@ -52,10 +52,10 @@ def command(
 
 def _show_finished(out: Path, bag: Path | None, port: int, host: str, browser: bool) -> None:
     # Here and not above: loading viser takes a second, and --help should not.
-    from slam_bringup.viewer.finished import FinishedView
-    from slam_bringup.viewer.page import ViewerPage
-    from slam_bringup.viewer.pictures import BagPictures, RecordedPictures
-    from slam_bringup.viewer.run_folder import RunFolder
+    from slam_viewer.page.finished import FinishedView
+    from slam_viewer.page.page import ViewerPage
+    from slam_viewer.page.pictures import BagPictures, RecordedPictures
+    from slam_viewer.page.run_folder import RunFolder
 
     run = RunFolder.read(out)
     recording = out / "result.mcap"
@@ -78,4 +78,4 @@ def _show_finished(out: Path, bag: Path | None, port: int, host: str, browser: b
 
 def _run_node(agents: tuple[str, ...], port: int, host: str) -> None:
     parameters = {"port": port, "host": host, **({"agents": list(agents)} if agents else {})}
-    become_node("slam_bringup", "viewer", ros_arguments(parameters))
+    become_node("slam_viewer", "viewer", ros_arguments(parameters))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.commands.console import progress_bar
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag

@@ -3,7 +3,7 @@
 
     messages of a bag -> streams (all stamps) -> sample (three bursts of consecutive images) -> decoded images
 
-Unlike :class:`slam_bringup.bags.sensor_bag.SensorBag` it takes any bag, for what is missing is a finding.
+Unlike :class:`slam_bags.reading.sensor_bag.SensorBag` it takes any bag, for what is missing is a finding.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from slam_bringup.bags.bag import BagReader, TopicInfo
-from slam_bringup.bags.pacing import header_stamp_ns
-from slam_bringup.bags.sensor_topics import BagNames, find_agents, is_rectified, topics_of
+from slam_bags.nodes.pacing import header_stamp_ns
+from slam_bags.reading.sensor_topics import BagNames, find_agents, is_rectified, topics_of
+from slam_bags.storage.bag import BagReader, TopicInfo
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
@@ -64,7 +64,7 @@ class Calibration:
 
 @dataclass(eq=False)
 class Evidence:
-    """One agent. Roles as in :mod:`slam_bringup.bags.sensor_topics`; ``depth`` may be a range along the ray.
+    """One agent. Roles as in :mod:`slam_bags.reading.sensor_topics`; ``depth`` may be a range along the ray.
 
     images: decoded sample by role and stamp; depth and range in m. faults: messages that could not be decoded, by topic
     with the first reason. imu: rows of stamp s, angular velocity rad/s, specific force m/s2, in the IMU's axes.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from slam_bringup.bags.sensor_topics import BagNames
+from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.doctor.calibration import check_calibration
 from slam_bringup.doctor.depth_images import check_depth_images
 from slam_bringup.doctor.evidence import Evidence, gather

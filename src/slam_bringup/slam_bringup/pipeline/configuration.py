@@ -15,8 +15,8 @@ from dense_mapping.dense_model import DenseConfig
 from ekf_slam_node.stage import IMU, MOTION, FilterConfig
 from ndt_registration.odometry import OdometryConfig
 from sjsam_node.global_map import GlobalMapConfig
-from slam_bringup.bags.bag_calibration import calibration_file
-from slam_bringup.bags.readings import AgentSensors
+from slam_bags.reading.readings import AgentSensors
+from slam_bags.storage.bag_calibration import calibration_file
 from slam_bringup.pipeline.overrides import (
     NODE_CONFIGS,
     Overrides,
@@ -25,8 +25,8 @@ from slam_bringup.pipeline.overrides import (
     require_known_nodes,
     require_known_parameters,
 )
-from slam_bringup.pipeline.verdict import RunConfig
 from slam_core.config import Config, from_mapping, group, iterate_parameters
+from slam_viewer.verdict import RunConfig
 from stereo_frontend.frontend_config import FrontendConfig
 from tof_driver.depth import DepthConfig
 

@@ -11,9 +11,9 @@ import numpy as np
 from dense_mapping.colours import NO_PICTURE
 from dense_mapping.dense_stage import DenseStage
 from dense_mapping.keyframes import grey_levels
-from slam_bringup.bags.reading_times import ReadingTimes, Stamps
-from slam_bringup.bags.readings import AgentSensors, ColourReading, DepthReading, ImuReading, Reading, StereoReading
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.reading_times import ReadingTimes, Stamps
+from slam_bags.reading.readings import AgentSensors, ColourReading, DepthReading, ImuReading, Reading, StereoReading
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage

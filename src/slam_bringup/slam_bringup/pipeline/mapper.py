@@ -16,7 +16,7 @@ from ndt_registration.stage import ScanEstimate
 from sjsam_node.agents import in_order
 from sjsam_node.map_session import MapSession, Mode, Outcome
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
-from slam_bringup.bags.readings import AgentSensors, SessionStart
+from slam_bags.reading.readings import AgentSensors, SessionStart
 from slam_bringup.pipeline.configuration import SystemConfig, filter_config
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges
 from slam_bringup.pipeline.sensor_pipeline import AgentItem

@@ -19,18 +19,18 @@ from pathlib import Path
 import cv2
 
 from sjsam_node.map_session import MapSession
-from slam_bringup.bags.readings import ImuReading, Reading
-from slam_bringup.bags.sensor_bag import SensorBag
-from slam_bringup.bags.sensor_topics import BagNames
+from slam_bags.reading.readings import ImuReading, Reading
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.mapper import Mapper
-from slam_bringup.pipeline.results import RunResult
 from slam_bringup.pipeline.run_record import run_result, told
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.runtime.memory import give_back, keep_little
 from slam_core.types import ImuSample
+from slam_viewer.results import RunResult
 
 _LOG = logging.getLogger(__name__)
 

@@ -13,16 +13,16 @@ import numpy as np
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.surface import Surface
 from sjsam_node.smoothing.map_snapshot import MapLandmarks, MapSnapshot
-from slam_bringup.bags.sensor_bag import SensorBag
+from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.dense_run import dense_model
-from slam_bringup.pipeline.frame_log import LoggedFrame
-from slam_bringup.pipeline.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
 from slam_core.config import iterate_parameters
 from slam_core.geometry import FloatArray
 from slam_core.runtime.memory import give_back
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
+from slam_viewer.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
+from stereo_frontend.frame_log import LoggedFrame
 from stereo_frontend.frontend_config import FrontendReport
 
 _LOG = logging.getLogger(__name__)

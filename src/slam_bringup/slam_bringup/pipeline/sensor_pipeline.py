@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 from ndt_registration.stage import Scan, ScanEstimate, ScanOdometryStage
-from slam_bringup.bags.readings import (
+from slam_bags.reading.readings import (
     AgentSensors,
     DepthReading,
     ImuReading,
@@ -24,9 +24,9 @@ from slam_bringup.bags.readings import (
     StereoReading,
 )
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.frame_log import FrameLog
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.types import Features, ImuSample
+from stereo_frontend.frame_log import FrameLog
 from stereo_frontend.frontend_config import FrontendReport
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
 from tof_driver.stage import DepthStage

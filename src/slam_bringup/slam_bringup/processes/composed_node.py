@@ -43,7 +43,7 @@ _NODES = {
     "ekf_slam": "ekf_slam_node.node:EkfNode",
     "radio_link": "slam_radio.radio_link_node:RadioLinkNode",
     "sjsam": "sjsam_node.node:SjsamNode",
-    "viewer": "slam_bringup.viewer.viewer_node:ViewerNode",
+    "viewer": "slam_viewer.viewer_node:ViewerNode",
 }
 """Module and class of the node of each executable."""
 

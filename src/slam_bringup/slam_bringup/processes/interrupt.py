@@ -21,9 +21,6 @@ from slam_core.process_life import INTERRUPTED as INTERRUPTED
 from slam_core.process_life import on_request_to_end
 from slam_core.storage.output_folder import OutputFolder
 
-STOPPED = "stopped before the end: no dense model and no report"
-"""Words of a result about a run that ended early."""
-
 MAP = "map"
 """The part of the results that a user who gives up keeps."""
 

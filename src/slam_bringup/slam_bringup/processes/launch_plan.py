@@ -15,9 +15,9 @@ from typing import Any
 
 import yaml
 
-from slam_bringup.bags.rig_calibration import read_rig_calibration
-from slam_bringup.bags.sensor_bag import SensorBag
-from slam_bringup.bags.sensor_topics import BagNames, nodes_name, parse_topics
+from slam_bags.reading.rig_calibration import read_rig_calibration
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.reading.sensor_topics import BagNames, nodes_name, parse_topics
 from slam_bringup.pipeline.configuration import ODOMETRIES, choose, overrides_for, system_config, with_files
 from slam_bringup.pipeline.overrides import Overrides, overrides_of, parse_assignments, read_overrides
 from slam_bringup.processes.node_graph import NodeGraph, NodeSpec, live_nodes, plan_nodes
@@ -177,4 +177,4 @@ def _player(path: Path, graph: NodeGraph, values: Mapping[str, str]) -> NodeSpec
         "transforms": graph.transforms,
     }
     parameters = {name: value for name, value in parameters.items() if value != ()}
-    return NodeSpec("slam_bringup", "bag_player", "", parameters)
+    return NodeSpec("slam_bags", "bag_player", "", parameters)

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ekf_slam_node.stage import IMU
-from slam_bringup.bags.readings import AgentSensors
-from slam_bringup.bags.rig_calibration import RigCalibration
-from slam_bringup.bags.sensor_topics import is_rectified, join, nodes_name
+from slam_bags.reading.readings import AgentSensors
+from slam_bags.reading.rig_calibration import RigCalibration
+from slam_bags.reading.sensor_topics import is_rectified, join, nodes_name
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.overrides import Overrides, is_parameter_of
 from slam_bringup.processes.node_arguments import ros_arguments
@@ -157,7 +157,7 @@ def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port
     """The dense model and the page that shows it, beside the nodes of :func:`plan_nodes`."""
     agents = tuple(sensors) if any(sensors) else ()
     model = _spec("dense_mapping", "dense_mapper", config.dense_mapper, "", {}, agents=agents)
-    page = _spec("slam_bringup", "viewer", None, "", {}, agents=agents, port=port)
+    page = _spec("slam_viewer", "viewer", None, "", {}, agents=agents, port=port)
     return [model, page]
 
 
@@ -175,7 +175,7 @@ def post_nodes(agents: Sequence[str], addresses: Sequence[str], port: int, confi
     return [
         NodeSpec("slam_radio", "radio_link", "", link),
         _spec("sjsam_node", "sjsam", config.sjsam, "", {}, agents=tuple(agents)),
-        NodeSpec("slam_bringup", "viewer", "", {"agents": tuple(agents), "port": port}),
+        NodeSpec("slam_viewer", "viewer", "", {"agents": tuple(agents), "port": port}),
     ]
 
 

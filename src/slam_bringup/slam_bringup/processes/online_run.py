@@ -16,8 +16,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from slam_bringup.bags.sensor_bag import SensorBag
-from slam_bringup.bags.sensor_topics import BagNames
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.overrides import Overrides
 from slam_bringup.processes.node_arguments import ros_arguments
@@ -192,7 +192,7 @@ class _Choreography:
 
     def _recorder(self) -> NodeCommand:
         parameters = {"bag": str(self._recording), "topics": self._graph.recorded_topics, "header_stamps": True}
-        return NodeCommand("slam_bringup", "recorder", tuple(ros_arguments(parameters)))
+        return NodeCommand("slam_bags", "recorder", tuple(ros_arguments(parameters)))
 
     def _wait_for_recorder(self) -> None:
         topics = [t for t in self._graph.recorded_topics if self._supervisor.publishes(t)]
@@ -215,7 +215,7 @@ class _Choreography:
             "transforms": self._graph.transforms,
             "subscribers": tuple(f"{t}={len(self._supervisor.subscribers(t))}" for t in heard_topics),
         }
-        player = self._group.start(NodeCommand("slam_bringup", "bag_player", tuple(ros_arguments(parameters))))
+        player = self._group.start(NodeCommand("slam_bags", "bag_player", tuple(ros_arguments(parameters))))
         self._supervisor.count_submaps(f"{name.rpartition('/')[0]}/submap/info" for name in self._graph.filters)
         self._supervisor.prepare((*(f"{name}/finish" for name in self._graph.finishers), _FINISH_MAP, _SAVE_MAP))
         self._wait_until_ready(from_outside=())

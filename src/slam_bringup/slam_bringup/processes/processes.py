@@ -24,9 +24,9 @@ _MODULES = {
     ("ekf_slam_node", "ekf_slam"): "ekf_slam_node.node",
     ("sjsam_node", "sjsam"): "sjsam_node.node",
     ("slam_bringup", "slam_composed"): "slam_bringup.processes.composed_node",
-    ("slam_bringup", "bag_player"): "slam_bringup.bags.bag_player_node",
-    ("slam_bringup", "recorder"): "slam_bringup.bags.recorder_node",
-    ("slam_bringup", "viewer"): "slam_bringup.viewer.viewer_node",
+    ("slam_bags", "bag_player"): "slam_bags.nodes.bag_player_node",
+    ("slam_bags", "recorder"): "slam_bags.nodes.recorder_node",
+    ("slam_viewer", "viewer"): "slam_viewer.viewer_node",
     ("dense_mapping", "dense_mapper"): "dense_mapping.node",
     ("slam_radio", "radio_link"): "slam_radio.radio_link_node",
 }

@@ -9,18 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from sjsam_node.global_map import GlobalMap
-from slam_bringup.bags.bag import BagReader
-from slam_bringup.bags.readings import AgentSensors
-from slam_bringup.bags.sensor_bag import SensorBag
-from slam_bringup.bags.sensor_topics import BagNames
+from slam_bags.reading.readings import AgentSensors
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.reading.sensor_topics import BagNames
+from slam_bags.storage.bag import BagReader
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.results import RunResult
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges, run_result
-from slam_bringup.processes.interrupt import STOPPED
 from slam_bringup.processes.online_run import OnlineRun, unclean_ends
 from slam_bringup.processes.start_map import StartMap
 from slam_core.messages import estimate_from_message
 from slam_core.types import PoseEstimate
+from slam_viewer.results import STOPPED, RunResult
 from stereo_frontend.frontend_config import FrontendReport
 from stereo_frontend.stereo.rectification_error import RectificationError
 

@@ -21,7 +21,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
-from slam_bringup.bags.pacing import Connections
+from slam_bags.nodes.pacing import Connections
 from slam_core.nodes.base_node import PROGRESS_TOPIC
 from slam_core.ros import RosTypes, sensor_qos, use_fast_dds_profile
 

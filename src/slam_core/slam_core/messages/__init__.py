@@ -3,7 +3,7 @@
 
 Messages are read by attribute (duck typing) and made through a :class:`MessageTypes`, so that the same code serves the
 messages of rclpy (``slam_core.ros.RosTypes``) and those of a bag read by rosbags
-(``slam_bringup.bags.bag_types.BagTypes``).
+(``slam_bags.storage.bag_types.BagTypes``).
 ``x_message(types, ...)`` makes a message, ``x_from_message(message)`` reads one. A message that contradicts
 itself raises ``ValueError`` naming what is wrong.
 """

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The thesis's planar estimators: EKF, smoothing, SEIF, submaps."""

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bag files: messages in and out, their types, their owner, and what lies beside them."""

@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ``viewer`` node: what the other nodes publish, live on the page."""
+
+# rclpy is annotated in part only.
+# mypy: allow-untyped-calls
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
+
+from dense_mapping.floor_plan import FloorPlan
+from slam_core.config import Config, parameter
+from slam_core.geometry import FloatArray
+from slam_core.messages import (
+    cloud_from_message,
+    estimate_from_message,
+    header_message,
+    image_from_message,
+    occupancy_from_message,
+    path_from_message,
+    pose_from_message,
+    transform_from_message,
+)
+from slam_core.messages.base import Message
+from slam_core.nodes.base_node import SlamNode
+from slam_core.nodes.stamp_guard import StampPolicy
+from slam_core.ros import below, run_node, sensor_qos
+from slam_core.types import ByteArray, PoseEstimate
+from slam_viewer.page.command_post import position_radius, radius_text, unseen, ways_out
+from slam_viewer.page.page import ViewerPage
+from slam_viewer.page.panel import AgentRow
+
+_SILENT_S = 3.0
+_STOREYS = 4
+_STATES = ("OK", "DEGRADED", "LOST")
+
+
+@dataclass(frozen=True)
+class ViewerConfig(Config):
+    """The viewer."""
+
+    agents: tuple[str, ...] = parameter(("",), "namespaces of the agents that are shown")
+    port: int = parameter(8080, "port of the page; 0: any that is free", minimum=0, maximum=65535)
+    host: str = parameter(
+        "127.0.0.1",
+        "address the page listens on; 0.0.0.0 lets other machines see it, who know the token in its address",
+    )
+    map_frame: str = parameter("map", "frame of the map")
+    post_period_s: float = 2.0
+    """Time from one look for ways out to the next, s."""
+
+
+@dataclass
+class _Agent:
+    """State of one agent."""
+
+    state: str = "no news yet"
+    reason: str = ""
+    T_map_odom: FloatArray = field(default_factory=lambda: np.eye(4))
+    pose: PoseEstimate | None = None
+    T_odom_base: FloatArray | None = None
+    heard_at_ns: int = 0
+    picture_at_ns: int = 0
+    path: FloatArray | None = None
+
+
+class ViewerNode(SlamNode[ViewerConfig]):
+    """Shows agents, map, model and floor plan.
+
+    A click on the page, once asked for, is published as ``clicked_point``.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("viewer", ViewerConfig)
+        self.page = ViewerPage(self.config.port, self.config.host)
+        self._agents = {agent: _Agent() for agent in self.config.agents}
+        self._plans: dict[int, FloorPlan] = {}
+        self._looked = False
+        self.advertise("clicked_point", "PointStamped")
+        for index, agent in enumerate(self.config.agents):
+            self._listen_to(index, agent)
+        self._listen_to_map()
+        with self.page.overview:
+            button = self.page.server.gui.add_button("Mark a place: then click into the scene")
+            button.on_click(lambda _: self.page.on_click(self._on_click))
+            for agent in self.config.agents:
+                here = self.page.server.gui.add_button(f"Mark where {agent or 'the rig'} is")
+                here.on_click(partial(self._mark_agent, agent))
+        self.create_timer(self.config.post_period_s, self._show_post, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_logger().info(f"the page is at {self.page.url}")
+
+    def on_shutdown(self) -> None:  # type: ignore[override]  # no lifecycle node: rclpy's own takes a state
+        """Close the page."""
+        self.page.stop()
+
+    def _listen_to(self, index: int, agent: str) -> None:
+        own = partial(below, agent)
+        self.listen(
+            own("odom"), "Odometry", partial(self._on_odometry, index, agent), required=False, stamps=StampPolicy.ANY
+        )
+        self.listen(
+            own("map_to_odom"),
+            "TransformStamped",
+            partial(self._on_map_to_odom, agent),
+            latched=True,
+            required=False,
+            stamps=StampPolicy.ANY,
+        )
+        self.listen(
+            own("pose"),
+            "PoseWithCovarianceStamped",
+            partial(self._on_pose, agent),
+            required=False,
+            stamps=StampPolicy.ANY,
+        )
+        self.listen(
+            own("map/path"),
+            "Path",
+            partial(self._on_path, index, agent),
+            latched=True,
+            required=False,
+            stamps=StampPolicy.ANY,
+        )
+        self.listen(
+            own("features/image"), "Image", partial(self._on_picture, agent), required=False, stamps=StampPolicy.ANY
+        )
+
+    def _listen_to_map(self) -> None:
+        self.listen(
+            "map/landmarks", "PointCloud2", self._on_landmarks, latched=True, required=False, stamps=StampPolicy.ANY
+        )
+        # Markers have no stamp of their own, which the inputs of estimators need.
+        for topic, show in (("map/graph", self._on_graph), ("map/marks", self._on_marks)):
+            take = partial(self._take_markers, topic, show)
+            self.create_subscription(self._ros_types.MarkerArray, topic, take, sensor_qos(1, latched=True))
+        # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
+        self.create_subscription(self._ros_types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
+        self.listen(
+            "map/dense_cloud", "PointCloud2", self._on_dense_cloud, latched=True, required=False, stamps=StampPolicy.ANY
+        )
+        for number in range(_STOREYS):
+            topic = f"map/occupancy_{number}" if number else "map/occupancy"
+            self.listen(
+                topic,
+                "OccupancyGrid",
+                partial(self._on_plan, number),
+                latched=True,
+                required=False,
+                stamps=StampPolicy.ANY,
+            )
+
+    # -- agents --------------------------------------------------------------------------------------------------------
+
+    def _on_odometry(self, index: int, agent: str, message: Message) -> None:
+        own = self._agents[agent]
+        own.T_odom_base, own.heard_at_ns = pose_from_message(message.pose.pose), self._now_ns()
+        if own.state == "no news yet":
+            own.state = "OK"
+        self.page.show_agent(agent, index, own.T_map_odom @ own.T_odom_base)
+
+    def _on_map_to_odom(self, agent: str, message: Message) -> None:
+        self._agents[agent].T_map_odom = transform_from_message(message)[2]
+
+    def _on_pose(self, agent: str, message: Message) -> None:
+        self._agents[agent].pose = estimate_from_message(message)
+
+    def _on_path(self, index: int, agent: str, message: Message) -> None:
+        poses = path_from_message(message)
+        if len(poses) < 2:
+            return
+        matrices = np.stack([T for _, T in poses])
+        self._agents[agent].path = matrices[:, :3, 3]
+        self.page.show_trajectory(index, matrices)
+
+    def _on_picture(self, agent: str, message: Message) -> None:
+        own, now = self._agents[agent], self._now_ns()
+        if now - own.picture_at_ns < 200_000_000:  # five a second are enough for the eye
+            return
+        own.picture_at_ns = now
+        picture = _rgb(message)
+        self.page.show_picture(picture, f"{agent or 'rig'}: features by depth; circle stereo, square ToF")
+        if own.T_odom_base is not None:
+            self.page.show_camera(own.T_map_odom @ own.T_odom_base, picture)
+
+    def _on_diagnostics(self, message: Message) -> None:
+        for status in message.status:
+            for agent, own in self._agents.items():
+                if status.name == f"/{below(agent, 'ekf_slam')}":
+                    level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+                    own.state, own.reason = _STATES[min(level, 2)], str(status.message)
+
+    # -- map -----------------------------------------------------------------------------------------------------------
+
+    def _on_landmarks(self, message: Message) -> None:
+        cloud = cloud_from_message(message)
+        covariances = np.empty((len(cloud), 3, 3))
+        for i, a in enumerate("xyz"):
+            for j, b in enumerate("xyz"):
+                covariances[:, i, j] = cloud[f"cov_{min(a, b)}{max(a, b)}"]
+        positions = np.stack([cloud[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        self.page.show_landmarks(positions, covariances, cloud["sightings"].astype(np.int64))
+
+    def _take_markers(self, topic: str, show: Callable[[Message], None], message: Message) -> None:
+        """Rejects what is no marker of ours, as :meth:`listen` does for messages with a stamp."""
+        try:
+            if not np.isfinite([[p.x, p.y, p.z] for marker in message.markers for p in marker.points]).all():
+                raise ValueError("a point is not finite")
+            show(message)
+        except ValueError as error:
+            self._reject(f"{topic}: message rejected: {error}")
+
+    def _on_graph(self, message: Message) -> None:
+        for marker in message.markers:
+            lines = np.array([[p.x, p.y, p.z] for p in marker.points]).reshape(-1, 2, 3)
+            if marker.ns == "closures":
+                self.page.show_closures(lines)
+            else:
+                self.page.show_submaps(lines[:, 0], lines[:, 1])
+
+    def _on_marks(self, message: Message) -> None:
+        points = [[p.x, p.y, p.z] for marker in message.markers for p in marker.points]
+        self.page.show_marks([f"mark {k + 1}" for k in range(len(points))], np.array(points).reshape(-1, 3))
+
+    def _on_dense_cloud(self, message: Message) -> None:
+        cloud = cloud_from_message(message)
+        points = np.stack([cloud[axis] for axis in "xyz"], axis=1).astype(np.float32)
+        packed = np.ascontiguousarray(cloud["rgb"]).view(np.uint32)
+        colours = np.stack([(packed >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
+        self.page.show_layer("dense points")
+        self.page.show_points(points, colours)
+        if not self._looked and len(points):
+            self._looked = True
+            self.page.look_at(points.astype(np.float64))
+
+    def _on_plan(self, number: int, message: Message) -> None:
+        plan = FloorPlan(*occupancy_from_message(message))
+        self._plans[number] = plan
+        self.page.show_plan(plan, number)
+        borders = unseen(tuple(self._plans.values()))
+        self.page.show_frontiers(np.array([f.point for f in borders]).reshape(-1, 3), [f.length for f in borders])
+
+    # -- command post --------------------------------------------------------------------------------------------------
+
+    def _show_post(self) -> None:
+        rows, poses, paths = [], {}, {}
+        for agent, own in self._agents.items():
+            rows.append(self._row(agent, own))
+            if own.T_odom_base is not None and own.path is not None:
+                covariance = np.zeros((6, 6)) if own.pose is None else own.pose.covariance
+                poses[agent] = PoseEstimate(0, own.T_map_odom @ own.T_odom_base, covariance)
+                paths[agent] = own.path
+        self.page.show_agent_table(rows)
+        texts = []
+        for out in ways_out(tuple(self._plans.values()), poses, paths) if self._plans else ():
+            points = np.empty((0, 3)) if out.way is None else out.way.points
+            self.page.show_way(list(self._agents).index(out.agent), points, out.label)
+            texts.append((out.agent, out.text))
+        self.page.show_ways_text(texts)
+
+    def _row(self, agent: str, own: _Agent) -> AgentRow:
+        silent_s = (self._now_ns() - own.heard_at_ns) / 1e9
+        state = f"silent for {silent_s:.0f} s" if own.heard_at_ns and silent_s > _SILENT_S else own.state
+        note = own.reason if own.reason not in ("", "OK") else ""
+        if own.pose is not None:
+            note = " ".join(filter(None, (note, radius_text(position_radius(own.pose)))))
+        return AgentRow(agent, state, note)
+
+    def _on_click(self, origin: FloatArray, direction: FloatArray) -> None:
+        """Publish where the ray of a click meets the lowest floor plan, or the map's plane z = 0."""
+        T = self._plans[0].T_map_plan if self._plans else np.eye(4)
+        along = float(direction @ T[:3, 2])
+        if abs(along) < 1e-6:
+            return
+        self._publish_mark(origin + direction * ((T[:3, 3] - origin) @ T[:3, 2]) / along)
+
+    def _mark_agent(self, agent: str, _: object) -> None:
+        """Publish where an agent is, as a find of its own; nothing while that is not known."""
+        own = self._agents[agent]
+        if own.T_odom_base is not None:
+            self._publish_mark((own.T_map_odom @ own.T_odom_base)[:3, 3])
+
+    def _publish_mark(self, point: FloatArray) -> None:
+        x, y, z = point.tolist()
+        header = header_message(self.types, self._now_ns(), self.config.map_frame)
+        self.publish("clicked_point", self.types.PointStamped(header=header, point=self.types.Point(x=x, y=y, z=z)))
+
+    def _now_ns(self) -> int:
+        """Time of this machine: how long nobody was heard is a matter of the page, not of the map."""
+        return int(self.get_clock().now().nanoseconds)
+
+
+def _rgb(message: Message) -> ByteArray:
+    """A picture as RGB (h, w, 3) uint8."""
+    picture = image_from_message(message)
+    if picture.ndim == 2:
+        return np.repeat(picture[..., None], 3, axis=2).astype(np.uint8)
+    return np.ascontiguousarray(picture[..., ::-1] if message.encoding == "bgr8" else picture)
+
+
+def main() -> None:
+    """Entry point of ``ros2 run slam_viewer viewer``."""
+    run_node(ViewerNode)
