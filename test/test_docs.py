@@ -15,7 +15,7 @@ from pathlib import Path
 import click
 import pytest
 
-from slam_bringup.cli import COMMANDS, slam
+from slam_bringup.cli import slam
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "bags/README.md", *(ROOT / "docs").rglob("*.md")])
@@ -38,8 +38,8 @@ def test_every_command_has_these_options(page, line):
     name, *arguments = shlex.split(line)[1:]
     if name in SCRIPT_ONLY:
         return
-    assert name in COMMANDS, f"{page}: no command {name}"
     command = slam.get_command(click.Context(slam), name)
+    assert command is not None, f"{page}: no command {name}"
     while isinstance(command, click.Group):
         command, arguments = command.get_command(click.Context(command), arguments[0]), arguments[1:]
         assert command is not None, f"{page}: {line}"

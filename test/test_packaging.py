@@ -68,8 +68,8 @@ def test_setup_installs_files_by_their_ending(package: str) -> None:
 def installed(tmp_path_factory) -> Path:
     """What a wheel and a colcon install hold of the packages that bring data."""
     folder = tmp_path_factory.mktemp("installed")
-    for package in ("slam_simulation", "slam_bringup"):
-        build = [sys.executable, "setup.py", "-q", "build_py", "-d", str(folder)]
+    for package in ("slam_simulation", "slam_bags", "slam_viewer", "slam_bringup", "slam_experiments"):
+        build = [sys.executable, "setup.py", "-q", "egg_info", "-e", str(folder), "build_py", "-d", str(folder)]
         subprocess.run(build, cwd=SRC / package, check=True, capture_output=True, timeout=120)
     return folder
 
@@ -94,6 +94,7 @@ def test_scenarios_bounds_and_demo_bag_are_installed(installed):
         (("simulate", "demo", "-o", "bag", "--frames", "1"), 0, ""),
         (("experiment", "planar", "--quick", "-o", "page"), 0, "written to"),
         (("demo", "--help"), 0, "--view"),
+        (("--help",), 0, "experiment the experiments of the thesis"),
     ],
 )
 def test_installed_commands_run_in_an_empty_folder(installed, tmp_path, arguments, code, said):

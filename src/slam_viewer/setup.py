@@ -33,7 +33,7 @@ setup(
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",
     maintainer_email="maintainers@indoor-slam.org",
-    description="What a run shows: results, report, result bag, and the live page in the browser.",
+    description="Results of a run, report, result bag, and the live page in the browser.",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [

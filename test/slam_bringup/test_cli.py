@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,6 +19,8 @@ from click.testing import CliRunner
 
 from slam_bringup.cli import COMMANDS, VERSION, slam
 from slam_bringup.commands.console import progress_bar, show
+from slam_bringup.registered_commands import registered_commands
+from slam_experiments.command_table import COMMANDS as REGISTERED
 
 COMMAND = [sys.executable, "-m", "slam_bringup.cli"]
 SOURCES = Path(__file__).resolve().parents[2] / "src"
@@ -90,8 +93,52 @@ def test_ctrl_c_ends_every_command_with_its_exit_code(monkeypatch) -> None:
     assert result.output == "\nstopped\n"
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", [*COMMANDS, *REGISTERED])
 def test_every_command_has_its_help(name: str) -> None:
     result = CliRunner().invoke(slam, [name, "--help"])
     assert result.exit_code == 0
-    assert importlib.import_module(f"slam_bringup.commands.{name}").command.help
+    module = f"slam_bringup.commands.{name}" if name in COMMANDS else REGISTERED[name][0]
+    assert importlib.import_module(module).command.help
+
+
+@pytest.fixture
+def packages(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Makes an environment in which no other package registers commands, but for those in the folders given."""
+
+    def only(*folders: Path) -> None:
+        others = [p for p in sys.path if not list(Path(p).glob("slam_experiments*-info"))]
+        monkeypatch.setattr(sys, "path", [*others, *map(str, folders)])
+        registered_commands.cache_clear()
+
+    yield only
+    registered_commands.cache_clear()
+
+
+def test_commands_of_installed_packages_are_listed() -> None:
+    text = CliRunner().invoke(slam, ["--help"]).output
+    assert [name for name in (*COMMANDS, *REGISTERED) if not re.search(rf"^  {name} ", text, re.MULTILINE)] == []
+
+
+@pytest.mark.parametrize("name", REGISTERED)
+def test_without_its_package_a_command_says_what_to_install(name: str, packages: Callable[..., None]) -> None:
+    packages()
+    with pytest.raises(ValueError, match="slam_experiments, which is not installed"):
+        CliRunner().invoke(slam, [name, "x"], catch_exceptions=False)
+    assert name not in CliRunner().invoke(slam, ["--help"]).output.split()
+
+
+def test_another_package_registers_a_command(packages: Callable[..., None], tmp_path: Path) -> None:
+    info = tmp_path / "greeting-1.0.dist-info"
+    info.mkdir()
+    (info / "entry_points.txt").write_text(
+        "[console_scripts]\nx = a:b\n\n[slam.commands]\ngreeting = greeting:TABLE\ngone = no_such_module:TABLE\n"
+        "\n[y]\nz = a:b\n"
+    )
+    (tmp_path / "greeting.py").write_text(
+        "import click\nTABLE = {'greet': ('greeting', 'says hello')}\n"
+        "@click.command()\ndef command():\n    click.echo('hello')\n"
+    )
+    packages(tmp_path)
+    assert CliRunner().invoke(slam, ["greet"]).output == "hello\n"
+    assert "says hello" in CliRunner().invoke(slam, ["--help"]).output
+    assert "Did you mean greet?" in CliRunner().invoke(slam, ["gret"]).output

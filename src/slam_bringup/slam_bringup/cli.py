@@ -59,7 +59,8 @@ class _LazyGroup(click.Group):
         known = COMMANDS if name in COMMANDS or name.startswith("-") else self.list_commands(ctx)
         if name not in known and not name.startswith("-") and not ctx.resilient_parsing:
             if name in _IN_EXPERIMENTS:
-                raise ValueError(f"{name} is a command of the package slam_experiments: install that as well")
+                where = "in a checkout ./slam setup does it, elsewhere pip install src/slam_experiments"
+                raise ValueError(f"{name} comes with the package slam_experiments, which is not installed: {where}")
             close = get_close_matches(name, known)
             ctx.fail(f"No such command '{name}'." + (f" Did you mean {' or '.join(close)}?" if close else ""))
         return super().resolve_command(ctx, args)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run shows: its results, their files and figures, and the page in the browser."""
+"""Results of a run: their files and figures, and the page that shows them in the browser."""
