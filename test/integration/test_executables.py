@@ -24,7 +24,10 @@ ESTIMATORS = (
 TOOLS = (
     ("dense_mapping", "dense_mapper"),
     ("slam_radio", "radio_link"),
-    *(("slam_bringup", name) for name in ("bag_player", "recorder", "slam_composed", "viewer")),
+    ("slam_bags", "bag_player"),
+    ("slam_bags", "recorder"),
+    ("slam_viewer", "viewer"),
+    ("slam_bringup", "slam_composed"),
 )
 RECORDED = ("/stereo/left/image_rect", "/tof/points", "/features", "/odom", "/ndt/odometry", "/diagnostics")
 
