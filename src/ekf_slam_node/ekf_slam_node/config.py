@@ -63,7 +63,7 @@ class InertialConfig(ImuConfig):
 
 @dataclass(frozen=True)
 class MeasurementConfig(Config):
-    """When the features of a picture were measured."""
+    """The time that a picture takes to be read out, while the features come about."""
 
     readout: float = parameter(
         0.0, "time from a picture's first row to its last, where known beforehand; negative from the last to the first",

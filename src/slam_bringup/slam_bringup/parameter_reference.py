@@ -6,21 +6,13 @@ python -m slam_bringup.parameter_reference > docs/parameters.md
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import fields
 from typing import Any
 
 from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.overrides import NODE_CONFIGS
+from slam_bringup.pipeline.node_table import NODES
 from slam_core.config import Config, ParameterInfo, iterate_parameters
 from slam_core.nodes.input_config import InputConfig
-
-_TOOLS = {
-    "viewer": ("slam_viewer.viewer_node", "ViewerConfig"),
-    "bag_player": ("slam_bags.nodes.bag_player_node", "PlayerConfig"),
-    "recorder": ("slam_bags.nodes.recorder_node", "RecorderConfig"),
-}
-"""Nodes that are no estimators."""
 
 _PREAMBLE = """\
 # Parameters
@@ -40,7 +32,7 @@ ekf_slam:
 def reference() -> str:
     """The page as Markdown; it needs ROS, whose nodes have parameters of their own."""
     system = {f.name: getattr(SystemConfig(), f.name) for f in fields(SystemConfig)}
-    sections = [_node_section(name, system.get(name), *where) for name, where in (NODE_CONFIGS | _TOOLS).items()]
+    sections = [_node_section(d.executable, system.get(d.executable), d.load_config_class()()) for d in NODES]
     judged = [_row(*entry) for entry in iterate_parameters(system["run"])]
     sections.append(
         _section("run (no node: by this `slam run`, `slam nodes` and `slam demo` judge a finished run)", judged)
@@ -50,10 +42,9 @@ def reference() -> str:
     return "\n".join([_PREAMBLE, *sections])
 
 
-def _node_section(name: str, algorithm: Config | None, module: str, kind: str) -> str:
+def _node_section(name: str, algorithm: Config | None, node: Config) -> str:
     """The parameters of the algorithm, which ``slam run`` takes as well, then those that only the node has."""
     known = {} if algorithm is None else {n: (n, v, info) for n, v, info in iterate_parameters(algorithm)}
-    node: Config = getattr(importlib.import_module(module), kind)()
     own = [entry for entry in iterate_parameters(node) if entry[0] not in known]
     rows = [_row(*entry) for entry in known.values()] + [_row(*entry, "node: ") for entry in own]
     return _section(name, rows)

@@ -17,8 +17,8 @@ from ndt_registration.odometry import OdometryConfig
 from sjsam_node.global_map import GlobalMapConfig
 from slam_bags.reading.readings import AgentSensors
 from slam_bags.storage.bag_calibration import calibration_file
+from slam_bringup.pipeline.node_table import NODES
 from slam_bringup.pipeline.overrides import (
-    NODE_CONFIGS,
     Overrides,
     is_parameter_of,
     read_overrides,
@@ -80,12 +80,13 @@ def system_config(overrides: Overrides) -> SystemConfig:
         With file, node and parameter, if a node or parameter is unknown or a value out of range.
     """
     groups = {f.name: getattr(SystemConfig(), f.name) for f in fields(SystemConfig)}
-    require_known_nodes(overrides, {*groups, *NODE_CONFIGS})
+    nodes = {declared.executable for declared in NODES if not declared.is_tool}
+    require_known_nodes(overrides, {*groups, *nodes})
     known = {name: {parameter for parameter, _, _ in iterate_parameters(config)} for name, config in groups.items()}
     for name in overrides.of_all:
-        if not any(name in k for k in known.values()) and not any(is_parameter_of(n, name) for n in NODE_CONFIGS):
+        if not any(name in k for k in known.values()) and not any(is_parameter_of(n, name) for n in nodes):
             raise ValueError(f"{overrides.origin}: no node has a parameter '{name}'")
-    for node in NODE_CONFIGS.keys() - groups.keys():
+    for node in sorted(nodes - groups.keys()):
         require_known_parameters(overrides, node)
     parsed: dict[str, Any] = {name: _group(name, type(groups[name]), known[name], overrides) for name in groups}
     return SystemConfig(**parsed)

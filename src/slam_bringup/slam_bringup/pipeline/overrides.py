@@ -26,20 +26,9 @@ from typing import Any
 
 import yaml
 
+from slam_bringup.pipeline.node_table import is_node, node_named
 from slam_core.config import Config, iterate_parameters
 from slam_core.storage.files import read_yaml
-
-NODE_CONFIGS = {
-    "stereo_driver": ("stereo_frontend.driver_node", "StereoDriverConfig"),
-    "tof_driver": ("tof_driver.node", "TofDriverConfig"),
-    "feature_extractor": ("stereo_frontend.node", "FrontendConfig"),
-    "ndt_odometry": ("ndt_registration.node", "NdtNodeConfig"),
-    "ekf_slam": ("ekf_slam_node.node", "EkfNodeConfig"),
-    "sjsam": ("sjsam_node.node_config", "SjsamNodeConfig"),
-    "dense_mapper": ("dense_mapping.node", "DenseNodeConfig"),
-    "radio_link": ("slam_radio.radio_config", "RadioConfig"),
-}
-"""Module and class of each node's own configuration; the modules need ROS."""
 
 _BASE_CONFIG = ("slam_core.nodes.listening_node", "InputConfig", "input.")
 _EVERY_NODE = "/**"
@@ -130,11 +119,11 @@ def is_parameter_of(node: str, name: str) -> bool:
 
 @cache
 def _parameters_of(node: str) -> frozenset[str]:
-    if node not in NODE_CONFIGS:
+    if not is_node(node):
         return frozenset()
     module, name, prefix = _BASE_CONFIG
     try:
-        own = getattr(importlib.import_module(NODE_CONFIGS[node][0]), NODE_CONFIGS[node][1])
+        own = node_named(node).load_config_class()
         base = getattr(importlib.import_module(module), name)
     except ImportError:
         return frozenset()

@@ -13,7 +13,6 @@ Topics, parameters, services and namespaces are those of the separate nodes; ``-
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import sys
 import threading
@@ -26,6 +25,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from slam_bringup.pipeline.configuration import ODOMETRIES, choose, load_system_config
+from slam_bringup.pipeline.node_table import node_named
 from slam_bringup.processes.node_graph import live_nodes
 from slam_bringup.processes.processes import NodeCommand
 from slam_core.nodes.exchange import Exchange
@@ -34,18 +34,6 @@ from slam_core.ros import spin, use_fast_dds_profile
 from slam_core.runtime.blas_threads import use_one_blas_thread
 from slam_core.runtime.memory import search_less_garbage, share_one_heap
 from stereo_frontend.frontend_config import MODES
-
-_NODES = {
-    "stereo_driver": "stereo_frontend.driver_node:StereoDriverNode",
-    "tof_driver": "tof_driver.node:TofDriverNode",
-    "ndt_odometry": "ndt_registration.node:NdtNode",
-    "feature_extractor": "stereo_frontend.node:FeatureNode",
-    "ekf_slam": "ekf_slam_node.node:EkfNode",
-    "radio_link": "slam_radio.radio_link_node:RadioLinkNode",
-    "sjsam": "sjsam_node.node:SjsamNode",
-    "viewer": "slam_viewer.viewer_node:ViewerNode",
-}
-"""Module and class of the node of each executable."""
 
 _JOIN_S = 10.0
 
@@ -87,8 +75,7 @@ def run_composed(commands: Sequence[NodeCommand], ros_arguments: Sequence[str] =
 
 
 def _make(exchange: Exchange, command: NodeCommand, ros_arguments: Sequence[str]) -> Any:
-    module, _, name = _NODES[command.executable].partition(":")
-    node_type = getattr(importlib.import_module(module), name)
+    node_type = node_named(command.executable).load_node_class()
     with exchange.node([*command.arguments, *ros_arguments]):
         return node_type()
 

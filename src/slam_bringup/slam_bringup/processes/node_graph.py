@@ -12,21 +12,13 @@ from slam_bags.reading.readings import AgentSensors
 from slam_bags.reading.rig_calibration import RigCalibration
 from slam_bags.reading.sensor_topics import is_rectified, join, nodes_name
 from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.node_table import NODES, RESULT_TOPICS
 from slam_bringup.pipeline.overrides import Overrides, is_parameter_of
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand
 from slam_bringup.processes.start_map import StartMap
 from slam_core.config import Config, iterate_parameters
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC
-
-RESULT_TOPICS = (
-    "odom", "pose", "features", "landmarks", "ndt/odometry", "ndt/motion", "map_to_odom", "submap/landmarks",
-    "submap/info", "submap/path", "map/landmarks", "map/path", "map/graph", "map/ellipsoids", "map/cloud", "map/marks",
-)  # fmt: skip
-"""Topics that ``slam nodes`` records, below each agent's namespace and at the root."""
-
-_FINISHERS = ("ndt_odometry", "feature_extractor", "ekf_slam")
-"""Nodes that hold frames back, front to back."""
 
 _REPLAY = {"input.policy": "all"}
 """The player waits for the nodes: they need not leave anything out."""
@@ -139,7 +131,8 @@ def plan_nodes(
         with_laser=[a for a, s in sensors.items() if s.scanner == "scan"],
     )  # fmt: skip
     specs = [replace(spec, parameters=spec.parameters | _REPLAY) for spec in specs]
-    names = {e: tuple(s.command.full_name for s in specs if s.executable == e) for e in _FINISHERS}
+    finishers = [declared.executable for declared in NODES if declared.holds_frames]
+    names = {e: tuple(s.command.full_name for s in specs if s.executable == e) for e in finishers}
     recorded = {join(agent, topic) for agent in ("", *sensors) for topic in RESULT_TOPICS}
     return NodeGraph(
         specs=tuple(specs),
@@ -148,7 +141,7 @@ def plan_nodes(
         pace=tuple(p for s in sensors.values() for p in _pace(s, mode, odometry)),
         recorded_topics=(*sorted(recorded), "/diagnostics", STATIC_TRANSFORMS_TOPIC),
         filters=names["ekf_slam"],
-        finishers=tuple(name for executable in _FINISHERS for name in names[executable]),
+        finishers=tuple(name for executable in finishers for name in names[executable]),
         transforms=tuple(t.text for t in calibration.transforms(first.left_frame, first.tof_frame)),
     )
 

@@ -14,21 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
+from slam_bringup.pipeline.node_table import NODES
 from slam_core.process_life import PARENT
 
-_MODULES = {
-    ("stereo_frontend", "stereo_driver"): "stereo_frontend.driver_node",
-    ("stereo_frontend", "feature_extractor"): "stereo_frontend.node",
-    ("tof_driver", "tof_driver"): "tof_driver.node",
-    ("ndt_registration", "ndt_odometry"): "ndt_registration.node",
-    ("ekf_slam_node", "ekf_slam"): "ekf_slam_node.node",
-    ("sjsam_node", "sjsam"): "sjsam_node.node",
-    ("slam_bringup", "slam_composed"): "slam_bringup.processes.composed_node",
-    ("slam_bags", "bag_player"): "slam_bags.nodes.bag_player_node",
-    ("slam_bags", "recorder"): "slam_bags.nodes.recorder_node",
-    ("slam_viewer", "viewer"): "slam_viewer.viewer_node",
-    ("dense_mapping", "dense_mapper"): "dense_mapping.node",
-    ("slam_radio", "radio_link"): "slam_radio.radio_link_node",
+_MODULES = {(declared.package, declared.executable): declared.module for declared in NODES} | {
+    ("slam_bringup", "slam_composed"): "slam_bringup.processes.composed_node"
 }
 """Module of each executable's ``main``, for a workspace that has not been built."""
 
