@@ -171,6 +171,8 @@ def _only_some_have(result: RunResult, first: AgentResult) -> dict[str, Any]:
         }
     if first.front_end.picture:
         summary["features_from"] = first.front_end.picture
+    if first.front_end.device != "cpu":
+        summary["features_device"] = first.front_end.device
     if first.front_end.rectification:
         summary["rectification"] = dict(first.front_end.rectification)
     if first.front_end.ranges:

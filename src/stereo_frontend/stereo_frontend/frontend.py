@@ -70,14 +70,16 @@ class Frontend:
     def __init__(self, config: FrontendConfig | None = None) -> None:
         self.config = config or FrontendConfig()
         self.counters = Counters()
-        self._left = FeatureExtractor(self.config.features, for_pairs=True)
-        self._right = FeatureExtractor(_more(self.config.features, RIGHT_SURPLUS), for_pairs=True)
+        features = self.config.features
+        self._device = features.open_device(lambda: self.counters.add("gpu_fallbacks"))
+        self._left = FeatureExtractor(features, for_pairs=True, device=self._device)
+        self._right = FeatureExtractor(_more(features, RIGHT_SURPLUS), for_pairs=True, device=self._device)
         self._noise = PixelNoise(self.config.noise)
         self.self_calibration = StereoSelfCalibration(self.config.self_calibration)
         self.range_calibration = RangeSelfCalibration(self.config.range_calibration)
         self._wide = self.self_calibration.widened(self.config.matching)
-        self._tracker = Tracker(self.config.features.max_tracks) if self.config.tracks else None
-        self._tof = TofFeatures(self.config.tof, self.config.features, self.config.noise, self._tracker)
+        self._tracker = Tracker(features.max_tracks) if self.config.tracks else None
+        self._tof = TofFeatures(self.config.tof, features, self.config.noise, self._tracker, self._device)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="second_core")
 
     def process(
@@ -241,15 +243,18 @@ class Frontend:
 
     def report(self) -> FrontendReport:
         """Findings about the images so far."""
-        advice = (self.self_calibration.advice(), self.range_calibration.advice(), self._tof.advice())
+        calibrations = (self.self_calibration, self.range_calibration)
+        advice = (self._device.complaint, *(part.advice() for part in (*calibrations, self._tof)))
         picture = "+".join(self._tof.used) if self.config.mode == "tof" else "stereo"
         correction = self.self_calibration.error if self.self_calibration.corrects else None
         return FrontendReport(
-            self.self_calibration.figures(),
-            tuple(text for text in advice if text),
+            calibrations[0].figures(),
+            tuple(filter(None, advice)),
             picture,
             correction,
-            self.range_calibration.figures(),
+            calibrations[1].figures(),
+            self._device.name,
+            self._device.complaint,
         )
 
     def _described(self, images: StereoImages, left: Keypoints, needed: npt.NDArray[np.bool_]) -> Keypoints:

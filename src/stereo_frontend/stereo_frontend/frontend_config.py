@@ -16,6 +16,7 @@ from stereo_frontend.stereo.matching import MatchingConfig
 from stereo_frontend.stereo.pixel_noise import PixelNoiseConfig
 from stereo_frontend.stereo.rectification_error import RectificationError
 from stereo_frontend.stereo.self_calibration import SelfCalibrationConfig
+from stereo_frontend.surf.surf_device import CPU
 
 MODES = ("stereo", "tof", "replace", "fuse")
 _TRACKED = ("stereo",)
@@ -49,7 +50,8 @@ class FrontendReport:
 
     rectification: figures of the stereo pair; ranges: of the depth camera beside it; advice: to the user, a sentence
     each; picture: what features are searched in: "stereo", "amplitude", "intensity", "range" or "" before the first
-    image; correction: what the right image's rectification is wrong by, where disparities are corrected for it.
+    image; correction: what the right image's rectification is wrong by, where disparities are corrected for it; device:
+    where SURF is computed; device_complaint: why not where it was asked for, or "", also one of ``advice``.
     """
 
     rectification: Mapping[str, float | str] = field(default_factory=dict)
@@ -57,3 +59,5 @@ class FrontendReport:
     picture: str = ""
     correction: RectificationError | None = None
     ranges: Mapping[str, float | str] = field(default_factory=dict)
+    device: str = CPU
+    device_complaint: str = ""

@@ -154,6 +154,9 @@ class FeatureNode(StageNode[FrontendConfig]):
             self.health.show(f"ranges_{name}", value)
         self.health.show("correction", report.correction.text if report.correction else "")
         self.health.show("picture", report.picture)
+        self.health.show("device", report.device)
+        if report.device_complaint:
+            self.get_logger().warning(report.device_complaint, once=True)
         self.health.show("advice", "; ".join(report.advice))
         few = f"only {number} features" if number < FEW_FEATURES else ""
         complaint = few or self.stage.complaint

@@ -123,7 +123,8 @@ def _front_end(sensors: AgentSensors, diagnostics: dict[str, dict[str, str]]) ->
         for prefix in _FIGURES
     )
     advice = tuple(text for text in values.get("advice", "").split("; ") if text)
-    return FrontendReport(rectification, advice, values.get("picture", ""), correction, ranges)
+    picture, device = values.get("picture", ""), values.get("device", "cpu")
+    return FrontendReport(rectification, advice, picture, correction, ranges, device)
 
 
 def _number(text: str) -> float | str:

@@ -21,6 +21,7 @@ from stereo_frontend.depth.depth_lookup import sample_depth
 from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.stereo.pixel_noise import PixelNoise, PixelNoiseConfig
+from stereo_frontend.surf.surf_device import SurfDevice
 from stereo_frontend.tracking.tracked_features import MeasuredKeypoints, follow_or_detect
 from stereo_frontend.tracking.tracker import Followed, Tracker
 
@@ -46,10 +47,16 @@ class TofFeatures:
     """Extracts features with depth from depth images of one camera, by a tracker where there is one."""
 
     def __init__(
-        self, config: TofFeatureConfig, features: FeatureConfig, noise: PixelNoiseConfig, tracker: Tracker | None
+        self,
+        config: TofFeatureConfig,
+        features: FeatureConfig,
+        noise: PixelNoiseConfig,
+        tracker: Tracker | None,
+        device: SurfDevice | None = None,
     ) -> None:
         self.config = config
-        self._extractors = {name: FeatureExtractor(features) for name in ("amplitude", "intensity", "range")}
+        names = ("amplitude", "intensity", "range")
+        self._extractors = {name: FeatureExtractor(features, device=device) for name in names}
         self._noise = PixelNoise(noise)
         self._tracker = tracker
         self.used: tuple[str, ...] = ()

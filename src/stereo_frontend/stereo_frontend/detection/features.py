@@ -11,6 +11,7 @@ so that features cover the image (thesis section 3.2); the threshold follows the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ from stereo_frontend.detection.fast import FastDetector
 from stereo_frontend.detection.opencv_detectors import OpenCvDetector
 from stereo_frontend.keypoints import Detector, Keypoints, spread_over_grid
 from stereo_frontend.surf.surf import SurfConfig, SurfDetector
+from stereo_frontend.surf.surf_device import CPU, SurfDevice
 
 _GRID_COLUMNS = 10
 """Columns of the coverage grid."""
@@ -54,14 +56,26 @@ class FeatureConfig(Config):
         "auto: in mode stereo",
         choices=TRACKING,
     )
+    device: str = parameter(
+        "cpu",
+        "where SURF is computed: cpu; gpu, the first one that OpenCL knows; auto, the same if there is one; or a part "
+        "of the name of any OpenCL device (needs pyopencl)",
+    )
     max_tracks: int = parameter(150, "most features followed at a time", minimum=20, maximum=2000)
     surf: SurfConfig = group(SurfConfig)
 
+    def open_device(self, on_failure: Callable[[], None] = lambda: None) -> SurfDevice:
+        """The device that SURF asks for; the CPU for other detectors. ``on_failure``: see :class:`SurfDevice`."""
+        return SurfDevice(self.device if self.detector == "surf" else CPU, on_failure)
 
-def make_detector(config: FeatureConfig, *, for_pairs: bool = False) -> Detector:
-    """The configured detector; ``for_pairs``: its descriptors need do for matching within a stereo pair only."""
+
+def make_detector(config: FeatureConfig, *, for_pairs: bool = False, device: SurfDevice | None = None) -> Detector:
+    """The configured detector; ``for_pairs``: its descriptors need do for matching within a stereo pair only.
+
+    ``device``: one that is open already and shared.
+    """
     if config.detector == "surf":
-        return SurfDetector(config.surf, for_pairs=for_pairs)
+        return SurfDetector(config.surf, for_pairs=for_pairs, device=device or config.open_device())
     if config.detector == "fast":
         return FastDetector(config.surf)
     return CensureDetector(config.surf) if config.detector == "censure" else OpenCvDetector(config.detector)
@@ -73,10 +87,12 @@ class FeatureExtractor:
     The state is that one number, so equal images give equal features however they arrive.
     """
 
-    def __init__(self, config: FeatureConfig | None = None, *, for_pairs: bool = False) -> None:
+    def __init__(
+        self, config: FeatureConfig | None = None, *, for_pairs: bool = False, device: SurfDevice | None = None
+    ) -> None:
         self.config = config or FeatureConfig()
         self.threshold = _FIRST_THRESHOLD
-        self._detect = make_detector(self.config, for_pairs=for_pairs)
+        self._detect = make_detector(self.config, for_pairs=for_pairs, device=device)
 
     def __call__(self, image: ByteArray) -> Keypoints:
         """At most ``target`` keypoints of an image, uint8 (height, width), best of each grid cell first.

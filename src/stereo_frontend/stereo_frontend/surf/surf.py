@@ -31,6 +31,7 @@ from stereo_frontend.surf.surf_descriptor import (
     region_weights,
 )
 from stereo_frontend.surf.surf_detector import MAX_PIXELS, find_keypoints, fitting_octaves, integral_image
+from stereo_frontend.surf.surf_device import SurfDevice
 from stereo_frontend.surf.surf_pair import PAIR_DIMENSION, SAMPLES, WEIGHT_SIGMA, describe_for_pair
 
 _OCTAVES = 3
@@ -58,8 +59,11 @@ class SurfConfig(Config):
 class SurfDetector:
     """Finds and describes SURF keypoints; ``for_pairs``: only as well as matching within a stereo pair needs it."""
 
-    def __init__(self, config: SurfConfig | None = None, *, for_pairs: bool = False) -> None:
+    def __init__(
+        self, config: SurfConfig | None = None, *, for_pairs: bool = False, device: SurfDevice | None = None
+    ) -> None:
         self.config, self.for_pairs = config or SurfConfig(), for_pairs
+        self._device = device or SurfDevice()
         self._found = np.empty((MOST_KEYPOINTS, 4), np.float32)
 
     def __call__(self, image: ByteArray, threshold: float, select: Selector) -> Keypoints:
@@ -76,7 +80,7 @@ class SurfDetector:
         found = self._find_all(image, threshold * _CUSTOMARY_THRESHOLD)
         found = found[select(found[:, :2], _DIAMETER * found[:, 2], found[:, 3])]
         places = found[:, :3].astype(np.float64)
-        descriptors = pair_descriptors(image, places) if self.for_pairs else self._describe(image, places)
+        descriptors = self._describe_for_pair(image, places) if self.for_pairs else self._describe(image, places)
         return Keypoints(found[:, :2].copy(), _DIAMETER * found[:, 2], found[:, 3].copy(), descriptors)
 
     def describe(self, image: ByteArray, keypoints: Keypoints) -> Keypoints:
@@ -85,15 +89,32 @@ class SurfDetector:
         return replace(keypoints, descriptors=self._describe(image, places))
 
     def _describe(self, image: ByteArray, places: FloatArray) -> Float32Array:
-        return describe(image, places, upright=self.config.upright, extended=self.config.extended)
+        upright = self.config.upright
+        descriptors: Float32Array = self._device.compute(
+            lambda surf: surf.describe(image, places, upright=upright),
+            lambda: describe(image, places, upright=upright, extended=True),
+        )
+        return descriptors if self.config.extended else merged_signs(descriptors)
+
+    def _describe_for_pair(self, image: ByteArray, places: FloatArray) -> Float32Array:
+        descriptors: Float32Array = self._device.compute(
+            lambda surf: surf.describe_for_pair(image, places), lambda: pair_descriptors(image, places)
+        )
+        return descriptors
 
     def _find_all(self, image: ByteArray, threshold: float) -> Float32Array:
         """Rows of u, v, scale, response, in pixels of ``image``."""
-        pixel = 0.5 if self.config.doubled else 1.0
+        doubled, pixel = self.config.doubled, 0.5 if self.config.doubled else 1.0
         height, width = (int(side / pixel) for side in image.shape)
         octaves = fitting_octaves(height, width, _OCTAVES)
-        number = find_keypoints(image, self.config.doubled, octaves, np.float32(threshold), self._found)
-        found = self._found[:number].copy()
+
+        def on_cpu() -> Float32Array:
+            number = find_keypoints(image, doubled, octaves, np.float32(threshold), self._found)
+            return self._found[:number].copy()
+
+        found: Float32Array = self._device.compute(
+            lambda surf: surf.find(image, doubled=doubled, octaves=octaves, threshold=threshold), on_cpu
+        )
         found[:, :2] = (found[:, :2] + 0.5) * pixel - 0.5
         found[:, 2] *= pixel
         return found

@@ -33,9 +33,9 @@ mutual matches from 0.90 to 0.91 and from 0.82 to 0.85 with 5 % more of them."""
 
 DIRECTIONS = 36
 _WINDOW = DIRECTIONS // 6
-_RADIUS = 6
-_SIDE = 2 * _RADIUS + 1
-_FIRST = (TURNED_CORNERS - 4) // 2 - _RADIUS
+DISC_RADIUS = 6
+_SIDE = 2 * DISC_RADIUS + 1
+_FIRST = (TURNED_CORNERS - 4) // 2 - DISC_RADIUS
 """First row and column of the wavelets of size 4s that the orientation takes: a disc of this radius around the
 middle.
 """
@@ -43,9 +43,9 @@ middle.
 
 def _disc() -> tuple[np.ndarray, np.ndarray]:
     """Places of the disc's wavelets in a lattice that begins at its first row, and their Gaussian weights."""
-    along = np.arange(_SIDE) - _RADIUS
+    along = np.arange(_SIDE) - DISC_RADIUS
     squared = along[:, None] ** 2 + along[None, :] ** 2
-    j, i = np.nonzero(squared <= _RADIUS**2)
+    j, i = np.nonzero(squared <= DISC_RADIUS**2)
     return j * STRIDE + _FIRST + i, np.exp(-squared[j, i] / 8.0)
 
 

@@ -23,9 +23,9 @@ from stereo_frontend.surf.surf_integral import integral_room, next_integral_row
 MAX_PIXELS = 2**31 // 255
 """A larger image would overflow the 32-bit integral image."""
 
-_STEP = 6
+STEP = 6
 """From one size to the next."""
-_BORDERS = (14, 17)
+BORDERS = (14, 17)
 """Pixels from the edge within which no maximum of the two middle layers is looked for: half of the largest filter that
 it is compared with, and one around it, and one for the vertex."""
 _KEPT_ROWS = 4
@@ -39,7 +39,7 @@ IntegralImage = npt.NDArray[np.int32]
 
 def fitting_octaves(height: int, width: int, octaves: int) -> int:
     """Number of the given octaves whose filters fit an image (height, width) px."""
-    return sum(2 * _BORDERS[1] + 1 < min(height, width) >> octave for octave in range(octaves))
+    return sum(2 * BORDERS[1] + 1 < min(height, width) >> octave for octave in range(octaves))
 
 
 @njit(cache=True, nogil=True)
@@ -121,7 +121,7 @@ def _find_in_rows(image, doubled, size, rows, threshold, sums, layers, marks, cu
         if FILTER_SIZES[2] // 2 <= y < height - FILTER_SIZES[2] // 2:
             _fill_larger(integral, y, sums, layers[1, y % _KEPT_ROWS])
         for place in range(2):
-            if _BORDERS[place] <= y - 1 < height - _BORDERS[place]:
+            if BORDERS[place] <= y - 1 < height - BORDERS[place]:
                 count += _find_in_row(
                     integral, width, layers, place, y - 1, threshold, marks, cube, offset, found[count:]
                 )
@@ -134,7 +134,7 @@ def _find_in_row(integral, width, layers, place, y, threshold, marks, cube, offs
 
     Their position and scale are those of the vertex of the parabola through the neighbourhood (Brown and Lowe 2002).
     """
-    size, outer, border = FILTER_SIZES[place + 1], FILTER_SIZES[3 * place], _BORDERS[place]
+    size, outer, border = FILTER_SIZES[place + 1], FILTER_SIZES[3 * place], BORDERS[place]
     rows = ((y - 1) % _KEPT_ROWS, y % _KEPT_ROWS, (y + 1) % _KEPT_ROWS)
     own, other = layers[place], layers[1 - place]
     above, here, below = own[rows[0]], own[rows[1]], own[rows[2]]
@@ -163,7 +163,7 @@ def _find_in_row(integral, width, layers, place, y, threshold, marks, cube, offs
             if vertex(cube, offset):
                 found[count, 0] = x + offset[0]
                 found[count, 1] = y + offset[1]
-                found[count, 2] = 1.2 / 9.0 * (size + offset[2] * _STEP)
+                found[count, 2] = 1.2 / 9.0 * (size + offset[2] * STEP)
                 found[count, 3] = value
                 count += 1
     return count
