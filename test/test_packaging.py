@@ -29,6 +29,9 @@ FROM_ROS = re.compile(r"rclpy|launch(_ros)?|ament_index_python|std_srvs|rcl_inte
 PEERS = {"gtsam"}
 """What results are compared with, where it is installed."""
 
+OPTIONAL = {"pyopencl"}
+"""What is used where it is installed; one of the extras of setup.py brings it."""
+
 BROUGHT_BY_ANOTHER = {"llvmlite": "numba", "mpl_toolkits": "matplotlib", "dask": "distributed", "websockets": "viser"}
 
 
@@ -46,11 +49,16 @@ def imported(package: str) -> set[str]:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_setup_and_package_xml_name_every_import(package: str) -> None:
     setup, manifest = ((SRC / package / name).read_text(encoding="utf-8") for name in ("setup.py", "package.xml"))
-    required = set(re.findall(r'"([^"]+)"', re.search(r"install_requires=\[(.*?)\]", setup, re.DOTALL).group(1)))
+    required, optional = (
+        {name for text in re.findall(pattern, setup, re.DOTALL) for name in re.findall(r'"([^"]+)"', text)}
+        for pattern in (r"install_requires=\[(.*?)\]", r"extras_require={(.*?)}")
+    )
     named = set(re.findall(r"<(?:exec_)?depend>([^<]+)<", manifest))
     for name in imported(package):
         if FROM_ROS.fullmatch(name):
             assert name in named, f"package.xml of {package} lacks {name}"
+        elif name in OPTIONAL:
+            assert name in optional, f"no extra of setup.py of {package} brings {name}"
         elif name not in BROUGHT_BY_ANOTHER and name not in PEERS:
             assert PIP_NAME.get(name, name) in required, f"setup.py of {package} lacks {name}"
             key = name if name in PACKAGES else ROSDEP_KEY.get(name)
@@ -72,6 +80,13 @@ def installed(tmp_path_factory) -> Path:
         build = [sys.executable, "setup.py", "-q", "egg_info", "-e", str(folder), "build_py", "-d", str(folder)]
         subprocess.run(build, cwd=SRC / package, check=True, capture_output=True, timeout=120)
     return folder
+
+
+def test_kernels_in_opencl_are_installed(tmp_path):
+    build = [sys.executable, "setup.py", "-q", "build_py", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=SRC / "stereo_frontend", check=True, capture_output=True, timeout=120)
+    kernels = {path.name for path in (SRC / "stereo_frontend").rglob("*.cl")}
+    assert {path.name for path in tmp_path.rglob("*.cl")} == kernels == {"surf_detector.cl", "surf_descriptor.cl"}
 
 
 def test_scenarios_bounds_and_demo_bag_are_installed(installed):

@@ -9,7 +9,7 @@ setup(
     name=PACKAGE,
     version="0.2.0",
     packages=find_packages(),
-    package_data={"": ["py.typed"]},
+    package_data={"": ["py.typed", "*.cl"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -22,6 +22,7 @@ setup(
         "opencv-python-headless",
         "scipy",
     ],
+    extras_require={"gpu": ["pyopencl"]},
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",
     maintainer_email="maintainers@indoor-slam.org",

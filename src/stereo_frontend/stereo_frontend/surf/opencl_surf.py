@@ -45,7 +45,21 @@ _KERNELS = (
 )  # fmt: skip
 Array = TypeVar("Array", bound=AnyArray)
 DEVICE_ERRORS = (cl.Error, MemoryError)
-"""What calls raise where a device has no memory left, has vanished, or cannot compile the kernels."""
+"""Errors of a device that has no memory left, has vanished, or cannot compile the kernels."""
+
+
+def is_gpu(device: Any) -> bool:
+    """True for a GPU, False for OpenCL on the CPU and the like."""
+    return bool(device.type & cl.device_type.GPU)
+
+
+def known_devices() -> list[Any]:
+    """All OpenCL devices of this machine, GPUs first."""
+    try:
+        devices = [device for platform in cl.get_platforms() for device in platform.get_devices()]
+    except cl.Error:  # no platform at all
+        devices = []
+    return sorted(devices, key=is_gpu, reverse=True)
 
 
 def find_device(name: str = "") -> Any:
@@ -56,13 +70,10 @@ def find_device(name: str = "") -> Any:
     LookupError
         If there is none; the message names those that there are.
     """
-    try:
-        devices = [device for platform in cl.get_platforms() for device in platform.get_devices()]
-    except cl.Error:  # no platform at all
-        devices = []
+    devices = known_devices()
     for device in devices:
         names = f"{device.name}\n{device.platform.name}".lower()
-        if name.lower() in names if name else device.type & cl.device_type.GPU:
+        if name.lower() in names if name else is_gpu(device):
             return device
     known = ", ".join(device.name.strip() for device in devices) or "none"
     raise LookupError(f"no OpenCL device is {f'named {name!r}' if name else 'a GPU'}; known: {known}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where SURF is computed: on the CPU, or through OpenCL on a GPU until that fails.
+"""Choice of the device that SURF is computed on: the CPU, or through OpenCL a GPU, until that fails.
 
 pyopencl, an optional requirement, is loaded only where another device than the CPU is asked for.
 """
@@ -15,6 +15,16 @@ AUTO = "auto"
 GPU = "gpu"
 
 T = TypeVar("T")
+
+
+def best_opencl_device() -> tuple[str, bool] | None:
+    """Name of a GPU, else of any other OpenCL device, and whether it is a GPU; None where there is none."""
+    try:
+        from stereo_frontend.surf import opencl_surf  # which needs pyopencl
+    except ImportError:
+        return None
+    devices = opencl_surf.known_devices()
+    return (devices[0].name.strip(), opencl_surf.is_gpu(devices[0])) if devices else None
 
 
 class SurfDevice:
@@ -33,7 +43,7 @@ class SurfDevice:
         self.name = CPU
         """The device in use."""
         self.complaint = ""
-        """Why it is not the one that was asked for, or ""."""
+        """Reason for which it is not the one that was asked for, or ""."""
         self._on_failure, self._lock = on_failure, Lock()
         self._surf: Any = None
         self._errors: tuple[type[Exception], ...] = ()
