@@ -4,9 +4,9 @@
     python benchmarks/features/gpu_surf.py [--device NAME] [--frames N]
 
 A frame is upload, detection, choice of 500 keypoints, SURF-128 of them, download: all on the wall, one picture after
-the other. Pictures are simulated ones of 640 x 480, and the same enlarged. The device is a GPU where there is one; else
-whatever runs OpenCL, and that says nothing about a GPU's speed. "different": keypoints that only one of both has, and
-share of descriptors with a number that differs by more than 1e-3.
+the other. Pictures are simulated ones of 640 x 480, the same enlarged, and EuRoC's and KITTI's where these are. The
+device is a GPU where there is one; else whatever runs OpenCL, and that says nothing about a GPU's speed. "different":
+share of keypoints that only one of both has, and of descriptors with a number that differs by more than 1e-3.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
+from datasets import DATA, euroc_pairs, kitti_pairs
 
 from slam_bringup.experiments.true_frames import simulated_frames
 from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
@@ -26,6 +28,15 @@ from stereo_frontend.surf.surf_device import best_opencl_device
 SIZES = ((640, 480), (1024, 768))
 THESIS = 85
 WARM_UP = 3
+
+
+def picture_sets() -> Iterator[tuple[str, list[np.ndarray]]]:
+    views = [view.images.left for view in simulated_frames("small_room", 4, 3)]
+    for size in SIZES:
+        yield "simulated", [cv2.resize(view, size, interpolation=cv2.INTER_CUBIC) for view in views]
+    if DATA.is_dir():
+        for name, pairs in (("EuRoC", euroc_pairs(10)), ("KITTI", kitti_pairs(5))):
+            yield name, [images.left for images in pairs]
 
 
 def measure(pictures: list[np.ndarray], device: str, frames: int) -> tuple[float, float, list[Keypoints]]:
@@ -62,18 +73,17 @@ def main() -> None:
         sys.exit("no OpenCL device: pip install pyopencl, and pocl-binary-distribution where there is no GPU")
     device = arguments.device or best[0]
     print(f"device: {device}{'' if best[1] else ' (no GPU on this machine)'}; the thesis's GPU-SURF: {THESIS} frames/s")
-    print(f"{'size':12s}{'device':>10s}{'95 %':>10s}{'frames/s':>10s}{'CPU':>10s}{'frames/s':>10s}   different")
-    views = [view.images.left for view in simulated_frames("small_room", 4, 3)]
+    print(f"{'pictures':21s}{'device':>10s}{'95 %':>10s}{'frames/s':>10s}{'CPU':>10s}{'frames/s':>10s}   different")
     cv2.setNumThreads(1)
-    for size in SIZES:
-        pictures = [cv2.resize(view, size, interpolation=cv2.INTER_CUBIC) for view in views]
+    for name, pictures in picture_sets():
         ms, slow, found = measure(pictures, device, arguments.frames)
         cpu_ms, _, expected = measure(pictures, "cpu", arguments.frames)
         alone, wrong = differences(found, expected)
         print(
-            f"{size[0]} x {size[1]:<6d}{ms:7.1f} ms{slow:7.1f} ms{1e3 / ms:10.0f}{cpu_ms:7.1f} ms{1e3 / cpu_ms:10.0f}"
-            f"   {100 * alone:.2f} %, {100 * wrong:.2f} %"
+            f"{name:10s}{pictures[0].shape[1]:4d} x {pictures[0].shape[0]:4d}{ms:7.1f} ms{slow:7.1f} ms{1e3 / ms:10.0f}"
+            f"{cpu_ms:7.1f} ms{1e3 / cpu_ms:10.0f}   {100 * alone:.2f} %, {100 * wrong:.2f} %"
         )
+
 
 
 if __name__ == "__main__":
