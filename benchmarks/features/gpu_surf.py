@@ -85,6 +85,5 @@ def main() -> None:
         )
 
 
-
 if __name__ == "__main__":
     main()

@@ -19,6 +19,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from sensor_msgs.msg import CameraInfo as InfoMessage  # noqa: E402
 from sensor_msgs.msg import Image, PointCloud2  # noqa: E402
 from sensor_msgs.srv import SetCameraInfo  # noqa: E402
@@ -194,6 +195,22 @@ def test_pairs_under_another_calibration_are_rejected_until_the_node_is_reset(pr
     np.testing.assert_array_equal(image_from_message(rectified[0]), expected)
     process.send_signal(signal.SIGINT)
     assert "has changed (fx 198 to 257.4 px)" in process.communicate(timeout=30)[1]
+
+
+def test_a_device_that_is_not_there_is_told_once_and_counted(probe, start, stereo_pair):
+    probe.listen("/diagnostics", DiagnosticArray)
+    start("driver_node")
+    process = start("node", **{"features.device": "nonsense"})
+    stamps, pair = itertools.count(10_000_000_000, 100_000_000), stereo_pair()
+
+    def told() -> set[tuple[str, str]]:
+        probe.send_pair(next(stamps), pair)
+        statuses = [s for array in probe.received["/diagnostics"] for s in array.status]
+        return {(value.key, value.value) for s in statuses for value in s.values}
+
+    probe.wait(lambda: {("gpu_fallbacks", "1"), ("device", "cpu")} <= told(), "no fallback in the diagnostics")
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=30)[1].count("SURF is computed on the CPU") == 1
 
 
 def test_a_source_without_calibration_does_not_start(start, tmp_path: Path):

@@ -71,7 +71,7 @@ class Frontend:
         self.config = config or FrontendConfig()
         self.counters = Counters()
         features = self.config.features
-        self._device = features.open_device(lambda: self.counters.add("gpu_fallbacks"))
+        self._device = features.open_device()
         self._left = FeatureExtractor(features, for_pairs=True, device=self._device)
         self._right = FeatureExtractor(_more(features, RIGHT_SURPLUS), for_pairs=True, device=self._device)
         self._noise = PixelNoise(self.config.noise)

@@ -146,8 +146,9 @@ class FeatureNode(StageNode[FrontendConfig]):
         return normalised_picture(grey, CLIP, GAMMA)
 
     def _report(self, number: int) -> None:
-        self.health.take(self.stage.counters | self.pairs.counters)
         report = self.stage.report()
+        fallbacks = {"gpu_fallbacks": int(report.device_complaint != "")}
+        self.health.take(self.stage.counters | self.pairs.counters | fallbacks)
         for name, value in report.rectification.items():
             self.health.show(f"rectification_{name}", value)
         for name, value in report.ranges.items():

@@ -137,8 +137,8 @@ def test_the_same_picture_gives_the_same_bytes_from_two_threads_too(on_device):
         np.testing.assert_array_equal(keypoints.descriptors, alone[k % 2].descriptors)
 
 
-def opened(surf: object, on_failure: Callable[[], None] = lambda: None) -> SurfDevice:
-    device = SurfDevice(on_failure=on_failure)
+def opened(surf: object) -> SurfDevice:
+    device = SurfDevice()
     device._surf, device.name, device._errors = surf, "stand-in", opencl_surf.DEVICE_ERRORS
     return device
 
@@ -201,12 +201,14 @@ def no_platform() -> list[object]:
 
 
 @pytest.mark.parametrize("platforms", [no_platform, list, platforms_of(fake("pthread", cl.device_type.CPU))])
-@pytest.mark.parametrize(("wanted", "failures"), [("auto", 0), ("gpu", 1), ("cpu", 0), ("Radeon", 1)])
-def test_without_a_gpu_surf_is_on_the_cpu_and_says_so_where_one_was_asked_for(monkeypatch, platforms, wanted, failures):
+@pytest.mark.parametrize(("wanted", "complains"), [("auto", False), ("gpu", True), ("cpu", False), ("Radeon", True)])
+def test_without_a_gpu_surf_is_on_the_cpu_and_says_so_where_one_was_asked_for(
+    monkeypatch, platforms, wanted, complains
+):
     monkeypatch.setattr(cl, "get_platforms", platforms)
-    told: list[bool] = []
-    device = SurfDevice(wanted, lambda: told.append(True))
-    assert (device.name, len(told), bool(device.complaint)) == ("cpu", failures, bool(failures))
+    device = SurfDevice(wanted)
+    assert device.name == "cpu"
+    assert bool(device.complaint) == complains
     assert device.compute(lambda surf: "device", lambda: "cpu") == "cpu"
 
 
@@ -258,7 +260,7 @@ def test_a_device_that_fails_leaves_the_same_frames_to_the_cpu_and_one_complaint
         features, expected = frontend.process(pair), twin.process(pair)
         np.testing.assert_array_equal(features.uv, expected.uv)
         np.testing.assert_allclose(features.descriptors, expected.descriptors, atol=1e-3)
-    assert frontend.counters.counts["gpu_fallbacks"] == 1
+    assert next(calls) <= after + 2, "it was tried again, not only for the other image of the pair"
     report = frontend.report()
     assert report.device == "cpu"
     assert report.advice == (report.device_complaint,)
@@ -279,7 +281,6 @@ def test_the_front_end_uses_the_device_that_its_parameter_names(device, stereo_p
         features, expected = frontend.process(stereo_pair()), twin.process(stereo_pair())
         np.testing.assert_array_equal(features.uv, expected.uv)
         np.testing.assert_allclose(features.xyz, expected.xyz, atol=1e-4)
-    assert "gpu_fallbacks" not in frontend.counters.counts
     assert frontend.report().advice == ()
 
 

@@ -11,7 +11,6 @@ so that features cover the image (thesis section 3.2); the threshold follows the
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,9 +63,9 @@ class FeatureConfig(Config):
     max_tracks: int = parameter(150, "most features followed at a time", minimum=20, maximum=2000)
     surf: SurfConfig = group(SurfConfig)
 
-    def open_device(self, on_failure: Callable[[], None] = lambda: None) -> SurfDevice:
-        """The device that SURF asks for; the CPU for other detectors. ``on_failure``: see :class:`SurfDevice`."""
-        return SurfDevice(self.device if self.detector == "surf" else CPU, on_failure)
+    def open_device(self) -> SurfDevice:
+        """The device that SURF asks for; the CPU for other detectors."""
+        return SurfDevice(self.device if self.detector == "surf" else CPU)
 
 
 def make_detector(config: FeatureConfig, *, for_pairs: bool = False, device: SurfDevice | None = None) -> Detector:

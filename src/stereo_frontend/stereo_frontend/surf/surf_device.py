@@ -7,7 +7,6 @@ pyopencl, an optional requirement, is loaded only where another device than the 
 from __future__ import annotations
 
 from collections.abc import Callable
-from threading import Lock
 from typing import Any, TypeVar
 
 CPU = "cpu"
@@ -35,16 +34,13 @@ class SurfDevice:
     wanted
         "cpu"; "gpu", the first GPU; "auto", the same, but without a complaint where there is none; else a part of the
         name of an OpenCL device of any kind, or of its platform.
-    on_failure
-        Called once, when the device that was asked for is not there or fails.
     """
 
-    def __init__(self, wanted: str = CPU, on_failure: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, wanted: str = CPU) -> None:
         self.name = CPU
         """The device in use."""
         self.complaint = ""
         """Reason for which it is not the one that was asked for, or ""."""
-        self._on_failure, self._lock = on_failure, Lock()
         self._surf: Any = None
         self._errors: tuple[type[Exception], ...] = ()
         if wanted != CPU:
@@ -78,8 +74,6 @@ class SurfDevice:
         return on_cpu()
 
     def _fall_back(self, why: str) -> None:
-        with self._lock:  # both images of a pair may find out at once
-            if not self.complaint:
-                self.complaint = f"SURF is computed on the CPU: {why.splitlines()[0]}"
-                self.name, self._surf = CPU, None
-                self._on_failure()
+        self.name, self._surf = CPU, None
+        # Both images of a pair may find out; the first has the reason.
+        self.complaint = self.complaint or f"SURF is computed on the CPU: {why.splitlines()[0]}"
