@@ -107,6 +107,16 @@ def test_descriptors_are_the_cpus(on_device, double, kind):
     assert same.mean() >= (1.0 if double else 0.98)
 
 
+def test_single_precision_keeps_its_digits_in_large_squares_of_bright_pictures(on_device):
+    """Sums over the image, or over bright pixels as they are, would lose two of them."""
+    image, rng = (noise(500, 600, blur=5.0).astype(float) / 16 + 200).astype(np.uint8), np.random.default_rng(6)
+    places = np.column_stack([rng.uniform(90, 509, 200), rng.uniform(90, 409, 200), rng.uniform(6, 13, 200)])
+    places = places.astype(np.float32).astype(np.float64)
+    expected = describe(image, places, upright=False, extended=True)
+    error = np.abs(on_device(False).describe(image, places, upright=False) - expected).max(axis=1)
+    assert np.median(error) < 5e-7
+
+
 @pytest.mark.parametrize("shape", [(5, 7), (1, 1), (100, 120)])
 def test_flat_and_tiny_images_have_no_keypoints(on_device, shape):
     surf, image = on_device(True), np.full(shape, 255, np.uint8)
