@@ -100,7 +100,7 @@ float determinant(global const uint *sums, int columns, int x, int y, int size)
     const int xy = box(sums, columns, x - lobe, y - lobe, x, y) - box(sums, columns, x + 1, y - lobe, x + lobe + 1, y)
         + box(sums, columns, x + 1, y + 1, x + lobe + 1, y + lobe + 1)
         - box(sums, columns, x - lobe, y + 1, x, y + lobe + 1);
-    const float scale = 1.0f / (float)(size * size);
+    const float scale = (float)((real)1 / (size * size)); // division of floats may be inexact on a GPU
     const float dxx = (float)xx * scale, dyy = (float)yy * scale, dxy = (float)xy * scale;
     return dxx * dyy - 0.81f * dxy * dxy;
 }
