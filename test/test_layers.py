@@ -26,6 +26,7 @@ LAYER = {
     "dense_mapping": 2,
     "slam_viewer": 3,
     "slam_bringup": 4,
+    "indoor_slam": 5,
     "slam_experiments": 5,
 }
 NOT_SHIPPED = {"slam_simulation", "slam_experiments"}

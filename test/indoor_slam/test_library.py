@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The library gives what ``slam run`` gives, the README's lines run, and what is wrong is said."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from indoor_slam import Camera, CameraInfo, DepthSlam, GlobalMap, StereoSlam, register
+from slam_bags.reading.readings import DepthReading, StereoReading
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.offline import run_bag
+
+ROOT = Path(__file__).resolve().parents[2]
+DEMO = ROOT / "bags" / "demo"
+FRAMES = 20
+
+
+@pytest.fixture(scope="module")
+def demo():
+    """Sensors and the first readings of the demo bag."""
+    with SensorBag(DEMO) as bag:
+        sensors = bag.sensors[""]
+        readings = list(bag.readings())
+    return sensors, readings
+
+
+def pairs_of(readings):
+    return [(r.stamp_ns, r.pair.left, r.pair.right) for r in readings if isinstance(r, StereoReading)]
+
+
+def test_the_library_maps_as_slam_run_does(demo):
+    sensors, readings = demo
+    result, _ = run_bag(DEMO, choose(load_system_config(None), "stereo", "sjsam", "none", "off"))
+    with StereoSlam(sensors.left, sensors.right, T_base_left=sensors.transform("base", "left")) as slam:
+        frames = [frame for pair in pairs_of(readings) for frame in slam.add_pair(*pair)]
+        joined = slam.finish()
+    online = result.agents[0]
+    np.testing.assert_array_equal([f.stamp_ns for f in frames], online.filtered.stamps_ns)
+    np.testing.assert_array_equal([f.pose.T for f in frames], online.filtered.poses)
+    np.testing.assert_array_equal([p.T for p in joined.trajectory()[""]], online.trajectory.poses)
+
+
+def test_the_lines_of_the_readme_run(demo, tmp_path, monkeypatch, capsys):
+    sensors, readings = demo
+    lines = re.search(
+        r"```python\n(from indoor_slam .*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
+    )
+    assert lines is not None
+    monkeypatch.chdir(tmp_path)
+    names = {"left_info": sensors.left, "right_info": sensors.right, "pairs": pairs_of(readings)[:FRAMES]}
+    exec(compile(lines[1], "README.md", "exec"), names)
+    assert "landmarks" in capsys.readouterr().out
+    assert len(names["path"]) == FRAMES
+    for pose in names["path"][1:]:
+        assert np.linalg.eigvalsh(pose.covariance).min() > 0.0
+    assert len(GlobalMap.load(tmp_path / "map").trajectory("")) == FRAMES
+
+
+def test_a_depth_camera_with_scan_odometry_gives_poses(demo):
+    sensors, readings = demo
+    raw = [r.raw for r in readings if isinstance(r, DepthReading)][:6]
+    with DepthSlam(sensors.tof, measurement=sensors.measurement, odometry="ndt") as slam:
+        frames = [f for image in raw for f in slam.add_image(image.stamp_ns, image.image, image.amplitude)]
+        joined = slam.finish()
+    assert len(joined.trajectory()[""]) == len(raw) >= len(frames) >= 1
+
+
+def test_what_is_wrong_is_said(demo):
+    sensors, readings = demo
+    stamp, left, right = pairs_of(readings)[0]
+    with StereoSlam(sensors.left, sensors.right) as slam:
+        slam.add_pair(stamp, left, right)
+        with pytest.raises(ValueError, match="not later"):
+            slam.add_pair(stamp, left, right)
+        with pytest.raises(ValueError, match="no IMU"):
+            slam.add_imu(stamp, np.zeros(3), np.zeros(3))
+        with pytest.raises(ValueError, match="image"):
+            slam.add_pair(stamp + 1, left[:10], right[:10])
+    with pytest.raises(ValueError, match="unknown parameter"):
+        StereoSlam(sensors.left, sensors.right, parameters={"ekf_slam": {"submap.max_distanc": 1.0}})
+    with pytest.raises(ValueError, match="measurement"):
+        DepthSlam(CameraInfo(Camera(4, 4, 2.0, 2.0, 2.0, 2.0)), measurement="height")
+
+
+def test_clouds_are_registered(rng):
+    walls = rng.uniform(0.0, 2.0, (3000, 3)) * np.repeat(1.0 - np.eye(3), 1000, axis=0)
+    moved = walls + np.array([0.05, -0.03, 0.02])
+    assert np.abs(register(walls, moved).T_target_source[:3, 3] - [0.05, -0.03, 0.02]).max() < 0.01
+
+
+def test_ros_is_not_loaded():
+    program = "import sys, indoor_slam; sys.exit('rclpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
