@@ -17,11 +17,11 @@ import numpy as np
 from slam_calibration.board import AprilGrid, Board, parse_board
 from slam_calibration.bundle import LensState
 from slam_calibration.detection import find_corners
-from slam_calibration.drawing import draw_board
 from slam_calibration.rig import calibrate
-from slam_calibration.simulated import beside, example_camera, random_view
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.types import ByteArray
+from slam_simulation.calibration.board_pictures import draw_board
+from slam_simulation.calibration.board_views import beside, example_camera, random_view
 
 SCALE = 3000.0
 SUPERSAMPLING = 3

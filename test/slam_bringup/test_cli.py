@@ -125,6 +125,7 @@ def test_without_its_package_a_command_says_what_to_install(name: str, packages:
     with pytest.raises(ValueError, match="slam_experiments, which is not installed"):
         CliRunner().invoke(slam, [name, "x"], catch_exceptions=False)
     assert name not in CliRunner().invoke(slam, ["--help"]).output.split()
+    assert name in CliRunner().invoke(slam, [name[:-1]]).output.partition("Did you mean")[2]
 
 
 def test_another_package_registers_a_command(packages: Callable[..., None], tmp_path: Path) -> None:

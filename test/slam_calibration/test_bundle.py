@@ -16,8 +16,8 @@ from slam_calibration.bundle import (
     adjust,
 )
 from slam_calibration.detection import Corners
-from slam_calibration.simulated import beside, example_camera, random_view, simulate_views
 from slam_core.geometry import FloatArray
+from slam_simulation.calibration.board_views import beside, example_camera, random_view, simulate_views
 
 BOARD = Chessboard(7, 5, 0.05)
 POINTS = BOARD.points - BOARD.points.mean(axis=0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slam_calibration.board import AprilGrid, Board, Charuco, Chessboard, parse_board
 from slam_calibration.detection import find_corners, grey8, load_grey
-from slam_calibration.drawing import draw_board
+from slam_simulation.calibration.board_pictures import draw_board
 
 SCALE = 2000.0
 """Texture pixels per metre of board."""

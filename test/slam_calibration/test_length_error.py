@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from slam_calibration.board import Chessboard
 from slam_calibration.bundle import LensState, Rig, adjust
 from slam_calibration.length_error import DISTANCE, PairError, pair_error, parameter_file
-from slam_calibration.simulated import beside, covering_view, example_camera, simulate_views
 from slam_core.estimation.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, transform_points
+from slam_simulation.calibration.board_views import beside, covering_view, example_camera, simulate_views
 
 BOARD = Chessboard(9, 7, 0.04).points
 PAIR = (example_camera("plumb_bob"), example_camera("plumb_bob", beside(0.12, 0.0, (0.01, -0.02, 0.0))))

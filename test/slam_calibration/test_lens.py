@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slam_calibration.lens import DISTORTION_PARAMETERS, parameter_names, project_with_jacobians
-from slam_calibration.simulated import example_camera
+from slam_simulation.calibration.board_views import example_camera
 
 
 @pytest.mark.parametrize("lens", DISTORTION_PARAMETERS)

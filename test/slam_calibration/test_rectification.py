@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from slam_calibration.rectification import stereo_infos
-from slam_calibration.simulated import beside, example_camera
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import make_transform, so3_exp, transform_points
+from slam_simulation.calibration.board_views import beside, example_camera
 
 T_RIGHT_LEFT = beside(0.12, 0.002, (0.01, -0.03, 0.008))
 

@@ -14,8 +14,8 @@ from slam_calibration.bundle import BundleConfig, BundleResult, LensState
 from slam_calibration.detection import NOTHING, Corners, find_corners, load_grey
 from slam_calibration.lens import DISTORTION_PARAMETERS
 from slam_calibration.rig import CalibrationConfig, calibrate
-from slam_calibration.simulated import beside, example_camera, random_view, simulate_views
 from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform
+from slam_simulation.calibration.board_views import beside, example_camera, random_view, simulate_views
 
 BOARD = Chessboard(9, 7, 0.04).points
 

@@ -61,7 +61,7 @@ class _LazyGroup(click.Group):
             if name in _IN_EXPERIMENTS:
                 where = "in a checkout ./slam setup does it, elsewhere pip install src/slam_experiments"
                 raise ValueError(f"{name} comes with the package slam_experiments, which is not installed: {where}")
-            close = get_close_matches(name, known)
+            close = get_close_matches(name, dict.fromkeys([*known, *_IN_EXPERIMENTS]))
             ctx.fail(f"No such command '{name}'." + (f" Did you mean {' or '.join(close)}?" if close else ""))
         return super().resolve_command(ctx, args)
 

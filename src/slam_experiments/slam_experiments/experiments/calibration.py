@@ -13,12 +13,12 @@ from scipy.stats import norm
 from slam_calibration.board import Chessboard
 from slam_calibration.bundle import LensState
 from slam_calibration.rig import calibrate
-from slam_calibration.simulated import beside, example_camera, random_view, simulate_views
 from slam_core.geometry import boxminus
 from slam_experiments import thesis
 from slam_experiments.experiments import plots
 from slam_experiments.findings import Comparison, Experiment, Findings, Picture, Table
 from slam_experiments.job import Job, JobResult, Kept
+from slam_simulation.calibration.board_views import beside, example_camera, random_view, simulate_views
 
 MODULE = "slam_experiments.experiments.calibration"
 _BOARD = Chessboard(9, 7, 0.04).points

@@ -15,9 +15,9 @@ import numpy as np
 from slam_calibration.board import Chessboard
 from slam_calibration.bundle import LensState, Rig, adjust
 from slam_calibration.length_error import PairError, pair_error
-from slam_calibration.simulated import covering_view, simulate_views
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, make_transform
+from slam_simulation.calibration.board_views import covering_view, simulate_views
 
 _BOARD = Chessboard(9, 7, 0.04).points
 
