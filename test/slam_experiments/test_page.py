@@ -11,7 +11,7 @@ from slam_experiments.catalogue import EXPERIMENTS
 from slam_experiments.page import write_markdown
 from slam_experiments.simulated.expected import expected
 
-DOCS = Path(__file__).resolve().parents[3] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = json.loads((DOCS / "experiments.json").read_text())
 
 

@@ -11,7 +11,7 @@ import pytest
 from slam_experiments import thesis
 from slam_experiments.thesis import Claim
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 SEED = ROOT.parent / "shared" / "seed" / "000_f49c7e5b3e960886.txt"
 CLAIMS = {name: claim for name, claim in vars(thesis).items() if isinstance(claim, Claim)}
 PAGE = json.loads((ROOT / "docs" / "experiments.json").read_text())
