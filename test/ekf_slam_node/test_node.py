@@ -24,8 +24,10 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from ekf_slam_node.config import EkfSlamConfig  # noqa: E402
 from ekf_slam_node.slam import EkfSlam  # noqa: E402
+from ekf_slam_node.stage import ODOMETRY, FilterConfig, FilterStage  # noqa: E402
 from feature_world import T_RIG_OPTICAL, loop, room  # noqa: E402
 from ros_probe import Probe  # noqa: E402
+from slam_core.frame_tree import FrameTree  # noqa: E402
 from slam_core.messages import (  # noqa: E402
     FEATURE_TOPICS,
     STATIC_TRANSFORMS_TOPIC,
@@ -33,11 +35,12 @@ from slam_core.messages import (  # noqa: E402
     SubmapMessages,
     estimate_from_message,
     features_messages,
+    odometry_message,
     submap_from_messages,
     transform_message,
 )
 from slam_core.ros import sensor_qos  # noqa: E402
-from slam_core.types import Features  # noqa: E402
+from slam_core.types import Features, OdometryReading, PoseEstimate  # noqa: E402
 
 pytestmark = pytest.mark.ros
 
@@ -128,6 +131,39 @@ def test_poses_and_submaps_are_those_of_the_offline_filter(probe: FeatureProbe, 
         np.testing.assert_array_equal(got.covariance, submap.covariance)
         np.testing.assert_array_equal(got.landmark_ids, submap.landmark_ids)
         assert got.follows_previous == submap.follows_previous
+
+
+def test_an_odometry_bridges_darkness(probe: FeatureProbe, filter_process: object) -> None:
+    """Twenty dark frames of 50: the poses are those of the stage, every frame has one, and the odometry is named."""
+    rng = np.random.default_rng(4)
+    world, poses = room(rng), loop(60)[:50]
+    frames = [world.features(T, (k + 1) * STEP_NS, rng)[0] for k, T in enumerate(poses)]
+    frames[25:45] = [frame.select(np.zeros(0, dtype=np.int64)) for frame in frames[25:45]]
+    own = [
+        OdometryReading((k + 1) * STEP_NS, T, 1e-6 * (k + 1) * np.eye(6), np.zeros(6), np.zeros((6, 6)))
+        for k, T in enumerate(poses)
+    ]
+    tree = FrameTree()
+    tree.add("base_link", frames[0].frame_id, T_RIG_OPTICAL)
+    stage, expected = FilterStage(FilterConfig(agent="a", wait_for=(ODOMETRY,)), tree), []
+    probe.senders["odometry"] = probe.node.create_publisher(Odometry, "odometry", sensor_qos(100))
+    probe.wait(probe.is_heard, "the filter does not listen")
+    probe.send_mounting(frames[0].frame_id)
+    time.sleep(1.0)
+    for frame, reading in zip(frames, own, strict=True):
+        estimate, twist = PoseEstimate(reading.stamp_ns, reading.T, reading.covariance), (np.zeros(6), np.zeros((6, 6)))
+        probe.send("odometry", odometry_message(probe.types, "wheels", "base_link", estimate, twist))
+        stage.add_odometry(reading)
+        probe.send_features(frame)
+        stage.add_features(frame)
+        expected += stage.ready()
+    probe.wait(lambda: len(probe.received["odom"]) == len(frames), "poses are missing")
+    for message, result in zip(probe.received["odom"], expected, strict=True):
+        np.testing.assert_allclose(estimate_from_message(message).T, result.estimate.pose.T, atol=1e-9)
+    assert {result.estimate.reason for result in expected[25:45]} == {"no visual association, bridged by odometry"}
+    error = np.linalg.inv(poses[0]) @ poses[-1] - estimate_from_message(probe.received["odom"][-1]).T
+    assert np.linalg.norm(error[:3, 3]) < 0.05
+    probe.wait(lambda: "odometry: way x" in _diagnostics(probe), "the odometry is not named")
 
 
 def test_loss_is_on_diagnostics(probe: FeatureProbe, filter_process: object) -> None:

@@ -62,6 +62,22 @@ class InertialConfig(ImuConfig):
 
 
 @dataclass(frozen=True)
+class ExternalOdometryConfig(Config):
+    """Odometry of wheels, legs or another estimator: how well it is known before anything is learnt of it."""
+
+    use: str = parameter("auto", "whether it is used: where there is one, or never", choices=("auto", "off"))
+    sigma_scale: float = parameter(
+        0.03, "error of its way's scale (the wheels' radius), which is learnt", minimum=1e-6, maximum=0.5
+    )
+    sigma_turn_scale: float = parameter(
+        0.05, "error of its turns' scale (the wheels' distance), which is learnt", minimum=1e-6, maximum=0.5
+    )
+    sigma_yaw_deg: float = parameter(
+        2.0, "error of its mounting's yaw, which is learnt", unit="deg", minimum=1e-6, maximum=45.0
+    )
+
+
+@dataclass(frozen=True)
 class MeasurementConfig(Config):
     """The time that a picture takes to be read out, while the features come about."""
 
@@ -165,6 +181,7 @@ class EkfSlamConfig(Config):
     )
     motion: MotionConfig = group(MotionConfig)
     imu: InertialConfig = group(InertialConfig)
+    odometry: ExternalOdometryConfig = group(ExternalOdometryConfig)
     measurement: MeasurementConfig = group(MeasurementConfig)
     association: FeatureAssociationConfig = group(FeatureAssociationConfig)
     landmark: LandmarkConfig = group(LandmarkConfig)

@@ -22,6 +22,7 @@ from slam_core.messages import (
     imu_from_message,
     landmark_cloud,
     motion_from_message,
+    odometry_from_message,
     odometry_message,
     path_message,
     stamp_ns,
@@ -68,6 +69,7 @@ class EkfNode(StageNode[EkfNodeConfig]):
         self.listen_together(FEATURE_TOPICS, self.on_features)
         self.listen("ndt/motion", "PoseWithCovarianceStamped", self.on_motion, required=False)
         self.listen("imu", "Imu", self.on_imu, required=False)
+        self.listen("odometry", "Odometry", self.on_odometry, required=False)
 
     def _advertise_outputs(self) -> None:
         self.advertise("odom", "Odometry")
@@ -90,6 +92,11 @@ class EkfNode(StageNode[EkfNodeConfig]):
     def on_imu(self, message: Message) -> None:
         """A reading of the IMU."""
         self.stage.add_imu(imu_from_message(message))
+        self.publish_ready()
+
+    def on_odometry(self, message: Message) -> None:
+        """A pose of wheels, legs or another estimator."""
+        self.stage.add_odometry(odometry_from_message(message))
         self.publish_ready()
 
     def on_config(self, config: EkfNodeConfig) -> None:
@@ -126,7 +133,8 @@ class EkfNode(StageNode[EkfNodeConfig]):
             self._publish_submaps(result.submaps)
             self.health.set(_STATES[result.state], result.reason)
             self.health.take(self.stage.counters.counts)
-            self.health.show("rolling_shutter", self.stage.finding or "none seen")
+            self.health.show("rolling_shutter", self.stage.shutter_finding or "none seen")
+            self.health.show("odometry", self.stage.odometry_finding or "none heard")
 
     def _publish_result(self, result: EkfResult) -> None:
         pose, types, twist = result.pose, self.types, (result.twist, result.twist_covariance)

@@ -34,7 +34,7 @@ from ekf_slam_node.submaps.rolling_shutter import RollingShutter
 from ekf_slam_node.submaps.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submaps.submap_chain import SubmapChain
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
-from slam_core.types import Counters, Features, ImuSample, PoseEstimate, RelativeMotion, Submap
+from slam_core.types import Counters, Features, ImuSample, OdometryReading, PoseEstimate, RelativeMotion, Submap
 
 
 class EkfSlam:
@@ -74,7 +74,7 @@ class EkfSlam:
         return submaps
 
     def _forget(self) -> None:
-        self._aids = MotionAids(self.config.motion, self.config.imu)
+        self._aids = MotionAids(self.config.motion, self.config.imu, self.config.odometry)
         self._noise = NoiseMonitor()
         self._innovations = InnovationWatch()
         self._common = CommonError(COMMON_ERROR_FACTOR)
@@ -101,10 +101,13 @@ class EkfSlam:
         frame = self._noise.corrected(frame_of_strongest(features, usable, MAX_FRAME_FEATURES))
         if not self._chain.is_open:
             return self._begin(frame)
+        slips = self._aids.external.slips
         try:
             result = self._advance(frame)
         except np.linalg.LinAlgError:
             return self._abandon(frame, "a matrix could not be factored")
+        if self._aids.external.slips > slips:
+            self.counters.add("odometry_slips", self._aids.external.slips - slips)
         if not self._chain.local.is_finite:
             return self._abandon(frame, "the estimate was no longer finite", result)
         return result
@@ -134,10 +137,20 @@ class EkfSlam:
         if not self._aids.add_imu(sample):
             self.counters.add("imu_rejected")
 
+    def process_odometry(self, reading: OdometryReading) -> None:
+        """A pose of an external odometry, in the order of the stamps, before the frames that come after it."""
+        if reason := self._aids.add_odometry(reading):
+            self.counters.add(f"odometry_{reason.replace(' ', '_')}")
+
     @property
     def complaint(self) -> str:
-        """Complaint about the IMU or about the association, or ""."""
-        return self._aids.inertial.complaint or self._innovations.complaint
+        """Complaint about the IMU, the odometry or the association, or ""."""
+        return self._aids.inertial.complaint or self._aids.external.complaint or self._innovations.complaint
+
+    @property
+    def odometry_finding(self) -> str:
+        """The calibration of an external odometry as it was learnt, or ""."""
+        return self._aids.external.finding
 
     @property
     def readout_s(self) -> tuple[float, float]:
@@ -152,7 +165,15 @@ class EkfSlam:
         return self._chain.landmark_view()
 
     def finish(self) -> tuple[Submap, ...]:
-        """Close the open submap; the next frame begins a new one that does not follow it."""
+        """Close the open submap; the next frame begins a new one that does not follow it.
+
+        It ends where an odometry has carried the rig to, if the last frames had no link.
+        """
+        last = self._missed.last
+        if last is not None and self._chain.is_open and self._chain.is_bridging:
+            bridge = self._aids.bridge(self._chain.stamp_ns, last.stamp_ns)
+            if bridge is not None and bridge.reckoned is not None and is_known(bridge):
+                self._go_with(last, seconds_between(self._chain.stamp_ns, last.stamp_ns), bridge)
         return self._chain.finish()
 
     # ----------------------------------------------------------------------------------------------------- Algorithm 3
@@ -161,7 +182,7 @@ class EkfSlam:
         dt = seconds_between(self._chain.stamp_ns, frame.stamp_ns)
         aid = self._aids.between(self._chain.stamp_ns, frame.stamp_ns)
         linked = self._link(frame, dt, aid)
-        if linked is None and aid is not None and aid.rows == ALL:
+        if linked is None and aid is not None and aid.rows == ALL and aid.source == "scans":
             return self._coast(frame, dt, aid)
         bridge = None
         if linked is None or self._chain.is_bridging:
@@ -304,8 +325,8 @@ class EkfSlam:
     def _miss(self, frame: Frame, bridge: Aid | None) -> EkfResult:
         """No link: nothing is mapped.
 
-        The filter stays at the last linked frame, so that the old map can be found again. The IMU tells meanwhile where
-        the rig is, as long as it knows. Two missed frames that link to each other begin a new submap.
+        The filter stays at the last linked frame, so that the old map can be found again. Odometry or IMU tell
+        meanwhile where the rig is, as long as they know. Two missed frames that link to each other begin a new submap.
         """
         is_bridged = bridge is not None and is_known(bridge)
         missed = self._missed.add(frame)
@@ -313,7 +334,7 @@ class EkfSlam:
             return self._cross(missed, frame) if is_bridged else self._restart(missed, frame)
         if bridge is not None and is_bridged:
             self.counters.add("frames_bridged")
-            reason = "no visual association, bridged by the IMU"
+            reason = f"no visual association, bridged by {bridge.source}"
             bridged = self._chain.add_bridged_pose(frame.stamp_ns, bridge)
             return self._chain.result(frame.stamp_ns, TrackingState.DEGRADED, reason, pose=bridged)
         self.counters.add("frames_lost")
@@ -321,7 +342,7 @@ class EkfSlam:
         return self._chain.result(frame.stamp_ns, TrackingState.LOST, reason)
 
     def _cross(self, missed: Frame, frame: Frame) -> EkfResult:
-        """Begin a new submap at a missed frame, to which the IMU has carried the rig: the old one ends there.
+        """Begin a new submap at a missed frame, to which odometry or IMU have carried the rig: the old one ends there.
 
         The old landmarks are no longer known well from there, and all wrong by the same: a gate that holds this error
         lets a few features of other places through, and these would decide where the rig is.

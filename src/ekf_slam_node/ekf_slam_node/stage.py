@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """EKF-SLAM of one rig without ROS: features, motions and IMU readings in any order in, results in order of stamps out.
 
-    features ------> wait until motions and IMU have reached their stamp -> EkfSlam -> result, finished submaps
-    motions, IMU --^
+    features ----------------> wait until all others have reached their stamp -> EkfSlam -> result, finished submaps
+    motions, IMU, odometry --^
 
 A stream that falls silent holds nothing up: the filter goes on without it, says so in its state, and uses it again when
 it comes back.
@@ -20,9 +20,9 @@ from ekf_slam_node.slam import EkfSlam
 from slam_core.config import parameter
 from slam_core.frame_tree import FrameTree
 from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams
-from slam_core.types import Counters, Features, ImuSample, RelativeMotion, Submap
+from slam_core.types import Counters, Features, ImuSample, OdometryReading, RelativeMotion, Submap
 
-MOTION, IMU = "motion", "imu"
+MOTION, IMU, ODOMETRY = STREAMS = "motion", "imu", "odometry"
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class FilterConfig(EkfSlamConfig):
     """The filter's parameters, and which other streams its frames wait for."""
 
     wait_for: tuple[str, ...] = parameter(
-        (), "streams that frames wait for from the start: motion, imu; what is heard later is waited for as well"
+        (),
+        f"streams that frames wait for from the start: {', '.join(STREAMS)}; what is heard later is waited for as well",
     )
     patience: int = parameter(
         PATIENCE, "frames that may wait for a stream before they go on without it", unit="frames", minimum=1
@@ -38,8 +39,9 @@ class FilterConfig(EkfSlamConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if unknown := set(self.wait_for) - {MOTION, IMU}:
-            raise ValueError(f"parameter 'wait_for' may hold {MOTION} and {IMU}, got {', '.join(sorted(unknown))}")
+        if unknown := set(self.wait_for) - set(STREAMS):
+            known = ", ".join(STREAMS)
+            raise ValueError(f"parameter 'wait_for' may hold {known}, got {', '.join(sorted(unknown))}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,8 @@ class FilterStage:
         self._motions: deque[RelativeMotion] = deque()
         self._samples: deque[ImuSample] = deque()
         self._last_sample_ns = -1
+        self._poses: deque[OdometryReading] = deque()
+        self._last_pose_ns = -1
         self._awaited = AwaitedStreams(config.wait_for, config.patience)
         self._slam: EkfSlam | None = None
         self._next_session = session
@@ -103,6 +107,14 @@ class FilterStage:
         self._samples.append(seen)
         self._awaited.heard(IMU, seen.stamp_ns)
 
+    def add_odometry(self, reading: OdometryReading) -> None:
+        """Take a pose of an external odometry; ValueError if it is not known where on the rig its frame sits."""
+        if self._config.odometry.use == "off":
+            return
+        mounting = self._frames.lookup(self._base_frame, reading.frame_id)
+        self._poses.append(replace(reading, T_rig_frame=mounting))
+        self._awaited.heard(ODOMETRY, reading.stamp_ns)
+
     def ready(self) -> Iterator[FrameResult]:
         """Results of the frames that need not wait, oldest first.
 
@@ -121,10 +133,20 @@ class FilterStage:
 
     @property
     def finding(self) -> str:
-        """Finding about the camera that a user should know of, or ""."""
+        """Findings about camera and odometry that a user should know of, or ""."""
+        return "; ".join(filter(None, [self.shutter_finding, self.odometry_finding]))
+
+    @property
+    def shutter_finding(self) -> str:
+        """Finding about the time in which the camera reads a picture out, or ""."""
         readout, sigma = (1e3 * s for s in self.readout_s)
         rows = "first row to the last" if readout > 0.0 else "last row to the first"
         return f"rolling shutter: {abs(readout):.1f} +- {sigma:.1f} ms from the {rows}, corrected" if readout else ""
+
+    @property
+    def odometry_finding(self) -> str:
+        """The calibration of an external odometry as it was learnt, or ""."""
+        return "" if self._slam is None else self._slam.odometry_finding
 
     def landmark_view(self) -> LandmarkView:
         """The landmarks of the open submap after the newest result, of which there must be one."""
@@ -156,7 +178,8 @@ class FilterStage:
         self._waiting.clear()
         self._motions.clear()
         self._samples.clear()
-        self._last_sample_ns = -1
+        self._poses.clear()
+        self._last_sample_ns = self._last_pose_ns = -1
         self._awaited.clear()
 
     def _process(self, features: Features) -> FrameResult:
@@ -187,3 +210,7 @@ class FilterStage:
             sample = self._samples.popleft()
             self._last_sample_ns = sample.stamp_ns
             slam.process_imu(sample)
+        while self._poses and self._last_pose_ns < stamp_ns:
+            pose = self._poses.popleft()
+            self._last_pose_ns = pose.stamp_ns
+            slam.process_odometry(pose)

@@ -195,6 +195,23 @@ class ImuSample:
 
 
 @dataclass(frozen=True, eq=False)
+class OdometryReading:
+    """A pose of ``frame_id`` as wheels, legs or another estimator have it, T_odom_frame (4, 4).
+
+    covariance: (6, 6) of the pose; twist: (6,) m/s and rad/s along the frame's axes; twist_covariance: (6, 6). The
+    covariances are as reported: they may be zero, huge or not finite. T_rig_frame: (4, 4) mounting of the frame.
+    """
+
+    stamp_ns: int
+    T: FloatArray
+    covariance: FloatArray
+    twist: FloatArray
+    twist_covariance: FloatArray
+    frame_id: str = "base_link"
+    T_rig_frame: FloatArray = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True, eq=False)
 class Submap:
     """A local map as one joint Gaussian, in the frame of its own first rig pose, ``<agent>/submap_<index>``.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion from elsewhere: scan registration between two frames, the turn rate of an IMU (thesis 9.4.1)."""
+"""Motion from elsewhere: scan registration, an external odometry, the turn rate of an IMU (thesis 9.4.1)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ekf_slam_node.config import InertialConfig, MotionConfig
+from ekf_slam_node.config import ExternalOdometryConfig, InertialConfig, MotionConfig
+from ekf_slam_node.odometry.external_odometry import ExternalOdometry, Reckoning
 from ekf_slam_node.odometry.inertial import InertialFilter, at_place
 from ekf_slam_node.odometry.odometry import UpDirection
 from ekf_slam_node.odometry.preintegration import ImuReadings, Preintegral
@@ -21,7 +22,7 @@ from slam_core.geometry import (
     make_transform,
     so3_log,
 )
-from slam_core.types import ImuSample, RelativeMotion
+from slam_core.types import ImuSample, OdometryReading, RelativeMotion
 
 _AID_STAMP_TOLERANCE = 0.005
 """Largest difference of the stamps of a motion aid and of the frames it joins."""
@@ -40,11 +41,16 @@ ROTATION = slice(3, 6)
 
 @dataclass(frozen=True, eq=False)
 class Aid:
-    """A measured motion T = T_previous_now; ``rows`` of its error are known, with their covariance (k, k)."""
+    """A measured motion T = T_previous_now; ``rows`` of its error are known, with their covariance (k, k).
+
+    source: what has measured it, for people to read. reckoned: the steps of an external odometry that it is made of.
+    """
 
     T: FloatArray
     covariance: FloatArray
     rows: slice
+    source: str = "scans"
+    reckoned: Reckoning | None = None
 
 
 class MotionAids:
@@ -54,11 +60,17 @@ class MotionAids:
     own length, with the noise of the constant-velocity model on top.
     """
 
-    def __init__(self, config: MotionConfig, inertial: InertialConfig | None = None) -> None:
+    def __init__(
+        self,
+        config: MotionConfig,
+        inertial: InertialConfig | None = None,
+        external: ExternalOdometryConfig | None = None,
+    ) -> None:
         self._config = config
         self._motions: list[RelativeMotion] = []
         self._readings = ImuReadings()
         self.inertial = InertialFilter(config, inertial or InertialConfig())
+        self.external = ExternalOdometry(external or ExternalOdometryConfig())
         self._newest: tuple[int, int, Preintegral | None] = (0, 0, None)
         self._reached_ns = self._doubted_ns = 0
 
@@ -75,13 +87,26 @@ class MotionAids:
         """Take an IMU reading; False if it is not finite or not newer than the last."""
         return self._readings.add(sample)
 
+    def add_odometry(self, reading: OdometryReading) -> str:
+        """Take a reading of an external odometry; returns why it is rejected, or ""."""
+        return self.external.add(reading)
+
     def between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
         """The best aid that covers the time between two stamps, or None."""
-        return self._motion_between(start_stamp_ns, end_stamp_ns) or self._rotation_between(
-            start_stamp_ns, end_stamp_ns
+        return (
+            self._motion_between(start_stamp_ns, end_stamp_ns)
+            or self._reckoned_between(start_stamp_ns, end_stamp_ns)
+            or self._rotation_between(start_stamp_ns, end_stamp_ns)
         )
 
     def bridge(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+        """The motion without any image, by an external odometry or else by the IMU alone; None where neither knows."""
+        reckoned = self._reckon(start_stamp_ns, end_stamp_ns)
+        if reckoned is None:
+            return self._inertial_bridge(start_stamp_ns, end_stamp_ns)
+        return Aid(reckoned.T, reckoned.covariance[:6, :6], ALL, "odometry", reckoned)
+
+    def _inertial_bridge(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
         """The motion as the IMU alone tells it, from velocity and gravity at the start; None where it does not."""
         if not self.inertial.can_bridge:
             return None
@@ -90,7 +115,7 @@ class MotionAids:
             return None
         step = self.inertial.predict(pre)
         covariance = self.inertial.motion_covariance(step)
-        return Aid(*at_place(step.T, covariance, -self._place()), ALL)
+        return Aid(*at_place(step.T, covariance, -self._place()), ALL, "the IMU")
 
     def moved(
         self,
@@ -99,10 +124,14 @@ class MotionAids:
         T_previous_now: FloatArray | None = None,
         covariance: FloatArray | None = None,
     ) -> bool:
-        """Tell the IMU's filter of the motion that the images alone show, or that they show none.
+        """Tell the IMU's filter and the odometry of the motion that the images alone show, or that they show none.
 
         covariance: (6, 6) along the axes of the previous frame. False if the IMU contradicts it.
         """
+        if T_previous_now is None or covariance is None:
+            self.external.forget_motion()
+        elif self.external.is_heard:
+            self.external.learn(start_stamp_ns, end_stamp_ns, T_previous_now, covariance)
         if self._readings.newest is None:
             return True
         pre = self._preintegral(start_stamp_ns, end_stamp_ns)
@@ -126,7 +155,8 @@ class MotionAids:
         Only by much: places that look the same are not next to each other. It counts against the IMU, too, which soon
         refutes no more if it is the one that is wrong.
         """
-        told = self.bridge(start_stamp_ns, end_stamp_ns) or self._rotation_between(start_stamp_ns, end_stamp_ns)
+        told = self._inertial_bridge(start_stamp_ns, end_stamp_ns)
+        told = told or self._rotation_between(start_stamp_ns, end_stamp_ns)
         if told is None or not self.inertial.is_proven:
             return False
         error = np.abs(boxminus(told.T, T_previous_now))
@@ -149,7 +179,9 @@ class MotionAids:
         return UpDirection(self.inertial.up, self.inertial.tilt_covariance) if self.inertial.can_bridge else None
 
     def velocity(self) -> tuple[FloatArray, FloatArray]:
-        """Velocities (6,) of the rig as the IMU has them, with standard deviations (6,)."""
+        """Velocities (6,) of the rig as the odometry has them, or else the IMU, with standard deviations (6,)."""
+        if (known := self.external.velocity()) is not None:
+            return known
         newest = self._readings.newest
         rate = np.zeros(3) if newest is None else newest.angular_velocity - self.inertial.biases[:3]
         velocity = np.concatenate([self.inertial.velocity - np.cross(rate, self._place()), rate])
@@ -160,6 +192,25 @@ class MotionAids:
         older = sum(motion.end_stamp_ns <= stamp_ns for motion in self._motions)
         del self._motions[: max(older - 1, 0)]
         self._readings.forget_before(stamp_ns)
+        learning_ns = self.external.window_start_ns
+        self.external.readings.forget_before(stamp_ns if learning_ns is None else learning_ns)
+
+    # ---- an external odometry
+    def _reckon(self, start_stamp_ns: int, end_stamp_ns: int) -> Reckoning | None:
+        if not self.external.is_heard:
+            return None
+        return self.external.reckon(start_stamp_ns, end_stamp_ns, self._turns, self.inertial.gyro_bias_covariance)
+
+    def _reckoned_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+        reckoned = self._reckon(start_stamp_ns, end_stamp_ns)
+        if reckoned is None:
+            return None
+        return Aid(reckoned.T, self.external.between(reckoned), ALL, "odometry", reckoned)
+
+    def _turns(self, start_stamp_ns: int, end_stamp_ns: int) -> Preintegral | None:
+        if not self.inertial.is_proven:
+            return None
+        return self._readings.integrate(start_stamp_ns, end_stamp_ns, self.inertial.biases, self.inertial.noise)
 
     # ---- scans
     def _motion_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
@@ -196,7 +247,7 @@ class MotionAids:
         if pre is None or not self.inertial.uses_turns:
             return None
         variance = np.eye(3) * MEAN_TURN_RATE_SIGMA**2 + self.inertial.gyro_bias_covariance
-        return Aid(make_transform(pre.R, np.zeros(3)), variance * pre.dt**2, ROTATION)
+        return Aid(make_transform(pre.R, np.zeros(3)), variance * pre.dt**2, ROTATION, "the IMU")
 
     def _place(self) -> FloatArray:
         return np.zeros(3) if self._readings.newest is None else self._readings.newest.position

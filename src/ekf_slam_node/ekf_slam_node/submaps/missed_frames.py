@@ -26,6 +26,11 @@ class MissedFrames:
         self._last: Frame | None = None
         self._count = 0
 
+    @property
+    def last(self) -> Frame | None:
+        """The newest frame, if it had no link."""
+        return self._last
+
     def clear(self) -> None:
         """A frame was linked."""
         self._last, self._count = None, 0

@@ -15,7 +15,11 @@ from ekf_slam_node.submaps.steps import LinkedFrame
 from slam_core.geometry import FloatArray, boxminus
 
 _BRIDGE_SIGMA = 0.3
-"""Frames without association are bridged while the position is known this well, m."""
+"""Frames without association are bridged while the position is known this well, m, ..."""
+_BRIDGE_SHARE = 0.1
+"""... or to this share of the way that an odometry has counted."""
+_LONGEST_BRIDGE_NS = 600_000_000_000
+"""The poses of an odometry's bridge are kept until images see again, at most for so long."""
 _STANDING_SIGMA = np.repeat([0.002, np.radians(0.05)], 3)
 """Motions (m, rad) must be known as well as this for a rig to be seen standing."""
 
@@ -83,4 +87,9 @@ def widened(aid: Aid, common: FloatArray) -> Aid:
 
 def is_known(aid: Aid) -> bool:
     """True if the place that a motion leads to is known well enough to go on from it."""
-    return float(np.trace(aid.covariance[:3, :3])) < _BRIDGE_SIGMA**2
+    limit = _BRIDGE_SIGMA
+    if (reckoned := aid.reckoned) is not None:
+        if reckoned.stamp_ns - reckoned.start_ns > _LONGEST_BRIDGE_NS:
+            return False
+        limit = max(limit, _BRIDGE_SHARE * reckoned.travelled)
+    return float(np.trace(aid.covariance[:3, :3])) < limit**2

@@ -6,9 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from ekf_slam_node.config import SubmapConfig
+from ekf_slam_node.submaps.bridging import BridgedPose, positive_definite, smoothed
 from ekf_slam_node.submaps.open_submap import OpenSubmap
-from slam_core.geometry import FloatArray, boxminus, boxplus
-from slam_core.linear_algebra import blas
 from slam_core.types import ORIGIN_SIGMA, PoseEstimate, Submap
 
 _MIN_FRAMES = 5
@@ -18,9 +17,6 @@ _MIN_SHARED = 15
 
 _FOUND_AGAIN_S = 0.5
 """Age at which a submap that begins after a loss ends, so that the map soon hears of what it can be recognised by."""
-
-_LEAST_EIGENVALUE = 1e-12
-"""Share of the largest eigenvalue that rounding may reach."""
 
 
 class SubmapBuilder:
@@ -40,13 +36,13 @@ class SubmapBuilder:
         self._session = session
         self._path = [PoseEstimate(start_stamp_ns, np.eye(4), ORIGIN_SIGMA**2 * np.eye(6))]
         self._standing = 0
-        self._bridged: list[PoseEstimate] = []
+        self._bridged: list[BridgedPose] = []
 
     def add_pose(self, pose: PoseEstimate, standing: bool = False) -> None:
         """Add the filter's present pose to the path; one of a rig that stands does not make the submap older."""
         self._standing += standing
         if self._bridged and self._bridged[-1].stamp_ns == pose.stamp_ns:
-            self._path += smoothed(self._path[-1].stamp_ns, self._bridged, pose)
+            self._path += smoothed(self._bridged, pose)
         self._bridged = []
         self._path.append(pose)
 
@@ -55,7 +51,7 @@ class SubmapBuilder:
         """True if poses that no image confirms wait for one that ends them."""
         return bool(self._bridged)
 
-    def add_bridged_pose(self, pose: PoseEstimate) -> None:
+    def add_bridged_pose(self, pose: BridgedPose) -> None:
         """Add a pose that no image confirms, or the first after these as it was predicted.
 
         They are in the submap only if a pose of the filter ends them.
@@ -92,34 +88,10 @@ class SubmapBuilder:
     def close(self, local: OpenSubmap) -> Submap:
         """The submap as it is now: its end pose is the last pose added."""
         landmarks, joint = local.close()
-        covariance, table, end = _positive_definite(joint), local.table, self._path[-1]
+        covariance, table, end = positive_definite(joint), local.table, self._path[-1]
         return Submap(
             agent=self._agent, index=self.index, start_stamp_ns=self._start_stamp_ns, end_stamp_ns=end.stamp_ns,
             end_pose=end.T, landmarks=landmarks, covariance=covariance, landmark_ids=table.ids.copy(),
             sightings=table.sightings.copy(), descriptors=table.descriptors.copy(), path=tuple(self._path),
             follows_previous=self._follows_previous, session=self._session,
         )  # fmt: skip
-
-
-def smoothed(start_ns: int, bridged: list[PoseEstimate], end: PoseEstimate) -> list[PoseEstimate]:
-    """The poses since ``start_ns`` that were ``bridged`` but for the last, corrected by what is known of it in the end.
-
-    The error of a way found by accelerations grows with the square of time at most, that of the turn with time.
-    """
-    last = bridged[-1]
-    error, excess = boxminus(end.T, last.T), last.covariance - end.covariance
-    corrected = []
-    for pose in bridged[:-1]:
-        share = (pose.stamp_ns - start_ns) / (end.stamp_ns - start_ns)
-        gain = np.repeat([share**2, share], 3)
-        covariance = _positive_definite(pose.covariance - gain[:, None] * excess * gain)
-        corrected.append(PoseEstimate(pose.stamp_ns, boxplus(pose.T, gain * error), covariance))
-    return corrected
-
-
-def _positive_definite(P: FloatArray) -> FloatArray:
-    """A covariance whose smallest eigenvalues rounding has made negative, with these raised; others as they are."""
-    if blas.cholesky(np.array(P.T, order="F")):
-        return P
-    values, vectors = np.linalg.eigh(P)
-    return np.asarray((vectors * np.maximum(values, _LEAST_EIGENVALUE * values[-1])) @ vectors.T)

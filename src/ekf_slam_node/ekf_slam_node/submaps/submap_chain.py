@@ -12,6 +12,7 @@ from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.odometry.aids import Aid
 from ekf_slam_node.odometry.odometry import OdometryChain, UpDirection
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
+from ekf_slam_node.submaps.bridging import BridgedPose
 from ekf_slam_node.submaps.open_submap import OpenSubmap, Sight, inheriting, pending_of
 from ekf_slam_node.submaps.steps import UpdatedFrame
 from ekf_slam_node.submaps.submap_builder import SubmapBuilder
@@ -115,11 +116,9 @@ class SubmapChain:
     def add_bridged_pose(self, stamp_ns: int, motion: Aid) -> PoseEstimate:
         """Add the pose after a motion from the filter's pose that no image confirms; returns it as T_odom_rig."""
         before = self.local.filter_pose(self.stamp_ns)
-        covariance = compose_covariance(before.T, before.covariance, motion.T, motion.covariance)
-        pose = PoseEstimate(stamp_ns, before.T @ motion.T, covariance)
-        self._builder.add_bridged_pose(pose)
+        self._builder.add_bridged_pose(BridgedPose(before, motion, stamp_ns))
         drifted = compose_covariance(before.T, self.local.pose_covariance(), motion.T, motion.covariance)
-        return self._odometry.pose(stamp_ns, pose.T, drifted)
+        return self._odometry.pose(stamp_ns, before.T @ motion.T, drifted)
 
     def is_complete(self, shared: int) -> bool:
         """True if the submap ends with this frame, in which the next one would share so many landmarks with it."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from slam_core.geometry import FloatArray, pose7_from_transform, transform_from_pose7
 from slam_core.messages.base import Message, MessageTypes, header_message, stamp_ns
-from slam_core.types import ImuSample, PoseEstimate, RelativeMotion
+from slam_core.types import ImuSample, OdometryReading, PoseEstimate, RelativeMotion
 
 FARTHEST_M = 1e6
 """Positions beyond are no positions in a building; their squares would spoil covariances."""
@@ -72,6 +72,25 @@ def _twist(types: MessageTypes, twist: tuple[FloatArray, FloatArray] | None) -> 
     velocity, covariance = (np.zeros(6), _UNKNOWN_VARIANCE * np.eye(6)) if twist is None else twist
     parts = types.Twist(linear=_vector(types, velocity[:3]), angular=_vector(types, velocity[3:]))
     return types.TwistWithCovariance(twist=parts, covariance=np.asarray(covariance, dtype=np.float64).ravel())
+
+
+def odometry_from_message(message: Message) -> OdometryReading:
+    """Pose and covariances of a nav_msgs/Odometry, the latter as they are.
+
+    Raises
+    ------
+    ValueError
+        If the pose is not finite or no pose, or no child frame is named.
+    """
+    if not message.child_frame_id:
+        raise ValueError("odometry without a child_frame_id: what moves there is not known")
+    pose, twist = message.pose, message.twist
+    velocity = np.concatenate([_xyz(twist.twist.linear), _xyz(twist.twist.angular)])
+    covariances = (np.array(part.covariance, dtype=np.float64).reshape(6, 6) for part in (pose, twist))
+    return OdometryReading(
+        stamp_ns(message), pose_from_message(pose.pose), next(covariances), velocity, next(covariances),
+        message.child_frame_id,
+    )  # fmt: skip
 
 
 def estimate_from_message(message: Message) -> PoseEstimate:
