@@ -32,6 +32,17 @@ def test_a_loop_closes_and_the_landmarks_of_the_second_lap_are_those_of_the_firs
     assert len(joined.landmarks().ids) <= 1.02 * len(seen)
 
 
+def test_after_a_way_without_images_no_landmark_is_matched_by_place_alone(rng: np.random.Generator) -> None:
+    """The end of one submap is known to a decimetre: the next stays tied to it, by the way alone."""
+    submaps = ring_agent(rng, turns=0.75).submaps()
+    covariance = submaps[2].covariance.copy()
+    covariance[:3, :3] += 0.01 * np.eye(3)
+    submaps[2] = replace(submaps[2], covariance=covariance)
+    joined, reports = join(submaps[:5])
+    assert [report.matched > 0 for report in reports] == [False, True, True, False, True]
+    assert joined.components == 1
+
+
 def test_landmark_count_stays_bounded_over_laps(rng: np.random.Generator) -> None:
     agent = ring_agent(rng, turns=3.0, radius=3.0)
     joined, _ = join(agent.submaps())

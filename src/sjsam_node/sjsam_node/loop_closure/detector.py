@@ -41,6 +41,9 @@ from sjsam_node.smoothing.state import EstimateState
 from slam_core.geometry import FloatArray, compose_covariance
 from slam_core.linear_algebra.block_pattern import IntArray
 
+_BRIDGED_SIGMA = 0.08
+"""A submap whose end is known no better than this (m) was carried on without images: the next is found by closures."""
+
 
 @dataclass
 class LoopDetector:
@@ -76,6 +79,8 @@ class LoopDetector:
         for k, previous in enumerate(chain[: self.config.window]):
             record, threshold = graph.records[previous], self.config.association.descriptor_threshold
             end, end_covariance = record.submap.end_pose, record.submap.covariance[:6, :6]
+            if np.trace(end_covariance[:3, :3]) > _BRIDGED_SIGMA**2:
+                break  # gates as wide as this let look-alikes through
             points = at_start(graph.records[new]).at(left)
             alike = (record.submap.descriptors @ points.descriptors.T >= threshold).any(axis=1)
             there = np.nonzero(alike & ~np.isin(graph.landmarks_of(previous), taken))[0]
