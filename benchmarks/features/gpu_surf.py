@@ -19,8 +19,8 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 from datasets import DATA, euroc_pairs, kitti_pairs
-from slam_bringup.experiments.true_frames import simulated_frames
 
+from slam_experiments.simulated.true_frames import simulated_frames
 from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.surf.surf_device import best_opencl_device

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bag in bags/ with an IMU, through the nodes and offline: the same trajectory and map, nothing lost."""
+"""The bag in bags/, an IMU and an odometry through the nodes and offline: the same trajectory and map, nothing lost."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.recorded_run import collect
 from slam_bringup.processes.start_map import StartMap
 from slam_core.geometry import make_transform, so3_exp, so3_log
-from slam_core.types import ImuSample
+from slam_core.types import ImuSample, OdometryReading
 from slam_viewer.results import summarise
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
@@ -33,6 +33,7 @@ DEMO = Path(__file__).resolve().parents[2] / "bags" / "demo"
 FRAMES_NS = 2_500_000_000
 IMU_STEP_NS = 10_000_000
 IMU_OFFSET_NS = 3_000_000
+ODOMETRY_STEP_NS = 23_000_000
 ROUNDED_IN_A_QUATERNION = 1e-14
 """Error of a rotation matrix that went through an Odometry message; maps do not go through one."""
 T_BASE_IMU = make_transform(so3_exp(np.array([0.0, 0.0, 0.5 * np.pi])), np.array([0.1, 0.0, 0.0]))
@@ -40,17 +41,19 @@ T_BASE_IMU = make_transform(so3_exp(np.array([0.0, 0.0, 0.5 * np.pi])), np.array
 
 @pytest.fixture(scope="module")
 def short_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first two and a half seconds of the bag in bags/, and an IMU at 100 Hz whose stamps are not the cameras'."""
+    """The first 2.5 s of the bag in bags/, and an IMU and an odometry whose stamps are not the cameras'."""
     if not DEMO.is_dir():
         pytest.skip(f"no bag at {DEMO}")
     path = tmp_path_factory.mktemp("bags") / "short"
     with BagReader(DEMO) as long, BagWriter(path) as short:
         types = {topic: info.type_name for topic, info in long.topics.items()}
-        writer, samples = SensorWriter(short), turn_rates(long.start_ns)
+        writer, samples, poses = SensorWriter(short), turn_rates(long.start_ns), odometry(long.start_ns)
         writer.extrinsics(long.start_ns, {IMU_FRAME: T_BASE_IMU})
         for topic, stamp, data in long.raw():
             while samples and samples[0].stamp_ns <= stamp:
                 writer.imu(samples.popleft())
+            while poses and poses[0].stamp_ns <= stamp:
+                writer.odometry(poses.popleft())
             if stamp <= long.start_ns + FRAMES_NS:
                 short.write_raw(topic, types[topic], data, stamp)
     return path
@@ -66,6 +69,22 @@ def turn_rates(start_ns: int) -> deque[ImuSample]:
     R_imu_base = T_BASE_IMU[:3, :3].T
     rates = [R_imu_base @ so3_log(a[:3, :3].T @ b[:3, :3]) / (IMU_STEP_NS * 1e-9) for a, b in pairwise(poses)]
     return deque(ImuSample(int(t), rate, np.array([0.0, 0.0, 9.8])) for t, rate in zip(stamps, rates, strict=True))
+
+
+def odometry(start_ns: int) -> deque[OdometryReading]:
+    """The true way of the IMU's frame, 2 % too long, with a covariance that grows."""
+    with SensorBag(DEMO) as bag:
+        truth = bag.ground_truth("")
+    assert truth is not None
+    stamps = start_ns + np.arange(FRAMES_NS // ODOMETRY_STEP_NS) * ODOMETRY_STEP_NS
+    poses = truth.interpolate(stamps) @ T_BASE_IMU
+    own = np.linalg.inv(poses[0]) @ poses
+    own[:, :3, 3] *= 1.02
+    none = np.zeros(6), np.zeros((6, 6))
+    return deque(
+        OdometryReading(int(t), T, 1e-6 * (k + 1) * np.eye(6), *none, IMU_FRAME)
+        for k, (t, T) in enumerate(zip(stamps, own, strict=True))
+    )
 
 
 def files(folder: Path) -> dict[str, bytes]:

@@ -5,7 +5,7 @@ description: one room, once round, both cameras
 seed: 16
 rate: 10.0                       # frames per second
 frames: 414
-sensors: [stereo, tof, imu]
+sensors: [stereo, tof, imu]      # and wheels, of a rig that drives: wheels: {slip: 0.01, radius_error: 0.02}
 profile: ideal                   # or real: what real rooms and sensors add; single effects: realism: {...}
 rooms:
   - {name: office, x: [0, 5], y: [0, 4], style: office}
@@ -32,6 +32,7 @@ from slam_simulation.sensors.imu import ImuSensorConfig
 from slam_simulation.sensors.profiles import PROFILES, REAL, REAL_STEREO, RealismConfig
 from slam_simulation.sensors.stereo_sensor import StereoSensorConfig
 from slam_simulation.sensors.tof_sensor import TofSensorConfig
+from slam_simulation.sensors.wheels import WheelSensorConfig
 from slam_simulation.trajectory import MOTION_STYLES, Path, SplinePath, StationPath, resolve_waypoints
 from slam_simulation.world.building import WALL_GAP, Doorway, Room, build_doorways, build_shell, room_walls
 from slam_simulation.world.furniture import Spot, chair, furnish_wall, pillar, table
@@ -39,7 +40,9 @@ from slam_simulation.world.moving import add_moving
 from slam_simulation.world.world import World
 
 SENSORS = ("stereo", "tof", "imu")
-_SUITE = (*SENSORS, "realism")
+"""Sensors of a rig unless a scenario says otherwise."""
+_KNOWN = (*SENSORS, "wheels")
+_SUITE = (*_KNOWN, "realism")
 SCENARIOS = FilePath(__file__).with_name("scenarios")
 """``bags/scenarios`` of the sources, installed with the package."""
 
@@ -83,6 +86,7 @@ class SensorSuite(Config):
     stereo: StereoSensorConfig = group(StereoSensorConfig)
     tof: TofSensorConfig = group(TofSensorConfig)
     imu: ImuSensorConfig = group(ImuSensorConfig)
+    wheels: WheelSensorConfig = group(WheelSensorConfig)
     realism: RealismConfig = group(RealismConfig)
     start_stamp_s: float = parameter(1000.0, "header stamp of the first frame", unit="s", minimum=0.0)
 
@@ -114,9 +118,9 @@ class Scenario:
             )
         if not self.rooms or not self.agents:
             raise ValueError(f"scenario '{self.name}' needs at least one room and one agent")
-        unknown = set(self.sensors) - set(SENSORS)
+        unknown = set(self.sensors) - set(_KNOWN)
         if unknown:
-            raise ValueError(f"scenario '{self.name}': unknown sensors {sorted(unknown)}, known: {', '.join(SENSORS)}")
+            raise ValueError(f"scenario '{self.name}': unknown sensors {sorted(unknown)}, known: {', '.join(_KNOWN)}")
         for agent in self.agents:
             for x, y, *_ in (*agent.path, *agent.stations):
                 if not any(room.holds(x, y, WALL_GAP) for room in self.rooms):

@@ -16,12 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
-from slam_core.types import ByteArray, Float32Array, ImuSample
+from slam_core.types import ByteArray, Float32Array, ImuSample, OdometryReading
 from slam_simulation.rendering.raycaster import Rays, camera_rays, make_view, trace
 from slam_simulation.scenario import Scenario
 from slam_simulation.sensors.imu import ImuSensor
 from slam_simulation.sensors.stereo_sensor import StereoSensor
 from slam_simulation.sensors.tof_sensor import TofImages, TofSensor
+from slam_simulation.sensors.wheels import WheelSensor
 from slam_simulation.trajectory import rig_twist
 from slam_simulation.world.finishes import finished
 from slam_simulation.world.moving import MovingThings
@@ -44,8 +45,8 @@ class SimulatedFrame:
     """All that one agent's sensors report at one moment.
 
     left, right: raw uint8 images, None for a sensor that is not carried or a frame that was lost; right_stamp_ns
-    differs from stamp_ns by the jitter between the cameras. tof: raw images or None. imu: samples since the previous
-    frame.
+    differs from stamp_ns by the jitter between the cameras. tof: raw images or None. imu, wheels: readings since the
+    previous frame.
     """
 
     index: int
@@ -57,6 +58,7 @@ class SimulatedFrame:
     right: ByteArray | None
     tof: TofImages | None
     imu: tuple[ImuSample, ...]
+    wheels: tuple[OdometryReading, ...]
     truth: DepthTruth | None
 
 
@@ -102,6 +104,10 @@ class Simulator:
         self.stereo = StereoSensor(scenario.suite.stereo, scenario.seed, rectified=rectified, realism=realism)
         self.tof = TofSensor(scenario.suite.tof, scenario.seed, realism)
         self.imu = ImuSensor(scenario.suite.imu, (scenario.seed, 9, agent))
+        self.wheels: WheelSensor | None = None
+        if "wheels" in scenario.sensors:
+            height = scenario.agents[agent].height
+            self.wheels = WheelSensor(scenario.suite.wheels, self.path, height, (scenario.seed, 10, agent))
         self.threads = threads or os.cpu_count() or 1
         self._truth_rays = camera_rays(self.stereo.stereo.camera) if truth else None
 
@@ -159,6 +165,7 @@ class Simulator:
             right=right,
             tof=tof,
             imu=self._imu_samples(t - every / scenario.rate, t),
+            wheels=self._wheel_readings(t - every / scenario.rate, t),
             truth=None if self._truth_rays is None else self._truth(T, world, self._truth_rays, pool),
         )
 
@@ -179,6 +186,9 @@ class Simulator:
             return ()
         # The first frame brings the sample of its own moment.
         return self.imu.read(self.path, max(previous, -1e-6), t, self.stamp_ns(0))
+
+    def _wheel_readings(self, previous: float, t: float) -> tuple[OdometryReading, ...]:
+        return () if self.wheels is None else self.wheels.read(max(previous, -1e-6), t, self.stamp_ns(0))
 
     def _truth(self, T: FloatArray, world: SurfaceTable, rays: Rays, pool: ThreadPoolExecutor | None) -> DepthTruth:
         view = make_view(world, T @ self.T_rig_left, rays.bounds)

@@ -83,3 +83,15 @@ def test_a_command_post_has_link_map_and_page(started: dict[str, Any]) -> None:
     assert 'role:="post"' in started["radio_link"]
     assert 'listen:=["tcp/0.0.0.0:7447"]' in started["radio_link"]
     assert "port:=0" in started["viewer"]
+
+
+def test_an_odometry_topic_goes_with_a_camera_and_with_topics(started: dict[str, Any], tmp_path: Path) -> None:
+    words = ["live", "--topics", "--odometry-topic", "/base_controller/odom"]
+    result = CliRunner().invoke(slam, words)
+    assert result.exit_code == 0, result.output
+    assert "/odometry:=/base_controller/odom" in started["rest"]
+    folder = write_calibrations(DEMO, tmp_path / "calibration")[0]
+    words = ["live", "0", "--calibration", str(folder), "--odometry-topic", "/base_controller/odom"]
+    result = CliRunner().invoke(slam, words)
+    assert result.exit_code == 0, result.output
+    assert "/odometry:=/base_controller/odom" in started["rest"]

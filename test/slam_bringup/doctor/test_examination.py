@@ -13,12 +13,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.cli import slam
+from slam_bringup.doctor.evidence import Evidence
 from slam_bringup.doctor.examination import examine, require_stereo
+from slam_bringup.doctor.finding import Finding
+from slam_bringup.doctor.odometry import check_odometry
+from slam_core.frame_tree import FrameTree
+from slam_core.geometry import make_transform
+from slam_core.types import OdometryReading
 
 ROOT = Path(__file__).resolve().parents[3]
 DEMO = ROOT / "bags" / "demo"
@@ -89,7 +96,8 @@ def test_the_command_ends_with_one_where_something_is_wrong(bench: ModuleType, t
     good = CliRunner().invoke(slam, ["doctor", str(DEMO)])
     assert good.exit_code == 0
     assert (
-        "nothing wrong found in: topics, stamps, frames, calibration, stereo images, depth images, imu" in good.output
+        "nothing wrong found in: topics, stamps, frames, calibration, stereo images, depth images, imu, odometry"
+        in good.output
     )
     assert isinstance(CliRunner().invoke(slam, ["doctor"]).exception, ValueError)
 
@@ -128,3 +136,36 @@ def test_a_clock_that_jumps_back_is_told(bench: ModuleType, tmp_path: Path) -> N
 
     found = {f.check: f.what for f in examine(bench.copy(DEMO, tmp_path / "bag", change))}
     assert found["time goes back"].startswith("time jumped back by ")
+
+
+def odometry(faults: dict[str, Any], *, standing: bool = False) -> list[Finding]:
+    """Findings about ten seconds of driving at 1 m/s, 50 poses a second, with faults."""
+    hz, unit = faults.get("hz", 50), np.eye(6)
+    poses = []
+    for k in range(10 * hz):
+        T = make_transform(np.eye(3), np.array([0.0 if standing else k / hz, 0.0, 0.0]))
+        T[0, 3] += 30.0 * (faults.get("jump") == k)
+        covariance = faults.get("covariance", 1e-6 * (k + 1) * unit)
+        poses.append(OdometryReading(10**12 + k * 10**9 // hz, T, covariance, np.zeros(6), np.zeros((6, 6))))
+    evidence = Evidence("", {"odometry": "/odometry"}, {}, {}, FrameTree(), "base_link", odometry=poses)
+    return list(check_odometry(evidence))
+
+
+def test_an_odometry_that_says_how_good_it_is_is_well() -> None:
+    assert odometry({}) == []
+    assert odometry({"covariance": np.zeros((6, 6))}, standing=True) == []
+
+
+@pytest.mark.parametrize(
+    ("faults", "check"),
+    [
+        ({"covariance": np.zeros((6, 6))}, "odometry covariance"),
+        ({"covariance": 1e-3 * np.eye(6)}, "odometry covariance"),
+        ({"hz": 4, "covariance": 1e9 * np.eye(6)}, "odometry rate"),
+        ({"jump": 30}, "odometry poses"),
+    ],
+)
+def test_what_an_odometry_lacks_is_told(faults: dict[str, Any], check: str) -> None:
+    findings = odometry(faults)
+    assert check in {finding.check for finding in findings}
+    assert all(finding.advice and "/odometry" in finding.what for finding in findings)

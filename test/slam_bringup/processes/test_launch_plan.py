@@ -53,6 +53,11 @@ def test_a_rig_may_name_its_topics_frames_and_files() -> None:
     assert "stereo_driver" not in {s.executable for s in plan_launch({"rectified": "true"}).nodes}
 
 
+def test_the_odometry_of_a_rig_has_an_argument_of_its_own() -> None:
+    plan = plan_launch({"odometry_topic": "/wheels", "topics": "imu=/imu/data"})
+    assert dict(plan.remappings) == {"/odometry": "/wheels", "/imu": "/imu/data"}
+
+
 def test_one_line_goes_before_the_file(tmp_path: Path) -> None:
     config = tmp_path / "my.yaml"
     config.write_text("/**:\n  ros__parameters: {input.depth: 20}\nstereo_driver: {left_info: a.yaml}\n")

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from ekf_slam_node.config import ExternalOdometryConfig
 from slam_bags.reading.readings import AgentSensors
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.processes.node_graph import live_nodes, plan_nodes
@@ -92,6 +94,18 @@ def test_frames_wait_for_the_imu_of_a_bag_that_has_one() -> None:
     graph = plan_nodes(choose(load_system_config(None), "fuse", "sjsam", "ndt"), {"": with_imu}, True, "map")
     arguments = {c.executable: " ".join(c.arguments) for c in graph.commands}
     assert 'wait_for:=["motion", "imu"]' in arguments["ekf_slam"]
+
+
+def test_frames_wait_for_the_odometry_of_a_bag_unless_it_is_off() -> None:
+    driven = sensors()
+    driven.topics["odometry"] = "/base_controller/odom"
+    config = choose(load_system_config(None), "stereo", "sjsam", "none")
+    graph = plan_nodes(config, {"": driven}, False, "map")
+    assert graph.played["/base_controller/odom"] == "/odometry"
+    assert next(s for s in graph.specs if s.executable == "ekf_slam").parameters["wait_for"] == ("odometry",)
+    filters = replace(config.ekf_slam, odometry=ExternalOdometryConfig(use="off"))
+    off = plan_nodes(replace(config, ekf_slam=filters), {"": driven}, False, "map")
+    assert "wait_for" not in next(s for s in off.specs if s.executable == "ekf_slam").parameters
 
 
 def test_the_frames_of_an_agent_are_those_of_its_bag_or_lie_below_its_name() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from slam_bags.reading.readings import DepthReading, StereoReading
+from slam_bags.reading.readings import DepthReading, PoseReading, StereoReading
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.storage.bag import BagReader
 from slam_bags.storage.bag_calibration import calibration_file
@@ -153,3 +153,27 @@ def test_unknown_scenario_is_one_clear_line(tmp_path: Path) -> None:
     assert isinstance(result.exception, ValueError)
     assert "no_such_place" in str(result.exception)
     assert not (tmp_path / "bag").exists()
+
+
+def test_a_rig_on_wheels_has_odometry_and_its_mounting(tmp_path: Path) -> None:
+    room = {key: value for key, value in ROOM.items() if key != "agents"}
+    driven = [{"motion": "rig", "height": 0.9, "path": [[1, 1], [3, 1.2]]}]
+    scenario = Scenario.from_mapping("room", room | {"agents": driven, "sensors": ["stereo", "wheels"]})
+    write_bag(scenario, tmp_path / "bag", threads=1)
+    with SensorBag(tmp_path / "bag") as source:
+        poses = [r.pose for r in source.readings() if isinstance(r, PoseReading)]
+        assert source.sensors[""].frames.lookup("base_link", "base_footprint")[2, 3] == -0.9
+    assert len(poses) == 1 + 20  # 50 Hz over two steps of 0.2 s
+    assert all(pose.frame_id == "base_footprint" for pose in poses)
+    assert poses[-1].covariance[0, 0] > poses[1].covariance[0, 0] > 0.0
+
+
+def test_the_wheels_option_adds_them_and_changes_no_image(tmp_path: Path) -> None:
+    pictures = {}
+    for name, option in (("with", ["--wheels"]), ("without", [])):
+        words = ["small_room", "--frames", "1", "--profile", "ideal", "-o", str(tmp_path / name), *option]
+        assert CliRunner().invoke(command, words).exit_code == 0
+        with BagReader(tmp_path / name) as reader:
+            assert ("/odometry" in reader.topics) == (name == "with")
+            pictures[name] = [data for _, _, data in reader.raw(["/stereo/left/image_raw"])]
+    assert pictures["with"] == pictures["without"]

@@ -16,7 +16,7 @@ from slam_core.nodes.stamp_guard import StampDecision, StampGuard
 from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S
 
 _UNPAIRED = f"images without a partner within {1000 * PAIRING_TOLERANCE_S:g} ms of their stamp"
-_FOLLOWING = ("imu",)
+FOLLOWING = ("imu", "odometry")
 """Roles that begin no session."""
 
 
@@ -33,7 +33,7 @@ class AgentStream:
 
     def add(self, role: str, message: Message) -> list[Reading]:
         """The readings that this message leads to."""
-        starts = role not in _FOLLOWING
+        starts = role not in FOLLOWING
         return self._take(role, self._guard.add(role, stamp_ns(message), message, starts_sessions=starts))
 
     def finish(self) -> list[Reading]:

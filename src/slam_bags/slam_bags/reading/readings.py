@@ -16,13 +16,14 @@ from slam_core.messages import (
     grey_and_colour_from_message,
     grey_from_message,
     imu_from_message,
+    odometry_from_message,
     picture_from_message,
     points_from_scan,
     stamp_ns,
 )
 from slam_core.messages.base import Message
 from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
-from slam_core.types import ByteArray, ImuSample
+from slam_core.types import ByteArray, ImuSample, OdometryReading
 from stereo_frontend.sources import RawPair
 from tof_driver.stage import RawDepth
 
@@ -67,6 +68,19 @@ class ImuReading:
 
 
 @dataclass(frozen=True, eq=False)
+class PoseReading:
+    """A pose of an external odometry, of a frame of its own."""
+
+    agent: str
+    pose: OdometryReading
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the pose."""
+        return self.pose.stamp_ns
+
+
+@dataclass(frozen=True, eq=False)
 class LaserReading:
     """A scan of a laser scanner, points (n, 2) in its own frame."""
 
@@ -106,7 +120,7 @@ class InfoReading:
     info: CameraInfo
 
 
-Reading = StereoReading | DepthReading | LaserReading | ImuReading | ColourReading | SessionStart
+Reading = StereoReading | DepthReading | LaserReading | ImuReading | PoseReading | ColourReading | SessionStart
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +167,12 @@ def _imu_reading(sensors: AgentSensors, message: Message) -> Reading:
     return ImuReading(sensors.agent, sample)
 
 
+def _pose_reading(sensors: AgentSensors, message: Message) -> Reading:
+    pose = odometry_from_message(message)
+    sensors.frames.lookup(sensors.base_frame, pose.frame_id)  # unusable where that is not known
+    return PoseReading(sensors.agent, pose)
+
+
 def _laser_reading(sensors: AgentSensors, message: Message) -> Reading:
     return LaserReading(sensors.agent, Scan(stamp_ns(message), points_from_scan(message), message.header.frame_id))
 
@@ -163,6 +183,7 @@ def _colour_reading(sensors: AgentSensors, message: Message) -> Reading:
 
 UNPAIRED_ROLES: dict[str, Callable[[AgentSensors, Message], Reading]] = {
     "imu": _imu_reading,
+    "odometry": _pose_reading,
     "scan": _laser_reading,
     "color": _colour_reading,
 }

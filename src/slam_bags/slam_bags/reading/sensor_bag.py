@@ -3,7 +3,7 @@
 
     with SensorBag(path) as bag:
         for reading in bag.readings():
-            ...  # StereoReading, DepthReading, LaserReading or ImuReading, in the order of the bag
+            ...  # StereoReading, DepthReading, LaserReading, ImuReading or PoseReading, in the order of the bag
 
 Topics are those of the nodes, or given by role, see :mod:`slam_bags.reading.sensor_topics`:
 
@@ -12,7 +12,7 @@ Topics are those of the nodes, or given by role, see :mod:`slam_bags.reading.sen
   ``tof/camera_info`` and, where there are any, ``tof/{amplitude,intensity}/image_raw``, and ``tof/color/image_raw``
   in the pixels of the depth image: colours of the dense model, and the picture that features come from where there is
   no other;
-- ``scan`` of a laser scanner, ``imu`` and ``ground_truth/pose``.
+- ``scan`` of a laser scanner, ``imu``, ``odometry`` and ``ground_truth/pose``.
 
 Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts, and
 images under another one are left out. So is a message that is broken, has no partner or an odd stamp; all are counted.
@@ -43,6 +43,7 @@ from slam_bags.reading.readings import (
     ImuReading,
     InfoReading,
     LaserReading,
+    PoseReading,
     Reading,
     SessionStart,
     StereoReading,
@@ -64,7 +65,7 @@ from slam_core.trajectory import Trajectory
 
 R = TypeVar("R", bound=Reading | InfoReading)
 
-_RANKS = (SessionStart, InfoReading, ImuReading, ColourReading, DepthReading, LaserReading, StereoReading)
+_RANKS = (SessionStart, InfoReading, ImuReading, PoseReading, ColourReading, DepthReading, LaserReading, StereoReading)
 _LEADER: dict[type[Reading], str] = {StereoReading: "left", DepthReading: "depth"}
 """Role of the first image of each kind of reading of a camera."""
 _IMAGES_OF: dict[str, type[Reading]] = {"left": StereoReading, "right": StereoReading, "depth": DepthReading}
@@ -114,7 +115,7 @@ class SensorBag:
         self.reader.__exit__()
 
     def readings(self, *, colours: bool = False) -> Generator[Reading, None, None]:
-        """Every reading in the order of the bag; of those with one stamp IMU and depth come before the stereo pair.
+        """Every reading in the order of the bag; of those with one stamp the stereo pair comes last.
 
         What helps a frame thus comes before it, as at the node, which waits for it. ``colours``: the colour pictures
         too, which only the dense model needs.

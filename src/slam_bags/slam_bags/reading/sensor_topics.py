@@ -22,6 +22,7 @@ _CANDIDATES = {
     "intensity": ("tof/intensity/image_raw",),
     "color": ("tof/color/image_raw", "tof/color/image_raw/compressed"),
     "imu": ("imu",),
+    "odometry": ("odometry",),
     "scan": ("scan",),
     "ground_truth": ("ground_truth/pose",),
 }

@@ -16,10 +16,11 @@ from slam_core.messages import (
     header_message,
     image_message,
     imu_message,
+    odometry_message,
     pose_stamped_message,
     transform_message,
 )
-from slam_core.types import AnyArray, ByteArray, ImuSample
+from slam_core.types import AnyArray, ByteArray, ImuSample, OdometryReading, PoseEstimate
 
 BASE_FRAME = "base_link"
 LEFT_FRAME = "stereo_left_optical_frame"
@@ -83,6 +84,13 @@ class SensorWriter:
         """An IMU reading in the axes of ``imu_link``."""
         message = imu_message(self._types, self._frame(IMU_FRAME), sample)
         self._bag.write(f"{self._prefix}/imu", message, sample.stamp_ns)
+
+    def odometry(self, reading: OdometryReading) -> None:
+        """A pose of the reading's own frame, in a frame ``wheel_odom``."""
+        pose = PoseEstimate(reading.stamp_ns, reading.T, reading.covariance)
+        twist = reading.twist, reading.twist_covariance
+        frames = self._frame("wheel_odom"), self._frame(reading.frame_id)
+        self._bag.write(f"{self._prefix}/odometry", odometry_message(self._types, *frames, pose, twist), pose.stamp_ns)
 
     def ground_truth(self, stamp_ns: int, T_world_base: FloatArray) -> None:
         """True pose of base_link."""

@@ -36,7 +36,8 @@ def command(
     finished run, with --localize-only the rig is only located in it. With --post and the rig's name (--agents) its
     submaps and poses go to a command post too.
     """
-    if (by_topics or bool(topics)) == (camera is not None):
+    by_topics = by_topics or any(not topic.startswith("odometry=") for topic in topics)
+    if by_topics == (camera is not None):
         raise ValueError("say what to map: a CAMERA, or --topics of the sensors' drivers")
     given = {
         "agents": agents, "mode": mode, "odometry": odometry, "config": config, "topics": ",".join(topics),

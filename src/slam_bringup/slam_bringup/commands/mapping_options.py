@@ -17,6 +17,19 @@ from slam_bringup.pipeline.configuration import MAPPERS, ODOMETRIES
 from slam_viewer.results import RunResult
 from stereo_frontend.frontend_config import MODES
 
+_ODOMETRY = "slam_bringup.odometry_topic"
+
+
+def _keep_odometry(context: click.Context, _: click.Parameter, topic: str | None) -> None:
+    context.meta[_ODOMETRY] = topic
+
+
+def _with_odometry(context: click.Context, _: click.Parameter, topics: tuple[str, ...]) -> tuple[str, ...]:
+    """The topics given by role, with that of ``--odometry-topic``, which is read before them."""
+    topic = context.meta.get(_ODOMETRY)
+    return (*topics, f"odometry={topic}") if topic else topics
+
+
 # fmt: off
 _BAG_OPTIONS = (
     click.argument("bag", type=UserPath(exists=True)),
@@ -37,7 +50,11 @@ _RIG_OPTIONS = (
         help="YAML, one group per node, as in docs/parameters.md",
     ),
     click.option(
-        "--topic", "topics", multiple=True, metavar="ROLE=TOPIC",
+        "--odometry-topic", metavar="TOPIC", is_eager=True, expose_value=False, callback=_keep_odometry,
+        help="odometry of wheels, legs or another estimator (nav_msgs/Odometry) [odometry, if there is one]",
+    ),
+    click.option(
+        "--topic", "topics", multiple=True, metavar="ROLE=TOPIC", callback=_with_odometry,
         help=f"a topic that is not named like the nodes' (may be repeated); roles: {', '.join(ROLES)}",
     ),
     calibration_option(),

@@ -26,17 +26,19 @@ from slam_core.messages import (
     grey_from_message,
     imu_from_message,
     metres_from_message,
+    odometry_from_message,
     picture_from_message,
     transform_from_message,
 )
 from slam_core.messages.base import Message
-from slam_core.types import AnyArray
+from slam_core.types import AnyArray, OdometryReading
 
 Stamps = npt.NDArray[np.int64]
 BURSTS, BURST = 3, 12
 """Bursts of consecutive images that are looked at, and images in each."""
 
-_STREAMED = ("left", "right", "depth", "range", "amplitude", "intensity", "imu")
+_STREAMED = ("left", "right", "depth", "range", "amplitude", "intensity", "imu", "odometry")
+"""Roles of which all stamps are looked at."""
 _PICTURES = ("left", "right", "depth", "range", "amplitude")
 _INFOS = {"left": "left_info", "right": "right_info", "depth": "tof_info", "range": "tof_info"}
 
@@ -68,6 +70,7 @@ class Evidence:
 
     images: decoded sample by role and stamp; depth and range in m. faults: messages that could not be decoded, by topic
     with the first reason. imu: rows of stamp s, angular velocity rad/s, specific force m/s2, in the IMU's axes.
+    odometry: every pose that could be read.
     """
 
     agent: str
@@ -80,6 +83,7 @@ class Evidence:
     images: dict[str, dict[int, AnyArray]] = field(default_factory=dict)
     faults: dict[str, str] = field(default_factory=dict)
     imu: FloatArray = field(default_factory=lambda: np.empty((0, 7)))
+    odometry: list[OdometryReading] = field(default_factory=list)
 
     @property
     def depth_role(self) -> str:
@@ -198,28 +202,34 @@ def _decode_sample(bag: BagReader, evidence: Evidence, messages: int | None) -> 
     }
     role_of = {topic: role for role, topic in evidence.topics.items() if role in _STREAMED}
     samples: list[FloatArray] = []
-    imu = [evidence.topics["imu"]] if "imu" in evidence.streams else []
+    accompanying = {evidence.topics[role]: role for role in ("imu", "odometry") if role in evidence.streams}
     last = max(max(stamps, default=0) for stamps in chosen.values())
-    for count, (topic, _, data) in enumerate(bag.raw([*chosen, *imu])):
+    for count, (topic, _, data) in enumerate(bag.raw([*chosen, *accompanying])):
         if messages is not None and count >= messages:
             break
         stamp = header_stamp_ns(data)
-        if topic not in imu and stamp not in chosen[topic]:
-            continue
-        if topic in imu and stamp > last:
+        if stamp > last if topic in accompanying else stamp not in chosen[topic]:
             continue
         try:
             message = bag.decode(bag.topics[topic].type_name, data)
-            if topic in imu:
+            if topic in accompanying:
+                evidence.image_frames.setdefault(accompanying[topic], _frame_of(message))
+            if accompanying.get(topic) == "odometry":
+                evidence.odometry.append(odometry_from_message(message))
+            elif topic in accompanying:
                 sample = imu_from_message(message)
                 samples.append(np.array([stamp / 1e9, *sample.angular_velocity, *sample.linear_acceleration]))
-                evidence.image_frames.setdefault("imu", message.header.frame_id)
             else:
                 _keep_image(evidence, role_of[topic], stamp, message)
         except ValueError as error:
             evidence.faults.setdefault(topic, str(error))
     if samples:
         evidence.imu = np.stack(samples)
+
+
+def _frame_of(message: Message) -> str:
+    """The frame that moves, of an odometry, or in whose axes an IMU reports."""
+    return str(getattr(message, "child_frame_id", "") or message.header.frame_id)
 
 
 def _keep_image(evidence: Evidence, role: str, stamp: int, message: Message) -> None:

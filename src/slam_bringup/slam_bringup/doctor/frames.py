@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from slam_bags.reading.agent_stream import FOLLOWING
 from slam_bringup.doctor.evidence import Evidence
 from slam_bringup.doctor.finding import Finding
 from slam_core.camera import CameraInfo
@@ -25,15 +26,16 @@ def check_frames(evidence: Evidence) -> Iterator[Finding]:
     for role in roles:
         yield from _mounting(evidence, role, evidence.calibrations[role].frame)
         yield from _disagreement(evidence, role)
-    if "imu" in evidence.image_frames:
-        yield from _mounting(evidence, "imu", evidence.image_frames["imu"])
+    for role in FOLLOWING:
+        if role in evidence.image_frames:
+            yield from _mounting(evidence, role, evidence.image_frames[role])
     yield from _right_camera(evidence)
 
 
 def _no_transforms(evidence: Evidence, roles: list[str]) -> Iterator[Finding]:
     """Sensors that nothing joins to the rig's frame; a camera that is the rig's frame itself needs no transform."""
     frames = [evidence.calibrations[role].frame for role in roles]
-    frames += [frame for role, frame in evidence.image_frames.items() if role == "imu"]
+    frames += [frame for role, frame in evidence.image_frames.items() if role in FOLLOWING]
     unknown = sorted({frame for frame in frames if frame != evidence.base_frame})
     if not unknown:
         return
@@ -66,7 +68,7 @@ def _mounting(evidence: Evidence, role: str, frame: str) -> Iterator[Finding]:
                 "record them, or name another frame of the rig: --base-frame",
             )
         return
-    if role != "imu" and np.allclose(T[:3, :3], np.eye(3), atol=1e-3):
+    if role not in FOLLOWING and np.allclose(T[:3, :3], np.eye(3), atol=1e-3):
         yield Finding(
             "optical frame",
             f"'{frame}' has the axes of {evidence.base_frame}, an optical frame has x right, y down, z forward",

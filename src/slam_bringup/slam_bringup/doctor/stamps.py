@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from slam_bags.reading.agent_stream import FOLLOWING
 from slam_bringup.doctor.evidence import Evidence, Stamps, Stream
 from slam_bringup.doctor.finding import Finding
 from slam_core.geometry import FloatArray
@@ -49,7 +50,7 @@ def _order(evidence: Evidence) -> Iterator[Finding]:
     """Stamps that ``slam run`` and the nodes leave out, by the same guard, in the order of the recording."""
     guard, judged = StampGuard[None](), {role: _Judged() for role in evidence.streams}
     for role, stamp in _as_recorded(evidence.streams):
-        judged[role].take(guard.add(role, stamp, None, starts_sessions=role != "imu"))
+        judged[role].take(guard.add(role, stamp, None, starts_sessions=role not in FOLLOWING))
     for role, decision in guard.finish():
         judged[role].take(decision)
     for role, stream in evidence.streams.items():

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dense_mapping.dense_model import DenseConfig
-from ekf_slam_node.stage import IMU, MOTION, FilterConfig
+from ekf_slam_node.stage import IMU, MOTION, ODOMETRY, FilterConfig
 from ndt_registration.odometry import OdometryConfig
 from sjsam_node.global_map import GlobalMapConfig
 from slam_bags.reading.readings import AgentSensors
@@ -128,7 +128,7 @@ def choose(config: SystemConfig, mode: str, mapper: str, odometry: str, imu: str
 
 
 def filter_config(config: FilterConfig, sensors: AgentSensors) -> FilterConfig:
-    """The filter of an agent, whose frames wait for its IMU as well where it has one that is used.
+    """The filter of an agent, whose frames wait for its IMU and odometry as well where it has some that are used.
 
     Raises
     ------
@@ -138,7 +138,8 @@ def filter_config(config: FilterConfig, sensors: AgentSensors) -> FilterConfig:
     if config.imu.use == "on" and "imu" not in sensors.topics:
         raise ValueError("an IMU is asked for (--imu on) and there is no topic imu: name it by --topic imu=/...")
     imu = (IMU,) if "imu" in sensors.topics and config.imu.use != "off" else ()
-    return replace(config, agent=sensors.agent, wait_for=(*config.wait_for, *imu))
+    odometry = (ODOMETRY,) if "odometry" in sensors.topics and config.odometry.use != "off" else ()
+    return replace(config, agent=sensors.agent, wait_for=(*config.wait_for, *imu, *odometry))
 
 
 def _method(odometry: str, configured: str) -> str:

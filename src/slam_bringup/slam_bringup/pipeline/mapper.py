@@ -23,7 +23,7 @@ from slam_bringup.pipeline.sensor_pipeline import AgentItem
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.messages import motion_as_received, rounded
 from slam_core.runtime.memory import give_back, leave_libraries
-from slam_core.types import Features, ImuSample, PoseEstimate, Submap
+from slam_core.types import Features, ImuSample, OdometryReading, PoseEstimate, Submap
 
 _LOADED = 1, 4
 """Frames of an agent after which what images, and what the filter needs, is loaded."""
@@ -58,6 +58,8 @@ class Mapper:
         stage, value = self._filters[item.agent], item.value
         if isinstance(value, ImuSample):
             stage.add_imu(value)
+        elif isinstance(value, OdometryReading):
+            stage.add_odometry(value)
         elif isinstance(value, ScanEstimate):
             self._diaries[item.agent].scans.append(value.pose)
             stage.add_motion(value.pose.stamp_ns, motion_as_received(value.motion))

@@ -19,7 +19,7 @@ from pathlib import Path
 import cv2
 
 from sjsam_node.map_session import MapSession
-from slam_bags.reading.readings import ImuReading, Reading
+from slam_bags.reading.readings import ImuReading, PoseReading, Reading
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.pipeline.ahead import ahead
@@ -29,7 +29,7 @@ from slam_bringup.pipeline.run_record import run_result, told
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.runtime.memory import give_back, keep_little
-from slam_core.types import ImuSample
+from slam_core.types import ImuSample, OdometryReading
 from slam_viewer.results import RunResult
 
 _LOG = logging.getLogger(__name__)
@@ -144,4 +144,5 @@ def _extracted(
 
 
 def _is_of_an_image(item: Reading | AgentItem) -> bool:
-    return not isinstance(item.value if isinstance(item, AgentItem) else item, ImuReading | ImuSample)
+    value = item.value if isinstance(item, AgentItem) else item
+    return not isinstance(value, ImuReading | ImuSample | PoseReading | OdometryReading)

@@ -5,6 +5,7 @@ stereo -> StereoStage -> FeatureStage -> features
 depth  -> DepthStage ----^   \-> ScanOdometryStage -> motions
 laser  -------------------------^
 IMU    -------------------------^----------------> turn rates
+odometry ----------------------------------------> poses
 """
 
 from __future__ import annotations
@@ -19,19 +20,20 @@ from slam_bags.reading.readings import (
     DepthReading,
     ImuReading,
     LaserReading,
+    PoseReading,
     Reading,
     SessionStart,
     StereoReading,
 )
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_core.types import Features, ImuSample
+from slam_core.types import Features, ImuSample, OdometryReading
 from stereo_frontend.frame_log import FrameLog
 from stereo_frontend.frontend_config import FrontendReport
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
 from tof_driver.stage import DepthStage
 
-Value: TypeAlias = ExtractedFrame | Features | ScanEstimate | ImuSample | SessionStart
+Value: TypeAlias = ExtractedFrame | Features | ScanEstimate | ImuSample | OdometryReading | SessionStart
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,8 @@ class SensorPipeline:
         """Take a reading; yields what it leads to. A stereo pair that waits for its ToF image comes out later."""
         if isinstance(reading, ImuReading):
             yield from self._on_imu(reading.sample)
+        elif isinstance(reading, PoseReading):
+            yield self._item(reading.pose)
         elif isinstance(reading, StereoReading) and self._uses_stereo:
             yield from self._on_pair(reading)
         elif isinstance(reading, DepthReading) and self._uses_depth:

@@ -45,6 +45,7 @@ ARGUMENTS = (
     LaunchArgument("config", "", "YAML of parameters: groups named after the nodes, or ROS's form"),
     LaunchArgument("set", "", "parameters in one line: ekf_slam.submap.max_distance=1.5, tof_driver.pictures=both"),
     LaunchArgument("topics", "", "topics that are named otherwise: left=/cam/left/image_raw, right_info=/..."),
+    LaunchArgument("odometry_topic", "", "odometry of wheels, legs or another estimator [odometry]"),
     LaunchArgument("base_frame", "", "frame of the rig [base_link, below the agent's name]"),
     LaunchArgument("calibration", "", "folders of slam calibrate, comma-separated, instead of the drivers' infos"),
     LaunchArgument("rectified", "false", "the stereo images are rectified: image_rect", _BOOLEANS),
@@ -78,7 +79,9 @@ def plan_launch(values: Mapping[str, str]) -> LaunchPlan:
     """
     values = {argument.name: argument.default for argument in ARGUMENTS} | dict(values)
     overrides = _overrides(values)
-    topics = parse_topics(part.strip() for part in values["topics"].split(",") if part.strip())
+    given = [part.strip() for part in values["topics"].split(",") if part.strip()]
+    given += [f"odometry={values['odometry_topic']}"] if values["odometry_topic"] else []
+    topics = parse_topics(given)
     folders = [Path(part.strip()).expanduser() for part in values["calibration"].split(",") if part.strip()]
     names = BagNames(topics, values["base_frame"], read_rig_calibration(folders))
     overrides = with_files(overrides, names.calibration.parameters)

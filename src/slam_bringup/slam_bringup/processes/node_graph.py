@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ekf_slam_node.stage import IMU
+from ekf_slam_node.stage import IMU, ODOMETRY
 from slam_bags.reading.readings import AgentSensors
 from slam_bags.reading.rig_calibration import RigCalibration
 from slam_bags.reading.sensor_topics import is_rectified, join, nodes_name
@@ -71,17 +71,20 @@ def live_nodes(
     extra: Mapping[str, Mapping[str, Any]] | None = None,
     base_frames: Mapping[str, str] | None = None,
     with_imu: Iterable[str] = (),
+    with_odometry: Iterable[str] = (),
     with_laser: Iterable[str] = (),
     overrides: Overrides | None = None,
 ) -> list[NodeSpec]:
     """Nodes for rigs with the sensors that the mode of ``config`` needs.
 
     ``rectified``: their stereo images are. ``extra``: parameters by executable. ``base_frames``: frame of each agent's
-    rig, by default ``base_link`` below the agent's name. ``with_imu``: agents whose IMU is known to report; another's
-    is used as well, once it does. ``with_laser``: agents whose scan odometry registers the scans of a laser.
+    rig, by default ``base_link`` below the agent's name. ``with_imu``, ``with_odometry``: agents whose IMU or external
+    odometry is known to report; another's is used as well, once it does. ``with_laser``: agents whose scan odometry
+    registers the scans of a laser.
     ``overrides``: what of them is not in ``config``.
     """
-    base_frames, with_imu, with_laser = base_frames or {}, set(with_imu), set(with_laser)
+    base_frames, with_laser = base_frames or {}, set(with_laser)
+    known_streams = ((IMU, set(with_imu)), (ODOMETRY, set(with_odometry)))
     mode, extra, agents = config.feature_extractor.mode, extra or {}, tuple(agents)
     specs = []
     for agent in agents:
@@ -94,7 +97,7 @@ def live_nodes(
             frames = base | _below(agent, odom_frame="odom")
             specs.append(_spec("ndt_registration", "ndt_odometry", config.ndt_odometry, agent, extra, **frames))
         specs.append(_spec("stereo_frontend", "feature_extractor", config.feature_extractor, agent, extra))
-        wait_for = (*config.ekf_slam.wait_for, *(IMU,) * (agent in with_imu))
+        wait_for = (*config.ekf_slam.wait_for, *(name for name, known in known_streams if agent in known))
         own = base | {"agent": agent, "wait_for": wait_for}
         specs.append(_spec("ekf_slam_node", "ekf_slam", config.ekf_slam, agent, extra, **own))
     specs.append(_spec("sjsam_node", "sjsam", config.sjsam, "", extra, agents=agents if any(agents) else ()))
@@ -127,7 +130,8 @@ def plan_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
         extra=extra, base_frames=base_frames,
         overrides=overrides,
-        with_imu=[a for a, s in sensors.items() if "imu" in s.topics and config.ekf_slam.imu.use != "off"],
+        with_imu=_with(sensors, "imu", config.ekf_slam.imu.use),
+        with_odometry=_with(sensors, "odometry", config.ekf_slam.odometry.use),
         with_laser=[a for a, s in sensors.items() if s.scanner == "scan"],
     )  # fmt: skip
     specs = [replace(spec, parameters=spec.parameters | _REPLAY) for spec in specs]
@@ -144,6 +148,11 @@ def plan_nodes(
         finishers=tuple(name for executable in finishers for name in names[executable]),
         transforms=tuple(t.text for t in calibration.transforms(first.left_frame, first.tof_frame)),
     )
+
+
+def _with(sensors: Mapping[str, AgentSensors], role: str, use: str) -> list[str]:
+    """Agents with a topic of a role, unless its ``use`` is off."""
+    return [agent for agent, own in sensors.items() if role in own.topics and use != "off"]
 
 
 def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port: int) -> list[NodeSpec]:
@@ -193,7 +202,7 @@ def _bag_parameters(
 
 def _topics(sensor: AgentSensors, mode: str, odometry: bool, calibrated: Collection[str]) -> dict[str, str]:
     """Topics to play by the nodes' names; the camera infos of cameras that are ``calibrated`` come from files."""
-    roles = ["imu"]
+    roles = ["imu", "odometry"]
     if mode != "tof":
         roles += ["left", "right", "left_info", "right_info"]
     if odometry and sensor.scanner == "scan":

@@ -33,6 +33,7 @@ from slam_core.types import ByteArray
 from slam_simulation import Scenario, SimulatedFrame, Simulator
 from slam_simulation.sensors.stereo_sensor import SIDES
 from slam_simulation.sensors.tof_sensor import TofImages
+from slam_simulation.sensors.wheels import FRAME
 from slam_simulation.world.surface_table import compile_world
 
 IMAGE_FORMATS = ("raw", "png", "jpeg")
@@ -101,12 +102,16 @@ class SimulationWriter(SensorWriter):
             frames[TOF_FRAME] = s.tof.T_rig_tof
         if "imu" in sensors:
             frames[IMU_FRAME] = np.eye(4)
+        if s.wheels is not None:
+            frames[FRAME] = s.wheels.T_rig_frame
         self.extrinsics(stamp, frames)
 
     def frame(self, frame: SimulatedFrame) -> None:
         """All that one frame brings."""
         for sample in frame.imu:
             self.imu(sample)
+        for reading in frame.wheels:
+            self.odometry(reading)
         self.ground_truth(frame.stamp_ns, frame.T_world_rig)
         self._moving_truth(frame.stamp_ns, frame.T_world_rig)
         if frame.left is not None and frame.right is not None:
