@@ -135,6 +135,7 @@ class EkfNode(StageNode[EkfNodeConfig]):
             self.health.take(self.stage.counters.counts)
             self.health.show("rolling_shutter", self.stage.shutter_finding or "none seen")
             self.health.show("odometry", self.stage.odometry_finding or "none heard")
+            self.health.show("moving_objects", self.stage.moving_objects or "none seen")
 
     def _publish_result(self, result: EkfResult) -> None:
         pose, types, twist = result.pose, self.types, (result.twist, result.twist_covariance)

@@ -11,12 +11,13 @@ from functools import partial
 
 import numpy as np
 
-from ekf_slam_node.association.linking import FrameLink, Linker
+from ekf_slam_node.association.linking import CONVINCING, FrameLink, Linker
 from ekf_slam_node.config import MAX_FRAME_FEATURES, MAX_UPDATE_LANDMARKS, EkfSlamConfig
-from ekf_slam_node.filtering.candidates import motion_prior
+from ekf_slam_node.filtering.candidates import Candidates, MotionPrior, motion_prior
 from ekf_slam_node.filtering.common_error import COMMON_ERROR_FACTOR, CommonError
 from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.filtering.noise_monitor import InnovationWatch, NoiseMonitor
+from ekf_slam_node.loss_recovery import LossRecovery
 from ekf_slam_node.odometry.aids import AID_GATE, ALL, Aid, MotionAids, contradicts
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.submaps.frame_input import frame_of_strongest, usable_features
@@ -25,7 +26,6 @@ from ekf_slam_node.submaps.motion_checks import (
     StandingDetector,
     aided,
     explaining_sigma,
-    is_known,
     is_surprising,
     widened,
 )
@@ -34,7 +34,10 @@ from ekf_slam_node.submaps.rolling_shutter import RollingShutter
 from ekf_slam_node.submaps.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submaps.submap_chain import SubmapChain
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
-from slam_core.types import Counters, Features, ImuSample, OdometryReading, PoseEstimate, RelativeMotion, Submap
+from slam_core.types import Counters, Features, ImuSample, OdometryReading, RelativeMotion, Submap
+
+MOVING = "moving_objects"
+"""Name of things that move in the counters: ``frames_with_moving_objects``, ``features_on_moving_objects``."""
 
 
 class EkfSlam:
@@ -82,7 +85,8 @@ class EkfSlam:
         self._next_id = 0
         self._newest_stamp_ns = 0
         self._standing = StandingDetector(self.config.motion.standing_frames, self.config.association.gate)
-        self._missed = MissedFrames(self._linker, self._T_rig_optical, self.config.motion)
+        missed = MissedFrames(self._linker, self._T_rig_optical, self.config.motion)
+        self._recovery = LossRecovery(self.config, self._chain, self._aids, missed, self.counters, self._advance)
 
     # --------------------------------------------------------------------------------------------------------- input
     def process(self, features: Features, motion: RelativeMotion | None = None) -> EkfResult:
@@ -100,16 +104,16 @@ class EkfSlam:
         self.counters.add("features_unusable", int(len(features) - usable.sum()))
         frame = self._noise.corrected(frame_of_strongest(features, usable, MAX_FRAME_FEATURES))
         if not self._chain.is_open:
-            return self._begin(frame)
+            return self._recovery.begin(frame)
         slips = self._aids.external.slips
         try:
             result = self._advance(frame)
         except np.linalg.LinAlgError:
-            return self._abandon(frame, "a matrix could not be factored")
+            return self._recovery.abandon(frame, "a matrix could not be factored")
         if self._aids.external.slips > slips:
             self.counters.add("odometry_slips", self._aids.external.slips - slips)
         if not self._chain.local.is_finite:
-            return self._abandon(frame, "the estimate was no longer finite", result)
+            return self._recovery.abandon(frame, "the estimate was no longer finite", result)
         return result
 
     def _problem_with(self, features: Features) -> str:
@@ -169,11 +173,7 @@ class EkfSlam:
 
         It ends where an odometry has carried the rig to, if the last frames had no link.
         """
-        last = self._missed.last
-        if last is not None and self._chain.is_open and self._chain.is_bridging:
-            bridge = self._aids.bridge(self._chain.stamp_ns, last.stamp_ns)
-            if bridge is not None and bridge.reckoned is not None and is_known(bridge):
-                self._go_with(last, seconds_between(self._chain.stamp_ns, last.stamp_ns), bridge)
+        self._recovery.end_where_odometry_is()
         return self._chain.finish()
 
     # ----------------------------------------------------------------------------------------------------- Algorithm 3
@@ -183,23 +183,23 @@ class EkfSlam:
         aid = self._aids.between(self._chain.stamp_ns, frame.stamp_ns)
         linked = self._link(frame, dt, aid)
         if linked is None and aid is not None and aid.rows == ALL and aid.source == "scans":
-            return self._coast(frame, dt, aid)
+            return self._recovery.dead_reckon(frame, dt, aid)
         bridge = None
         if linked is None or self._chain.is_bridging:
             bridge = self._aids.bridge(self._chain.stamp_ns, frame.stamp_ns)
         if linked is None and bridge is not None:
             linked = self._link(frame, dt, bridge)
         if linked is None:
-            return self._miss(frame, bridge)
+            return self._recovery.track_lost(frame, bridge)
         if bridge is not None:
             self._chain.add_bridged_pose(frame.stamp_ns, bridge)
         if self._standing.add(linked):
-            return self._stand(linked)
+            return self._zero_velocity_update(linked)
         seen = self._augment(linked)
         self._predict(linked)
         updated = self._update(linked, seen)
         submaps = self._close(linked, seen, updated) if updated.closes else self._maintain(linked, updated)
-        return self._chain.result(frame.stamp_ns, *updated.state, submaps, updated)
+        return self._chain.result(frame.stamp_ns, *updated.state(linked.link), submaps, updated)
 
     def _link(self, frame: Frame, dt: float, aid: Aid | None) -> LinkedFrame | None:
         """Associate a frame with what is known, and learn its noise from the pairs; None if nothing fits."""
@@ -208,9 +208,16 @@ class EkfSlam:
         prior = aided(expected, aid)
         known = None if aid is None else prior.T
         predicted = self._shutter.corrected(frame, dt, known)
-        link = self._linker.link(local.candidates(), predicted, prior, partial(self._is_refuted, frame.stamp_ns))
+        candidates = local.candidates()
+        link = self._linker.link(candidates, predicted, prior, partial(self._is_refuted, frame.stamp_ns))
         if link is None:
             return None
+        link = self._without_moving(frame.stamp_ns, candidates, predicted, expected, link)
+        if link is None:
+            return None
+        if link.moving:
+            self.counters.add(f"frames_with_{MOVING}")
+            self.counters.add(f"features_on_{MOVING}", link.moving)
         measured = self._noise.learn(frame, link.excess)
         frame = self._shutter.corrected(measured, dt, link.T if known is None else known)
         if link.wrong is not None:
@@ -222,6 +229,29 @@ class EkfSlam:
         common = self._common.sigma(frame)
         aid = None if aid is None else widened(aid, common)
         return LinkedFrame(frame, measured, dt, link, aid, common, surprising, len(local.table))
+
+    def _without_moving(
+        self, stamp_ns: int, candidates: Candidates, frame: Frame, expected: MotionPrior, link: FrameLink
+    ) -> FrameLink | None:
+        """The link, or where the IMU contradicts it that of the features which agree with the IMU, if there are any.
+
+        None if there are not, and few features have made the link: the IMU bridges the frame.
+        """
+        told = self._aids.witness(self._chain.stamp_ns, stamp_ns)
+        if told is None:
+            return link
+        if not contradicts(told, link.T, link.covariance, AID_GATE):
+            return replace(link, is_sure=True)
+        other = self._linker.link_at(candidates, frame, aided(expected, told), link.excess)
+        if other is None or contradicts(told, other.T, other.covariance, AID_GATE):
+            if told.rows != ALL or len(link.rows) >= CONVINCING * min(len(candidates), len(frame)):
+                return link
+            self._aids.doubt(stamp_ns)
+            self.counters.add("links_refuted")
+            return None
+        moving = np.setdiff1d(link.columns, other.columns)
+        self._linker.mark_moving(frame, moving)
+        return replace(other, moving=link.moving + len(moving))  # which the IMU is sure of
 
     def _is_refuted(self, stamp_ns: int, link: FrameLink) -> bool:
         """True if looks alone have led to a place where the IMU says that the rig cannot be."""
@@ -250,7 +280,7 @@ class EkfSlam:
         step = local.predict(linked.dt, sigma, link.T)
         if aid is not None:
             fits = not contradicts(aid, link.T, linked.motion_covariance, AID_GATE)
-            self._count_aid(fits and local.apply_motion(step, aid, link.T))
+            self._recovery.count_aid(fits and local.apply_motion(step, aid, link.T))
         self._tell_imu(linked)
 
     def _tell_imu(self, linked: LinkedFrame) -> None:
@@ -267,7 +297,7 @@ class EkfSlam:
         if not report.applied:
             self.counters.add("updates_failed")
         local.drift_by(linked.common)
-        self._arrive(linked.frame)
+        self._recovery.arrive(linked.frame)
         ids, index = local.table.ids[measured.slots], linked.frame.index[measured.columns]
         self._shutter.learn(linked.measured, ids, measured.columns, linked.link.T, linked.dt)
         return UpdatedFrame(report, measured, closes, ids, index)
@@ -284,21 +314,8 @@ class EkfSlam:
         self._chain.follow(linked.frame, seen, updated.measured, self._aids.up)
         return submaps
 
-    def _count_aid(self, applied: bool) -> None:
-        self.counters.add("aids_used" if applied else "aids_rejected")
-
-    def _arrive(self, frame: Frame, standing: bool = False) -> None:
-        """The filter has reached a frame: its pose joins the submap's path."""
-        self._chain.add_pose(frame.stamp_ns, standing)
-        self._drop_older(frame)
-
-    def _drop_older(self, frame: Frame) -> None:
-        """Forget missed frames and readings of other sensors from before a frame that is in the map."""
-        self._missed.clear()
-        self._aids.forget_before(frame.stamp_ns)
-
     # ------------------------------------------------------------------------------------------------------- standing
-    def _stand(self, linked: LinkedFrame) -> EkfResult:
+    def _zero_velocity_update(self, linked: LinkedFrame) -> EkfResult:
         """The rig stands: neither pose nor map change.
 
         If it creeps, the frames link to the landmarks at an ever larger motion, which ends the standing.
@@ -306,81 +323,5 @@ class EkfSlam:
         self._chain.local.stand()
         self._tell_imu(linked)
         self.counters.add("frames_standing")
-        self._arrive(linked.frame, standing=True)
+        self._recovery.arrive(linked.frame, standing=True)
         return self._chain.result(linked.frame.stamp_ns, TrackingState.OK, "")
-
-    # ------------------------------------------------------------------------------------------------ without a link
-    def _coast(self, frame: Frame, dt: float, aid: Aid) -> EkfResult:
-        """No link, but something else has measured the motion: go with it."""
-        self._go_with(frame, dt, aid)
-        reason = "no visual association, moved by odometry alone"
-        return self._chain.result(frame.stamp_ns, TrackingState.DEGRADED, reason)
-
-    def _go_with(self, frame: Frame, dt: float, aid: Aid) -> None:
-        """Move the filter to a frame that is not linked by a motion that something else has measured."""
-        self._count_aid(self._chain.local.move_without_link(frame, dt, aid))
-        self._aids.moved(self._chain.stamp_ns, frame.stamp_ns)
-        self._arrive(frame)
-
-    def _miss(self, frame: Frame, bridge: Aid | None) -> EkfResult:
-        """No link: nothing is mapped.
-
-        The filter stays at the last linked frame, so that the old map can be found again. Odometry or IMU tell
-        meanwhile where the rig is, as long as they know. Two missed frames that link to each other begin a new submap.
-        """
-        is_bridged = bridge is not None and is_known(bridge)
-        missed = self._missed.add(frame)
-        if missed is not None:
-            return self._cross(missed, frame) if is_bridged else self._restart(missed, frame)
-        if bridge is not None and is_bridged:
-            self.counters.add("frames_bridged")
-            reason = f"no visual association, bridged by {bridge.source}"
-            bridged = self._chain.add_bridged_pose(frame.stamp_ns, bridge)
-            return self._chain.result(frame.stamp_ns, TrackingState.DEGRADED, reason, pose=bridged)
-        self.counters.add("frames_lost")
-        reason = f"{len(frame)} features, fewer than {self.config.association.min_inliers} associations"
-        return self._chain.result(frame.stamp_ns, TrackingState.LOST, reason)
-
-    def _cross(self, missed: Frame, frame: Frame) -> EkfResult:
-        """Begin a new submap at a missed frame, to which odometry or IMU have carried the rig: the old one ends there.
-
-        The old landmarks are no longer known well from there, and all wrong by the same: a gate that holds this error
-        lets a few features of other places through, and these would decide where the rig is.
-        """
-        start_ns = self._chain.stamp_ns
-        bridge = self._aids.bridge(start_ns, missed.stamp_ns)
-        if bridge is None:
-            return self._restart(missed, frame)
-        self.counters.add("gaps_bridged")
-        self._go_with(missed, seconds_between(start_ns, missed.stamp_ns), bridge)
-        submaps = self._chain.close()
-        self._chain.follow(missed, Sight.of_nothing(), Sight.of_nothing(), self._aids.up)
-        self._chain.local.set_velocity(*self._aids.velocity())
-        result = self._advance(frame)
-        return replace(result, submaps=submaps + result.submaps)
-
-    def _restart(self, missed: Frame, frame: Frame) -> EkfResult:
-        """The old map is not found again, but two missed frames agree: a new submap begins at the first of them."""
-        submaps = self._chain.close()
-        self._start(missed, self._chain.pose(missed.stamp_ns))
-        result = self._advance(frame)
-        return replace(result, submaps=submaps + result.submaps)
-
-    def _abandon(self, frame: Frame, reason: str, result: EkfResult | None = None) -> EkfResult:
-        """Give up the open submap, which cannot be trusted any more, and begin a new one at this frame."""
-        self.counters.add("submaps_abandoned")
-        self._start(frame, self._chain.last_sound_pose(frame.stamp_ns))
-        reason = f"{reason}: the open submap is given up, a new one begins"
-        return self._chain.result(frame.stamp_ns, TrackingState.LOST, reason, () if result is None else result.submaps)
-
-    def _begin(self, frame: Frame) -> EkfResult:
-        self._start(frame)
-        if len(frame) < self.config.association.min_inliers:
-            reason = f"only {len(frame)} features to begin with"
-            return self._chain.result(frame.stamp_ns, TrackingState.DEGRADED, reason)
-        return self._chain.result(frame.stamp_ns, TrackingState.OK, "")
-
-    def _start(self, frame: Frame, pose: PoseEstimate | None = None) -> None:
-        self._aids.moved(self._chain.stamp_ns, frame.stamp_ns)
-        self._chain.start(frame, pose, self._aids.up)
-        self._drop_older(frame)

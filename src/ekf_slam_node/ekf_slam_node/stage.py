@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
-from ekf_slam_node.slam import EkfSlam
+from ekf_slam_node.slam import MOVING, EkfSlam
 from slam_core.config import parameter
 from slam_core.frame_tree import FrameTree
 from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams
@@ -147,6 +147,13 @@ class FilterStage:
     def odometry_finding(self) -> str:
         """The calibration of an external odometry as it was learnt, or ""."""
         return "" if self._slam is None else self._slam.odometry_finding
+
+    @property
+    def moving_objects(self) -> str:
+        """In how many frames objects moved, whose features were left out, or ""."""
+        counts = self.counters.counts
+        frames, features = (counts.get(f"{what}_{MOVING}", 0) for what in ("frames_with", "features_on"))
+        return f"moving objects in {frames} frames: {features} features on them were left out" if frames else ""
 
     def landmark_view(self) -> LandmarkView:
         """The landmarks of the open submap after the newest result, of which there must be one."""

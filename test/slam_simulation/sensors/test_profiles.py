@@ -147,3 +147,15 @@ def test_exposure_moves_in_steps() -> None:
     gains = np.array([stepped(g, 1.0 / 3.0) for g in np.linspace(0.5, 2.0, 400)])
     assert len(np.unique(gains.round(9))) == 7
     assert stepped(0.7312, 0.0) == 0.7312
+
+
+def test_a_companion_stays_with_the_rig_and_is_seen(scenario: Scenario) -> None:
+    path = scenario.path()
+    things = MovingThings(MovingConfig(companions=1), path)
+    for t in np.arange(0.0, path.duration, 0.5):
+        assert 1.1 < np.linalg.norm(things.companion(0, t)[:2, 3] - path.pose(t)[:2, 3]) < 1.3
+    frames = [
+        next(Simulator(s, threads=1, truth=True).run(first=10, frames=11))
+        for s in (scenario, under(scenario, moving__companions=1))
+    ]
+    assert (frames[1].truth.depth < frames[0].truth.depth - 0.05).mean() > 0.03

@@ -22,6 +22,7 @@ from ekf_slam_node.association.association import (
     wrong_pair_variance,
 )
 from ekf_slam_node.association.motion_guess import MotionGuess, guess_motion, refine_motion
+from ekf_slam_node.association.two_motions import MovingTracks, two_motions
 from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.filtering.candidates import Candidates, MotionPrior
 from ekf_slam_node.filtering.models import Frame
@@ -42,11 +43,13 @@ _TRACK_HYPOTHESES = 30
 """Samples drawn for the motion of tracks, few of which are wrong."""
 _HYPOTHESES = 200
 """Samples drawn for the motion guess."""
+_ALIKE = 0.5
+"""Features on moving things, over those linked, from which on it is not sure which of them belong to the room."""
 _MAX_GATE_PX = 80.0
 """Prediction uncertainty (one sigma in the image) above which the prediction is not tried, px."""
 
 _METHODS = {"mahalanobis": associate_mahalanobis, "jcbb": associate_jcbb, "ccda": associate_ccda}
-_CONVINCING = 0.5
+CONVINCING = 0.5
 """Share of the features, or of the candidates where these are fewer, that a right prediction links."""
 
 
@@ -57,6 +60,7 @@ class FrameLink:
     T, covariance: (4, 4) T_previous_now from these pairs alone, with its covariance (6, 6). excess: (3,) by what
     factors the pairs' errors exceed their claimed variances. error: (k, 3) measured less predicted of each pair. wrong:
     (n, 3) variance of the frame's n features for wrong pairs, or None where the association lets hardly any through.
+    moving: how many features are on things that move. is_sure: by number and size it is clear which features these are.
     """
 
     T: FloatArray
@@ -66,6 +70,8 @@ class FrameLink:
     columns: IndexArray
     error: FloatArray
     wrong: FloatArray | None = None
+    moving: int = 0
+    is_sure: bool = True
 
 
 class Linker:
@@ -80,6 +86,8 @@ class Linker:
     def __init__(self, config: FeatureAssociationConfig, T_rig_optical: FloatArray) -> None:
         self._config = config
         self._T_rig_optical = T_rig_optical
+        self._moving = MovingTracks()
+        self._excess = np.ones(3)
 
     def link(
         self,
@@ -99,11 +107,32 @@ class Linker:
         predicted = self._by_tracks(candidates, frame, prior, rng)
         if predicted is None:
             predicted = self._by_prediction(candidates, frame, prior, rng)
-        if predicted is not None and len(predicted.rows) >= _CONVINCING * min(len(candidates), len(frame)):
+        known = min(len(candidates), len(frame))
+        if predicted is not None and (predicted.moving or len(predicted.rows) >= CONVINCING * known):
             return predicted
         # A prediction that is wrong and sure of itself finds the few pairs that agree with it: looks alone decide.
         guessed = self._by_guess(candidates, frame, rng, is_refuted)
         return max((link for link in (predicted, guessed) if link is not None), key=_number_of_pairs, default=None)
+
+    def link_at(self, candidates: Candidates, frame: Frame, prior: MotionPrior, excess: FloatArray) -> FrameLink | None:
+        """The pairs inside the gates of a motion that another sensor tells, and the motion that they agree on.
+
+        The gates are those of the features' true noise, by ``excess`` (3,) smaller than what they claim: what moves
+        slowly hides in the difference.
+        """
+        config, tight = self._config, frame.with_larger_noise(np.minimum(excess, 1.0))
+        rows, columns = self._associate(candidates, tight, prior)
+        rng = np.random.default_rng((config.seed, frame.stamp_ns))
+        pairs = candidates.places(rows), tight.places(columns)
+        guess = guess_motion(*pairs, self._T_rig_optical, rng, _HYPOTHESES, config.gate, prior.T)
+        if guess is None:
+            return None
+        rows, columns = rows[guess.inliers], columns[guess.inliers]
+        return self._link_of(candidates, frame, guess.T, rows, columns, config.min_inliers)
+
+    def mark_moving(self, frame: Frame, columns: IndexArray) -> None:
+        """Do not use the tracks of features ``columns`` (k,) again: they are on something that moves."""
+        self._moving.mark(frame.tracks[columns])
 
     def _by_tracks(
         self, candidates: Candidates, frame: Frame, prior: MotionPrior, rng: np.random.Generator
@@ -113,20 +142,37 @@ class Linker:
         rows, columns = same_tracks(candidates.tracks, frame.tracks)
         if len(rows) < max(config.min_inliers, _FOLLOWED * min(len(candidates), len(frame))):
             return None
+        still = ~self._moving.marks(frame.tracks[columns])
+        marked = int(np.sum(~still))
+        rows, columns = rows[still], columns[still]
+        two = two_motions(
+            candidates, frame, (rows, columns), self._T_rig_optical, rng, config.gate, config.min_inliers, self._excess,
+            prior.T,
+        )  # fmt: skip
+        if two is not None:
+            rows, columns = two.rows, two.columns
+            self.mark_moving(frame, two.moving)
         followed = candidates.places(rows), frame.places(columns)
-        guess = guess_motion(*followed, self._T_rig_optical, rng, _TRACK_HYPOTHESES, config.gate, prior.T)
+        initial = prior.T if two is None else two.T
+        guess = guess_motion(*followed, self._T_rig_optical, rng, _TRACK_HYPOTHESES, config.gate, initial)
         if guess is None or guess.inliers.sum() < max(config.min_inliers, 0.5 * len(rows)):
             return None
         more = self._of_the_rest(candidates, frame, guess, rows, columns)
         rows, columns = np.concatenate([rows, more[0]]), np.concatenate([columns, more[1]])
-        return self._link_of(candidates, frame, guess.T, rows, columns, config.min_inliers)
+        link = self._link_of(candidates, frame, guess.T, rows, columns, config.min_inliers)
+        if link is None:
+            return None
+        self._excess = 0.9 * self._excess + 0.1 * np.minimum(link.excess, 1.0)
+        moving = marked + (0 if two is None else len(two.moving))
+        is_sure = moving < _ALIKE * len(link.rows) and (two is None or two.is_larger)
+        return replace(link, moving=moving, is_sure=is_sure)
 
     def _of_the_rest(
         self, candidates: Candidates, frame: Frame, guess: MotionGuess, rows: IndexArray, columns: IndexArray
     ) -> tuple[IndexArray, IndexArray]:
         """Pairs of candidates and features of no common track, which a new track may have in sight again."""
-        free_rows = np.setdiff1d(np.arange(len(candidates)), rows)
-        free_columns = np.setdiff1d(np.arange(len(frame)), columns)
+        free_rows = np.setdiff1d(np.flatnonzero(~self._moving.marks(candidates.tracks)), rows)
+        free_columns = np.setdiff1d(np.flatnonzero(~self._moving.marks(frame.tracks)), columns)
         if min(len(free_rows), len(free_columns)) == 0:
             return rows[:0], columns[:0]
         noisier = frame.select(free_columns).with_larger_noise(np.maximum(guess.excess, 1.0))

@@ -147,6 +147,13 @@ class MotionAids:
             return True
         return self.inertial.measure(step, *at_place(T_previous_now, covariance, self._place()))
 
+    def witness(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+        """The motion, or its rotation, as an IMU tells it that has agreed with the images so far; None without one."""
+        if not self.inertial.is_proven:
+            return None
+        bridge = self._inertial_bridge(start_stamp_ns, end_stamp_ns)
+        return bridge or self._rotation_between(start_stamp_ns, end_stamp_ns)
+
     def refute(
         self, start_stamp_ns: int, end_stamp_ns: int, T_previous_now: FloatArray, covariance: FloatArray
     ) -> bool:
@@ -155,18 +162,21 @@ class MotionAids:
         Only by much: places that look the same are not next to each other. It counts against the IMU, too, which soon
         refutes no more if it is the one that is wrong.
         """
-        told = self._inertial_bridge(start_stamp_ns, end_stamp_ns)
-        told = told or self._rotation_between(start_stamp_ns, end_stamp_ns)
-        if told is None or not self.inertial.is_proven:
+        told = self.witness(start_stamp_ns, end_stamp_ns)
+        if told is None:
             return False
         error = np.abs(boxminus(told.T, T_previous_now))
         is_far = (error > _ELSEWHERE)[told.rows].any()
         if not is_far or not contradicts(told, T_previous_now, covariance, AID_GATE):
             return False
-        if end_stamp_ns != self._doubted_ns:
-            self._doubted_ns = end_stamp_ns
-            self.inertial.doubt()
+        self.doubt(end_stamp_ns)
         return True
+
+    def doubt(self, stamp_ns: int) -> None:
+        """A motion up to a stamp is not believed because of the IMU, which may be the one that is wrong."""
+        if stamp_ns != self._doubted_ns:
+            self._doubted_ns = stamp_ns
+            self.inertial.doubt()
 
     @property
     def newest_stamp_ns(self) -> int:

@@ -54,9 +54,11 @@ class UpdatedFrame:
     ids: np.ndarray
     index: np.ndarray
 
-    @property
-    def state(self) -> tuple[TrackingState, str]:
+    def state(self, link: FrameLink) -> tuple[TrackingState, str]:
         """State of the filter after the frame, and its reason."""
-        if self.report.applied:
-            return TrackingState.OK, ""
-        return TrackingState.DEGRADED, "no landmark could be measured, moved by the prediction alone"
+        if not self.report.applied:
+            return TrackingState.DEGRADED, "no landmark could be measured, moved by the prediction alone"
+        if not link.is_sure:
+            counts = f"{link.moving} features move against the {len(link.rows)} that the pose rests on"
+            return TrackingState.DEGRADED, f"moving objects: {counts}, and nothing else tells which are the room"
+        return TrackingState.OK, ""

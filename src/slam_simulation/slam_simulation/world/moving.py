@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Moving things: people who walk through the view, and a chair that somebody moves.
+"""Moving things: people who walk through the view or ahead of the rig, and a chair that somebody moves.
 
 Moving things are the last surfaces of the world, drawn where they stand at first; :class:`MovingThings` takes them to
 where they are at a time. Light is baked once, so a thing keeps the light, and its soft shadow, of its first place.
@@ -21,6 +21,8 @@ from slam_simulation.world.world import Material, World
 
 _EVERY_S, _SPEED, _AHEAD_M = 12.0, 1.2, 1.8
 """A person crosses the view so often (s), so fast (m/s), so far ahead of where the rig is then (m)."""
+_LEAD_S, _LEAD_M, _SWAY_M, _SWAY_HZ = 1.0, 1.2, 0.3, 0.13
+"""A companion walks so far (m) ahead of the rig, where it looks so much later (s), and to and fro across its way."""
 _CHAIR_AT = (0.3, 0.5)
 """Shares of the recording: where on the rig's way the chair stands, and when it is moved."""
 _CHAIR_SHIFT = np.array([0.5, 0.3, 0.0])
@@ -31,6 +33,7 @@ class MovingConfig(Config):
     """Numbers of moving things."""
 
     people: int = parameter(0, "people who walk through the view", minimum=0, maximum=5)
+    companions: int = parameter(0, "people who walk ahead of the rig at its own pace", minimum=0, maximum=2)
     moved_chairs: int = parameter(0, "chairs that are moved halfway through", minimum=0, maximum=5)
 
 
@@ -39,6 +42,8 @@ def add_moving(world: World, config: MovingConfig, path: Path, rooms: tuple[Room
     things = MovingThings(config, path)
     for k in range(config.people):
         _person(world, _spot(rooms, things.person(k, 0.0)))
+    for k in range(config.companions):
+        _person(world, _spot(rooms, things.companion(k, 0.0)))
     for k in range(config.moved_chairs):
         chair(world, _spot(rooms, things.chair(k, 0.0)))
 
@@ -54,6 +59,7 @@ class MovingThings:
         """The world at time ``t`` s."""
         c = self._config
         motions = [(self.person(k, 0.0), self.person(k, t), _PERSON_SURFACES) for k in range(c.people)]
+        motions += [(self.companion(k, 0.0), self.companion(k, t), _PERSON_SURFACES) for k in range(c.companions)]
         motions += [(self.chair(k, 0.0), self.chair(k, t), _CHAIR_SURFACES) for k in range(c.moved_chairs)]
         first = len(table.origin) - sum(number for *_, number in motions)
         parts = [np.array(part) for part in (table.origin, table.edge_u, table.edge_v, table.normal)]
@@ -73,6 +79,13 @@ class MovingThings:
         crossing = first + number * _EVERY_S
         aside = (-1) ** (number + k) * _SPEED * (t - crossing)
         return self._beside_the_way(crossing, aside, _AHEAD_M)
+
+    def companion(self, k: int, t: float) -> FloatArray:
+        """Pose (4, 4) of the feet of somebody who walks ahead of the rig, at time ``t`` s."""
+        T = self._beside_the_way(t + _LEAD_S, 0.0)
+        aside = _SWAY_M * np.sin(2.0 * np.pi * _SWAY_HZ * t + k) + 0.6 * k
+        T[:2, 3] = self._path.pose(min(t, self._path.duration))[:2, 3] + T[:2, :2] @ [_LEAD_M, aside]
+        return T
 
     def chair(self, k: int, t: float) -> FloatArray:
         """Pose (4, 4) of a chair at time ``t`` s."""
