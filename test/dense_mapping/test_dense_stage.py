@@ -11,7 +11,7 @@ from dense_mapping.dense_stage import DenseStage
 from dense_room import Room
 from slam_core.geometry import OPTICAL_FROM_RIG, boxplus, invert_transform, make_transform, so3_exp
 from slam_core.trajectory import Trajectory
-from slam_core.types import ByteArray
+from slam_core.types import ByteArray, Mask
 
 T_BASE_CAMERA = make_transform(OPTICAL_FROM_RIG.T, np.array([0.1, 0.0, 0.0]))
 T_MAP_WORLD = make_transform(so3_exp(np.array([0.06, -0.04, 0.0])), np.zeros(3))
@@ -100,3 +100,38 @@ def test_what_was_put_in_at_a_wrong_pose_follows_and_so_does_gravity(room: Room)
 
 def test_without_an_accelerometer_nothing_is_said_of_gravity(room: Room) -> None:
     assert DenseStage(DenseConfig(), {"one": path_of(room, "one")}).specific_force() is None
+
+
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("final", [False, True])
+def test_masked_pixels_are_not_in_the_model(room: Room, final: bool, late: bool) -> None:
+    path = path_of(room, "one")
+    stamp, image = int(path.stamps_ns[0]), room.depth(0, np.random.default_rng(5))
+    object.__setattr__(image, "stamp_ns", stamp)
+    pixels = np.zeros(image.depth.shape, np.uint8)
+    pixels[:, : pixels.shape[1] // 2] = 1
+    masks = frozenset({"one/tof"})
+    with DenseStage(DenseConfig(), {"one": path} if final else None, with_masks=masks) as stage:
+        stage.add_odometry("one", path.poses[0])
+        assert stage.wants("one", "tof", stamp, T_BASE_CAMERA)
+        steps = [
+            lambda: stage.add_mask("one", "tof", Mask(stamp, pixels)),
+            lambda: stage.add("one", "tof", T_BASE_CAMERA, image),
+        ]
+        for step in reversed(steps) if late else steps:
+            step()
+        stage.set_path("one", path)
+        stage.finish()
+    (placed,) = stage.model.keyframes
+    depth = placed.keyframe.depth
+    edge = (pixels.shape[1] // 2 + 8) * depth.shape[1] // pixels.shape[1]
+    assert not depth[:, :edge].any()
+    assert depth[:, edge + 1 :].any()
+    assert stage.refused_masks == 0
+
+
+def test_a_mask_of_another_size_is_refused(room: Room) -> None:
+    stage, image = DenseStage(DenseConfig()), room.depth(0, np.random.default_rng(5))
+    stage.add_mask("one", "tof", Mask(image.stamp_ns, np.ones((7, 9), np.uint8)))
+    stage.add("one", "tof", T_BASE_CAMERA, image)
+    assert (stage.refused_masks, stage.waiting) == (1, 1)

@@ -46,6 +46,7 @@ pytestmark = pytest.mark.ros
 LENS = Camera(320, 240, 198.0, 199.0, 158.0, 123.0, "plumb_bob", (-0.05, 0.01, 1e-4, 0.0, 0.0))
 P = np.array([[200.0, 0, 160, 0], [0, 200.0, 120, 0], [0, 0, 1, 0]])
 INFOS = {"left": CameraInfo(LENS, P=P), "right": CameraInfo(LENS, P=P - np.array([[0, 0, 0, 24.0], [0] * 4, [0] * 4]))}
+RECTIFIED = {side: CameraInfo(info.rectified, P=info.P) for side, info in INFOS.items()}
 SIDES = ("left", "right")
 
 
@@ -218,3 +219,47 @@ def test_a_source_without_calibration_does_not_start(start, tmp_path: Path):
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 2
     assert "left_info" in errors
+
+
+def test_the_node_honours_masks_and_rejects_others(probe, start, stereo_pair):
+    """Rectified images come in, and masks after them; one of 16 bits is rejected, one of another size said."""
+    for topic, kind in zip(FEATURE_TOPICS, (PointCloud2, Image, InfoMessage), strict=True):
+        probe.listen(topic, kind)
+    probe.listen("/diagnostics", DiagnosticArray)
+    start("node", **{"mask.use": "always"})
+    pair, mask = stereo_pair(), np.zeros((240, 320), np.uint8)
+    mask[:, 160:] = 255
+    for topic in ("stereo/left/image_rect", "stereo/right/image_rect", "mask"):
+        probe.wait(lambda t=topic: probe.node.count_subscribers(t) > 0, f"no subscriber to {topic}")
+
+    def header(stamp: int, side: str = "left") -> object:
+        return header_message(probe.types, stamp, f"stereo_{side}_optical_frame")
+
+    def send(stamp: int, pixels: np.ndarray) -> None:
+        for side, image in zip(SIDES, (pair.left, pair.right), strict=True):
+            probe.send(f"stereo/{side}/camera_info", camera_info_message(probe.types, header(stamp), RECTIFIED[side]))
+            probe.send(f"stereo/{side}/image_rect", image_message(probe.types, header(stamp, side), image))
+        probe.send("mask", image_message(probe.types, header(stamp), pixels))
+
+    outputs = [probe.received[t] for t in FEATURE_TOPICS]
+    stamp = 1_000_000_000
+    while not all(outputs):
+        assert stamp < 8_000_000_000, "no features"
+        send(stamp, mask)
+        probe.spin(0.5)
+        stamp += 100_000_000
+    features = features_from_messages(*(o[-1] for o in outputs))
+    assert len(features) > 30
+    assert features.uv[:, 0].max() < 160
+    send(stamp, mask.astype(np.uint16))
+    send(stamp + 100_000_000, mask[::2, ::2])
+
+    def values() -> dict[str, str]:
+        status = [s for m in probe.received["/diagnostics"] for s in m.status if s.name.endswith("feature_extractor")]
+        return {entry.key: entry.value for entry in status[-1].values} if status else {}
+
+    probe.wait(lambda: values().get("masks_of_another_size") == "1", "not counted")
+    assert values()["rejected"] == "1"
+    assert "masks are 160 x 120 px, the rectified images 320 x 240 px" in values()["reason"]
+    assert values()["state"] == "DEGRADED"
+    assert int(values()["frames_masked"]) >= 1

@@ -10,8 +10,8 @@
     with DenseStage(config, final=trajectories) as stage:   # key frames are chosen by the trajectories
         ...
 
-A key frame waits until a path has a pose for its stamp, and of a final model until the colour picture of its time can
-have come. What accelerometers read turns with the path too: it levels the floor plans.
+A key frame waits until a path has a pose for its stamp, and of a final model until the colour picture and the mask of
+its time can have come. What accelerometers read turns with the path too: it levels the floor plans.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ from dense_mapping.colours import RecentColours, stereo_picture
 from dense_mapping.dense_model import DenseConfig, DenseModel
 from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.keyframes import Keyframe, KeyframeSelector, make_keyframe, with_picture
+from dense_mapping.masks import RecentMasks, masked
 from dense_mapping.stereo_depth import stereo_depth
 from dense_mapping.surface import Surface
 from slam_core.geometry import FloatArray
 from slam_core.runtime.memory import give_back, trim
 from slam_core.trajectory import Trajectory
-from slam_core.types import ByteArray, DepthImage
+from slam_core.types import ByteArray, DepthImage, Mask
 from stereo_frontend.sources import RawPair
 from stereo_frontend.stage import StereoStage
 
@@ -62,6 +63,8 @@ class DenseStage:
         Trajectories by agent that will not change; None: they come by :meth:`set_path` and change.
     coloured
         Agents whose depth images have colour pictures; of others it is known when one comes.
+    with_masks
+        Cameras, ``AGENT/stereo`` or ``AGENT/tof``, that have masks; of others it is known when one comes.
 
     Attributes
     ----------
@@ -69,13 +72,19 @@ class DenseStage:
         The model; what waits is not in it yet.
     dropped
         Key frames that were dropped because no pose came for them.
+    refused_masks
+        Key frames whose mask was of another size.
     """
 
     def __init__(
-        self, config: DenseConfig, final: Mapping[str, Trajectory] | None = None, coloured: frozenset[str] = frozenset()
+        self,
+        config: DenseConfig,
+        final: Mapping[str, Trajectory] | None = None,
+        coloured: frozenset[str] = frozenset(),
+        with_masks: frozenset[str] = frozenset(),
     ) -> None:
         self.config = config
-        self._final, self._first_coloured = final, coloured
+        self._final, self._first_coloured, self._first_masked = final, coloured, with_masks
         self._pool = None if final is None else ThreadPoolExecutor(1, "field")
         self._last: Future[None] | None = None
         self.reset()
@@ -91,7 +100,7 @@ class DenseStage:
     def reset(self) -> None:
         """Forget everything."""
         self.model = DenseModel(self.config, fixed=self._final is not None)
-        self.dropped = self._put = 0
+        self.dropped = self.refused_masks = self._put = 0
         self._paths = dict(self._final or {})
         self._coloured = set(self._first_coloured)
         self._selectors: dict[str, KeyframeSelector] = {}
@@ -99,6 +108,7 @@ class DenseStage:
         self._mounts: dict[str, tuple[str, FloatArray]] = {}
         self._waiting: deque[_Waiting] = deque()
         self._colours: dict[str, RecentColours] = {}
+        self._masks = {camera: RecentMasks() for camera in self._first_masked}
         self._forces: dict[str, deque[tuple[int, FloatArray]]] = {}
 
     def begin_session(self) -> None:
@@ -142,7 +152,8 @@ class DenseStage:
         """Take the depth image of a key frame; ``picture`` (h, w[, 3]) uint8, by default the amplitude."""
         camera = f"{agent}/{sensor}"
         self._mounts[camera] = (agent, T_base_camera)
-        self._waiting.append(self._with_colour(_Waiting(camera, make_keyframe(image, self.config.keyframe, picture))))
+        item = _Waiting(camera, make_keyframe(image, self.config.keyframe, picture))
+        self._waiting.append(self._with_mask(self._with_colour(item)))
         if self._final is not None:
             self._place()
         elif len(self._waiting) > _MAX_WAITING:
@@ -167,6 +178,17 @@ class DenseStage:
         self._coloured.add(agent)
         self._colours.setdefault(camera, RecentColours()).add(stamp_ns, picture)
         self._waiting = deque(self._with_colour(item) if item.camera == camera else item for item in self._waiting)
+        if self._final is not None:
+            self._place()
+
+    def add_mask(self, agent: str, sensor: str, mask: Mask) -> None:
+        """Take a mask in the pixels of the camera's images, before or after the image that it belongs to.
+
+        One of another size than a key frame of its time is counted as refused.
+        """
+        camera = f"{agent}/{sensor}"
+        self._masks.setdefault(camera, RecentMasks()).add(mask)
+        self._waiting = deque(self._with_mask(item) if item.camera == camera else item for item in self._waiting)
         if self._final is not None:
             self._place()
 
@@ -217,6 +239,22 @@ class DenseStage:
         picture = None if colours is None else colours.near(item.keyframe.stamp_ns)
         return item if picture is None else replace(item, keyframe=with_picture(item.keyframe, picture))
 
+    def _with_mask(self, item: _Waiting) -> _Waiting:
+        masks = self._masks.get(item.camera)
+        mask = None if masks is None else masks.at(item.keyframe.stamp_ns)
+        if mask is None:
+            return item
+        try:
+            return replace(item, keyframe=masked(item.keyframe, mask))
+        except ValueError:
+            self.refused_masks += 1
+            return item
+
+    def _awaits_mask(self, item: _Waiting) -> bool:
+        """True if the mask of an image of a final model may still come."""
+        masks = self._masks.get(item.camera)
+        return self._final is not None and masks is not None and masks.newest_ns < item.keyframe.stamp_ns
+
     def _awaits_colour(self, item: _Waiting) -> bool:
         """True if the colour picture of a depth image of a final model may still come."""
         agent, _, sensor = item.camera.rpartition("/")
@@ -231,7 +269,7 @@ class DenseStage:
         before = self._put
         for item in self._waiting:
             T = self._pose(item.camera, item.keyframe.stamp_ns)
-            if T is None or (not is_over and self._awaits_colour(item)):
+            if T is None or (not is_over and (self._awaits_colour(item) or self._awaits_mask(item))):
                 still.append(item)
             else:
                 self._add_to_model(item, T)

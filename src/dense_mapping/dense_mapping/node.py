@@ -31,6 +31,7 @@ from slam_core.messages import (
     grey_from_message,
     header_message,
     imu_from_message,
+    mask_from_message,
     occupancy_message,
     path_from_message,
     pose_from_message,
@@ -106,6 +107,8 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
             topics = {own(topic): kind for topic, kind in topics.items()}
             listen_together(topics, partial(self._on_depth, agent), required=False)
             listen(own("tof/color/image"), "Image", partial(self._on_colour, agent, "tof"), required=False)
+            masks = partial(self._on_mask, agent, "tof")
+            listen(own("tof/mask"), "Image", masks, required=False, stamps=StampPolicy.FOLLOWS)
         if self.config.use_stereo:
             for side in SIDES:
                 topic = own(f"stereo/{side}/camera_info")
@@ -114,6 +117,8 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
             listen_together(pairs, partial(self._on_pair, agent), required=False)
             # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
             self.create_subscription(self.types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
+            masks = partial(self._on_mask, agent, "stereo")
+            listen(own("mask"), "Image", masks, required=False, stamps=StampPolicy.FOLLOWS)
             colours = own("stereo/left/image_rect_color")
             listen(colours, "Image", partial(self._on_colour, agent, "stereo"), required=False)
 
@@ -127,6 +132,9 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
 
     def _on_colour(self, agent: str, sensor: str, message: Message) -> None:
         self.mapper.add_colour(agent, sensor, stamp_ns(message), colour_from_message(message))
+
+    def _on_mask(self, agent: str, sensor: str, message: Message) -> None:
+        self.mapper.add_mask(agent, sensor, mask_from_message(message))
 
     def _on_info(self, agent: str, side: str, message: Message) -> None:
         self._pairs[agent].set_info(side, camera_info_from_message(message))
@@ -163,6 +171,7 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
                 "key frames": len(self.mapper.model.keyframes),
                 "waiting for a pose": self.mapper.waiting,
                 "dropped without a pose": self.mapper.dropped,
+                "masks of another size": self.mapper.refused_masks,
                 "key frames moved": self.mapper.model.moved,
                 "blocks refused": self.mapper.model.volume.refused_blocks,
             }

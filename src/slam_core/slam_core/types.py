@@ -47,10 +47,19 @@ def no_colour() -> None:
 
 
 @dataclass(frozen=True, eq=False)
+class Mask:
+    """Pixels (height, width) uint8 of a rectified image that are not to be used, of people for instance: not zero."""
+
+    stamp_ns: int
+    pixels: ByteArray
+
+
+@dataclass(frozen=True, eq=False)
 class StereoImages:
     """A rectified pair: ``left`` and ``right`` uint8, shape (height, width), of ``stereo``, left in ``frame_id``.
 
-    ``colour`` makes the left image in colour: few frames are shown, all are searched for features.
+    ``colour`` makes the left image in colour: few frames are shown, all are searched for features. ``mask``: see
+    :class:`Mask`, of the left image.
     """
 
     stamp_ns: int
@@ -59,6 +68,7 @@ class StereoImages:
     stereo: StereoCamera
     frame_id: str = "stereo_left_optical_frame"
     colour: MakeColour = no_colour
+    mask: ByteArray | None = None
 
     def picture(self) -> ByteArray:
         """The left image in colour, or grey of a grey camera."""
@@ -81,6 +91,7 @@ class DepthImage:
     amplitude: Float32Array | None = None
     intensity: Float32Array | None = None
     frame_id: str = "tof_optical_frame"
+    mask: ByteArray | None = None
 
     def points(self) -> Float32Array:
         """Points (height, width, 3) float32 in the optical frame, NaN where there is no depth."""

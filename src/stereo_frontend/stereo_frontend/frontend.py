@@ -101,7 +101,7 @@ class Frontend:
         return self._extract(images) if self._tracker is None else None
 
     def _extract(self, images: StereoImages) -> tuple[Keypoints, Keypoints]:
-        left = self._pool.submit(self._left, images.left)
+        left = self._pool.submit(self._left, images.left, images.mask)
         right = self._right(images.right)
         return left.result(), right
 
@@ -193,7 +193,7 @@ class Frontend:
             return self._measured(images, *self._extract(images), depth, T_left_tof)
 
         parts = follow_or_detect(
-            tracker, images.left, images.stereo.camera, images.stamp_ns, measure, detect, self._noise.sigma
+            tracker, images.left, images.stereo.camera, images.stamp_ns, measure, detect, self._noise.sigma, images.mask
         )
         features = [self._features(images, p.keypoints, p.estimate, p.sigma_uv, p.track_ids) for p in parts]
         return features[0] if len(features) == 1 else features[0].joined(features[1])
@@ -241,21 +241,18 @@ class Frontend:
             self._tracker.reset()
         self.counters = Counters()
 
+    @property
+    def masked(self) -> int:
+        """Keypoints left out so far because they lie in masks."""
+        return self._left.masked + self._tof.masked
+
     def report(self) -> FrontendReport:
         """Findings about the images so far."""
-        calibrations = (self.self_calibration, self.range_calibration)
-        advice = (self._device.complaint, *(part.advice() for part in (*calibrations, self._tof)))
+        stereo, ranges, device = self.self_calibration, self.range_calibration, self._device
+        advice = tuple(filter(None, (device.complaint, stereo.advice(), ranges.advice(), self._tof.advice())))
         picture = "+".join(self._tof.used) if self.config.mode == "tof" else "stereo"
-        correction = self.self_calibration.error if self.self_calibration.corrects else None
-        return FrontendReport(
-            calibrations[0].figures(),
-            tuple(filter(None, advice)),
-            picture,
-            correction,
-            calibrations[1].figures(),
-            self._device.name,
-            self._device.complaint,
-        )
+        error = stereo.error if stereo.corrects else None
+        return FrontendReport(stereo.figures(), advice, picture, error, ranges.figures(), device.name, device.complaint)
 
     def _described(self, images: StereoImages, left: Keypoints, needed: npt.NDArray[np.bool_]) -> Keypoints:
         """The left keypoints with descriptors for other moments: of those ``needed``, zeros for the others."""

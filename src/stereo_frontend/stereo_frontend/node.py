@@ -18,11 +18,13 @@ from slam_core.messages import (
     grey_from_message,
     header_message,
     image_message,
+    mask_from_message,
     stamp_ns,
 )
 from slam_core.messages.base import Message
 from slam_core.nodes.calibration_watch import CalibrationWatch
 from slam_core.nodes.stage_node import StageNode
+from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.ros import run_node
 from slam_core.types import ByteArray, Features
 from stereo_frontend.depth.tof_features import CLIP, GAMMA, normalised_picture
@@ -53,6 +55,9 @@ class FeatureNode(StageNode[FrontendConfig]):
             self._listen_to_stereo()
         if self.config.mode != "stereo":
             self._listen_to_depth()
+        if self.config.mask.use != "never":
+            topic = "tof/mask" if self.config.mode == "tof" else "mask"
+            self.listen(topic, "Image", self._on_mask, required=False, stamps=StampPolicy.FOLLOWS)
 
     def on_reset(self) -> None:
         """Forget thresholds, noise and queues, and use the newest calibration."""
@@ -112,6 +117,10 @@ class FeatureNode(StageNode[FrontendConfig]):
         self.depth_calibration.require_unchanged()
         pictures = {} if picture is None else {self._tof_picture(): picture}
         self.stage.add_depth(depth_from_messages(depth, noise, info, **pictures))
+        self.publish_ready()
+
+    def _on_mask(self, message: Message) -> None:
+        self.stage.add_mask(mask_from_message(message))
         self.publish_ready()
 
     # -- outputs -------------------------------------------------------------------------------------------------------

@@ -2,22 +2,23 @@
 """The stereo front end without ROS, in two stages: raw pairs to rectified ones, and these, with depth, to features.
 
 RawPair -> StereoStage -> StereoImages --> FeatureStage -> Features
-                           DepthImage -----^
+                     DepthImage, Mask -----^
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
-from slam_core.types import DepthImage, Features, StereoImages
-from stereo_frontend.depth.depth_pairing import DepthPairing
+from slam_core.types import DepthImage, Features, Mask, StereoImages
 from stereo_frontend.frontend import Frontend
 from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
+from stereo_frontend.masks import Masking
+from stereo_frontend.nearest_pairing import NearestPairing
 from stereo_frontend.sources import RawPair
 from stereo_frontend.stereo.calibrated_pairs import CalibratedPairs
 from stereo_frontend.stereo.corrected_info import corrected_right
@@ -106,13 +107,15 @@ class FeatureStage:
         self._mode = config.mode
         self._frames = frames
         self._frontend = Frontend(config)
-        self._pairing = DepthPairing(config.fusion.max_age)
+        self._masking = Masking(config.mask)
+        self._pairing = NearestPairing[StereoImages, DepthImage]("depth image", config.fusion.max_age)
         self._ready: deque[tuple[StereoImages | None, DepthImage | None]] = deque()
 
     @property
     def counters(self) -> dict[str, int]:
         """Counts of what was accepted and rejected, by name."""
-        return self._frontend.counters.counts
+        masked = {"keypoints_masked": self._frontend.masked} if self._masking.counters.counts else {}
+        return self._frontend.counters.counts | self._masking.counters.counts | masked
 
     def report(self) -> FrontendReport:
         """Findings of the front end about the images so far."""
@@ -120,27 +123,40 @@ class FeatureStage:
 
     @property
     def complaint(self) -> str:
-        """Reason for which features lack depth that they should have, or ""."""
-        return self._pairing.complaint
+        """Reason for which features lack depth or a mask that they should have, or ""."""
+        return "; ".join(filter(None, (self._pairing.complaint, self._masking.complaint)))
 
     @property
     def oldest_waiting_ns(self) -> int | None:
-        """Stamp of the oldest pair that waits for a depth image."""
-        return self._pairing.oldest_waiting_ns
+        """Stamp of the oldest frame that waits for a depth image or a mask."""
+        stamps = (self._pairing.oldest_waiting_ns, self._masking.oldest_waiting_ns)
+        return min((stamp for stamp in stamps if stamp is not None), default=None)
 
     def add_images(self, images: StereoImages) -> None:
-        """Take a rectified pair, which may have to wait for a depth image."""
-        if self._mode == "stereo":
-            self._ready.append((images, None))
-        elif self._mode != "tof":
-            self._ready += self._pairing.add_pair(images)
+        """Take a rectified pair, which may have to wait for a depth image or a mask."""
+        if self._mode != "tof":
+            self._take(self._masking.add_frame(images))
 
     def add_depth(self, depth: DepthImage) -> None:
         """Take a depth image."""
         if self._mode == "tof":
-            self._ready.append((None, depth))
+            self._take(self._masking.add_frame(depth))
         elif self._mode != "stereo":
-            self._ready += self._pairing.add_depth(depth)
+            self._ready += self._pairing.add_companion(depth)
+
+    def add_mask(self, mask: Mask) -> None:
+        """Take a mask of the left image, in mode ``tof`` of the depth image."""
+        self._take(self._masking.add_mask(mask))
+
+    def _take(self, frames: Iterable[StereoImages | DepthImage]) -> None:
+        """Frames that have their masks go on, pairs to wait for a depth image if they have to."""
+        for frame in frames:
+            if isinstance(frame, DepthImage):
+                self._ready.append((None, frame))
+            elif self._mode == "stereo":
+                self._ready.append((frame, None))
+            else:
+                self._ready += self._pairing.add_frame(frame)
 
     def extracted(self) -> Iterator[ExtractedFrame]:
         """Yield the frames that need not wait any more, with their keypoints, oldest first."""
@@ -166,11 +182,13 @@ class FeatureStage:
         return replace(features, frame_id=source.frame_id)
 
     def give_up(self) -> None:
-        """Let go on what waits for a depth camera that a live node has not heard for long."""
+        """Let go on what waits for a depth camera or for masks that a live node has not heard for long."""
+        self._take(self._masking.give_up())
         self._ready += self._pairing.give_up()
 
     def finish(self) -> None:
         """The input has ended: nothing waits any more."""
+        self._take(self._masking.flush())
         self._ready += self._pairing.flush()
 
     def reset(self) -> None:
@@ -180,5 +198,6 @@ class FeatureStage:
 
     def clear(self) -> None:
         """Forget what waits, while another thread may measure."""
+        self._masking.clear()
         self._pairing.clear()
         self._ready.clear()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 from ndt_registration.stage import Scan
 from slam_bags.reading.left_out import LeftOut
@@ -16,6 +17,7 @@ from slam_core.messages import (
     grey_and_colour_from_message,
     grey_from_message,
     imu_from_message,
+    mask_from_message,
     odometry_from_message,
     picture_from_message,
     points_from_scan,
@@ -23,7 +25,7 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
-from slam_core.types import ByteArray, ImuSample, OdometryReading
+from slam_core.types import ByteArray, ImuSample, Mask, OdometryReading
 from stereo_frontend.sources import RawPair
 from tof_driver.stage import RawDepth
 
@@ -102,6 +104,20 @@ class ColourReading:
     image: ByteArray
 
 
+@dataclass(frozen=True, eq=False)
+class MaskReading:
+    """A mask of the rectified images of ``camera``: "stereo", of its left one, or "tof"."""
+
+    agent: str
+    camera: str
+    mask: Mask
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the image that it belongs to."""
+        return self.mask.stamp_ns
+
+
 @dataclass(frozen=True)
 class SessionStart:
     """The clock of an agent's sensors has jumped back for good: what follows has nothing to do with what was before."""
@@ -120,7 +136,9 @@ class InfoReading:
     info: CameraInfo
 
 
-Reading = StereoReading | DepthReading | LaserReading | ImuReading | PoseReading | ColourReading | SessionStart
+Reading = (
+    StereoReading | DepthReading | LaserReading | ImuReading | PoseReading | ColourReading | MaskReading | SessionStart
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,11 +199,20 @@ def _colour_reading(sensors: AgentSensors, message: Message) -> Reading:
     return ColourReading(sensors.agent, stamp_ns(message), colour_from_message(message))
 
 
+def _mask_reading(camera: str, sensors: AgentSensors, message: Message) -> Reading:
+    return MaskReading(sensors.agent, camera, mask_from_message(message))
+
+
+MASK_ROLES = {"stereo": "mask", "tof": "tof_mask"}
+"""Role of the masks of each camera."""
+
 UNPAIRED_ROLES: dict[str, Callable[[AgentSensors, Message], Reading]] = {
     "imu": _imu_reading,
     "odometry": _pose_reading,
     "scan": _laser_reading,
     "color": _colour_reading,
+    "mask": partial(_mask_reading, "stereo"),
+    "tof_mask": partial(_mask_reading, "tof"),
 }
 """Decoders of the roles whose every message is a reading by itself."""
 

@@ -12,7 +12,8 @@ Topics are those of the nodes, or given by role, see :mod:`slam_bags.reading.sen
   ``tof/camera_info`` and, where there are any, ``tof/{amplitude,intensity}/image_raw``, and ``tof/color/image_raw``
   in the pixels of the depth image: colours of the dense model, and the picture that features come from where there is
   no other;
-- ``scan`` of a laser scanner, ``imu``, ``odometry`` and ``ground_truth/pose``.
+- ``scan`` of a laser scanner, ``imu``, ``odometry`` and ``ground_truth/pose``;
+- ``mask`` of the rectified left image and ``tof/mask`` of the depth image: pixels that are not zero are not used.
 
 Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts, and
 images under another one are left out. So is a message that is broken, has no partner or an odd stamp; all are counted.
@@ -35,6 +36,7 @@ from slam_bags.reading.reading_times import ReadingTimes, Stamps
 from slam_bags.reading.readings import (
     IMAGE_ROLES,
     INFO_ROLES,
+    MASK_ROLES,
     ROLES_READ,
     AgentPairing,
     AgentSensors,
@@ -43,6 +45,7 @@ from slam_bags.reading.readings import (
     ImuReading,
     InfoReading,
     LaserReading,
+    MaskReading,
     PoseReading,
     Reading,
     SessionStart,
@@ -65,10 +68,14 @@ from slam_core.trajectory import Trajectory
 
 R = TypeVar("R", bound=Reading | InfoReading)
 
-_RANKS = (SessionStart, InfoReading, ImuReading, PoseReading, ColourReading, DepthReading, LaserReading, StereoReading)
+_RANKS = (
+    SessionStart, InfoReading, ImuReading, PoseReading, ColourReading, MaskReading, DepthReading, LaserReading,
+    StereoReading,
+)  # fmt: skip
 _LEADER: dict[type[Reading], str] = {StereoReading: "left", DepthReading: "depth"}
 """Role of the first image of each kind of reading of a camera."""
 _IMAGES_OF: dict[str, type[Reading]] = {"left": StereoReading, "right": StereoReading, "depth": DepthReading}
+_ROLES_OF_IMAGES = (*IMAGE_ROLES, *MASK_ROLES.values())
 _AFTER_STAMP = 12
 """Bytes of a message up to its stamp's end: encapsulation, seconds, nanoseconds."""
 
@@ -135,14 +142,16 @@ class SensorBag:
             yield reading
 
     def images_at(self, wanted: Mapping[str, Stamps]) -> Generator[Reading, None, None]:
-        """The stereo and depth readings with some stamps, by agent, and perhaps others; after :meth:`readings`.
+        """The stereo and depth readings with some stamps, by agent, their masks, and perhaps others.
+
+        After :meth:`readings`.
 
         Only the parts of the bag that hold them are unpacked, as ``times`` has it.
         """
         given = set()
         for reading in _with_ranks(self._at(wanted)):
             key = (reading.agent, type(reading), reading.stamp_ns)
-            if isinstance(reading, StereoReading | DepthReading) and key not in given:
+            if isinstance(reading, StereoReading | DepthReading | MaskReading) and key not in given:
                 given.add(key)
                 yield reading
 
@@ -170,7 +179,7 @@ class SensorBag:
                 newest[topic] = data[_AFTER_STAMP:]
                 yield from self._infos(infos[topic], topic, message)
             for agent, role in route.get(topic, ()):
-                if role in IMAGE_ROLES:
+                if role in _ROLES_OF_IMAGES:
                     times.add_image(agent, stamp_ns(message), recorded_ns)
                 yield from streams[agent].add(role, message)
         for stream in streams.values():
@@ -198,7 +207,7 @@ class SensorBag:
 
     def _at(self, wanted: Mapping[str, Stamps]) -> Iterator[Reading]:
         pairing = {agent: AgentPairing(self.sensors[agent], LeftOut()) for agent in wanted}
-        route = self._route(IMAGE_ROLES)
+        route = self._route(_ROLES_OF_IMAGES)
         types = {name: info.type_name for name, info in self.reader.topics.items()}
         for topic, _, data in self.reader.raw(route, self.times.spans(wanted)):
             for agent, role in route[topic]:

@@ -21,6 +21,8 @@ _CANDIDATES = {
     "amplitude": ("tof/amplitude/image_raw",),
     "intensity": ("tof/intensity/image_raw",),
     "color": ("tof/color/image_raw", "tof/color/image_raw/compressed"),
+    "mask": ("mask",),
+    "tof_mask": ("tof/mask",),
     "imu": ("imu",),
     "odometry": ("odometry",),
     "scan": ("scan",),

@@ -12,7 +12,16 @@ from dense_mapping.colours import NO_PICTURE
 from dense_mapping.dense_stage import DenseStage
 from dense_mapping.keyframes import grey_levels
 from slam_bags.reading.reading_times import ReadingTimes, Stamps
-from slam_bags.reading.readings import AgentSensors, ColourReading, DepthReading, ImuReading, Reading, StereoReading
+from slam_bags.reading.readings import (
+    MASK_ROLES,
+    AgentSensors,
+    ColourReading,
+    DepthReading,
+    ImuReading,
+    MaskReading,
+    Reading,
+    StereoReading,
+)
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import SystemConfig
@@ -39,7 +48,8 @@ def dense_model(
     """
     paths = {agent: trajectory for agent, trajectory in trajectories.items() if len(trajectory)}
     coloured = frozenset(a for a in paths if config.dense_mapper.use_tof and "color" in bag.sensors[a].topics)
-    stage = DenseStage(config.dense_mapper, paths, coloured)
+    masked = frozenset(f"{a}/{c}" for a in paths for c, role in MASK_ROLES.items() if role in bag.sensors[a].topics)
+    stage = DenseStage(config.dense_mapper, paths, coloured, masked)
     cameras = {
         a: _Images(bag.sensors[a], config, stage, (path.stamps_ns[0], path.stamps_ns[-1]), (corrections or {}).get(a))
         for a, path in paths.items()
@@ -144,6 +154,8 @@ class _Images:
                     self._out.add(self._agent, "tof", self._T_base_tof, image, self._picture(image))
         elif isinstance(reading, ColourReading) and self._depth is not None:
             self._out.add_colour(self._agent, "tof", reading.stamp_ns, self._depth.colour(reading.image))
+        elif isinstance(reading, MaskReading):
+            self._out.add_mask(self._agent, reading.camera, reading.mask)
         elif isinstance(reading, ImuReading):
             sample = reading.sample
             self._add_force(sample.frame_id, sample.stamp_ns, sample.linear_acceleration)

@@ -78,8 +78,8 @@ class Mapper:
         last: list[Submap] = []
         for agent, stage in self._filters.items():
             self._process_waiting(agent)
-            if stage.finding:
-                self._events.append(f"{agent}: {stage.finding}" if agent else stage.finding)
+            for text in filter(None, (stage.finding, stage.moving_objects)):
+                self._events.append(f"{agent}: {text}" if agent else text)
             last += stage.start_session()  # which no frame begins: the filter forgets its state
         give_back()
         self._hand_over(in_order(last))

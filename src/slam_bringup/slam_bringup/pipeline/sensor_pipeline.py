@@ -6,6 +6,7 @@ depth  -> DepthStage ----^   \-> ScanOdometryStage -> motions
 laser  -------------------------^
 IMU    -------------------------^----------------> turn rates
 odometry ----------------------------------------> poses
+masks  ------> FeatureStage
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ from typing import TypeAlias
 
 from ndt_registration.stage import Scan, ScanEstimate, ScanOdometryStage
 from slam_bags.reading.readings import (
+    MASK_ROLES,
     AgentSensors,
     DepthReading,
     ImuReading,
     LaserReading,
+    MaskReading,
     PoseReading,
     Reading,
     SessionStart,
@@ -29,7 +32,7 @@ from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.types import Features, ImuSample, OdometryReading
 from stereo_frontend.frame_log import FrameLog
-from stereo_frontend.frontend_config import FrontendReport
+from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
 from tof_driver.stage import DepthStage
 
@@ -64,7 +67,8 @@ class SensorPipeline:
         self._require(mode, sensors, odometry)
         self._stereo = stereo_stage(sensors)
         self._depth = depth_stage(config, sensors)
-        self._features = FeatureStage(config.feature_extractor, sensors.frames)
+        self._mask_role = MASK_ROLES["stereo" if self._uses_stereo else "tof"]
+        self._features = FeatureStage(with_masks(config.feature_extractor, sensors), sensors.frames)
         self._odometry = (
             ScanOdometryStage(config.ndt_odometry, sensors.frames, sensors.base_frame) if odometry else None
         )
@@ -79,6 +83,9 @@ class SensorPipeline:
             yield from self._on_pair(reading)
         elif isinstance(reading, DepthReading) and self._uses_depth:
             yield from self._on_depth(reading)
+        elif isinstance(reading, MaskReading) and MASK_ROLES[reading.camera] == self._mask_role:
+            self._features.add_mask(reading.mask)
+            yield from self._frames()
         elif isinstance(reading, LaserReading) and self._odometry is not None:
             self._odometry.add_scan(reading.scan)
             yield from self._scans()
@@ -157,6 +164,13 @@ class SensorPipeline:
             raise ValueError(f"mode '{mode}' needs ToF images, and {who} has none: try {hint}")
         if no_scans:
             raise ValueError(f"scan odometry needs ToF images or laser scans, and {who} has none: leave --odometry out")
+
+
+def with_masks(config: FrontendConfig, sensors: AgentSensors) -> FrontendConfig:
+    """The front end's parameters for an agent: where its bag has masks, frames wait for them from the first one on."""
+    has_masks = MASK_ROLES["tof" if config.mode == "tof" else "stereo"] in sensors.topics
+    use = "always" if has_masks and config.mask.use == "auto" else config.mask.use
+    return replace(config, mask=replace(config.mask, use=use))
 
 
 def stereo_stage(sensors: AgentSensors) -> StereoStage:

@@ -14,6 +14,7 @@ from slam_bags.reading.sensor_topics import is_rectified, join, nodes_name
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.node_table import NODES, RESULT_TOPICS
 from slam_bringup.pipeline.overrides import Overrides, is_parameter_of
+from slam_bringup.pipeline.sensor_pipeline import with_masks
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand
 from slam_bringup.processes.start_map import StartMap
@@ -195,7 +196,8 @@ def _bag_parameters(
     return {
         "stereo_driver": drivers["stereo_driver"] | ({"compressed": True} if compressed else {}),
         "tof_driver": drivers["tof_driver"] | {"measurement": sensor.measurement, "pictures": chosen},
-        "feature_extractor": {"tof.images": pictures[0] if pictures else "range"} if chooses else {},
+        "feature_extractor": ({"tof.images": pictures[0] if pictures else "range"} if chooses else {})
+        | ({"mask.use": "always"} if with_masks(config.feature_extractor, sensor).mask.use == "always" else {}),
         "sjsam": {"map_path": map_path} | ({} if autosave else {"autosave_period_s": 0.0}),
     }
 
@@ -204,11 +206,11 @@ def _topics(sensor: AgentSensors, mode: str, odometry: bool, calibrated: Collect
     """Topics to play by the nodes' names; the camera infos of cameras that are ``calibrated`` come from files."""
     roles = ["imu", "odometry"]
     if mode != "tof":
-        roles += ["left", "right", "left_info", "right_info"]
+        roles += ["mask", "left", "right", "left_info", "right_info"]
     if odometry and sensor.scanner == "scan":
         roles += ["scan"]
     if mode != "stereo" or (odometry and sensor.scanner == "depth"):
-        roles += ["depth", "amplitude", "intensity", "color", "tof_info"]
+        roles += ["depth", "amplitude", "intensity", "color", "tof_info", "tof_mask"]
     from_files = {f"{camera}_info" for camera in calibrated}
     roles = [role for role in roles if role not in from_files]
     return {sensor.topics[role]: _heard(sensor, role) for role in roles if role in sensor.topics}

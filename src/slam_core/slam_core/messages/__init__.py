@@ -28,6 +28,7 @@ from slam_core.messages.images import (
     grey_from_message,
     image_from_message,
     image_message,
+    mask_from_message,
     metres_from_message,
     picture_from_message,
 )
@@ -84,6 +85,7 @@ __all__ = [
     "imu_from_message",
     "imu_message",
     "landmark_cloud",
+    "mask_from_message",
     "metres_from_message",
     "motion_as_received",
     "motion_from_message",

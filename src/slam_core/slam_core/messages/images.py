@@ -9,8 +9,8 @@ from functools import partial
 import cv2
 import numpy as np
 
-from slam_core.messages.base import Message, MessageTypes
-from slam_core.types import AnyArray, ByteArray, Float32Array, MakeColour, no_colour
+from slam_core.messages.base import Message, MessageTypes, stamp_ns
+from slam_core.types import AnyArray, ByteArray, Float32Array, MakeColour, Mask, no_colour
 
 ENCODINGS = {
     "mono8": ("u1", 1), "8UC1": ("u1", 1), "8UC3": ("u1", 3), "bgr8": ("u1", 3), "rgb8": ("u1", 3), "bgra8": ("u1", 4),
@@ -111,6 +111,19 @@ def grey_and_colour_from_message(message: Message) -> tuple[ByteArray, MakeColou
     image, encoding = _decoded(message)
     is_colour = encoding in _TO_GREY and image.dtype == np.uint8
     return _grey(image, encoding), partial(_colours, image, encoding) if is_colour else no_colour
+
+
+def mask_from_message(message: Message) -> Mask:
+    """A mask: pixels that are not zero are not to be used.
+
+    Raises
+    ------
+    ValueError
+        For an encoding other than mono8 and 8UC1.
+    """
+    if message.encoding not in ("mono8", "8UC1"):
+        raise ValueError(f"a mask is mono8 or 8UC1 (0: use, else: leave out), got {message.encoding}")
+    return Mask(stamp_ns(message), image_from_message(message))
 
 
 def picture_from_message(message: Message) -> AnyArray:

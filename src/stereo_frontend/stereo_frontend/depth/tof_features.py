@@ -66,7 +66,7 @@ class TofFeatures:
         """Features of ``image`` in the ToF optical frame; those without a single surface below them are left out."""
         before, pictures = self.used, self._pictures(image)
         if self._tracker is None or len(pictures) > 1:
-            keypoints = _joined([self._extractors[name](picture) for name, picture in pictures.items()])
+            keypoints = _joined([self._extractors[name](picture, image.mask) for name, picture in pictures.items()])
             sigma_uv = np.repeat(self._noise.sigma(keypoints.size)[:, None], 2, axis=1)
             parts = [
                 MeasuredKeypoints(keypoints, _depth_at(image, keypoints), sigma_uv, np.zeros(len(keypoints), np.int32))
@@ -91,10 +91,17 @@ class TofFeatures:
             return _depth_at(image, followed.keypoints)
 
         def detect() -> tuple[Keypoints, DepthEstimate]:
-            keypoints = self._extractors[name](picture)
+            keypoints = self._extractors[name](picture, image.mask)
             return keypoints, _depth_at(image, keypoints)
 
-        return follow_or_detect(tracker, picture, image.camera, image.stamp_ns, measure, detect, self._noise.sigma)
+        return follow_or_detect(
+            tracker, picture, image.camera, image.stamp_ns, measure, detect, self._noise.sigma, image.mask
+        )
+
+    @property
+    def masked(self) -> int:
+        """Keypoints left out so far because they lie in masks."""
+        return sum(extractor.masked for extractor in self._extractors.values())
 
     def reset(self) -> None:
         """Forget the detector thresholds."""

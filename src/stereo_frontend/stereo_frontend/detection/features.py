@@ -22,6 +22,7 @@ from stereo_frontend.detection.censure import CensureDetector
 from stereo_frontend.detection.fast import FastDetector
 from stereo_frontend.detection.opencv_detectors import OpenCvDetector
 from stereo_frontend.keypoints import Detector, Keypoints, spread_over_grid
+from stereo_frontend.masks import is_masked
 from stereo_frontend.surf.surf import SurfConfig, SurfDetector
 from stereo_frontend.surf.surf_device import CPU, SurfDevice
 
@@ -91,10 +92,14 @@ class FeatureExtractor:
     ) -> None:
         self.config = config or FeatureConfig()
         self.threshold = _FIRST_THRESHOLD
+        self.masked = 0
+        """Keypoints left out so far because they lie in masks."""
         self._detect = make_detector(self.config, for_pairs=for_pairs, device=device)
 
-    def __call__(self, image: ByteArray) -> Keypoints:
+    def __call__(self, image: ByteArray, mask: ByteArray | None = None) -> Keypoints:
         """At most ``target`` keypoints of an image, uint8 (height, width), best of each grid cell first.
+
+        None lies where ``mask``, of the same shape, is not zero.
 
         Raises
         ------
@@ -104,7 +109,7 @@ class FeatureExtractor:
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f"features need a uint8 grey image (height, width), got {image.dtype} {image.shape}")
         for _ in range(_MOST_PASSES):
-            keypoints, candidates = self._one_pass(image)
+            keypoints, candidates = self._one_pass(image, mask)
             enough = candidates >= self.config.target or self.threshold <= _THRESHOLD_RANGE[0]
             self._adapt(candidates)
             if enough or _ADAPTATION == 0.0:
@@ -119,18 +124,18 @@ class FeatureExtractor:
         """Forget the threshold."""
         self.threshold = _FIRST_THRESHOLD
 
-    def _one_pass(self, image: ByteArray) -> tuple[Keypoints, int]:
-        candidates = 0
+    def _one_pass(self, image: ByteArray, mask: ByteArray | None) -> tuple[Keypoints, int]:
+        candidates = masked = 0
 
         def select(uv: Float32Array, size: Float32Array, response: Float32Array) -> npt.NDArray[np.intp]:
-            nonlocal candidates
-            candidates = len(uv)
-            c = self.config
-            return spread_over_grid(
-                uv, response, (image.shape[0], image.shape[1]), (_GRID_ROWS, _GRID_COLUMNS), c.target
-            )
+            nonlocal candidates, masked
+            free = np.flatnonzero(~is_masked(mask, uv))
+            candidates, masked = len(free), len(uv) - len(free)
+            shape, grid = (image.shape[0], image.shape[1]), (_GRID_ROWS, _GRID_COLUMNS)
+            return free[spread_over_grid(uv[free], response[free], shape, grid, self.config.target)]
 
         keypoints = self._detect(image, self.threshold, select)
+        self.masked += masked
         return keypoints, candidates
 
     def _adapt(self, candidates: int) -> None:

@@ -40,15 +40,16 @@ def follow_or_detect(
     measure: Callable[[Followed], DepthEstimate],
     detect: Callable[[], tuple[Keypoints, DepthEstimate]],
     noise: Callable[[Float32Array], Float32Array],
+    mask: ByteArray | None = None,
 ) -> list[MeasuredKeypoints]:
     """Features that were followed into a picture, and where that is too little, what is new in it.
 
     ``measure`` gives the depth of what was followed, ``detect`` keypoints with depth, ``noise`` the
-    standard deviations (n,) px of keypoints by their size (n,) px.
+    standard deviations (n,) px of keypoints by their size (n,) px. Nothing is followed where ``mask`` is not zero.
     """
     parts = []
     number = 0
-    followed = tracker.follow(picture, camera, stamp_ns)
+    followed = tracker.follow(picture, camera, stamp_ns, mask)
     if followed is not None:
         estimate = measure(followed)
         tracker.measured(followed, estimate.depth, camera)

@@ -21,6 +21,7 @@ from slam_core.camera import Camera
 from slam_core.geometry import FloatArray, transform_points
 from slam_core.types import AnyArray, ByteArray, Float32Array
 from stereo_frontend.keypoints import Keypoints, spread_over_grid
+from stereo_frontend.masks import is_masked
 from stereo_frontend.tracking.frame_motion import facing_warp, fit_motion, scaled_motion
 from stereo_frontend.tracking.track_alignment import OUTPUTS, align_to_references
 
@@ -116,10 +117,13 @@ class Tracker:
         self._stamp_ns = 0
 
     # ---- one picture, in order
-    def follow(self, picture: ByteArray, camera: Camera, stamp_ns: int) -> Followed | None:
+    def follow(
+        self, picture: ByteArray, camera: Camera, stamp_ns: int, mask: ByteArray | None = None
+    ) -> Followed | None:
         """Tracks found in a picture; None while there are none.
 
-        Those of another camera, and of a picture too long ago, are forgotten.
+        Those of another camera, and of a picture too long ago, are forgotten; those where ``mask``, of the picture's
+        shape, is not zero count as not found.
         """
         dt = 1e-9 * (stamp_ns - self._stamp_ns)
         if camera != self._camera or dt > _LONGEST_STEP_S:
@@ -144,7 +148,7 @@ class Tracker:
             picture, tracks.references, tracks.offset, start, warp, _MAX_SHIFT, 1.0 / _WARP_SIGMA**2, found
         )
         sigma = np.sqrt(_SIGMA_SCALE**2 * found[:, 6:8] + _SIGMA_FLOOR**2)
-        good = _is_sound(found) & (sigma.max(axis=1) < _MAX_SIGMA)
+        good = _is_sound(found) & (sigma.max(axis=1) < _MAX_SIGMA) & ~is_masked(mask, found[:, :2])
         points = transform_points(T, tracks.points)
         uv = np.where(good[:, None], found[:, :2], start)
         tracks = dataclasses.replace(

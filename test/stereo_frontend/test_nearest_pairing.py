@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slam_core.camera import Camera, CameraInfo
-from stereo_frontend.depth.depth_pairing import DepthPairing
+from stereo_frontend.nearest_pairing import NearestPairing
 from stereo_frontend.stereo.calibrated_pairs import CalibratedPairs
 
 MS = 1_000_000
@@ -24,10 +24,10 @@ def stamps(result):
 
 
 def play(events, **options):
-    pairing = DepthPairing(0.03, **options)
+    pairing = NearestPairing("depth image", 0.03, **options)
     out = []
     for kind, time in events:
-        out += (pairing.add_pair if kind == "pair" else pairing.add_depth)(pair_or_depth(time))
+        out += (pairing.add_frame if kind == "pair" else pairing.add_companion)(pair_or_depth(time))
     return stamps(out + pairing.flush())
 
 
@@ -48,8 +48,8 @@ def test_a_pair_without_a_depth_image_near_enough_goes_alone():
 
 
 def test_a_silent_depth_camera_holds_nothing_up():
-    pairing = DepthPairing(0.03, patience=2)
-    released = [stamps(pairing.add_pair(pair_or_depth(t))) for t in (0, 100, 200, 300)]
+    pairing = NearestPairing("depth image", 0.03, patience=2)
+    released = [stamps(pairing.add_frame(pair_or_depth(t))) for t in (0, 100, 200, 300)]
     assert released == [[], [], [(0.0, None), (100.0, None), (200.0, None)], [(300.0, None)]]
     assert "no depth image" in pairing.complaint
     pairing.clear()
