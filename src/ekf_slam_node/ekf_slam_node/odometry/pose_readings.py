@@ -117,6 +117,8 @@ class PoseReadings:
 
 def _growth(before: OdometryReading, after: OdometryReading, step: FloatArray) -> FloatArray:
     """By how much (6,) the covariance has grown, along the axes of the frame before."""
+    if min(np.diagonal(r.covariance).min() for r in (before, after)) < 0.0:
+        return np.full(6, np.nan)
     J_before, J_step = compose_jacobians(before.T, step)
     with np.errstate(invalid="ignore", over="ignore"):
         grown = after.covariance - J_before @ before.covariance @ J_before.T
