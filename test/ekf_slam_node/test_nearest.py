@@ -53,9 +53,9 @@ def test_innovations_that_stay_too_large_are_complained_of():
     watch = InnovationWatch()
     for ratio in (1.0, 5.0, 0.8, 5.0):
         watch.add(ratio)
-    assert watch.complaint == ""
+    assert watch.diagnostic == ""
     watch.add(3.0)
-    assert "4.3 times" in watch.complaint
+    assert "4.3 times" in watch.diagnostic
 
 
 @pytest.mark.parametrize("wrong", [False, True])
@@ -69,5 +69,5 @@ def test_the_filter_warns_where_its_pairs_are_wrong(wrong, rng):
             world.points + 0.03 * rng.standard_normal(world.points.shape), world.descriptors
         )  # fmt: skip
         slam.process(seen.features(T, k * 100_000_000, rng)[0])
-        complaints.append(slam.complaint)
+        complaints.append(slam.diagnostic)
     assert bool(complaints[-1]) == wrong

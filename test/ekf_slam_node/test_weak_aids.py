@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ekf_slam_node.config import EkfSlamConfig
-from ekf_slam_node.odometry.aids import MEAN_TURN_RATE_SIGMA
+from ekf_slam_node.odometry.relative_poses import MEAN_TURN_RATE_SIGMA
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.slam import EkfSlam
 from feature_world import loop, room

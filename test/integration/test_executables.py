@@ -64,7 +64,7 @@ def test_every_node_starts_publishes_and_stops_on_sigint(
         supervisor.listen(1.0)
         group.stop()
         failed = [node for node in nodes if group.exit_codes[node.command.full_name] != 0]
-    assert not failed, [(group.exit_codes[node.command.full_name], node.complaint()) for node in failed]
+    assert not failed, [(group.exit_codes[node.command.full_name], node.diagnostic()) for node in failed]
     for node in nodes:
         check_log(node)
     with BagReader(recording) as bag:

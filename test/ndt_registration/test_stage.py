@@ -56,7 +56,7 @@ def test_a_scan_waits_for_the_imu_and_goes_without_it_when_told(corner) -> None:
     assert list(scans.ready()) == []
     scans.give_up()
     assert len(list(scans.ready())) == 1
-    assert "no imu" in scans.complaint
+    assert "no imu" in scans.diagnostic
 
 
 def test_an_imu_that_is_not_used_holds_nothing_up(corner) -> None:

@@ -35,7 +35,7 @@ def test_a_copy_is_found_after_a_kill_and_not_after_an_end_in_order(joined: Glob
     second = Autosave(path, 10.0)
     copy = GlobalMap.load(second.found() or Path())
     assert np.array_equal(copy.state.poses, joined.state.poses)
-    second.put_away()
+    second.retire()
     second.close()
     assert [p.name for p in tmp_path.iterdir()] == ["map.autosave.ended"]
     assert Autosave(path, 10.0).found() is None
@@ -49,7 +49,7 @@ def test_what_is_not_ours_stays(joined: GlobalMap, tmp_path: Path) -> None:
     autosave = Autosave(path, 1.0)
     autosave.save(joined.stored(), 0.0)
     autosave.wait()
-    autosave.put_away()
+    autosave.retire()
     assert [p.name for p in path.iterdir()] == ["chapter.tex"]
     assert (path / "chapter.tex").read_text() == "years of work"
     autosave.save(joined.stored(), 5.0)

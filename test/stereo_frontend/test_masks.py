@@ -95,7 +95,7 @@ def test_features_go_on_without_masks_that_never_come(stereo_pair) -> None:
         stage.add_images(replace(pair, stamp_ns=k * _STEP_NS))
         numbers.append(len(run(stage)))
     assert numbers == [0, 0, 3, 1, 1]
-    assert stage.complaint == "no mask so far"
+    assert stage.diagnostic == "no mask so far"
 
 
 def test_a_frame_whose_mask_is_missing_is_counted_and_takes_a_near_one(stereo_pair, stage: FeatureStage) -> None:
@@ -116,7 +116,7 @@ def test_a_mask_of_another_size_is_counted_and_said(stereo_pair, stage: FeatureS
     (features,) = run(stage)
     assert (features.uv[:, 0] > 160).any()
     assert stage.counters["masks_of_another_size"] == 1
-    assert "masks are 640 x 480 px, the rectified images 320 x 240 px" in stage.complaint
+    assert "masks are 640 x 480 px, the rectified images 320 x 240 px" in stage.diagnostic
 
 
 def test_masks_can_be_left_alone(stereo_pair) -> None:

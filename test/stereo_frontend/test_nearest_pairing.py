@@ -51,7 +51,7 @@ def test_a_silent_depth_camera_holds_nothing_up():
     pairing = NearestPairing("depth image", 0.03, patience=2)
     released = [stamps(pairing.add_frame(pair_or_depth(t))) for t in (0, 100, 200, 300)]
     assert released == [[], [], [(0.0, None), (100.0, None), (200.0, None)], [(300.0, None)]]
-    assert "no depth image" in pairing.complaint
+    assert "no depth image" in pairing.diagnostic
     pairing.clear()
     assert pairing.flush() == []
 

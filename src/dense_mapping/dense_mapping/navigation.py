@@ -30,7 +30,7 @@ class Frontier:
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class Route:
     """A way through cells that were seen free: ``points`` (n, 3) m on the floor; length, least clearance, m."""
 
     points: FloatArray
@@ -55,7 +55,7 @@ def frontiers(plan: FloorPlan, min_length: float = 0.4) -> list[Frontier]:
     return sorted(found, key=lambda f: -f.length)
 
 
-def way(plan: FloorPlan, start: FloatArray, goal: FloatArray, half_width: float = 0.25) -> Way | None:
+def plan_route(plan: FloorPlan, start: FloatArray, goal: FloatArray, half_width: float = 0.25) -> Route | None:
     """The way from ``start`` to ``goal`` (3,) m, map frame, for someone ``half_width`` m wide to each side.
 
     Where there is none so wide, it is looked for at half that width and at one cell; None if there is none at all.
@@ -70,7 +70,7 @@ def way(plan: FloorPlan, start: FloatArray, goal: FloatArray, half_width: float 
         if cells is not None:
             points = plan.point_of(cells)
             length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-            return Way(points, length, float(clearance[cells[:, 0], cells[:, 1]].min()))
+            return Route(points, length, float(clearance[cells[:, 0], cells[:, 1]].min()))
     return None
 
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.filtering.models import Frame, seconds_between
-from ekf_slam_node.odometry.aids import Aid, MotionAids
+from ekf_slam_node.odometry.relative_poses import RelativePoseBuffer, RelativePoseMeasurement
 from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.submaps.missed_frames import MissedFrames
 from ekf_slam_node.submaps.motion_checks import is_known
-from ekf_slam_node.submaps.open_submap import Sight
+from ekf_slam_node.submaps.open_submap import LandmarkMatches
 from ekf_slam_node.submaps.submap_chain import SubmapChain
 from slam_core.types import Counters, PoseEstimate
 
@@ -26,7 +26,7 @@ class LossRecovery:
 
     config: EkfSlamConfig
     chain: SubmapChain
-    aids: MotionAids
+    aids: RelativePoseBuffer
     missed: MissedFrames
     counters: Counters
     advance: Callable[[Frame], EkfResult]
@@ -40,13 +40,13 @@ class LossRecovery:
         self.chain.add_pose(frame.stamp_ns, standing)
         self._drop_older(frame)
 
-    def dead_reckon(self, frame: Frame, dt: float, aid: Aid) -> EkfResult:
+    def dead_reckon(self, frame: Frame, dt: float, aid: RelativePoseMeasurement) -> EkfResult:
         """No link, but something else has measured the motion: go with it."""
         self._go_with(frame, dt, aid)
         reason = "no visual association, moved by odometry alone"
         return self.chain.result(frame.stamp_ns, TrackingState.DEGRADED, reason)
 
-    def track_lost(self, frame: Frame, bridge: Aid | None) -> EkfResult:
+    def track_lost(self, frame: Frame, bridge: RelativePoseMeasurement | None) -> EkfResult:
         """No link: nothing is mapped.
 
         The filter stays at the last linked frame, so that the old map can be found again. Odometry or IMU tell
@@ -89,7 +89,7 @@ class LossRecovery:
         if bridge is not None and bridge.reckoned is not None and is_known(bridge):
             self._go_with(last, seconds_between(self.chain.stamp_ns, last.stamp_ns), bridge)
 
-    def _go_with(self, frame: Frame, dt: float, aid: Aid) -> None:
+    def _go_with(self, frame: Frame, dt: float, aid: RelativePoseMeasurement) -> None:
         """Move the filter to a frame that is not linked by a motion that something else has measured."""
         self.count_aid(self.chain.local.move_without_link(frame, dt, aid))
         self.aids.moved(self.chain.stamp_ns, frame.stamp_ns)
@@ -108,7 +108,7 @@ class LossRecovery:
         self.counters.add("gaps_bridged")
         self._go_with(missed, seconds_between(start_ns, missed.stamp_ns), bridge)
         submaps = self.chain.close()
-        self.chain.follow(missed, Sight.of_nothing(), Sight.of_nothing(), self.aids.up)
+        self.chain.follow(missed, LandmarkMatches.of_nothing(), LandmarkMatches.of_nothing(), self.aids.up)
         self.chain.local.set_velocity(*self.aids.velocity())
         result = self.advance(frame)
         return replace(result, submaps=submaps + result.submaps)

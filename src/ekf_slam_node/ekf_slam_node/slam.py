@@ -14,22 +14,28 @@ import numpy as np
 from ekf_slam_node.association.linking import CONVINCING, FrameLink, Linker
 from ekf_slam_node.config import MAX_FRAME_FEATURES, MAX_UPDATE_LANDMARKS, EkfSlamConfig
 from ekf_slam_node.filtering.candidates import Candidates, MotionPrior, motion_prior
-from ekf_slam_node.filtering.common_error import COMMON_ERROR_FACTOR, CommonError
+from ekf_slam_node.filtering.correlated_noise import CORRELATED_NOISE_FACTOR, CorrelatedNoise
 from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.filtering.noise_monitor import InnovationWatch, NoiseMonitor
 from ekf_slam_node.loss_recovery import LossRecovery
-from ekf_slam_node.odometry.aids import AID_GATE, ALL, Aid, MotionAids, contradicts
+from ekf_slam_node.odometry.relative_poses import (
+    ALL,
+    RELATIVE_POSE_GATE,
+    RelativePoseBuffer,
+    RelativePoseMeasurement,
+    contradicts,
+)
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.submaps.frame_input import frame_of_strongest, usable_features
 from ekf_slam_node.submaps.missed_frames import MissedFrames
 from ekf_slam_node.submaps.motion_checks import (
     StandingDetector,
-    aided,
-    explaining_sigma,
+    fused_prior,
+    inflated_process_noise,
     is_surprising,
     widened,
 )
-from ekf_slam_node.submaps.open_submap import Sight
+from ekf_slam_node.submaps.open_submap import LandmarkMatches
 from ekf_slam_node.submaps.rolling_shutter import RollingShutter
 from ekf_slam_node.submaps.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submaps.submap_chain import SubmapChain
@@ -77,10 +83,10 @@ class EkfSlam:
         return submaps
 
     def _forget(self) -> None:
-        self._aids = MotionAids(self.config.motion, self.config.imu, self.config.odometry)
+        self._aids = RelativePoseBuffer(self.config.motion, self.config.imu, self.config.odometry)
         self._noise = NoiseMonitor()
         self._innovations = InnovationWatch()
-        self._common = CommonError(COMMON_ERROR_FACTOR)
+        self._common = CorrelatedNoise(CORRELATED_NOISE_FACTOR)
         self._chain = SubmapChain(self.config, self._T_rig_optical, self.session)
         self._next_id = 0
         self._newest_stamp_ns = 0
@@ -147,9 +153,9 @@ class EkfSlam:
             self.counters.add(f"odometry_{reason.replace(' ', '_')}")
 
     @property
-    def complaint(self) -> str:
+    def diagnostic(self) -> str:
         """Complaint about the IMU, the odometry or the association, or ""."""
-        return self._aids.inertial.complaint or self._aids.external.complaint or self._innovations.complaint
+        return self._aids.inertial.diagnostic or self._aids.external.diagnostic or self._innovations.diagnostic
 
     @property
     def odometry_finding(self) -> str:
@@ -201,15 +207,15 @@ class EkfSlam:
         submaps = self._close(linked, seen, updated) if updated.closes else self._maintain(linked, updated)
         return self._chain.result(frame.stamp_ns, *updated.state(linked.link), submaps, updated)
 
-    def _link(self, frame: Frame, dt: float, aid: Aid | None) -> LinkedFrame | None:
+    def _link(self, frame: Frame, dt: float, aid: RelativePoseMeasurement | None) -> LinkedFrame | None:
         """Associate a frame with what is known, and learn its noise from the pairs; None if nothing fits."""
         local = self._chain.local
         expected = motion_prior(local.velocity, local.velocity_covariance(), self.config.motion.sigma, dt)
-        prior = aided(expected, aid)
+        prior = fused_prior(expected, aid)
         known = None if aid is None else prior.T
         predicted = self._shutter.corrected(frame, dt, known)
         candidates = local.candidates()
-        link = self._linker.link(candidates, predicted, prior, partial(self._is_refuted, frame.stamp_ns))
+        link = self._linker.link(candidates, predicted, prior, partial(self._is_inconsistent, frame.stamp_ns))
         if link is None:
             return None
         link = self._without_moving(frame.stamp_ns, candidates, predicted, expected, link)
@@ -218,11 +224,11 @@ class EkfSlam:
         if link.moving:
             self.counters.add(f"frames_with_{MOVING}")
             self.counters.add(f"features_on_{MOVING}", link.moving)
-        measured = self._noise.learn(frame, link.excess)
+        measured = self._noise.learn(frame, link.variance_scale)
         frame = self._shutter.corrected(measured, dt, link.T if known is None else known)
         if link.wrong is not None:
             wider = frame.variance + link.wrong
-            self._innovations.add(float(np.max(link.excess[:2] * (frame.variance / wider).mean(axis=0)[:2])))
+            self._innovations.add(float(np.max(link.variance_scale[:2] * (frame.variance / wider).mean(axis=0)[:2])))
             frame = replace(frame, variance=wider)
         self._common.learn(frame.z[link.columns, :2], link.error[:, :2], frame.camera.width)
         surprising = is_surprising(link, expected, self.config.association.gate)
@@ -240,34 +246,34 @@ class EkfSlam:
         told = self._aids.witness(self._chain.stamp_ns, stamp_ns)
         if told is None:
             return link
-        if not contradicts(told, link.T, link.covariance, AID_GATE):
+        if not contradicts(told, link.T, link.covariance, RELATIVE_POSE_GATE):
             return replace(link, is_sure=True)
-        other = self._linker.link_at(candidates, frame, aided(expected, told), link.excess)
-        if other is None or contradicts(told, other.T, other.covariance, AID_GATE):
+        other = self._linker.link_at(candidates, frame, fused_prior(expected, told), link.variance_scale)
+        if other is None or contradicts(told, other.T, other.covariance, RELATIVE_POSE_GATE):
             if told.rows != ALL or len(link.rows) >= CONVINCING * min(len(candidates), len(frame)):
                 return link
-            self._aids.doubt(stamp_ns)
+            self._aids.add_inconsistency(stamp_ns)
             self.counters.add("links_refuted")
             return None
         moving = np.setdiff1d(link.columns, other.columns)
         self._linker.mark_moving(frame, moving)
         return replace(other, moving=link.moving + len(moving))  # which the IMU is sure of
 
-    def _is_refuted(self, stamp_ns: int, link: FrameLink) -> bool:
+    def _is_inconsistent(self, stamp_ns: int, link: FrameLink) -> bool:
         """True if looks alone have led to a place where the IMU says that the rig cannot be."""
-        if not self._aids.refute(self._chain.stamp_ns, stamp_ns, link.T, link.covariance):
+        if not self._aids.is_inconsistent(self._chain.stamp_ns, stamp_ns, link.T, link.covariance):
             return False
         self.counters.add("links_refuted")
         return True
 
-    def _augment(self, linked: LinkedFrame) -> Sight:
+    def _augment(self, linked: LinkedFrame) -> LandmarkMatches:
         """Add the landmarks that the frame confirms, at the previous pose; returns all landmarks that it sees."""
         # A surprising motion rests on these pairs alone: all of them are worth their cost.
         config = self.config
         wanted = MAX_UPDATE_LANDMARKS if linked.surprising else config.landmark.target_in_view
         new_ids = np.arange(self._next_id, self._next_id + len(linked.link.rows))
         self._next_id += len(new_ids)
-        return self._chain.local.confirm(linked.frame, linked.link, wanted, new_ids)
+        return self._chain.local.initialise_landmarks(linked.frame, linked.link, wanted, new_ids)
 
     def _predict(self, linked: LinkedFrame) -> None:
         """Time update, linearised at the motion found, and measurement of the motion by other sensors.
@@ -276,10 +282,10 @@ class EkfSlam:
         """
         local, link, aid, sigma = self._chain.local, linked.link, linked.aid, self.config.motion.sigma
         if linked.surprising:
-            sigma = explaining_sigma(link.T, local.velocity, sigma, linked.dt)
+            sigma = inflated_process_noise(link.T, local.velocity, sigma, linked.dt)
         step = local.predict(linked.dt, sigma, link.T)
         if aid is not None:
-            fits = not contradicts(aid, link.T, linked.motion_covariance, AID_GATE)
+            fits = not contradicts(aid, link.T, linked.motion_covariance, RELATIVE_POSE_GATE)
             self._recovery.count_aid(fits and local.apply_motion(step, aid, link.T))
         self._tell_imu(linked)
 
@@ -289,7 +295,7 @@ class EkfSlam:
         if not self._aids.moved(self._chain.stamp_ns, linked.frame.stamp_ns, T, covariance):
             self.counters.add("imu_contradicted")
 
-    def _update(self, linked: LinkedFrame, seen: Sight) -> UpdatedFrame:
+    def _update(self, linked: LinkedFrame, seen: LandmarkMatches) -> UpdatedFrame:
         """Measurement update; in a submap's last frame with half of the landmarks, the others start the next one."""
         local, closes = self._chain.local, self._chain.is_complete(len(seen))
         chosen = seen.every_second() if closes and self.config.submap.start == "independent" else seen
@@ -305,10 +311,10 @@ class EkfSlam:
     def _maintain(self, linked: LinkedFrame, updated: UpdatedFrame) -> tuple[Submap, ...]:
         """Keep the frame's other features for the next one and remove landmarks that cannot be relied on."""
         self._chain.local.remember(linked.frame, updated.measured, linked.link, linked.landmarks)
-        self._chain.local.tidy(linked.frame, updated.measured)
+        self._chain.local.prune_landmarks(linked.frame, updated.measured)
         return ()
 
-    def _close(self, linked: LinkedFrame, seen: Sight, updated: UpdatedFrame) -> tuple[Submap, ...]:
+    def _close(self, linked: LinkedFrame, seen: LandmarkMatches, updated: UpdatedFrame) -> tuple[Submap, ...]:
         """Finish the submap and open the one that follows, at the rig's pose in this frame."""
         submaps = self._chain.close()
         self._chain.follow(linked.frame, seen, updated.measured, self._aids.up)

@@ -132,7 +132,7 @@ class FilterStage:
         return (0.0, 0.0) if self._slam is None else self._slam.readout_s
 
     @property
-    def finding(self) -> str:
+    def diagnostic(self) -> str:
         """Findings about camera and odometry that a user should know of, or ""."""
         return "; ".join(filter(None, [self.shutter_finding, self.odometry_finding]))
 
@@ -194,8 +194,8 @@ class FilterStage:
         slam = self._filter(features)
         self._give_aids(slam, features.stamp_ns)
         result = slam.process(features)
-        if result.state is TrackingState.OK and (complaint := self._awaited.complaint() or slam.complaint):
-            result = replace(result, state=TrackingState.DEGRADED, reason=complaint)
+        if result.state is TrackingState.OK and (diagnostic := self._awaited.diagnostic() or slam.diagnostic):
+            result = replace(result, state=TrackingState.DEGRADED, reason=diagnostic)
         return FrameResult(result, len(features))
 
     def _filter(self, features: Features) -> EkfSlam:

@@ -128,7 +128,7 @@ class NdtNode(StageNode[NdtNodeConfig]):
     def _report(self, result: OdometryResult) -> None:
         self.health.take(self.stage.counters.counts)
         self._show(result)
-        degraded = result.status is OdometryStatus.FAILED or self.stage.complaint
+        degraded = result.status is OdometryStatus.FAILED or self.stage.diagnostic
         self.health.set(State.DEGRADED if degraded else State.OK, result.reason)
 
     def _show(self, result: OdometryResult) -> None:

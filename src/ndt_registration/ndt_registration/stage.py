@@ -62,9 +62,9 @@ class ScanOdometryStage:
         self._awaited = AwaitedStreams()
 
     @property
-    def complaint(self) -> str:
+    def diagnostic(self) -> str:
         """Since when the IMU is silent, or ""."""
-        return self._awaited.complaint()
+        return self._awaited.diagnostic()
 
     @property
     def oldest_waiting_ns(self) -> int | None:
@@ -114,8 +114,8 @@ class ScanOdometryStage:
         self._use_turn_rates(scan.frame_id)
         result = self._odometry.process(scan.stamp_ns, scan.points)
         self.counters.add(result.status.value.lower())
-        if result.status is not OdometryStatus.FAILED and self.complaint:
-            result = replace(result, reason=self.complaint)
+        if result.status is not OdometryStatus.FAILED and self.diagnostic:
+            result = replace(result, reason=self.diagnostic)
         pose = pose_of_rig(PoseEstimate(result.stamp_ns, result.T, result.covariance), T_base_sensor)
         motion = None if result.motion is None else motion_of_rig(result.motion, T_base_sensor)
         return ScanEstimate(pose, motion, result, scan, pose.T @ T_base_sensor)

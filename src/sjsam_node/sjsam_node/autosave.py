@@ -64,7 +64,7 @@ class Autosave:
         storage.write_packed(self.path, packed)
         return time.perf_counter() - started
 
-    def put_away(self) -> None:
+    def retire(self) -> None:
         """Wait for the writer and rename the copy: the node ends in order, or its map was reset."""
         self.wait()
         if storage.is_map(self.path) and (storage.is_map(self.ended) or not self.ended.exists()):

@@ -140,7 +140,7 @@ class GlobalMap:
 
     def add(self, submap: Submap) -> JoinReport:
         """Join one submap; a faulty one is refused with the reason, counted, and changes nothing."""
-        reason = self._fault(submap)
+        reason = self._rejection(submap)
         if reason:
             self.counters.add(f"refused: {reason}")
             return JoinReport(False, reason)
@@ -210,7 +210,7 @@ class GlobalMap:
         """Parts of the map that nothing ties together yet."""
         return len(self.state.components())
 
-    def _fault(self, submap: Submap) -> str:
+    def _rejection(self, submap: Submap) -> str:
         """Reason for which a submap cannot be joined; empty if it can."""
         if not (np.all(np.isfinite(submap.covariance)) and np.all(np.isfinite(submap.landmarks))):
             return "not finite"

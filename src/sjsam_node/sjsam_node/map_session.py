@@ -242,7 +242,7 @@ class MapSession:
         self.mode = Mode.MAP
         self._go_on_with(GlobalMap(self._config))
         if self._autosave is not None:
-            self._autosave.put_away()
+            self._autosave.retire()
 
     def save(self, path: Path, *, is_last: bool = False) -> Future[None]:
         """Save the map with the submaps joined so far; ValueError for an empty one where there is another.
@@ -310,7 +310,7 @@ class MapSession:
         self._executor.shutdown()
         self._copy_now()
         if self._autosave is not None:
-            self._autosave.put_away()
+            self._autosave.retire()
             self._autosave.close()
 
     def _copy_now(self) -> None:

@@ -58,15 +58,15 @@ class Health:
         self._durations.append(duration_s)
         self._frames += is_frame
 
-    def report(self, now_s: float, complaint: str = "") -> dict[str, str]:
+    def report(self, now_s: float, diagnostic: str = "") -> dict[str, str]:
         """Key and text of every value; starts a new period for rate and durations. ``now_s`` is any steady clock.
 
-        ``complaint``: fault beside the estimator's own, with which no state is OK.
+        ``diagnostic``: fault beside the estimator's own, with which no state is OK.
         """
         period = now_s - self._reported_at if self._reported_at is not None else 0.0
         durations, self._durations, self._reported_at = self._durations, [], now_s
-        state = max(self.state, State.DEGRADED) if complaint else self.state
-        values = {"state": state.name, "reason": "; ".join(filter(None, (complaint, self.reason)))}
+        state = max(self.state, State.DEGRADED) if diagnostic else self.state
+        values = {"state": state.name, "reason": "; ".join(filter(None, (diagnostic, self.reason)))}
         frames, self._frames = self._frames, 0
         values["rate_hz"] = f"{frames / period:.2f}" if period > 0.0 else "0.00"
         if frames:

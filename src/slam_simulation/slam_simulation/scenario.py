@@ -123,7 +123,7 @@ class Scenario:
             raise ValueError(f"scenario '{self.name}': unknown sensors {sorted(unknown)}, known: {', '.join(_KNOWN)}")
         for agent in self.agents:
             for x, y, *_ in (*agent.path, *agent.stations):
-                if not any(room.holds(x, y, WALL_GAP) for room in self.rooms):
+                if not any(room.contains(x, y, WALL_GAP) for room in self.rooms):
                     raise ValueError(f"agent '{agent.name}' of scenario '{self.name}' leaves all rooms at ({x}, {y}) m")
 
     @classmethod
@@ -206,7 +206,7 @@ class Scenario:
 
     def _room_at(self, at: tuple[float, float]) -> int:
         for k, room in enumerate(self.rooms):
-            if room.holds(*at):
+            if room.contains(*at):
                 return k
         raise ValueError(f"scenario '{self.name}': {at} m lies in no room")
 

@@ -257,7 +257,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
         self.page.show_agent_table(rows)
         texts = []
         for out in ways_out(tuple(self._plans.values()), poses, paths) if self._plans else ():
-            points = np.empty((0, 3)) if out.way is None else out.way.points
+            points = np.empty((0, 3)) if out.route is None else out.route.points
             self.page.show_way(list(self._agents).index(out.agent), points, out.label)
             texts.append((out.agent, out.text))
         self.page.show_ways_text(texts)

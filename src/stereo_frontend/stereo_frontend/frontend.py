@@ -249,10 +249,12 @@ class Frontend:
     def report(self) -> FrontendReport:
         """Findings about the images so far."""
         stereo, ranges, device = self.self_calibration, self.range_calibration, self._device
-        advice = tuple(filter(None, (device.complaint, stereo.advice(), ranges.advice(), self._tof.advice())))
+        advice = tuple(filter(None, (device.diagnostic, stereo.advice(), ranges.advice(), self._tof.advice())))
         picture = "+".join(self._tof.used) if self.config.mode == "tof" else "stereo"
         error = stereo.error if stereo.corrects else None
-        return FrontendReport(stereo.figures(), advice, picture, error, ranges.figures(), device.name, device.complaint)
+        return FrontendReport(
+            stereo.figures(), advice, picture, error, ranges.figures(), device.name, device.diagnostic
+        )
 
     def _described(self, images: StereoImages, left: Keypoints, needed: npt.NDArray[np.bool_]) -> Keypoints:
         """The left keypoints with descriptors for other moments: of those ``needed``, zeros for the others."""

@@ -48,9 +48,9 @@ class Masking:
         self._wrong_size = ""
 
     @property
-    def complaint(self) -> str:
+    def diagnostic(self) -> str:
         """Complaint about a mask of the wrong size, or since when there are no masks, or ""."""
-        return self._wrong_size or self._pairing.complaint
+        return self._wrong_size or self._pairing.diagnostic
 
     @property
     def oldest_waiting_ns(self) -> int | None:

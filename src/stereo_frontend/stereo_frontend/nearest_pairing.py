@@ -53,9 +53,9 @@ class NearestPairing(Generic[F, C]):
         self._companions: deque[C] = deque(maxlen=_KEPT)
 
     @property
-    def complaint(self) -> str:
+    def diagnostic(self) -> str:
         """Since when the companions' stream is silent, or ""."""
-        return self._awaited.complaint()
+        return self._awaited.diagnostic()
 
     @property
     def oldest_waiting_ns(self) -> int | None:

@@ -169,8 +169,8 @@ class FeatureNode(StageNode[FrontendConfig]):
             self.get_logger().warning(report.device_complaint, once=True)
         self.health.show("advice", "; ".join(report.advice))
         few = f"only {number} features" if number < FEW_FEATURES else ""
-        complaint = few or self.stage.complaint
-        self.health.set(State.DEGRADED if complaint else State.OK, complaint)
+        diagnostic = few or self.stage.diagnostic
+        self.health.set(State.DEGRADED if diagnostic else State.OK, diagnostic)
 
 
 def main() -> None:

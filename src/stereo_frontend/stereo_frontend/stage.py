@@ -122,9 +122,9 @@ class FeatureStage:
         return self._frontend.report()
 
     @property
-    def complaint(self) -> str:
+    def diagnostic(self) -> str:
         """Reason for which features lack depth or a mask that they should have, or ""."""
-        return "; ".join(filter(None, (self._pairing.complaint, self._masking.complaint)))
+        return "; ".join(filter(None, (self._pairing.diagnostic, self._masking.diagnostic)))
 
     @property
     def oldest_waiting_ns(self) -> int | None:

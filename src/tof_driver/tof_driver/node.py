@@ -164,7 +164,7 @@ class TofDriverNode(SlamNode[TofDriverConfig]):
     def _publish_ready(self) -> None:
         for depth in self.stage.ready():
             self._publish(depth)
-            self.health.set(State.DEGRADED if self.stage.complaint else State.OK, self.stage.complaint)
+            self.health.set(State.DEGRADED if self.stage.diagnostic else State.OK, self.stage.diagnostic)
         self.health.take(self.stage.counters)
 
     def _publish(self, depth: DepthImage) -> None:

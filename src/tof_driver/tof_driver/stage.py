@@ -35,7 +35,7 @@ class DepthStage:
 
     def __init__(self, config: DepthConfig) -> None:
         self.info: CameraInfo | None = None
-        self.complaint = ""
+        self.diagnostic = ""
         """Fault of the newest image, or ""."""
         self._config = config
         self._processor: DepthProcessor | None = None
@@ -77,7 +77,7 @@ class DepthStage:
             raw = self._waiting.popleft()
             depth = self._processor.process(raw.stamp_ns, raw.image, raw.amplitude, raw.intensity)
             share = self._processor.share_with_depth
-            self.complaint = f"{100.0 * share:.1f} % of the pixels have depth" if share < FEW_PIXELS else ""
+            self.diagnostic = f"{100.0 * share:.1f} % of the pixels have depth" if share < FEW_PIXELS else ""
             yield replace(depth, frame_id=raw.frame_id)
 
     def colour(self, picture: ByteArray) -> ByteArray | None:

@@ -176,7 +176,7 @@ def test_excess_tells_how_much_noisier_the_features_are(world: PointWorld, rng: 
     guess = guess_motion(candidates_of(before).select(rows), now.select(columns), T_RIG_OPTICAL, rng, 200, 16.27)
     assert guess is not None
     # Nine times the variance now, once before, against twice claimed.
-    np.testing.assert_allclose(guess.excess, 5.0, rtol=0.5)
+    np.testing.assert_allclose(guess.variance_scale, 5.0, rtol=0.5)
 
 
 def test_large_step_is_linked_and_a_foreign_place_is_not(world: PointWorld, rng: np.random.Generator) -> None:

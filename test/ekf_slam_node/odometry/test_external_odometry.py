@@ -12,10 +12,10 @@ import pytest
 from imu_world import carried, readings
 
 from ekf_slam_node.config import EkfSlamConfig, ExternalOdometryConfig, InertialConfig, MotionConfig
-from ekf_slam_node.odometry.aids import MotionAids
 from ekf_slam_node.odometry.external_odometry import ExternalOdometry, calibrated
 from ekf_slam_node.odometry.pose_readings import PoseReadings
 from ekf_slam_node.odometry.preintegration import Preintegral
+from ekf_slam_node.odometry.relative_poses import RelativePoseBuffer
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.slam import EkfSlam
 from feature_world import room
@@ -98,7 +98,7 @@ def test_the_scale_is_worth_its_learning() -> None:
     sigma = np.sqrt(np.diagonal(odometry.covariance))
     assert sigma[0] < 0.3 * ExternalOdometryConfig().sigma_scale
     assert abs(odometry.calibration[0] + RADIUS) < 0.5 * RADIUS
-    assert "way x 0.98" in odometry.finding
+    assert "way x 0.98" in odometry.diagnostic
 
 
 def test_without_a_covariance_the_images_tell_the_noise() -> None:
@@ -205,8 +205,8 @@ def test_an_odometry_along_other_axes_counts_for_little_and_says_so() -> None:
     """Its frame looks back, and nobody has said so."""
     back = make_transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     poses = tuple(replace(p, T=p.T @ back) for p in wheel_readings(GOOD, 3))
-    assert "contradicts the images" in learnt(poses, 3).complaint
-    assert learnt(wheel_readings(GOOD, 3), 3).complaint == ""
+    assert "contradicts the images" in learnt(poses, 3).diagnostic
+    assert learnt(wheel_readings(GOOD, 3), 3).diagnostic == ""
 
 
 def test_images_that_see_again_correct_what_was_bridged() -> None:
@@ -274,7 +274,7 @@ def test_the_map_goes_on_after_darkness(with_imu: bool) -> None:
 
 
 def test_an_imu_does_not_condemn_and_the_odometry_is_taken_first() -> None:
-    aids = MotionAids(MotionConfig(), InertialConfig(), ExternalOdometryConfig())
+    aids = RelativePoseBuffer(MotionConfig(), InertialConfig(), ExternalOdometryConfig())
     for pose in pose_readings(1.0, np.random.default_rng(0)):
         assert aids.add_odometry(pose) == ""
     aid = aids.bridge(0, 5 * STEP_NS)

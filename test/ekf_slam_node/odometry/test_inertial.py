@@ -10,9 +10,9 @@ import pytest
 from imu_world import ACCELEROMETER_BIAS, GYRO_BIAS, PLACE, carried, imu_place, readings, velocity
 
 from ekf_slam_node.config import EkfSlamConfig, InertialConfig, MotionConfig
-from ekf_slam_node.odometry.aids import MotionAids
 from ekf_slam_node.odometry.odometry import OdometryChain, UpDirection
 from ekf_slam_node.odometry.preintegration import ImuNoise, ImuReadings, Preintegral
+from ekf_slam_node.odometry.relative_poses import RelativePoseBuffer
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.slam import EkfSlam
 from feature_world import room
@@ -93,9 +93,9 @@ def test_missing_readings_are_said_to_be_unknown() -> None:
     assert not buffer(samples).add(samples[-1])
 
 
-def followed(samples: list[ImuSample], seconds: float, rng: np.random.Generator) -> MotionAids:
+def followed(samples: list[ImuSample], seconds: float, rng: np.random.Generator) -> RelativePoseBuffer:
     """Aids that were told at 10 Hz of the motions that the images show."""
-    aids = MotionAids(MotionConfig(), InertialConfig())
+    aids = RelativePoseBuffer(MotionConfig(), InertialConfig())
     coming = iter(samples)
     for k in range(1, round(10 * seconds) + 1):
         while aids.newest_stamp_ns < k * STEP_NS:
@@ -154,8 +154,8 @@ def test_an_accelerometer_that_reads_something_else_is_left_out(turned: FloatArr
     wrong = [replace(s, linear_acceleration=turned @ s.linear_acceleration) for s in readings(8.0, rng)]
     aids = followed(wrong, 7.0, rng)
     assert not aids.inertial.uses_force
-    assert said in aids.inertial.complaint
-    assert (said == "") == (aids.inertial.complaint == "")
+    assert said in aids.inertial.diagnostic
+    assert (said == "") == (aids.inertial.diagnostic == "")
     assert aids.bridge(7 * 10**9, 8 * 10**9) is None
     np.testing.assert_allclose(aids.inertial.biases[:3], GYRO_BIAS, atol=2e-3)
 
@@ -164,7 +164,7 @@ def test_an_imu_along_other_axes_is_left_out() -> None:
     """Mounted upside down, and nobody has said so: it turns the other way."""
     rng, over = np.random.default_rng(3), np.diag([1.0, -1.0, -1.0])
     aids = followed([s.seen_from(make_transform(over, np.zeros(3)), "base_link") for s in readings(8.0, rng)], 6.0, rng)
-    assert "turn rates contradict the images" in aids.inertial.complaint
+    assert "turn rates contradict the images" in aids.inertial.diagnostic
     assert aids.between(60 * STEP_NS, 61 * STEP_NS) is None
     assert aids.up is None
 
@@ -235,7 +235,7 @@ def test_a_place_that_looks_like_another_is_told_from_it_by_the_imu(imu: str) ->
 def test_an_imu_refutes_a_few_frames_in_a_row_and_no_more() -> None:
     aids = followed(readings(8.0, np.random.default_rng(3)), 6.0, np.random.default_rng(4))
     aside = make_transform(so3_exp(0.5 * Z), np.zeros(3))
-    refuted = [aids.refute(60 * STEP_NS, k * STEP_NS, aside, 1e-6 * np.eye(6)) for k in range(61, 71)]
+    refuted = [aids.is_inconsistent(60 * STEP_NS, k * STEP_NS, aside, 1e-6 * np.eye(6)) for k in range(61, 71)]
     assert refuted == [True] * sum(refuted) + [False] * (10 - sum(refuted))
     assert 1 <= sum(refuted) <= 4
 

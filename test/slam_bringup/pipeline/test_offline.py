@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from slam_bags.reading.readings import AgentSensors
-from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
+from slam_bringup.pipeline.prefetch import ahead
 from slam_bringup.pipeline.run_record import StateChanges
 from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes

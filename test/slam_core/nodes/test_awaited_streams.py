@@ -23,13 +23,13 @@ def test_a_frame_waits_until_every_stream_has_reached_its_stamp() -> None:
     assert streams.must_wait(100)
     streams.heard("imu", 101)
     assert not streams.must_wait(100)
-    assert streams.complaint() == ""
+    assert streams.diagnostic() == ""
 
 
 def test_a_stream_that_is_never_heard_holds_up_no_more_frames_than_the_patience() -> None:
     streams = AwaitedStreams(["motion"], patience=3)
     assert frames(streams, range(5)) == [True, True, True, False, False]
-    assert streams.complaint() == "no motion so far"
+    assert streams.diagnostic() == "no motion so far"
 
 
 def test_an_unexpected_stream_is_waited_for_once_it_was_heard() -> None:
@@ -45,7 +45,7 @@ def test_a_stream_that_comes_back_is_waited_for_again() -> None:
     streams = AwaitedStreams(["motion"], patience=2)
     streams.heard("motion", 2_000_000_000)
     frames(streams, range(3_000_000_000, 3_000_000_004))
-    assert streams.complaint() == "no motion since 2.000 s"
+    assert streams.diagnostic() == "no motion since 2.000 s"
     streams.heard("motion", 3_000_000_003)
     streams.frame(3_000_000_010)
     assert streams.must_wait(3_000_000_010)

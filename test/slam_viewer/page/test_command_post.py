@@ -42,10 +42,10 @@ def agent_at(x: float, y: float, z: float = 1.2, sigma: float = 0.02) -> PoseEst
 
 def test_the_way_out_goes_through_the_door_and_says_how_sure_it_is():
     (out,) = ways_out([drawn_plan()], {"one": agent_at(1.0, 1.0)}, {"one": np.array([[5.5, 1.0, 0.0]])})
-    assert out.way is not None
-    at_wall = out.way.points[np.abs(out.way.points[:, 0] - 3.75) < 0.2]
+    assert out.route is not None
+    at_wall = out.route.points[np.abs(out.route.points[:, 0] - 3.75) < 0.2]
     assert np.all(np.abs(at_wall[:, 1] - 1.75) < 0.3)
-    assert 4.7 < out.way.length < 6.0
+    assert 4.7 < out.route.length < 6.0
     assert out.radius == pytest.approx(0.02 * 3.255, rel=0.01)
     assert "m to the exit" in out.text
     assert "wide at its narrowest" in out.text
@@ -55,7 +55,7 @@ def test_an_agent_behind_a_wall_without_a_door_has_no_way_out():
     plan = drawn_plan()
     plan.cells[:, 40:45] = OCCUPIED
     (out,) = ways_out([plan], {"one": agent_at(1.0, 1.0)}, {"one": np.array([[5.5, 1.0, 0.0]])})
-    assert out.way is None
+    assert out.route is None
     assert out.text == "no way out through what was seen free or walked on"
 
 
@@ -66,12 +66,12 @@ def test_who_has_walked_through_what_nobody_saw_finds_the_way_back():
     path = np.stack([x, np.where(x < 3.0, 1.0, 1.7), np.full_like(x, 1.2)], axis=1)
     agents = {"one": agent_at(*path[0]), "two": agent_at(5.5, 1.7)}
     two = path[-1:]
-    assert ways_out([plan], agents, {"one": path[-2:], "two": two})[0].way is None
+    assert ways_out([plan], agents, {"one": path[-2:], "two": two})[0].route is None
     one, _ = ways_out([plan], agents, {"one": path[::-1], "two": two})
-    assert one.way is not None
-    assert 4.5 < one.way.length < 6.0
+    assert one.route is not None
+    assert 4.5 < one.route.length < 6.0
     crossing = path[[0, -1]]
-    assert ways_out([plan], agents, {"one": crossing[::-1], "two": two})[0].way is None, "nobody saw what is between"
+    assert ways_out([plan], agents, {"one": crossing[::-1], "two": two})[0].route is None, "nobody saw what is between"
 
 
 def test_a_position_that_nothing_ties_to_the_map_is_not_told_in_metres():
@@ -87,7 +87,7 @@ def test_each_agent_is_on_the_highest_floor_below_it():
     assert storey_at([], np.zeros(3)) is None
     upstairs = {"two": agent_at(1.0, 1.0, 4.2)}
     (out,) = ways_out(plans, upstairs, {"two": np.array([[5.5, 1.0, 0.0]])})
-    assert out.way is None, "stairs are on no plan"
+    assert out.route is None, "stairs are on no plan"
 
 
 def test_borders_of_what_was_seen_are_told_the_longest_first():

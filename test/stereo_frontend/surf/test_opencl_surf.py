@@ -218,27 +218,27 @@ def test_without_a_gpu_surf_is_on_the_cpu_and_says_so_where_one_was_asked_for(
     monkeypatch.setattr(cl, "get_platforms", platforms)
     device = SurfDevice(wanted)
     assert device.name == "cpu"
-    assert bool(device.complaint) == complains
+    assert bool(device.diagnostic) == complains
     assert device.compute(lambda surf: "device", lambda: "cpu") == "cpu"
 
 
 @pytest.mark.parametrize(("wanted", "complaint"), [("auto", ""), ("gpu", "pip install pyopencl"), ("cpu", "")])
-def test_without_pyopencl_surf_is_on_the_cpu(monkeypatch, wanted, complaint):
+def test_without_pyopencl_surf_is_on_the_cpu(monkeypatch, wanted, diagnostic):
     monkeypatch.setitem(sys.modules, "stereo_frontend.surf.opencl_surf", None)
     monkeypatch.delattr("stereo_frontend.surf.opencl_surf")
     device = SurfDevice(wanted)
     assert best_opencl_device() is None
     assert device.name == "cpu"
-    assert complaint in device.complaint
-    assert bool(device.complaint) == bool(complaint)
+    assert diagnostic in device.diagnostic
+    assert bool(device.diagnostic) == bool(diagnostic)
 
 
 def test_a_device_that_cannot_compile_the_kernels_is_not_used(device, monkeypatch):
     monkeypatch.setattr(opencl_surf, "_MACROS", opencl_surf._MACROS | {"SAMPLES": "nonsense"})
     chosen = SurfDevice(device.name)
     assert chosen.name == "cpu"
-    assert "\n" not in chosen.complaint
-    assert device.name.strip() in chosen.complaint
+    assert "\n" not in chosen.diagnostic
+    assert device.name.strip() in chosen.diagnostic
 
 
 ERRORS = [

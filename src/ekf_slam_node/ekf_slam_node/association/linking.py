@@ -65,7 +65,7 @@ class FrameLink:
 
     T: FloatArray
     covariance: FloatArray
-    excess: FloatArray
+    variance_scale: FloatArray
     rows: IndexArray
     columns: IndexArray
     error: FloatArray
@@ -114,13 +114,15 @@ class Linker:
         guessed = self._by_guess(candidates, frame, rng, is_refuted)
         return max((link for link in (predicted, guessed) if link is not None), key=_number_of_pairs, default=None)
 
-    def link_at(self, candidates: Candidates, frame: Frame, prior: MotionPrior, excess: FloatArray) -> FrameLink | None:
+    def link_at(
+        self, candidates: Candidates, frame: Frame, prior: MotionPrior, variance_scale: FloatArray
+    ) -> FrameLink | None:
         """The pairs inside the gates of a motion that another sensor tells, and the motion that they agree on.
 
-        The gates are those of the features' true noise, by ``excess`` (3,) smaller than what they claim: what moves
-        slowly hides in the difference.
+        The gates are those of the features' true noise, by ``variance_scale`` (3,) smaller than what they claim: what
+        moves slowly hides in the difference.
         """
-        config, tight = self._config, frame.with_larger_noise(np.minimum(excess, 1.0))
+        config, tight = self._config, frame.with_larger_noise(np.minimum(variance_scale, 1.0))
         rows, columns = self._associate(candidates, tight, prior)
         rng = np.random.default_rng((config.seed, frame.stamp_ns))
         pairs = candidates.places(rows), tight.places(columns)
@@ -162,7 +164,7 @@ class Linker:
         link = self._link_of(candidates, frame, guess.T, rows, columns, config.min_inliers)
         if link is None:
             return None
-        self._excess = 0.9 * self._excess + 0.1 * np.minimum(link.excess, 1.0)
+        self._excess = 0.9 * self._excess + 0.1 * np.minimum(link.variance_scale, 1.0)
         moving = marked + (0 if two is None else len(two.moving))
         is_sure = moving < _ALIKE * len(link.rows) and (two is None or two.is_larger)
         return replace(link, moving=moving, is_sure=is_sure)
@@ -175,7 +177,7 @@ class Linker:
         free_columns = np.setdiff1d(np.flatnonzero(~self._moving.marks(frame.tracks)), columns)
         if min(len(free_rows), len(free_columns)) == 0:
             return rows[:0], columns[:0]
-        noisier = frame.select(free_columns).with_larger_noise(np.maximum(guess.excess, 1.0))
+        noisier = frame.select(free_columns).with_larger_noise(np.maximum(guess.variance_scale, 1.0))
         more_rows, more_columns = associate_mahalanobis(
             candidates.select(free_rows), noisier, guess.T, guess.covariance, self._T_rig_optical, self._config
         )
@@ -199,7 +201,7 @@ class Linker:
         )
         if guess is None or guess.inliers.sum() < max(config.min_inliers, 0.5 * len(rows)):
             return None
-        return self._settle(candidates, frame, guess, config.min_inliers)
+        return self._refine_matches(candidates, frame, guess, config.min_inliers)
 
     def _by_guess(
         self,
@@ -225,7 +227,7 @@ class Linker:
             enough = max(config.min_inliers, _MIN_INLIER_RATIO * len(rows))
             if guess is None or guess.inliers.sum() < enough:
                 continue
-            link = self._settle(candidates, frame, guess, _GUESS_MIN_INLIERS)
+            link = self._refine_matches(candidates, frame, guess, _GUESS_MIN_INLIERS)
             if link is not None and not is_refuted(link):
                 return link
         return None
@@ -236,13 +238,13 @@ class Linker:
             return associate_nearest(candidates, frame, prior.T, self._T_rig_optical, config)
         return _METHODS[config.method](candidates, frame, prior.T, prior.covariance, self._T_rig_optical, config)
 
-    def _settle(self, candidates: Candidates, frame: Frame, guess: MotionGuess, least: int) -> FrameLink | None:
+    def _refine_matches(self, candidates: Candidates, frame: Frame, guess: MotionGuess, least: int) -> FrameLink | None:
         """Associate once more around the motion found, where the gates are as small as they can be."""
         if self._config.method == "nearest":
             by_distance = candidates, frame, guess.T, self._T_rig_optical, self._config
             link = self._link_of(candidates, frame, guess.T, *associate_nearest(*by_distance), least)
             return None if link is None else replace(link, wrong=wrong_pair_variance(*by_distance))
-        noisier = frame.with_larger_noise(np.maximum(guess.excess, 1.0))
+        noisier = frame.with_larger_noise(np.maximum(guess.variance_scale, 1.0))
         rows, columns = associate_mahalanobis(
             candidates, noisier, guess.T, guess.covariance, self._T_rig_optical, self._config
         )
@@ -258,7 +260,9 @@ class Linker:
         # In the order of the features, not of their errors: to measure the best-fitting first would choose by noise.
         inliers = np.flatnonzero(final.inliers)
         inliers = inliers[np.argsort(columns[inliers], kind="stable")]
-        return FrameLink(final.T, final.covariance, final.excess, rows[inliers], columns[inliers], final.error[inliers])
+        return FrameLink(
+            final.T, final.covariance, final.variance_scale, rows[inliers], columns[inliers], final.error[inliers]
+        )
 
 
 def _is_usable(motion: MotionGuess) -> bool:

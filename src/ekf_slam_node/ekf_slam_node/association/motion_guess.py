@@ -37,7 +37,7 @@ class MotionGuess:
     T: FloatArray
     covariance: FloatArray
     inliers: np.ndarray
-    excess: FloatArray
+    variance_scale: FloatArray
     error: FloatArray
 
 
@@ -82,11 +82,12 @@ def refine_motion(
 ) -> MotionGuess | None:
     """Gauss-Newton on the pairs inside the gate, chosen anew in each step, the gate closing from wide to its value.
 
-    The spread of the pairs' errors tells how much larger they are than claimed (``excess``); gate and weights follow.
+    The spread of the pairs' errors tells how much larger they are than claimed (``variance_scale``); gate and weights
+    follow.
     """
     pairs = PairErrors.room(len(candidates))
-    found, T, covariance, inliers, excess = refined(
+    found, T, covariance, inliers, variance_scale = refined(
         candidates.points, candidates.covariances, frame.z, frame.variance, T_rig_optical, frame.camera.lens,
         T, gate, iterations, pairs.error, pairs.S, pairs.J, pairs.depth,
     )  # fmt: skip
-    return MotionGuess(T, covariance, inliers, excess, pairs.error) if found else None
+    return MotionGuess(T, covariance, inliers, variance_scale, pairs.error) if found else None

@@ -159,23 +159,23 @@ def refined(points, covariances, z, variance, T_rig_optical, lens, start, gate, 
     inliers (n,), and by how much their errors exceed the claimed variances (3,).
     """
     T, covariance, camera = start.copy(), np.eye(6), np.eye(4)
-    excess, root, inliers = np.ones(3), np.ones(3), np.zeros(len(points), np.bool_)
+    variance_scale, root, inliers = np.ones(3), np.ones(3), np.zeros(len(points), np.bool_)
     for step in range(iterations):
         _product(T, T_rig_optical, camera)
         pair_errors(points, covariances, z, variance, camera, T[:3, 3], lens, error, S, J, depth)
         updated = gated(error, S, depth, root, gate * max(1.0, 4.0 - step))
         if updated.sum() < 4:
-            return False, T, covariance, inliers, excess
+            return False, T, covariance, inliers, variance_scale
         if step > 3 and not (updated != inliers).any():
             break
         inliers = updated
-        _excess(error, S, inliers, excess)
-        root = np.sqrt(np.maximum(excess, 1.0))
+        _excess(error, S, inliers, variance_scale)
+        root = np.sqrt(np.maximum(variance_scale, 1.0))
         information, gradient = normal_equations(error, S, J, inliers, root)
         if not _inverse(information, covariance):
-            return False, T, covariance, inliers, excess
+            return False, T, covariance, inliers, variance_scale
         _move(T, covariance, gradient)
-    return True, T, covariance, inliers, excess
+    return True, T, covariance, inliers, variance_scale
 
 
 @in_place()

@@ -67,15 +67,15 @@ def two_motions(
     rng: np.random.Generator,
     gate: float,
     least: int,
-    excess: FloatArray,
+    variance_scale: FloatArray,
     initial: FloatArray,
 ) -> TwoMotions | None:
     """The two motions of followed pairs, ``least`` at least of each; None where there is one only.
 
-    ``excess`` (3,): by what factors the pairs' errors usually exceed their claimed variances; ``initial``: the motion
-    expected.
+    ``variance_scale`` (3,): by what factors the pairs' errors usually exceed their claimed variances; ``initial``: the
+    motion expected.
     """
-    tight = frame.with_larger_noise(np.minimum(excess, 1.0))
+    tight = frame.with_larger_noise(np.minimum(variance_scale, 1.0))
     groups: list[tuple[MotionGuess, IndexArray, IndexArray]] = []
     rows, columns = pairs
     for first in (initial, None):
@@ -83,7 +83,7 @@ def two_motions(
             return None
         places = candidates.places(rows), tight.places(columns)
         found = guess_motion(*places, T_rig_optical, rng, _HYPOTHESES, gate, first)
-        if found is None or found.inliers.sum() < least or found.excess.max() > _LOOSEST:
+        if found is None or found.inliers.sum() < least or found.variance_scale.max() > _LOOSEST:
             return None
         groups.append((found, rows[found.inliers], columns[found.inliers]))
         rows, columns = rows[~found.inliers], columns[~found.inliers]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drift of odometry that no residual shows: what a frame's common error leaves behind in the map.
 
-Of the error that all features of a frame have in common (:mod:`ekf_slam_node.filtering.common_error`) a part does not
-average out while the view changes: new landmarks are placed by frames that err, and rig and landmarks in view move away
-together. Each frame adds a small rigid motion about the camera, a random walk. The filter cannot see it, and its
-estimate stays; the poses that it gives out are as much less certain. Submaps are handed on without: with it in their
-covariances, maps joined of recordings became up to 8 % less accurate.
+Of the error that all features of a frame have in common (:mod:`ekf_slam_node.filtering.correlated_noise`) a part does
+not average out while the view changes: new landmarks are placed by frames that err, and rig and landmarks in view
+move away together. Each frame adds a small rigid motion about the camera, a random walk. The filter cannot see it,
+and its estimate stays; the poses that it gives out are as much less certain. Submaps are handed on without: with it
+in their covariances, maps joined of recordings became up to 8 % less accurate.
 """
 
 from __future__ import annotations

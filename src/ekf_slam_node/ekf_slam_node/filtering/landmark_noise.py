@@ -15,9 +15,9 @@ import numpy as np
 from ekf_slam_node.filtering.covariance import IndexArray
 from slam_core.geometry import FloatArray
 
-_ENOUGH = 5
+_MIN_SIGHTINGS = 5
 """Sightings after which a landmark's record tells something of the spread."""
-_FEW = 20
+_MIN_LANDMARKS = 20
 """Such landmarks, below which nothing is said."""
 _FACTORS = (0.5, 10.0)
 """Limits: a keypoint moves with the view later on, however steady it was so far."""
@@ -55,8 +55,8 @@ class LandmarkNoise:
 
     def factors(self, slots: IndexArray) -> FloatArray:
         """Factors (k,) on the claimed variances of ``slots``; the mean over all landmarks stays as claimed."""
-        known = self.counts >= _ENOUGH
-        if known.sum() < _FEW:
+        known = self.counts >= _MIN_SIGHTINGS
+        if known.sum() < _MIN_LANDMARKS:
             return np.ones(len(slots))
         squares = self.sums[known] / self.counts[known]
         level = np.mean(squares)

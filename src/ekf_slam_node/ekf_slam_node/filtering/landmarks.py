@@ -20,7 +20,7 @@ _COLUMNS, _ROWS = 8, 6
 
 
 @dataclass(frozen=True, eq=False)
-class Pending:
+class CandidateLandmarks:
     """Features of the last frame that are no landmarks (yet): a feature becomes one when a second frame confirms it.
 
     candidates: points in the rig frame of that frame. ids: (n,) of the landmarks they belong to where a new submap has
@@ -33,11 +33,13 @@ class Pending:
     sightings: np.ndarray
     free: np.ndarray
 
-    def select(self, index: np.ndarray) -> Pending:
+    def select(self, index: np.ndarray) -> CandidateLandmarks:
         """The features at ``index``."""
-        return Pending(self.candidates.select(index), self.ids[index], self.sightings[index], self.free[index])
+        return CandidateLandmarks(
+            self.candidates.select(index), self.ids[index], self.sightings[index], self.free[index]
+        )
 
-    def without(self, index: IndexArray) -> Pending:
+    def without(self, index: IndexArray) -> CandidateLandmarks:
         """All but the features at ``index``."""
         keep = np.ones(len(self.ids), dtype=bool)
         keep[index] = False

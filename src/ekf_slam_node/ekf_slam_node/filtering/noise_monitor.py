@@ -15,7 +15,7 @@ import numpy as np
 from ekf_slam_node.filtering.models import Frame
 from slam_core.geometry import FloatArray
 
-_NOISE_MEMORY = 0.9
+_FORGETTING = 0.9
 """Share of the past in the running estimate of how much larger the noise is than claimed."""
 _NOISE_TOLERANCE = 2.0
 """Variances of one frame are enlarged only if its errors exceed them by more than this factor."""
@@ -54,7 +54,7 @@ class NoiseMonitor:
         applied = np.log(self.factor)
         own = np.minimum(np.where(ratio > _NOISE_TOLERANCE, ratio, 1.0), np.exp(limit - applied))
         seen = applied + np.log(ratio)
-        self._log_factor = np.clip(_NOISE_MEMORY * self._log_factor + (1.0 - _NOISE_MEMORY) * seen, -_CHANCE, limit)
+        self._log_factor = np.clip(_FORGETTING * self._log_factor + (1.0 - _FORGETTING) * seen, -_CHANCE, limit)
         return frame.with_larger_noise(own)
 
 
@@ -69,7 +69,7 @@ class InnovationWatch:
         self._ratios.append(ratio)
 
     @property
-    def complaint(self) -> str:
+    def diagnostic(self) -> str:
         """Complaint about the frames of late, or ""."""
         high = [ratio for ratio in self._ratios if ratio > _NOISE_TOLERANCE]
         if len(high) < _FEW_FRAMES:

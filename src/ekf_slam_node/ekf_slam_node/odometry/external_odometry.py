@@ -149,7 +149,7 @@ class ExternalOdometry:
         return f"no usable covariance of {', '.join(names)}: estimated from the images"
 
     @property
-    def complaint(self) -> str:
+    def diagnostic(self) -> str:
         """Complaint about the odometry, or ""."""
         if self.noise.max() < _CONTRADICTION:
             return ""

@@ -41,9 +41,9 @@ _GRAVITY_SPREAD = 0.03
 _GRAVITY_RANGE = (0.8, 1.25)
 """Mean specific force of the first second, over gravity, of an accelerometer that can be meant."""
 _FIRST_S = 1.0
-_MEMORY = 0.95
+_FORGETTING = 0.95
 """Weight of the past in the running mean of the normalised errors: twenty frames."""
-_ENOUGH = 20
+_MIN_JUDGED_STEPS = 20
 """Motions after which the accelerometer is judged, and may bridge."""
 _CONTRADICTION = 8.0
 """Mean normalised error squared, 1 if all is as claimed, beyond which an accelerometer is left out."""
@@ -78,7 +78,7 @@ class InertialFilter:
     """Twelve states of a rig with an IMU; see the module.
 
     velocity, gravity: (3,) m/s and m/s2; biases: (6,) rad/s and m/s2; covariance: (12, 12) of all, in this order.
-    ``uses_force``: whether the accelerometer is used; ``uses_turns``: whether the IMU is used at all; ``complaint``
+    ``uses_force``: whether the accelerometer is used; ``uses_turns``: whether the IMU is used at all; ``diagnostic``
     says why not, or is "" (also where there is no accelerometer).
     """
 
@@ -94,8 +94,8 @@ class InertialFilter:
         self.covariance = np.zeros((12, 12))
         sigma = np.repeat([config.gyroscope_bias, config.accelerometer_bias], 3)
         self.covariance[B, B] = np.diag(sigma**2)
-        self.uses_force, self.uses_turns, self.complaint = True, True, ""
-        self._excess, self._turn_excess, self._judged = 1.0, 1.0, 0
+        self.uses_force, self.uses_turns, self.diagnostic = True, True, ""
+        self._variance_scale, self._turn_variance_scale, self._judged = 1.0, 1.0, 0
         self._first_force = self._first_s = 0.0
         self.forget_motion()
 
@@ -116,17 +116,17 @@ class InertialFilter:
     @property
     def sigma_velocity(self) -> FloatArray:
         """Standard deviations (3,) of the velocity, m/s."""
-        return np.sqrt(max(self._excess, 1.0) * np.diagonal(self.covariance[V, V]))
+        return np.sqrt(max(self._variance_scale, 1.0) * np.diagonal(self.covariance[V, V]))
 
     @property
     def can_bridge(self) -> bool:
         """True if velocity and gravity are known well enough to go on without images."""
-        return self.uses_force and self._steps >= _ENOUGH and self.sigma_tilt < _UPRIGHT
+        return self.uses_force and self._steps >= _MIN_JUDGED_STEPS and self.sigma_tilt < _UPRIGHT
 
     @property
     def is_proven(self) -> bool:
         """True if the turn rates have agreed with the images so far: they are believed when a motion does not."""
-        return self.uses_turns and self._judged > 0 and self._turn_excess < _PROVEN
+        return self.uses_turns and self._judged > 0 and self._turn_variance_scale < _PROVEN
 
     @property
     def up(self) -> FloatArray:
@@ -137,7 +137,7 @@ class InertialFilter:
     def tilt_covariance(self) -> FloatArray:
         """Covariance (3, 3) of ``up``, singular along it."""
         across = (np.eye(3) - np.outer(self.up, self.up)) / GRAVITY
-        return np.asarray(max(self._excess, 1.0) * across @ self.covariance[G, G] @ across)
+        return np.asarray(max(self._variance_scale, 1.0) * across @ self.covariance[G, G] @ across)
 
     @property
     def sigma_tilt(self) -> float:
@@ -170,7 +170,7 @@ class InertialFilter:
 
     def motion_covariance(self, step: Prediction) -> FloatArray:
         """Covariance (6, 6) of a predicted motion, larger by as much as predictions so far were off."""
-        return np.asarray(max(self._excess, 1.0) * step.covariance[:6, :6])
+        return np.asarray(max(self._variance_scale, 1.0) * step.covariance[:6, :6])
 
     def advance(self, step: Prediction) -> None:
         """Move on to the end of a prediction; nothing else is known of the motion."""
@@ -182,14 +182,14 @@ class InertialFilter:
         T is that of the IMU's place along the rig's axes. False if the two contradict each other.
         """
         error = boxminus(T, step.T)
-        S = step.covariance[:6, :6] + covariance * max(self._excess, 1.0)
+        S = step.covariance[:6, :6] + covariance * max(self._variance_scale, 1.0)
         squared = _normalised(error[3:], S[3:, 3:])
         self._judge_turns(squared / 3.0)
         turns = squared < _GATE
         moves = turns and self.uses_force
         if moves:
             squared = _normalised(error[:3], S[:3, :3])
-            self._judge(squared * max(self._excess, 1.0) / 3.0)
+            self._judge(squared * max(self._variance_scale, 1.0) / 3.0)
             moves = squared < _GATE
         rows = np.arange(0 if moves else 3, 6 if turns else 3)
         cross = step.covariance[:, rows]
@@ -200,7 +200,7 @@ class InertialFilter:
         self._move(step, gain @ error[rows], 0.5 * (P + P.T))
         return moves or (turns and not self.uses_force)
 
-    def watch(self, pre: Preintegral) -> None:
+    def check_specific_force(self, pre: Preintegral) -> None:
         """Judge the specific force of the first second: gravity is the most of it, whatever a hand does."""
         if self._first_s >= _FIRST_S:
             return
@@ -211,24 +211,24 @@ class InertialFilter:
             told = f"accelerometer left out: it reads {mean:.2f} m/s2 where gravity has 9.81 (REP-145: with gravity)"
             self._leave_out(told if mean > 0.0 else "")
 
-    def doubt(self) -> None:
+    def add_inconsistency(self) -> None:
         """The images tell another turn by far, and are not believed: it may be the IMU that is wrong."""
         self._judge_turns(_LARGEST_ERROR)
 
     # ----------------------------------------------------------------------------------------------------- inside
-    def _leave_out(self, complaint: str) -> None:
-        self.uses_force, self.complaint, self._excess = False, complaint, 1.0
+    def _leave_out(self, diagnostic: str) -> None:
+        self.uses_force, self.diagnostic, self._variance_scale = False, diagnostic, 1.0
 
     def _judge(self, normalised: float) -> None:
         """Take a normalised squared error of the way, 1 if all is as claimed, into the running mean."""
-        self._excess = _followed(self._excess, normalised)
-        if self._judged >= _ENOUGH and self._excess > _CONTRADICTION:
+        self._variance_scale = _followed(self._variance_scale, normalised)
+        if self._judged >= _MIN_JUDGED_STEPS and self._variance_scale > _CONTRADICTION:
             self._leave_out("accelerometer left out: it contradicts the images (check mounting, stamps and units)")
 
     def _judge_turns(self, normalised: float) -> None:
         self._judged += 1
-        self._turn_excess = _followed(self._turn_excess, normalised)
-        if self._judged >= _ENOUGH and self._turn_excess > _CONTRADICTION:
+        self._turn_variance_scale = _followed(self._turn_variance_scale, normalised)
+        if self._judged >= _MIN_JUDGED_STEPS and self._turn_variance_scale > _CONTRADICTION:
             self.uses_turns = False
             self._leave_out("IMU left out: its turn rates contradict the images (check mounting, stamps and units)")
 
@@ -259,7 +259,7 @@ class InertialFilter:
 
 def _followed(mean: float, normalised: float) -> float:
     """A running mean with one more value."""
-    return _MEMORY * mean + (1.0 - _MEMORY) * min(normalised, _LARGEST_ERROR)
+    return _FORGETTING * mean + (1.0 - _FORGETTING) * min(normalised, _LARGEST_ERROR)
 
 
 def _normalised(error: FloatArray, S: FloatArray) -> float:

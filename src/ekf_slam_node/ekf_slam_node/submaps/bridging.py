@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekf_slam_node.odometry.aids import Aid
+from ekf_slam_node.odometry.relative_poses import RelativePoseMeasurement
 from slam_core.geometry import FloatArray, both_halves, boxminus, boxplus, compose_covariance, compose_jacobians
 from slam_core.linear_algebra import blas
 from slam_core.types import PoseEstimate
@@ -21,7 +21,7 @@ class BridgedPose:
     """A pose that ``motion`` leads to from the last pose that images have confirmed."""
 
     before: PoseEstimate
-    motion: Aid
+    motion: RelativePoseMeasurement
     stamp_ns: int
 
     @property

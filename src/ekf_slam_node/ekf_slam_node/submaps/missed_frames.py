@@ -9,7 +9,7 @@ from ekf_slam_node.association.linking import Linker
 from ekf_slam_node.config import MotionConfig
 from ekf_slam_node.filtering.candidates import motion_prior
 from ekf_slam_node.filtering.models import Frame, seconds_between
-from ekf_slam_node.submaps.open_submap import pending_of
+from ekf_slam_node.submaps.open_submap import candidate_landmarks
 from slam_core.geometry import FloatArray
 
 _LOST_FRAMES = 2
@@ -45,4 +45,4 @@ class MissedFrames:
     def _link(self, first: Frame, second: Frame) -> bool:
         dt = seconds_between(first.stamp_ns, second.stamp_ns)
         prior = motion_prior(np.zeros(6), np.diag(self._motion.initial_variance), self._motion.sigma, dt)
-        return self._linker.link(pending_of(first, self._T_rig_optical).candidates, second, prior) is not None
+        return self._linker.link(candidate_landmarks(first, self._T_rig_optical).candidates, second, prior) is not None

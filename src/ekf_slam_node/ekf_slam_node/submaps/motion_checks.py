@@ -10,7 +10,7 @@ import numpy as np
 from ekf_slam_node.association.linking import FrameLink
 from ekf_slam_node.filtering.candidates import MotionPrior
 from ekf_slam_node.filtering.models import relative_motion
-from ekf_slam_node.odometry.aids import ALL, Aid
+from ekf_slam_node.odometry.relative_poses import ALL, RelativePoseMeasurement
 from ekf_slam_node.submaps.steps import LinkedFrame
 from slam_core.geometry import FloatArray, boxminus
 
@@ -58,14 +58,16 @@ class StandingDetector:
         return 0 < self._frames < self._still
 
 
-def explaining_sigma(T_previous_now: FloatArray, velocity: FloatArray, sigma: FloatArray, dt: float) -> FloatArray:
+def inflated_process_noise(
+    T_previous_now: FloatArray, velocity: FloatArray, sigma: FloatArray, dt: float
+) -> FloatArray:
     """Acceleration noise (6,) with which the model can explain a motion: sigma (6,), larger where it must be."""
     needed = 2.0 * boxminus(T_previous_now, relative_motion(velocity, dt)) / dt**2
     sizes = np.repeat(np.linalg.norm(needed.reshape(2, 3), axis=1), 3)
     return np.asarray(np.maximum(sigma, sizes))
 
 
-def aided(expected: MotionPrior, aid: Aid | None) -> MotionPrior:
+def fused_prior(expected: MotionPrior, aid: RelativePoseMeasurement | None) -> MotionPrior:
     """Motion prior of the next frame where another sensor has measured the motion, or its rotation."""
     if aid is None:
         return expected
@@ -78,14 +80,14 @@ def aided(expected: MotionPrior, aid: Aid | None) -> MotionPrior:
     return MotionPrior(T, covariance)
 
 
-def widened(aid: Aid, common: FloatArray) -> Aid:
+def widened(aid: RelativePoseMeasurement, common: FloatArray) -> RelativePoseMeasurement:
     """A motion from scans as seen by the picture: at both ends the two differ by the pose error (6,) of a frame."""
     if aid.rows != ALL:
         return aid
     return replace(aid, covariance=aid.covariance + 2.0 * np.diag(common**2))
 
 
-def is_known(aid: Aid) -> bool:
+def is_known(aid: RelativePoseMeasurement) -> bool:
     """True if the place that a motion leads to is known well enough to go on from it."""
     limit = _BRIDGE_SIGMA
     if (reckoned := aid.reckoned) is not None:

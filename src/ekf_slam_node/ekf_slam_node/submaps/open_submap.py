@@ -16,9 +16,9 @@ from ekf_slam_node.filtering.candidates import Candidates, squared_distances
 from ekf_slam_node.filtering.covariance import IndexArray
 from ekf_slam_node.filtering.drift import Drift
 from ekf_slam_node.filtering.ekf import Ekf, TimeUpdate, UpdateReport
-from ekf_slam_node.filtering.landmarks import LandmarkTable, Pending, spread_choice
+from ekf_slam_node.filtering.landmarks import CandidateLandmarks, LandmarkTable, spread_choice
 from ekf_slam_node.filtering.models import CORE_DIM, Frame, observe, relative_motion, rig_points
-from ekf_slam_node.odometry.aids import AID_GATE, Aid, aid_error
+from ekf_slam_node.odometry.relative_poses import RELATIVE_POSE_GATE, RelativePoseMeasurement, relative_pose_error
 from slam_core.camera import MIN_DEPTH
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate
@@ -28,25 +28,25 @@ _STANDING_VELOCITY = np.repeat([0.02, np.radians(0.5)], 3)
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class LandmarkMatches:
     """Landmarks ``slots`` (k,) seen as features ``columns`` (k,) of a frame, to be measured."""
 
     slots: IndexArray
     columns: IndexArray
 
     @classmethod
-    def of_nothing(cls) -> Sight:
+    def of_nothing(cls) -> LandmarkMatches:
         """No landmark."""
         return cls(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.slots)
 
-    def select(self, index: np.ndarray) -> Sight:
+    def select(self, index: np.ndarray) -> LandmarkMatches:
         """The sightings at ``index``."""
-        return Sight(self.slots[index], self.columns[index])
+        return LandmarkMatches(self.slots[index], self.columns[index])
 
-    def every_second(self) -> Sight:
+    def every_second(self) -> LandmarkMatches:
         """Half of the sightings."""
         return self.select(np.arange(0, len(self), 2))
 
@@ -63,7 +63,12 @@ class OpenSubmap:
     """
 
     def __init__(
-        self, config: EkfSlamConfig, T_rig_optical: FloatArray, ekf: Ekf, table: LandmarkTable, pending: Pending
+        self,
+        config: EkfSlamConfig,
+        T_rig_optical: FloatArray,
+        ekf: Ekf,
+        table: LandmarkTable,
+        pending: CandidateLandmarks,
     ) -> None:
         self._ekf = ekf
         self.table = table
@@ -76,7 +81,7 @@ class OpenSubmap:
     @classmethod
     def empty(
         cls, config: EkfSlamConfig, T_rig_optical: FloatArray, velocity: FloatArray, variance: FloatArray,
-        pending: Pending,
+        pending: CandidateLandmarks,
     ) -> OpenSubmap:  # fmt: skip
         """A map without landmarks, with a velocity (6,) of some variances (6,)."""
         covariance = np.zeros((CORE_DIM, CORE_DIM))
@@ -84,7 +89,7 @@ class OpenSubmap:
         table = LandmarkTable(pending.candidates.descriptors.shape[1])
         return cls(config, T_rig_optical, Ekf(velocity, covariance, config.error == "invariant"), table, pending)
 
-    def given_pose(self, slots: IndexArray, pending: Pending) -> OpenSubmap:
+    def given_pose(self, slots: IndexArray, pending: CandidateLandmarks) -> OpenSubmap:
         """The seed's start of the next map, in the rig's frame: landmarks ``slots`` and velocity given its pose.
 
         What is known of them stays in this submap too, so that joining counts it twice: the joint NEES test shows it.
@@ -164,17 +169,17 @@ class OpenSubmap:
         self._ekf.apply_time_update(step)
         return step
 
-    def apply_motion(self, step: TimeUpdate, aid: Aid, T_previous_now: FloatArray) -> bool:
+    def apply_motion(self, step: TimeUpdate, aid: RelativePoseMeasurement, T_previous_now: FloatArray) -> bool:
         """Measure the step just predicted by another sensor, unless that contradicts it; returns whether it was."""
         rotation = step.T[:3, :3] @ T_previous_now[:3, :3].T
-        error, covariance = aid_error(aid, T_previous_now, rotation)
-        return self._ekf.update_increment(step, error, covariance, aid.rows, AID_GATE).applied
+        error, covariance = relative_pose_error(aid, T_previous_now, rotation)
+        return self._ekf.update_increment(step, error, covariance, aid.rows, RELATIVE_POSE_GATE).applied
 
-    def move_without_link(self, frame: Frame, dt: float, aid: Aid) -> bool:
+    def move_without_link(self, frame: Frame, dt: float, aid: RelativePoseMeasurement) -> bool:
         """Move to a frame that no image links, by a motion that something else has measured; whether it was used."""
         applied = self.apply_motion(self.predict(dt, self._config.motion.sigma, aid.T), aid, aid.T)
         self._ekf.move_to_mean()
-        self.pending = pending_of(frame, self._T_rig_optical)
+        self.pending = candidate_landmarks(frame, self._T_rig_optical)
         return applied
 
     def stand(self) -> None:
@@ -185,7 +190,7 @@ class OpenSubmap:
         """Replace what is known of the velocity by (6,) with standard deviations (6,)."""
         self._ekf.restart(velocity, sigma)
 
-    def confirm(self, frame: Frame, link: FrameLink, wanted: int, new_ids: IndexArray) -> Sight:
+    def initialise_landmarks(self, frame: Frame, link: FrameLink, wanted: int, new_ids: IndexArray) -> LandmarkMatches:
         """Make landmarks of the pending features that the frame confirms, until ``wanted`` are in sight.
 
         The rig must still be at the previous frame: a new landmark's place comes from that frame's measurement.
@@ -205,7 +210,7 @@ class OpenSubmap:
         others = others[spread_choice(pixels[others], pixels[np.concatenate([known, first])], room, size)]
         chosen = np.concatenate([first, others])
         slots = self._add(link.rows[chosen] - len(self.table), new_ids)
-        return Sight(
+        return LandmarkMatches(
             np.concatenate([link.rows[known], slots]), np.concatenate([link.columns[known], link.columns[chosen]])
         )
 
@@ -217,7 +222,9 @@ class OpenSubmap:
         self.table.add(ids, pending.sightings[which], candidates.descriptors, candidates.tracks, self._frames)
         return slots
 
-    def measure(self, frame: Frame, sight: Sight, common: FloatArray, closes: bool) -> tuple[UpdateReport, Sight]:
+    def measure(
+        self, frame: Frame, sight: LandmarkMatches, common: FloatArray, closes: bool
+    ) -> tuple[UpdateReport, LandmarkMatches]:
         """Measurement update with the sightings whose innovation is inside the gate; returns those.
 
         ``common`` (6,): standard deviations of an error of the camera's pose that all of them share. ``closes``: the
@@ -242,21 +249,21 @@ class OpenSubmap:
         """Take in what a frame's common error (6,) leaves behind, at the camera's present place."""
         self._drift.add(common, (self._ekf.T @ self._T_rig_optical)[:3, 3])
 
-    def _noise_factors(self, sight: Sight) -> FloatArray:
+    def _noise_factors(self, sight: LandmarkMatches) -> FloatArray:
         """Factors (k, 3) on the variances of u, v and inverse depth: a landmark's own share of the pixel noise."""
         own = self.table.noise.factors(sight.slots)
         return np.column_stack([own, own, np.ones(len(own))])
 
-    def remember(self, frame: Frame, sight: Sight, link: FrameLink, landmarks_before: int) -> None:
+    def remember(self, frame: Frame, sight: LandmarkMatches, link: FrameLink, landmarks_before: int) -> None:
         """Keep the features of a frame that measured nothing as the next frame's pending ones, with any names."""
         named = np.flatnonzero(link.rows >= landmarks_before)
         which = link.rows[named] - landmarks_before
-        pending = pending_of(frame, self._T_rig_optical)
+        pending = candidate_landmarks(frame, self._T_rig_optical)
         pending.ids[link.columns[named]] = self.pending.ids[which]
         pending.sightings[link.columns[named]] = self.pending.sightings[which] + 1
         self.pending = pending.without(sight.columns)
 
-    def tidy(self, frame: Frame, sight: Sight) -> None:
+    def prune_landmarks(self, frame: Frame, sight: LandmarkMatches) -> None:
         """Count who was seen and who should have been, and remove landmarks that cannot be relied on."""
         view = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks, frame.camera)
         self.table.tracks[sight.slots] = frame.tracks[sight.columns]
@@ -267,11 +274,11 @@ class OpenSubmap:
             self.table.remove(slot)
 
 
-def pending_of(frame: Frame, T_rig_optical: FloatArray) -> Pending:
+def candidate_landmarks(frame: Frame, T_rig_optical: FloatArray) -> CandidateLandmarks:
     """All features of a frame, nameless, as candidates for the next one."""
     points, covariances = rig_points(frame, T_rig_optical)
     n = len(frame)
-    return Pending(
+    return CandidateLandmarks(
         Candidates(points, covariances, frame.descriptors, frame.tracks),
         np.full(n, -1, dtype=np.int64),
         np.ones(n, dtype=np.int32),
@@ -279,13 +286,15 @@ def pending_of(frame: Frame, T_rig_optical: FloatArray) -> Pending:
     )
 
 
-def inheriting(frame: Frame, T_rig_optical: FloatArray, sight: Sight, used: Sight, table: LandmarkTable) -> Pending:
+def with_inherited_ids(
+    frame: Frame, T_rig_optical: FloatArray, sight: LandmarkMatches, used: LandmarkMatches, table: LandmarkTable
+) -> CandidateLandmarks:
     """All features of a frame, those in ``sight`` with their landmarks' names: what an independent submap starts from.
 
     Names and descriptors are inherited, no places: these come from this frame's measurements except the ``used`` ones,
     which have gone into the submap before. So the two submaps share no information.
     """
-    pending = pending_of(frame, T_rig_optical)
+    pending = candidate_landmarks(frame, T_rig_optical)
     descriptors = pending.candidates.descriptors.copy()
     descriptors[sight.columns] = table.descriptors[sight.slots]
     pending.ids[sight.columns] = table.ids[sight.slots]

@@ -36,9 +36,9 @@ _DOUBTED = 2.0
 """Standard errors below which a readout that was certain no longer is."""
 _BOUND = 1.5
 """Pairs of frames further from the mean, in robust standard deviations, count as being so far."""
-_ENOUGH, _SELDOM = 60, 4
+_MIN_FRAME_PAIRS, _FRAMES_PER_ESTIMATE = 60, 4
 """Pairs of frames from which on only one in so many is looked at, which saves a millisecond a frame."""
-_MEMORY = 400
+_MAX_FRAME_PAIRS = 400
 """Pairs of frames remembered."""
 _MIN_PAIRS = 16
 """Pairs of frames before which nothing is corrected."""
@@ -61,7 +61,7 @@ _LONGEST_STEP_S = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class _Moment:
+class _FramePair:
     """A frame as it was measured, ids and columns (k,) of its landmarks, the motion that led to it within dt (s)."""
 
     frame: Frame
@@ -84,8 +84,8 @@ class RollingShutter:
 
     def __init__(self, T_rig_optical: FloatArray, known: tuple[float, float] = (0.0, 0.0)) -> None:
         self._T_rig_optical = T_rig_optical
-        self._moments: deque[_Moment] = deque(maxlen=_APART + 2)
-        self._evidence: deque[tuple[float, float]] = deque(maxlen=_MEMORY)
+        self._frame_pairs: deque[_FramePair] = deque(maxlen=_APART + 2)
+        self._evidence: deque[tuple[float, float]] = deque(maxlen=_MAX_FRAME_PAIRS)
         self._known = known
         self._readout_s, self._sigma_s = known
         self._frames = 0
@@ -109,8 +109,8 @@ class RollingShutter:
         if readout == 0.0:
             return frame
         velocities = [] if T_previous_now is None else [velocity_of_motion(T_previous_now, dt)]
-        if self._moments and self._follows(frame, dt):
-            velocities += [velocity_of_motion(m.T_previous_now, m.dt) for m in reversed(self._moments)]
+        if self._frame_pairs and self._follows(frame, dt):
+            velocities += [velocity_of_motion(m.T_previous_now, m.dt) for m in reversed(self._frame_pairs)]
         if not velocities:
             return frame
         newest = np.array(velocities[: len(_SMOOTHING)])
@@ -118,17 +118,17 @@ class RollingShutter:
         return replace(frame, z=self._moved(frame, weights @ newest, readout))
 
     def _follows(self, frame: Frame, dt: float) -> bool:
-        return abs(1e-9 * (frame.stamp_ns - self._moments[-1].frame.stamp_ns) - dt) < 1e-6
+        return abs(1e-9 * (frame.stamp_ns - self._frame_pairs[-1].frame.stamp_ns) - dt) < 1e-6
 
     def learn(self, frame: Frame, ids: np.ndarray, columns: np.ndarray, T_previous_now: FloatArray, dt: float) -> None:
         """Take in a frame as it was measured, its landmarks ``ids`` at ``columns``, and its motion over dt (s)."""
-        if dt > _LONGEST_STEP_S or not (self._moments and self._follows(frame, dt)):
-            self._moments.clear()
-        self._moments.append(_Moment(frame, ids, columns, T_previous_now, dt))
+        if dt > _LONGEST_STEP_S or not (self._frame_pairs and self._follows(frame, dt)):
+            self._frame_pairs.clear()
+        self._frame_pairs.append(_FramePair(frame, ids, columns, T_previous_now, dt))
         self._frames += 1
-        if len(self._evidence) > _ENOUGH and self._frames % _SELDOM:
+        if len(self._evidence) > _MIN_FRAME_PAIRS and self._frames % _FRAMES_PER_ESTIMATE:
             return
-        for apart in range(len(self._moments) - 2, 0, -1):
+        for apart in range(len(self._frame_pairs) - 2, 0, -1):
             found = self._of_pair(apart)
             if found is not None:
                 self._add(*found)
@@ -155,7 +155,7 @@ class RollingShutter:
     # ---- one pair of frames
     def _of_pair(self, apart: int) -> tuple[float, float] | None:
         """Readout, s, and its standard deviation from the last moment but one and the one so many frames before it."""
-        moments = list(self._moments)[-2 - apart :]
+        moments = list(self._frame_pairs)[-2 - apart :]
         first, second = moments[0], moments[-2]
         _, a, b = np.intersect1d(first.ids, second.ids, return_indices=True)
         if len(a) < _MIN_SHARED:
@@ -173,7 +173,7 @@ class RollingShutter:
         later = replace(now, z=self._moved(now, _velocity(second, moments[-1]), _STEP_S))
         pairs = self._errors(candidates, now, motion.T)
         slope = (later.z - now.z) / _STEP_S + np.einsum("nij,nj->ni", pairs.J[:, :, :3], rates)
-        return _solve(pairs, slope, np.maximum(motion.excess, 1.0))
+        return _solve(pairs, slope, np.maximum(motion.variance_scale, 1.0))
 
     def _errors(self, candidates: Candidates, frame: Frame, T: FloatArray) -> PairErrors:
         c, pairs = frame.camera, PairErrors.room(len(frame))
@@ -198,18 +198,18 @@ class RollingShutter:
         return moved
 
 
-def _velocity(moment: _Moment, after: _Moment) -> FloatArray:
+def _velocity(moment: _FramePair, after: _FramePair) -> FloatArray:
     """Velocity (6,) of the rig at a moment: the mean of the motions that led to it and away from it."""
     before = velocity_of_motion(moment.T_previous_now, moment.dt)
     return np.asarray(0.5 * (before + velocity_of_motion(after.T_previous_now, after.dt)))
 
 
-def _solve(pairs: PairErrors, slope: FloatArray, excess: FloatArray) -> tuple[float, float] | None:
+def _solve(pairs: PairErrors, slope: FloatArray, variance_scale: FloatArray) -> tuple[float, float] | None:
     """Readout and its standard deviation with the motion beside it, by weights that far-off pairs lose (Huber 1964).
 
     ``slope`` (n, 3): what a second of readout adds to the errors.
     """
-    root = np.sqrt(excess)
+    root = np.sqrt(variance_scale)
     S = pairs.S * root[:, None] * root
     H = np.concatenate([pairs.J, -slope[:, :, None]], axis=2)
     WH = np.linalg.solve(S, H)

@@ -10,9 +10,9 @@ import numpy as np
 from ekf_slam_node.association.linking import FrameLink
 from ekf_slam_node.filtering.ekf import UpdateReport
 from ekf_slam_node.filtering.models import Frame
-from ekf_slam_node.odometry.aids import Aid
+from ekf_slam_node.odometry.relative_poses import RelativePoseMeasurement
 from ekf_slam_node.results import TrackingState
-from ekf_slam_node.submaps.open_submap import Sight
+from ekf_slam_node.submaps.open_submap import LandmarkMatches
 from slam_core.geometry import FloatArray
 
 
@@ -29,7 +29,7 @@ class LinkedFrame:
     measured: Frame
     dt: float
     link: FrameLink
-    aid: Aid | None
+    aid: RelativePoseMeasurement | None
     common: FloatArray
     surprising: bool
     landmarks: int
@@ -49,7 +49,7 @@ class UpdatedFrame:
     """
 
     report: UpdateReport
-    measured: Sight
+    measured: LandmarkMatches
     closes: bool
     ids: np.ndarray
     index: np.ndarray

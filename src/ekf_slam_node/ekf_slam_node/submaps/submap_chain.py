@@ -9,11 +9,11 @@ import numpy as np
 
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.filtering.models import Frame, seconds_between
-from ekf_slam_node.odometry.aids import Aid
 from ekf_slam_node.odometry.odometry import OdometryChain, UpDirection
+from ekf_slam_node.odometry.relative_poses import RelativePoseMeasurement
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.submaps.bridging import BridgedPose
-from ekf_slam_node.submaps.open_submap import OpenSubmap, Sight, inheriting, pending_of
+from ekf_slam_node.submaps.open_submap import LandmarkMatches, OpenSubmap, candidate_landmarks, with_inherited_ids
 from ekf_slam_node.submaps.steps import UpdatedFrame
 from ekf_slam_node.submaps.submap_builder import SubmapBuilder
 from slam_core.estimation.calibration_error import widened_by_calibration
@@ -77,22 +77,26 @@ class SubmapChain:
             pose = self.pose(self.stamp_ns)
         if pose is not None:
             self._odometry.advance(pose, up)
-        pending = pending_of(frame, self._T_rig_optical)
+        pending = candidate_landmarks(frame, self._T_rig_optical)
         variance = self._config.motion.initial_variance
         local = OpenSubmap.empty(self._config, self._T_rig_optical, np.zeros(6), variance, pending)
         return self._open(local, frame, follows=False)
 
-    def follow(self, frame: Frame, seen: Sight, measured: Sight, up: UpDirection | None = None) -> OpenSubmap:
+    def follow(
+        self, frame: Frame, seen: LandmarkMatches, measured: LandmarkMatches, up: UpDirection | None = None
+    ) -> OpenSubmap:
         """Open the submap that follows the one just closed, at the rig's pose in this frame, and gravity if known."""
         local = self.local
         self._odometry.advance(self.pose(frame.stamp_ns), up)
         if self._config.submap.start == "independent":
-            pending = inheriting(frame, self._T_rig_optical, seen, measured, local.table)
+            pending = with_inherited_ids(frame, self._T_rig_optical, seen, measured, local.table)
             # The velocity is a starting point with a variance so wide that it carries no information over.
             wide = np.repeat([_RESTART_SIGMA_VELOCITY, _RESTART_SIGMA_TURN_RATE], 3) ** 2
             new = OpenSubmap.empty(self._config, self._T_rig_optical, local.velocity, wide, pending)
         else:
-            new = local.given_pose(measured.slots, pending_of(frame, self._T_rig_optical).without(measured.columns))
+            new = local.given_pose(
+                measured.slots, candidate_landmarks(frame, self._T_rig_optical).without(measured.columns)
+            )
         return self._open(new, frame, follows=True)
 
     def _open(self, local: OpenSubmap, frame: Frame, follows: bool) -> OpenSubmap:
@@ -113,7 +117,7 @@ class SubmapChain:
         """True if poses that no image confirms wait for one that ends them."""
         return self._builder.is_bridging
 
-    def add_bridged_pose(self, stamp_ns: int, motion: Aid) -> PoseEstimate:
+    def add_bridged_pose(self, stamp_ns: int, motion: RelativePoseMeasurement) -> PoseEstimate:
         """Add the pose after a motion from the filter's pose that no image confirms; returns it as T_odom_rig."""
         before = self.local.filter_pose(self.stamp_ns)
         self._builder.add_bridged_pose(BridgedPose(before, motion, stamp_ns))

@@ -16,7 +16,7 @@ from ndt_registration.methods.ndt import Layer
 from slam_core.geometry import FloatArray, boxplus
 from slam_core.runtime.in_place import in_place
 
-_FEW = 4
+_COARSE_STRIDE = 4
 """One in so many points tells at once where a pose is held without doubt."""
 
 
@@ -35,7 +35,7 @@ class ScoreLoss:
         """Share of the fit that is lost when the pose is moved by a vector (6,), or back by it: the lesser of both."""
         moved = [boxplus(self._T, step), boxplus(self._T, -step)]
         R, t = np.stack([T[:3, :3] for T in moved]), np.stack([T[:3, 3] for T in moved])
-        few = self._lost(_FEW, R, t)
+        few = self._lost(_COARSE_STRIDE, R, t)
         return few if few > self._clear else self._lost(1, R, t)
 
     def _lost(self, share: int, R: FloatArray, t: FloatArray) -> float:

@@ -177,8 +177,8 @@ class LoopDetector:
         if not by_looks and prior is not None:
             found, status = self.verifier.verify_near(first, second, prior), Status.CONSISTENT
         else:
-            way = self.graph.path_length_between(old, new)
-            found, status = self.verifier.verify(first, second, prior, way, old, new)
+            path_length = self.graph.path_length_between(old, new)
+            found, status = self.verifier.verify(first, second, prior, path_length, old, new)
         if found is None:
             return None
         may_move = status is not Status.INCONSISTENT and prior is not None
@@ -239,10 +239,10 @@ class LoopDetector:
         """T_first_second by the map, with the drift to expect; None where nothing ties the two."""
         if first == second:
             return Prior(np.eye(4), None)
-        prior, way = self.estimate.relative_pose(first, second), self.graph.path_length_between(first, second)
+        prior, path_length = self.estimate.relative_pose(first, second), self.graph.path_length_between(first, second)
         if prior is None or prior.covariance is None:
             return prior
-        return Prior(prior.T, prior.covariance + self.verifier.drift(way))
+        return Prior(prior.T, prior.covariance + self.verifier.drift(path_length))
 
     def _log10_false_alarms(self, link: Link) -> float:
         """See :meth:`Verifier.log10_false_alarms`; of a link that waits it is kept."""

@@ -80,8 +80,8 @@ class PairwiseConsistency:
         if not links:
             return np.empty(0, dtype=bool)
         ends = np.array([k.ends for k in links])
-        T, way = graph.odometry_between(ends[:, 0], ends[:, 1])
-        return self._are_off(T, np.array([k.T for k in links]), np.array([k.covariance for k in links]), way)
+        T, path_length = graph.odometry_between(ends[:, 0], ends[:, 1])
+        return self._are_off(T, np.array([k.T for k in links]), np.array([k.covariance for k in links]), path_length)
 
     def excluded(self, graph: MapGraph, one: Link, others: Sequence[Link]) -> BoolArray:
         """Mask of links that say something else than ``one`` of the same two stretches of way."""
@@ -90,22 +90,24 @@ class PairwiseConsistency:
         out = np.zeros(len(others), dtype=bool)
         for links in (others, [k.inverted() for k in others]):
             ends = np.array([k.ends for k in links])
-            before, way = graph.odometry_between(np.full(len(links), one.first), ends[:, 0])
+            before, path_length = graph.odometry_between(np.full(len(links), one.first), ends[:, 0])
             after, way_back = graph.odometry_between(ends[:, 1], np.full(len(links), one.second))
             T = before @ np.array([k.T for k in links]) @ after
             covariance = one.covariance + np.array([k.covariance for k in links])
-            out |= self._are_off(T, np.broadcast_to(one.T, T.shape), covariance, way + way_back)
+            out |= self._are_off(T, np.broadcast_to(one.T, T.shape), covariance, path_length + way_back)
         return out
 
-    def _are_off(self, T: FloatArray, T_claimed: FloatArray, covariance: FloatArray, way: FloatArray) -> BoolArray:
-        """Mask of claimed poses (n, 4, 4) further from ``T`` than odometry drifts on a ``way`` (n,) m.
+    def _are_off(
+        self, T: FloatArray, T_claimed: FloatArray, covariance: FloatArray, path_length: FloatArray
+    ) -> BoolArray:
+        """Mask of claimed poses (n, 4, 4) further from ``T`` than odometry drifts on a ``path_length`` (n,) m.
 
         Not where ``T`` is NaN.
         """
         known, drift = np.isfinite(T[:, 0, 0]), self.drift
         error = boxminus(T_claimed[known], T[known])
-        turn = drift.drift_angle * way[known]
-        shift = drift.drift * way[known] + turn * np.linalg.norm(T[known][:, :3, 3], axis=1)
+        turn = drift.drift_angle * path_length[known]
+        shift = drift.drift * path_length[known] + turn * np.linalg.norm(T[known][:, :3, 3], axis=1)
         spread = np.repeat(np.stack([shift**2, turn**2], axis=1) + 1e-4, 3, axis=1)
         expected = covariance[known] + spread[:, :, None] * np.eye(6)
         nis = np.einsum("ni,ni->n", error, np.linalg.solve(expected, error[..., None])[..., 0])

@@ -85,16 +85,20 @@ class Verifier:
     config: ClosureConfig = field(default_factory=ClosureConfig)
 
     def verify(
-        self, first: PointSet, second: PointSet, prior: Prior | None, way: float, *key: int
+        self, first: PointSet, second: PointSet, prior: Prior | None, path_length: float, *key: int
     ) -> tuple[Alignment | None, Status]:
         """The alignment of two submaps if geometry supports it, and what the prior says of it.
 
-        First around the prior, if it is informative, then by looks. ``way`` is the length of the path between them, m:
-        what the prior does not know is at least its drift. ``key`` seeds the random samples, so that the same pair
+        First around the prior, if it is informative, then by looks. ``path_length`` is that of the path between them,
+        m: what the prior does not know is at least its drift. ``key`` seeds the random samples, so that the same pair
         always gets the same verdict.
         """
         found = self.verify_near(first, second, prior)
-        return (found, Status.CONSISTENT) if found is not None else self.verify_alike(first, second, prior, way, *key)
+        return (
+            (found, Status.CONSISTENT)
+            if found is not None
+            else self.verify_alike(first, second, prior, path_length, *key)
+        )
 
     def verify_near(self, first: PointSet, second: PointSet, prior: Prior | None) -> Alignment | None:
         """The alignment of two submaps around a prior.
@@ -108,13 +112,13 @@ class Verifier:
         return found if enough else None
 
     def verify_alike(
-        self, first: PointSet, second: PointSet, prior: Prior | None, way: float, *key: int
+        self, first: PointSet, second: PointSet, prior: Prior | None, path_length: float, *key: int
     ) -> tuple[Alignment | None, Status]:
         """The alignment of two submaps by their looks, if geometry supports it, and what the prior says of it."""
         guess = self._by_looks(first, second, key)
         if guess is None or not self._is_supported(first, second, guess):
             return None, Status.UNINFORMATIVE
-        if prior is None or not self.is_against(guess, prior, way):
+        if prior is None or not self.is_against(guess, prior, path_length):
             return guess, Status.UNINFORMATIVE
         return guess if self.is_evident(first, second, guess) else None, Status.INCONSISTENT
 
@@ -187,19 +191,21 @@ class Verifier:
         expected = min(_inside(first.points, low, high), _inside(moved, low, high))
         return len(matched) >= _MIN_OVERLAP * expected
 
-    def is_against(self, found: Alignment, prior: Prior, way: float) -> bool:
-        """True if an alignment contradicts the prior, which has drifted along the ``way`` (m)."""
-        return self.error_against(found, prior, way) > chi_square_bound(self.config.probability, 6)
+    def is_against(self, found: Alignment, prior: Prior, path_length: float) -> bool:
+        """True if an alignment contradicts the prior, which has drifted along ``path_length`` m."""
+        return self.error_against(found, prior, path_length) > chi_square_bound(self.config.probability, 6)
 
-    def error_against(self, found: Alignment, prior: Prior, way: float) -> float:
-        """Normalised squared error of an alignment against the prior, which has drifted along the ``way`` (m)."""
+    def error_against(self, found: Alignment, prior: Prior, path_length: float) -> float:
+        """Normalised squared error of an alignment against the prior, which has drifted along ``path_length`` m."""
         assert prior.covariance is not None
         error = boxminus(found.T, prior.T)
-        return float(error @ np.linalg.solve(prior.covariance + found.covariance + self.drift(way), error))
+        return float(error @ np.linalg.solve(prior.covariance + found.covariance + self.drift(path_length), error))
 
-    def drift(self, way: float) -> FloatArray:
-        """Covariance (6, 6) of the drift to expect on a ``way`` (m) beyond what the odometry claims."""
-        return np.diag([(self.config.drift * way) ** 2] * 3 + [(self.config.drift_angle * way) ** 2] * 3)
+    def drift(self, path_length: float) -> FloatArray:
+        """Covariance (6, 6) of the drift to expect on a ``path_length`` (m) beyond what the odometry claims."""
+        return np.diag(
+            [(self.config.drift * path_length) ** 2] * 3 + [(self.config.drift_angle * path_length) ** 2] * 3
+        )
 
 
 def largest_sigma(covariance: FloatArray | None) -> float:

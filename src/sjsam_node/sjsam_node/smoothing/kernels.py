@@ -60,7 +60,7 @@ def local_residual(model, Ri, ti, poses, landmarks, z, R, t, points, r, B):
 @njit(cache=True, nogil=True)
 def joint_cost(model, maps, R, t, points):
     """Sum of ``r^T information r + 2 pull^T r`` over all local maps."""
-    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info, pull = maps
+    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info, cost_gradient = maps
     total = 0.0
     d = t.shape[1]
     a = 1 if d == 2 else 3
@@ -74,7 +74,7 @@ def joint_cost(model, maps, R, t, points):
         )  # fmt: skip
         base = info_ptr[f]
         for i in range(m):
-            row = 2.0 * pull[z_ptr[f] + i]
+            row = 2.0 * cost_gradient[z_ptr[f] + i]
             for j in range(m):
                 row += info[base + i * m + j] * r[j]
             total += r[i] * row
@@ -197,7 +197,7 @@ def _left_multiply(JB, start, width, A, out):
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(J, JB, start, width, info, r, pull, work, H, g):
+def normal_equations(J, JB, start, width, info, r, cost_gradient, work, H, g):
     """Dense ``H = J^T info J``, ``g = J^T (info r + pull)`` of one local map over (reference pose, poses, landmarks).
 
     The part of J beyond the reference pose is block diagonal, so that H costs O(m^2), not O(m^3).
@@ -210,7 +210,7 @@ def normal_equations(J, JB, start, width, info, r, pull, work, H, g):
             turned[j, i] = half[i, j]
     _left_multiply(JB, start, width, turned, half)
     weighted = info @ J
-    flat = info @ r + pull
+    flat = info @ r + cost_gradient
     whitened = flat.reshape((m, 1))
     mixed, moved = np.empty((m, dp)), np.empty((m, 1))
     _left_multiply(JB, start, width, weighted, mixed)
@@ -226,7 +226,7 @@ def normal_equations(J, JB, start, width, info, r, pull, work, H, g):
 @njit(cache=True, nogil=True)
 def local_normal_equations(model, f, maps, R, t, points, work):
     """H (n, n) and g (n,) of local map ``f`` at the given state; ``work`` as :func:`work_space` makes it."""
-    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info, pull = maps
+    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info, cost_gradient = maps
     d = t.shape[1]
     a = 1 if d == 2 else 3
     m = z_ptr[f + 1] - z_ptr[f]
@@ -241,14 +241,14 @@ def local_normal_equations(model, f, maps, R, t, points, work):
     n = d + a + m
     H, g = work[2 * m * m : 2 * m * m + n * n].reshape((n, n)), np.empty(n)
     matrix = info[info_ptr[f] : info_ptr[f + 1]].reshape((m, m))
-    normal_equations(J, JB, start, width, matrix, r, pull[z_ptr[f] : z_ptr[f + 1]], work, H, g)
+    normal_equations(J, JB, start, width, matrix, r, cost_gradient[z_ptr[f] : z_ptr[f + 1]], work, H, g)
     return H, g
 
 
 @njit(cache=True, nogil=True)
 def joint_gradient(model, maps, R, t, points, scatter, gradient):
     """Add ``J^T (information r + pull)`` of every local map."""
-    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info, pull = maps
+    ref, pose_ptr, pose_idx, lm_ptr, lm_idx, z_ptr, z, info_ptr, info, cost_gradient = maps
     item_ptr, item_group, item_offset, item_width, group_ptr, group_start = scatter[:6]
     d = t.shape[1]
     a = 1 if d == 2 else 3
@@ -262,7 +262,7 @@ def joint_gradient(model, maps, R, t, points, scatter, gradient):
         other_blocks(R[ref[f]], poses, landmarks, B, JB)
         start, width = _block_starts(d, len(poses), len(landmarks))
         flat, g = np.dot(info[info_ptr[f] : info_ptr[f + 1]].reshape((m, m)), r), np.empty(d + a + m)
-        flat += pull[z_ptr[f] : z_ptr[f + 1]]
+        flat += cost_gradient[z_ptr[f] : z_ptr[f + 1]]
         _left_multiply(JB, start, width, flat.reshape((m, 1)), g[d + a :].reshape((m, 1)))
         g[: d + a] = np.dot(J.T, flat)
         row = 0

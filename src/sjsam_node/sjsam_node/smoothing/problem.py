@@ -31,7 +31,7 @@ class LocalMap:
     landmarks: IntArray
     mean: FloatArray
     information: FloatArray
-    pull: FloatArray | None = None
+    cost_gradient: FloatArray | None = None
 
 
 def block_rows(m: LocalMap, pose_size: int, landmark_size: int) -> LocalMap:
@@ -59,24 +59,26 @@ class FlatMaps(NamedTuple):
     mean: FloatArray
     information_ptr: IntArray
     information: FloatArray
-    pull: FloatArray
+    cost_gradient: FloatArray
 
     def first(self, count: int) -> FlatMaps:
         """The first ``count`` local maps, without copying the values."""
         return FlatMaps(
             self.reference[:count], self.pose_ptr[: count + 1], self.poses, self.landmark_ptr[: count + 1],
             self.landmarks, self.mean_ptr[: count + 1], self.mean, self.information_ptr[: count + 1],
-            self.information, self.pull,
+            self.information, self.cost_gradient,
         )  # fmt: skip
 
     def unflattened(self) -> list[LocalMap]:
         """The local maps one by one."""
         ptrs = self.pose_ptr, self.landmark_ptr, self.mean_ptr, self.information_ptr, self.mean_ptr
-        values = self.poses, self.landmarks, self.mean, self.information, self.pull
+        values = self.poses, self.landmarks, self.mean, self.information, self.cost_gradient
         parts = [split(v, p) for p, v in zip(ptrs, values, strict=True)]
         return [
-            LocalMap(int(reference), poses, landmarks, mean, information.reshape(len(mean), -1), pull)
-            for reference, poses, landmarks, mean, information, pull in zip(self.reference, *parts, strict=True)
+            LocalMap(int(reference), poses, landmarks, mean, information.reshape(len(mean), -1), cost_gradient)
+            for reference, poses, landmarks, mean, information, cost_gradient in zip(
+                self.reference, *parts, strict=True
+            )
         ]
 
 
@@ -92,7 +94,7 @@ def flatten(maps: Sequence[LocalMap]) -> FlatMaps:
         _joined([m.mean for m in maps], np.float64),
         pointers([m.information.size for m in maps]),
         _joined([m.information.ravel() for m in maps], np.float64),
-        _joined([np.zeros(len(m.mean)) if m.pull is None else m.pull for m in maps], np.float64),
+        _joined([np.zeros(len(m.mean)) if m.cost_gradient is None else m.cost_gradient for m in maps], np.float64),
     )
 
 

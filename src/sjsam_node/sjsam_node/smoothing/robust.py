@@ -80,8 +80,8 @@ def closing_rows(maps: list[LocalMap], pose_size: int, landmark_size: int) -> li
 
 def normalized_error(information: FloatArray, residual: FloatArray, rows: IntArray) -> float:
     """Squared error of some rows as all the others of the map predict them; chi-square of ``len(rows)``."""
-    pull = (information @ residual)[rows]
-    return float(pull @ np.linalg.solve(information[np.ix_(rows, rows)], pull))
+    cost_gradient = (information @ residual)[rows]
+    return float(cost_gradient @ np.linalg.solve(information[np.ix_(rows, rows)], cost_gradient))
 
 
 def widened(information: FloatArray, rows: IntArray, factor: float) -> FloatArray:

@@ -61,7 +61,7 @@ def read_pairs(folder: Path, rate: float | None) -> tuple[list[StampedPair], Cou
         If the stamps do not ascend as those of a camera do and no rate is given, or do and one is given.
     """
     colour, depth = (_read_list(folder / name) for name in LISTS)
-    faults = [fault for name, rows in zip(LISTS, (colour, depth), strict=True) if (fault := _fault(name, rows))]
+    faults = [fault for name, rows in zip(LISTS, (colour, depth), strict=True) if (fault := _diagnostic(name, rows))]
     if rate is None and faults:
         raise ValueError(f"{folder}: {faults[0]}: give --rate HZ to take the files in the order of the lists")
     if rate is not None:
@@ -93,7 +93,7 @@ def _in_order(folder: Path, colour: _Rows, depth: _Rows, rate: float) -> tuple[l
     return [StampedPair(START_NS + i * step, c, d) for i, ((_, c), (_, d)) in enumerate(files)], Counter()
 
 
-def _fault(name: str, rows: _Rows) -> str:
+def _diagnostic(name: str, rows: _Rows) -> str:
     """Fault of the stamps of a list, in words; "" if nothing is."""
     steps = np.diff([stamp for stamp, _ in rows])
     if (back := np.flatnonzero(steps <= 0)).size:

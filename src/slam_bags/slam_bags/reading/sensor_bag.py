@@ -133,10 +133,10 @@ class SensorBag:
             if isinstance(reading, InfoReading):
                 watches[reading.agent][_IMAGES_OF[reading.camera]].hear(reading.camera, reading.info)
                 continue
-            watch = watches[reading.agent].get(type(reading))
-            if watch is not None and (complaint := watch.complaint):
+            guard = watches[reading.agent].get(type(reading))
+            if guard is not None and (diagnostic := guard.diagnostic):
                 topic = self.sensors[reading.agent].topics[_LEADER[type(reading)]]
-                self._left_out.add(f"images on {topic} under another calibration", warning=f"{topic}: {complaint}")
+                self._left_out.add(f"images on {topic} under another calibration", warning=f"{topic}: {diagnostic}")
                 continue
             self.times.add(reading)
             yield reading

@@ -107,7 +107,7 @@ def _refine(bags: tuple[str, ...], output: Path, overwrite: bool) -> None:
         found = refine(bag)
         with results.staged() as folder:
             write_refined(folder, bag, found)
-    click.echo(f"{found.told()}\nwritten to {output}")
+    click.echo(f"{found.description()}\nwritten to {output}")
 
 
 def _lenses(model: str, cameras: int) -> list[str]:

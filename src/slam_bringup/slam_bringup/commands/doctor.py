@@ -83,7 +83,7 @@ def examine_live(seconds: float, names: BagNames) -> list[Finding]:
         finally:
             code = process.stop(_START_S)
         if code != 0 or not bag.exists():
-            raise ValueError(f"the recorder ended with code {code}:\n{process.complaint()}")
+            raise ValueError(f"the recorder ended with code {code}:\n{process.diagnostic()}")
         try:
             return examine(bag, names)
         except ValueError as error:

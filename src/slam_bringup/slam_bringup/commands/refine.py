@@ -40,7 +40,7 @@ class Refined:
     parameters: Mapping[str, float]
     figures: Mapping[str, Any]
 
-    def told(self) -> str:
+    def description(self) -> str:
         """Findings as a line each."""
         found, f = [], self.figures
         if self.is_corrected:

@@ -23,8 +23,8 @@ from slam_bags.reading.readings import (
     StereoReading,
 )
 from slam_bags.reading.sensor_bag import SensorBag
-from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import SystemConfig
+from slam_bringup.pipeline.prefetch import prefetch
 from slam_bringup.pipeline.sensor_pipeline import depth_stage, stereo_stage
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
@@ -70,7 +70,7 @@ def _readings(
     """Readings of the bag: where it has been read before, its key frames alone, with what accelerometers read then."""
     times = bag.times
     if not times.is_whole or any(camera.needs_colours for camera in cameras.values()):
-        with closing(ahead(bag.readings(colours=True), _is_an_image)) as readings:
+        with closing(prefetch(bag.readings(colours=True), _is_an_image)) as readings:
             for reading in readings:
                 yield reading
                 if not isinstance(reading, ColourReading):
@@ -80,7 +80,7 @@ def _readings(
         camera.add_forces(times)
     wanted = {agent: camera.key_stamps(times) for agent, camera in cameras.items()}
     expected, passed = max(1, sum(map(len, wanted.values()))), 0
-    with closing(ahead(bag.images_at(wanted), _is_an_image)) as readings:
+    with closing(prefetch(bag.images_at(wanted), _is_an_image)) as readings:
         for k, reading in enumerate(readings, 1):
             yield reading
             now = min(times.count, k * times.count // expected)

@@ -78,7 +78,7 @@ class Mapper:
         last: list[Submap] = []
         for agent, stage in self._filters.items():
             self._process_waiting(agent)
-            for text in filter(None, (stage.finding, stage.moving_objects)):
+            for text in filter(None, (stage.diagnostic, stage.moving_objects)):
                 self._events.append(f"{agent}: {text}" if agent else text)
             last += stage.start_session()  # which no frame begins: the filter forgets its state
         give_back()

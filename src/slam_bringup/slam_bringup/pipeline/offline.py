@@ -22,10 +22,10 @@ from sjsam_node.map_session import MapSession
 from slam_bags.reading.readings import ImuReading, PoseReading, Reading
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames
-from slam_bringup.pipeline.ahead import ahead
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.mapper import Mapper
-from slam_bringup.pipeline.run_record import run_result, told
+from slam_bringup.pipeline.prefetch import prefetch
+from slam_bringup.pipeline.run_record import describe_error, run_result
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.runtime.memory import give_back, keep_little
@@ -111,12 +111,12 @@ def _map(mapping: Mapper, items: Generator[AgentItem, None, None]) -> str:
     """Map all items; the reason is returned if an error ended the run early, and raised before the first frame."""
     failure = ""
     try:
-        for item in ahead(items, _is_of_an_image):
+        for item in prefetch(items, _is_of_an_image):
             mapping.process(item)
     except Exception as error:
         if not mapping.has_frames:
             raise
-        failure = told(error, "the run ended early")
+        failure = describe_error(error, "the run ended early")
     mapping.finish()
     return failure
 
@@ -125,7 +125,7 @@ def _measured(
     bag: SensorBag, pipelines: dict[str, SensorPipeline], on_reading: Callable[[], None], stopped: Callable[[], bool]
 ) -> Generator[AgentItem, None, None]:
     """Reading, finding features and measuring their depth, each on a thread of its own."""
-    with closing(ahead(_extracted(bag, pipelines, on_reading, stopped), _is_of_an_image)) as items:
+    with closing(prefetch(_extracted(bag, pipelines, on_reading, stopped), _is_of_an_image)) as items:
         for item in items:
             yield pipelines[item.agent].measure(item)
 
@@ -133,7 +133,7 @@ def _measured(
 def _extracted(
     bag: SensorBag, pipelines: dict[str, SensorPipeline], on_reading: Callable[[], None], stopped: Callable[[], bool]
 ) -> Generator[AgentItem, None, None]:
-    with closing(ahead(bag.readings(), _is_of_an_image)) as readings:
+    with closing(prefetch(bag.readings(), _is_of_an_image)) as readings:
         for reading in readings:
             yield from pipelines[reading.agent].add(reading)
             on_reading()

@@ -175,7 +175,7 @@ def run_result(
     return replace(mapped, dense=surface, floor_plans=plans, events=events, failure=failure)
 
 
-def told(error: Exception, consequence: str) -> str:
+def describe_error(error: Exception, consequence: str) -> str:
     """An error as one line for a person; where it came from goes to the log."""
     _LOG.debug(consequence, exc_info=error)
     kind = "" if isinstance(error, ValueError | OSError) else f"{type(error).__name__}: "
@@ -206,7 +206,7 @@ def _dense(
             surface = model.surface()
             plans = model.floor_plans(surface)
     except Exception as error:  # what was mapped is worth more than its picture
-        failure = failure or told(error, "no dense model was made")
+        failure = failure or describe_error(error, "no dense model was made")
     return surface, plans, failure
 
 

@@ -163,7 +163,7 @@ class NodeProcess:
             self.process.kill()
             return self.process.wait()
 
-    def complaint(self) -> str:
+    def diagnostic(self) -> str:
         """The end of its log, for a message about why it ended."""
         lines = self.log.read_text(errors="replace").strip().splitlines()
         return "\n".join(lines[-15:])
@@ -202,7 +202,7 @@ class NodeGroup:
         for node in self.nodes:
             if not node.is_running and node.process.returncode != 0:
                 raise ValueError(
-                    f"node {node.command.full_name} ended with code {node.process.returncode}:\n{node.complaint()}"
+                    f"node {node.command.full_name} ended with code {node.process.returncode}:\n{node.diagnostic()}"
                 )
 
     def stop(self, within_s: float = _STOP_AFTER_S) -> None:

@@ -67,7 +67,7 @@ class AwaitedStreams:
         """Streams that nobody waits for, sorted."""
         return tuple(sorted(name for name, newest in self._newest.items() if self._is_silent(name, newest)))
 
-    def complaint(self) -> str:
+    def diagnostic(self) -> str:
         """Names of the silent streams with their last stamps, or ""."""
         return "; ".join(f"no {name} {self._since(name)}" for name in self.silent)
 

@@ -26,7 +26,7 @@ class CalibrationWatch:
         return self._used.setdefault(camera, info) is info
 
     @property
-    def complaint(self) -> str:
+    def diagnostic(self) -> str:
         """Cameras whose newest info is another than the one in use, and by what, or ""."""
         changed = [_change(name, self._used[name], info) for name, info in self._newest.items()]
         return "; ".join(filter(None, changed))
@@ -39,8 +39,8 @@ class CalibrationWatch:
         ValueError
             With the camera, and what has changed.
         """
-        if complaint := self.complaint:
-            raise ValueError(f"{complaint}; reset the node (~/reset) to use the new one")
+        if diagnostic := self.diagnostic:
+            raise ValueError(f"{diagnostic}; reset the node (~/reset) to use the new one")
 
     def restart(self) -> Mapping[str, CameraInfo]:
         """Use the newest calibrations, which are returned by camera."""

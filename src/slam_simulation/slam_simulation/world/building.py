@@ -55,7 +55,7 @@ class Room:
         if not (self.x[1] - self.x[0] > 0.5 and self.y[1] - self.y[0] > 0.5 and self.height > 1.0):
             raise ValueError(f"room '{self.name}' is too small: x {self.x}, y {self.y}, height {self.height} m")
 
-    def holds(self, x: float, y: float, margin: float = 0.0) -> bool:
+    def contains(self, x: float, y: float, margin: float = 0.0) -> bool:
         """True if a place lies in the room, or no farther than ``margin`` (m) beside it."""
         inside_x = self.x[0] - margin <= x <= self.x[1] + margin
         return inside_x and self.y[0] - margin <= y <= self.y[1] + margin

@@ -113,7 +113,7 @@ def _person(world: World, spot: Spot) -> None:
 
 
 def _spot(rooms: tuple[Room, ...], T: FloatArray) -> Spot:
-    room = next((k for k, room in enumerate(rooms) if room.holds(T[0, 3], T[1, 3])), 0)
+    room = next((k for k, room in enumerate(rooms) if room.contains(T[0, 3], T[1, 3])), 0)
     return Spot(room, T[:3, 3].copy(), float(np.arctan2(T[1, 0], T[0, 0])))
 
 

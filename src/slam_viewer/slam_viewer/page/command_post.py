@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.navigation import Frontier, Way, frontiers, walked, way
+from dense_mapping.navigation import Frontier, Route, frontiers, plan_route, walked
 from slam_core.estimation.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate
@@ -26,21 +26,21 @@ class WayOut:
     """
 
     agent: str
-    way: Way | None
+    route: Route | None
     radius: float
 
     @property
     def label(self) -> str:
         """The length alone, for the scene."""
-        return "" if self.way is None else f"{self.way.length:.1f} m to the exit"
+        return "" if self.route is None else f"{self.route.length:.1f} m to the exit"
 
     @property
     def text(self) -> str:
         """Way to the exit and uncertainty, in words."""
-        if self.way is None:
+        if self.route is None:
             return "no way out through what was seen free or walked on"
-        narrow = f", {2 * self.way.clearance:.1f} m wide at its narrowest" if self.way.clearance < 0.5 else ""
-        return f"{self.way.length:.1f} m to the exit{narrow}, {radius_text(self.radius)}"
+        narrow = f", {2 * self.route.clearance:.1f} m wide at its narrowest" if self.route.clearance < 0.5 else ""
+        return f"{self.route.length:.1f} m to the exit{narrow}, {radius_text(self.radius)}"
 
 
 def storey_at(plans: Sequence[FloorPlan], point: FloatArray) -> FloorPlan | None:
@@ -68,7 +68,7 @@ def ways_out(
         exit_ = paths[name][0]
         plan, target = storey_at(plans, pose.T[:3, 3]), storey_at(plans, exit_)
         same = plan is not None and plan is target
-        found = way(trodden[id(plan)], pose.T[:3, 3], exit_) if same else None
+        found = plan_route(trodden[id(plan)], pose.T[:3, 3], exit_) if same else None
         out.append(WayOut(name, found, position_radius(pose)))
     return out
 

@@ -100,7 +100,7 @@ class FinishedView:
         texts = []
         for out in ways_out(self.run.plans, poses, paths):
             index = list(self.run.trajectories).index(out.agent)
-            points = np.empty((0, 3)) if out.way is None else out.way.points
+            points = np.empty((0, 3)) if out.route is None else out.route.points
             self.page.show_way(index, points, out.label)
             texts.append((out.agent, out.text))
         unseen_count = len(unseen(self.run.plans))

@@ -40,11 +40,11 @@ _HYSTERESIS = 0.5
 """A correction stays until what asks for it falls below this share of what it took to begin."""
 _MIN_CHANGE = 0.02
 """Median change of depth, relative, after which a view is another one."""
-_MEMORY = 400
+_MAX_GROUPS = 400
 """Views remembered."""
 _GROUP = 5
 """Consecutive views that are not independent: they share landmarks."""
-_FEW = 20
+_MIN_FEATURES = 20
 """Fewer features say nothing."""
 _NEIGHBOURS = 0.1
 """Features nearer than this share of the image's width are neighbours."""
@@ -106,8 +106,8 @@ class RangeSelfCalibration:
         self._covariance: FloatArray = np.zeros((0, 0))
         self._prior: FloatArray = np.zeros((0, 0))
         self._mean_amplitude = 0.0
-        self._evidence = EvidenceWindow(_GROUP, _MEMORY)
-        self._squares = EvidenceWindow(_GROUP, _MEMORY)
+        self._evidence = EvidenceWindow(_GROUP, _MAX_GROUPS)
+        self._squares = EvidenceWindow(_GROUP, _MAX_GROUPS)
         """Squares of the rows in place of their information, with how many they are."""
         self._reference: FloatArray = np.zeros((0, 0))
         self._shared = self._weight = 0.0
@@ -164,7 +164,7 @@ class RangeSelfCalibration:
 
     def learn(self, image: DepthImage, fields: RangeFields | None, seen: RangeDifferences) -> None:
         """Take in one view; ``seen`` is measured on the image as :meth:`corrected` gave it."""
-        if fields is None or len(seen.uv) < _FEW or not self._has_changed(image):
+        if fields is None or len(seen.uv) < _MIN_FEATURES or not self._has_changed(image):
             return
         self._reference = _grid(image)
         size = dimension(fields.has_amplitude)
@@ -174,7 +174,7 @@ class RangeSelfCalibration:
         value = seen.value + (rows @ self._theta if self.corrects else 0.0)
         self._evidence.add(self._equations(rows, value, seen.sigma**2))
         self._squares.add(NormalEquations(rows.T @ rows, np.array([len(rows)])))
-        self._settle()
+        self._estimate_error()
         self._learn_unexplained(seen, value - rows @ self._theta, fields.weakness_at(seen.uv), image.camera.width)
 
     def _begin(self, size: int) -> None:
@@ -205,7 +205,7 @@ class RangeSelfCalibration:
             theta = np.asarray(np.linalg.solve(evidence.information + known, evidence.vector + known @ at))
         return evidence
 
-    def _settle(self) -> None:
+    def _estimate_error(self) -> None:
         """Estimate from all evidence, and judge it."""
         self._theta, self._covariance = sandwich_estimate(self._evidence.sums, self._prior)
         features = sum(float(s.vector[0]) for s in self._squares.sums)

@@ -23,7 +23,7 @@ ROW_FLOOR = 0.06
 """Standard deviation of the row of the smallest keypoints in one clean image, px."""
 ROW_SLOPE = 0.003
 """Growth of that with the keypoint's diameter."""
-_MEMORY = 0.9
+_FORGETTING = 0.9
 """Weight of the past in the running factor; 1 keeps it constant."""
 _MIN_MATCHES = 30
 """Matches needed in a frame to learn from it."""
@@ -73,7 +73,7 @@ class PixelNoise:
         clean = np.sqrt(2.0) * np.hypot(ROW_FLOOR, ROW_SLOPE * size)
         normalised = (row_difference - np.median(row_difference)) / clean
         measured = float(np.clip(MAD_TO_SIGMA * np.median(np.abs(normalised)), _MIN_FACTOR, c.max_factor))
-        self.factor = _MEMORY * self.factor + (1.0 - _MEMORY) * measured
+        self.factor = _FORGETTING * self.factor + (1.0 - _FORGETTING) * measured
 
     def learn_rectification(self, row_shift: Float32Array, row_sigma: Float32Array) -> None:
         """Take in the row shifts (n,) px of aligned patches and their standard deviations (n,) px."""
@@ -81,8 +81,8 @@ class PixelNoise:
             return
         spread = MAD_TO_SIGMA * np.median(np.abs(row_shift - np.median(row_shift)))
         excess = np.sqrt(max(0.0, float(spread**2 - np.median(row_sigma) ** 2)))
-        memory = _MEMORY
-        self.rectification_sigma = memory * self.rectification_sigma + (1.0 - memory) * excess
+        forgetting = _FORGETTING
+        self.rectification_sigma = forgetting * self.rectification_sigma + (1.0 - forgetting) * excess
 
     def reset(self) -> None:
         """Forget what was learnt."""

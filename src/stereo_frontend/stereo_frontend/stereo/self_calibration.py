@@ -35,11 +35,11 @@ _MIN_CHI_SQUARE = 36.0
 """Evidence against a perfect calibration from which disparities are corrected."""
 _MIN_ROW_ERROR = 0.25
 """Row differences, root mean square over the image, from which rows are corrected, px."""
-_MIN_MOMENTS = 4
+_MIN_FRAME_PAIRS = 4
 """Pairs of moments needed before disparities are corrected."""
 _MIN_PARALLAX = 8.0
 """Median motion of keypoints between two moments that are compared, px."""
-_MEMORY = 400
+_MAX_GROUPS = 400
 """Pairs of moments remembered."""
 _ROW_REACH = 2.0
 """Row difference looked for beyond the epipolar band while the rows are not known, px."""
@@ -54,7 +54,7 @@ _EVERY = 3
 """Frames of which one is learnt from then: it shows much the same keypoints as the others."""
 _GROUP = 4
 """Consecutive pieces of evidence that are not independent: they share keypoints."""
-_FEW = 30
+_MIN_MATCHES = 30
 """Fewer matches say nothing."""
 _HYSTERESIS = 0.5
 """A correction stays until what asks for it falls below this share of what it took to begin."""
@@ -90,8 +90,8 @@ class StereoSelfCalibration:
         self.error: RectificationError | None = None
         self.corrects_rows = self.corrects = self._is_significant = False
         self._reference: StereoView | None = None
-        self._evidence = EvidenceWindow(_GROUP, _MEMORY)
-        self._moments = self._views = 0
+        self._evidence = EvidenceWindow(_GROUP, _MAX_GROUPS)
+        self._frame_pairs = self._views = 0
 
     # ---- what is known
     def widened(self, matching: MatchingConfig) -> MatchingConfig:
@@ -143,34 +143,36 @@ class StereoSelfCalibration:
         if self.config.mode == "off":
             return
         unknown = RectificationError.unknown(view.stereo.camera)
-        rows = [row_equations(view, unknown, self.config.row_floor)] if len(view) >= _FEW else []
-        self._settle(self._estimate(rows, unknown.camera))
+        rows = [row_equations(view, unknown, self.config.row_floor)] if len(view) >= _MIN_MATCHES else []
+        self._estimate_error(self._estimate(rows, unknown.camera))
 
     def learn(self, view: StereoView) -> None:
         """Take in the matches of one pair; disparities and rows as measured, without any correction."""
         self._views += 1
-        needless = self._moments >= _SETTLED and not (self.corrects_rows or self.corrects) and self._views % _EVERY > 0
-        if self.error is None or len(view) < _FEW or needless:
+        needless = (
+            self._frame_pairs >= _SETTLED and not (self.corrects_rows or self.corrects) and self._views % _EVERY > 0
+        )
+        if self.error is None or len(view) < _MIN_MATCHES or needless:
             return
         if self._reference is None:
             self._take(view, row_equations(view, self.error, self.config.row_floor))
             return
         rows, columns = match_views(self._reference, view, _MIN_SIMILARITY, _MAX_RATIO)
         first, second = self._reference.select(rows), view.select(columns)
-        stays = len(rows) >= _FEW and np.median(np.linalg.norm(first.uv - second.uv, axis=1)) < _MIN_PARALLAX
+        stays = len(rows) >= _MIN_MATCHES and np.median(np.linalg.norm(first.uv - second.uv, axis=1)) < _MIN_PARALLAX
         if stays:
             return
         evidence = row_equations(view, self.error, self.config.row_floor)
         consistency = consistency_equations(first, second, self.error)
         if consistency is not None:
             evidence = evidence + consistency
-            self._moments += 1
+            self._frame_pairs += 1
         self._take(view, evidence)
 
     def _take(self, view: StereoView, evidence: NormalEquations) -> None:
         self._reference = view
         self._evidence.add(evidence)
-        self._settle(self._estimate(list(self._evidence.sums), view.stereo.camera))
+        self._estimate_error(self._estimate(list(self._evidence.sums), view.stereo.camera))
 
     def _estimate(self, evidence: list[NormalEquations], camera: Camera) -> RectificationError:
         """The solution of all groups of evidence, with the sandwich covariance."""
@@ -182,13 +184,13 @@ class StereoSelfCalibration:
             prior += _FREE / self.config.sigma_disparity**2 * unknown.column_moment()
         return RectificationError(camera, *sandwich_estimate(evidence, prior))
 
-    def _settle(self, error: RectificationError) -> None:
+    def _estimate_error(self, error: RectificationError) -> None:
         self.error = error
         slack = _HYSTERESIS if self.corrects_rows else 1.0
         rows = error.row_rms()
         self.corrects_rows = rows > slack * _MIN_ROW_ERROR and rows > slack * self._significant(error.row_sigma_rms())
         slack = _HYSTERESIS if self._is_significant else 1.0
-        enough = self._moments >= _MIN_MOMENTS
+        enough = self._frame_pairs >= _MIN_FRAME_PAIRS
         self._is_significant = enough and error.column_rms() > slack * self._significant(error.column_sigma_rms())
         self.corrects = self._is_significant or (enough and self.config.sigma_disparity > 0.0)
 

@@ -39,7 +39,7 @@ class SurfDevice:
     def __init__(self, wanted: str = CPU) -> None:
         self.name = CPU
         """The device in use."""
-        self.complaint = ""
+        self.diagnostic = ""
         """Reason for which it is not the one that was asked for, or ""."""
         self._surf: Any = None
         self._errors: tuple[type[Exception], ...] = ()
@@ -76,4 +76,4 @@ class SurfDevice:
     def _fall_back(self, why: str) -> None:
         self.name, self._surf = CPU, None
         # Both images of a pair may find out; the first has the reason.
-        self.complaint = self.complaint or f"SURF is computed on the CPU: {why.splitlines()[0]}"
+        self.diagnostic = self.diagnostic or f"SURF is computed on the CPU: {why.splitlines()[0]}"

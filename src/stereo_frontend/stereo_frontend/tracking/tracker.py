@@ -45,7 +45,7 @@ _LONGEST_STEP_S = 0.3
 """Time between pictures beyond which nothing is followed: what little is found again displaces what can be detected."""
 _MAX_MISSED = 5
 """Frames for which a track is looked for where the motion predicts it."""
-_FEW = 0.7
+_KEY_FRAME_SHARE = 0.7
 """Share of the wanted tracks, and of those that the last key frame left, below which a frame becomes a key frame."""
 _LOST = 0.3
 """Share of the wanted tracks below which all features of a key frame are of use."""
@@ -182,7 +182,7 @@ class Tracker:
 
     def needs_key_frame(self, measured: int) -> bool:
         """True if so many tracks with depth are too few."""
-        return measured < _FEW * min(self._wanted, self._begun) or measured < 0.5 * self._wanted
+        return measured < _KEY_FRAME_SHARE * min(self._wanted, self._begun) or measured < 0.5 * self._wanted
 
     def has_lost_sight(self, measured: int) -> bool:
         """True if so few tracks with depth are left that other means have to find the motion."""

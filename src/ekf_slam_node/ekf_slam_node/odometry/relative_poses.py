@@ -32,7 +32,7 @@ _SIGMA_TURN_RATE = 0.1
 """By how much (rad/s) the turn rate of a moment may differ from that of a single reading."""
 _ELSEWHERE = np.repeat([0.3, np.radians(5.0)], 3)
 """Places (m, rad) that look the same are at least so far apart."""
-AID_GATE = chi_square_bound(0.999, 6)
+RELATIVE_POSE_GATE = chi_square_bound(0.999, 6)
 """Gate of a motion's six coordinates by two sensors, 99.9 % of true ones inside."""
 
 ALL = slice(0, 6)
@@ -40,7 +40,7 @@ ROTATION = slice(3, 6)
 
 
 @dataclass(frozen=True, eq=False)
-class Aid:
+class RelativePoseMeasurement:
     """A measured motion T = T_previous_now; ``rows`` of its error are known, with their covariance (k, k).
 
     source: what has measured it, for people to read. reckoned: the steps of an external odometry that it is made of.
@@ -53,7 +53,7 @@ class Aid:
     reckoned: Reckoning | None = None
 
 
-class MotionAids:
+class RelativePoseBuffer:
     """Collects what other sensors say of the motion and sums it up between two frames of the filter.
 
     Scans need not have the frames' stamps: a scan's motion is taken as even, and the last one goes on for at most its
@@ -91,7 +91,7 @@ class MotionAids:
         """Take a reading of an external odometry; returns why it is rejected, or ""."""
         return self.external.add(reading)
 
-    def between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+    def between(self, start_stamp_ns: int, end_stamp_ns: int) -> RelativePoseMeasurement | None:
         """The best aid that covers the time between two stamps, or None."""
         return (
             self._motion_between(start_stamp_ns, end_stamp_ns)
@@ -99,14 +99,14 @@ class MotionAids:
             or self._rotation_between(start_stamp_ns, end_stamp_ns)
         )
 
-    def bridge(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+    def bridge(self, start_stamp_ns: int, end_stamp_ns: int) -> RelativePoseMeasurement | None:
         """The motion without any image, by an external odometry or else by the IMU alone; None where neither knows."""
         reckoned = self._reckon(start_stamp_ns, end_stamp_ns)
         if reckoned is None:
             return self._inertial_bridge(start_stamp_ns, end_stamp_ns)
-        return Aid(reckoned.T, reckoned.covariance[:6, :6], ALL, "odometry", reckoned)
+        return RelativePoseMeasurement(reckoned.T, reckoned.covariance[:6, :6], ALL, "odometry", reckoned)
 
-    def _inertial_bridge(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+    def _inertial_bridge(self, start_stamp_ns: int, end_stamp_ns: int) -> RelativePoseMeasurement | None:
         """The motion as the IMU alone tells it, from velocity and gravity at the start; None where it does not."""
         if not self.inertial.can_bridge:
             return None
@@ -115,7 +115,7 @@ class MotionAids:
             return None
         step = self.inertial.predict(pre)
         covariance = self.inertial.motion_covariance(step)
-        return Aid(*at_place(step.T, covariance, -self._place()), ALL, "the IMU")
+        return RelativePoseMeasurement(*at_place(step.T, covariance, -self._place()), ALL, "the IMU")
 
     def moved(
         self,
@@ -140,21 +140,21 @@ class MotionAids:
         self._newest, self._reached_ns = (0, 0, None), end_stamp_ns
         if pre is None:
             return True
-        self.inertial.watch(pre)
+        self.inertial.check_specific_force(pre)
         step = self.inertial.predict(pre)
         if T_previous_now is None or covariance is None:
             self.inertial.advance(step)
             return True
         return self.inertial.measure(step, *at_place(T_previous_now, covariance, self._place()))
 
-    def witness(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+    def witness(self, start_stamp_ns: int, end_stamp_ns: int) -> RelativePoseMeasurement | None:
         """The motion, or its rotation, as an IMU tells it that has agreed with the images so far; None without one."""
         if not self.inertial.is_proven:
             return None
         bridge = self._inertial_bridge(start_stamp_ns, end_stamp_ns)
         return bridge or self._rotation_between(start_stamp_ns, end_stamp_ns)
 
-    def refute(
+    def is_inconsistent(
         self, start_stamp_ns: int, end_stamp_ns: int, T_previous_now: FloatArray, covariance: FloatArray
     ) -> bool:
         """True if the IMU rules out a motion that rests on looks alone, with its covariance (6, 6).
@@ -167,16 +167,16 @@ class MotionAids:
             return False
         error = np.abs(boxminus(told.T, T_previous_now))
         is_far = (error > _ELSEWHERE)[told.rows].any()
-        if not is_far or not contradicts(told, T_previous_now, covariance, AID_GATE):
+        if not is_far or not contradicts(told, T_previous_now, covariance, RELATIVE_POSE_GATE):
             return False
-        self.doubt(end_stamp_ns)
+        self.add_inconsistency(end_stamp_ns)
         return True
 
-    def doubt(self, stamp_ns: int) -> None:
+    def add_inconsistency(self, stamp_ns: int) -> None:
         """A motion up to a stamp is not believed because of the IMU, which may be the one that is wrong."""
         if stamp_ns != self._doubted_ns:
             self._doubted_ns = stamp_ns
-            self.inertial.doubt()
+            self.inertial.add_inconsistency()
 
     @property
     def newest_stamp_ns(self) -> int:
@@ -211,11 +211,11 @@ class MotionAids:
             return None
         return self.external.reckon(start_stamp_ns, end_stamp_ns, self._turns, self.inertial.gyro_bias_covariance)
 
-    def _reckoned_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+    def _reckoned_between(self, start_stamp_ns: int, end_stamp_ns: int) -> RelativePoseMeasurement | None:
         reckoned = self._reckon(start_stamp_ns, end_stamp_ns)
         if reckoned is None:
             return None
-        return Aid(reckoned.T, self.external.between(reckoned), ALL, "odometry", reckoned)
+        return RelativePoseMeasurement(reckoned.T, self.external.between(reckoned), ALL, "odometry", reckoned)
 
     def _turns(self, start_stamp_ns: int, end_stamp_ns: int) -> Preintegral | None:
         if not self.inertial.is_proven:
@@ -223,7 +223,7 @@ class MotionAids:
         return self._readings.integrate(start_stamp_ns, end_stamp_ns, self.inertial.biases, self.inertial.noise)
 
     # ---- scans
-    def _motion_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+    def _motion_between(self, start_stamp_ns: int, end_stamp_ns: int) -> RelativePoseMeasurement | None:
         if not self._motions or not self._motions_cover(start_stamp_ns, end_stamp_ns):
             return None
         T, covariance = np.eye(4), np.zeros((6, 6))
@@ -236,7 +236,7 @@ class MotionAids:
                 beyond = max(end - motion.end_stamp_ns, 0) * 1e-9
                 part = self._part(motion, share, beyond)
                 T, covariance = T @ part.T, compose_covariance(T, covariance, part.T, part.covariance)
-        return Aid(T, covariance, ALL)
+        return RelativePoseMeasurement(T, covariance, ALL)
 
     def _motions_cover(self, start_stamp_ns: int, end_stamp_ns: int) -> bool:
         first, last = self._motions[0], self._motions[-1]
@@ -252,12 +252,12 @@ class MotionAids:
         return replace(motion, T=T, covariance=motion.covariance * max(share, 1.0) ** 2 + noise)
 
     # ---- turn rates
-    def _rotation_between(self, start_stamp_ns: int, end_stamp_ns: int) -> Aid | None:
+    def _rotation_between(self, start_stamp_ns: int, end_stamp_ns: int) -> RelativePoseMeasurement | None:
         pre = self._preintegral(start_stamp_ns, end_stamp_ns)
         if pre is None or not self.inertial.uses_turns:
             return None
         variance = np.eye(3) * MEAN_TURN_RATE_SIGMA**2 + self.inertial.gyro_bias_covariance
-        return Aid(make_transform(pre.R, np.zeros(3)), variance * pre.dt**2, ROTATION, "the IMU")
+        return RelativePoseMeasurement(make_transform(pre.R, np.zeros(3)), variance * pre.dt**2, ROTATION, "the IMU")
 
     def _place(self) -> FloatArray:
         return np.zeros(3) if self._readings.newest is None else self._readings.newest.position
@@ -273,7 +273,9 @@ class MotionAids:
         return abs(a - b) <= _AID_STAMP_TOLERANCE * 1e9
 
 
-def aid_error(aid: Aid, T_previous_now: FloatArray, rotation_map_previous: FloatArray) -> tuple[FloatArray, FloatArray]:
+def relative_pose_error(
+    aid: RelativePoseMeasurement, T_previous_now: FloatArray, rotation_map_previous: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Error (k,) of a motion as an aid sees it, along the map's axes, and its covariance (k, k)."""
     error = np.concatenate([aid.T[:3, 3] - T_previous_now[:3, 3], so3_log(aid.T[:3, :3] @ T_previous_now[:3, :3].T)])
     turn = both_halves(rotation_map_previous)
@@ -281,7 +283,7 @@ def aid_error(aid: Aid, T_previous_now: FloatArray, rotation_map_previous: Float
     return (turn @ error)[aid.rows], rows @ aid.covariance @ rows.T
 
 
-def contradicts(aid: Aid, T_previous_now: FloatArray, covariance: FloatArray, gate: float) -> bool:
+def contradicts(aid: RelativePoseMeasurement, T_previous_now: FloatArray, covariance: FloatArray, gate: float) -> bool:
     """True if an aid lies beyond the gate of a motion found otherwise, with its covariance (6, 6).
 
     Scan registration that has slid along a wall is as wrong as it is sure of itself, and only vision can tell.

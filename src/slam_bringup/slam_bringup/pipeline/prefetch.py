@@ -15,7 +15,7 @@ _AHEAD = 8
 """Batches that may wait between two stages."""
 
 
-def ahead(items: Generator[T, None, None], ends_batch: Callable[[T], bool]) -> Generator[T, None, None]:
+def prefetch(items: Generator[T, None, None], ends_batch: Callable[[T], bool]) -> Generator[T, None, None]:
     """Items of an iterator, made by another thread a few batches ahead of their use.
 
     Handing over wakes threads: IMU samples, ten to a frame, go together with the image that they come before.

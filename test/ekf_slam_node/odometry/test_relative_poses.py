@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ekf_slam_node.config import EkfSlamConfig, InertialConfig, MotionConfig
-from ekf_slam_node.odometry.aids import ALL, MEAN_TURN_RATE_SIGMA, ROTATION, MotionAids
+from ekf_slam_node.odometry.relative_poses import ALL, MEAN_TURN_RATE_SIGMA, ROTATION, RelativePoseBuffer
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.slam import EkfSlam
 from feature_world import loop, room
@@ -26,7 +26,7 @@ def motion(poses: list[FloatArray], k: int, error: FloatArray | None = None) -> 
 
 
 def test_motions_are_chained_over_several_scans() -> None:
-    poses, aids = loop(10), MotionAids(MotionConfig())
+    poses, aids = loop(10), RelativePoseBuffer(MotionConfig())
     for k in range(1, 6):
         assert aids.add_motion(motion(poses, k))
     aid = aids.between(0, 5 * STEP_NS)
@@ -37,7 +37,7 @@ def test_motions_are_chained_over_several_scans() -> None:
 
 
 def test_scan_of_another_stamp_is_interpolated_and_goes_on_for_a_while() -> None:
-    poses, aids = loop(20), MotionAids(MotionConfig())
+    poses, aids = loop(20), RelativePoseBuffer(MotionConfig())
     for k in range(1, 4):
         aids.add_motion(motion(poses, k))
     inside = aids.between(STEP_NS // 2, 2 * STEP_NS)
@@ -50,7 +50,7 @@ def test_scan_of_another_stamp_is_interpolated_and_goes_on_for_a_while() -> None
 
 
 def test_unusable_motions_are_refused() -> None:
-    aids = MotionAids(MotionConfig())
+    aids = RelativePoseBuffer(MotionConfig())
     assert not aids.add_motion(RelativeMotion(0, 1, np.full((4, 4), np.nan), COVARIANCE))
     assert not aids.add_motion(RelativeMotion(0, 1, np.eye(4), -COVARIANCE))
     assert not aids.add_motion(RelativeMotion(1, 1, np.eye(4), COVARIANCE))
@@ -58,7 +58,7 @@ def test_unusable_motions_are_refused() -> None:
 
 
 def test_turn_rates_are_integrated() -> None:
-    aids = MotionAids(MotionConfig())
+    aids = RelativePoseBuffer(MotionConfig())
     rate = np.array([0.1, -0.4, 0.8])
     for k in range(-1, 25):
         aids.add_imu(ImuSample(k * 5_000_000, rate, np.zeros(3)))
@@ -72,7 +72,11 @@ def test_turn_rates_are_integrated() -> None:
 def test_constant_error_of_turn_rates_is_learnt() -> None:
     """From the turns that the images show; one that has nothing to do with it is left out."""
     config, rng, dt = MotionConfig(), np.random.default_rng(3), 0.1
-    aids, bias, seen = MotionAids(config), np.array([0.01, -0.02, 0.005]), np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
+    aids, bias, seen = (
+        RelativePoseBuffer(config),
+        np.array([0.01, -0.02, 0.005]),
+        np.diag(np.repeat([1e-3, 5e-4], 3) ** 2),
+    )
     turn = np.array([0.3, 0.1, -0.6])
     for k in range(200):
         for part in range(11):
@@ -107,7 +111,7 @@ def test_biased_turn_rates_do_not_turn_the_map() -> None:
     assert np.degrees(np.linalg.norm(boxminus(*ends)[3:])) < 0.3
 
 
-def run(aided: str, steps: int = 30) -> tuple[EkfSlam, list[float]]:
+def run(fused_prior: str, steps: int = 30) -> tuple[EkfSlam, list[float]]:
     """NEES of the last pose over runs with noisy aids."""
     values = []
     for seed in range(12):
@@ -115,9 +119,9 @@ def run(aided: str, steps: int = 30) -> tuple[EkfSlam, list[float]]:
         world, poses = room(rng, 700), loop(steps)
         slam = EkfSlam(EkfSlamConfig())
         for k, T in enumerate(poses):
-            if k and aided == "motion":
+            if k and fused_prior == "motion":
                 slam.process_motion(motion(poses, k, np.sqrt(np.diag(COVARIANCE)) * rng.standard_normal(6)))
-            if k and aided == "imu":
+            if k and fused_prior == "imu":
                 step = so3_log(poses[k - 1][:3, :3].T @ T[:3, :3]) / 0.1
                 noisy = step + MEAN_TURN_RATE_SIGMA * rng.standard_normal(3)
                 for part in range(10):
@@ -129,8 +133,8 @@ def run(aided: str, steps: int = 30) -> tuple[EkfSlam, list[float]]:
 
 
 @pytest.mark.parametrize("aided", ["motion", "imu"])
-def test_aided_filter_stays_honest(aided: str) -> None:
-    slam, values = run(aided)
+def test_aided_filter_stays_honest(fused_prior: str) -> None:
+    slam, values = run(fused_prior)
     assert slam.counters.counts["aids_used"] >= 25
     assert 0.5 < np.mean(values) < 1.6
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ekf_slam_node.config import EkfSlamConfig
-from ekf_slam_node.filtering.common_error import CommonError
+from ekf_slam_node.filtering.correlated_noise import CorrelatedNoise
 from ekf_slam_node.filtering.ekf import Ekf
 from ekf_slam_node.filtering.models import observe
-from ekf_slam_node.odometry.aids import ALL, ROTATION, Aid
+from ekf_slam_node.odometry.relative_poses import ALL, ROTATION, RelativePoseMeasurement
 from ekf_slam_node.slam import EkfSlam
 from ekf_slam_node.submaps.motion_checks import widened
 from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, loop, room
@@ -34,7 +34,7 @@ def smooth_field(uv: FloatArray, rng: np.random.Generator, size: float) -> Float
 
 
 def test_fresh_noise_is_not_taken_for_a_common_error(rng: np.random.Generator) -> None:
-    common = CommonError(2.5)
+    common = CorrelatedNoise(2.5)
     for _ in range(300):
         uv = pixels(rng)
         common.learn(uv, 0.6 * rng.standard_normal((100, 2)), WIDTH)
@@ -43,7 +43,7 @@ def test_fresh_noise_is_not_taken_for_a_common_error(rng: np.random.Generator) -
 
 
 def test_a_smooth_error_is_found_below_larger_noise(rng: np.random.Generator) -> None:
-    common = CommonError(2.5)
+    common = CorrelatedNoise(2.5)
     for _ in range(200):
         uv = pixels(rng)
         common.learn(uv, smooth_field(uv, rng, 0.3) + 0.6 * rng.standard_normal((100, 2)), WIDTH)
@@ -51,9 +51,9 @@ def test_a_smooth_error_is_found_below_larger_noise(rng: np.random.Generator) ->
 
 
 def test_nothing_is_said_where_it_is_switched_off_or_unknown(rng: np.random.Generator) -> None:
-    off, uv = CommonError(0.0), pixels(rng)
+    off, uv = CorrelatedNoise(0.0), pixels(rng)
     off.learn(uv, smooth_field(uv, rng, 1.0), WIDTH)
-    assert (off.shared_px, CommonError(2.5).shared_px) == (0.0, 0.0)
+    assert (off.shared_px, CorrelatedNoise(2.5).shared_px) == (0.0, 0.0)
 
 
 def test_the_update_is_honest_about_a_pose_error_that_all_features_share(rng: np.random.Generator) -> None:
@@ -91,6 +91,9 @@ def test_smooth_errors_widen_the_poses_of_a_run(rng: np.random.Generator) -> Non
 
 def test_a_scan_motion_is_as_sure_as_the_frames_it_joins() -> None:
     common = np.repeat([0.003, 0.002], 3)
-    scan, gyro = Aid(np.eye(4), 1e-6 * np.eye(6), ALL), Aid(np.eye(4), 1e-6 * np.eye(3), ROTATION)
+    scan, gyro = (
+        RelativePoseMeasurement(np.eye(4), 1e-6 * np.eye(6), ALL),
+        RelativePoseMeasurement(np.eye(4), 1e-6 * np.eye(3), ROTATION),
+    )
     np.testing.assert_allclose(np.diag(widened(scan, common).covariance), 1e-6 + 2.0 * common**2)
     np.testing.assert_array_equal(widened(gyro, common).covariance, gyro.covariance)

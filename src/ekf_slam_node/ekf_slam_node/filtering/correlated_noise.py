@@ -22,7 +22,7 @@ from slam_core.estimation.least_squares import MAD_TO_SIGMA, median
 from slam_core.geometry import FloatArray
 from slam_core.runtime.in_place import in_place
 
-COMMON_ERROR_FACTOR = 2.5
+CORRELATED_NOISE_FACTOR = 2.5
 """Error of the camera's pose, new in every frame, in multiples of what the residuals of neighbouring features share."""
 _NEIGHBOURS = 0.1
 """Features nearer than this share of the image's width are neighbours."""
@@ -34,7 +34,7 @@ _OUTLIER = 3.0
 """Residuals beyond so many robust standard deviations count as this large."""
 
 
-class CommonError:
+class CorrelatedNoise:
     """Running estimate of the covariance (px2) that residuals of neighbouring features share.
 
     Parameters
