@@ -36,7 +36,7 @@ _OPTICAL = make_transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.
 
 
 class _Slam:
-    """What rigs with either camera have in common."""
+    """SLAM of one rig, whatever its camera."""
 
     def __init__(self, config: SystemConfig, sensors: AgentSensors, odometry: str) -> None:
         self._pipeline = SensorPipeline(config, sensors, odometry != "none", StageTimes())

@@ -66,7 +66,7 @@ NODES = (
     NodeDeclaration(
         "stereo_frontend", "feature_extractor", "stereo_frontend.node", "FeatureNode",
         "stereo_frontend.node:FrontendConfig",
-        inputs=(*_RECTIFIED, *_DEPTH, "tof/amplitude/image"), outputs=_FEATURES,
+        inputs=(*_RECTIFIED, *_DEPTH, "tof/amplitude/image", "mask"), outputs=_FEATURES,
         holds_frames=True, recorded=("features",),
     ),
     NodeDeclaration(
@@ -90,7 +90,7 @@ NODES = (
     ),
     NodeDeclaration(
         "dense_mapping", "dense_mapper", "dense_mapping.node", "DenseMapperNode", "dense_mapping.node:DenseNodeConfig",
-        inputs=(*_DEPTH, "tof/color/image", *_RECTIFIED, "odom", "map/path", "imu"),
+        inputs=(*_DEPTH, "tof/color/image", *_RECTIFIED, "mask", "tof/mask", "odom", "map/path", "imu"),
         outputs=("map/dense_cloud", "map/occupancy"),
     ),
     NodeDeclaration(
