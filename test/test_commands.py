@@ -49,7 +49,7 @@ NOT_RUN = {
     r"\./slam live ": "needs a camera",
     r"\./slam post ": "runs until Ctrl-C; test/slam_bringup/commands/test_live.py looks at what it starts",
     r"docker ": "needs a Docker daemon",
-    r"source |rosdep |colcon |python3? -m (venv|colcon)|pip |ros2 bag ": "needs a ROS installation or the network",
+    r"source |rosdep |colcon |python3? -m (venv|colcon)|(\.venv/bin/)?pip |ros2 bag ": "needs ROS or the network",
     r"evo_ape ": "a program of evo, which test/slam_core/test_evaluation.py compares with ours",
     r"ros2 launch (realsense2_camera|depthai_ros_driver|zed_wrapper)|ros2 param ": "needs a vendor's driver and camera",
     r"ros2 launch slam_bringup": "starts nodes; arguments are checked below, test/integration/test_launch.py runs it",
@@ -135,12 +135,18 @@ def prepare(line: str, request: pytest.FixtureRequest) -> None:
 
 
 def write_bag(path: Path, topics: dict[str, str]) -> None:
-    """The first second of the demo as it is, or on the topics by role."""
+    """The first second of the demo as it is, or on the topics by role; masks beside it that leave nothing out."""
+    mask, topics = topics.get("mask"), {role: topic for role, topic in topics.items() if role != "mask"}
     with SensorBag(DEMO) as demo, BagReader(DEMO) as raw, BagWriter(path) as bag:
         types = {topic: info.type_name for topic, info in raw.topics.items()}
         for topic, stamp, data in raw.raw():
             if stamp <= raw.start_ns + 10**9 and (not topics or topic == "/tf_static"):
                 bag.write_raw(topic, types[topic], data, stamp)
+        for reading in islice(demo.readings(), 3 * FRAMES) if mask else ():
+            if isinstance(reading, StereoReading):
+                SensorWriter(bag).picture(
+                    mask.strip("/"), reading.stamp_ns, LEFT_FRAME, np.zeros_like(reading.pair.left)
+                )
         if topics:
             write_renamed(SensorWriter(bag), demo, {role: topic.strip("/") for role, topic in topics.items()})
 

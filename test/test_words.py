@@ -22,7 +22,7 @@ REPLACED = {
     "excess": "variance_scale",
     "CommonError": "CorrelatedNoise",
     "explaining_sigma": "inflated_process_noise",
-    "aided": "fused_prior",
+    "aided": "aided",
     "doubt": "add_inconsistency, overconfidence",
     "strain": "reduced_chi2",
     "relieve": "resolve_overconfidence",

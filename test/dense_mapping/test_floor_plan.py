@@ -21,7 +21,7 @@ from dense_mapping.floor_plan import (
     _occupied,
 )
 from dense_mapping.levelling import floor_heights, level_transform, up_direction
-from dense_mapping.navigation import frontiers, way
+from dense_mapping.navigation import frontiers, plan_route
 from slam_core.camera import Camera
 from slam_core.geometry import OPTICAL_FROM_RIG, boxplus, make_transform, rotation_from_euler, so3_exp
 from slam_core.types import DepthImage
@@ -113,7 +113,9 @@ def test_a_room_nobody_entered_is_a_frontier_at_its_door():
     plan = plan_of(flat_model([(1.5, 1.5), (2.5, 1.5)]))
     beyond = sum(f.length for f in frontiers(plan) if f.point[0] > 4.0)
     assert beyond > 1.0
-    assert way(plan, np.array([1.5, 1.5, 0]), frontiers(plan)[0].point) is not None, "and one can go there to look"
+    assert plan_route(plan, np.array([1.5, 1.5, 0]), frontiers(plan)[0].point) is not None, (
+        "and one can go there to look"
+    )
 
 
 def test_a_room_that_was_looked_into_everywhere_has_less_of_a_border(both_rooms):
@@ -124,7 +126,7 @@ def test_a_room_that_was_looked_into_everywhere_has_less_of_a_border(both_rooms)
 
 def test_the_way_out_leads_through_the_door_and_through_no_wall(both_rooms):
     plan = plan_of(both_rooms)
-    found = way(plan, np.array([6.0, 1.5, 1.2]), np.array([1.5, 1.5, 1.2]))
+    found = plan_route(plan, np.array([6.0, 1.5, 1.2]), np.array([1.5, 1.5, 1.2]))
     assert found is not None
     assert 4.4 <= found.length < 6.0
     assert set(value_at(plan, *map(tuple, found.points))) == {FREE}
@@ -135,7 +137,7 @@ def test_the_way_out_leads_through_the_door_and_through_no_wall(both_rooms):
 
 def test_there_is_no_way_through_what_nobody_has_seen():
     plan = plan_of(flat_model([(1.0, 1.5)]))
-    assert way(plan, np.array([1.0, 1.5, 0]), np.array([7.5, 0.5, 0])) is None
+    assert plan_route(plan, np.array([1.0, 1.5, 0]), np.array([7.5, 0.5, 0])) is None
 
 
 def test_a_map_that_starts_tilted_is_levelled_by_its_floor():

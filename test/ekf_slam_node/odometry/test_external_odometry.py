@@ -98,7 +98,7 @@ def test_the_scale_is_worth_its_learning() -> None:
     sigma = np.sqrt(np.diagonal(odometry.covariance))
     assert sigma[0] < 0.3 * ExternalOdometryConfig().sigma_scale
     assert abs(odometry.calibration[0] + RADIUS) < 0.5 * RADIUS
-    assert "way x 0.98" in odometry.diagnostic
+    assert "way x 0.98" in odometry.finding
 
 
 def test_without_a_covariance_the_images_tell_the_noise() -> None:

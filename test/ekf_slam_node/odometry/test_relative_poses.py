@@ -111,7 +111,7 @@ def test_biased_turn_rates_do_not_turn_the_map() -> None:
     assert np.degrees(np.linalg.norm(boxminus(*ends)[3:])) < 0.3
 
 
-def run(fused_prior: str, steps: int = 30) -> tuple[EkfSlam, list[float]]:
+def run(aided: str, steps: int = 30) -> tuple[EkfSlam, list[float]]:
     """NEES of the last pose over runs with noisy aids."""
     values = []
     for seed in range(12):
@@ -119,9 +119,9 @@ def run(fused_prior: str, steps: int = 30) -> tuple[EkfSlam, list[float]]:
         world, poses = room(rng, 700), loop(steps)
         slam = EkfSlam(EkfSlamConfig())
         for k, T in enumerate(poses):
-            if k and fused_prior == "motion":
+            if k and aided == "motion":
                 slam.process_motion(motion(poses, k, np.sqrt(np.diag(COVARIANCE)) * rng.standard_normal(6)))
-            if k and fused_prior == "imu":
+            if k and aided == "imu":
                 step = so3_log(poses[k - 1][:3, :3].T @ T[:3, :3]) / 0.1
                 noisy = step + MEAN_TURN_RATE_SIGMA * rng.standard_normal(3)
                 for part in range(10):
@@ -133,8 +133,8 @@ def run(fused_prior: str, steps: int = 30) -> tuple[EkfSlam, list[float]]:
 
 
 @pytest.mark.parametrize("aided", ["motion", "imu"])
-def test_aided_filter_stays_honest(fused_prior: str) -> None:
-    slam, values = run(fused_prior)
+def test_aided_filter_stays_honest(aided: str) -> None:
+    slam, values = run(aided)
     assert slam.counters.counts["aids_used"] >= 25
     assert 0.5 < np.mean(values) < 1.6
 

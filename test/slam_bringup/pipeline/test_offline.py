@@ -12,7 +12,7 @@ import yaml
 from slam_bags.reading.readings import AgentSensors
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
-from slam_bringup.pipeline.prefetch import ahead
+from slam_bringup.pipeline.prefetch import prefetch
 from slam_bringup.pipeline.run_record import StateChanges
 from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
@@ -45,7 +45,7 @@ def doubled(items):
 
 def stage(items):
     """A stage that hands over three items at a time."""
-    return ahead(items, lambda k: k % 3 == 0)
+    return prefetch(items, lambda k: k % 3 == 0)
 
 
 def squared(items):

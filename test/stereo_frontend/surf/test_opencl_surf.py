@@ -222,7 +222,7 @@ def test_without_a_gpu_surf_is_on_the_cpu_and_says_so_where_one_was_asked_for(
     assert device.compute(lambda surf: "device", lambda: "cpu") == "cpu"
 
 
-@pytest.mark.parametrize(("wanted", "complaint"), [("auto", ""), ("gpu", "pip install pyopencl"), ("cpu", "")])
+@pytest.mark.parametrize(("wanted", "diagnostic"), [("auto", ""), ("gpu", "pip install pyopencl"), ("cpu", "")])
 def test_without_pyopencl_surf_is_on_the_cpu(monkeypatch, wanted, diagnostic):
     monkeypatch.setitem(sys.modules, "stereo_frontend.surf.opencl_surf", None)
     monkeypatch.delattr("stereo_frontend.surf.opencl_surf")
