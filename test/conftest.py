@@ -15,6 +15,35 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+LONG = Path(__file__).with_name("long_tests.txt")
+"""Names of the tests that take longer than half a second, which ``--fast`` leaves out; ``--write-long`` writes it."""
+LONG_S = 0.5
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--fast", action="store_true", help="leave out what takes long, and what needs ROS or data sets")
+    parser.addoption("--write-long", action="store_true", help=f"add the tests that take long to {LONG.name}")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--fast"):
+        return
+    long = set(LONG.read_text(encoding="utf-8").split("\n"))
+    left_out = [
+        item for item in items if item.nodeid in long or any(map(item.get_closest_marker, ("slow", "ros", "data")))
+    ]
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if item not in set(left_out)]
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if not config.getoption("--write-long"):
+        return
+    seconds: dict[str, float] = {}
+    for report in (r for reports in terminalreporter.stats.values() for r in reports if hasattr(r, "duration")):
+        seconds[report.nodeid] = seconds.get(report.nodeid, 0.0) + report.duration
+    long = {name for name, duration in seconds.items() if duration > LONG_S}
+    LONG.write_text("\n".join(sorted({*LONG.read_text(encoding="utf-8").split("\n"), *long} - {""})) + "\n", "utf-8")
 
 
 @pytest.fixture(scope="session")

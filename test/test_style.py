@@ -44,3 +44,10 @@ def test_a_summary_says_what_is_returned_or_done_and_asks_no_question(package):
     assert lines
     questions = [line for line in lines if re.search(r":\d+: (What|Whether|Which|Where|When|Who|Why|How)\b", line)]
     assert not questions, "\n".join(questions)
+
+
+def test_the_long_tests_are_tests_that_there_are():
+    for line in (ROOT / "test" / "long_tests.txt").read_text(encoding="utf-8").splitlines():
+        path, _, name = line.partition("::")
+        name = re.split(r"[\[]", name.rpartition("::")[2])[0]
+        assert f"def {name}(" in (ROOT / path).read_text(encoding="utf-8"), f"{line}: remove it from long_tests.txt"
