@@ -29,11 +29,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if not config.getoption("--fast"):
         return
     long = set(LONG.read_text(encoding="utf-8").split("\n"))
-    left_out = [
-        item for item in items if item.nodeid in long or any(map(item.get_closest_marker, ("slow", "ros", "data")))
-    ]
+    kept: list[pytest.Item] = []
+    left_out: list[pytest.Item] = []
+    for item in items:
+        is_left_out = item.nodeid in long or any(map(item.get_closest_marker, ("slow", "ros", "data")))
+        (left_out if is_left_out else kept).append(item)
     config.hook.pytest_deselected(items=left_out)
-    items[:] = [item for item in items if item not in set(left_out)]
+    items[:] = kept
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:

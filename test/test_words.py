@@ -65,7 +65,8 @@ def defined(tree: ast.AST) -> Iterator[str]:
         elif isinstance(node, ast.Module | ast.ClassDef):
             for part in node.body:
                 if isinstance(part, ast.Assign):
-                    yield from (target.id for target in part.targets if isinstance(target, ast.Name))
+                    names = (name for target in part.targets for name in ast.walk(target))
+                    yield from (name.id for name in names if isinstance(name, ast.Name))
 
 
 def test_no_name_is_a_word_that_was_replaced():

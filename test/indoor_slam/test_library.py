@@ -63,13 +63,40 @@ def test_the_lines_of_the_readme_run(demo, tmp_path, monkeypatch, capsys):
     assert len(GlobalMap.load(tmp_path / "map").trajectory("")) == FRAMES
 
 
-def test_a_depth_camera_with_scan_odometry_gives_poses(demo):
+def test_a_depth_camera_with_scan_odometry_maps_as_slam_run_does(demo):
     sensors, readings = demo
-    raw = [r.raw for r in readings if isinstance(r, DepthReading)][:6]
-    with DepthSlam(sensors.tof, measurement=sensors.measurement, odometry="ndt") as slam:
-        frames = [f for image in raw for f in slam.add_image(image.stamp_ns, image.image, image.amplitude)]
+    result, _ = run_bag(DEMO, choose(load_system_config(None), "tof", "sjsam", "ndt", "off"), odometry="ndt")
+    raw = [r.raw for r in readings if isinstance(r, DepthReading)]
+    mounting = sensors.transform("base", "tof")
+    with DepthSlam(sensors.tof, measurement=sensors.measurement, odometry="ndt", T_base_camera=mounting) as slam:
+        for image in raw:
+            slam.add_image(image.stamp_ns, image.image, image.amplitude)
         joined = slam.finish()
-    assert len(joined.trajectory()[""]) == len(raw) >= len(frames) >= 1
+    np.testing.assert_array_equal([p.T for p in joined.trajectory()[""]], result.agents[0].trajectory.poses)
+
+
+def test_frames_wait_for_the_imu(demo):
+    sensors, readings = demo
+    (first, *images), (second, *others) = pairs_of(readings)[:2]
+    with StereoSlam(sensors.left, sensors.right, T_base_imu=np.eye(4)) as slam:
+        assert slam.add_pair(first, *images) == slam.add_pair(second, *others) == []
+        stamps = range(first - 10**7, second + 2 * 10**7, 10**7)
+        found = [f for stamp in stamps for f in slam.add_imu(stamp, np.zeros(3), np.array([0.0, 0.0, 9.81]))]
+    assert [f.stamp_ns for f in found] == [first, second]
+
+
+def test_a_submap_that_cannot_be_joined_is_named(demo, monkeypatch, caplog):
+    sensors, readings = demo
+
+    def fail(*_):
+        raise RuntimeError("no room")
+
+    monkeypatch.setattr("sjsam_node.global_map.GlobalMap.add", fail)
+    with StereoSlam(sensors.left, sensors.right) as slam:
+        for pair in pairs_of(readings)[:FRAMES]:
+            slam.add_pair(*pair)
+        assert len(slam.finish()) == 0
+    assert "no room" in caplog.text
 
 
 def test_what_is_wrong_is_said(demo):

@@ -14,7 +14,7 @@ from slam_core.frame_tree import FrameTree
 from slam_core.messages import image_message, mask_from_message
 from slam_core.types import ByteArray, DepthImage, Features, Mask
 from stereo_frontend.frontend_config import FrontendConfig
-from stereo_frontend.masks import MaskConfig, is_masked, widened
+from stereo_frontend.masks import MaskingConfig, is_masked, widened
 from stereo_frontend.stage import FeatureStage
 
 _STEP_NS = 100_000_000
@@ -54,7 +54,7 @@ def test_neither_new_features_nor_tracks_lie_in_masks(stereo_pair, stage: Featur
     frames = run(stage)
     assert [(f.uv[:, 0] >= 160).sum() > 20 for f in frames] == [True, True, False, False]
     for features in frames[2:]:
-        assert features.uv[:, 0].max() < 160 - MaskConfig().margin + 0.5
+        assert features.uv[:, 0].max() < 160 - MaskingConfig().margin + 0.5
         assert len(features) > 30
     assert stage.counters["frames_masked"] == 2
     assert stage.counters["keypoints_masked"] > 20
@@ -89,7 +89,7 @@ def test_a_frame_waits_for_its_mask_once_there_are_any(stereo_pair, stage: Featu
 
 def test_features_go_on_without_masks_that_never_come(stereo_pair) -> None:
     pair = stereo_pair()
-    stage = FeatureStage(FrontendConfig(mask=MaskConfig(use="always", patience=2)), FrameTree())
+    stage = FeatureStage(FrontendConfig(mask=MaskingConfig(use="always", patience=2)), FrameTree())
     numbers = []
     for k in range(5):
         stage.add_images(replace(pair, stamp_ns=k * _STEP_NS))
@@ -121,7 +121,7 @@ def test_a_mask_of_another_size_is_counted_and_said(stereo_pair, stage: FeatureS
 
 def test_masks_can_be_left_alone(stereo_pair) -> None:
     pair = stereo_pair()
-    stage = FeatureStage(FrontendConfig(mask=MaskConfig(use="never")), FrameTree())
+    stage = FeatureStage(FrontendConfig(mask=MaskingConfig(use="never")), FrameTree())
     stage.add_mask(Mask(pair.stamp_ns, mask_of(pair.left.shape)))
     stage.add_images(pair)
     (features,) = run(stage)

@@ -6,7 +6,9 @@ The stages are those of the nodes and of ``slam run``; joining runs on a thread 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,21 +16,22 @@ import numpy as np
 
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.stage import FilterStage
-from ndt_registration.stage import ScanEstimate
-from sjsam_node.map_session import MapSession
+from sjsam_node.map_session import MapSession, Outcome
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_bags.reading.readings import AgentSensors, DepthReading, ImuReading, Reading, StereoReading
 from slam_bringup.pipeline.configuration import SystemConfig, choose, filter_config, system_config
+from slam_bringup.pipeline.mapper import add_to_filter
 from slam_bringup.pipeline.overrides import overrides_of
 from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray, make_transform
-from slam_core.types import AnyArray, ByteArray, Features, ImuSample
+from slam_core.types import AnyArray, ByteArray, ImuSample, Submap
 from stereo_frontend.sources import RawPair
 from tof_driver.stage import RawDepth
 
+_LOG = logging.getLogger(__name__)
 _BASE, _IMU = "base_link", "imu"
 _LEFT, _TOF = "stereo_left_optical_frame", "tof_optical_frame"
 _OPTICAL = make_transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -44,6 +47,7 @@ class _Slam:
         self._session = MapSession(config.sjsam)
         self._has_imu = "imu" in sensors.topics
         self._newest_ns: dict[type[Reading], int] = {}
+        self._futures: list[Future[Outcome | None]] = []
 
     def __enter__(self) -> Self:
         return self
@@ -78,14 +82,19 @@ class _Slam:
         return self._add(ImuReading("", sample))
 
     def finish(self) -> MapSnapshot:
-        """The map of everything that was added: the open submap is closed, all are joined, closures judged again."""
+        """The map of everything that was added: the open submap is closed, all are joined, closures judged again.
+
+        A submap that could not be joined is left out; a warning of :mod:`logging` says so.
+        """
         for item in self._pipeline.finish():
-            self._take(self._pipeline.measure(item).value)
+            add_to_filter(self._filter, self._pipeline.measure(item).value)
         self._filter.give_up()
         self._results()
-        for submap in self._filter.start_session():
-            self._session.add(submap)
+        self._join(self._filter.start_session())
         self._session.finish().result()
+        for error in filter(None, (future.exception() for future in self._futures)):
+            _LOG.warning("a submap could not be joined and is left out of the map: %r", error)
+        self._futures.clear()
         return self._session.read(lambda now: now).result()
 
     def save(self, folder: Path | str) -> None:
@@ -98,23 +107,16 @@ class _Slam:
             raise ValueError(f"stamp {reading.stamp_ns} is not later than the last one, {last}")
         self._newest_ns[type(reading)] = reading.stamp_ns
         for item in self._pipeline.add(reading):
-            self._take(self._pipeline.measure(item).value)
+            add_to_filter(self._filter, self._pipeline.measure(item).value)
         return self._results()
-
-    def _take(self, value: Any) -> None:
-        if isinstance(value, ImuSample):
-            self._filter.add_imu(value)
-        elif isinstance(value, ScanEstimate):
-            self._filter.add_motion(value.pose.stamp_ns, value.motion)
-        elif isinstance(value, Features):
-            self._filter.add_features(value)
 
     def _results(self) -> list[EkfResult]:
         found = [frame.estimate for frame in self._filter.ready()]
-        for estimate in found:
-            for submap in estimate.submaps:
-                self._session.add(submap)
+        self._join(submap for estimate in found for submap in estimate.submaps)
         return found
+
+    def _join(self, submaps: Iterable[Submap]) -> None:
+        self._futures += [self._session.add(submap) for submap in submaps]
 
 
 class StereoSlam(_Slam):

@@ -11,7 +11,7 @@ from stereo_frontend.depth.depth_fusion import FusionConfig
 from stereo_frontend.depth.range_self_calibration import RangeSelfCalibrationConfig
 from stereo_frontend.depth.tof_features import TofFeatureConfig
 from stereo_frontend.detection.features import FeatureConfig
-from stereo_frontend.masks import MaskConfig
+from stereo_frontend.masks import MaskingConfig
 from stereo_frontend.stereo.disparity import DisparityConfig
 from stereo_frontend.stereo.matching import MatchingConfig
 from stereo_frontend.stereo.pixel_noise import PixelNoiseConfig
@@ -37,7 +37,7 @@ class FrontendConfig(Config):
     fusion: FusionConfig = group(FusionConfig)
     range_calibration: RangeSelfCalibrationConfig = group(RangeSelfCalibrationConfig)
     tof: TofFeatureConfig = group(TofFeatureConfig)
-    mask: MaskConfig = group(MaskConfig)
+    mask: MaskingConfig = group(MaskingConfig)
 
     @property
     def tracks(self) -> bool:

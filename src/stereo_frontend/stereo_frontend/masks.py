@@ -16,7 +16,7 @@ from stereo_frontend.nearest_pairing import NearestPairing
 
 
 @dataclass(frozen=True)
-class MaskConfig(Config):
+class MaskingConfig(Config):
     """Masks of what moves, from a detector that the user has."""
 
     use: str = parameter(
@@ -39,7 +39,7 @@ class Masking:
     ``counters``: frames with a mask, frames without one that should have had it, and masks of another size.
     """
 
-    def __init__(self, config: MaskConfig) -> None:
+    def __init__(self, config: MaskingConfig) -> None:
         self._config = config
         self._pairing = NearestPairing[StereoImages | DepthImage, Mask](
             "mask", config.max_age, expected=config.use == "always", patience=config.patience

@@ -11,7 +11,7 @@ from submap_world import two_views, unit
 
 from sjsam_node.graph.links import Prior
 from sjsam_node.loop_closure.association import Alignment, AssociationConfig, PointSet, align
-from sjsam_node.loop_closure.evidence import Evidence, evidence_of
+from sjsam_node.loop_closure.evidence import ClosureEvidence, evidence_of
 from sjsam_node.loop_closure.verification import Verifier
 
 CONFIG = AssociationConfig()
@@ -21,20 +21,20 @@ def test_the_number_of_false_alarms_is_that_of_all_triples_times_the_binomial_ta
     triples = len(list(combinations(range(30), 3)))
     for agreeing in (4, 7, 20, 30):
         expected = np.log10(triples * binom.sf(agreeing - 4, 27, 0.02))
-        assert Evidence(30, agreeing, 0.02).log10_false_alarms == pytest.approx(expected, abs=1e-9)
+        assert ClosureEvidence(30, agreeing, 0.02).log10_false_alarms == pytest.approx(expected, abs=1e-9)
 
 
 def test_three_pairs_agree_with_an_alignment_of_their_own_and_say_nothing() -> None:
-    assert Evidence(30, 3, 0.001).log10_false_alarms > 0.0
-    assert Evidence(2, 2, 0.001).log10_false_alarms >= 0.0
-    assert Evidence(0, 0, 1.0).log10_false_alarms >= 0.0
+    assert ClosureEvidence(30, 3, 0.001).log10_false_alarms > 0.0
+    assert ClosureEvidence(2, 2, 0.001).log10_false_alarms >= 0.0
+    assert ClosureEvidence(0, 0, 1.0).log10_false_alarms >= 0.0
 
 
 def test_more_agreement_fewer_pairs_and_smaller_chance_are_better_evidence() -> None:
-    base = Evidence(40, 12, 0.01).log10_false_alarms
-    assert Evidence(40, 13, 0.01).log10_false_alarms < base
-    assert Evidence(60, 12, 0.01).log10_false_alarms > base
-    assert Evidence(40, 12, 0.05).log10_false_alarms > base
+    base = ClosureEvidence(40, 12, 0.01).log10_false_alarms
+    assert ClosureEvidence(40, 13, 0.01).log10_false_alarms < base
+    assert ClosureEvidence(60, 12, 0.01).log10_false_alarms > base
+    assert ClosureEvidence(40, 12, 0.05).log10_false_alarms > base
 
 
 def test_pairs_of_one_place_are_evident_and_pairs_at_random_are_none(rng: np.random.Generator) -> None:

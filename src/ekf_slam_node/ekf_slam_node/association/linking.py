@@ -87,7 +87,7 @@ class Linker:
         self._config = config
         self._T_rig_optical = T_rig_optical
         self._moving = MovingTracks()
-        self._excess = np.ones(3)
+        self._variance_scale = np.ones(3)
 
     def link(
         self,
@@ -102,7 +102,7 @@ class Linker:
         """
         if min(len(candidates), len(frame)) < self._config.min_inliers:
             return None
-        # Seeded by the frame's own stamp: the result does not depend on what happened before.
+        # Seeded by the frame's own stamp: the samples do not depend on what happened before.
         rng = np.random.default_rng((self._config.seed, frame.stamp_ns))
         predicted = self._by_tracks(candidates, frame, prior, rng)
         if predicted is None:
@@ -148,8 +148,8 @@ class Linker:
         marked = int(np.sum(~still))
         rows, columns = rows[still], columns[still]
         two = two_motions(
-            candidates, frame, (rows, columns), self._T_rig_optical, rng, config.gate, config.min_inliers, self._excess,
-            prior.T,
+            candidates, frame, (rows, columns), self._T_rig_optical, rng, config.gate, config.min_inliers,
+            self._variance_scale, prior.T,
         )  # fmt: skip
         if two is not None:
             rows, columns = two.rows, two.columns
@@ -164,7 +164,7 @@ class Linker:
         link = self._link_of(candidates, frame, guess.T, rows, columns, config.min_inliers)
         if link is None:
             return None
-        self._excess = 0.9 * self._excess + 0.1 * np.minimum(link.variance_scale, 1.0)
+        self._variance_scale = 0.9 * self._variance_scale + 0.1 * np.minimum(link.variance_scale, 1.0)
         moving = marked + (0 if two is None else len(two.moving))
         is_sure = moving < _ALIKE * len(link.rows) and (two is None or two.is_larger)
         return replace(link, moving=moving, is_sure=is_sure)

@@ -46,7 +46,7 @@ _KEPT_NS = 10_000_000_000
 """Readings of so long ago are forgotten in the dark."""
 _WINDOW_S, _FEWEST = 2.0, 3
 """Motions of images are compared over this time, and so many frames: slip lasts for less."""
-_MEMORY, _BEFORE = 10, 2
+_MAX_WINDOWS, _WINDOWS_BEFORE = 10, 2
 """The noise's size is a mean over so many windows; what is believed before counts as so many."""
 _UNSEEN = 4.0
 """The noise's size before a window has told of it, where nothing is claimed."""
@@ -60,6 +60,8 @@ _CONTRADICTION = 100.0
 """Size of the noise beyond which a user should know."""
 _LASTING_STEPS = 20.0
 """Steps of a submap that share the calibration's error."""
+_SIGMA_VELOCITY = 0.3
+"""By how much (m/s, rad/s) the velocity of a moment may differ from its mean over the newest step."""
 _SLIPPED = 0.5
 """Share of a slipping step that may be wrong."""
 _CALIBRATION_WALK = np.array([2e-4, 2e-4, 1e-4])
@@ -197,7 +199,7 @@ class ExternalOdometry:
         dt = _LONGEST_STEP_NS * 1e-9
         start = self._begin(newest.stamp_ns - _LONGEST_STEP_NS, None)
         step = self._advanced(start, newest.stamp_ns, lambda start, end: None)
-        return boxminus(step.T, np.eye(4)) / dt, np.repeat([0.3, 0.3], 3)
+        return boxminus(step.T, np.eye(4)) / dt, np.full(6, _SIGMA_VELOCITY)
 
     def _begin(self, stamp_ns: int, bias: FloatArray | None) -> Reckoning:
         covariance = np.zeros((12, 12))
@@ -306,7 +308,7 @@ class ExternalOdometry:
         error, variance = turn @ error, np.diagonal(turn @ S @ turn.T)
         _, claimed = self.readings.motion(window.start.stamp_ns, reckoned.stamp_ns)
         beyond = np.minimum(error**2, _OUTLIER * variance) - (variance - claimed * self._sizes())
-        share = 1.0 / min(self.windows + _BEFORE, _MEMORY)
+        share = 1.0 / min(self.windows + _WINDOWS_BEFORE, _MAX_WINDOWS)
         for axes in _GROUPS:
             seen = float(beyond[axes].mean() / claimed[axes].mean())
             self.noise[axes] = np.clip((1.0 - share) * self.noise[axes] + share * seen, _LEAST, _LARGEST)

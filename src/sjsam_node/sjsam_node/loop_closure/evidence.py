@@ -40,7 +40,7 @@ _LEAST = 1e-300
 
 
 @dataclass(frozen=True)
-class Evidence:
+class ClosureEvidence:
     """Pairs made by descriptors alone, those of them that agree with one alignment, and their mean chance to do so."""
 
     pairs: int
@@ -63,13 +63,13 @@ def _choices(n: int) -> float:
 
 def evidence_of(
     first: PointSet, second: PointSet, pairs: IntArray, found: Alignment, config: AssociationConfig
-) -> Evidence:
+) -> ClosureEvidence:
     """Evidence of ``pairs`` (n, 2), made by descriptors alone, for an alignment of two submaps.
 
     The gates are as wide as the errors of the alignment's own matches say that the submaps are too sure of themselves.
     """
     if not len(pairs) or not len(found.pairs):
-        return Evidence(len(pairs), 0, 1.0)
+        return ClosureEvidence(len(pairs), 0, 1.0)
     alignment = Prior(found.T, found.covariance)
     own = variance_factor(nis_one_by_one(first, second, found.pairs, alignment, config))
     bound = min(own, config.max_variance_factor) * chi_square_bound(config.probability, 3)
@@ -84,7 +84,7 @@ def evidence_of(
     agrees = is_inside[np.arange(len(pairs)), pairs[:, 0]]
     chance = np.maximum(is_inside.sum(axis=1), 1) / len(first.points)
     kept = _apart(pairs[:, 0], is_inside, agrees)
-    return Evidence(len(kept), int(agrees[kept].sum()), float(chance[kept].mean()))
+    return ClosureEvidence(len(kept), int(agrees[kept].sum()), float(chance[kept].mean()))
 
 
 def _apart(partner: IntArray, is_inside: BoolArray, agrees: BoolArray) -> IntArray:

@@ -6,7 +6,7 @@ The form of the file: :mod:`slam_bringup.pipeline.overrides`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -137,9 +137,13 @@ def filter_config(config: FilterConfig, sensors: AgentSensors) -> FilterConfig:
     """
     if config.imu.use == "on" and "imu" not in sensors.topics:
         raise ValueError("an IMU is asked for (--imu on) and there is no topic imu: name it by --topic imu=/...")
-    imu = (IMU,) if "imu" in sensors.topics and config.imu.use != "off" else ()
-    odometry = (ODOMETRY,) if "odometry" in sensors.topics and config.odometry.use != "off" else ()
-    return replace(config, agent=sensors.agent, wait_for=(*config.wait_for, *imu, *odometry))
+    return replace(config, agent=sensors.agent, wait_for=awaited_streams(config, sensors.topics))
+
+
+def awaited_streams(config: FilterConfig, roles: Collection[str]) -> tuple[str, ...]:
+    """The streams that frames wait for from the start, with those of the sensors in ``roles`` that are used."""
+    used = ((IMU, "imu", config.imu.use), (ODOMETRY, "odometry", config.odometry.use))
+    return (*config.wait_for, *(stream for stream, role, use in used if role in roles and use != "off"))
 
 
 def _method(odometry: str, configured: str) -> str:

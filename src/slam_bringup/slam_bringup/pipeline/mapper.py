@@ -19,7 +19,7 @@ from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_bags.reading.readings import AgentSensors, SessionStart
 from slam_bringup.pipeline.configuration import SystemConfig, filter_config
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges
-from slam_bringup.pipeline.sensor_pipeline import AgentItem
+from slam_bringup.pipeline.sensor_pipeline import AgentItem, Value
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.messages import motion_as_received, rounded
 from slam_core.runtime.memory import give_back, leave_libraries
@@ -56,18 +56,12 @@ class Mapper:
     def process(self, item: AgentItem) -> None:
         """One step of one agent's filter, and of the map where that finished a submap."""
         stage, value = self._filters[item.agent], item.value
-        if isinstance(value, ImuSample):
-            stage.add_imu(value)
-        elif isinstance(value, OdometryReading):
-            stage.add_odometry(value)
-        elif isinstance(value, ScanEstimate):
-            self._diaries[item.agent].scans.append(value.pose)
-            stage.add_motion(value.pose.stamp_ns, motion_as_received(value.motion))
-        elif isinstance(value, Features):
-            stage.add_features(value)
-        elif isinstance(value, SessionStart):
+        if isinstance(value, SessionStart):
             self._process_waiting(item.agent)
             self._hand_over(stage.start_session())
+        elif isinstance(value, ScanEstimate):
+            self._diaries[item.agent].scans.append(value.pose)
+        add_to_filter(stage, value)
         self._take_results(item.agent)
 
     def finish(self) -> None:
@@ -164,6 +158,18 @@ class Mapper:
 
     def _hand_over(self, submaps: Iterable[Submap]) -> None:
         self._futures += [self.session.add(rounded(submap) if self._compact else submap) for submap in submaps]
+
+
+def add_to_filter(stage: FilterStage, value: Value) -> None:
+    """Hand a filter what its sensors have led to, as its node receives it."""
+    if isinstance(value, ImuSample):
+        stage.add_imu(value)
+    elif isinstance(value, OdometryReading):
+        stage.add_odometry(value)
+    elif isinstance(value, ScanEstimate):
+        stage.add_motion(value.pose.stamp_ns, motion_as_received(value.motion))
+    elif isinstance(value, Features):
+        stage.add_features(value)
 
 
 def _loose(shown: MapSnapshot, known: int) -> list[str]:

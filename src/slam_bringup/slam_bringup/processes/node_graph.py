@@ -7,12 +7,11 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ekf_slam_node.stage import IMU, ODOMETRY
 from slam_bags.reading.readings import AgentSensors
 from slam_bags.reading.rig_calibration import RigCalibration
 from slam_bags.reading.sensor_topics import is_rectified, join, nodes_name
-from slam_bringup.pipeline.configuration import SystemConfig
-from slam_bringup.pipeline.node_table import NODES, RESULT_TOPICS
+from slam_bringup.pipeline.configuration import SystemConfig, awaited_streams
+from slam_bringup.pipeline.node_table import NODES, RESULT_TOPICS, node_named
 from slam_bringup.pipeline.overrides import Overrides, is_parameter_of
 from slam_bringup.pipeline.sensor_pipeline import with_masks
 from slam_bringup.processes.node_arguments import ros_arguments
@@ -71,37 +70,34 @@ def live_nodes(
     rectified: bool = False,
     extra: Mapping[str, Mapping[str, Any]] | None = None,
     base_frames: Mapping[str, str] | None = None,
-    with_imu: Iterable[str] = (),
-    with_odometry: Iterable[str] = (),
+    known_roles: Mapping[str, Collection[str]] | None = None,
     with_laser: Iterable[str] = (),
     overrides: Overrides | None = None,
 ) -> list[NodeSpec]:
     """Nodes for rigs with the sensors that the mode of ``config`` needs.
 
     ``rectified``: their stereo images are. ``extra``: parameters by executable. ``base_frames``: frame of each agent's
-    rig, by default ``base_link`` below the agent's name. ``with_imu``, ``with_odometry``: agents whose IMU or external
-    odometry is known to report; another's is used as well, once it does. ``with_laser``: agents whose scan odometry
-    registers the scans of a laser.
-    ``overrides``: what of them is not in ``config``.
+    rig, by default ``base_link`` below the agent's name. ``known_roles``: sensors of each agent that are known to
+    report, such as its IMU; another is used as well, once it does. ``with_laser``: agents whose scan odometry registers
+    the scans of a laser. ``overrides``: what of them is not in ``config``.
     """
     base_frames, with_laser = base_frames or {}, set(with_laser)
-    known_streams = ((IMU, set(with_imu)), (ODOMETRY, set(with_odometry)))
     mode, extra, agents = config.feature_extractor.mode, extra or {}, tuple(agents)
     specs = []
     for agent in agents:
         base = {"base_frame": base_frames[agent]} if agent in base_frames else _below(agent, base_frame="base_link")
         if mode != "tof" and not rectified:
-            specs.append(_spec("stereo_frontend", "stereo_driver", None, agent, extra))
+            specs.append(_spec("stereo_driver", None, agent, extra))
         if mode != "stereo" or (odometry and agent not in with_laser):
-            specs.append(_spec("tof_driver", "tof_driver", config.tof_driver, agent, extra))
+            specs.append(_spec("tof_driver", config.tof_driver, agent, extra))
         if odometry:
             frames = base | _below(agent, odom_frame="odom")
-            specs.append(_spec("ndt_registration", "ndt_odometry", config.ndt_odometry, agent, extra, **frames))
-        specs.append(_spec("stereo_frontend", "feature_extractor", config.feature_extractor, agent, extra))
-        wait_for = (*config.ekf_slam.wait_for, *(name for name, known in known_streams if agent in known))
+            specs.append(_spec("ndt_odometry", config.ndt_odometry, agent, extra, **frames))
+        specs.append(_spec("feature_extractor", config.feature_extractor, agent, extra))
+        wait_for = awaited_streams(config.ekf_slam, (known_roles or {}).get(agent, ()))
         own = base | {"agent": agent, "wait_for": wait_for}
-        specs.append(_spec("ekf_slam_node", "ekf_slam", config.ekf_slam, agent, extra, **own))
-    specs.append(_spec("sjsam_node", "sjsam", config.sjsam, "", extra, agents=agents if any(agents) else ()))
+        specs.append(_spec("ekf_slam", config.ekf_slam, agent, extra, **own))
+    specs.append(_spec("sjsam", config.sjsam, "", extra, agents=agents if any(agents) else ()))
     return [_overridden(spec, config, overrides) for spec in specs] if overrides else specs
 
 
@@ -131,8 +127,7 @@ def plan_nodes(
         config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
         extra=extra, base_frames=base_frames,
         overrides=overrides,
-        with_imu=_with(sensors, "imu", config.ekf_slam.imu.use),
-        with_odometry=_with(sensors, "odometry", config.ekf_slam.odometry.use),
+        known_roles={agent: own.topics for agent, own in sensors.items()},
         with_laser=[a for a, s in sensors.items() if s.scanner == "scan"],
     )  # fmt: skip
     specs = [replace(spec, parameters=spec.parameters | _REPLAY) for spec in specs]
@@ -151,16 +146,11 @@ def plan_nodes(
     )
 
 
-def _with(sensors: Mapping[str, AgentSensors], role: str, use: str) -> list[str]:
-    """Agents with a topic of a role, unless its ``use`` is off."""
-    return [agent for agent, own in sensors.items() if role in own.topics and use != "off"]
-
-
 def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port: int) -> list[NodeSpec]:
     """The dense model and the page that shows it, beside the nodes of :func:`plan_nodes`."""
     agents = tuple(sensors) if any(sensors) else ()
-    model = _spec("dense_mapping", "dense_mapper", config.dense_mapper, "", {}, agents=agents)
-    page = _spec("slam_viewer", "viewer", None, "", {}, agents=agents, port=port)
+    model = _spec("dense_mapper", config.dense_mapper, "", {}, agents=agents)
+    page = _spec("viewer", None, "", {}, agents=agents, port=port)
     return [model, page]
 
 
@@ -177,8 +167,8 @@ def post_nodes(agents: Sequence[str], addresses: Sequence[str], port: int, confi
     link = {"role": "post", "agents": tuple(agents), "listen": tuple(addresses)}
     return [
         NodeSpec("slam_radio", "radio_link", "", link),
-        _spec("sjsam_node", "sjsam", config.sjsam, "", {}, agents=tuple(agents)),
-        NodeSpec("slam_viewer", "viewer", "", {"agents": tuple(agents), "port": port}),
+        _spec("sjsam", config.sjsam, "", {}, agents=tuple(agents)),
+        _spec("viewer", None, "", {}, agents=tuple(agents), port=port),
     ]
 
 
@@ -231,7 +221,6 @@ def _pace(sensor: AgentSensors, mode: str, odometry: bool) -> Iterable[str]:
 
 
 def _spec(
-    package: str,
     executable: str,
     config: Config | None,
     namespace: str,
@@ -240,7 +229,9 @@ def _spec(
 ) -> NodeSpec:
     changed = dict(_changed(config)) if config is not None else {}
     given = {name: value for name, value in own.items() if value not in ("", (), False)}
-    return NodeSpec(package, executable, namespace, changed | given | dict(extra.get(executable, {})))
+    return NodeSpec(
+        node_named(executable).package, executable, namespace, changed | given | dict(extra.get(executable, {}))
+    )
 
 
 def _below(agent: str, **frames: str) -> dict[str, str]:
