@@ -228,7 +228,7 @@ def _spec(
     **own: Any,
 ) -> NodeSpec:
     changed = dict(_changed(config)) if config is not None else {}
-    given = {name: value for name, value in own.items() if value not in ("", (), False)}
+    given = {name: value for name, value in own.items() if value is not False and value not in ("", ())}
     return NodeSpec(
         node_named(executable).package, executable, namespace, changed | given | dict(extra.get(executable, {}))
     )
