@@ -19,7 +19,6 @@ sys.path[:0] = [str(HERE), str(HERE / "ekf_slam_node")]
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped, TransformStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from nav_msgs.msg import Path as PathMessage  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
 
 from feature_world import T_RIG_OPTICAL, loop, room  # noqa: E402
 from ros_probe import Probe  # noqa: E402
@@ -152,15 +151,6 @@ class Chain(Probe):
         """Until the filter has spoken of a frame."""
         messages = self.received[below(agent, "odom")]
         self.wait(lambda: any(stamp_of(m) == stamp for m in messages), f"no odometry at {stamp}")
-
-    def call(self, name: str) -> Any:
-        """Answer of a service; a client of its own each time, because a killed node's never answers."""
-        client = self.node.create_client(Trigger, name)
-        self.wait(client.service_is_ready, f"no service {name}")
-        future = client.call_async(Trigger.Request())
-        self.wait(future.done, f"{name} does not answer")
-        self.node.destroy_client(client)
-        return future.result()
 
     def wait_for_map(self, stamp: int, agent: str = "") -> None:
         """Until the map has a pose of a stamp."""

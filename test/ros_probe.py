@@ -9,11 +9,13 @@ from typing import Any
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from std_srvs.srv import Trigger
 
 from slam_core.ros import RosTypes, sensor_qos
 
 _MOMENT_S = 0.5
 _PATIENCE_S = 3.0
+_ASK_AGAIN_S = 5.0
 
 
 class Probe:
@@ -47,6 +49,24 @@ class Probe:
         while not condition():
             assert time.monotonic() < end, why
             self.executor.spin_once(timeout_sec=0.05)
+
+    def call(self, name: str, request: Any = None, service_type: Any = Trigger) -> Any:
+        """Answer of a service that may be called twice: an answer to a client that is not discovered yet is lost.
+
+        A client of its own each time, because a killed node's never answers.
+        """
+        client = self.node.create_client(service_type, name)
+        self.wait(client.service_is_ready, f"no service {name}")
+        asked, futures = time.monotonic(), []
+
+        def answered() -> bool:
+            if time.monotonic() >= asked + _ASK_AGAIN_S * len(futures):
+                futures.append(client.call_async(request or service_type.Request()))
+            return any(future.done() for future in futures)
+
+        self.wait(answered, f"{name} does not answer")
+        self.node.destroy_client(client)
+        return next(future.result() for future in futures if future.done())
 
     def spin(self, seconds: float) -> None:
         """Listen for a while."""

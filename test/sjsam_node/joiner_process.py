@@ -18,8 +18,6 @@ from slam_core.types import Submap
 
 rclpy = pytest.importorskip("rclpy")
 
-from std_srvs.srv import Trigger  # noqa: E402
-
 
 @contextmanager
 def neighbour() -> Iterator[Probe]:
@@ -56,11 +54,7 @@ def running(*parameters: str, **options: Any) -> Iterator[subprocess.Popen[str]]
 
 
 def call(probe: Probe, name: str) -> Any:
-    client = probe.node.create_client(Trigger, f"/sjsam/{name}")
-    probe.wait(client.service_is_ready, f"no service {name}")
-    future = client.call_async(Trigger.Request())
-    probe.wait(future.done, f"{name} does not answer")
-    return future.result()
+    return probe.call(f"/sjsam/{name}")
 
 
 def send(probe: Probe, submaps: list[Submap], poses: int) -> None:

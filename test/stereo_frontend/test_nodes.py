@@ -23,7 +23,6 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from sensor_msgs.msg import CameraInfo as InfoMessage  # noqa: E402
 from sensor_msgs.msg import Image, PointCloud2  # noqa: E402
 from sensor_msgs.srv import SetCameraInfo  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
 
 from ros_probe import Probe  # noqa: E402
 from slam_core.camera import Camera, CameraInfo  # noqa: E402
@@ -157,14 +156,11 @@ def test_a_new_calibration_is_written_and_used(probe, start, tmp_path: Path):
     for side in SIDES:
         CameraInfoFile(INFOS[side], side).write(paths[side])
     start("driver_node", **{f"{side}_info": paths[side] for side in SIDES})
-    client = probe.node.create_client(SetCameraInfo, "stereo/left/set_camera_info")
-    probe.wait(client.service_is_ready, "no set_camera_info service")
     new = CameraInfo(Camera(320, 240, 190.0, 190.0, 158.0, 123.0), P=P)
     header = header_message(probe.types, 0, "stereo_left_optical_frame")
     request = SetCameraInfo.Request(camera_info=camera_info_message(probe.types, header, new))
-    future = client.call_async(request)
-    probe.wait(future.done, "no answer")
-    assert future.result().success, future.result().status_message
+    answer = probe.call("stereo/left/set_camera_info", request, SetCameraInfo)
+    assert answer.success, answer.status_message
     assert read_camera_info(paths["left"]).info.camera.fx == 190.0
 
 
@@ -186,10 +182,7 @@ def test_pairs_under_another_calibration_are_rejected_until_the_node_is_reset(pr
         probe.send_pair(next(stamps), pair, infos=new)
     probe.spin(2.0)
     assert not rectified
-    client = probe.node.create_client(Trigger, "stereo_driver/reset")
-    probe.wait(client.service_is_ready, "no reset service")
-    future = client.call_async(Trigger.Request())
-    probe.wait(future.done, "no answer")
+    probe.call("stereo_driver/reset")
     probe.send_pair(next(stamps), pair, infos=new)
     probe.wait(lambda: bool(rectified), "nothing after the reset")
     expected = StereoRectifier(new["left"], new["right"])(0, pair.left, pair.right).left

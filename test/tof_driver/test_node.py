@@ -18,7 +18,6 @@ rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from sensor_msgs.srv import SetCameraInfo  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
 
 from ros_probe import Probe  # noqa: E402
 from slam_core.camera import Camera  # noqa: E402
@@ -173,12 +172,9 @@ def test_calibration_from_a_file_is_published_and_replaced(
     probe.wait(lambda: len(probe.received["tof/camera_info"]) == 1, "the info of the file should be published")
     assert camera_info_from_message(probe.received["tof/camera_info"][0]).camera == LENS
     changed = Camera(64, 48, 95.0, 95.0, 31.0, 24.0)
-    client = probe.node.create_client(SetCameraInfo, "tof/set_camera_info")
-    probe.wait(client.service_is_ready, "the service should be offered")
     message = camera_info_message(probe.types, header_message(probe.types, 0, ""), Calibration(changed))
-    answer = client.call_async(SetCameraInfo.Request(camera_info=message))
-    probe.wait(answer.done, "the service should answer")
-    assert answer.result().success, answer.result().status_message
+    answer = probe.call("tof/set_camera_info", SetCameraInfo.Request(camera_info=message), SetCameraInfo)
+    assert answer.success, answer.status_message
     assert read_camera_info(path).info.camera == changed
     probe.send_frame(2, scene(2)["distance"])
     probe.wait(lambda: len(probe.received["tof/camera_info"]) == 2, "the new info should be in use")
@@ -219,10 +215,7 @@ def test_frames_under_another_calibration_are_rejected_until_the_node_is_reset(
     sent = iter(range(3))
     play(refocused, lambda: next(sent, None) is None, "")
     assert not depths
-    client = probe.node.create_client(Trigger, "tof_driver/reset")
-    probe.wait(client.service_is_ready, "no reset service")
-    future = client.call_async(Trigger.Request())
-    probe.wait(future.done, "no answer")
+    probe.call("tof_driver/reset")
     play(refocused, lambda: bool(depths), "nothing after the reset")
     raw = scene(1)
     expected = DepthProcessor(DepthConfig(), refocused).process(1, raw["distance"], raw["amplitude"], raw["intensity"])
