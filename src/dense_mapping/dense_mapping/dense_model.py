@@ -20,7 +20,7 @@ import numpy as np
 from dense_mapping.floor_plan import RAY_STEP, FloorPlan, FloorPlanConfig, floor_plans
 from dense_mapping.keyframes import Keyframe, KeyframeConfig, KeyframeSelector, PlacedKeyframe, make_keyframe, thinned
 from dense_mapping.stereo_depth import StereoDepthConfig
-from dense_mapping.surface import Surface, SurfaceConfig, extract_surface
+from dense_mapping.surface import Surface, extract_surface
 from dense_mapping.tsdf import TsdfConfig, TsdfVolume
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, boxminus
@@ -49,7 +49,6 @@ class DenseConfig(Config):
     keyframe: KeyframeConfig = group(KeyframeConfig)
     stereo: StereoDepthConfig = group(StereoDepthConfig)
     tsdf: TsdfConfig = group(TsdfConfig)
-    surface: SurfaceConfig = group(SurfaceConfig)
     floor_plan: FloorPlanConfig = group(FloorPlanConfig)
 
 
@@ -116,7 +115,7 @@ class DenseModel:
 
     def surface(self) -> Surface:
         """Mesh of all key frames. Where poses are final it is made once: its field is forgotten."""
-        return extract_surface(self.volume, self.config.surface, release=self._fixed)
+        return extract_surface(self.volume, release=self._fixed)
 
     def floor_plans(self, surface: Surface, gravity_up: FloatArray | None = None) -> tuple[FloorPlan, ...]:
         """Plans of all storeys, lowest first.

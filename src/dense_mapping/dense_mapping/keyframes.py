@@ -20,6 +20,8 @@ _MAX_PIXELS = 320 * 240
 
 _DEPTH_UNIT = 0.00025
 _SIGMA_UNIT = 0.0005
+_ANGLE_DEG = 11.0
+"""Turn since the last key frame from which on a frame becomes one, deg."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,6 @@ class KeyframeConfig(Config):
     """Selection of key frames, and of their pixels that count."""
 
     distance: float = parameter(0.22, "a key frame every so much way", unit="m", minimum=0.01)
-    angle_deg: float = 11.0
-    """Or every so much turn, deg."""
     min_depth: float = parameter(0.3, "depth below which a pixel is left out", unit="m", minimum=0.0)
     max_depth: float = parameter(5.0, "depth beyond which a pixel is left out", unit="m", minimum=0.5, maximum=16.0)
     max_sigma: float = parameter(
@@ -48,7 +48,7 @@ class KeyframeSelector:
         if self._last is not None:
             moved = boxminus(T_map_camera, self._last)
             near = np.linalg.norm(moved[:3]) < self._config.distance
-            if near and np.linalg.norm(moved[3:]) < np.radians(self._config.angle_deg):
+            if near and np.linalg.norm(moved[3:]) < np.radians(_ANGLE_DEG):
                 return False
         self._last = T_map_camera
         return True

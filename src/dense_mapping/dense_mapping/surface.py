@@ -18,7 +18,6 @@ from dense_mapping.row_keys import row_keys
 from dense_mapping.surface_kernels import add_normals, fill_means, march, pieces
 from dense_mapping.tsdf import TsdfVolume
 from dense_mapping.tsdf_kernels import BLOCK
-from slam_core.config import Config
 from slam_core.geometry import FloatArray
 from slam_core.types import ByteArray, Float32Array
 
@@ -35,16 +34,10 @@ _THREADS = 2
 """Cubes at once; more threads would only wait for the interpreter between their kernels."""
 _UNSEEN = 150
 """Grey of a surface that no picture shows."""
-
-
-@dataclass(frozen=True)
-class SurfaceConfig(Config):
-    """Choice of the voxels that shape the surface."""
-
-    min_images: int = 2
-    """A voxel counts from so many key frames on."""
-    max_sigma: float = 0.06
-    """Voxels whose distance is less certain are left out, m."""
+_MIN_IMAGES = 2
+"""Key frames that must have seen a voxel for it to count."""
+_MAX_SIGMA = 0.06
+"""Voxels whose distance is less certain are left out, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +64,11 @@ class Surface:
         return len(self.points)
 
 
-def extract_surface(volume: TsdfVolume, config: SurfaceConfig, *, release: bool = False) -> Surface:
+def extract_surface(volume: TsdfVolume, *, release: bool = False) -> Surface:
     """The zero level of the field, with everything known of it; ``release``: the field is emptied on the way."""
     voxel_size = volume.config.voxel_size
     with ThreadPoolExecutor(_THREADS) as pool:
-        pieces = list(pool.map(lambda chunk: _chunk_surface(volume, chunk, config), _chunks(volume)))
+        pieces = list(pool.map(lambda chunk: _chunk_surface(volume, chunk), _chunks(volume)))
     pieces = [piece for piece in pieces if len(piece[1])]
     if release:  # by far the largest part, and what follows needs room
         volume.clear()
@@ -92,20 +85,20 @@ def extract_surface(volume: TsdfVolume, config: SurfaceConfig, *, release: bool 
     return Surface(points, _normals(points, faces), colours[kept][used], sigma[kept][used], faces)
 
 
-def voxel_statistics(voxels: Float32Array, config: SurfaceConfig) -> tuple[Float32Array, Float32Array]:
+def voxel_statistics(voxels: Float32Array) -> tuple[Float32Array, Float32Array]:
     """Mean distance (..., ) m of each voxel and its standard deviation, NaN where it was not seen well enough.
 
     The spread of the images about their mean widens what their sigmas claim, and never narrows it; a share of the
     variance, ``correlation``, stays however many images there are, because neighbours see a place with equal errors.
     """
     weighted, weight, squared, number = np.moveaxis(voxels, -1, 0)
-    seen = (number >= config.min_images - 0.5) & (weight > 0.0)
+    seen = (number >= _MIN_IMAGES - 0.5) & (weight > 0.0)
     w, count = weight[seen].astype(np.float64), number[seen].astype(np.float64)
     seen_mean = weighted[seen] / w
     spread = np.maximum(squared[seen] - weighted[seen] * seen_mean, 0.0) / np.maximum(count - 1.0, 1.0)
     variance = np.maximum(spread, 1.0) * (1.0 + (count - 1.0) * _CORRELATION) / w + _SIGMA_FLOOR**2
     seen_sigma = np.sqrt(variance)
-    known = seen_sigma <= config.max_sigma
+    known = seen_sigma <= _MAX_SIGMA
     mean, sigma = (np.full(seen.shape, np.nan, dtype=np.float32) for _ in range(2))
     mean[seen], sigma[seen] = np.where(known, seen_mean, np.nan), np.where(known, seen_sigma, np.nan)
     return mean, sigma
@@ -117,7 +110,7 @@ def _chunks(volume: TsdfVolume) -> npt.NDArray[np.int64]:
 
 
 def _chunk_surface(
-    volume: TsdfVolume, chunk: npt.NDArray[np.int64], config: SurfaceConfig
+    volume: TsdfVolume, chunk: npt.NDArray[np.int64]
 ) -> tuple[Float32Array, npt.NDArray[np.int32], ByteArray, Float32Array]:
     """Points, faces, colours and sigma of one cube of blocks, one voxel of overlap with the next cubes."""
     corner = chunk * _CHUNK
@@ -126,7 +119,7 @@ def _chunk_surface(
     rows[tuple((volume.coordinates[inside] - corner).T)] = inside
     edge = _CHUNK * BLOCK + 1
     distance = np.full(((_CHUNK + 1) * BLOCK,) * 3, np.nan, dtype=np.float32)
-    limits, noise = (config.min_images, config.max_sigma), (_CORRELATION, _SIGMA_FLOOR)
+    limits, noise = (_MIN_IMAGES, _MAX_SIGMA), (_CORRELATION, _SIGMA_FLOOR)
     fill_means(volume.voxels, inside, (volume.coordinates[inside] - corner) * BLOCK, limits, noise, distance)
     vertices, voxels, faces = march(distance[:edge, :edge, :edge], triangle_table())
     if not len(faces):
@@ -137,7 +130,7 @@ def _chunk_surface(
     voxel = (x * BLOCK + y) * BLOCK + z
     shown = volume.colours[block, voxel]
     colours = np.where(shown[:, 3:] > 0, shown[:, :3], np.uint8(_UNSEEN))
-    return points, faces, colours, voxel_statistics(volume.voxels[block, voxel], config)[1]
+    return points, faces, colours, voxel_statistics(volume.voxels[block, voxel])[1]
 
 
 def _nothing() -> tuple[Float32Array, npt.NDArray[np.int32], ByteArray, Float32Array]:

@@ -17,6 +17,8 @@ MAX_FRAME_FEATURES = 800
 """The strongest features of a frame that are looked at."""
 MAX_UPDATE_LANDMARKS = 120
 """Most landmarks of one update: further ones tell it little and cost the square of their number."""
+STANDING_FRAMES = 5
+"""Frames without motion after which the rig counts as standing: nothing is mapped until it moves."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,6 @@ class MotionConfig(Config):
         2.0, "uncertainty of the speed of a rig never seen before", unit="m/s", minimum=0.0
     )
     sigma_initial_turn_rate: float = parameter(2.0, "the same for its turn rate", unit="rad/s", minimum=0.0)
-    standing_frames: int = 5
-    """Frames without motion after which the rig counts as standing: nothing is mapped until it moves; 0: never."""
 
     @property
     def sigma(self) -> FloatArray:

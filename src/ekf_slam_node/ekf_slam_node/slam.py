@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from ekf_slam_node.association.linking import CONVINCING, FrameLink, Linker
-from ekf_slam_node.config import MAX_FRAME_FEATURES, MAX_UPDATE_LANDMARKS, EkfSlamConfig
+from ekf_slam_node.config import MAX_FRAME_FEATURES, MAX_UPDATE_LANDMARKS, STANDING_FRAMES, EkfSlamConfig
 from ekf_slam_node.filtering.candidates import Candidates, MotionPrior, motion_prior
 from ekf_slam_node.filtering.correlated_noise import CORRELATED_NOISE_FACTOR, CorrelatedNoise
 from ekf_slam_node.filtering.models import Frame, seconds_between
@@ -90,7 +90,7 @@ class EkfSlam:
         self._chain = SubmapChain(self.config, self._T_rig_optical, self.session)
         self._next_id = 0
         self._newest_stamp_ns = 0
-        self._standing = StandingDetector(self.config.motion.standing_frames, self.config.association.gate)
+        self._standing = StandingDetector(STANDING_FRAMES, self.config.association.gate)
         missed = MissedFrames(self._linker, self._T_rig_optical, self.config.motion)
         self._recovery = LossRecovery(self.config, self._chain, self._aids, missed, self.counters, self._advance)
 

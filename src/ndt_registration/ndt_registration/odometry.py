@@ -59,16 +59,16 @@ ODOMETRY_REGISTRATION = RegistrationConfig(
 on perfect planes it would slide. That is little knowledge of the pose: a determined one must lose more, and how far one
 that is not may be off follows from what it loses.
 """
+_KEYFRAMES = 10
+"""Keyframes in the local map."""
+_KEYFRAME_DISTANCE = 0.3
+"""Distance (m) from the last keyframe above which a scan becomes one."""
 
 
 @dataclass(frozen=True)
 class OdometryConfig(Config):
     """ScanPoints odometry."""
 
-    keyframes: int = 10
-    """Keyframes in the local map."""
-    keyframe_distance: float = 0.3
-    """Distance from the last keyframe above which a scan becomes one, m."""
     restart_after: int = 5
     """Failures after which the map starts anew."""
     motion: MotionFilterConfig = group(MotionFilterConfig)
@@ -106,7 +106,7 @@ class ScanOdometry:
 
     def __init__(self, config: OdometryConfig | None = None) -> None:
         self._config = config or OdometryConfig()
-        self._map = KeyframeWindow(self._config.keyframes)
+        self._map = KeyframeWindow(_KEYFRAMES)
         self._filter = MotionFilter(self._config.motion)
         self._gyro = Gyro(self._config.imu)
         self.reset()
@@ -224,11 +224,10 @@ class ScanOdometry:
         self._best_overlap = 0.0
 
     def _is_keyframe(self, result: RegistrationResult) -> bool:
-        c = self._config
         moved = boxminus(result.T_target_source, np.eye(4))
         return bool(
             result.overlap < _KEYFRAME_OVERLAP * self._best_overlap
-            or np.linalg.norm(moved[:3]) > c.keyframe_distance
+            or np.linalg.norm(moved[:3]) > _KEYFRAME_DISTANCE
             or np.rad2deg(np.linalg.norm(moved[3:])) > _KEYFRAME_ANGLE_DEG
         )
 

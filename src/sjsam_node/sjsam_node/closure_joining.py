@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 
 from sjsam_node.graph.links import Link, Status
 from sjsam_node.loop_closure.consistency import (
+    JOINING_ROUNDS,
+    MAX_REFUSED_CLOSURES,
     RETRY_GROWTH,
     SETTLING_ROUNDS,
     ConsistencyConfig,
@@ -23,7 +25,7 @@ from sjsam_node.loop_closure.consistency import (
 from sjsam_node.loop_closure.map_test import MapTest
 from sjsam_node.loop_closure.overconfidence import OverconfidenceTest, links_of, reduced_chi2
 from sjsam_node.loop_closure.pairwise import PairwiseConsistency, support_of
-from sjsam_node.loop_closure.verification import ClosureConfig
+from sjsam_node.loop_closure.verification import LINKED_SUBMAPS, ClosureConfig
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.smoothing.solver import relinked, updated
 from sjsam_node.smoothing.state import EstimateState
@@ -42,7 +44,7 @@ class ClosureJoiner:
     def __post_init__(self) -> None:
         self.pairwise = PairwiseConsistency(self.config, self.drift)
         self.map_test = MapTest(self.config)
-        self.overconfidence = OverconfidenceTest(self.config, self.drift.window)
+        self.overconfidence = OverconfidenceTest(self.config, LINKED_SUBMAPS)
 
     def join_closures(self, found: Sequence[Link], newest: int) -> Verdict:
         """Update the map with the closures that it can live with; the others wait.
@@ -124,7 +126,7 @@ class ClosureJoiner:
         """Update the map with closures and without others; None, and all as it was, if it cannot live with that."""
         before = self.estimate.state
         after = updated(before, newest, added, removed, self.estimate.config)
-        after, chi2_fall = self._without_contradictions(after, newest, self.config.rounds)
+        after, chi2_fall = self._without_contradictions(after, newest, JOINING_ROUNDS)
         verdict = verdict_on(added, [*before.graph.links, *added], after.graph.links)
         if not self.map_test.accepts(before, after, verdict, newest, chi2_fall):
             return None
@@ -151,4 +153,4 @@ class ClosureJoiner:
         """Let closures wait until more speaks for them."""
         known = {k.ends for k in self.refused}
         waiting = [k.with_status(Status.INCONSISTENT) for k in links if k.ends not in known]
-        self.refused = [*self.refused, *waiting][-self.config.waiting :]
+        self.refused = [*self.refused, *waiting][-MAX_REFUSED_CLOSURES:]

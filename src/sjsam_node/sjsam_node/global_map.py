@@ -25,7 +25,7 @@ from sjsam_node.graph.links import Link, Status
 from sjsam_node.graph.offload import Offload
 from sjsam_node.loop_closure.consistency import ConsistencyConfig, Verdict
 from sjsam_node.loop_closure.detector import LoopDetector
-from sjsam_node.loop_closure.verification import ClosureConfig
+from sjsam_node.loop_closure.verification import LINKED_SUBMAPS, ClosureConfig
 from sjsam_node.marks import Marks
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.smoothing.map_snapshot import InnerPaths, MapLandmarks, MapSnapshot
@@ -50,14 +50,14 @@ _COMPARED_AT_ONCE = 2
 """Pairs of submaps that a closure has brought near each other, compared with each new submap."""
 _COMPARED_AT_SETTLING = 2
 """Such pairs compared per submap when the map settles."""
+_UNLINKED_SIGMA = 100.0
+"""Standard deviation given to poses of a stretch that nothing ties to the map yet (m)."""
 
 
 @dataclass(frozen=True)
 class GlobalMapConfig(Config):
     """The joined map."""
 
-    unlinked_sigma: float = 100.0
-    """Standard deviation given to poses of a stretch that nothing ties to the map yet (m)."""
     joined_at_once: int = 12
     """Closures found when the map settles that are joined, and refused, together."""
     ties: int = parameter(8, "landmarks by which two submaps are tied together, at most", minimum=3)
@@ -123,7 +123,7 @@ class GlobalMap:
     def _take(self, state: EstimateState) -> None:
         """Go on from a state."""
         self.estimate = MapEstimate(self.config.smoothing, state)
-        self.agents = Agents(self.estimate, self.config.closure.window)
+        self.agents = Agents(self.estimate, LINKED_SUBMAPS)
         self.detector = LoopDetector(self.estimate, self.config.closure)
         self.closures = ClosureJoiner(self.estimate, self.config.consistency, self.config.closure)
         self._inner_paths = InnerPaths()
@@ -136,7 +136,7 @@ class GlobalMap:
     def snapshot(self) -> MapSnapshot:
         """The map as it is now, for those who read it."""
         marks = Marks(list(self.marks.marks))
-        return MapSnapshot(self.state, self.config.unlinked_sigma, self.config.calibration, marks, self._inner_paths)
+        return MapSnapshot(self.state, _UNLINKED_SIGMA, self.config.calibration, marks, self._inner_paths)
 
     def add(self, submap: Submap) -> JoinReport:
         """Join one submap; a faulty one is refused with the reason, counted, and changes nothing."""
@@ -162,7 +162,7 @@ class GlobalMap:
         is_redundant = bool(self.state.is_redundant(new))
         if not is_redundant:
             self.detector.index.add(new, submap.descriptors)
-        self._page_out(new - self.config.closure.window)
+        self._page_out(new - LINKED_SUBMAPS)
         result, shared = self.state.result(self.state.component(new)), self.estimate.graph.shared_by(new)
         return JoinReport(
             True, "", matched, len(submap.landmarks) - shared, self._named(verdict.accepted), verdict.dropped,

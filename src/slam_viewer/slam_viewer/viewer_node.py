@@ -38,6 +38,8 @@ from slam_viewer.page.panel import AgentRow
 _SILENT_S = 3.0
 _STOREYS = 4
 _STATES = ("OK", "DEGRADED", "LOST")
+_POST_PERIOD_S = 2.0
+"""Time from one look for ways out to the next, s."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,6 @@ class ViewerConfig(Config):
         "address the page listens on; 0.0.0.0 lets other machines see it, who know the token in its address",
     )
     map_frame: str = parameter("map", "frame of the map")
-    post_period_s: float = 2.0
-    """Time from one look for ways out to the next, s."""
 
 
 @dataclass
@@ -91,7 +91,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
             for agent in self.config.agents:
                 here = self.page.server.gui.add_button(f"Mark where {agent or 'the rig'} is")
                 here.on_click(partial(self._mark_agent, agent))
-        self.create_timer(self.config.post_period_s, self._show_post, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(_POST_PERIOD_S, self._show_post, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f"the page is at {self.page.url}")
 
     def on_shutdown(self) -> None:  # type: ignore[override]  # no lifecycle node: rclpy's own takes a state

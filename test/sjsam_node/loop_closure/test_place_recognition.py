@@ -41,8 +41,7 @@ def test_excluded_places_are_not_returned_and_the_number_is_bounded(rng: np.rand
 
 def test_the_same_descriptors_give_the_same_words(rng: np.random.Generator) -> None:
     descriptors = np.concatenate(places(10, rng))
-    config = PlaceRecognitionConfig()
-    first, second = VocabularyTree(descriptors, config), VocabularyTree(descriptors, config)
+    first, second = VocabularyTree(descriptors), VocabularyTree(descriptors)
     assert np.array_equal(first.words(descriptors), second.words(descriptors))
     assert len(np.unique(first.words(descriptors))) > 50
 

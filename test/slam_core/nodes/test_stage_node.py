@@ -12,10 +12,8 @@ rclpy = pytest.importorskip("rclpy", reason="needs ROS")
 pytestmark = pytest.mark.ros
 
 from slam_core.config import Config  # noqa: E402
+from slam_core.nodes.input_config import OVERDUE_S  # noqa: E402
 from slam_core.nodes.stage_node import StageNode  # noqa: E402
-
-OVERDUE_S = 1.0
-"""``input.overdue`` by default."""
 
 
 class Stage:

@@ -55,8 +55,6 @@ class SearchConfig(Config):
     """Largest translation looked for, over the scale."""
     translation_step: float = 0.07
     """Spacing of the translations, over the scale."""
-    candidates: int = 4
-    """Distinct refined poses that are handed on."""
 
 
 PRICES = Prices(unseen=0.15, hidden=0.5, free=2.0)

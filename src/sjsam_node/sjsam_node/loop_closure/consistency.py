@@ -26,21 +26,21 @@ VIEW_CHANGE_FACTOR = 2.0
 """Factor by which squared errors of matches from another view are larger than those in a whole map."""
 RETRY_GROWTH = 1.2
 """Growth of the landmarks that speak for refused closures, from which these are tried again."""
+JOINING_ROUNDS = 1
+"""Updates that a submap may cost beyond its first, to remove closures."""
+MAX_REFUSED_CLOSURES = 40
+"""Refused closures that are remembered."""
 
 
 @dataclass(frozen=True)
 class ConsistencyConfig(Config):
     """Conditions on a joined map for a closure to be held."""
 
-    rounds: int = 1
-    """Updates that a submap may cost beyond its first, to remove closures."""
     max_variance_factor: float = parameter(
         16.0,
         "a map whose submaps seem too sure of themselves by more than this factor holds false closures",
         minimum=1.0,
     )
-    waiting: int = 40
-    """Refused closures that are remembered."""
 
 
 @dataclass(frozen=True, eq=False)

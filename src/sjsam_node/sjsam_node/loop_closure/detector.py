@@ -26,9 +26,12 @@ from sjsam_node.loop_closure.point_sets import at_end, at_start
 from sjsam_node.loop_closure.redundancy import RedundancyCheck
 from sjsam_node.loop_closure.verification import (
     ALIKE_CANDIDATES,
+    CLOSURE_PROBABILITY,
     INFORMATIVE_SIGMA,
     LEAST_NEWS_SHARE,
+    LINKED_SUBMAPS,
     MAX_FALSE_ALARMS,
+    MAX_PENDING_LINKS,
     MIN_NEAR_INLIERS,
     NEAR_CANDIDATES,
     RANSAC_DISTANCE,
@@ -76,7 +79,7 @@ class LoopDetector:
         graph, links = self.graph, []
         T, covariance = np.eye(4), np.zeros((6, 6))
         left, taken = np.arange(len(graph.records[new].observations)), np.empty(0, dtype=np.int64)
-        for k, previous in enumerate(chain[: self.config.window]):
+        for k, previous in enumerate(chain[:LINKED_SUBMAPS]):
             record, threshold = graph.records[previous], self.config.association.descriptor_threshold
             end, end_covariance = record.submap.end_pose, record.submap.covariance[:6, :6]
             if np.trace(end_covariance[:3, :3]) > _BRIDGED_SIGMA**2:
@@ -97,7 +100,7 @@ class LoopDetector:
 
     def closures(self, chain: list[int], new: int) -> list[Link]:
         """Verified links of record ``new`` beyond its chain, consistent or inconsistent with the map; others wait."""
-        graph, recent = self.graph, {*range(new, len(self.graph.records)), *chain[: self.config.window]}
+        graph, recent = self.graph, {*range(new, len(self.graph.records)), *chain[:LINKED_SUBMAPS]}
         near = self._near(new, recent)
         known = self._redundancy_check()
         found = self._around(near, new, known)
@@ -191,7 +194,7 @@ class LoopDetector:
         self._alarms.pop(frozenset(link.ends), None)
         if self._log10_false_alarms(link) <= np.log10(MAX_FALSE_ALARMS):
             return [link]
-        self.pending = [*self.pending, link][-self.config.waiting :]
+        self.pending = [*self.pending, link][-MAX_PENDING_LINKS:]
         return self._believed(self._evident_cycle(link, cache(self._hop)))
 
     def reconsidered(self) -> list[Link]:
@@ -228,9 +231,9 @@ class LoopDetector:
         others = [k for k in self.pending if k is not link]
         cycles, found = list(cycles_through(link, others, hop)), []
         for k, cycle in enumerate(cycles):
-            if cycle.closes(self.config.probability):
+            if cycle.closes(CLOSURE_PROBABILITY):
                 weakest = max((self._log10_false_alarms(one), one.ends) for one in cycle.links)
-                chance = cycle.chance(self.config.probability, sum(map(self._reach, weakest[1])))
+                chance = cycle.chance(CLOSURE_PROBABILITY, sum(map(self._reach, weakest[1])))
                 found.append((weakest[0] + np.log10(chance * len(cycles)), k))
         best = min(found, default=(np.inf, 0))
         return cycles[best[1]].links if best[0] <= np.log10(MAX_FALSE_ALARMS) else ()

@@ -24,14 +24,14 @@ _BRANCHING = 10
 """Children of a node of the vocabulary tree."""
 _PROPOSALS_PER_CANDIDATE = 5
 """Times as many places as are checked that the vocabulary proposes."""
+_DEPTH = 3
+"""Levels of the vocabulary tree."""
 
 
 @dataclass(frozen=True)
 class PlaceRecognitionConfig(Config):
     """The vocabulary and how many places are looked at."""
 
-    depth: int = 3
-    """Levels of the vocabulary tree."""
     training_descriptors: int = 1500
     """Descriptors from which the tree is grown."""
     candidates: int = parameter(6, "best ranked submaps that are proposed", minimum=1)
@@ -40,13 +40,13 @@ class PlaceRecognitionConfig(Config):
 class VocabularyTree:
     """Hierarchical k-means over unit descriptors; a word is a leaf."""
 
-    def __init__(self, descriptors: Descriptors, config: PlaceRecognitionConfig) -> None:
-        self.branching, self.depth = _BRANCHING, config.depth
+    def __init__(self, descriptors: Descriptors) -> None:
+        self.branching = _BRANCHING
         self._centres: dict[int, Descriptors] = {}
         self._grow(0, np.asarray(descriptors, dtype=np.float32), 0)
 
     def _grow(self, node: int, members: Descriptors, level: int) -> None:
-        if level == self.depth or len(members) < 2 * self.branching:
+        if level == _DEPTH or len(members) < 2 * self.branching:
             return
         centres = _kmeans(members, self.branching)
         nearest = np.argmax(members @ centres.T, axis=1)
@@ -57,7 +57,7 @@ class VocabularyTree:
     def words(self, descriptors: Descriptors) -> IntArray:
         """Word of each descriptor (n, d), shape (n,)."""
         node = np.zeros(len(descriptors), dtype=np.int64)
-        for _ in range(self.depth):
+        for _ in range(_DEPTH):
             for parent in np.unique(node):
                 centres = self._centres.get(int(parent))
                 if centres is not None:
@@ -98,7 +98,7 @@ class PlaceIndex:
         if self._tree is None:
             if sum(len(d) for _, d in self._waiting) < self.config.training_descriptors:
                 return
-            self._tree = VocabularyTree(np.concatenate([d for _, d in self._waiting]), self.config)
+            self._tree = VocabularyTree(np.concatenate([d for _, d in self._waiting]))
         for waiting, held in self._waiting:
             self._post(waiting, self._tree.words(held))
         self._waiting.clear()

@@ -54,14 +54,18 @@ _MIN_SPREAD = 0.25
 """Least second-largest standard deviation of the matched landmarks (m)."""
 _MIN_OVERLAP = 0.3
 """Least share of the landmarks expected in both that match."""
+LINKED_SUBMAPS = 3
+"""Submaps back along the agent's path that a new one is linked to directly."""
+MAX_PENDING_LINKS = 20
+"""Links that wait for others to close a cycle with, at most."""
+CLOSURE_PROBABILITY = 0.9999
+"""Share of true closures inside the chi-square gate."""
 
 
 @dataclass(frozen=True)
 class ClosureConfig(Config):
     """Conditions on a link between submaps for it to be believed."""
 
-    window: int = 3
-    """Submaps back along the agent's path that a new one is linked to directly."""
     proximity: float = parameter(
         3.0, "distance between the middles of submaps that are tried as near", unit="m", minimum=0.0
     )
@@ -69,10 +73,6 @@ class ClosureConfig(Config):
         0.01, "drift of odometry to expect beyond its covariance, per metre of way, one sigma", unit="m/m", minimum=0.0
     )
     drift_angle: float = parameter(0.003, "the same for rotation", unit="rad/m", minimum=0.0)
-    waiting: int = 20
-    """Links that wait for others to close a cycle with, at most."""
-    probability: float = 0.9999
-    """Share of true closures inside the chi-square gate."""
     seed: int = parameter(1, "seed of the random samples", minimum=0)
     association: AssociationConfig = group(AssociationConfig)
     places: PlaceRecognitionConfig = group(PlaceRecognitionConfig)
@@ -193,7 +193,7 @@ class Verifier:
 
     def is_against(self, found: Alignment, prior: Prior, path_length: float) -> bool:
         """True if an alignment contradicts the prior, which has drifted along ``path_length`` m."""
-        return self.error_against(found, prior, path_length) > chi_square_bound(self.config.probability, 6)
+        return self.error_against(found, prior, path_length) > chi_square_bound(CLOSURE_PROBABILITY, 6)
 
     def error_against(self, found: Alignment, prior: Prior, path_length: float) -> float:
         """Normalised squared error of an alignment against the prior, which has drifted along ``path_length`` m."""

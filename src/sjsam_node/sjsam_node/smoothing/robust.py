@@ -32,6 +32,8 @@ _SETTLING = 3
 
 Residual = Callable[[LocalMap, JoiningState], FloatArray]
 Solve = Callable[[list[LocalMap], JoiningState], JoiningState]
+_KEPT_SHARE = 0.9999
+"""Share of true rows that are kept; their bound is the scale of the loss."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,6 @@ class RobustConfig(Config):
     """Treatment of closures that the rest of the map contradicts."""
 
     loss: str = parameter("none", "loss of rows that close something", choices=LOSSES)
-    probability: float = 0.9999
-    """Share of true rows that are kept; their bound is the scale of the loss."""
 
 
 def weight(loss: str, nis: float, bound: float) -> float:
@@ -134,7 +134,7 @@ class RobustJoining:
         return RobustResult(self._solve(kept, state), kept, dropped, int(count))
 
     def _bound(self, dof: int) -> float:
-        return chi_square_bound(self.config.probability, dof)
+        return chi_square_bound(_KEPT_SHARE, dof)
 
     def _worst(self, state: JoiningState) -> float:
         """Largest error of any closing row, in units of its bound."""

@@ -35,6 +35,8 @@ from slam_core.ros import RosTypes, declare_config, message_class, run_node, sen
 _DEPTH = 200
 _SETTLE_S = 1.0
 _CLOCK_STEP_NS = 10_000_000
+_PATIENCE_S = 120.0
+"""Longest wait for a paced node that reports nothing, s."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,6 @@ class PlayerConfig(Config):
     rename: tuple[str, ...] = parameter((), "'<topic of the bag>=<topic>': publish under this name")
     pace: tuple[str, ...] = parameter((), "'<node>=<topic>': do not run ahead of this node on this topic")
     window: int = parameter(4, "messages of a paced topic that may be unprocessed", minimum=1)
-    patience: float = 120.0
-    """Longest wait for a paced node that reports nothing, s."""
     wait_for_subscribers: float = parameter(3.0, "longest wait for subscribers at the start", unit="s", minimum=0.0)
     wait_for_start: bool = parameter(False, "begin when the service ~/start is called, not when subscribers are there")
     subscribers: tuple[str, ...] = parameter(
@@ -73,7 +73,7 @@ class BagPlayerNode(Node):
         if not self.config.bag:
             raise ValueError("parameter 'bag' must name the bag to play")
         self._types = RosTypes()
-        self._flow = FlowControl(self.config.pace, self.config.window, self.config.patience)
+        self._flow = FlowControl(self.config.pace, self.config.window, _PATIENCE_S)
         self._required_subscribers = RequiredSubscribers(self.config.subscribers)
         self._connections = Connections()
         self._transforms = [StaticTransform.parse(text) for text in self.config.transforms]
@@ -150,7 +150,7 @@ class BagPlayerNode(Node):
         topic = self._names.get(raw.topic, raw.topic)
         if topic in self._flow.topics:
             if not self._flow.wait(topic):
-                self.get_logger().warning(f"no progress on {topic} for {self.config.patience:.0f} s, going on")
+                self.get_logger().warning(f"no progress on {topic} for {_PATIENCE_S:.0f} s, going on")
             self._flow.sent(topic, header_stamp_ns(raw.data))
         self._send_clock(raw.stamp_ns)
         self._outputs[raw.topic].publish(raw.data)
@@ -226,7 +226,7 @@ class BagPlayerNode(Node):
 
     def _wait_until(self, obstacles: Callable[[], list[str]]) -> None:
         """Until there are none any more, or patience runs out."""
-        deadline = time.monotonic() + self.config.patience
+        deadline = time.monotonic() + _PATIENCE_S
         while found := obstacles():
             if self._stop.wait(0.02):
                 return

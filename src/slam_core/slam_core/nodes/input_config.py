@@ -9,6 +9,11 @@ from slam_core.config import Config, parameter
 from slam_core.nodes.job_queue import POLICIES
 from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S
 
+MAX_WAITING_FRAMES = 1
+"""Frames of an input that may wait with policy newest."""
+OVERDUE_S = 1.0
+"""With policy newest: longest wait of a frame for another sensor, s."""
+
 
 @dataclass(frozen=True)
 class InputConfig(Config):
@@ -25,11 +30,7 @@ class InputConfig(Config):
         " counted; all: every frame is processed, however late",
         choices=POLICIES,
     )
-    waiting: int = 1
-    """Frames of an input that may wait with policy newest."""
     depth: int = parameter(200, "messages kept per topic until received, and until paired", minimum=1)
-    overdue: float = 1.0
-    """With policy newest: longest wait of a frame for another sensor, s."""
     pairing_tolerance_s: float = parameter(
         PAIRING_TOLERANCE_S, "largest difference of stamps that belong together", unit="s", minimum=0.0
     )

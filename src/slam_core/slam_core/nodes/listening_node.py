@@ -19,7 +19,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from slam_core.guarded_node import GuardedNode
 from slam_core.messages.base import Message
 from slam_core.nodes.exchange import Exchange
-from slam_core.nodes.input_config import InputConfig
+from slam_core.nodes.input_config import MAX_WAITING_FRAMES, InputConfig
 from slam_core.nodes.job_queue import JobQueue, QueuedCall
 from slam_core.nodes.stamp_gaps import StampGaps
 from slam_core.nodes.stamp_guard import StampPolicy
@@ -71,7 +71,7 @@ class ListeningNode(GuardedNode):
         super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
         self.input_config = declare_config(self, InputConfig, "input.")
         self._inputs: dict[str, Input] = {}
-        self._jobs = JobQueue(self.input_config.policy, self.input_config.waiting)
+        self._jobs = JobQueue(self.input_config.policy, MAX_WAITING_FRAMES)
         self._inbox: deque[tuple[Input, Message]] = deque()
         self._topics_out: list[str] = []
         self._at_work = False

@@ -13,11 +13,12 @@ from rclpy.clock import Clock, ClockType
 
 from slam_core.config import C
 from slam_core.nodes.base_node import SlamNode
+from slam_core.nodes.input_config import OVERDUE_S
 from slam_core.nodes.job_queue import QueuedCall
 
 
 class StageNode(SlamNode[C]):
-    """Goes on without what is overdue: frames of a live node wait for another sensor no longer than ``input.overdue``.
+    """Goes on without what is overdue: frames of a live node wait for another sensor no longer than ``OVERDUE_S``.
 
     This is the clock's part in patience; the stage itself counts frames, which may have ended as well.
     """
@@ -30,7 +31,7 @@ class StageNode(SlamNode[C]):
         self._waiting: tuple[int | None, float] = (None, 0.0)
         if self.input_config.policy == "newest":
             steady = Clock(clock_type=ClockType.STEADY_TIME)
-            self.create_timer(0.25 * self.input_config.overdue, self._look_for_overdue, clock=steady)
+            self.create_timer(0.25 * OVERDUE_S, self._look_for_overdue, clock=steady)
 
     def publish_ready(self) -> object:
         """Publish the results of all frames that need not wait."""
@@ -40,7 +41,7 @@ class StageNode(SlamNode[C]):
         waiting, now = self.stage.oldest_waiting_ns, time.monotonic()
         if waiting is None or waiting != self._waiting[0]:
             self._waiting = (waiting, now)
-        elif now - self._waiting[1] > self.input_config.overdue:
+        elif now - self._waiting[1] > OVERDUE_S:
             self._jobs.add(QueuedCall("overdue", self._go_on_without))
 
     def _go_on_without(self) -> None:

@@ -29,6 +29,8 @@ _MIN_MATCHES = 30
 """Matches needed in a frame to learn from it."""
 _MIN_FACTOR = 0.7
 """Least factor."""
+_SLOPE = 0.015
+"""Growth of the standard deviation with the keypoint's diameter."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,6 @@ class PixelNoiseConfig(Config):
     floor: float = parameter(
         0.11, "standard deviation of the smallest keypoints", unit="px", minimum=0.01, maximum=10.0
     )
-    slope: float = 0.015
-    """Growth of the standard deviation with the keypoint's diameter."""
     max_factor: float = 3.0
     """Greatest factor."""
 
@@ -58,7 +58,7 @@ class PixelNoise:
 
     def sigma(self, size: Float32Array) -> Float32Array:
         """Standard deviation (px) of u and of v for keypoints of diameter ``size`` (n,) px."""
-        return np.asarray(self.factor * np.hypot(self.config.floor, self.config.slope * size), np.float32)
+        return np.asarray(self.factor * np.hypot(self.config.floor, _SLOPE * size), np.float32)
 
     def learn(self, row_difference: Float32Array, size: Float32Array) -> None:
         """Take in the row differences (n,) px of the matches of one pair, left minus right.
