@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dense_mapping.surface import Surface
+from dense_mapping.reconstruction.surface import Surface
 from slam_core.camera import Camera
 from slam_core.geometry import OPTICAL_FROM_RIG, make_transform, rotation_from_euler
 from slam_core.types import DepthImage

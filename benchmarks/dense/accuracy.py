@@ -22,7 +22,7 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from dense_mapping.dense_model import DenseModel
-from dense_mapping.surface import Surface
+from dense_mapping.reconstruction.surface import Surface
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.dense_run import dense_model

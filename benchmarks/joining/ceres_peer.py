@@ -16,7 +16,7 @@ from memory import PeakMemory
 from pycolmap import cost_functions
 from scipy.spatial.transform import Rotation
 
-from sjsam_node.smoothing.problem import JoiningState, LocalMap
+from sjsam_node.joint_problem.problem import JoiningState, LocalMap
 from slam_core.geometry import make_transform, so3_exp
 
 THREADS = 1

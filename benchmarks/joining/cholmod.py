@@ -19,7 +19,7 @@ from typing import Any
 
 from problems import flattened, joining_problem, local_maps, ring
 
-from sjsam_node.smoothing.joining import JoiningProblem
+from sjsam_node.joint_problem.joining import JoiningProblem
 from slam_core.estimation.least_squares import LevenbergMarquardtConfig
 from slam_core.linear_algebra.sparse_cholesky import SparseCholesky
 

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from memory import PeakMemory
 
-from sjsam_node.smoothing.problem import JoiningState, LocalMap
+from sjsam_node.joint_problem.problem import JoiningState, LocalMap
 from slam_core.geometry import make_transform, so3_exp
 
 X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L

@@ -37,8 +37,8 @@ import numpy as np
 from memory import PeakMemory
 from problems import KnownProblem, flattened, joining_problem, local_maps, ring
 
-from sjsam_node.smoothing.joining import JoiningProblem
-from sjsam_node.smoothing.problem import JoiningState, LocalMap
+from sjsam_node.joint_problem.joining import JoiningProblem
+from sjsam_node.joint_problem.problem import JoiningState, LocalMap
 from slam_core.estimation.least_squares import LevenbergMarquardtConfig
 from slam_core.geometry import so3_exp
 from slam_experiments.linear_slam.block_problem import BlockProblem

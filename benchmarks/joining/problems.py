@@ -19,9 +19,9 @@ sys.path[:0] = [str(p) for p in [*sorted((ROOT / "src").iterdir()), *TESTS]]
 
 from submap_world import Agent, circle, ring_world  # noqa: E402
 
-from sjsam_node.smoothing import kernels  # noqa: E402
-from sjsam_node.smoothing.joining import JoiningProblem  # noqa: E402
-from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten  # noqa: E402
+from sjsam_node.joint_problem import kernels  # noqa: E402
+from sjsam_node.joint_problem.joining import JoiningProblem  # noqa: E402
+from sjsam_node.joint_problem.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten  # noqa: E402
 from slam_core.geometry import so3_log  # noqa: E402
 from slam_core.types import Submap  # noqa: E402
 from slam_experiments.linear_slam.block_problem import BlockProblem, FlatRows, flatten_rows  # noqa: E402

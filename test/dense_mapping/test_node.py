@@ -11,8 +11,8 @@ rclpy = pytest.importorskip("rclpy")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
-from dense_mapping.floor_plan import OCCUPIED  # noqa: E402
 from dense_mapping.node import DenseMapperNode  # noqa: E402
+from dense_mapping.plans.floor_plan import OCCUPIED  # noqa: E402
 from slam_core.camera import Camera  # noqa: E402
 from slam_core.geometry import OPTICAL_FROM_RIG, make_transform  # noqa: E402
 from slam_core.messages import (  # noqa: E402

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sjsam_node.smoothing import kernels
-from sjsam_node.smoothing.joining import JoiningProblem
-from sjsam_node.smoothing.problem import JoiningState, LocalMap
+from sjsam_node.joint_problem import kernels
+from sjsam_node.joint_problem.joining import JoiningProblem
+from sjsam_node.joint_problem.problem import JoiningState, LocalMap
 from slam_core.geometry import boxminus, euler_from_rotation, make_transform, so3_exp
 
 MODELS = {"planar": kernels.PLANAR, "tangent": kernels.TANGENT, "euler": kernels.EULER}

@@ -18,8 +18,8 @@ import pytest
 from click.testing import CliRunner
 
 from slam_bringup.cli import COMMANDS, VERSION, slam
-from slam_bringup.commands.console import progress_bar, show
 from slam_bringup.registered_commands import registered_commands
+from slam_bringup.terminal.console import progress_bar, show
 from slam_experiments.command_table import COMMANDS as REGISTERED
 
 COMMAND = [sys.executable, "-m", "slam_bringup.cli"]

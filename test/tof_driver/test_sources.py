@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slam_core.frame_sources import FrameCapture
+from slam_core.nodes.frame_sources import FrameCapture
 from tof_driver.sources import DepthFolder, DepthVideo, RealSense, depth_of, info_of
 
 NAMES = ("range", "amplitude", "intensity")

@@ -17,11 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dense_mapping.floor_plan import RAY_STEP, FloorPlan, FloorPlanConfig, floor_plans
 from dense_mapping.keyframes import Keyframe, KeyframeConfig, KeyframeSelector, PlacedKeyframe, make_keyframe, thinned
+from dense_mapping.plans.floor_plan import RAY_STEP, FloorPlan, FloorPlanConfig, floor_plans
+from dense_mapping.reconstruction.surface import Surface, extract_surface
+from dense_mapping.reconstruction.tsdf import TsdfConfig, TsdfVolume
 from dense_mapping.stereo_depth import StereoDepthConfig
-from dense_mapping.surface import Surface, extract_surface
-from dense_mapping.tsdf import TsdfConfig, TsdfVolume
 from slam_core.config import Config, group, parameter
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.types import ByteArray, DepthImage

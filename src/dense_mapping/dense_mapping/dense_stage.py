@@ -27,13 +27,12 @@ import numpy.typing as npt
 
 from dense_mapping.colours import RecentColours, stereo_picture
 from dense_mapping.dense_model import DenseConfig, DenseModel
-from dense_mapping.floor_plan import FloorPlan
 from dense_mapping.keyframes import Keyframe, KeyframeSelector, make_keyframe, with_picture
 from dense_mapping.masks import RecentMasks, masked
+from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.reconstruction.surface import Surface
 from dense_mapping.stereo_depth import stereo_depth
-from dense_mapping.surface import Surface
 from slam_core.geometry import FloatArray
-from slam_core.runtime.memory import give_back, trim
 from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray, DepthImage, Mask
 from stereo_frontend.sources import RawPair
@@ -44,8 +43,6 @@ _MAX_WAITING = 400
 _MAX_FORCES = 100_000
 _FORCE_STEP_NS = 50_000_000
 """Of a path that still moves, so many readings of an accelerometer are kept, and one in so much time."""
-_TRIMMED_EVERY = 4
-"""Key frames of a final model after which freed memory is returned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,10 +281,6 @@ class DenseStage:
             return
         self._wait()
         self._last = self._pool.submit(self.model.add_keyframe, item.camera, T_map_camera, item.keyframe)
-        if self._put == _TRIMMED_EVERY:
-            give_back()  # all that measuring and fusing needs is loaded
-        elif self._put % _TRIMMED_EVERY == 0:
-            trim()
 
     def _wait(self) -> None:
         if self._last is not None:

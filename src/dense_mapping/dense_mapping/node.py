@@ -17,9 +17,9 @@ from std_srvs.srv import Trigger
 from dense_mapping.colours import NO_PICTURE
 from dense_mapping.dense_model import DenseConfig
 from dense_mapping.dense_stage import DenseStage
-from dense_mapping.plan_io import plan_names, write_plan
-from dense_mapping.surface_cloud import cloud_of
-from dense_mapping.surface_io import write_mesh
+from dense_mapping.plans.plan_io import plan_names, write_plan
+from dense_mapping.reconstruction.surface_cloud import cloud_of
+from dense_mapping.reconstruction.surface_io import write_mesh
 from slam_core.config import parameter
 from slam_core.health import State
 from slam_core.messages import (

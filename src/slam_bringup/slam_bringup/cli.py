@@ -11,9 +11,9 @@ from typing import Any
 
 import click
 
-import slam_core.process_life  # noqa: F401  # its clock starts with the program
-from slam_bringup.commands.console import log_to_terminal, with_verbosity
+import slam_core.runtime.process_life  # noqa: F401  # its clock starts with the program
 from slam_bringup.registered_commands import registered_commands
+from slam_bringup.terminal.console import log_to_terminal, with_verbosity
 from slam_core.runtime.blas_threads import use_one_blas_thread
 from slam_core.runtime.memory import search_less_garbage, share_one_heap
 from slam_core.version import VERSION

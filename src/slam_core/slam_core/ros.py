@@ -36,10 +36,10 @@ from slam_core.config import Config, ParameterInfo, changed, from_mapping, itera
 from slam_core.guarded_node import GuardedNode
 from slam_core.messages import MessageTypes
 from slam_core.messages.base import Message
-from slam_core.process_life import INTERRUPTED, end_with_parent, on_request_to_end
+from slam_core.messages.tf_message import tf_message_class
 from slam_core.runtime.blas_threads import use_one_blas_thread
 from slam_core.runtime.memory import search_less_garbage, share_one_heap
-from slam_core.tf_message import tf_message_class
+from slam_core.runtime.process_life import INTERRUPTED, end_with_parent, on_request_to_end
 from slam_core.types import AnyArray
 
 C = TypeVar("C", bound=Config)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.surface import Surface
+from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.reconstruction.surface import Surface
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_core.evaluation import Evaluation, evaluate

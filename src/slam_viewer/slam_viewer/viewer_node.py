@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 
-from dense_mapping.floor_plan import FloorPlan
+from dense_mapping.plans.floor_plan import FloorPlan
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.messages import (

@@ -21,7 +21,6 @@ from sensor_msgs.srv import SetCameraInfo
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.config import Config, parameter
-from slam_core.frame_sources import SourceTimer
 from slam_core.messages import (
     camera_info_from_message,
     camera_info_message,
@@ -34,6 +33,7 @@ from slam_core.messages import (
 from slam_core.messages.base import Message
 from slam_core.nodes.base_node import SlamNode
 from slam_core.nodes.calibration_watch import CalibrationWatch
+from slam_core.nodes.frame_sources import SourceTimer
 from slam_core.ros import run_node
 from stereo_frontend.sources import FolderSource, RawPair, SideBySideSource
 from stereo_frontend.stage import StereoStage

@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slam_core.frame_sources import FrameCapture, images_in, stamp_of_image
+from slam_core.nodes.frame_sources import FrameCapture, images_in, stamp_of_image
 from slam_core.types import AnyArray, ByteArray, MakeColour, no_colour
 
 _SUBFOLDERS = (

@@ -26,7 +26,6 @@ from sensor_msgs.srv import SetCameraInfo
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile, read_camera_info
 from slam_core.config import parameter
-from slam_core.frame_sources import SourceTimer
 from slam_core.health import State
 from slam_core.messages import (
     DEPTH_TOPICS,
@@ -43,6 +42,7 @@ from slam_core.messages import (
 from slam_core.messages.base import Message
 from slam_core.nodes.base_node import SlamNode
 from slam_core.nodes.calibration_watch import CalibrationWatch
+from slam_core.nodes.frame_sources import SourceTimer
 from slam_core.ros import run_node
 from slam_core.types import DepthImage
 from tof_driver.depth import DepthConfig

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from slam_core.camera import Camera, CameraInfo
-from slam_core.frame_sources import FrameCapture, images_in, stamp_of_image
+from slam_core.nodes.frame_sources import FrameCapture, images_in, stamp_of_image
 from slam_core.types import AnyArray
 from tof_driver.stage import RawDepth
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from random_joining import MODELS, perturbed, random_problem
 
-from sjsam_node.smoothing.joining import JoiningProblem
-from sjsam_node.smoothing.problem import block_rows, flatten
+from sjsam_node.joint_problem.joining import JoiningProblem
+from sjsam_node.joint_problem.problem import block_rows, flatten
 from slam_experiments.linear_slam.block_problem import BlockProblem, flatten_rows
 
 

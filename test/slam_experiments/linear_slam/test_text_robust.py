@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from text_world import city, park
 
-from sjsam_node.smoothing.joining import JoiningProblem
-from sjsam_node.smoothing.problem import flatten
-from sjsam_node.smoothing.robust import RobustConfig
+from sjsam_node.joint_problem.joining import JoiningProblem
+from sjsam_node.joint_problem.problem import flatten
+from sjsam_node.joint_problem.robust import RobustConfig
 from slam_experiments.linear_slam.text_joining import (
     TextIndex,
     TextJoiner,

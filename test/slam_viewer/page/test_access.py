@@ -23,7 +23,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from browser import Browser, find_chromium
-from dense_mapping.surface import Surface
+from dense_mapping.reconstruction.surface import Surface
 from sjsam_node.global_map import GlobalMap
 from slam_core.trajectory import Trajectory
 from slam_viewer.page.access import Access

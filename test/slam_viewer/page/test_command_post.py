@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 
-from dense_mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
+from dense_mapping.plans.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
 from slam_core.geometry import make_transform
 from slam_core.types import PoseEstimate
 from slam_viewer.page.command_post import storey_at, unseen, ways_out

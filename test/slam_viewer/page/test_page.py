@@ -12,9 +12,9 @@ import pytest
 import trimesh
 
 from browser import Browser, find_chromium
-from dense_mapping.decimation import at_most
-from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.surface import Surface
+from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.reconstruction.decimation import at_most
+from dense_mapping.reconstruction.surface import Surface
 from slam_core.geometry import boxplus
 from slam_core.types import ByteArray
 from slam_viewer.page.page import ViewerPage

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.surface import Surface
+from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.reconstruction.surface import Surface
 from slam_core.geometry import boxplus
 from slam_core.trajectory import Trajectory, read_trajectory
 from slam_viewer.report.early_output import EarlyOutput

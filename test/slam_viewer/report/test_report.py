@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.surface import Surface
-from slam_bringup.commands.console import show
+from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.reconstruction.surface import Surface
+from slam_bringup.terminal.console import show
 from slam_core.evaluation import evaluate
 from slam_core.geometry import boxplus, make_transform
 from slam_core.trajectory import Trajectory

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dense_mapping.surface import Surface
+from dense_mapping.reconstruction.surface import Surface
 from slam_bags.nodes.recording_clock import RecordingClock
 from slam_bags.storage.bag import BagReader, BagWriter
 from slam_bags.storage.bag_types import BagTypes

@@ -10,12 +10,12 @@ import numpy as np
 from sjsam_node.graph import offload
 from sjsam_node.graph.landmark_sets import no_indices
 from sjsam_node.graph.map_graph import MapGraph
-from sjsam_node.smoothing import kernels
+from sjsam_node.joint_problem import kernels
+from sjsam_node.joint_problem.joining import JoiningProblem
+from sjsam_node.joint_problem.problem import JoiningState, LocalMap, flatten, split
 from sjsam_node.smoothing.component_problem import ComponentProblem
 from sjsam_node.smoothing.condensed import CondensedSubmap
 from sjsam_node.smoothing.frozen import FrozenSubmaps
-from sjsam_node.smoothing.joining import JoiningProblem
-from sjsam_node.smoothing.problem import JoiningState, LocalMap, flatten, split
 from sjsam_node.smoothing.reduction import ReducedMap, reduce_map
 from sjsam_node.smoothing.state import EstimateState
 from slam_core.linear_algebra.block_pattern import IntArray, pointers

@@ -10,11 +10,11 @@ from functools import cached_property
 import numpy as np
 
 from sjsam_node.graph.landmark_sets import no_indices
-from sjsam_node.smoothing import kernels
+from sjsam_node.joint_problem import kernels
+from sjsam_node.joint_problem.joining import JoiningProblem, joint_errors
+from sjsam_node.joint_problem.problem import FlatMaps, JoiningState
 from sjsam_node.smoothing.condensed import CondensedSubmap
 from sjsam_node.smoothing.frozen import FrozenSubmaps
-from sjsam_node.smoothing.joining import JoiningProblem, joint_errors
-from sjsam_node.smoothing.problem import FlatMaps, JoiningState
 from sjsam_node.smoothing.reduction import ReducedMap
 from slam_core.geometry import FloatArray, compose_covariance
 from slam_core.linear_algebra.block_pattern import IntArray

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from sjsam_node.graph.map_graph import MapGraph
-from sjsam_node.smoothing.problem import LocalMap
+from sjsam_node.joint_problem.problem import LocalMap
 from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 

@@ -21,7 +21,6 @@ from sjsam_node.smoothing.marginals import prior_of_pair, relative_pose, seen_fr
 from sjsam_node.smoothing.solver import SmootherConfig, optimize_full, relinearized, simplified
 from sjsam_node.smoothing.state import EstimateState, with_links, with_submap
 from slam_core.geometry import FloatArray, compose_covariance
-from slam_core.runtime.memory import trim
 from slam_core.types import Submap
 
 
@@ -86,7 +85,6 @@ class MapEstimate:
         And where they do not contradict each other: then fewer say more. ``coarse``: as near to it as an update does.
         """
         self._state = simplified(self._state, self.config)  # the problem and factor of before are as large as the new
-        trim()
         self._state = optimize_full(self._state, self.config, coarse=coarse)
 
     def relinearize(self) -> None:

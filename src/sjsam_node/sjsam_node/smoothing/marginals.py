@@ -15,8 +15,8 @@ import scipy.linalg
 
 from sjsam_node.graph.links import Prior
 from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.joint_problem.joining import Marginals
 from sjsam_node.smoothing.component_problem import ComponentProblem
-from sjsam_node.smoothing.joining import Marginals
 from slam_core.geometry import FloatArray, compose_jacobians, inverse_jacobian, invert_transform, skew
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sjsam_node.graph.map_graph import BoolArray, Record
-from sjsam_node.smoothing.problem import LocalMap, block_rows
+from sjsam_node.joint_problem.problem import LocalMap, block_rows
 from slam_core.geometry import FloatArray, so3_log
 from slam_core.linear_algebra import blas
 from slam_core.linear_algebra.block_pattern import IntArray

@@ -19,16 +19,16 @@ import numpy as np
 
 from sjsam_node.graph.links import Link
 from sjsam_node.graph.map_graph import ALL
-from sjsam_node.smoothing import kernels
+from sjsam_node.joint_problem import kernels
+from sjsam_node.joint_problem.joining import joint_errors, map_residual
+from sjsam_node.joint_problem.problem import JoiningState, LocalMap, flatten, split
+from sjsam_node.joint_problem.robust import RobustConfig, RobustJoining, closing_rows, predicted
 from sjsam_node.smoothing.assembly import assemble, observations_of, with_component
 from sjsam_node.smoothing.component_problem import ComponentProblem, UpdateResult
 from sjsam_node.smoothing.condensed import CondensedSubmap
 from sjsam_node.smoothing.condensing import RegionConfig, expanded, fully_expanded, valid_submaps
 from sjsam_node.smoothing.frozen import FrozenSubmaps
-from sjsam_node.smoothing.joining import joint_errors, map_residual
-from sjsam_node.smoothing.problem import JoiningState, LocalMap, flatten, split
 from sjsam_node.smoothing.reduction import RecoveredLandmarks, ReducedMap
-from sjsam_node.smoothing.robust import RobustConfig, RobustJoining, closing_rows, predicted
 from sjsam_node.smoothing.state import EstimateState, SolvedComponent, with_exactly, with_links, without
 from slam_core.config import Config, group, parameter
 from slam_core.estimation.least_squares import LeastSquaresResult, LevenbergMarquardtConfig

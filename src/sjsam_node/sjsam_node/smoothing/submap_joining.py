@@ -9,11 +9,11 @@ import numpy as np
 
 from sjsam_node.graph.landmark_sets import no_indices
 from sjsam_node.graph.map_graph import MapGraph
-from sjsam_node.smoothing import kernels
+from sjsam_node.joint_problem import kernels
+from sjsam_node.joint_problem.joining import JoiningProblem
+from sjsam_node.joint_problem.problem import FlatMaps, JoiningState, flatten
 from sjsam_node.smoothing.assembly import local_maps, reduced_maps
 from sjsam_node.smoothing.condensed import Active, CondensedSubmap
-from sjsam_node.smoothing.joining import JoiningProblem
-from sjsam_node.smoothing.problem import FlatMaps, JoiningState, flatten
 from sjsam_node.smoothing.state import EstimateState
 from slam_core.geometry import FloatArray, compose_jacobians, invert_transform, transform_points
 from slam_core.linear_algebra.sparse_cholesky import IntArray

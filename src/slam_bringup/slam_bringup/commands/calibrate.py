@@ -12,9 +12,9 @@ import numpy as np
 
 from slam_bags.reading.extrinsics import EXTRINSICS, URDF, extrinsics_text, extrinsics_urdf
 from slam_bags.storage.bag_calibration import FILE_NAME
-from slam_bringup.commands.console import progress_bar
-from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.commands.refine import refine, write_refined
+from slam_bringup.terminal.console import progress_bar
+from slam_bringup.terminal.paths import UserPath, overwrite_option
 from slam_calibration.board import Board, parse_board
 from slam_calibration.bundle import BundleResult
 from slam_calibration.length_error import pair_error, parameter_file

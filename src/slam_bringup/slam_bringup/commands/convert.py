@@ -15,8 +15,8 @@ from slam_bags.datasets.rgbd import RgbdDataset
 from slam_bags.storage.bag import COMPRESSIONS, BagWriter
 from slam_bags.storage.bag_owner import require_free
 from slam_bags.storage.sensor_writer import SensorWriter
-from slam_bringup.commands.console import is_quiet, progress_bar
-from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_bringup.terminal.console import is_quiet, progress_bar
+from slam_bringup.terminal.paths import UserPath, overwrite_option
 
 DATASETS: dict[str, Callable[[Path, Path | None, Path | None, float | None], Dataset]] = {
     "euroc": EurocDataset,

@@ -15,11 +15,11 @@ import click
 
 from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bags.reading.sensor_topics import ROLES, BagNames, parse_topics
-from slam_bringup.commands.paths import UserPath, calibration_option
 from slam_bringup.doctor.examination import GROUPS, examine
 from slam_bringup.doctor.finding import Finding
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand, NodeProcess
+from slam_bringup.terminal.paths import UserPath, calibration_option
 
 FAULTS = 1
 """Exit code where something is wrong."""

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_bringup.terminal.paths import UserPath, overwrite_option
 from slam_core.estimation.body_frame import describe
 from slam_core.evaluation import ALIGNMENTS, ErrorStatistics, Evaluation, TruthAccuracy, evaluate
 from slam_core.geometry import FloatArray

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import click
 
-from slam_bringup.commands.mapping_options import map_folder, rig_options
 from slam_bringup.processes.launch_plan import plan_launch
 from slam_bringup.processes.node_graph import NodeSpec, radio_node
+from slam_bringup.terminal.mapping_options import map_folder, rig_options
 
 
 @click.command()

@@ -11,20 +11,20 @@ import click
 from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames, parse_topics
-from slam_bringup.commands.console import LOG_NAME, Transcript, progress_bar, show
-from slam_bringup.commands.mapping_options import (
-    map_folder,
-    mapping_options,
-    mode_for,
-    require_map,
-)
-from slam_bringup.commands.run_end import end_run
 from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, overrides_for, system_config, with_files
 from slam_bringup.pipeline.overrides import Overrides, read_overrides
 from slam_bringup.processes.interrupt import MAP, Interrupt, giving_up
 from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.start_map import StartMap
+from slam_bringup.terminal.console import LOG_NAME, Transcript, progress_bar, show
+from slam_bringup.terminal.mapping_options import (
+    map_folder,
+    mapping_options,
+    mode_for,
+    require_map,
+)
+from slam_bringup.terminal.run_end import end_run
 from slam_core.storage.output_folder import LOGS, OutputFolder
 from slam_core.version import VERSION
 from slam_viewer.report.summary_table import summary_table

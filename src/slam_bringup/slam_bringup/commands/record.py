@@ -8,9 +8,9 @@ from pathlib import Path
 import click
 
 from slam_bags.storage.bag_owner import require_free
-from slam_bringup.commands.paths import UserPath, overwrite_option
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import become_node
+from slam_bringup.terminal.paths import UserPath, overwrite_option
 
 
 @click.command()

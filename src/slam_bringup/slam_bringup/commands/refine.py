@@ -18,11 +18,11 @@ import yaml
 from ekf_slam_node.stage import FilterStage
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.storage.bag_calibration import FILE_NAME, calibration_file
-from slam_bringup.commands.mapping_options import mode_for
 from slam_bringup.pipeline.configuration import choose, filter_config, load_system_config
 from slam_bringup.pipeline.overrides import read_overrides
 from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
+from slam_bringup.terminal.mapping_options import mode_for
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile
 from slam_core.storage.files import atomic_text

@@ -16,7 +16,7 @@ from rich.table import Table
 from ndt_registration.clouds.cloud import finite_points
 from ndt_registration.clouds.cloud_io import read_cloud
 from ndt_registration.registration import RegistrationConfig, RegistrationResult, register
-from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_bringup.terminal.paths import UserPath, overwrite_option
 from slam_core.config import from_mapping
 from slam_core.geometry import (
     FloatArray,

@@ -16,13 +16,13 @@ from sjsam_node.map_session import MapSession, Mode
 from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames, parse_topics
-from slam_bringup.commands.console import LOG_NAME, Transcript, is_quiet, progress_bar, show
-from slam_bringup.commands.mapping_options import map_folder, mapping_options, mode_for, require_map
-from slam_bringup.commands.run_end import end_run
 from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.interrupt import MAP, Interrupt, giving_up
+from slam_bringup.terminal.console import LOG_NAME, Transcript, is_quiet, progress_bar, show
+from slam_bringup.terminal.mapping_options import map_folder, mapping_options, mode_for, require_map
+from slam_bringup.terminal.run_end import end_run
 from slam_core.storage.output_folder import LOGS, OutputFolder
 from slam_core.version import VERSION
 from slam_viewer.report.early_output import EarlyOutput

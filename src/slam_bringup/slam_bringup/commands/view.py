@@ -10,9 +10,9 @@ from pathlib import Path
 
 import click
 
-from slam_bringup.commands.paths import UserPath
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import become_node
+from slam_bringup.terminal.paths import UserPath
 
 
 @click.command()

@@ -8,9 +8,9 @@ from pathlib import Path
 import click
 
 from slam_bags.reading.sensor_bag import SensorBag
-from slam_bringup.commands.console import progress_bar
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
+from slam_bringup.terminal.console import progress_bar
 
 _RUNS = (("fuse", "ndt"), ("stereo", "none"))
 """Modes and scan odometries that need all kernels between them; stereo alone tracks its features."""

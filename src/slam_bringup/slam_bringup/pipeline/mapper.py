@@ -22,7 +22,7 @@ from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, St
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, Value
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.messages import motion_as_received, rounded
-from slam_core.runtime.memory import give_back, leave_libraries
+from slam_core.runtime.memory import leave_libraries
 from slam_core.types import Features, ImuSample, OdometryReading, PoseEstimate, Submap
 
 _LOADED = 1, 4
@@ -75,7 +75,6 @@ class Mapper:
             for text in filter(None, (stage.diagnostic, stage.moving_objects)):
                 self._events.append(f"{agent}: {text}" if agent else text)
             last += stage.start_session()  # which no frame begins: the filter forgets its state
-        give_back()
         self._hand_over(in_order(last))
         self.session.finish().result()
         for future in self._futures:
@@ -85,7 +84,6 @@ class Mapper:
                 self._outcomes.append(outcome)
                 self._times.ms["sjsam"].append(1e3 * outcome.duration_s)
         self._events += self._warnings()
-        give_back()
 
     def _process_waiting(self, agent: str) -> None:
         """Process an agent's frames that wait for another stream: there will be no more of it."""

@@ -28,7 +28,6 @@ from slam_bringup.pipeline.prefetch import prefetch
 from slam_bringup.pipeline.run_record import describe_error, run_result
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_core.runtime.memory import give_back, keep_little
 from slam_core.types import ImuSample, OdometryReading
 from slam_viewer.results import RunResult
 
@@ -91,8 +90,6 @@ def run_bag(
         _LOG.info("mapped %d submaps in %.1f s; the dense model is next", record.submaps, record.wall_s)
         session = mapping.session
         del pipelines, mapping  # with their images and filters
-        keep_little()
-        give_back()
         with times.measure("dense model"):
             result = run_result(
                 bag,

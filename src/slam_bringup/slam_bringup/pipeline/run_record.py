@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.surface import Surface
+from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.reconstruction.surface import Surface
 from sjsam_node.smoothing.map_snapshot import MapLandmarks, MapSnapshot
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.dense_run import dense_model
 from slam_core.config import iterate_parameters
 from slam_core.geometry import FloatArray
-from slam_core.runtime.memory import give_back
 from slam_core.trajectory import Trajectory
 from slam_core.types import PoseEstimate
 from slam_viewer.results import EMPTY_TRAJECTORY, AgentResult, LandmarkMap, RunResult
@@ -202,7 +201,6 @@ def _dense(
         corrections = {agent: known.front_end.correction for agent, known in record.agents.items()}
         model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading, stopped, corrections)
         if not stopped():
-            give_back()
             surface = model.surface()
             plans = model.floor_plans(surface)
     except Exception as error:  # what was mapped is worth more than its picture

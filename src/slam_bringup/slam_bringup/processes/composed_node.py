@@ -29,10 +29,10 @@ from slam_bringup.pipeline.node_table import node_named
 from slam_bringup.processes.node_graph import live_nodes
 from slam_bringup.processes.processes import NodeCommand
 from slam_core.nodes.exchange import Exchange
-from slam_core.process_life import end_with_parent, on_request_to_end
 from slam_core.ros import spin, use_fast_dds_profile
 from slam_core.runtime.blas_threads import use_one_blas_thread
 from slam_core.runtime.memory import search_less_garbage, share_one_heap
+from slam_core.runtime.process_life import end_with_parent, on_request_to_end
 from stereo_frontend.frontend_config import MODES
 
 _JOIN_S = 10.0

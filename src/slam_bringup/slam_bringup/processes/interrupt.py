@@ -17,8 +17,8 @@ from typing import Any, Self
 
 import click
 
-from slam_core.process_life import INTERRUPTED as INTERRUPTED
-from slam_core.process_life import on_request_to_end
+from slam_core.runtime.process_life import INTERRUPTED as INTERRUPTED
+from slam_core.runtime.process_life import on_request_to_end
 from slam_core.storage.output_folder import OutputFolder
 
 MAP = "map"

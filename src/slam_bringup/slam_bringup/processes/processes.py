@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from slam_bringup.pipeline.node_table import NODES
-from slam_core.process_life import PARENT
+from slam_core.runtime.process_life import PARENT
 
 _MODULES = {(declared.package, declared.executable): declared.module for declared in NODES} | {
     ("slam_bringup", "slam_composed"): "slam_bringup.processes.composed_node"

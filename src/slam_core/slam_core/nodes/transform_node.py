@@ -12,10 +12,10 @@ from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray
 from slam_core.messages import STATIC_TRANSFORMS_TOPIC, transform_from_message
 from slam_core.messages.base import Message
+from slam_core.messages.tf_message import transforms_from_octets
 from slam_core.nodes.exchange import as_ros
 from slam_core.nodes.listening_node import LATCHED_DEPTH, ListeningNode
 from slam_core.ros import RosTypes, has_tf2_msgs, sensor_qos
-from slam_core.tf_message import transforms_from_octets
 
 
 class TransformNode(ListeningNode):

@@ -4,6 +4,9 @@
 A cached kernel comes with its LLVM code too, for kernels that are yet to be compiled and call it. Numba parses that of
 every kernel that it loads and keeps it, 0.4 MB each. Here it stays packed until somebody asks, which nobody does once
 all kernels are compiled (``slam warmup``). Which functions a kernel defines is read from its machine code instead.
+
+Without it ``slam run`` of 200 frames of a depth camera with scan odometry takes 352 MB instead of 301 and a sixth more
+processor time (39 s instead of 31 and 32, three runs each, other work beside); ``bags/demo`` 287 MB instead of 280.
 """
 
 from __future__ import annotations

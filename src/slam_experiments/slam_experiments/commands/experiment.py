@@ -11,8 +11,8 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from slam_bringup.commands.console import progress_bar
-from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_bringup.terminal.console import progress_bar
+from slam_bringup.terminal.paths import UserPath, overwrite_option
 from slam_core.storage.files import atomic_text
 from slam_core.storage.output_folder import OutputFolder
 from slam_experiments.catalogue import chosen, listing

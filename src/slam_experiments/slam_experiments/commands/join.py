@@ -11,9 +11,9 @@ from typing import Any
 
 import click
 
-from sjsam_node.smoothing.robust import LOSSES
-from slam_bringup.commands.console import progress_bar
-from slam_bringup.commands.paths import UserPath, overwrite_option
+from sjsam_node.joint_problem.robust import LOSSES
+from slam_bringup.terminal.console import progress_bar
+from slam_bringup.terminal.paths import UserPath, overwrite_option
 from slam_core.config import from_mapping
 from slam_core.storage.files import atomic_text, read_yaml
 from slam_core.storage.output_folder import OutputFolder

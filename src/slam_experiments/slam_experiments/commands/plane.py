@@ -11,7 +11,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_bringup.terminal.paths import UserPath, overwrite_option
 from slam_core.storage.files import atomic_text
 from slam_core.storage.output_folder import OutputFolder
 from slam_experiments.planar.ekf import PlanarEkf

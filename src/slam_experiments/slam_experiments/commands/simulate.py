@@ -9,8 +9,8 @@ from pathlib import Path
 import click
 
 from slam_bags.storage.bag_owner import require_free
-from slam_bringup.commands.console import progress_bar
-from slam_bringup.commands.paths import UserPath, overwrite_option
+from slam_bringup.terminal.console import progress_bar
+from slam_bringup.terminal.paths import UserPath, overwrite_option
 from slam_experiments.simulated.simulated_bag import IMAGE_FORMATS, BagOptions, write_bag
 from slam_simulation import Scenario
 from slam_simulation.sensors.profiles import PROFILES

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sjsam_node.smoothing import kernels
-from sjsam_node.smoothing.joining import solved_covariance, variable_scalars
-from sjsam_node.smoothing.layout import Layout, make_layout
-from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, flatten
+from sjsam_node.joint_problem import kernels
+from sjsam_node.joint_problem.joining import solved_covariance, variable_scalars
+from sjsam_node.joint_problem.layout import Layout, make_layout
+from sjsam_node.joint_problem.problem import FlatMaps, JoiningState, LocalMap, flatten
 from slam_core.estimation.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
 from slam_core.geometry import FloatArray
 from slam_core.linear_algebra.block_pattern import IntArray, pointers
@@ -77,7 +77,7 @@ class Sightings(NamedTuple):
 
 
 class BlockProblem:
-    """Least squares of :class:`~sjsam_node.smoothing.joining.JoiningProblem` over maps of uncorrelated rows.
+    """Least squares of :class:`~sjsam_node.joint_problem.joining.JoiningProblem` over maps of uncorrelated rows.
 
     Unknowns are ordered poses first, then landmarks; parameters as there.
     """

@@ -13,10 +13,10 @@ from functools import partial
 
 import numpy as np
 
-from sjsam_node.smoothing import kernels
-from sjsam_node.smoothing.joining import JoiningProblem, map_residual
-from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten
-from sjsam_node.smoothing.robust import RobustConfig, RobustJoining, closing_rows
+from sjsam_node.joint_problem import kernels
+from sjsam_node.joint_problem.joining import JoiningProblem, map_residual
+from sjsam_node.joint_problem.problem import FlatMaps, JoiningState, LocalMap, block_rows, flatten
+from sjsam_node.joint_problem.robust import RobustConfig, RobustJoining, closing_rows
 from slam_core.config import Config, group, parameter
 from slam_core.estimation.least_squares import LeastSquaresResult, LevenbergMarquardtConfig
 from slam_core.geometry import FloatArray, euler_from_rotation, rotation_from_euler

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.navigation import Frontier, Route, frontiers, plan_route, walked
+from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.plans.navigation import Frontier, Route, frontiers, plan_route, walked
 from slam_core.estimation.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate

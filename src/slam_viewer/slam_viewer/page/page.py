@@ -18,9 +18,9 @@ import numpy.typing as npt
 import trimesh
 import viser
 
-from dense_mapping.decimation import at_most
-from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.surface import Surface
+from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.reconstruction.decimation import at_most
+from dense_mapping.reconstruction.surface import Surface
 from slam_core.estimation.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, quaternion_from_rotation
 from slam_core.types import ByteArray, Float32Array

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dense_mapping.floor_plan import FREE, OCCUPIED, FloorPlan
+from dense_mapping.plans.floor_plan import FREE, OCCUPIED, FloorPlan
 from slam_core.types import ByteArray
 
 _RGBA = {FREE: (235, 245, 235, 150), OCCUPIED: (40, 40, 60, 255)}

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.plan_io import read_plan
-from dense_mapping.surface import Surface
-from dense_mapping.surface_io import read_mesh
+from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.plans.plan_io import read_plan
+from dense_mapping.reconstruction.surface import Surface
+from dense_mapping.reconstruction.surface_io import read_mesh
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_core.geometry import FloatArray

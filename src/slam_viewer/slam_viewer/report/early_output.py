@@ -6,13 +6,11 @@ Charts come after it: what draws them and the model's field of voxels take 40 an
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from slam_core.runtime.memory import give_back, leave_libraries
 from slam_viewer.report.mapped_files import write_mapped
 from slam_viewer.results import RunResult
 
@@ -47,7 +45,6 @@ class EarlyOutput:
         from slam_viewer.report.result_bag import write_result_bag
 
         messages = self._mapped.result() if self._mapped is not None else None
-        give_back()  # images and field of the dense model
         charts = self._pool.submit(_draw, result) if pictures else None
         write_result_bag(self._out / "result.mcap", result, messages)
         made = charts.result() if charts is not None else None
@@ -61,7 +58,6 @@ class EarlyOutput:
         from slam_viewer.report.result_bag import agents_messages
 
         write_mapped(self._out, result, self._save_map)
-        give_back()  # what the map was solved with
         return agents_messages(result)
 
 
@@ -71,8 +67,4 @@ def _draw(result: RunResult) -> Charts:
     load_without_documentation()
     from slam_viewer.report.report import draw_charts
 
-    leave_libraries()
-    charts = draw_charts(result)
-    gc.collect()  # parts of figures name each other
-    give_back()
-    return charts
+    return draw_charts(result)

@@ -13,8 +13,8 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from dense_mapping.floor_plan import FREE, OCCUPIED, FloorPlan
-from dense_mapping.navigation import frontiers
+from dense_mapping.plans.floor_plan import FREE, OCCUPIED, FloorPlan
+from dense_mapping.plans.navigation import frontiers
 from slam_core.estimation.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.evaluation import align, associate
 from slam_core.geometry import FloatArray, boxminus, invert_transform

@@ -16,11 +16,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dense_mapping.floor_plan import FloorPlan
-from dense_mapping.plan_io import plan_names, write_plan
-from dense_mapping.surface_io import write_glb, write_mesh, write_points
-from slam_core.process_life import STARTED_S
-from slam_core.runtime.memory import give_back
+from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.plans.plan_io import plan_names, write_plan
+from dense_mapping.reconstruction.surface_io import write_glb, write_mesh, write_points
+from slam_core.runtime.memory import leave_libraries
+from slam_core.runtime.process_life import STARTED_S
 from slam_core.storage.files import atomic_text
 from slam_core.version import VERSION
 from slam_viewer.report.figures import map_figure, save_png
@@ -52,7 +52,7 @@ def write_results(
     write_points(out / "map.ply", result.dense)
     write_mesh(out / "mesh.ply", result.dense)
     write_glb(out / "mesh.glb", result.dense)
-    give_back()  # it takes 70 MB for a moment, as drawing does
+    leave_libraries()  # it takes 70 MB for a moment, as drawing does
     _write_plans(out, result.floor_plans)
     if (out / "result.mcap").is_file():
         write_layout(out / "foxglove_layout.json", out / "result.mcap")
@@ -60,7 +60,6 @@ def write_results(
     if pictures:
         save_png(out / "map.png", map_figure(result), dpi=170)
         map_png = (out / "map.png").read_bytes()  # drawn once: it is the dearest of the figures
-        give_back()
         write_report(out / "report.html", result, summary | _in_all(result), map_png, charts or draw_charts(result))
     summary |= _in_all(result)
     atomic_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")

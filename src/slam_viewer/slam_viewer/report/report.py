@@ -14,7 +14,7 @@ import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 
-from dense_mapping.plan_io import plan_names
+from dense_mapping.plans.plan_io import plan_names
 from slam_core.evaluation import Evaluation
 from slam_core.storage.files import atomic_text
 from slam_viewer.report.agent_figures import motion_figure, side_view, sigma_figure

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dense_mapping.surface_cloud import cloud_of
+from dense_mapping.reconstruction.surface_cloud import cloud_of
 from sjsam_node.map_messages import graph_message, marks_message
 from slam_bags.storage.bag import BagReader, BagWriter
 from slam_bags.storage.bag_types import BagTypes, typestore

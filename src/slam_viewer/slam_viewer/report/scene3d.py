@@ -9,9 +9,9 @@ import numpy as np
 import trimesh
 from trimesh.viewer.notebook import scene_to_html
 
-from dense_mapping.decimation import at_most
-from dense_mapping.gltf import matt_glb
-from dense_mapping.surface import Surface
+from dense_mapping.reconstruction.decimation import at_most
+from dense_mapping.reconstruction.gltf import matt_glb
+from dense_mapping.reconstruction.surface import Surface
 from slam_core.geometry import FloatArray, make_transform
 from slam_core.types import ByteArray
 from slam_viewer.report.figures import COLOURS

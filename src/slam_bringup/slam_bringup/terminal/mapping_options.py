@@ -12,8 +12,8 @@ import click
 
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import ROLES
-from slam_bringup.commands.paths import UserPath, calibration_option, overwrite_option
 from slam_bringup.pipeline.configuration import MAPPERS, ODOMETRIES
+from slam_bringup.terminal.paths import UserPath, calibration_option, overwrite_option
 from slam_viewer.results import RunResult
 from stereo_frontend.frontend_config import MODES
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dense_mapping.tsdf_kernels import BLOCK, VOXELS, DepthView, integrate, surface_blocks
+from dense_mapping.reconstruction.tsdf_kernels import BLOCK, VOXELS, DepthView, integrate, surface_blocks
 from slam_core.camera import Camera
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, transform_points

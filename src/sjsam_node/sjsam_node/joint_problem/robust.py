@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sjsam_node.smoothing.problem import JoiningState, LocalMap
+from sjsam_node.joint_problem.problem import JoiningState, LocalMap
 from slam_core.config import Config, parameter
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from dense_mapping.surface import Surface
-from dense_mapping.surface_io import read_mesh, write_glb, write_mesh, write_points
+from dense_mapping.reconstruction.surface import Surface
+from dense_mapping.reconstruction.surface_io import read_mesh, write_glb, write_mesh, write_points
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import pytest
 from slam_bags.storage.bag_types import BagTypes, typestore
 from slam_core.geometry import boxplus
 from slam_core.messages import transform_message
-from slam_core.tf_message import TYPE_HASH, tf_message_class, transforms_from_octets, transforms_to_octets
+from slam_core.messages.tf_message import TYPE_HASH, tf_message_class, transforms_from_octets, transforms_to_octets
 
 TYPES = BagTypes()
 TRANSFORM = "geometry_msgs/msg/TransformStamped"

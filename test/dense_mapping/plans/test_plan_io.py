@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
-from dense_mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
-from dense_mapping.plan_io import read_plan, write_plan
+from dense_mapping.plans.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
+from dense_mapping.plans.plan_io import read_plan, write_plan
 from slam_core.geometry import make_transform, rotation_from_euler
 
 

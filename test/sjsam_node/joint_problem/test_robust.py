@@ -8,9 +8,17 @@ import pytest
 from submap_world import Agent, circle, ring_world
 
 from sjsam_node.graph.links import Link
+from sjsam_node.joint_problem.problem import LocalMap
+from sjsam_node.joint_problem.robust import (
+    LOSSES,
+    RobustConfig,
+    closing_rows,
+    normalized_error,
+    predicted,
+    weight,
+    widened,
+)
 from sjsam_node.smoothing.estimate import MapEstimate
-from sjsam_node.smoothing.problem import LocalMap
-from sjsam_node.smoothing.robust import LOSSES, RobustConfig, closing_rows, normalized_error, predicted, weight, widened
 from sjsam_node.smoothing.solver import EstimatorConfig, SmootherConfig
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import boxminus

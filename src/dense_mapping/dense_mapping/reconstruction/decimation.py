@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dense_mapping.row_keys import row_keys
-from dense_mapping.surface import Surface
+from dense_mapping.reconstruction.row_keys import row_keys
+from dense_mapping.reconstruction.surface import Surface
 from slam_core.types import AnyArray
 
 _FIRST_CELL_M = 0.045

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from dense_mapping.surface import Surface
+from dense_mapping.reconstruction.surface import Surface
 from slam_core.geometry import FloatArray, make_transform, so3_exp
 
 _NORMAL_CONES_DEG = (25.0, 10.0, 5.0)

@@ -10,10 +10,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from dense_mapping import surface_kernels as kernels
-from dense_mapping.cube_triangles import triangle_table
-from dense_mapping.row_keys import row_keys
-from dense_mapping.surface import _MAX_SIGMA, _MIN_IMAGES, voxel_statistics
+from dense_mapping.reconstruction import surface_kernels as kernels
+from dense_mapping.reconstruction.cube_triangles import triangle_table
+from dense_mapping.reconstruction.row_keys import row_keys
+from dense_mapping.reconstruction.surface import _MAX_SIGMA, _MIN_IMAGES, voxel_statistics
 
 
 @pytest.mark.parametrize("unknown", [0.0, 0.4])

@@ -6,7 +6,7 @@
     marginals = problem.marginals(state)
 
 Every local map enters with its full information matrix, as one factor ("joint rows"); the thesis's
-rows, each landmark with its own 3x3, are the same maps through :func:`sjsam_node.smoothing.problem.block_rows`.
+rows, each landmark with its own 3x3, are the same maps through :func:`sjsam_node.joint_problem.problem.block_rows`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sjsam_node.smoothing import kernels
-from sjsam_node.smoothing.layout import Layout, make_layout
-from sjsam_node.smoothing.problem import FlatMaps, JoiningState, LocalMap
+from sjsam_node.joint_problem import kernels
+from sjsam_node.joint_problem.layout import Layout, make_layout
+from sjsam_node.joint_problem.problem import FlatMaps, JoiningState, LocalMap
 from slam_core.estimation.least_squares import LeastSquaresResult, LevenbergMarquardtConfig, levenberg_marquardt
 from slam_core.geometry import FloatArray
 from slam_core.linear_algebra.block_pattern import IntArray
@@ -45,7 +45,7 @@ class JoiningProblem:
     backend
         Of ``slam_core.linear_algebra.sparse_cholesky``.
     last
-        Nodes to eliminate last (see :func:`~sjsam_node.smoothing.layout.make_layout`).
+        Nodes to eliminate last (see :func:`~sjsam_node.joint_problem.layout.make_layout`).
     constant
         What the local maps cost beyond their residuals and pulls.
     """

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dense_mapping.dense_model import DenseModel
-from dense_mapping.floor_plan import (
+from dense_mapping.plans.floor_plan import (
     FREE,
     OCCUPIED,
     UNKNOWN,
@@ -20,8 +20,8 @@ from dense_mapping.floor_plan import (
     _middles,
     _occupied,
 )
-from dense_mapping.levelling import floor_heights, level_transform, up_direction
-from dense_mapping.navigation import frontiers, plan_route
+from dense_mapping.plans.levelling import floor_heights, level_transform, up_direction
+from dense_mapping.plans.navigation import frontiers, plan_route
 from slam_core.camera import Camera
 from slam_core.geometry import OPTICAL_FROM_RIG, boxplus, make_transform, rotation_from_euler, so3_exp
 from slam_core.types import DepthImage

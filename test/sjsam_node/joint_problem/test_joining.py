@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from random_joining import MODELS, measured_pose, perturbed, random_problem
 
-from sjsam_node.smoothing import kernels
-from sjsam_node.smoothing.joining import JoiningProblem
-from sjsam_node.smoothing.problem import JoiningState, LocalMap, block_rows, flatten
+from sjsam_node.joint_problem import kernels
+from sjsam_node.joint_problem.joining import JoiningProblem
+from sjsam_node.joint_problem.problem import JoiningState, LocalMap, block_rows, flatten
 from slam_core.geometry import boxminus, make_transform, rotation_from_euler, so3_exp
 from slam_core.linear_algebra.sparse_cholesky import BACKENDS
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from dense_mapping.cube_triangles import Triangles
+from dense_mapping.reconstruction.cube_triangles import Triangles
 from slam_core.geometry import FloatArray
 from slam_core.runtime.in_place import in_place
 from slam_core.types import Float32Array

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dense_mapping.cube_triangles import triangle_table
-from dense_mapping.row_keys import row_keys
-from dense_mapping.surface_kernels import add_normals, fill_means, march, pieces
-from dense_mapping.tsdf import TsdfVolume
-from dense_mapping.tsdf_kernels import BLOCK
+from dense_mapping.reconstruction.cube_triangles import triangle_table
+from dense_mapping.reconstruction.row_keys import row_keys
+from dense_mapping.reconstruction.surface_kernels import add_normals, fill_means, march, pieces
+from dense_mapping.reconstruction.tsdf import TsdfVolume
+from dense_mapping.reconstruction.tsdf_kernels import BLOCK
 from slam_core.geometry import FloatArray
 from slam_core.types import ByteArray, Float32Array
 

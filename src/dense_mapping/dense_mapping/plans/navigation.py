@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from dense_mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
+from dense_mapping.plans.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
 from slam_core.geometry import FloatArray
 
 _REACH_M = 1.0

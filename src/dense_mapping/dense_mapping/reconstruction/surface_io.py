@@ -9,8 +9,8 @@ import numpy as np
 import plyfile
 import trimesh
 
-from dense_mapping.gltf import matt_glb
-from dense_mapping.surface import Surface
+from dense_mapping.reconstruction.gltf import matt_glb
+from dense_mapping.reconstruction.surface import Surface
 from slam_core.storage.files import atomic_path
 
 

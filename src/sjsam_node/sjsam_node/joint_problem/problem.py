@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sjsam_node.smoothing import kernels
+from sjsam_node.joint_problem import kernels
 from slam_core.geometry import FloatArray
 from slam_core.linear_algebra.block_pattern import IntArray, pointers
 

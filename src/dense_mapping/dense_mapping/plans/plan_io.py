@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import yaml
 
-from dense_mapping.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
+from dense_mapping.plans.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
 from slam_core.geometry import FloatArray, euler_from_rotation, make_transform, rotation_from_euler
 from slam_core.storage.files import atomic_path, atomic_text, read_yaml
 

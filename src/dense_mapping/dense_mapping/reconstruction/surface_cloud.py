@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dense_mapping.surface import Surface
+from dense_mapping.reconstruction.surface import Surface
 from slam_core.types import AnyArray
 
 CLOUD_DTYPE = np.dtype([(name, "<f4") for name in ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "sigma")])

@@ -31,7 +31,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from slam_core.process_life import STARTED_S
+from slam_core.runtime.process_life import STARTED_S
 from slam_core.storage.files import atomic_text
 
 LOG_NAME = "slam.log"

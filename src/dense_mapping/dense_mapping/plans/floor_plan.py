@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dense_mapping.keyframes import PlacedKeyframe, thinned
-from dense_mapping.levelling import floor_heights, level_transform, storey_of, up_direction
-from dense_mapping.surface import Surface
+from dense_mapping.plans.levelling import floor_heights, level_transform, storey_of, up_direction
+from dense_mapping.reconstruction.surface import Surface
 from slam_core.camera import MIN_DEPTH
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, invert_transform, make_transform, transform_points

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sjsam_node.smoothing.problem import FlatMaps
+from sjsam_node.joint_problem.problem import FlatMaps
 from slam_core.linear_algebra.block_pattern import BlockPattern, IntArray, pointers
 from slam_core.linear_algebra.sparse_cholesky import elimination_order
 

@@ -9,7 +9,7 @@ function is ``h = R_i^T (l - t_i)`` for a landmark (Eq. 7.2) and ``(R_i^T (t_j -
 
 ``model`` says how an angle residual is measured: 0 planar (one wrapped angle), 1 rotation vector ``Log(R_h R_z^T)``,
 2 difference of Euler angles yaw, pitch, roll, each wrapped. The local maps are stored flat, as
-:class:`~sjsam_node.smoothing.problem.FlatMaps`.
+:class:`~sjsam_node.joint_problem.problem.FlatMaps`.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -18,8 +18,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from sjsam_node.smoothing import angle_kernels
-from sjsam_node.smoothing.angle_kernels import angle_error, exp_rotation
+from sjsam_node.joint_problem import angle_kernels
+from sjsam_node.joint_problem.angle_kernels import angle_error, exp_rotation
 from slam_core.linear_algebra.small_kernels import solved_square
 
 PLANAR, TANGENT, EULER = angle_kernels.PLANAR, angle_kernels.TANGENT, angle_kernels.EULER
