@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -21,9 +22,13 @@ ROSDEP_KEY = {
     "cv2": "python3-opencv",
     "cvxopt": "python3-cvxopt",
     "rosbags": "python3-rosbags-pip",
+    "plyfile": "python3-plyfile-pip",
+    "trimesh": "python3-trimesh-pip",
     "filterpy": "python3-filterpy-pip",
 }
-"""Of the others there is no key in rosdep."""
+"""Keys of rosdep/python.yaml in ros/rosdistro (August 2026)."""
+NO_ROSDEP_KEY = {"threadpoolctl", "viser", "eclipse-zenoh", "distributed"}
+"""Projects that rosdep does not know; README says how to get them, and each manifest that it lacks them."""
 
 FROM_ROS = re.compile(r"rclpy|launch(_ros)?|ament_index_python|std_srvs|rcl_interfaces|\w+_msgs|builtin_interfaces")
 PEERS = {"gtsam"}
@@ -61,8 +66,44 @@ def test_setup_and_package_xml_name_every_import(package: str) -> None:
             assert name in optional, f"no extra of setup.py of {package} brings {name}"
         elif name not in BROUGHT_BY_ANOTHER and name not in PEERS:
             assert PIP_NAME.get(name, name) in required, f"setup.py of {package} lacks {name}"
-            key = name if name in PACKAGES else ROSDEP_KEY.get(name)
-            assert key is None or key in named, f"package.xml of {package} lacks {key}"
+            if (project := PIP_NAME.get(name, name)) in NO_ROSDEP_KEY:
+                assert f"{project} has no rosdep key" in manifest, package
+            else:
+                key = name if name in PACKAGES else ROSDEP_KEY.get(name)
+                assert key is not None, f"give the rosdep key of {name}, or say that there is none"
+                assert key in named, f"package.xml of {package} lacks {key}"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_xml_names_nothing_that_is_not_needed_and_is_whole(package: str) -> None:
+    """As bloom reads it (REP 149); a key that no import needs would be installed on every robot."""
+    manifest = ElementTree.parse(SRC / package / "package.xml").getroot()
+    assert manifest.get("format") == "3"
+    assert manifest.findtext("name") == package
+    assert manifest.findtext("export/build_type") == "ament_python"
+    assert manifest.findtext("license") == "Apache-2.0"
+    assert manifest.find("maintainer").get("email")
+    assert len(manifest.findtext("description")) > 20
+    needed = {ROSDEP_KEY.get(name, name) for name in imported(package)}
+    named = {element.text for kind in ("depend", "exec_depend") for element in manifest.findall(kind)}
+    assert len(named) == sum(len(manifest.findall(kind)) for kind in ("depend", "exec_depend"))
+    assert not {key for key in named if key.startswith("python3-")} - needed
+
+
+def test_what_the_readme_installs_is_what_rosdep_lacks_or_takes_from_pip() -> None:
+    readme = (SRC.parent / "README.md").read_text(encoding="utf-8")
+    skipped = set(re.search(r'--skip-keys "([^"]+)"', readme)[1].split())
+    assert skipped == {key for key in ROSDEP_KEY.values() if key.endswith("-pip")}
+    by_pip = set(re.search(r"^pip install (.*?) +#", readme, re.MULTILINE)[1].split())
+    without_key = NO_ROSDEP_KEY | {name for name, key in ROSDEP_KEY.items() if key.endswith("-pip")}
+    assert by_pip - {"'numpy<2'"} == without_key - {"distributed", "filterpy"}, "these two are of the experiments"
+
+
+@pytest.mark.parametrize("package", sorted(set(PACKAGES) - {"slam_simulation", "slam_experiments"}))
+def test_a_package_for_robots_holds_all_that_it_installs(package: str) -> None:
+    """Bloom releases each package as a tree of its own: a link out of it would lead nowhere."""
+    root = (SRC / package).resolve()
+    assert not [path for path in root.rglob("*") if path.is_symlink() and not path.resolve().is_relative_to(root)]
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -4,9 +4,6 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,79 +15,21 @@ from submap_world import Agent, circle, ring_world
 rclpy = pytest.importorskip("rclpy")
 pytestmark = pytest.mark.ros
 
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
+
+from node_bench import Bench, running  # noqa: E402
 
 from sjsam_node.agents import in_order  # noqa: E402
 from sjsam_node.global_map import GlobalMap, JoinReport  # noqa: E402
 from sjsam_node.map_session import MapSession  # noqa: E402
-from sjsam_node.node import SjsamNode  # noqa: E402
 from slam_core.geometry import boxminus, make_transform, rotation_from_euler, transform_from_pose7  # noqa: E402
 from slam_core.messages import SUBMAP_TOPICS, odometry_message, path_from_message, submap_messages  # noqa: E402
-from slam_core.ros import RosTypes, below, sensor_qos  # noqa: E402
 from slam_core.types import PoseEstimate, Submap  # noqa: E402
-
-
-class Bench:
-    """A node under test and a neighbour that talks to it."""
-
-    def __init__(self, node: SjsamNode) -> None:
-        self.node, self.types = node, RosTypes()
-        self.neighbour = rclpy.create_node("neighbour")
-        self.executor = SingleThreadedExecutor()
-        for member in (node, self.neighbour):
-            self.executor.add_node(member)
-        self.received: dict[str, list[Any]] = {}
-        self.submap_publishers: dict[str, list[Any]] = {}
-
-    def listen(self, topic: str, kind: str) -> None:
-        self.received[topic] = []
-        self.neighbour.create_subscription(
-            getattr(self.types, kind), topic, self.received[topic].append, sensor_qos(10, True)
-        )
-
-    def publisher(self, topic: str, kind: str) -> Any:
-        return self.neighbour.create_publisher(getattr(self.types, kind), topic, sensor_qos(100, True))
-
-    def spin_until(self, condition: Callable[[], bool], seconds: float = 30.0) -> bool:
-        end = time.monotonic() + seconds
-        while not condition() and time.monotonic() < end:
-            self.executor.spin_once(timeout_sec=0.05)
-            self.node.work()
-        return condition()
-
-    def ask(self, name: str) -> Any:
-        return self.neighbour.create_client(Trigger, f"/sjsam/{name}").call_async(Trigger.Request())
-
-    def call(self, name: str) -> Any:
-        future = self.ask(name)
-        assert self.spin_until(future.done, 20.0), f"{name} does not answer"
-        return future.result()
-
-    def send(self, submaps: list[Submap]) -> None:
-        for submap in submaps:
-            if submap.agent not in self.submap_publishers:
-                topics = {below(submap.agent, topic): kind for topic, kind in SUBMAP_TOPICS.items()}
-                self.submap_publishers[submap.agent] = [self.publisher(topic, kind) for topic, kind in topics.items()]
-            messages = submap_messages(self.types, submap)
-            for publisher, message in zip(self.submap_publishers[submap.agent], messages, strict=True):
-                publisher.publish(message)
-
-    @property
-    def counters(self) -> Counter[str]:
-        return self.node.health.counters
 
 
 @pytest.fixture(params=["agents:=['']"])
 def bench(request: pytest.FixtureRequest, tmp_path: Path, domain: int) -> Any:
-    arguments = [f"map_path:={tmp_path / 'map'}", f"ply_path:={tmp_path / 'map.ply'}", request.param]
-    rclpy.init(args=["--ros-args", *(word for a in arguments for word in ("-p", a))])
-    bench = Bench(SjsamNode())
-    yield bench
-    bench.executor.shutdown()
-    bench.node.destroy_node()
-    bench.neighbour.destroy_node()
-    rclpy.shutdown()
+    with running(f"map_path:={tmp_path / 'map'}", f"ply_path:={tmp_path / 'map.ply'}", request.param) as bench:
+        yield bench
 
 
 def test_submaps_in_map_out_and_services(bench: Bench, rng: np.random.Generator, tmp_path: Path) -> None:

@@ -7,8 +7,7 @@
 from __future__ import annotations
 
 import time
-import types
-from collections.abc import Awaitable, Callable, Generator
+from collections.abc import Awaitable, Callable
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
@@ -20,6 +19,7 @@ from std_srvs.srv import Trigger
 
 from sjsam_node.agents import separate_parts
 from sjsam_node.autosave import Autosave
+from sjsam_node.correction import MapToOdom
 from sjsam_node.global_map import ALREADY_JOINED, JoinReport
 from sjsam_node.map_messages import (
     cloud_message,
@@ -46,6 +46,7 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.messages.submaps import SubmapMessages
+from slam_core.nodes.awaiting import until
 from slam_core.nodes.base_node import SlamNode
 from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.point_cloud import is_ply, write_ply
@@ -55,8 +56,6 @@ from slam_core.types import PoseEstimate, Submap
 T = TypeVar("T")
 _MAP_PERIOD_S = 1.0
 _TRANSFORM_PERIOD_S = 0.05
-_LONGEST_SILENCE_S = 1.0
-"""``map_to_odom`` is stamped as if time went on for so long after the last odometry."""
 
 
 class SjsamNode(SlamNode[SjsamNodeConfig]):
@@ -77,10 +76,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._drawn = self.map.snapshot
         self._picture: Future[Any] = self.map.read(lambda _: None)
         self._advertise_outputs()
+        self.placements = {agent: MapToOdom(self.config) for agent in self.config.agents}
         self._start_trackers()
         self._go_on_from_last_time()
         self._order = SubmapOrder[tuple[str, Submap]](self.map.snapshot.keys)
-        self._heard_at_s: dict[str, float] = {}
         for agent in self.config.agents:
             self._listen_to(agent)
         self.listen("clicked_point", "PointStamped", self.on_clicked_point, required=False)
@@ -132,10 +131,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         """Follow every agent from its end in the map, else from the origin; one to be located from nowhere yet."""
         shown = self.map.snapshot
         last = dict(zip([agent for agent, _, _ in shown.keys], shown.poses[shown.nodes[:, 1]], strict=True))
-        self.trackers = {
-            agent: PoseTracker(None if self.config.localize_only else last.get(agent, np.eye(4)))
-            for agent in self.config.agents
-        }
+        for agent, placement in self.placements.items():
+            placement.start(PoseTracker(None if self.config.localize_only else last.get(agent, np.eye(4))))
 
     def _advertise_outputs(self) -> None:
         for name in ("map/landmarks", "map/cloud"):
@@ -146,6 +143,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self.advertise(below(agent, "map/path"), "Path", latched=True, depth=1)
             self.advertise(below(agent, "pose"), "PoseWithCovarianceStamped")
             self.advertise(below(agent, "map_to_odom"), "TransformStamped", latched=True, depth=1)
+            self.advertise(below(agent, "map_to_odom_pose"), "PoseWithCovarianceStamped", latched=True, depth=1)
 
     def _listen_to(self, agent: str) -> None:
         topics = {below(agent, topic): kind for topic, kind in SUBMAP_TOPICS.items()}
@@ -209,7 +207,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def _take_located(self, agent: str, located: Outcome) -> None:
         self.health.count("localized" if located.closures else "not recognised")
         if located.end is None:
-            self.health.set(State.LOST, "the place is not recognised in the map")
+            self.health.set(
+                State.LOST, "the place is not recognised in the map: no pose and no map_to_odom until it is"
+            )
+            self.placements[agent].lose()
             return
         is_seen = located.closures > 0
         self.health.set(State.OK if is_seen else State.DEGRADED, "" if is_seen else "by odometry alone")
@@ -220,8 +221,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def on_odometry(self, agent: str, message: Message) -> None:
         """Publish the pose of an agent in the map at a pose of its odometry."""
-        self._heard_at_s[agent] = time.monotonic()
-        for pose in self.trackers[agent].add_odometry(estimate_from_message(message)):
+        self.placements[agent].heard()
+        for pose in self.placements[agent].tracker.add_odometry(estimate_from_message(message)):
             self.publish(below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, pose))
 
     def on_clicked_point(self, message: Message) -> None:
@@ -258,9 +259,9 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def _follow(self, agent: str, end: PoseEstimate, in_odom: PoseEstimate | None = None) -> None:
         """The end of a submap is known in the map: carry the agent's odometry on from there."""
-        tracker = self.trackers[agent]
+        tracker = self.placements[agent].tracker
         if tracker.newest_ns is None:  # no odometry is heard: the ends of submaps are all that is known
-            self._heard_at_s[agent] = time.monotonic()
+            self.placements[agent].heard()
             self.publish(below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, end))
         if tracker.has_heard(end.stamp_ns):
             tracker.add_submap(end)
@@ -326,7 +327,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     async def _done(self, future: Future[T]) -> T:
         """Result of another thread; until it is there the node does all else."""
         future.add_done_callback(lambda _: self._wake.trigger())
-        await _until(future.done)
+        await until(future.done)
         return future.result()
 
     # -- outputs -------------------------------------------------------------------------------------------------------
@@ -375,24 +376,20 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def _publish_transforms(self) -> None:
         """``map_to_odom`` of every agent that has odometry, stamped a little ahead of the present time."""
-        for agent, heard_at_s in self._heard_at_s.items():
-            T_map_odom = self.trackers[agent].T_map_odom
-            if T_map_odom is None or self._paused:
+        if self._paused:
+            return
+        for agent, placement in self.placements.items():
+            found = placement.at_present(self._stamp_ns, self.config.transform_tolerance_s)
+            if found is None:
                 continue
-            stamp = self.trackers[agent].newest_ns or self._stamp_ns
-            gone_s = min(time.monotonic() - heard_at_s, _LONGEST_SILENCE_S)
-            ahead = stamp + round(1e9 * (gone_s + self.config.transform_tolerance_s))
-            odom = below(agent, self.config.odom_frame)
-            message = transform_message(self.types, ahead, self.config.map_frame, odom, T_map_odom)
+            pose, held_back_m = found
+            frame, odom = self.config.map_frame, below(agent, self.config.odom_frame)
+            message = transform_message(self.types, pose.stamp_ns, frame, odom, pose.T)
             self.publish(below(agent, "map_to_odom"), message)
             self.broadcast(message)
-
-
-@types.coroutine
-def _until(condition: Callable[[], bool]) -> Generator[None, None, None]:
-    """Await what another thread does in a callback of rclpy, whose executor goes on with all else."""
-    while not condition():
-        yield
+            self.publish(below(agent, "map_to_odom_pose"), pose_with_covariance_message(self.types, frame, pose))
+            if placement.is_bounded:
+                self.health.show(below(agent, "correction_held_back_m"), f"{held_back_m:.3f}")
 
 
 def main() -> None:

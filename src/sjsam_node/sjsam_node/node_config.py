@@ -33,6 +33,12 @@ class SjsamNodeConfig(GlobalMapConfig):
     transform_tolerance_s: float = parameter(
         0.2, "how far ahead map_to_odom is stamped, so that a lookup at the present time works", unit="s", minimum=0.0
     )
+    max_correction_speed: float = parameter(
+        0.0, "largest speed at which map_to_odom, and the rig by it, is corrected; 0: at once", unit="m/s", minimum=0.0
+    )
+    max_correction_rate: float = parameter(
+        0.0, "largest angular speed at which map_to_odom is corrected; 0: at once", unit="rad/s", minimum=0.0
+    )
 
 
 def copy_path(config: SjsamNodeConfig, namespace: str) -> Path:

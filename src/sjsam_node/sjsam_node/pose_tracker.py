@@ -64,6 +64,29 @@ class PoseTracker:
         """Stamp of the newest odometry pose; None before the first."""
         return None if self._newest is None else self._newest.stamp_ns
 
+    def newest_in_odom(self) -> PoseEstimate:
+        """T_odom_rig: the newest pose of the odometry, else the newest end of a submap in it, else its origin."""
+        if self._newest is not None:
+            return self._newest
+        return PoseEstimate(0, np.eye(4), np.zeros((6, 6))) if self._anchor is None else self._anchor.in_odom
+
+    def map_to_odom(self) -> PoseEstimate | None:
+        """T_map_odom with covariance, or None while it is not known.
+
+        The covariance is that of the rig's pose in the map, carried to the odometry's origin: whoever takes the
+        odometry as exact finds the rig with it as uncertain as it is.
+        """
+        rig = self.newest_in_odom()
+        in_map = self.pose_of(rig)
+        if in_map is None or self.T_map_odom is None:
+            return None
+        covariance = compose_covariance(in_map.T, in_map.covariance, invert_transform(rig.T), np.zeros((6, 6)))
+        return PoseEstimate(rig.stamp_ns, self.T_map_odom, covariance)
+
+    def lose(self) -> None:
+        """Forget where the agent is in the map, until a submap says it again."""
+        self.T_map_odom = self._anchor = None
+
     def _move_to(self, pose: PoseEstimate) -> PoseEstimate | None:
         if self._newest is not None and self._has_begun_anew(self._newest, pose):
             self._go_on_from(self.pose_of(self._newest), pose)

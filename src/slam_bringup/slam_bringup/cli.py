@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 import slam_core.runtime.process_life  # noqa: F401  # its clock starts with the program
+from slam_bringup.extras import advice_for
 from slam_bringup.registered_commands import registered_commands
 from slam_bringup.terminal.console import log_to_terminal, with_verbosity
 from slam_core.runtime.blas_threads import use_one_blas_thread
@@ -59,7 +60,7 @@ class _LazyGroup(click.Group):
         known = COMMANDS if name in COMMANDS or name.startswith("-") else self.list_commands(ctx)
         if name not in known and not name.startswith("-") and not ctx.resilient_parsing:
             if name in _IN_EXPERIMENTS:
-                where = "in a checkout ./slam setup does it, elsewhere pip install src/slam_experiments"
+                where = "in a checkout ./slam setup does it, elsewhere pip install 'indoor-slam[experiments]'"
                 raise ValueError(f"{name} comes with the package slam_experiments, which is not installed: {where}")
             close = get_close_matches(name, dict.fromkeys([*known, *_IN_EXPERIMENTS]))
             ctx.fail(f"No such command '{name}'." + (f" Did you mean {' or '.join(close)}?" if close else ""))
@@ -94,12 +95,17 @@ with_verbosity(slam)
 
 
 def main() -> None:
-    """Entry point: a ``ValueError`` or ``OSError`` of any command becomes one clear line and exit code 2."""
+    """Entry point: a bad value, a file error and a missing extra become one clear line and exit code 2."""
     gc.disable()  # while modules are loaded; the command enables it
     try:
         slam(prog_name="slam")
     except (ValueError, OSError) as error:
         click.echo(f"slam: {error}", err=True)
+        sys.exit(2)
+    except ModuleNotFoundError as error:
+        if (advice := advice_for(error)) is None:
+            raise
+        click.echo(f"slam: {advice}", err=True)
         sys.exit(2)
 
 

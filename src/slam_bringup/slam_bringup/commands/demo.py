@@ -1,25 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``slam demo``: ``slam nodes`` on the demo bag, with both cameras and scan odometry."""
+"""``slam demo``: the demo bag mapped with both cameras and scan odometry, by the nodes or, without ROS, offline."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from slam_bringup.commands import nodes
+from slam_bringup.commands import nodes, run
+from slam_bringup.extras import has_ros, require_ros
+from slam_bringup.processes.kernels import DEMO
 
-DEMO = Path(__file__).parents[1] / "demo"
-"""``bags/demo`` of the sources, installed with the package."""
 _DEFAULTS = {"output": "out/demo", "mode": "fuse", "odometry": "ndt", "composed": True}
+_OF_NODES_ALONE = ("rate", "view", "composed")
 
 
 def _demo(**options: Any) -> None:
     if not DEMO.is_dir():
         raise ValueError(f"{DEMO} is missing: install slam_bringup again from a whole clone")
-    assert nodes.command.callback is not None
-    nodes.command.callback(bag=DEMO, **options)
+    command = nodes.command
+    if not has_ros():
+        if options["rate"] or options["view"]:
+            require_ros("--rate and --view: the demo with nodes")
+        click.echo("no ROS 2 here: the demo is mapped offline, as by slam run", err=True)
+        command = run.command
+        options = {name: value for name, value in options.items() if name not in _OF_NODES_ALONE}
+    assert command.callback is not None
+    command.callback(bag=DEMO, **options)
 
 
 command = click.Command(
@@ -27,5 +34,5 @@ command = click.Command(
     callback=_demo,
     params=[parameter for parameter in nodes.command.params if parameter.name != "bag"],
     context_settings={"default_map": _DEFAULTS},
-    help="Map the demo bag with the nodes, into out/demo; the options are those of 'slam nodes'.",
+    help="Map the demo bag with the nodes (without ROS offline), into out/demo; the options are those of 'slam nodes'.",
 )

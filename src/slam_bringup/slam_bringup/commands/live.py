@@ -10,6 +10,8 @@ from pathlib import Path
 
 import click
 
+from slam_bringup.extras import GET_ROS
+from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.processes.launch_plan import plan_launch
 from slam_bringup.processes.node_graph import NodeSpec, radio_node
 from slam_bringup.terminal.mapping_options import map_folder, rig_options
@@ -51,6 +53,7 @@ def command(
         nodes = tuple(_with_camera(spec, camera, left_info, right_info) for spec in nodes)
     if post:
         nodes = (*nodes, radio_node(_only(agents), post))
+    compile_kernels_once()
     remapped = [word for inner, outer in plan.remappings for word in ("-r", f"{inner}:={outer}")]
     run_in_one_process(nodes, ["--ros-args", *remapped])
 
@@ -60,7 +63,7 @@ def run_in_one_process(nodes: Iterable[NodeSpec], ros_arguments: Sequence[str] =
     try:
         composed = importlib.import_module("slam_bringup.processes.composed_node")
     except ImportError as error:
-        raise ValueError(f"live mapping needs ROS 2 Jazzy ({error}): source an installation, or use ./slam") from error
+        raise ValueError(f"live mapping needs ROS 2 Jazzy ({error}): {GET_ROS}") from error
     composed.run_composed([spec.command for spec in nodes], ros_arguments)
 
 

@@ -15,6 +15,7 @@ from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, overrides_for, system_config, with_files
 from slam_bringup.pipeline.overrides import Overrides, read_overrides
 from slam_bringup.processes.interrupt import MAP, Interrupt, giving_up
+from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.processes.online_run import run_nodes
 from slam_bringup.processes.start_map import StartMap
 from slam_bringup.terminal.console import LOG_NAME, Transcript, progress_bar, show
@@ -54,6 +55,7 @@ def command(
     start = StartMap.read(system, map_folder(old_map, localize_only=localize_only), localize_only=localize_only)
     if mode != "tof":
         require_stereo(bag, names)
+    compile_kernels_once()
     port = _page(view)
     transcript, results = Transcript(VERSION), OutputFolder(output, "nodes", bag, overwrite=overwrite)
     with transcript, results, giving_up(results), results.staged(rescue=MAP) as folder:

@@ -20,6 +20,7 @@ from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.interrupt import MAP, Interrupt, giving_up
+from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.terminal.console import LOG_NAME, Transcript, is_quiet, progress_bar, show
 from slam_bringup.terminal.mapping_options import map_folder, mapping_options, mode_for, require_map
 from slam_bringup.terminal.run_end import end_run
@@ -54,6 +55,7 @@ def command(
         session.load(old, len).result()
     if mode != "tof":
         require_stereo(bag, names)
+    compile_kernels_once()
     results, transcript = OutputFolder(output, "run", bag, overwrite=overwrite), Transcript(VERSION)
     staged = results.staged(rescue=MAP)
     with (

@@ -84,7 +84,7 @@ NODES = (
         "sjsam_node", "sjsam", "sjsam_node.node", "SjsamNode", "sjsam_node.node_config:SjsamNodeConfig",
         inputs=(*_SUBMAP, "odom", "clicked_point", "initialpose"),
         outputs=("map/landmarks", "map/path", "map/graph", "map/ellipsoids", "map/cloud", "map/marks", "map_to_odom",
-                 "pose"),
+                 "map_to_odom_pose", "pose"),
         recorded=("pose", "map_to_odom", "map/landmarks", "map/path", "map/graph", "map/ellipsoids", "map/cloud",
                   "map/marks"),
     ),

@@ -18,6 +18,7 @@ from typing import Any
 
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames
+from slam_bringup.extras import GET_ROS
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.overrides import Overrides
 from slam_bringup.processes.node_arguments import ros_arguments
@@ -146,7 +147,7 @@ def _supervisor(environment: dict[str, str], group: NodeGroup) -> Any:
     try:
         module = importlib.import_module("slam_bringup.processes.supervisor_node")
     except ImportError as error:
-        raise ValueError(f"the nodes need ROS 2 Jazzy ({error}): source an installation, or use ./slam") from error
+        raise ValueError(f"the nodes need ROS 2 Jazzy ({error}): {GET_ROS}") from error
     return module.Supervisor(environment, group.check)
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
+from slam_bringup.extras import require_ros
 from slam_bringup.pipeline.node_table import NODES
 from slam_core.runtime.process_life import PARENT
 
@@ -56,7 +57,8 @@ def find_executable(package: str, executable: str, prefixes: Sequence[str] | Non
 
 
 def become_node(package: str, executable: str, arguments: Sequence[str]) -> NoReturn:
-    """Replace this process by a node, as ``ros2 run`` does: signals and exit code are the node's own."""
+    """Replace this process by a node, as ``ros2 run`` does: signals and exit code are its own; refused without ROS."""
+    require_ros(executable)
     command = [*find_executable(package, executable), *arguments]
     sys.stdout.flush()
     os.execv(command[0], command)
