@@ -1,91 +1,163 @@
 # SPDX-License-Identifier: Apache-2.0
 """Submaps for the air beside whole ones: bytes, time, and the map that is joined from them.
 
-    OPENBLAS_NUM_THREADS=1 python benchmarks/radio/light_submaps.py RUN ... [--landmarks 32 64 96 128] [--rank 8]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/radio/light_submaps.py RUN ... [--landmarks 64 96 128] [--rank 8]
 
-RUN: the folder of a run with its ``map``. Its submaps are packed and unpacked in order, and joined as whole ones are.
-Columns: kB a submap, kB a metre of way between the submaps' ends, processor ms to pack and unpack, closures, parts of
-the map, difference of the joined end poses to those of whole submaps (mm, rms), and their claimed sigma over that of
-whole submaps (median and least).
+RUN: the folder of a run with its ``map``, of one agent or of several (``split_agents.py``). Its submaps are packed and
+unpacked in order, and joined as whole ones are. Columns: kB a submap, kB a metre of way between the submaps' ends,
+processor ms to pack and to unpack a submap (median), closures that the settled map holds, and how many of these hold
+between whole submaps too, parts of the map, position error (mm, all agents aligned together) and ANEES at the poses
+that are sent, and the claimed sigma of the submaps' ends over that of whole submaps (median and least).
+
+``--only``: what is done to submaps, to find what a loss is due to: ``landmarks`` are chosen, ``descriptors`` coded,
+the ``gaussian`` compacted, and nothing else.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
 from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap
+from slam_core.evaluation import align, associate, evaluate
 from slam_core.geometry import FloatArray
-from slam_core.types import Submap
+from slam_core.trajectory import Trajectory, read_trajectory
+from slam_core.types import PoseEstimate, Submap
+from slam_radio.compact_gaussian import compact_gaussian
+from slam_radio.descriptor_code import decode, encode
+from slam_radio.landmark_choice import choose_landmarks
 from slam_radio.light_submap import LightConfig, pack, unpack
 
-_COLUMNS = ("run", "landmarks", "kB", "kB/m", "ms", "closures", "parts", "difference mm", "sigma", "least")
+_COLUMNS = ("run", "landmarks", "kB", "kB/m", "pack", "unpack", "closures", "of whole", "parts", "mm", "ANEES",
+            "sigma", "least")  # fmt: skip
+_TRUTH_GAP_S = 0.1
+T = TypeVar("T")
+Ends = tuple[tuple[str, int, int], tuple[str, int, int]]
 
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """End positions (n, 3) m of all submaps, their claimed sigma (n,) m, closures and parts of the map."""
+    """Poses by agent, claimed sigma (n,) m of all submaps' ends, closures held, and parts of the map."""
 
-    ends: FloatArray
+    poses: dict[str, list[PoseEstimate]]
     sigma: FloatArray
-    closures: int
+    closures: set[Ends]
     parts: int
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
-    parser.add_argument("--landmarks", type=int, nargs="+", default=(32, 64, 96, 128))
-    parser.add_argument("--rank", type=int, default=8)
+    parser.add_argument("--landmarks", type=int, nargs="+", default=(64, 96, 128, 160))
+    parser.add_argument("--rank", type=int, default=LightConfig().rank)
+    parser.add_argument("--only", choices=("landmarks", "descriptors", "gaussian"))
     arguments = parser.parse_args()
     table = Table(*_COLUMNS)
     for run in arguments.runs:
         submaps = [r.submap for r in storage.read(run / "map").state.graph.records]
+        stamps = {p.stamp_ns for s in submaps for p in unpack(pack(s)).path}
+        truth = truth_of(run, submaps)
         whole = joined(submaps)
-        table.add_row(run.name, "all", "", "", "", str(whole.closures), str(whole.parts), "", "", "")
+        errors = accuracy(whole, truth, stamps)
+        table.add_row(run.name, "all", "", "", "", "", str(len(whole.closures)), "", str(whole.parts), *errors)
         for landmarks in arguments.landmarks:
-            table.add_row(run.name, str(landmarks), *row(submaps, whole, LightConfig(landmarks, arguments.rank)))
-    Console().print(table)
+            config = LightConfig(landmarks, arguments.rank)
+            if arguments.only:
+                light, figures = [partly(s, arguments.only, config) for s in submaps], [""] * 4
+            else:
+                light, figures = packed(submaps, config)
+            found = joined(light)
+            cells = (*figures, *compared(found, whole, accuracy(found, truth, stamps)))
+            table.add_row(run.name, str(landmarks), *cells)
+    Console(width=140).print(table)
 
 
-def row(submaps: Sequence[Submap], whole: Joined, config: LightConfig) -> Iterator[str]:
-    """Figures of one size of submaps."""
-    begun = time.process_time()
-    sent = dict.fromkeys((s.agent for s in submaps), np.empty(0, dtype=np.int64))
-    light, size = [], 0
-    for submap in submaps:
-        data = pack(submap, config, sent[submap.agent])
-        light.append(unpack(data))
-        sent[submap.agent] = light[-1].landmark_ids
-        size += len(data)
-    spent = time.process_time() - begun
+def packed(submaps: Sequence[Submap], config: LightConfig) -> tuple[list[Submap], list[str]]:
+    """Submaps as they arrive, and kB, kB a metre, and ms of packing and of unpacking."""
+    spent: tuple[list[float], list[float]] = ([], [])
+    data = [timed(lambda s=s: pack(s, config), spent[0]) for s in submaps]  # type: ignore[misc]
+    light = [timed(lambda d=d: unpack(d), spent[1]) for d in data]  # type: ignore[misc]
     way = sum(float(np.linalg.norm(s.end_pose[:3, 3])) for s in submaps)
-    found = joined(light)
-    difference = np.linalg.norm(found.ends - whole.ends, axis=1)
-    ratio: npt.NDArray[np.float64] = found.sigma[1:] / whole.sigma[1:]
-    yield from (f"{size / len(submaps) / 1e3:.2f}", f"{size / way / 1e3:.2f}", f"{1e3 * spent / len(submaps):.1f}")
-    yield from (str(found.closures), str(found.parts), f"{1e3 * np.sqrt(np.mean(difference**2)):.1f}")
+    size = sum(map(len, data))
+    return light, [
+        f"{size / len(submaps) / 1e3:.2f}",
+        f"{size / way / 1e3:.2f}",
+        *(f"{np.median(s):.1f}" for s in spent),
+    ]
+
+
+def timed(call: Callable[[], T], spent: list[float]) -> T:
+    """What a call returns; the processor ms that it took are appended."""
+    begun = time.process_time()
+    result = call()
+    spent.append(1e3 * (time.process_time() - begun))
+    return result
+
+
+def partly(submap: Submap, only: str, config: LightConfig) -> Submap:
+    """The submap with one of its parts as it is sent, and the others as they are."""
+    if only == "descriptors":
+        return replace(submap, descriptors=decode(encode(submap.descriptors), submap.descriptors.shape[1]))
+    if only == "gaussian":
+        return replace(submap, covariance=compact_gaussian(submap.covariance, config.rank).covariance())
+    rows = choose_landmarks(submap, config.landmarks)
+    unknowns = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).ravel()])
+    return replace(
+        submap, landmarks=submap.landmarks[rows], covariance=submap.covariance[np.ix_(unknowns, unknowns)],
+        landmark_ids=submap.landmark_ids[rows], sightings=submap.sightings[rows], descriptors=submap.descriptors[rows],
+    )  # fmt: skip
+
+
+def compared(found: Joined, whole: Joined, errors: Sequence[str]) -> Iterator[str]:
+    """Figures of a map beside that of whole submaps."""
+    ratio = found.sigma[1:] / whole.sigma[1:]
+    yield from (str(len(found.closures)), str(len(found.closures & whole.closures)), str(found.parts), *errors)
     yield from (f"{np.median(ratio):.2f}", f"{ratio.min():.2f}")
 
 
 def joined(submaps: Sequence[Submap]) -> Joined:
     """The settled map of submaps."""
     joined_map = GlobalMap()
-    closures = sum(len(joined_map.add(submap).closures) for submap in submaps)
+    for submap in submaps:
+        joined_map.add(submap)
     joined_map.settle()
-    snapshot = joined_map.snapshot()
-    ends = [snapshot.end(record) for record in range(len(snapshot))]
-    sigma = np.array([np.sqrt(np.trace(end.covariance[:3, :3])) for end in ends])
-    return Joined(np.array([end.T[:3, 3] for end in ends]), sigma, closures, snapshot.components)
+    snapshot, records = joined_map.snapshot(), joined_map.estimate.graph.records
+    sigma = [np.sqrt(np.trace(snapshot.end(record).covariance[:3, :3])) for record in range(len(snapshot))]
+    closures = {(records[k.first].key, records[k.second].key) for k in joined_map.estimate.graph.links if k.is_closure}
+    ordered = {(min(ends), max(ends)) for ends in closures}
+    return Joined(snapshot.trajectory(), np.array(sigma), ordered, snapshot.components)
+
+
+def truth_of(run: Path, submaps: Sequence[Submap]) -> dict[str, Trajectory]:
+    """True poses by agent."""
+    return {
+        agent: read_trajectory(run / (f"ground_truth_{agent}.tum" if agent else "ground_truth.tum"))
+        for agent in {s.agent for s in submaps}
+    }
+
+
+def accuracy(found: Joined, truth: dict[str, Trajectory], stamps: set[int]) -> tuple[str, str]:
+    """Position error mm, all agents in one frame, and ANEES, mean of all poses, each from its agent's start."""
+    estimates, truths, nees = [], [], []
+    for agent, own in truth.items():
+        estimate = Trajectory.from_estimates(p for p in found.poses[agent] if p.stamp_ns in stamps)
+        matched, true_poses = associate(estimate, own, _TRUTH_GAP_S, interpolate=True)
+        estimates.append(matched.poses)
+        truths.append(true_poses)
+        result = evaluate(estimate, own, interpolate=True, max_difference_s=_TRUTH_GAP_S)
+        nees += [result.anees] * len(matched) if result.anees is not None else []
+    poses, true_poses = np.concatenate(estimates), np.concatenate(truths)
+    gap = align(poses, true_poses)[:, :3, 3] - true_poses[:, :3, 3]
+    return f"{1e3 * np.sqrt((gap**2).sum(axis=1).mean()):.1f}", f"{np.mean(nees):.2f}"
 
 
 if __name__ == "__main__":

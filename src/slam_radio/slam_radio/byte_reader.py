@@ -49,7 +49,8 @@ class ByteReader:
 
     def floats(self, kind: str, shape: tuple[int, ...]) -> FloatArray:
         """Finite floating point numbers as float64."""
-        values = self.array(kind, shape).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # of a signalling NaN, refused below
+            values = self.array(kind, shape).astype(np.float64)
         if not np.isfinite(values).all():
             raise ValueError("a message holds numbers that are not finite")
         return values

@@ -48,6 +48,10 @@ class CompactGaussian:
         U = self.common.astype(np.float64) / _STEPS
         return _factors(self.blocks).between(_sum(U @ U.T, self.inflation, _own(U)))
 
+    def end_covariance(self) -> FloatArray:
+        """The pose's own covariance (6, 6)."""
+        return CompactGaussian(self.blocks[:21], self.common[:6], self.inflation).covariance()
+
 
 def compact_gaussian(covariance: FloatArray, rank: int, rounding: float = 0.0) -> CompactGaussian:
     """The Gaussian of a pose and n landmarks with ``rank`` common directions.

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Descriptors in 24 bytes: their coordinates along the directions in which SURF-128 descriptors differ.
+"""Descriptors in 24 numbers of 81 values: their coordinates along the directions in which SURF-128 descriptors differ.
 
 SURF-128 descriptors fill few of their 128 dimensions: 24 principal directions hold 92 % of their squares. The
 directions were found on simulated rooms (``benchmarks/radio/descriptor_basis.py``) and are part of the format.
-Descriptors of another kind, whose likeness this would spoil, go out whole, a byte a number.
+Descriptors of another kind, whose likeness this would spoil, go out whole, a number for each of theirs. Few of the 81
+values are frequent: deflated, a descriptor has about 15 bytes.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from slam_core.types import Float32Array
 Int8Array = npt.NDArray[np.int8]
 
 DIRECTIONS = 24
+_STEPS = 40.0
 _LEAST_LIKENESS = 0.9
 """Median scalar product of descriptors and their codes below which they go out whole."""
 
@@ -50,6 +52,6 @@ def decode(codes: Int8Array, dimension: int) -> Float32Array:
 
 
 def _steps(values: Float32Array) -> Int8Array:
-    """Rows as multiples of a step of their own: the largest element is 127 steps."""
+    """Rows as multiples of a step of their own: the largest element is 40 steps."""
     largest = np.abs(values).max(axis=1, keepdims=True, initial=np.finfo(np.float32).tiny)
-    return np.asarray(np.rint(127.0 * (values / largest)), dtype=np.int8)
+    return np.asarray(np.rint(_STEPS * (values / largest)), dtype=np.int8)

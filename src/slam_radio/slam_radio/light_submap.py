@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A submap for the air: what joining needs, in two to three kilobytes, and no surer than the submap itself.
+"""A submap for the air: what joining needs, in about six kilobytes, and no surer than the submap itself.
 
-    data = pack(submap, LightConfig(), known=ids_sent_before)
+    data = pack(submap, LightConfig())
     light = unpack(data)            # a Submap, with fewer landmarks
 
-Format, version 1, little endian. A message is
+Format, version 2, little endian. A message is
 
 ==========  ==========================================================================================
 ``b"SL"``   two bytes
@@ -25,7 +25,7 @@ u16, u16, u8        dimension of descriptors, c, k
 6 x f32             tangent of the end pose: translation m, rotation rad
 6 x f32             box of the landmarks: lowest corner, size (m)
 n x 3 x u16         positions, in 65535ths of the box
-(21 + 6n) x f16     Cholesky factors of the unknowns' own blocks, mm and mrad
+(21 + 6n) x f16     Cholesky factors of the unknowns' own blocks, mm and mrad: all low bytes, then all high bytes
 f32                 inflation t
 (6 + 3n) x r x i8   common directions U, in 127ths (:mod:`slam_radio.compact_gaussian`)
 n x varint          ids, each less the one before (LEB128)
@@ -34,6 +34,8 @@ n x c x i8          descriptors (:mod:`slam_radio.descriptor_code`)
 k x (i64, 6 x f32,  poses of the path: stamp, tangent of T_start_rig, and the factor by which the end pose's
 f16)                covariance covers the pose's own
 ==================  ===================================================================================
+
+Deflate begins a new block for each kind of numbers, so that each has Huffman codes of its own.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ from slam_radio.compact_gaussian import CompactGaussian, compact_gaussian
 from slam_radio.descriptor_code import decode, encode
 from slam_radio.landmark_choice import choose_landmarks
 
-MAGIC, VERSION = b"SL", 1
+MAGIC, VERSION = b"SL", 2
 MOST_BYTES = 2**17
 """Largest message: 65535 bytes that deflate did not make smaller, and their envelope."""
 _ENVELOPE = struct.Struct("<2sBIH")
@@ -65,13 +67,13 @@ _CELLS = 65535
 class LightConfig(Config):
     """Size of a submap for the air."""
 
-    landmarks: int = parameter(96, "landmarks that are sent of a submap", minimum=3, maximum=200)
+    landmarks: int = parameter(128, "landmarks that are sent of a submap", minimum=3, maximum=200)
     rank: int = parameter(8, "directions in which the errors of a submap's unknowns are said to be common",
                           minimum=1, maximum=64)  # fmt: skip
     poses: int = parameter(4, "poses of the path that are sent of a submap", minimum=2, maximum=255)
 
 
-def pack(submap: Submap, config: LightConfig | None = None, known: npt.NDArray[np.int64] | None = None) -> bytes:
+def pack(submap: Submap, config: LightConfig | None = None) -> bytes:
     """The submap as a message.
 
     Parameters
@@ -80,8 +82,6 @@ def pack(submap: Submap, config: LightConfig | None = None, known: npt.NDArray[n
         A whole submap.
     config
         How much of it is sent.
-    known
-        Ids of the landmarks that were sent of the agent's submap before.
 
     Raises
     ------
@@ -89,29 +89,34 @@ def pack(submap: Submap, config: LightConfig | None = None, known: npt.NDArray[n
         If its covariance is not positive definite or a number is too large for the format.
     """
     config = config or LightConfig()
-    rows = choose_landmarks(submap, config.landmarks, known)
+    rows = choose_landmarks(submap, config.landmarks)
     points, box, step = _positions(submap.landmarks[rows])
     unknowns = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).ravel()])
     gaussian = compact_gaussian(submap.covariance[np.ix_(unknowns, unknowns)], config.rank, float(step.max(initial=0)))
     codes = encode(submap.descriptors[rows])
-    path = _key_poses(submap, gaussian.covariance()[:6, :6], config.poses)
+    path = _key_poses(submap, gaussian.end_covariance(), config.poses)
     name = submap.agent.encode()
     if len(name) > 255:
         raise ValueError(f"an agent's name may have 255 bytes, '{submap.agent[:20]}...' has {len(name)}")
-    rest = b"".join([
-        struct.pack("<B", len(name)), name,
-        struct.pack("<IIB", submap.session, submap.index, submap.follows_previous),
-        struct.pack("<qq", submap.start_stamp_ns, submap.end_stamp_ns),
-        _COUNTS.pack(len(rows), gaussian.common.shape[1], submap.descriptors.shape[1], codes.shape[1], len(path)),
-        _tangent(submap.end_pose), box.astype("<f4").tobytes(), points.astype("<u2").tobytes(),
-        gaussian.blocks.astype("<f2").tobytes(), struct.pack("<f", gaussian.inflation), gaussian.common.tobytes(),
+    kinds = (
+        b"".join([
+            struct.pack("<B", len(name)), name,
+            struct.pack("<IIB", submap.session, submap.index, submap.follows_previous),
+            struct.pack("<qq", submap.start_stamp_ns, submap.end_stamp_ns),
+            _COUNTS.pack(len(rows), gaussian.common.shape[1], submap.descriptors.shape[1], codes.shape[1], len(path)),
+            _tangent(submap.end_pose), box.astype("<f4").tobytes(), points.astype("<u2").tobytes(),
+        ]),
+        *_byte_planes(gaussian.blocks),
+        struct.pack("<f", gaussian.inflation) + gaussian.common.tobytes(),
         write_varints(np.diff(submap.landmark_ids[rows], prepend=0)),
-        np.minimum(submap.sightings[rows], 255).astype(np.uint8).tobytes(), codes.tobytes(),
-        *(struct.pack("<q", stamp) + _tangent(T) + np.float16(factor).tobytes() for stamp, T, factor in path),
-    ])  # fmt: skip
+        np.minimum(submap.sightings[rows], 255).astype(np.uint8).tobytes(),
+        codes.tobytes(),
+        b"".join(struct.pack("<q", stamp) + _tangent(T) + np.float16(factor).tobytes() for stamp, T, factor in path),
+    )  # fmt: skip
+    rest = b"".join(kinds)
     if len(rest) > 0xFFFF:
         raise ValueError(f"a submap for the air may have 65535 bytes, this one has {len(rest)}: send fewer landmarks")
-    body = zlib.compress(rest, 9)
+    body = _deflated(kinds)
     return _ENVELOPE.pack(MAGIC, VERSION, zlib.crc32(body), len(rest)) + body
 
 
@@ -131,7 +136,7 @@ def unpack(data: bytes) -> Submap:
     end_pose = _pose(reader.floats("<f4", (6,)))
     box = reader.floats("<f4", (2, 3))
     cells = reader.array("<u2", (n, 3))
-    blocks = reader.floats("<f2", (21 + 6 * n,)).astype(np.float16)
+    blocks = _from_byte_planes(reader.array("u1", (2, 21 + 6 * n)))
     (inflation,) = reader.numbers("<f")
     common = reader.array("i1", (6 + 3 * n, r))
     ids = np.cumsum(read_varints(reader, n))
@@ -155,6 +160,33 @@ def unpack(data: bytes) -> Submap:
 
 _LEAST_FACTOR = 1e-6
 """Covariance of the first pose, which is exact, over that of the end pose: keeps it positive definite."""
+
+
+def _deflated(kinds: tuple[bytes, ...]) -> bytes:
+    """One stream of several kinds of numbers, each in blocks of its own."""
+    deflater = zlib.compressobj(9)
+    parts = [deflater.compress(kind) + deflater.flush(zlib.Z_PARTIAL_FLUSH) for kind in kinds]
+    return b"".join(parts) + deflater.flush()
+
+
+def _byte_planes(values: npt.NDArray[np.float16]) -> tuple[bytes, bytes]:
+    """The low bytes of numbers, and their high bytes: sign, exponent and what is alike."""
+    planes = values.astype("<f2").view(np.uint8).reshape(-1, 2)
+    return planes[:, 0].tobytes(), planes[:, 1].tobytes()
+
+
+def _from_byte_planes(planes: npt.NDArray[np.uint8]) -> npt.NDArray[np.float16]:
+    """Inverse of :func:`_byte_planes`, of planes (2, n).
+
+    Raises
+    ------
+    ValueError
+        If one is not finite.
+    """
+    values = np.ascontiguousarray(planes.T).view("<f2")[:, 0].astype(np.float16)
+    if not np.isfinite(values).all():
+        raise ValueError("a submap for the air holds numbers that are not finite")
+    return values
 
 
 def _rest(data: bytes) -> bytes:

@@ -16,8 +16,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-import numpy.typing as npt
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 
 from slam_core.geometry import FloatArray
@@ -41,7 +39,7 @@ from slam_core.types import Submap
 from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox
 from slam_radio.index_ranges import Key
-from slam_radio.light_submap import pack, unpack
+from slam_radio.light_submap import pack
 from slam_radio.link_state import LinkState
 from slam_radio.outbox import Outbox
 from slam_radio.radio_config import RadioConfig
@@ -88,7 +86,6 @@ class AgentEnd(_End):
         outbox = Outbox(node.state_folder / "outbox" / self.name)
         self.uplink = Uplink(outbox, config.bytes_per_second, config.resend_after_s, config.silent_after_s)
         self._odometry: Message | None = None
-        self._sent_ids: npt.NDArray[np.int64] = np.empty(0, dtype=np.int64)
         self._T_map_odom: FloatArray | None = None
         if waiting := outbox.waiting:
             node.get_logger().info(f"{len(waiting)} submaps of before wait for the post")
@@ -106,8 +103,7 @@ class AgentEnd(_End):
         if self.uplink.outbox.knows(key):
             self.node.health.count("submaps sent again")
             return
-        light = pack(replace(submap, agent=self.name), self.node.config.light, self._sent_ids)
-        self._sent_ids = unpack(light).landmark_ids
+        light = pack(replace(submap, agent=self.name), self.node.config.light)
         try:
             self.uplink.add_submap(key, light, time.monotonic())
         except OSError as error:
