@@ -25,6 +25,7 @@ setup(
         "matplotlib",
         "numpy",
         "opencv-python-headless",
+        "PyYAML",
         "rich",
         "scipy",
         "trimesh",

@@ -26,7 +26,7 @@ from ekf_slam_node.odometry.relative_poses import (
     contradicts,
 )
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
-from ekf_slam_node.submaps.frame_input import frame_of_strongest, usable_features
+from ekf_slam_node.submaps.frame_input import frame_of_strongest, usable_features, without_tags
 from ekf_slam_node.submaps.missed_frames import MissedFrames
 from ekf_slam_node.submaps.motion_checks import (
     StandingDetector,
@@ -90,6 +90,7 @@ class EkfSlam:
         self._chain = SubmapChain(self.config, self._T_rig_optical, self.session)
         self._next_id = 0
         self._newest_stamp_ns = 0
+        self._tags: Frame | None = None
         self._standing = StandingDetector(STANDING_FRAMES, self.config.association.gate)
         missed = MissedFrames(self._linker, self._T_rig_optical, self.config.motion)
         self._recovery = LossRecovery(self.config, self._chain, self._aids, missed, self.counters, self._advance)
@@ -106,6 +107,7 @@ class EkfSlam:
         if problem:
             return self._chain.result(self._newest_stamp_ns, TrackingState.DEGRADED, problem)
         self._newest_stamp_ns = features.stamp_ns
+        features, self._tags = without_tags(features)
         usable = usable_features(features)
         self.counters.add("features_unusable", int(len(features) - usable.sum()))
         frame = self._noise.corrected(frame_of_strongest(features, usable, MAX_FRAME_FEATURES))
@@ -204,6 +206,7 @@ class EkfSlam:
         seen = self._augment(linked)
         self._predict(linked)
         updated = self._update(linked, seen)
+        self._measure_tags(linked, updated)
         submaps = self._close(linked, seen, updated) if updated.closes else self._maintain(linked, updated)
         return self._chain.result(frame.stamp_ns, *updated.state(linked.link), submaps, updated)
 
@@ -307,6 +310,18 @@ class EkfSlam:
         ids, index = local.table.ids[measured.slots], linked.frame.index[measured.columns]
         self._shutter.learn(linked.measured, ids, measured.columns, linked.link.T, linked.dt)
         return UpdatedFrame(report, measured, closes, ids, index)
+
+    def _measure_tags(self, linked: LinkedFrame, updated: UpdatedFrame) -> None:
+        """Measure the frame's fiducial tags; where the submap ends, the pose bears the common error already."""
+        if self._tags is None:
+            return
+        tags = self._shutter.corrected(self._tags, linked.dt, linked.link.T)
+        report = self._chain.local.measure_tags(tags, np.zeros(6) if updated.closes else linked.common)
+        self.counters.add("tags_measured", report.measured)
+        if report.elsewhere:
+            self.counters.add("tags_elsewhere", report.elsewhere)
+        if report.moved:
+            self.counters.add("tags_moved", report.moved)
 
     def _maintain(self, linked: LinkedFrame, updated: UpdatedFrame) -> tuple[Submap, ...]:
         """Keep the frame's other features for the next one and remove landmarks that cannot be relied on."""

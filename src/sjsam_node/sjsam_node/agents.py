@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sjsam_node.graph.map_graph import BUILDING
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_core.geometry import compose_covariance
@@ -77,7 +78,8 @@ class Agents:
 def in_order(submaps: Iterable[Submap]) -> list[Submap]:
     """Submaps as they come if none is late: by the stamps of their ends, each agent's in their own order.
 
-    The last one of each agent comes after all others: it is closed when all input has ended.
+    The last one of each agent comes after all others: it is closed when all input has ended. The building's comes
+    first.
     """
     runs: dict[str, list[Submap]] = {}
     for submap in sorted(submaps, key=lambda s: (s.session, s.index)):
@@ -85,7 +87,8 @@ def in_order(submaps: Iterable[Submap]) -> list[Submap]:
     turns: list[tuple[bool, int, str, int, Submap]] = []
     for agent, run in runs.items():
         stamps = np.maximum.accumulate([s.end_stamp_ns for s in run]).tolist()
-        turns += [(s is run[-1], stamp, agent, k, s) for k, (stamp, s) in enumerate(zip(stamps, run, strict=True))]
+        ends = None if agent == BUILDING else run[-1]
+        turns += [(s is ends, stamp, agent, k, s) for k, (stamp, s) in enumerate(zip(stamps, run, strict=True))]
     return [turn[-1] for turn in sorted(turns, key=lambda turn: turn[:4])]
 
 

@@ -154,3 +154,13 @@ class ClosureJoiner:
         known = {k.ends for k in self.refused}
         waiting = [k.with_status(Status.INCONSISTENT) for k in links if k.ends not in known]
         self.refused = [*self.refused, *waiting][-MAX_REFUSED_CLOSURES:]
+
+
+def grouped(found: Sequence[Link], size: int) -> list[list[Link]]:
+    """Links in groups of a ``size``, so that a false one takes few true ones with it.
+
+    Those that the map finds consistent come first, by themselves, and exclude nothing that it holds.
+    """
+    consistent = [k for k in found if k.status is Status.CONSISTENT]
+    others = [k for k in found if k.status is not Status.CONSISTENT]
+    return [links[i : i + size] for links in (consistent, others) for i in range(0, len(links), size)]

@@ -20,8 +20,9 @@ import numpy as np
 
 from sjsam_node import storage
 from sjsam_node.agents import Agents, in_order
-from sjsam_node.closure_joining import ClosureJoiner
+from sjsam_node.closure_joining import ClosureJoiner, grouped
 from sjsam_node.graph.links import Link, Status
+from sjsam_node.graph.map_graph import BUILDING
 from sjsam_node.graph.offload import Offload
 from sjsam_node.loop_closure.consistency import ConsistencyConfig, Verdict
 from sjsam_node.loop_closure.detector import LoopDetector
@@ -32,6 +33,8 @@ from sjsam_node.smoothing.map_snapshot import InnerPaths, MapLandmarks, MapSnaps
 from sjsam_node.smoothing.solver import SmootherConfig
 from sjsam_node.smoothing.state import EstimateState
 from sjsam_node.storage import StoredMap
+from sjsam_node.tags.known_tags import KnownTagsConfig, building_submap
+from sjsam_node.tags.tag_links import TagLinks, is_against_tags, with_tag_links
 from slam_core.config import Config, group, parameter
 from slam_core.estimation.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
@@ -70,6 +73,7 @@ class GlobalMapConfig(Config):
     closure: ClosureConfig = group(ClosureConfig)
     consistency: ConsistencyConfig = group(ConsistencyConfig)
     calibration: CalibrationErrorConfig = group(CalibrationErrorConfig)
+    tags: KnownTagsConfig = group(KnownTagsConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +114,7 @@ class GlobalMap:
     def __init__(self, config: GlobalMapConfig | None = None) -> None:
         self.config = config or GlobalMapConfig()
         self.counters = Counters()
+        self._known_tags = self.config.tags.known_tags()
         self.reset()
 
     def reset(self) -> None:
@@ -126,6 +131,10 @@ class GlobalMap:
         self.agents = Agents(self.estimate, LINKED_SUBMAPS)
         self.detector = LoopDetector(self.estimate, self.config.closure)
         self.closures = ClosureJoiner(self.estimate, self.config.consistency, self.config.closure)
+        self.tags = TagLinks(self.estimate, self.detector.verifier)
+        self.detector.is_refuted = lambda first, second, found: is_against_tags(
+            self.estimate.graph, first, second, found
+        )
         self._inner_paths = InnerPaths()
 
     @property
@@ -146,12 +155,13 @@ class GlobalMap:
             return JoinReport(False, reason)
         self._was_settled_before |= self._is_settled and bool(self.estimate.graph.records)
         self._is_settled = False
+        self._place_building(submap.descriptors.shape[1])
         new = self._place(submap)
         chain = self.agents.chain(new)
-        self.estimate.add_links(self.detector.sequential(chain, new))
+        self.estimate.add_links(with_tag_links(self.detector.sequential(chain, new), self.tags.sequential(chain, new)))
         matched = self.estimate.graph.shared_by(new)
         self.estimate.condense(new, chain)
-        found = self.detector.closures(chain, new)
+        found = with_tag_links(self.detector.closures(chain, new), self.tags.closures(chain, new))
         if self._has_moved:
             found += self.detector.missed(self.agents.chained, _COMPARED_AT_ONCE)
         self._judge_redundancy(new, found)
@@ -212,6 +222,8 @@ class GlobalMap:
 
     def _rejection(self, submap: Submap) -> str:
         """Reason for which a submap cannot be joined; empty if it can."""
+        if submap.agent == BUILDING:
+            return f"no agent may be called {BUILDING}"
         if not (np.all(np.isfinite(submap.covariance)) and np.all(np.isfinite(submap.landmarks))):
             return "not finite"
         if np.abs(submap.landmarks).max(initial=0.0) > FARTHEST_M:
@@ -240,7 +252,13 @@ class GlobalMap:
         start = self.estimate.graph.records[previous].end if follows and previous is not None else None
         new = self.estimate.add_submap(submap, start, self.last_pose(submap.agent), self.config.ties)
         self.agents.add(new)
+        self.tags.add(new)
         return new
+
+    def _place_building(self, columns: int) -> None:
+        """Add the tags of which the user knows where they are, before the first submap that has come since."""
+        if self._known_tags and self.agents.newest(BUILDING) is None:
+            self._place(building_submap(self._known_tags, columns))
 
     def last_pose(self, agent: str) -> FloatArray:
         """Last pose of an agent, (4, 4); the origin for one not seen before."""
@@ -279,7 +297,7 @@ class GlobalMap:
         newest = len(self.estimate.graph.records) - 1
         for _ in range(_PASSES):
             missed = self.detector.missed(self.agents.chained, _COMPARED_AT_SETTLING * len(self.estimate.graph.records))
-            for found in _grouped(missed, self.config.joined_at_once):
+            for found in grouped(missed, self.config.joined_at_once):
                 self._account(self.closures.join_closures(found, newest), len(found))
             if not missed:
                 break
@@ -305,7 +323,10 @@ class GlobalMap:
         if self._was_settled_before or ordered != submaps:
             rebuilt = GlobalMap(self.config)
             for submap in ordered:
-                rebuilt.add(submap)
+                if submap.agent == BUILDING:
+                    rebuilt._place(submap)
+                else:
+                    rebuilt.add(submap)
             rebuilt.counters = self.counters
             rebuilt.marks = self.marks_in(rebuilt)
         rebuilt.settle()
@@ -362,18 +383,9 @@ class GlobalMap:
         loaded.detector.pending, loaded.detector.near.compared = stored.pending, stored.compared
         for i, record in enumerate(graph.records):
             loaded.agents.add(i)
+            loaded.tags.add(i)
             if not stored.state.is_redundant(i):
                 loaded.detector.index.add(i, record.submap.descriptors)
             loaded._page_out(i)
         loaded.estimate.relinearize()
         return loaded
-
-
-def _grouped(found: list[Link], size: int) -> list[list[Link]]:
-    """Links in groups of a ``size``, so that a false one takes few true ones with it.
-
-    Those that the map finds consistent come first, by themselves, and exclude nothing that it holds.
-    """
-    consistent = [k for k in found if k.status is Status.CONSISTENT]
-    others = [k for k in found if k.status is not Status.CONSISTENT]
-    return [links[i : i + size] for links in (consistent, others) for i in range(0, len(links), size)]

@@ -33,6 +33,7 @@ from sjsam_node.node_config import SjsamNodeConfig, copy_path
 from sjsam_node.pose_tracker import PoseTracker
 from sjsam_node.smoothing.map_snapshot import ADVICE, MapSnapshot
 from sjsam_node.submap_order import SubmapOrder, gap_text
+from sjsam_node.tags.map_tags import map_tags, tags_text
 from slam_core.geometry import FloatArray
 from slam_core.health import State
 from slam_core.messages import (
@@ -361,6 +362,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         """Messages that show a map, by topic; on the thread that may read its covariances."""
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
         landmarks, paths = snapshot.landmarks(), snapshot.path()
+        if said := tags_text(map_tags(snapshot, landmarks)):
+            self.do_later("tags", lambda: self.health.show("tags", said))
         messages = {
             "map/landmarks": landmarks_message(self.types, header, landmarks),
             "map/cloud": cloud_message(self.types, header, landmarks),

@@ -31,11 +31,15 @@ LONGEST_IMU_STEP_S = 0.05
 
 
 class FeatureSource(IntEnum):
-    """Source of a feature's depth; the values of the ``source`` field of the ``features`` topic."""
+    """Source of a feature's depth; the values of the ``source`` field of the ``features`` topic.
+
+    ``TAG``: a corner of a fiducial tag, with depth from the tag's pose (:mod:`slam_core.tags`).
+    """
 
     STEREO = 0
     TOF = 1
     FUSED = 2
+    TAG = 3
 
 
 MakeColour = Callable[[], ByteArray | None]
@@ -108,7 +112,8 @@ class Features:
     xyz (n, 3) m in the optical frame ``frame_id``; uv (n, 2) px in the rectified image of ``camera``; depth (n,) m
     along z; sigma_uv (n, 2) px; sigma_depth (n,) m; response (n,); source (n,) uint8, see :class:`FeatureSource`;
     descriptors (n, d), unit norm, d = 128 for SURF-128 and SIFT. track_ids (n,): equal in the frames through which
-    the front end has followed a feature, 0 where it has not.
+    the front end has followed a feature, 0 where it has not. Corners of fiducial tags have descriptors of zeros and
+    negative track ids, which say the tag and the corner (:mod:`slam_core.tags`).
     """
 
     stamp_ns: int
@@ -229,7 +234,8 @@ class Submap:
     end_pose: T_start_end (4, 4), the rig pose at which the submap was closed. landmarks: (n, 3) m, in the start frame.
     covariance: (6 + 3n, 6 + 3n) of (end pose error, landmarks), positive definite. landmark_ids: (n,) int64, unique
     within the agent and kept when a landmark is carried into the next submap, so that equal ids of neighbours are a
-    known association (a hint, not proof). sightings: (n,) int32. descriptors: (n, d) float32, unit norm. path: the rig
+    known association (a hint, not proof); negative ones are corners of fiducial tags (:mod:`slam_core.tags`), the same
+    for every agent on every day. sightings: (n,) int32. descriptors: (n, d) float32, unit norm. path: the rig
     poses inside, T_start_rig, each with the marginal covariance (6, 6) at that time; the first is identity, the last is
     ``end_pose``. follows_previous: the start pose is the end pose of submap ``index - 1`` of the agent (odometry
     chains); False after the rig was lost. session: run of the agent's filter, given by the filter; indices begin anew

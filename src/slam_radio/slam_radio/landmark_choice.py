@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
+from slam_core.tags import is_tag_corner
 from slam_core.types import Float32Array, Submap
 from slam_radio.descriptor_code import basis
 
@@ -26,11 +27,11 @@ def choose_landmarks(submap: Submap, most: int) -> npt.NDArray[np.int64]:
     """Rows of at most ``most`` landmarks, in the order of their ids.
 
     In the order of :func:`rank_values`; one so near another one chosen that a closure would count them once comes only
-    after all that stand apart.
+    after all that stand apart. Corners of fiducial tags stay behind.
     """
-    n = len(submap.landmarks)
     order = np.argsort(-rank_values(submap.descriptors), kind="stable")
-    if n > most:
+    order = order[~is_tag_corner(submap.landmark_ids[order])]
+    if len(order) > most:
         crowded = _is_crowded(submap.landmarks[order])
         order = np.concatenate([order[~crowded], order[crowded]])[:most]
     return np.asarray(order[np.argsort(submap.landmark_ids[order])], dtype=np.int64)

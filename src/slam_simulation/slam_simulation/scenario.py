@@ -13,12 +13,15 @@ doorways:
   - {at: [2.5, 4.0]}
 objects:
   - {kind: table, at: [2.5, 2.0], size: [1.4, 0.8]}
+tags:
+  - {id: 7, at: [2.0, 4.0, 1.5], yaw: -90}       # fiducial, on the wall; yaw: the way it faces
 agents:
   - {name: "", motion: handheld, height: 1.3, path: [[1, 1], [4, 1, 90], [1, 1]]}   # x, y[, yaw[, pitch[, z]]]
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
@@ -37,6 +40,7 @@ from slam_simulation.trajectory import MOTION_STYLES, Path, SplinePath, StationP
 from slam_simulation.world.building import WALL_GAP, Doorway, Room, build_doorways, build_shell, room_walls
 from slam_simulation.world.furniture import Spot, chair, furnish_wall, pillar, table
 from slam_simulation.world.moving import add_moving
+from slam_simulation.world.tags import TagOnWall
 from slam_simulation.world.world import World
 
 SENSORS = ("stereo", "tof", "imu")
@@ -104,6 +108,7 @@ class Scenario:
     sensors: tuple[str, ...] = SENSORS
     doorways: tuple[Doorway, ...] = ()
     objects: tuple[FurnitureObject, ...] = ()
+    tags: tuple[TagOnWall, ...] = ()
     description: str = ""
     suite: SensorSuite = field(default_factory=SensorSuite)
     full_frames: int = 0
@@ -121,6 +126,9 @@ class Scenario:
         unknown = set(self.sensors) - set(_KNOWN)
         if unknown:
             raise ValueError(f"scenario '{self.name}': unknown sensors {sorted(unknown)}, known: {', '.join(_KNOWN)}")
+        for k, room in enumerate(self.rooms):
+            if room.like and room.like not in {r.name for r in self.rooms[:k]}:
+                raise ValueError(f"room '{room.name}' is like '{room.like}', which is no earlier room")
         for agent in self.agents:
             for x, y, *_ in (*agent.path, *agent.stations):
                 if not any(room.contains(x, y, WALL_GAP) for room in self.rooms):
@@ -144,11 +152,11 @@ class Scenario:
     @classmethod
     def from_mapping(cls, name: str, values: Mapping[str, Any]) -> Scenario:
         """A scenario from the YAML file's contents."""
-        own = ("rooms", "agents", "doorways", "objects", "profile", *_SUITE)
+        own = ("rooms", "agents", "doorways", "objects", "tags", "profile", *_SUITE)
         plain = {k: v for k, v in values.items() if k not in own}
         suite = {key: values[key] for key in _SUITE if key in values}
-        for key in ("rooms", "agents", "doorways", "objects"):
-            kind = {"rooms": Room, "agents": Agent, "doorways": Doorway, "objects": FurnitureObject}[key]
+        kinds = {"rooms": Room, "agents": Agent, "doorways": Doorway, "objects": FurnitureObject, "tags": TagOnWall}
+        for key, kind in kinds.items():
             plain[key] = tuple(_make(kind, row, name) for row in values.get(key, ()))
         plain["sensors"] = tuple(plain.get("sensors", SENSORS))
         made: Scenario = _make(cls, {**plain, "name": name, "suite": from_mapping(SensorSuite, suite)}, name)
@@ -182,13 +190,21 @@ class Scenario:
         world = World(self.seed)
         rng = np.random.default_rng([self.seed, 0])
         everything = [room_walls(k, room, list(self.doorways)) for k, room in enumerate(self.rooms)]
+        begun: dict[str, tuple[np.random.Generator, int]] = {}
         for k, (room, walls) in enumerate(zip(self.rooms, everything, strict=True)):
+            begun[room.name] = copy.deepcopy(rng), len(world.surfaces)
+            own, twin = (copy.deepcopy(begun[room.like][0]), begun[room.like][1]) if room.like else (rng, -1)
             build_shell(world, k, room, walls)
             for wall in walls:
-                furnish_wall(world, wall, room, rng)
+                furnish_wall(world, wall, room, own)
+            if room.like:
+                first = begun[room.name][1]
+                alike = [replace(s, looks_like=twin + m) for m, s in enumerate(world.surfaces[first:])]
+                world.surfaces[first:] = alike
         build_doorways(world, list(self.doorways), [wall for walls in everything for wall in walls])
         for item in self.objects:
             self._place(world, item, rng)
+        world.add(*(tag.surface(self._room_at(tag.at[:2], margin=0.1)) for tag in self.tags))
         add_moving(world, self.suite.realism.moving, self.path(), self.rooms)
         return world
 
@@ -204,9 +220,9 @@ class Scenario:
         else:
             raise ValueError(f"scenario '{self.name}': unknown object '{item.kind}', known: table, chair, pillar")
 
-    def _room_at(self, at: tuple[float, float]) -> int:
+    def _room_at(self, at: tuple[float, ...], margin: float = 0.0) -> int:
         for k, room in enumerate(self.rooms):
-            if room.contains(*at):
+            if room.contains(at[0], at[1], margin):
                 return k
         raise ValueError(f"scenario '{self.name}': {at} m lies in no room")
 

@@ -15,6 +15,7 @@ from dense_mapping.plans.floor_plan import FloorPlan
 from dense_mapping.reconstruction.surface import Surface
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
+from sjsam_node.tags.map_tags import MapTag, tags_summary
 from slam_core.evaluation import Evaluation, evaluate
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
@@ -110,6 +111,8 @@ class RunResult:
     """Thresholds that it is judged by."""
     is_localized: bool = False
     """True if the agents were located in a map of an earlier run, and nothing was mapped."""
+    tags: tuple[MapTag, ...] = ()
+    """Fiducial tags of the map, each once for every place."""
 
 
 def summarise(result: RunResult) -> dict[str, Any]:
@@ -177,6 +180,8 @@ def _only_some_have(result: RunResult, first: AgentResult) -> dict[str, Any]:
         summary["rectification"] = dict(first.front_end.rectification)
     if first.front_end.ranges:
         summary["ranges"] = dict(first.front_end.ranges)
+    if result.tags:
+        summary["tags"] = tags_summary(result.tags)
     if len(first.filtered):
         summary["filtered"] = _accuracy(first, first.filtered)
     if len(result.agents) > 1:

@@ -11,6 +11,7 @@ from stereo_frontend.depth.depth_fusion import FusionConfig
 from stereo_frontend.depth.range_self_calibration import RangeSelfCalibrationConfig
 from stereo_frontend.depth.tof_features import TofFeatureConfig
 from stereo_frontend.detection.features import FeatureConfig
+from stereo_frontend.fiducials.detector import TagConfig
 from stereo_frontend.masks import MaskingConfig
 from stereo_frontend.stereo.disparity import DisparityConfig
 from stereo_frontend.stereo.matching import MatchingConfig
@@ -38,6 +39,7 @@ class FrontendConfig(Config):
     range_calibration: RangeSelfCalibrationConfig = group(RangeSelfCalibrationConfig)
     tof: TofFeatureConfig = group(TofFeatureConfig)
     mask: MaskingConfig = group(MaskingConfig)
+    tags: TagConfig = group(TagConfig)
 
     @property
     def tracks(self) -> bool:

@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.types import DepthImage, Features, Mask, StereoImages
+from stereo_frontend.depth.tof_features import CLIP, GAMMA, normalised_picture
+from stereo_frontend.fiducials.tag_features import TagFeatures
 from stereo_frontend.frontend import Frontend
 from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
@@ -107,6 +109,7 @@ class FeatureStage:
         self._mode = config.mode
         self._frames = frames
         self._frontend = Frontend(config)
+        self._tags = TagFeatures(config.tags) if config.tags.is_used else None
         self._masking = Masking(config.mask)
         self._pairing = NearestPairing[StereoImages, DepthImage]("depth image", config.fusion.max_age)
         self._ready: deque[tuple[StereoImages | None, DepthImage | None]] = deque()
@@ -115,11 +118,14 @@ class FeatureStage:
     def counters(self) -> dict[str, int]:
         """Counts of what was accepted and rejected, by name."""
         masked = {"keypoints_masked": self._frontend.masked} if self._masking.counters.counts else {}
-        return self._frontend.counters.counts | self._masking.counters.counts | masked
+        tags = {} if self._tags is None else self._tags.counters.counts
+        return self._frontend.counters.counts | self._masking.counters.counts | masked | tags
 
     def report(self) -> FrontendReport:
         """Findings of the front end about the images so far."""
-        return self._frontend.report()
+        report = self._frontend.report()
+        advice = "" if self._tags is None else self._tags.advice
+        return replace(report, advice=(*report.advice, advice)) if advice else report
 
     @property
     def diagnostic(self) -> str:
@@ -179,7 +185,19 @@ class FeatureStage:
         features = self._frontend.measure(frame.keypoints, images, depth, T_left_tof)
         source = images or depth
         assert source is not None
-        return replace(features, frame_id=source.frame_id)
+        return self._with_tags(replace(features, frame_id=source.frame_id), images, depth)
+
+    def _with_tags(self, features: Features, images: StereoImages | None, depth: DepthImage | None) -> Features:
+        """The features and the fiducial tags of the left image, or of a depth camera without one."""
+        if self._tags is None:
+            return features
+        if images is not None:
+            return self._tags.with_tags(features, self._tags.of_pair(images, self._frontend.self_calibration))
+        grey = None if depth is None else next((g for g in (depth.intensity, depth.amplitude) if g is not None), None)
+        if depth is None or grey is None:
+            return features
+        picture = normalised_picture(grey, CLIP, GAMMA)
+        return self._tags.with_tags(features, self._tags.of_depth(depth, picture))
 
     def give_up(self) -> None:
         """Let go on what waits for a depth camera or for masks that a live node has not heard for long."""
@@ -194,6 +212,8 @@ class FeatureStage:
     def reset(self) -> None:
         """Forget thresholds, noise and what waits."""
         self._frontend.reset()
+        if self._tags is not None:
+            self._tags = TagFeatures(self._tags.config)
         self.clear()
 
     def clear(self) -> None:

@@ -13,6 +13,7 @@ from ekf_slam_node.filtering.covariance import IndexArray
 from ekf_slam_node.filtering.landmark_noise import LandmarkNoise
 from slam_core.geometry import FloatArray
 from slam_core.runtime.in_place import in_place
+from slam_core.tags import is_tag_corner
 from slam_core.types import Float32Array
 
 _COLUMNS, _ROWS = 8, 6
@@ -97,11 +98,12 @@ class LandmarkTable:
     def unreliable(self, frame: int, config: LandmarkConfig) -> IndexArray:
         """Slots to be removed, highest first.
 
-        Too few sightings in their first frames, or missed where they should be seen.
+        Too few sightings in their first frames, or missed where they should be seen. Never the corners of tags: a
+        detector that finds them less often from further away says nothing against them.
         """
         probation = (frame - self._first_frame >= config.probation_frames) & (self.sightings < config.min_sightings)
         missed = (self._expected >= config.min_expected) & (self._hits < config.min_hit_ratio * self._expected)
-        return np.flatnonzero(probation | missed)[::-1]
+        return np.flatnonzero((probation | missed) & ~is_tag_corner(self.ids))[::-1]
 
     def remove(self, slot: int) -> None:
         """Drop a landmark; the last one takes its slot, as in the filter."""

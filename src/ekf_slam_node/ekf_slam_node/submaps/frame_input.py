@@ -8,6 +8,7 @@ import numpy as np
 from ekf_slam_node.filtering.models import Frame, frame_from_features
 from slam_core.camera import MIN_DEPTH
 from slam_core.runtime.in_place import in_place
+from slam_core.tags import is_tag_corner, whole_tags
 from slam_core.types import Features
 
 _MAX_RELATIVE_DEPTH_SIGMA = 0.3
@@ -46,3 +47,18 @@ def frame_of_strongest(features: Features, usable: np.ndarray, most: int) -> Fra
     if len(index) > most:
         index = np.sort(index[np.argsort(-features.response[index], kind="stable")[:most]])
     return frame_from_features(features, index, _MIN_SIGMA_PX, _MIN_SIGMA_DEPTH)
+
+
+def without_tags(features: Features) -> tuple[Features, Frame | None]:
+    """The features, and the corners of fiducial tags among them as a frame: four of each tag, one tag after the other.
+
+    ``None`` where there is no tag; a tag with a corner that cannot be a measurement is left out.
+    """
+    is_corner = is_tag_corner(features.track_ids)
+    if not is_corner.any():
+        return features, None
+    usable = np.flatnonzero(usable_features(features) & is_corner)
+    tags = whole_tags(features.track_ids[usable])
+    corners = usable[np.concatenate([*tags.values(), np.zeros(0, np.int64)]).astype(np.int64)]
+    frame = frame_from_features(features, corners, _MIN_SIGMA_PX, _MIN_SIGMA_DEPTH)
+    return features.select(np.flatnonzero(~is_corner)), frame if len(frame) else None

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,11 +21,17 @@ from ekf_slam_node.filtering.landmarks import CandidateLandmarks, LandmarkTable,
 from ekf_slam_node.filtering.models import CORE_DIM, Frame, observe, relative_motion, rig_points
 from ekf_slam_node.odometry.relative_poses import RELATIVE_POSE_GATE, RelativePoseMeasurement, relative_pose_error
 from slam_core.camera import MIN_DEPTH
-from slam_core.geometry import FloatArray
+from slam_core.geometry import FloatArray, skew
+from slam_core.tags import CORNERS
 from slam_core.types import PoseEstimate
 
 _STANDING_VELOCITY = np.repeat([0.02, np.radians(0.5)], 3)
 """Standard deviations (m/s, rad/s) of the velocities of a rig that stands."""
+
+_MISSED_TAG = 4
+"""Frames in a row in which a tag is elsewhere, after which it has moved."""
+_ELSEWHERE = 3.0
+"""NIS of a tag's corners, in gates, beyond which it is elsewhere and not only badly seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +56,15 @@ class LandmarkMatches:
     def every_second(self) -> LandmarkMatches:
         """Half of the sightings."""
         return self.select(np.arange(0, len(self), 2))
+
+
+@dataclass(frozen=True)
+class TagReport:
+    """Numbers of fiducial tags of a frame: measured, seen elsewhere, and moved for good."""
+
+    measured: int
+    elsewhere: int
+    moved: int
 
 
 class OpenSubmap:
@@ -77,6 +93,7 @@ class OpenSubmap:
         self._config = config
         self._T_rig_optical = T_rig_optical
         self._frames = 0
+        self._missed_tags: Counter[int] = Counter()
 
     @classmethod
     def empty(
@@ -245,6 +262,62 @@ class OpenSubmap:
         self.table.noise.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
         return report, sight.select(good)
 
+    def measure_tags(self, frame: Frame, common: FloatArray) -> TagReport:
+        """Measure the corners of fiducial tags after a frame's features; new tags become landmarks.
+
+        frame: four corners of each tag. A tag is measured if all its corners are inside their gates; one that was not
+        for a while has moved, and begins anew with its next sighting. ``common``: as in :meth:`measure`.
+        """
+        tags = np.arange(len(frame)).reshape(-1, CORNERS)
+        slot_of = {corner: slot for slot, corner in enumerate(self.table.ids.tolist()) if corner < 0}
+        is_new = np.array([int(frame.tracks[columns[0]]) not in slot_of for columns in tags], dtype=bool)
+        columns = tags[~is_new].ravel()
+        slots = np.array([slot_of[c] for c in frame.tracks[columns].tolist()], dtype=np.int64)
+        distance = self._distances(frame, slots, columns, common).reshape(-1, CORNERS)
+        fits = (distance < self._config.association.gate).all(axis=1)
+        is_far = distance.mean(axis=1) > _ELSEWHERE * self._config.association.gate
+        good = np.repeat(fits, CORNERS)
+        if good.any():
+            self.measure(frame, LandmarkMatches(slots[good], columns[good]), common, closes=False)
+            self.table.sightings[slots[good]] += 1
+        moved = self._tags_missed(frame.tracks[columns][::CORNERS], is_far)
+        if is_new.any():
+            self._add_tags(frame.select(tags[is_new].ravel()), common)
+        return TagReport(int(fits.sum()), int(is_far.sum()), moved)
+
+    def _distances(self, frame: Frame, slots: IndexArray, columns: IndexArray, common: FloatArray) -> FloatArray:
+        """NIS (k,) of sightings; infinite behind the camera."""
+        seen = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks[slots], frame.camera)
+        S = self._ekf.innovation_blocks(seen, slots, frame.variance[columns], common)
+        distance = squared_distances(self._ekf.innovation(frame.z[columns], seen, slots), S)
+        return np.where(seen.depth > MIN_DEPTH, distance, np.inf)
+
+    def _tags_missed(self, first_corners: IndexArray, is_far: np.ndarray) -> int:
+        """Note tags that were seen elsewhere several times in a row, to be removed; returns how many."""
+        moved = 0
+        for corner, is_elsewhere in zip(first_corners.tolist(), is_far.tolist(), strict=True):
+            self._missed_tags[corner] = self._missed_tags[corner] + 1 if is_elsewhere else 0
+            moved += self._missed_tags[corner] == _MISSED_TAG
+        return moved
+
+    def _remove_moved_tags(self) -> None:
+        for corner in [c for c, missed in self._missed_tags.items() if missed >= _MISSED_TAG]:
+            del self._missed_tags[corner]
+            for slot in np.flatnonzero((self.table.ids <= corner) & (self.table.ids > corner - CORNERS))[::-1]:
+                self._remove(int(slot))
+
+    def _remove(self, slot: int) -> None:
+        self._ekf.remove(slot)
+        self.table.remove(slot)
+
+    def _add_tags(self, frame: Frame, common: FloatArray) -> None:
+        points, covariances = rig_points(frame, self._T_rig_optical)
+        J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -skew(points)], axis=2)
+        self._ekf.augment(points, covariances + J @ np.diag(common**2) @ np.swapaxes(J, 1, 2))
+        n = len(frame)
+        ids, once, untracked = frame.tracks.astype(np.int64), np.ones(n, np.int32), np.zeros(n, np.int32)
+        self.table.add(ids, once, frame.descriptors, untracked, self._frames)
+
     def drift_by(self, common: FloatArray) -> None:
         """Take in what a frame's common error (6,) leaves behind, at the camera's present place."""
         self._drift.add(common, (self._ekf.T @ self._T_rig_optical)[:3, 3])
@@ -270,8 +343,8 @@ class OpenSubmap:
         self.table.count(sight.slots, frame.descriptors[sight.columns], view.in_image(frame.camera, margin_px=10.0))
         self._frames += 1
         for slot in self.table.unreliable(self._frames, self._config.landmark):
-            self._ekf.remove(slot)
-            self.table.remove(slot)
+            self._remove(slot)
+        self._remove_moved_tags()
 
 
 def candidate_landmarks(frame: Frame, T_rig_optical: FloatArray) -> CandidateLandmarks:

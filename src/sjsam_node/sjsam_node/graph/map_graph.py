@@ -27,6 +27,8 @@ from slam_core.geometry import FloatArray
 from slam_core.linear_algebra.block_pattern import IntArray, pointers
 from slam_core.types import Submap
 
+BUILDING = "building"
+"""Agent whose only submap are the tags of which it is known where they are (:mod:`sjsam_node.tags.known_tags`)."""
 ALL = 1 << 30
 """Landmark budget of two submaps that all the landmarks which they share are to connect."""
 
@@ -44,6 +46,11 @@ class Record:
     def key(self) -> tuple[str, int, int]:
         """Agent, session and index: unique, and an order that does not depend on when a submap arrived."""
         return self.submap.agent, self.submap.session, self.submap.index
+
+    @property
+    def frame_order(self) -> tuple[bool, tuple[str, int, int]]:
+        """Sort key: the first record of a component defines its frame, the building's before all others."""
+        return self.submap.agent != BUILDING, self.key
 
     @cached_property
     def observations(self) -> IntArray:

@@ -10,7 +10,7 @@ with none that show nothing new.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -58,6 +58,8 @@ class LoopDetector:
     index: PlaceIndex = field(init=False)
     near: NearPairs = field(init=False)
     pending: list[Link] = field(default_factory=list)
+    is_refuted: Callable[[int, int, Alignment], bool] = lambda first, second, found: False
+    """True if something else than looks says that an alignment of two records is false."""
     _alarms: dict[frozenset[int], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -182,7 +184,7 @@ class LoopDetector:
         else:
             path_length = self.graph.path_length_between(old, new)
             found, status = self.verifier.verify(first, second, prior, path_length, old, new)
-        if found is None:
+        if found is None or self.is_refuted(old, new, found):
             return None
         may_move = status is not Status.INCONSISTENT and prior is not None
         error = self.verifier.error_against(found, prior, 0.0) if may_move and prior is not None else 0.0

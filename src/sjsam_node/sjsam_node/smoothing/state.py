@@ -129,10 +129,10 @@ class EstimateState:
         return np.asarray((T[:, :3, :3] @ self.graph.middles_of(records)[..., None])[..., 0] + T[:, :3, 3])
 
     def oldest(self, component: int) -> Record:
-        """The record of a component with the least key: its start defines the component's frame."""
+        """The record of a component that comes first in frame order: its start defines the component's frame."""
         if component not in self._oldest:
             records = (self.graph.records[i] for i in self.records_in(component))
-            self._oldest[component] = min(records, key=lambda r: r.key)
+            self._oldest[component] = min(records, key=lambda r: r.frame_order)
         return self._oldest[component]
 
     def most_overconfident(self) -> tuple[float, list[int]]:
@@ -199,7 +199,7 @@ def with_links(state: EstimateState, links: Sequence[Link]) -> EstimateState:
 def _merged(state: EstimateState, link: Link) -> EstimateState:
     first, second = state.component(link.first), state.component(link.second)
     anchor, moved, T_anchor_moved = link.first, link.second, link.T
-    if state.oldest(first).key > state.oldest(second).key:
+    if state.oldest(first).frame_order > state.oldest(second).frame_order:
         first, second, anchor, moved, T_anchor_moved = second, first, moved, anchor, invert_transform(link.T)
     T_map_moved = state.start(anchor) @ T_anchor_moved
     joined = transformed(state, second, T_map_moved @ invert_transform(state.start(moved)))

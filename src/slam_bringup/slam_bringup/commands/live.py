@@ -14,7 +14,7 @@ from slam_bringup.extras import GET_ROS
 from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.processes.launch_plan import plan_launch
 from slam_bringup.processes.node_graph import NodeSpec, radio_node
-from slam_bringup.terminal.mapping_options import map_folder, rig_options
+from slam_bringup.terminal.mapping_options import map_folder, rig_options, tag_parameters
 
 
 @click.command()
@@ -46,6 +46,7 @@ def command(
         "base_frame": base_frame, "calibration": ",".join(map(str, calibrations)),
         "initial_map": map_folder(old_map, localize_only=localize_only),
         "localize_only": "true" if localize_only else None,
+        "set": "; ".join(f"{node}.{k}={v}" for node, own in tag_parameters().items() for k, v in own.items()),
     }  # fmt: skip
     plan = plan_launch({name: str(value) for name, value in given.items() if value})
     nodes = plan.nodes

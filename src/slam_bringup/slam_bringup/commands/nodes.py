@@ -13,7 +13,6 @@ from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames, parse_topics
 from slam_bringup.doctor.examination import require_stereo
 from slam_bringup.pipeline.configuration import choose, overrides_for, system_config, with_files
-from slam_bringup.pipeline.overrides import Overrides, read_overrides
 from slam_bringup.processes.interrupt import MAP, Interrupt, giving_up
 from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.processes.online_run import run_nodes
@@ -23,6 +22,7 @@ from slam_bringup.terminal.mapping_options import (
     map_folder,
     mapping_options,
     mode_for,
+    own_overrides,
     require_map,
 )
 from slam_bringup.terminal.run_end import end_run
@@ -49,8 +49,7 @@ def command(
     with SensorBag(bag, names) as opened:
         mode = mode_for(opened, mode)
         frames = sum(opened.count(agent, "depth" if mode == "tof" else "left") for agent in opened.agents)
-    own = read_overrides(config) if config is not None else Overrides()
-    overrides = overrides_for(bag, with_files(own, names.calibration.parameters))
+    overrides = overrides_for(bag, with_files(own_overrides(config), names.calibration.parameters))
     system = choose(system_config(overrides), mode, mapper, odometry, imu)
     start = StartMap.read(system, map_folder(old_map, localize_only=localize_only), localize_only=localize_only)
     if mode != "tof":

@@ -17,12 +17,18 @@ from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames, parse_topics
 from slam_bringup.doctor.examination import require_stereo
-from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.configuration import choose, overrides_for, system_config, with_files
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.interrupt import MAP, Interrupt, giving_up
 from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.terminal.console import LOG_NAME, Transcript, is_quiet, progress_bar, show
-from slam_bringup.terminal.mapping_options import map_folder, mapping_options, mode_for, require_map
+from slam_bringup.terminal.mapping_options import (
+    map_folder,
+    mapping_options,
+    mode_for,
+    own_overrides,
+    require_map,
+)
 from slam_bringup.terminal.run_end import end_run
 from slam_core.storage.output_folder import LOGS, OutputFolder
 from slam_core.version import VERSION
@@ -49,7 +55,8 @@ def command(
     with SensorBag(bag, names) as opened:
         readings = sum(opened.count(agent, role) for agent in opened.agents for role in ("left", "depth", "imu"))
         mode = mode_for(opened, mode)
-    system = choose(load_system_config(config, bag, names.calibration.parameters), mode, mapper, odometry, imu)
+    overrides = overrides_for(bag, with_files(own_overrides(config), names.calibration.parameters))
+    system = choose(system_config(overrides), mode, mapper, odometry, imu)
     session = MapSession(system.sjsam, Mode.LOCALISE if localize_only else Mode.MAP)
     if (old := map_folder(old_map, localize_only=localize_only)) is not None:
         session.load(old, len).result()

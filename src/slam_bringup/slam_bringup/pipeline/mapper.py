@@ -16,6 +16,7 @@ from ndt_registration.stage import ScanEstimate
 from sjsam_node.agents import in_order
 from sjsam_node.map_session import MapSession, Mode, Outcome
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
+from sjsam_node.tags.map_tags import map_tags
 from slam_bags.reading.readings import AgentSensors, SessionStart
 from slam_bringup.pipeline.configuration import SystemConfig, filter_config
 from slam_bringup.pipeline.run_record import BACKLOG, AgentRecord, RunRecord, StateChanges
@@ -110,6 +111,7 @@ class Mapper:
         shown, landmarks, mapped = self.session.read(
             lambda now: (now.structure(), now.landmarks(), now.trajectory(known))
         ).result()
+        tags = map_tags(shown, landmarks)
         return RunRecord(
             agents={agent: diary.record() for agent, diary in self._diaries.items()},
             map=shown,
@@ -125,6 +127,7 @@ class Mapper:
             failure=failure,
             solver=next((o.report.solver for o in reversed(self._outcomes) if o.report and o.report.solver), ""),
             backlog=self._backlog(),
+            tags=tags,
         )
 
     def _located(self) -> dict[str, list[PoseEstimate]]:

@@ -13,6 +13,7 @@ import numpy as np
 from dense_mapping.plans.floor_plan import FloorPlan
 from dense_mapping.reconstruction.surface import Surface
 from sjsam_node.smoothing.map_snapshot import MapLandmarks, MapSnapshot
+from sjsam_node.tags.map_tags import MapTag, tags_text
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.dense_run import dense_model
@@ -100,6 +101,7 @@ class RunRecord:
     solver: str = ""
     failure: str = ""
     backlog: Mapping[str, int] = field(default_factory=dict)
+    tags: tuple[MapTag, ...] = ()
 
     def with_front_ends(
         self, reports: Mapping[str, FrontendReport], frames: Mapping[str, Sequence[LoggedFrame]] | None = None
@@ -165,11 +167,13 @@ def run_result(
         backlog=record.backlog,
         changed=_changed(config),
         limits=config.run,
+        tags=record.tags,
     )
     on_mapped(mapped)
     surface, plans, failure = _dense(bag, config, record, agents, on_reading, stopped)
     doubt = (_ONE_FILTER,) * (mapper == "ekf")
-    told_first = (*(failure,) * bool(failure), *doubt)
+    tags = tags_text(record.tags)
+    told_first = (*(failure,) * bool(failure), *doubt, *(tags,) * bool(tags))
     events = _logged((*told_first, *bag.warnings, *record.events, *_events(record.agents)))
     return replace(mapped, dense=surface, floor_plans=plans, events=events, failure=failure)
 

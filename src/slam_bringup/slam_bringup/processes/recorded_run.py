@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sjsam_node.global_map import GlobalMap
+from sjsam_node.tags.map_tags import map_tags
 from slam_bags.reading.readings import AgentSensors
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames
@@ -89,15 +90,17 @@ def collect(
     recording = Recording(run.recording)
     global_map = GlobalMap.load(run.map_folder)
     is_localized = start_map is not None and start_map.localize_only
+    snapshot, landmarks = global_map.snapshot(), global_map.landmarks()
     joiner = run.diagnostics.get("/sjsam", {})
     with SensorBag(bag, names) as opened:
         record = RunRecord(
             agents={agent: recording.of_agent(agent) for agent in opened.agents},
-            map=global_map.snapshot(),
-            landmarks=global_map.landmarks(),
+            map=snapshot,
+            landmarks=landmarks,
+            tags=map_tags(snapshot, landmarks),
             trajectories={agent: recording.located(agent) for agent in opened.agents}
             if is_localized
-            else global_map.snapshot().trajectory(start_map.submaps if start_map else 0),
+            else snapshot.trajectory(start_map.submaps if start_map else 0),
             submaps=recording.submaps,
             loop_closures=int(joiner.get("localized" if is_localized else "closures", "0")),
             wall_s=run.wall_s,

@@ -13,8 +13,10 @@ import click
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import ROLES
 from slam_bringup.pipeline.configuration import MAPPERS, ODOMETRIES
+from slam_bringup.pipeline.overrides import Overrides, overrides_of, read_overrides
 from slam_bringup.terminal.paths import UserPath, calibration_option, overwrite_option
 from slam_viewer.results import RunResult
+from stereo_frontend.fiducials.detector import DICTIONARIES
 from stereo_frontend.frontend_config import MODES
 
 _ODOMETRY = "slam_bringup.odometry_topic"
@@ -28,6 +30,35 @@ def _with_odometry(context: click.Context, _: click.Parameter, topics: tuple[str
     """The topics given by role, with that of ``--odometry-topic``, which is read before them."""
     topic = context.meta.get(_ODOMETRY)
     return (*topics, f"odometry={topic}") if topic else topics
+
+
+_TAGS = "slam_bringup.tags"
+_TAG_PARAMETERS = {
+    "tags": ("feature_extractor", "tags.dictionary"),
+    "tag_size": ("feature_extractor", "tags.size"),
+    "known_tags": ("sjsam", "tags.known"),
+}
+"""Node and parameter of each option about fiducial tags."""
+
+
+def _keep_tags(context: click.Context, option: click.Parameter, value: Any) -> None:
+    if value is not None:
+        context.meta.setdefault(_TAGS, {})[option.name] = str(value.resolve()) if isinstance(value, Path) else value
+
+
+def tag_parameters() -> dict[str, dict[str, Any]]:
+    """Parameters by node that the command line's options about tags set."""
+    found: dict[str, dict[str, Any]] = {}
+    for option, value in click.get_current_context().meta.get(_TAGS, {}).items():
+        node, name = _TAG_PARAMETERS[option]
+        found.setdefault(node, {})[name] = value
+    return found
+
+
+def own_overrides(config: Path | None) -> Overrides:
+    """Overrides of the user: those of a file, then those of options with a name of their own."""
+    own = Overrides() if config is None else read_overrides(config)
+    return Overrides(own.origin, (*own.rules, *overrides_of(tag_parameters(), "command line").rules))
 
 
 # fmt: off
@@ -65,6 +96,18 @@ _RIG_OPTIONS = (
     click.option(
         "--map", "old_map", type=UserPath(exists=True, file_okay=False),
         help="go on in the map of a finished run, which is only read: its folder OUT, or OUT/map",
+    ),
+    click.option(
+        "--tags", type=click.Choice(DICTIONARIES), expose_value=False, callback=_keep_tags,
+        help="fiducial tags to search for (docs/fiducials.md)",
+    ),
+    click.option(
+        "--tag-size", type=float, metavar="M", expose_value=False, callback=_keep_tags,
+        help="edge of a tag's black square, m [0.16]",
+    ),
+    click.option(
+        "--known-tags", type=UserPath(exists=True, dir_okay=False), expose_value=False, callback=_keep_tags,
+        help="YAML of tags whose poses in the building are known: the map is in that frame",
     ),
     click.option("--localize-only", is_flag=True, help="with --map: only find the way in that map"),
 )

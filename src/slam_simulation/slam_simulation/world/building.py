@@ -40,7 +40,10 @@ STYLES = {
 
 @dataclass(frozen=True)
 class Room:
-    """A room: ``x`` and ``y`` its extent (least, greatest) in m, ``clutter`` how densely its walls are furnished."""
+    """A room: ``x`` and ``y`` its extent (least, greatest) in m, ``clutter`` how densely its walls are furnished.
+
+    ``like``: name of an earlier room of the same size and openings that it looks exactly like.
+    """
 
     name: str
     x: tuple[float, float]
@@ -48,6 +51,7 @@ class Room:
     height: float = 2.7
     style: str = "office"
     clutter: float = 1.0
+    like: str = ""
 
     def __post_init__(self) -> None:
         if self.style not in STYLES:

@@ -14,6 +14,7 @@ from slam_simulation.world.atlas import TextureAtlas, TextureTable
 from slam_simulation.world.lighting import bake
 from slam_simulation.world.materials import PATTERNS
 from slam_simulation.world.pictures import PICTURES, draw_picture
+from slam_simulation.world.tags import is_tag, tag_picture
 from slam_simulation.world.world import Rectangle, World
 
 OVERLAY = "blotches"
@@ -71,11 +72,17 @@ def compile_world(world: World) -> SurfaceTable:
 def _appearance(seed: int, i: int, surface: Rectangle, atlas: TextureAtlas) -> tuple[list[float], tuple[int, int]]:
     """Row of ``look`` and the texture numbers of one surface."""
     material, (width, height) = surface.material, surface.size
+    i = i if surface.looks_like < 0 else surface.looks_like
     rng = np.random.default_rng([seed, i])
     tail = [material.brightness, material.gloss, material.infrared, material.emission]
-    if material.name in PICTURES:
-        picture = draw_picture(material.name, width, height, rng)
-        texture = atlas.add(f"{material.name}/{i}", picture, clamp=True)
+    if material.name in PICTURES or is_tag(material.name):
+        name = f"{material.name}/{i}"
+        if name not in atlas:
+            picture = (
+                tag_picture(material.name) if is_tag(material.name) else draw_picture(material.name, width, height, rng)
+            )
+            atlas.add(name, picture, clamp=True)
+        texture = atlas[name]
         # Rows of a picture run downwards, edge_v upwards.
         return [0.0, 1.0, 1.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, *tail], (texture, -1)
     texture, overlay = _pattern(seed, material.name, atlas), _pattern(seed, OVERLAY, atlas)

@@ -34,7 +34,7 @@ class Material:
 class Rectangle:
     """One rectangle: ``origin`` (3,) m, ``edge_u``, ``edge_v`` (3,) m, orthogonal.
 
-    ``room`` for the light it receives.
+    ``room`` for the light it receives. ``looks_like``: number of the surface whose texture it has too, -1 for its own.
     """
 
     origin: FloatArray
@@ -42,6 +42,7 @@ class Rectangle:
     edge_v: FloatArray
     material: Material
     room: int = 0
+    looks_like: int = -1
 
     def __post_init__(self) -> None:
         for name in ("origin", "edge_u", "edge_v"):

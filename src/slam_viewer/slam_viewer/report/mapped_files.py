@@ -7,8 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import yaml
 
+from sjsam_node.tags.map_tags import tags_file
 from slam_core.point_cloud import write_ply
+from slam_core.storage.files import atomic_text
 from slam_core.trajectory import write_covariance_csv, write_tum
 from slam_viewer.results import AgentResult, LandmarkMap, RunResult
 
@@ -23,6 +26,8 @@ def write_mapped(out: Path, result: RunResult, save_map: SaveMap | None = None) 
         save_map(out / "map")
     _write_trajectories(out, result.agents)
     _write_landmarks(out / "landmarks.ply", result.landmarks)
+    if any(tag.is_tied and tag.submaps for tag in result.tags):
+        atomic_text(out / "tags.yaml", yaml.safe_dump(tags_file(result.tags), sort_keys=False, default_flow_style=None))
 
 
 def _write_landmarks(path: Path, landmarks: LandmarkMap) -> None:
