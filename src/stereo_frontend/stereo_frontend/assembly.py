@@ -29,6 +29,12 @@ class DepthEstimate:
         """The estimates at ``index``."""
         return DepthEstimate(self.depth[index], self.sigma[index], self.source[index])
 
+    def completed(self, predicted: FloatArray, relative_sigma: float) -> DepthEstimate:
+        """With predicted depths (n,) m where none is known, of a standard deviation given as a share of them."""
+        missing = ~np.isfinite(self.depth)
+        sigma = np.where(missing, relative_sigma * predicted, self.sigma)
+        return DepthEstimate(np.where(missing, predicted, self.depth), sigma, self.source)
+
     @staticmethod
     def unknown(n: int) -> DepthEstimate:
         """No depth for any of ``n`` keypoints."""

@@ -87,6 +87,28 @@ def test_a_depth_camera_is_tracked_too(stereo_pair):
     np.testing.assert_allclose(counts[2].depth, 2.0, atol=0.01)
 
 
+def test_a_track_without_depth_measures_its_direction(stereo_pair):
+    frontend, pair = tracking_frontend("tof"), stereo_pair()
+    depth = np.full(pair.left.shape, 2.0, np.float32)
+    hole = np.index_exp[:, pair.left.shape[1] // 2 :]
+    frames = []
+    for k in range(4):
+        frame, seen = moved(pair, k), depth.copy()
+        seen[hole] = np.nan if k else 2.0
+        camera, grey = pair.stereo.camera, frame.left.astype(np.float32)
+        frames.append(frontend.process(None, DepthImage(frame.stamp_ns, seen, np.full_like(seen, 0.004), camera, grey)))
+    first, last = frames[0], frames[-1]
+    _, _, now = np.intersect1d(first.track_ids, last.track_ids, return_indices=True)
+    now = now[last.track_ids[now] > 0]
+    blind = now[last.uv[now, 0] > pair.left.shape[1] // 2 + 2]
+    sighted = np.setdiff1d(now, now[last.uv[now, 0] > pair.left.shape[1] // 2 - 2])
+    assert min(len(blind), len(sighted)) > 20
+    np.testing.assert_allclose(last.depth[blind], 2.0, atol=0.05)  # as the camera's motion predicts it
+    np.testing.assert_allclose(last.sigma_depth[blind], 0.25 * last.depth[blind], rtol=1e-5)
+    assert last.sigma_depth[sighted].max() < 0.01
+    assert last.sigma_uv[blind].max() < 0.5
+
+
 def test_the_motion_of_points_is_found_among_outliers(rng):
     from slam_core.camera import Camera
     from slam_core.geometry import make_transform, so3_exp, transform_points

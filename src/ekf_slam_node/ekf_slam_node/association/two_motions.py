@@ -56,7 +56,7 @@ class MovingTracks:
 
     def marks(self, tracks: np.ndarray) -> np.ndarray:
         """Mask (n,) of the tracks that are marked."""
-        return np.isin(tracks, self._marked)
+        return np.isin(tracks, self._marked) if len(self._marked) else np.zeros(len(tracks), bool)
 
 
 def two_motions(

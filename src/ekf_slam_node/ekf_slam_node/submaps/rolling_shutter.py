@@ -62,13 +62,16 @@ _LONGEST_STEP_S = 0.25
 
 @dataclass(frozen=True, eq=False)
 class _FramePair:
-    """A frame as it was measured, ids and columns (k,) of its landmarks, the motion that led to it within dt (s)."""
+    """A frame as it was measured, ids and columns (k,) of its landmarks.
+
+    The motion that led to it within some time and its velocity (6,).
+    """
 
     frame: Frame
     ids: np.ndarray
     columns: np.ndarray
     T_previous_now: FloatArray
-    dt: float
+    velocity: FloatArray
 
 
 class RollingShutter:
@@ -110,7 +113,7 @@ class RollingShutter:
             return frame
         velocities = [] if T_previous_now is None else [velocity_of_motion(T_previous_now, dt)]
         if self._frame_pairs and self._follows(frame, dt):
-            velocities += [velocity_of_motion(m.T_previous_now, m.dt) for m in reversed(self._frame_pairs)]
+            velocities += [m.velocity for m in reversed(self._frame_pairs)]
         if not velocities:
             return frame
         newest = np.array(velocities[: len(_SMOOTHING)])
@@ -124,7 +127,9 @@ class RollingShutter:
         """Take in a frame as it was measured, its landmarks ``ids`` at ``columns``, and its motion over dt (s)."""
         if dt > _LONGEST_STEP_S or not (self._frame_pairs and self._follows(frame, dt)):
             self._frame_pairs.clear()
-        self._frame_pairs.append(_FramePair(frame, ids, columns, T_previous_now, dt))
+        self._frame_pairs.append(
+            _FramePair(frame, ids, columns, T_previous_now, velocity_of_motion(T_previous_now, dt))
+        )
         self._frames += 1
         if len(self._evidence) > _MIN_FRAME_PAIRS and self._frames % _FRAMES_PER_ESTIMATE:
             return
@@ -200,8 +205,7 @@ class RollingShutter:
 
 def _velocity(moment: _FramePair, after: _FramePair) -> FloatArray:
     """Velocity (6,) of the rig at a moment: the mean of the motions that led to it and away from it."""
-    before = velocity_of_motion(moment.T_previous_now, moment.dt)
-    return np.asarray(0.5 * (before + velocity_of_motion(after.T_previous_now, after.dt)))
+    return np.asarray(0.5 * (moment.velocity + after.velocity))
 
 
 def _solve(pairs: PairErrors, slope: FloatArray, variance_scale: FloatArray) -> tuple[float, float] | None:
