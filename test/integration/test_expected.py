@@ -25,7 +25,13 @@ def summary_of(bag: Path, mode: str):
 def test_every_scenario_of_the_thesis_has_bounds():
     scenarios = {path.stem for path in (BAGS / "scenarios").glob("*.yaml")}
     assert set(expected()) <= scenarios
-    assert scenarios - set(expected()) <= {"tof_grid", "tof_turns", "fifty_rooms"}
+    assert scenarios - set(expected()) <= {
+        "tof_grid",
+        "tof_turns",
+        "fifty_rooms",
+        "tagged_corridor",
+        "tagged_corridor_2",
+    }
 
 
 @pytest.mark.slow

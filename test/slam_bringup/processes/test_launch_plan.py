@@ -9,7 +9,7 @@ import pytest
 
 from slam_bringup.processes.launch_plan import plan_launch
 
-DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
+DEMO = (Path(__file__).resolve().parents[3] / "bags" / "demo").resolve()
 
 
 def parameters(**values: str) -> dict[str, dict[str, object]]:
