@@ -27,6 +27,8 @@ METHODS = ("nearest", "mahalanobis", "joint")
 
 _JOINT_PAIRS = 64
 """Pairs that are tested together; where there are more, the others are tested against what these say."""
+MAX_VARIANCE_FACTOR = 16.0
+"""Submaps too sure of themselves by up to this factor are matched all the same."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,6 @@ class AssociationConfig(Config):
     probability: float = 0.999
     """Share of true pairs inside a chi-square gate."""
     nearest_gate: float = parameter(0.3, "distance below which the nearest neighbour is taken", unit="m", minimum=0.0)
-    max_variance_factor: float = 16.0
-    """Submaps too sure of themselves by up to this factor are matched all the same."""
     position_noise: float = 0.005
     """Standard deviation added to each landmark when gating: submaps are linearised (m)."""
 
@@ -180,7 +180,7 @@ def _compatible(
     scale = 1.0
     while True:
         solved = _solve(first, second, pairs, prior, config)
-        scale = min(max(scale, variance_factor(solved.nis)), config.max_variance_factor)
+        scale = min(max(scale, variance_factor(solved.nis)), MAX_VARIANCE_FACTOR)
         bound = scale * chi_square_bound(config.probability, max(solved.dof, 1))
         outlier = solved.nis > scale * chi_square_bound(config.probability, 3)
         if len(pairs) == 0 or (solved.chi2 <= bound and not outlier.any()):

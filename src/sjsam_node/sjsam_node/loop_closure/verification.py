@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sjsam_node.graph.links import Prior, Status
-from sjsam_node.loop_closure.association import (
+from sjsam_node.loop_closure.association import (  # fmt: skip
+    MAX_VARIANCE_FACTOR,
     Alignment,
     AssociationConfig,
     PointSet,
@@ -21,7 +22,7 @@ from sjsam_node.loop_closure.association import (
     match,
     mutual_best,
     similarity,
-)  # fmt: skip
+)
 from sjsam_node.loop_closure.evidence import evidence_of
 from sjsam_node.loop_closure.place_recognition import PlaceRecognitionConfig
 from slam_core.config import Config, group, parameter
@@ -131,7 +132,7 @@ class Verifier:
         found = match(first, second, prior, self.config.association)
         if len(found.pairs) < 3:
             return found
-        loose = self.config.association.max_variance_factor * prior.covariance
+        loose = MAX_VARIANCE_FACTOR * prior.covariance
         more = match(first, second, Prior(found.T, loose), self.config.association)
         return more if len(more.pairs) > len(found.pairs) else found
 

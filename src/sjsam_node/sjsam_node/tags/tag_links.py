@@ -17,9 +17,16 @@ import numpy as np
 
 from sjsam_node.graph.links import Link, Prior, Status
 from sjsam_node.graph.map_graph import MapGraph
-from sjsam_node.loop_closure.association import Alignment, AssociationConfig, PointSet, align, jointly_compatible
+from sjsam_node.loop_closure.association import (
+    MAX_VARIANCE_FACTOR,
+    Alignment,
+    AssociationConfig,
+    PointSet,
+    align,
+    jointly_compatible,
+)
 from sjsam_node.loop_closure.point_sets import at_end, at_start
-from sjsam_node.loop_closure.verification import Verifier
+from sjsam_node.loop_closure.verification import CLOSURE_PROBABILITY, Verifier
 from sjsam_node.smoothing.estimate import MapEstimate
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.estimation.rigid_alignment import umeyama
@@ -34,9 +41,6 @@ _MOST_COMPARED = 6
 """Older submaps that a new one is compared with by its tags."""
 _FREE = 1e4 * np.eye(6)
 """Covariance (m2, rad2) of a pose that nothing is known of."""
-_PROBABILITY = 0.9999
-_MAX_VARIANCE_FACTOR = 16.0
-"""Submaps may be too sure of themselves by this."""
 _SAME_PLACE = 0.5
 """Distance in edges below which two tags would cover each other."""
 _ELSEWHERE = 4.0
@@ -177,7 +181,7 @@ def with_tag_links(links: Sequence[Link], by_tags: Sequence[Link]) -> list[Link]
             continue
         apart = boxminus(link.T, other.T)
         nis = apart @ np.linalg.solve(link.covariance + other.covariance, apart)
-        if nis <= _MAX_VARIANCE_FACTOR * chi_square_bound(_PROBABILITY, 6):
+        if nis <= MAX_VARIANCE_FACTOR * chi_square_bound(CLOSURE_PROBABILITY, 6):
             tagged[link.ends] = replace(link, pairs=np.concatenate([link.pairs, other.pairs]))
     return out + list(tagged.values())
 
