@@ -92,10 +92,9 @@ def test_a_controller_sees_no_jump_and_knows_how_much_is_held_back(submaps: list
             bench.spin_until(lambda: False, 0.01)
         assert bench.spin_until(lambda: len(controller.transforms()) > 3)
         assert np.array_equal(controller.transforms()[-1][1], np.eye(4)), "nothing is joined yet"
-        bench.send(submaps)
-        assert bench.spin_until(lambda: bench.counters["submaps joined"] == len(submaps))
+        bench.send(submaps[:1])  # by another one the estimate would change on the way
+        assert bench.spin_until(lambda: bench.counters["submaps joined"] == 1)
         assert "correction_held_back_m" in bench.node.health.values
-        joined_ns = controller.now_ns + 1_200_000_000  # no stamp is later while no odometry comes
         wanted = bench.node.placements[""].tracker.T_map_odom
 
         def arrived() -> bool:
@@ -123,10 +122,13 @@ def test_a_controller_sees_no_jump_and_knows_how_much_is_held_back(submaps: list
     ), "/tf is the same"
 
     behind = []
-    for message in (m for m in bench.received["map_to_odom_pose"] if stamp_ns(m) > joined_ns):
+    for message in bench.received["map_to_odom_pose"]:
+        T = matrix(message.pose.pose.position, message.pose.pose.orientation)
+        if np.array_equal(T, np.eye(4)):
+            continue  # nothing was joined yet
         covariance = np.reshape(message.pose.covariance, (6, 6))
         assert np.linalg.eigvalsh(covariance)[0] > 0.0
-        rest = wanted[:3, 3] - matrix(message.pose.pose.position, message.pose.pose.orientation)[:3, 3]
+        rest = wanted[:3, 3] - T[:3, 3]
         assert rest @ np.linalg.solve(covariance[:3, :3], rest) < 1.0, "what is held back is within one sigma"
         behind.append(np.linalg.norm(rest))
     assert behind[0] > 1.0
