@@ -32,6 +32,8 @@ _MOVE_ANGLE_DEG = 0.3
 """Or turns by more, deg."""
 _MOVES_AT_ONCE = 40
 """Key frames moved in one step."""
+_MOVABLE_KEYFRAMES = 1500
+"""Key frames kept to be moved; the oldest beyond that stay where they are."""
 
 PoseLookup = Callable[[str, int], FloatArray | None]
 """T_map_camera of a camera at a stamp, or None where it is not known (any more)."""
@@ -43,9 +45,6 @@ class DenseConfig(Config):
 
     use_tof: bool = parameter(True, "depth of the ToF or depth camera, where there is one")
     use_stereo: bool = parameter(True, "depth of the stereo camera, where there is one")
-    max_keyframes: int = parameter(
-        1500, "key frames kept to be moved; the oldest beyond that stay where they are", minimum=1
-    )
     keyframe: KeyframeConfig = group(KeyframeConfig)
     stereo: StereoDepthConfig = group(StereoDepthConfig)
     tsdf: TsdfConfig = group(TsdfConfig)
@@ -99,7 +98,7 @@ class DenseModel:
         if self._fixed:
             placed.keyframe = thinned(keyframe, RAY_STEP)
         self._placed.append(placed)
-        del self._placed[: -self.config.max_keyframes]
+        del self._placed[:-_MOVABLE_KEYFRAMES]
 
     def move(self, lookup: PoseLookup, most: int | None = None) -> int:
         """Move key frames whose pose has changed, ``most`` at once (default ``moves_at_once``); returns how many."""

@@ -20,6 +20,8 @@ _MAX_PIXELS = 320 * 240
 
 _DEPTH_UNIT = 0.00025
 _SIGMA_UNIT = 0.0005
+_MAX_SIGMA = 0.12
+"""Standard deviation of depth beyond which a pixel is left out, m; the largest that a byte of ``_SIGMA_UNIT`` holds."""
 _ANGLE_DEG = 11.0
 """Turn since the last key frame from which on a frame becomes one, deg."""
 
@@ -31,9 +33,6 @@ class KeyframeConfig(Config):
     distance: float = parameter(0.22, "a key frame every so much way", unit="m", minimum=0.01)
     min_depth: float = parameter(0.3, "depth below which a pixel is left out", unit="m", minimum=0.0)
     max_depth: float = parameter(5.0, "depth beyond which a pixel is left out", unit="m", minimum=0.5, maximum=16.0)
-    max_sigma: float = parameter(
-        0.12, "standard deviation of depth beyond which a pixel is left out", unit="m", minimum=1e-3, maximum=0.12
-    )
 
 
 class KeyframeSelector:
@@ -98,7 +97,7 @@ def make_keyframe(image: DepthImage, config: KeyframeConfig, picture: ByteArray 
         picture = np.repeat(picture[..., None], 3, axis=2)
     depth, sigma, camera = image.depth, image.sigma, image.camera
     with np.errstate(invalid="ignore"):
-        good = (depth >= config.min_depth) & (depth <= config.max_depth) & (sigma <= config.max_sigma)
+        good = (depth >= config.min_depth) & (depth <= config.max_depth) & (sigma <= _MAX_SIGMA)
     depth, sigma = np.where(good, depth, 0.0).astype(np.float32), np.where(good, sigma, 0.0).astype(np.float32)
     # Every other pixel, not a mean: a mean over an edge would be a point in the air.
     spacing = thinning(depth.shape)

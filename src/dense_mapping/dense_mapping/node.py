@@ -48,6 +48,9 @@ from stereo_frontend.stage import StereoStage
 from stereo_frontend.stereo.calibrated_pairs import SIDES
 from stereo_frontend.stereo.rectification_error import RectificationError
 
+_PUBLISH_PERIOD_S = 5.0
+"""Least time from one model published to the next."""
+
 
 @dataclass(frozen=True)
 class DenseNodeConfig(DenseConfig):
@@ -56,7 +59,6 @@ class DenseNodeConfig(DenseConfig):
     agents: tuple[str, ...] = parameter(("",), "namespaces of the agents whose cameras make the model")
     map_frame: str = parameter("map", "frame of the map")
     base_frame: str = parameter("base_link", "frame of each agent's rig, below its namespace")
-    publish_period_s: float = parameter(5.0, "least time from one model published to the next", unit="s", minimum=0.5)
     output_path: str = parameter("dense", "folder that ~/save writes: mesh.ply, floor_plan*.yaml and .pgm")
 
 
@@ -76,9 +78,7 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         for agent in self.config.agents:
             self._listen_to(agent)
         self.create_service(Trigger, "~/save", self._on_save)
-        self.create_timer(
-            self.config.publish_period_s, self._publish_news, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        self.create_timer(_PUBLISH_PERIOD_S, self._publish_news, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def on_reset(self) -> None:
         """Forget the model."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,10 @@ import pytest
 from ndt_registration.odometry import OdometryConfig
 from ndt_registration.registration import RegistrationConfig
 from slam_bringup.pipeline.configuration import SystemConfig, choose, load_system_config, system_config
+from slam_bringup.pipeline.node_table import node_named
 from slam_bringup.pipeline.overrides import overrides_of, parse_assignments, read_overrides
 from slam_bringup.processes.node_graph import live_nodes
+from slam_core.config import changed, iterate_parameters
 
 ROS_FORM = """
 /**:
@@ -110,3 +113,24 @@ def test_parameters_in_one_line() -> None:
 def test_icp_is_point_to_plane_unless_point_to_point_is_configured(odometry, configured, method):
     config = SystemConfig(ndt_odometry=OdometryConfig(registration=RegistrationConfig(method=configured)))
     assert choose(config, "tof", "sjsam", odometry).ndt_odometry.registration.method == method
+
+
+PAGE = Path(__file__).parents[3] / "docs" / "configuration.md"
+BLOCKS = [*re.findall(r"```yaml\n(.*?)```", PAGE.read_text(), re.DOTALL), PAGE.with_suffix(".yaml").read_text()]
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block[:20].splitlines()[0])
+def test_numbers_of_the_page_are_taken_by_the_nodes_that_it_names(tmp_path: Path, block: str) -> None:
+    pytest.importorskip("rclpy")
+    path = written(tmp_path, block)
+    load_system_config(path)
+    for node, _ in read_overrides(path).rules:
+        values = read_overrides(path).of(f"/{node}")
+        config = node_named(node).load_config_class()()
+        found = {name: value for name, value, _ in iterate_parameters(changed(config, values))}
+        assert {name: found[name] for name in values} == values
+
+
+def test_the_file_to_copy_holds_defaults_alone() -> None:
+    assert load_system_config(PAGE.with_suffix(".yaml")) == load_system_config(None)

@@ -34,6 +34,7 @@ from sjsam_node.loop_closure.verification import (
     MAX_PENDING_LINKS,
     MIN_NEAR_INLIERS,
     NEAR_CANDIDATES,
+    NEAR_DISTANCE,
     RANSAC_DISTANCE,
     ClosureConfig,
     Verifier,
@@ -66,7 +67,7 @@ class LoopDetector:
         self.verifier = Verifier(self.config)
         self.index = PlaceIndex(self.config.places)
         noise = self.config.association.position_noise
-        self.near = NearPairs(self.config.proximity, 4 * NEAR_CANDIDATES, noise)
+        self.near = NearPairs(NEAR_DISTANCE, 4 * NEAR_CANDIDATES, noise)
 
     @property
     def graph(self) -> MapGraph:
@@ -145,7 +146,7 @@ class LoopDetector:
         candidates = np.array([i for i in records if i not in excluded and not state.is_redundant(i)], dtype=np.int64)
         distance = np.linalg.norm(state.middles(candidates) - middle, axis=1)
         ranked = sorted((d, i) for d, i in zip(distance.tolist(), candidates.tolist(), strict=True)
-                        if d < self.config.proximity)  # fmt: skip
+                        if d < NEAR_DISTANCE)  # fmt: skip
         return [i for _, i in ranked[:NEAR_CANDIDATES]]
 
     def _near(self, new: int, recent: set[int]) -> list[int]:

@@ -31,6 +31,8 @@ from slam_core.estimation.rigid_alignment import ransac_rigid_transform
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
+NEAR_DISTANCE = 3.0
+"""Distance between the middles of submaps that are tried as near (m)."""
 NEAR_CANDIDATES = 3
 """Near submaps tried per new one."""
 LEAST_NEWS_SHARE = 0.1
@@ -67,9 +69,6 @@ CLOSURE_PROBABILITY = 0.9999
 class ClosureConfig(Config):
     """Conditions on a link between submaps for it to be believed."""
 
-    proximity: float = parameter(
-        3.0, "distance between the middles of submaps that are tried as near", unit="m", minimum=0.0
-    )
     drift: float = parameter(
         0.01, "drift of odometry to expect beyond its covariance, per metre of way, one sigma", unit="m/m", minimum=0.0
     )
