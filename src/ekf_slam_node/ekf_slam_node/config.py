@@ -59,6 +59,13 @@ class InertialConfig(ImuConfig):
         minimum=-1.0,
         maximum=1.0,
     )
+    sigma_time_offset: float = parameter(
+        0.001,
+        "by how much time_offset may be wrong as long as the images show no more; 0: it is exact, nothing is learnt",
+        unit="s",
+        minimum=0.0,
+        maximum=0.05,
+    )
 
 
 @dataclass(frozen=True)

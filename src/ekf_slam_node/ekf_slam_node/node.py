@@ -134,6 +134,7 @@ class EkfNode(StageNode[EkfNodeConfig]):
             self.health.set(_STATES[result.state], result.reason)
             self.health.take(self.stage.counters.counts)
             self.health.show("rolling_shutter", self.stage.shutter_finding or "none seen")
+            self.health.show("imu_clock", self.stage.clock_finding or "as the images'")
             self.health.show("odometry", self.stage.odometry_finding or "none heard")
             self.health.show("moving_objects", self.stage.moving_objects or "none seen")
 

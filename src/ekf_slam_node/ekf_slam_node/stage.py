@@ -23,6 +23,8 @@ from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams
 from slam_core.types import Counters, Features, ImuSample, OdometryReading, RelativeMotion, Submap
 
 MOTION, IMU, ODOMETRY = STREAMS = "motion", "imu", "odometry"
+_SIGNIFICANT_LATE_S, _SIGNIFICANT_SIGMAS = 3e-3, 4.0
+"""A difference of the clocks so large is told."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ class FilterStage:
     @property
     def diagnostic(self) -> str:
         """Findings about camera and odometry that a user should know of, or ""."""
-        return "; ".join(filter(None, [self.shutter_finding, self.odometry_finding]))
+        return "; ".join(filter(None, [self.shutter_finding, self.clock_finding, self.odometry_finding]))
 
     @property
     def shutter_finding(self) -> str:
@@ -142,6 +144,20 @@ class FilterStage:
         readout, sigma = (1e3 * s for s in self.readout_s)
         rows = "first row to the last" if readout > 0.0 else "last row to the first"
         return f"rolling shutter: {abs(readout):.1f} +- {sigma:.1f} ms from the {rows}, corrected" if readout else ""
+
+    @property
+    def imu_late_s(self) -> tuple[float, float]:
+        """Time to be added to the IMU's stamps and its standard deviation, s; zeros where it is not significant."""
+        late, sigma = (0.0, 0.0) if self._slam is None else self._slam.imu_late_s
+        if abs(late) < max(_SIGNIFICANT_SIGMAS * sigma, _SIGNIFICANT_LATE_S):
+            return 0.0, 0.0
+        return self._config.imu.time_offset + late, sigma
+
+    @property
+    def clock_finding(self) -> str:
+        """Finding about the IMU's clock, or ""."""
+        late, sigma = (1e3 * s for s in self.imu_late_s)
+        return f"IMU: its stamps are {-late:+.1f} +- {sigma:.1f} ms off, corrected" if sigma else ""
 
     @property
     def odometry_finding(self) -> str:
@@ -194,6 +210,7 @@ class FilterStage:
         slam = self._filter(features)
         self._give_aids(slam, features.stamp_ns)
         result = slam.process(features)
+        self._awaited.is_late(IMU, slam.imu_late_ns)
         if result.state is TrackingState.OK and (diagnostic := self._awaited.diagnostic() or slam.diagnostic):
             result = replace(result, state=TrackingState.DEGRADED, reason=diagnostic)
         return FrameResult(result, len(features))
@@ -213,7 +230,7 @@ class FilterStage:
         """
         while self._motions and self._motions[0].start_stamp_ns < stamp_ns:
             slam.process_motion(self._motions.popleft())
-        while self._samples and self._last_sample_ns < stamp_ns:
+        while self._samples and self._last_sample_ns + slam.imu_late_ns < stamp_ns:
             sample = self._samples.popleft()
             self._last_sample_ns = sample.stamp_ns
             slam.process_imu(sample)

@@ -69,6 +69,11 @@ def test_preintegral_knows_its_errors() -> None:
     for axis, step in enumerate(np.eye(6) * 1e-4):
         change = as_vector(integrated(samples, 0.5, step), exact) / 1e-4
         np.testing.assert_allclose(exact.J[:, axis], change, atol=0.02)
+    longer = buffer(readings(1.0, np.random.default_rng(0), 0.0, 0.0))
+    now, earlier = (longer.integrate(10**8 - t, 6 * 10**8 - t, np.zeros(6), NOISE) for t in (0, 10**6))
+    assert now is not None
+    assert earlier is not None
+    np.testing.assert_allclose(now.J[:, 6], as_vector(earlier, now) / 1e-3, atol=0.02)
     rng, errors = np.random.default_rng(1), []
     for _ in range(300):
         noisy = [
@@ -93,12 +98,14 @@ def test_missing_readings_are_said_to_be_unknown() -> None:
     assert not buffer(samples).add(samples[-1])
 
 
-def followed(samples: list[ImuSample], seconds: float, rng: np.random.Generator) -> RelativePoseBuffer:
+def followed(
+    samples: list[ImuSample], seconds: float, rng: np.random.Generator, config: InertialConfig | None = None
+) -> RelativePoseBuffer:
     """Aids that were told at 10 Hz of the motions that the images show."""
-    aids = RelativePoseBuffer(MotionConfig(), InertialConfig())
+    aids = RelativePoseBuffer(MotionConfig(), config or InertialConfig())
     coming = iter(samples)
     for k in range(1, round(10 * seconds) + 1):
-        while aids.newest_stamp_ns < k * STEP_NS:
+        while aids.newest_stamp_ns < k * STEP_NS - aids.imu_late_ns:
             aids.add_imu(next(coming))
         T = invert_transform(carried(0.1 * (k - 1))) @ carried(0.1 * k)
         aids.moved((k - 1) * STEP_NS, k * STEP_NS, boxplus(T, SEEN * rng.standard_normal(6)), np.diag(SEEN**2))
@@ -119,13 +126,30 @@ def test_states_become_known_and_stay_honest() -> None:
                 aids.inertial.velocity - velocity(6.0),
                 aids.inertial.gravity + 9.81 * truth[:3, :3].T @ Z,
                 aids.inertial.biases - np.concatenate([GYRO_BIAS, ACCELEROMETER_BIAS]),
+                [aids.inertial.time_offset],
             ]
         )
-        values.append(error @ np.linalg.solve(aids.inertial.covariance, error) / 12)
+        values.append(error @ np.linalg.solve(aids.inertial.covariance, error) / 13)
         claimed.append(aids.inertial.sigma_tilt)
         assert aids.inertial.uses_force
     assert 0.2 < np.mean(values) < 1.3
     assert np.degrees(np.max(claimed)) < 0.4
+
+
+@pytest.mark.parametrize("late_s", [0.02, -0.02])
+def test_the_offset_of_a_clock_is_found_to_a_millisecond(late_s: float) -> None:
+    squared = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        samples = [replace(s, stamp_ns=s.stamp_ns - round(1e9 * late_s)) for s in readings(8.1, rng)]
+        aids = followed(samples, 8.0, rng, InertialConfig())
+        error = aids.inertial.time_offset - late_s
+        assert abs(error) < 1e-3
+        squared.append((error / aids.inertial.sigma_time_offset) ** 2)
+        assert aids.inertial.sigma_time_offset < 1e-3
+        exact = followed(samples, 8.0, np.random.default_rng(seed), InertialConfig(sigma_time_offset=0.0))
+        assert exact.inertial.time_offset == 0.0
+    assert np.mean(squared) < 2.5
 
 
 def test_three_seconds_are_bridged_within_what_is_claimed() -> None:

@@ -2,7 +2,8 @@
 """Velocity, gravity and the biases of an IMU, in one filter that goes on from submap to submap.
 
 State at the newest linked frame, along the rig's axes there: velocity of the IMU v, gravity g, biases b_g and b_a of
-gyroscope and accelerometer. Preintegrated readings (``preintegration``) predict the motion to the next frame,
+gyroscope and accelerometer, and what is to be added to the IMU's stamps, s (Li and Mourikis 2014). Preintegrated
+readings (``preintegration``) predict the motion to the next frame,
 
     R = R_pre,   p = v dt + g dt^2 / 2 + p_pre,   v <- R' (v + g dt + v_pre),   g <- R' g,
 
@@ -19,11 +20,12 @@ left out, with a reason, and the gyroscope is used alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ekf_slam_node.config import InertialConfig, MotionConfig
+from ekf_slam_node.odometry.clock_watch import ClockWatch
 from ekf_slam_node.odometry.preintegration import ImuNoise, Preintegral
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxminus, make_transform, skew, so3_exp
@@ -36,6 +38,8 @@ _GYROSCOPE_BIAS_WALK = 1e-4
 """Change (rad/s) of a gyroscope's bias within a second, growing with the root of the time."""
 _ACCELEROMETER_BIAS_WALK = 1e-3
 """Change (m/s2) of an accelerometer's bias within a second, growing with the root of the time."""
+_CLOCK_WALK = 1e-5
+"""Change (s) of the clocks' difference within a second, growing with the root of the time."""
 _GRAVITY_SPREAD = 0.03
 """Spread (m/s2) of gravity's size over the earth, with an accelerometer's scale."""
 _GRAVITY_RANGE = (0.8, 1.25)
@@ -56,7 +60,7 @@ _KNOWN = 0.5
 _UPRIGHT = np.radians(2.0)
 """Gravity must be known to this angle before anything is bridged."""
 
-V, G, B = slice(0, 3), slice(3, 6), slice(6, 12)
+V, G, B = slice(0, 3), slice(3, 6), slice(6, 13)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +68,8 @@ class Prediction:
     """Motion over dt (s).
 
     T: (4, 4) of the IMU's place, along the rig's axes. velocity, gravity: (3,) at the end, along the axes of the
-    start. covariance: (18, 18) of the errors of (p, turn, velocity, gravity, biases).
+    start. covariance: (19, 19) of the errors of (p, turn, velocity, gravity, biases, time offset). J_turn: (3, 4)
+    derivative of the turn with respect to the gyroscope's bias and the time offset.
     """
 
     dt: float
@@ -72,12 +77,14 @@ class Prediction:
     velocity: FloatArray
     gravity: FloatArray
     covariance: FloatArray
+    J_turn: FloatArray
 
 
 class InertialFilter:
-    """Twelve states of a rig with an IMU; see the module.
+    """Thirteen states of a rig with an IMU; see the module.
 
-    velocity, gravity: (3,) m/s and m/s2; biases: (6,) rad/s and m/s2; covariance: (12, 12) of all, in this order.
+    velocity, gravity: (3,) m/s and m/s2; biases: (6,) rad/s and m/s2; time_offset: s; covariance: (13, 13) of all, in
+    this order.
     ``uses_force``: whether the accelerometer is used; ``uses_turns``: whether the IMU is used at all; ``diagnostic``
     says why not, or is "" (also where there is no accelerometer).
     """
@@ -90,20 +97,21 @@ class InertialFilter:
             motion.sigma_initial_turn_rate,
             motion.sigma_acceleration,
         )
-        self.biases = np.zeros(6)
-        self.covariance = np.zeros((12, 12))
-        sigma = np.repeat([config.gyroscope_bias, config.accelerometer_bias], 3)
+        self.biases, self.time_offset = np.zeros(6), 0.0
+        self.covariance = np.zeros((13, 13))
+        sigma = np.append(np.repeat([config.gyroscope_bias, config.accelerometer_bias], 3), config.sigma_time_offset)
         self.covariance[B, B] = np.diag(sigma**2)
+        self._clock = ClockWatch(config.gyroscope_bias) if config.sigma_time_offset > 0.0 else None
         self.uses_force, self.uses_turns, self.diagnostic = True, True, ""
         self._variance_scale, self._turn_variance_scale, self._judged = 1.0, 1.0, 0
         self._first_force = self._first_s = 0.0
         self.forget_motion()
 
     def forget_motion(self) -> None:
-        """Velocity and gravity are unknown from here on: readings were missing. The biases stay."""
+        """Velocity and gravity are unknown from here on: readings were missing. The biases and the clock stay."""
         self.velocity, self.gravity = np.zeros(3), np.zeros(3)
         biases = self.covariance[B, B].copy()
-        self.covariance = np.zeros((12, 12))
+        self.covariance = np.zeros((13, 13))
         self.covariance[B, B] = biases
         self._steps = 0
         self._is_sized = False
@@ -112,6 +120,11 @@ class InertialFilter:
     def gyro_bias_covariance(self) -> FloatArray:
         """Covariance (3, 3) of the gyroscope's bias, rad2/s2."""
         return self.covariance[6:9, 6:9]
+
+    @property
+    def sigma_time_offset(self) -> float:
+        """Standard deviation of the time offset, s."""
+        return float(np.sqrt(self.covariance[12, 12]))
 
     @property
     def sigma_velocity(self) -> FloatArray:
@@ -154,19 +167,21 @@ class InertialFilter:
             self.covariance[V, V] = np.eye(3) * self._motion.sigma_initial_velocity**2
             self.covariance[G, G] = np.eye(3) * _HAND_SHAKE**2
         dt = pre.dt
-        F = np.zeros((18, 12))
+        F = np.zeros((19, 13))
         F[:3, V], F[:3, G], F[:3, B] = np.eye(3) * dt, np.eye(3) * (0.5 * dt**2), pre.J[6:]
         F[3:6, B] = pre.J[:3]
         F[6:9, V], F[6:9, G], F[6:9, B] = np.eye(3), np.eye(3) * dt, pre.J[3:6]
-        F[9:12, G], F[12:, B] = np.eye(3), np.eye(6)
+        F[9:12, G], F[12:, B] = np.eye(3), np.eye(7)
         covariance = F @ self.covariance @ F.T
         rows = np.array([3, 4, 5, 6, 7, 8, 0, 1, 2])
         covariance[np.ix_(rows, rows)] += pre.covariance
-        walk = np.repeat([_GYROSCOPE_BIAS_WALK, _ACCELEROMETER_BIAS_WALK], 3)
+        clock_walk = _CLOCK_WALK if self._clock is not None else 0.0
+        walk = np.append(np.repeat([_GYROSCOPE_BIAS_WALK, _ACCELEROMETER_BIAS_WALK], 3), clock_walk)
         covariance[12:, 12:] += np.diag(walk**2 * dt)
         p = self.velocity * dt + 0.5 * self.gravity * dt**2 + pre.p
         velocity = self.velocity + self.gravity * dt + pre.v
-        return Prediction(dt, make_transform(pre.R, p), velocity, self.gravity, covariance)
+        J_turn = pre.J[:3, [0, 1, 2, 6]]
+        return Prediction(dt, make_transform(pre.R, p), velocity, self.gravity, covariance, J_turn)
 
     def motion_covariance(self, step: Prediction) -> FloatArray:
         """Covariance (6, 6) of a predicted motion, larger by as much as predictions so far were off."""
@@ -174,7 +189,7 @@ class InertialFilter:
 
     def advance(self, step: Prediction) -> None:
         """Move on to the end of a prediction; nothing else is known of the motion."""
-        self._move(step, np.zeros(18), step.covariance)
+        self._move(step, np.zeros(19), step.covariance)
 
     def measure(self, step: Prediction, T: FloatArray, covariance: FloatArray) -> bool:
         """Move on to the end of a prediction, of which the images show the motion T (4, 4) +- covariance (6, 6).
@@ -182,6 +197,7 @@ class InertialFilter:
         T is that of the IMU's place along the rig's axes. False if the two contradict each other.
         """
         error = boxminus(T, step.T)
+        step = self._with_clock_checked(step, error[3:], covariance[3:, 3:])
         S = step.covariance[:6, :6] + covariance * max(self._variance_scale, 1.0)
         squared = _normalised(error[3:], S[3:, 3:])
         self._judge_turns(squared / 3.0)
@@ -199,6 +215,22 @@ class InertialFilter:
             P[6:9, 6:9] += np.eye(3) * float(error[:3] @ error[:3]) / step.dt**2
         self._move(step, gain @ error[rows], 0.5 * (P + P.T))
         return moves or (turns and not self.uses_force)
+
+    def _with_clock_checked(self, step: Prediction, turn_error: FloatArray, covariance: FloatArray) -> Prediction:
+        """The prediction, its clock as uncertain as the turns of all frames so far show it to be."""
+        if self._clock is None:
+            return step
+        known = np.append(self.biases[:3], self.time_offset)
+        self._clock.add(step.J_turn, turn_error + step.J_turn @ known, covariance)
+        wider = self._clock.contradicted(self.time_offset, self.sigma_time_offset)
+        if not wider:
+            return step
+        P = step.covariance.copy()
+        P[18, 18] += wider
+        P[3:6, 3:6] += wider * np.outer(step.J_turn[:, 3], step.J_turn[:, 3])
+        P[3:6, 18] += wider * step.J_turn[:, 3]
+        P[18, 3:6] = P[3:6, 18]
+        return replace(step, covariance=P)
 
     def check_specific_force(self, pre: Preintegral) -> None:
         """Judge the specific force of the first second: gravity is the most of it, whatever a hand does."""
@@ -236,11 +268,11 @@ class InertialFilter:
         turn = so3_exp(correction[3:6]) @ step.T[:3, :3]
         velocity, gravity = step.velocity + correction[6:9], step.gravity + correction[9:12]
         self.velocity, self.gravity = turn.T @ velocity, turn.T @ gravity
-        self.biases = self.biases + correction[12:]
-        M = np.zeros((12, 18))
+        self._correct_sensor(correction[12:])
+        M = np.zeros((13, 19))
         M[V, 6:9] = M[G, 9:12] = turn.T
         M[V, 3:6], M[G, 3:6] = turn.T @ skew(velocity), turn.T @ skew(gravity)
-        M[B, 12:] = np.eye(6)
+        M[B, 12:] = np.eye(7)
         self.covariance = M @ covariance @ M.T
         self._steps += 1
         if not self._is_sized and np.linalg.eigvalsh(self.covariance[G, G])[-1] < _KNOWN**2:
@@ -253,8 +285,11 @@ class InertialFilter:
         S = float(cross[G] @ -self.up) + _GRAVITY_SPREAD**2
         delta = cross * ((GRAVITY - float(np.linalg.norm(self.gravity))) / S)
         self.velocity, self.gravity = self.velocity + delta[V], self.gravity + delta[G]
-        self.biases = self.biases + delta[B]
+        self._correct_sensor(delta[B])
         self.covariance = self.covariance - np.outer(cross, cross) / S
+
+    def _correct_sensor(self, delta: FloatArray) -> None:
+        self.biases, self.time_offset = self.biases + delta[:6], self.time_offset + float(delta[6])
 
 
 def _followed(mean: float, normalised: float) -> float:

@@ -6,7 +6,12 @@ Neither velocity nor gravity is needed for it, so that these may stay unknowns o
     R = prod Exp((w - b_g) dt),   v = sum R (f - b_a) dt,   p = sum (v dt + R (f - b_a) dt^2 / 2)
 
 are the turn, the change of velocity and the way that a free fall would not explain; their errors (6 + 3, in this order
-of turn, v, p) depend linearly on those of the biases.
+of turn, v, p) depend linearly on those of the biases, and of the clock: readings stamped too early by e are those of
+a window that lies e later, so that the error is e times
+
+    w0 - R w1,   w0 x v + f0 - R f1,   w0 x p + f0 dt - v
+
+with rates w and forces f at the window's start (0) and end (1).
 """
 
 from __future__ import annotations
@@ -20,6 +25,8 @@ import numpy as np
 from slam_core.geometry import FloatArray, skew, so3_exp
 from slam_core.types import LONGEST_IMU_STEP_S, ImuSample
 
+_EDGE_S = np.linspace(-0.01, 0.01, 5)
+"""Rates at an edge are means around it: a single reading's noise would be taken for a change of the rates."""
 _LONGEST_S = 10.0
 """Nothing is integrated over longer times, and readings are kept for twice as long."""
 
@@ -41,7 +48,8 @@ class ImuNoise:
 class Preintegral:
     """Turn R (3, 3), change of velocity v (3,) m/s, way p (3,) m over dt (s).
 
-    J: (9, 6) derivative of the errors of (turn, v, p) with respect to the biases (gyroscope, accelerometer).
+    J: (9, 7) derivative of the errors of (turn, v, p) with respect to the biases (gyroscope, accelerometer) and to
+    what is to be added to the stamps, s.
     covariance: (9, 9) of their noise. force: (3,) mean specific force along the axes of the start, m/s2. reading: mean
     size of it as it was read, biases included.
     """
@@ -96,16 +104,19 @@ class ImuReadings:
         turn_rates = np.array([sample.angular_velocity for sample in self._samples])
         forces = np.array([sample.linear_acceleration for sample in self._samples])
         times = (stamps - start_ns).astype(np.float64)
-        at_middle = np.column_stack([np.interp(middle, times, column) for column in (*turn_rates.T, *forces.T)])
+        columns = (*turn_rates.T, *forces.T)
+        at_middle = np.column_stack([np.interp(middle, times, column) for column in columns])
+        around = np.array([[0.0], [end_ns - start_ns]]) + 1e9 * _EDGE_S
+        at_edges = np.stack([np.interp(around, times, column).mean(axis=1) for column in columns], axis=1)
         silent = np.clip(np.diff(edges) * 1e-9 - LONGEST_IMU_STEP_S, 0.0, None) > 0.0
         silent |= (middle < times[0]) | (middle > times[-1])
-        return _integrated(at_middle, biases, np.diff(edges) * 1e-9, silent, noise)
+        return _integrated(at_middle, at_edges, biases, np.diff(edges) * 1e-9, silent, noise)
 
 
 def _integrated(
-    readings: FloatArray, biases: FloatArray, dt: FloatArray, silent: np.ndarray, noise: ImuNoise
+    readings: FloatArray, at_edges: FloatArray, biases: FloatArray, dt: FloatArray, silent: np.ndarray, noise: ImuNoise
 ) -> Preintegral:
-    """Preintegral of readings (n, 6), each held for dt (n,) s."""
+    """Preintegral of readings (n, 6), each held for dt (n,) s; ``at_edges`` (2, 6) at start and end."""
     size = float(np.linalg.norm(readings[:, 3:], axis=1).mean())
     readings = readings - biases
     rates = readings[:, :3]
@@ -124,7 +135,9 @@ def _integrated(
         R,
         v[-1],
         p[-1],
-        _bias_jacobian(middle, force, dt),
+        np.column_stack(
+            [_bias_jacobian(middle, force, dt), _clock_jacobian(R, v[-1], p[-1], at_edges - biases, dt.sum())]
+        ),
         _noise_covariance(v, p, dt, until, silent, noise),
         v[-1] / dt.sum(),
         size,
@@ -143,6 +156,12 @@ def _bias_jacobian(middle: FloatArray, force: FloatArray, dt: FloatArray) -> Flo
     J = np.zeros((9, 6))
     J[:3, :3], J[3:6], J[6:] = turn[-1], v[-1], p
     return J
+
+
+def _clock_jacobian(R: FloatArray, v: FloatArray, p: FloatArray, at_edges: FloatArray, dt: float) -> FloatArray:
+    """Derivative (9,) with respect to what is to be added to the stamps."""
+    (w0, f0), (w1, f1) = np.split(at_edges[0], 2), np.split(at_edges[1], 2)
+    return np.concatenate([w0 - R @ w1, np.cross(w0, v) + f0 - R @ f1, np.cross(w0, p) + f0 * dt - v])
 
 
 def _noise_covariance(

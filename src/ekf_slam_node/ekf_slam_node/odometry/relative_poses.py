@@ -26,6 +26,8 @@ from slam_core.types import ImuSample, OdometryReading, RelativeMotion
 
 _AID_STAMP_TOLERANCE = 0.005
 """Largest difference of the stamps of a motion aid and of the frames it joins."""
+_KEPT_BEFORE_NS = 200_000_000
+"""Readings so much older than a frame may still be those of its time, once the clocks' difference is known."""
 MEAN_TURN_RATE_SIGMA = 0.02
 """Noise (rad/s) of an IMU's mean turn rate between two frames, of clocks and mounting too."""
 _SIGMA_TURN_RATE = 0.1
@@ -201,7 +203,7 @@ class RelativePoseBuffer:
         """Drop what lies before the frame the filter has reached; the last of it stays, it may go on."""
         older = sum(motion.end_stamp_ns <= stamp_ns for motion in self._motions)
         del self._motions[: max(older - 1, 0)]
-        self._readings.forget_before(stamp_ns)
+        self._readings.forget_before(stamp_ns - _KEPT_BEFORE_NS)
         learning_ns = self.external.window_start_ns
         self.external.readings.forget_before(stamp_ns if learning_ns is None else learning_ns)
 
@@ -220,7 +222,7 @@ class RelativePoseBuffer:
     def _turns(self, start_stamp_ns: int, end_stamp_ns: int) -> Preintegral | None:
         if not self.inertial.is_proven:
             return None
-        return self._readings.integrate(start_stamp_ns, end_stamp_ns, self.inertial.biases, self.inertial.noise)
+        return self._integrated(start_stamp_ns, end_stamp_ns)
 
     # ---- scans
     def _motion_between(self, start_stamp_ns: int, end_stamp_ns: int) -> RelativePoseMeasurement | None:
@@ -265,9 +267,17 @@ class RelativePoseBuffer:
     def _preintegral(self, start_stamp_ns: int, end_stamp_ns: int) -> Preintegral | None:
         """Preintegral with the present biases; the newest one is kept until they change."""
         if self._newest[:2] != (start_stamp_ns, end_stamp_ns):
-            pre = self._readings.integrate(start_stamp_ns, end_stamp_ns, self.inertial.biases, self.inertial.noise)
-            self._newest = start_stamp_ns, end_stamp_ns, pre
+            self._newest = start_stamp_ns, end_stamp_ns, self._integrated(start_stamp_ns, end_stamp_ns)
         return self._newest[2]
+
+    def _integrated(self, start_stamp_ns: int, end_stamp_ns: int) -> Preintegral | None:
+        start_ns, end_ns = start_stamp_ns - self.imu_late_ns, end_stamp_ns - self.imu_late_ns
+        return self._readings.integrate(start_ns, end_ns, self.inertial.biases, self.inertial.noise)
+
+    @property
+    def imu_late_ns(self) -> int:
+        """Time to be added to the IMU's stamps, as it was learnt, ns."""
+        return round(1e9 * self.inertial.time_offset)
 
     def _is_same_time(self, a: int, b: int) -> bool:
         return abs(a - b) <= _AID_STAMP_TOLERANCE * 1e9

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the turns that the images show come later or earlier than those of a gyroscope.
+
+A filter that thinks its clocks far apart to begin with knows gravity less well for many seconds. So the filter begins
+with clocks that agree, and this says when they do not: by a least-squares fit of the gyroscope's bias and of the
+clocks' difference to all turns so far.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam_core.geometry import FloatArray
+
+_SIGMA_S = 0.05
+"""Difference of two clocks beforehand."""
+_FORGETTING = 0.999
+"""Weight of the past at every turn: clocks drift."""
+_SIGMAS = 5.0
+"""A difference is believed beyond so many standard deviations."""
+_LEAST_S = 2e-3
+"""And from here on: less is in the noise of what a driver calls the time of an image."""
+
+
+class ClockWatch:
+    """Fits (bias rad/s, time offset s) to turns; ``gyroscope_bias``: standard deviation of the bias beforehand."""
+
+    def __init__(self, gyroscope_bias: float) -> None:
+        self._information = np.diag(1.0 / np.square([*3 * [max(gyroscope_bias, 1e-6)], _SIGMA_S]))
+        self._vector = np.zeros(4)
+
+    def add(self, J: FloatArray, turn: FloatArray, covariance: FloatArray) -> None:
+        """Take a turn (3,) beyond that of the readings as they are, its derivative (3, 4) and covariance (3, 3)."""
+        weighted = np.linalg.solve(covariance, J).T
+        self._information = _FORGETTING * self._information + weighted @ J
+        self._vector = _FORGETTING * self._vector + weighted @ turn
+
+    def contradicted(self, time_offset: float, sigma: float) -> float:
+        """Variance (s2) to be added to that of a time offset +- sigma, s, so that it may become the one found; or 0."""
+        P = np.linalg.inv(self._information)
+        apart = float(P[3] @ self._vector) - time_offset
+        bound = max(_SIGMAS * float(np.sqrt(P[3, 3])), _LEAST_S, _SIGMAS * sigma)
+        return apart**2 if abs(apart) > bound else 0.0
