@@ -178,11 +178,6 @@ class EkfSlam:
         inertial = self._aids.inertial
         return (inertial.time_offset, inertial.sigma_time_offset) if self._aids.newest_stamp_ns >= 0 else (0.0, 0.0)
 
-    @property
-    def imu_late_ns(self) -> int:
-        """Time to be added to the IMU's stamps, as it was learnt, ns."""
-        return self._aids.imu_late_ns
-
     def landmark_view(self) -> LandmarkView:
         """The landmarks of the open submap after the newest frame."""
         return self._chain.landmark_view()

@@ -147,11 +147,15 @@ class FilterStage:
 
     @property
     def imu_late_s(self) -> tuple[float, float]:
-        """Time to be added to the IMU's stamps and its standard deviation, s; zeros where it is not significant."""
+        """Time to be added to the IMU's stamps and its standard deviation, s; zeros where nothing is to be changed."""
+        late, sigma = self._imu_late
+        return (self._config.imu.time_offset + late, sigma) if sigma else (0.0, 0.0)
+
+    @property
+    def _imu_late(self) -> tuple[float, float]:
+        """Time to be added beyond the parameter, and its standard deviation, s; zeros where it is not significant."""
         late, sigma = (0.0, 0.0) if self._slam is None else self._slam.imu_late_s
-        if abs(late) < max(_SIGNIFICANT_SIGMAS * sigma, _SIGNIFICANT_LATE_S):
-            return 0.0, 0.0
-        return self._config.imu.time_offset + late, sigma
+        return (late, sigma) if abs(late) >= max(_SIGNIFICANT_SIGMAS * sigma, _SIGNIFICANT_LATE_S) else (0.0, 0.0)
 
     @property
     def clock_finding(self) -> str:
@@ -210,7 +214,7 @@ class FilterStage:
         slam = self._filter(features)
         self._give_aids(slam, features.stamp_ns)
         result = slam.process(features)
-        self._awaited.is_late(IMU, slam.imu_late_ns)
+        self._awaited.is_late(IMU, round(1e9 * self._imu_late[0]))
         if result.state is TrackingState.OK and (diagnostic := self._awaited.diagnostic() or slam.diagnostic):
             result = replace(result, state=TrackingState.DEGRADED, reason=diagnostic)
         return FrameResult(result, len(features))
@@ -230,7 +234,8 @@ class FilterStage:
         """
         while self._motions and self._motions[0].start_stamp_ns < stamp_ns:
             slam.process_motion(self._motions.popleft())
-        while self._samples and self._last_sample_ns + slam.imu_late_ns < stamp_ns:
+        late_ns = round(1e9 * self._imu_late[0])
+        while self._samples and self._last_sample_ns + late_ns < stamp_ns:
             sample = self._samples.popleft()
             self._last_sample_ns = sample.stamp_ns
             slam.process_imu(sample)

@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +93,23 @@ def test_bad_input_is_refused_and_leaves_nothing(data_dir: Path, tmp_path: Path)
         with pytest.raises(ValueError, match=message):
             run(*arguments, "-o", str(out))
     assert not out.exists()
+
+
+@pytest.mark.data
+def test_refine_writes_the_offset_of_the_imu_that_the_next_run_knows(data_dir: Path, tmp_path: Path) -> None:
+    """The IMU's stamps of a real recording, 20 ms too early."""
+    late_ns, source, copy, out = 20_000_000, data_dir / "euroc_mh01_10hz", tmp_path / "mh01", tmp_path / "out"
+    shutil.copytree(source, copy, copy_function=os.symlink)
+    (table,) = copy.rglob("imu0/data.txt")
+    early = re.sub(r"(?m)^\d+", lambda stamp: str(int(stamp[0]) - late_ns), table.read_text())
+    table.unlink()  # a link
+    table.write_text(early)
+    bag = tmp_path / "mh01.mcap"
+    slam(["convert", "euroc", str(copy), "-o", str(bag)], standalone_mode=False)
+    assert "to be added to the IMU's stamps" in run("refine", str(bag), "-o", str(out))
+    imu = load_system_config(None, None, read_rig_calibration([out]).parameters).ekf_slam.imu
+    assert imu.time_offset == pytest.approx(0.02, abs=1e-3)
+    assert 1e-4 < imu.sigma_time_offset < 1e-3
 
 
 @pytest.mark.data

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from slam_core.nodes.awaited_streams import AwaitedStreams
 
 
@@ -24,6 +26,17 @@ def test_a_frame_waits_until_every_stream_has_reached_its_stamp() -> None:
     streams.heard("imu", 101)
     assert not streams.must_wait(100)
     assert streams.diagnostic() == ""
+
+
+@pytest.mark.parametrize(("late", "enough"), [(20, 80), (-20, 120)])
+def test_stamps_of_another_clock_are_waited_for_by_that_clock(late: int, enough: int) -> None:
+    streams = AwaitedStreams(["imu"])
+    streams.is_late("imu", late)
+    streams.frame(100)
+    streams.heard("imu", enough - 1)
+    assert streams.must_wait(100)
+    streams.heard("imu", enough)
+    assert not streams.must_wait(100)
 
 
 def test_a_stream_that_is_never_heard_holds_up_no_more_frames_than_the_patience() -> None:

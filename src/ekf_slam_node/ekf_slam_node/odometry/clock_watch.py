@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ekf_slam_node.odometry.preintegration import Preintegral
 from slam_core.geometry import FloatArray
 
 _SIGMA_S = 0.05
@@ -29,15 +30,23 @@ class ClockWatch:
         self._information = np.diag(1.0 / np.square([*3 * [max(gyroscope_bias, 1e-6)], _SIGMA_S]))
         self._vector = np.zeros(4)
 
-    def add(self, J: FloatArray, turn: FloatArray, covariance: FloatArray) -> None:
-        """Take a turn (3,) beyond that of the readings as they are, its derivative (3, 4) and covariance (3, 3)."""
-        weighted = np.linalg.solve(covariance, J).T
-        self._information = _FORGETTING * self._information + weighted @ J
-        self._vector = _FORGETTING * self._vector + weighted @ turn
+    def add(self, pre: Preintegral, turn: FloatArray, covariance: FloatArray) -> None:
+        """Take a turn (3,) beyond that of readings without bias and offset, with its covariance (3, 3).
+
+        Readings before and after the edges of the step have noise of their own: one's derivative is the regressor, the
+        other's the instrument, so that noise is not taken for information.
+        """
+        before, after = (np.column_stack([pre.J[:3, :3], clock]) for clock in pre.clock_turns)
+        inverse = np.linalg.inv(covariance)
+        information = before.T @ inverse @ after
+        self._information = _FORGETTING * self._information + 0.5 * (information + information.T)
+        self._vector = _FORGETTING * self._vector + 0.5 * (before + after).T @ inverse @ turn
 
     def contradicted(self, time_offset: float, sigma: float) -> float:
         """Variance (s2) to be added to that of a time offset +- sigma, s, so that it may become the one found; or 0."""
         P = np.linalg.inv(self._information)
+        if not P[3, 3] > 0.0:
+            return 0.0
         apart = float(P[3] @ self._vector) - time_offset
         bound = max(_SIGMAS * float(np.sqrt(P[3, 3])), _LEAST_S, _SIGMAS * sigma)
         return apart**2 if abs(apart) > bound else 0.0

@@ -68,8 +68,7 @@ class Prediction:
     """Motion over dt (s).
 
     T: (4, 4) of the IMU's place, along the rig's axes. velocity, gravity: (3,) at the end, along the axes of the
-    start. covariance: (19, 19) of the errors of (p, turn, velocity, gravity, biases, time offset). J_turn: (3, 4)
-    derivative of the turn with respect to the gyroscope's bias and the time offset.
+    start. covariance: (19, 19) of the errors of (p, turn, velocity, gravity, biases, time offset).
     """
 
     dt: float
@@ -77,7 +76,7 @@ class Prediction:
     velocity: FloatArray
     gravity: FloatArray
     covariance: FloatArray
-    J_turn: FloatArray
+    pre: Preintegral
 
 
 class InertialFilter:
@@ -180,8 +179,7 @@ class InertialFilter:
         covariance[12:, 12:] += np.diag(walk**2 * dt)
         p = self.velocity * dt + 0.5 * self.gravity * dt**2 + pre.p
         velocity = self.velocity + self.gravity * dt + pre.v
-        J_turn = pre.J[:3, [0, 1, 2, 6]]
-        return Prediction(dt, make_transform(pre.R, p), velocity, self.gravity, covariance, J_turn)
+        return Prediction(dt, make_transform(pre.R, p), velocity, self.gravity, covariance, pre)
 
     def motion_covariance(self, step: Prediction) -> FloatArray:
         """Covariance (6, 6) of a predicted motion, larger by as much as predictions so far were off."""
@@ -220,15 +218,16 @@ class InertialFilter:
         """The prediction, its clock as uncertain as the turns of all frames so far show it to be."""
         if self._clock is None:
             return step
-        known = np.append(self.biases[:3], self.time_offset)
-        self._clock.add(step.J_turn, turn_error + step.J_turn @ known, covariance)
+        pre, J = step.pre, step.pre.J[:3, 6]
+        known = pre.J[:3, :3] @ self.biases[:3] + J * self.time_offset
+        self._clock.add(pre, turn_error + known, covariance + pre.covariance[:3, :3])
         wider = self._clock.contradicted(self.time_offset, self.sigma_time_offset)
         if not wider:
             return step
         P = step.covariance.copy()
         P[18, 18] += wider
-        P[3:6, 3:6] += wider * np.outer(step.J_turn[:, 3], step.J_turn[:, 3])
-        P[3:6, 18] += wider * step.J_turn[:, 3]
+        P[3:6, 3:6] += wider * np.outer(J, J)
+        P[3:6, 18] += wider * J
         P[18, 3:6] = P[3:6, 18]
         return replace(step, covariance=P)
 

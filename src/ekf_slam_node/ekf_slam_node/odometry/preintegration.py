@@ -25,8 +25,10 @@ import numpy as np
 from slam_core.geometry import FloatArray, skew, so3_exp
 from slam_core.types import LONGEST_IMU_STEP_S, ImuSample
 
-_EDGE_S = np.linspace(-0.01, 0.01, 5)
-"""Rates at an edge are means around it: a single reading's noise would be taken for a change of the rates."""
+_EDGE_S = np.linspace(0.0025, 0.0175, 4)
+"""Rates at an edge are means before and after it: a single reading's noise would be taken for a change of the rates."""
+_HELD_NS = 1_500_000
+"""The first and the last reading hold for twice as long beyond them."""
 _LONGEST_S = 10.0
 """Nothing is integrated over longer times, and readings are kept for twice as long."""
 
@@ -50,8 +52,9 @@ class Preintegral:
 
     J: (9, 7) derivative of the errors of (turn, v, p) with respect to the biases (gyroscope, accelerometer) and to
     what is to be added to the stamps, s.
-    covariance: (9, 9) of their noise. force: (3,) mean specific force along the axes of the start, m/s2. reading: mean
-    size of it as it was read, biases included.
+    clock_turns: (2, 3) derivative of the turn with respect to these, by readings before and after the edges alone.
+    covariance: (9, 9) of the errors' noise. force: (3,) mean specific force along the axes of the start, m/s2. reading:
+    mean size of it as it was read, biases included.
     """
 
     dt: float
@@ -59,6 +62,7 @@ class Preintegral:
     v: FloatArray
     p: FloatArray
     J: FloatArray
+    clock_turns: FloatArray
     covariance: FloatArray
     force: FloatArray
     reading: float
@@ -106,17 +110,17 @@ class ImuReadings:
         times = (stamps - start_ns).astype(np.float64)
         columns = (*turn_rates.T, *forces.T)
         at_middle = np.column_stack([np.interp(middle, times, column) for column in columns])
-        around = np.array([[0.0], [end_ns - start_ns]]) + 1e9 * _EDGE_S
-        at_edges = np.stack([np.interp(around, times, column).mean(axis=1) for column in columns], axis=1)
+        around = np.array([0.0, end_ns - start_ns])[:, None] + 1e9 * np.array([-_EDGE_S, _EDGE_S])[:, None]
+        at_edges = np.stack([np.interp(around, times, column).mean(axis=2) for column in columns], axis=2)
         silent = np.clip(np.diff(edges) * 1e-9 - LONGEST_IMU_STEP_S, 0.0, None) > 0.0
-        silent |= (middle < times[0]) | (middle > times[-1])
+        silent |= np.maximum(times[0] - middle, middle - times[-1]) > _HELD_NS
         return _integrated(at_middle, at_edges, biases, np.diff(edges) * 1e-9, silent, noise)
 
 
 def _integrated(
     readings: FloatArray, at_edges: FloatArray, biases: FloatArray, dt: FloatArray, silent: np.ndarray, noise: ImuNoise
 ) -> Preintegral:
-    """Preintegral of readings (n, 6), each held for dt (n,) s; ``at_edges`` (2, 6) at start and end."""
+    """Preintegral of readings (n, 6), each held for dt (n,) s; ``at_edges`` (2, 2, 6) before and after both ends."""
     size = float(np.linalg.norm(readings[:, 3:], axis=1).mean())
     readings = readings - biases
     rates = readings[:, :3]
@@ -130,14 +134,16 @@ def _integrated(
     step, until = dt[:, None], dt.sum() - np.cumsum(dt)
     v = np.cumsum(force * step, axis=0)
     p = np.cumsum((v - force * step) * step + 0.5 * force * step**2, axis=0)
+    clock = [
+        _clock_jacobian(R, v[-1], p[-1], part - biases, float(dt.sum())) for part in (*at_edges, at_edges.mean(axis=0))
+    ]
     return Preintegral(
         float(dt.sum()),
         R,
         v[-1],
         p[-1],
-        np.column_stack(
-            [_bias_jacobian(middle, force, dt), _clock_jacobian(R, v[-1], p[-1], at_edges - biases, dt.sum())]
-        ),
+        np.column_stack([_bias_jacobian(middle, force, dt), clock[2]]),
+        np.array(clock)[:2, :3],
         _noise_covariance(v, p, dt, until, silent, noise),
         v[-1] / dt.sum(),
         size,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``slam calibrate refine``: what a recording shows of its cameras without a board.
 
-A stereo pair that is not quite rectified is corrected; the readout of a rolling shutter is written down, so that the
-next run knows it from its first frame on.
+A stereo pair that is not quite rectified is corrected; the readout of a rolling shutter and the difference of the IMU's
+clock and the images' are written down, so that the next run knows them from its first frame on.
 """
 
 from __future__ import annotations
@@ -26,9 +26,15 @@ from slam_bringup.terminal.mapping_options import mode_for
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile
 from slam_core.storage.files import atomic_text
-from slam_core.types import Features
+from slam_core.types import Features, ImuSample
 from stereo_frontend.frontend_config import FrontendReport
 from stereo_frontend.stereo.corrected_info import corrected_right
+
+_TIMES = (
+    ("rows are read out within", "measurement.readout", "measurement.sigma_readout"),
+    ("to be added to the IMU's stamps:", "imu.time_offset", "imu.sigma_time_offset"),
+)
+"""What is found, and its parameters of the filter."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +54,10 @@ class Refined:
                 f"rows were off by {f['row_error_px']:.2f} px, disparities by {f['disparity_error_px']:.2f} +- "
                 f"{f['disparity_error_sigma_px']:.2f} px: corrected"
             )
-        if self.parameters:
-            readout, sigma = (1e3 * value for value in self.parameters.values())
-            found.append(f"rows are read out within {readout:.1f} +- {sigma:.1f} ms: {FILE_NAME}")
+        for text, name, sigma_name in _TIMES:
+            if name in self.parameters:
+                value, sigma = (1e3 * self.parameters[key] for key in (name, sigma_name))
+                found.append(f"{text} {value:.1f} +- {sigma:.1f} ms: {FILE_NAME}")
         return "\n".join(found)
 
 
@@ -79,23 +86,30 @@ def refine(bag: Path) -> Refined:
 
 
 def _learnt(source: SensorBag, agent: str, mode: str) -> tuple[FrontendReport, dict[str, float]]:
-    """Findings of the front end, and parameters of the rolling shutter as the filter learns them from the images alone.
+    """Findings of the front end, and times as the filters learn them; none where they see none.
 
-    There are none of these where it sees none.
+    One filter has the images alone, as the rolling shutter is seen best, another one the IMU as well.
     """
-    sensors, system = source.sensors[agent], choose(load_system_config(None), mode, "ekf", "none", "off")
-    pipeline = SensorPipeline(system, sensors, False, StageTimes())
-    stage = FilterStage(filter_config(system.ekf_slam, sensors), sensors.frames, sensors.base_frame)
+    sensors = source.sensors[agent]
+    alone, aided = (choose(load_system_config(None), mode, "ekf", "none", imu) for imu in ("off", "auto"))
+    pipeline = SensorPipeline(aided, sensors, False, StageTimes())
+    stages = [
+        FilterStage(filter_config(system.ekf_slam, sensors), sensors.frames, sensors.base_frame)
+        for system in (alone, aided)[: 1 + ("imu" in sensors.topics)]
+    ]
     for reading in source.readings():
         items = pipeline.add(reading) if reading.agent == agent else iter(())
         for value in (pipeline.measure(item).value for item in items):
-            if isinstance(value, Features):
-                stage.add_features(value)
-            for _ in stage.ready():
-                pass
-    readout, sigma = stage.readout_s
-    parameters = {"measurement.readout": readout, "measurement.sigma_readout": sigma} if readout else {}
-    return pipeline.front_end(), parameters
+            for stage in stages:
+                if isinstance(value, Features):
+                    stage.add_features(value)
+                elif isinstance(value, ImuSample) and stage is not stages[0]:
+                    stage.add_imu(value)
+                for _ in stage.ready():
+                    pass
+    found = (stages[0].readout_s, stages[-1].imu_late_s)
+    learnt = [zip(names, times, strict=True) for (_, *names), times in zip(_TIMES, found, strict=True) if times[0]]
+    return pipeline.front_end(), {name: value for times in learnt for name, value in times}
 
 
 def write_refined(folder: Path, bag: Path, found: Refined) -> None:
