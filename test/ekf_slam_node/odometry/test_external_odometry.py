@@ -164,7 +164,15 @@ def test_a_gyroscope_tells_slip_in_the_dark() -> None:
         for pose in poses:
             odometry.add(pose)
         still = Preintegral(
-            0.1, np.eye(3), np.zeros(3), np.zeros(3), np.zeros((9, 6)), 1e-6 * np.eye(9), np.zeros(3), 9.8
+            0.1,
+            np.eye(3),
+            np.zeros(3),
+            np.zeros(3),
+            np.zeros((9, 7)),
+            np.zeros((2, 3)),
+            1e-6 * np.eye(9),
+            np.zeros(3),
+            9.8,
         )
         reckoned = odometry.reckon((end - 1) * STEP_NS, end * STEP_NS, lambda start, end, still=still: still)  # type: ignore[misc]
         assert reckoned is not None
