@@ -4,14 +4,13 @@
     python benchmarks/chain/real.py [NAME ...] [--keep FOLDER]
 
 NAME: kitti, euroc, redkitchen, demo (default all). Prints one row per run: filter alone, after joining, scan odometry.
-ANEES first as it is; for recordings then with what else errs, ground truth and calibration (``../ekf/doubt.py``).
+ANEES first as it is; for recordings then with what else errs, truth and calibration (``slam_experiments.benchmark``).
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import sys
 import tempfile
 from pathlib import Path
 
@@ -24,11 +23,9 @@ from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_core.evaluation import EXACT_TRUTH, evaluate
 from slam_core.trajectory import Trajectory
+from slam_experiments.benchmark.truth import TRUTH, with_calibration_error
 from slam_viewer.report.output import write_results
 from slam_viewer.results import AgentResult, summarise
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "ekf"))
-from doubt import TRUTH, doubted
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("INDOOR_SLAM_DATA", ROOT.parent / "shared" / "data"))
@@ -87,7 +84,7 @@ def accuracy(name: str, agent: AgentResult, trajectory: Trajectory) -> str:
     own = f"{e.ate.rmse:.4f}, {e.drift_percent:.2f}, {e.anees:.1f}"
     if name not in SOURCES:  # simulated: truth and calibration are exact
         return own
-    in_all = evaluate(doubted(trajectory), agent.truth, accuracy=TRUTH.get(name, EXACT_TRUTH))
+    in_all = evaluate(with_calibration_error(trajectory), agent.truth, accuracy=TRUTH.get(name, EXACT_TRUTH))
     return f"{own}, {in_all.anees:.1f}"
 
 

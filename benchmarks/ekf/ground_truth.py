@@ -21,45 +21,26 @@ from real import T_OPTICAL_RIG, euroc, kitti, run
 
 from slam_core.geometry import FloatArray, invert_transform, make_transform, so3_log
 from slam_core.types import StereoImages
+from slam_experiments.benchmark.visual_odometry import matches, stereo_points
 
-_RATIO = 0.8
-_MOST_ROWS_APART = 1.5
 _LEAST_INLIERS = 30
-
-
-def matches(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Pairs (k, 2) of descriptors that pass Lowe's ratio test."""
-    found = cv2.BFMatcher().knnMatch(a, b, k=2)
-    return np.array([(m.queryIdx, m.trainIdx) for m, n in found if m.distance < _RATIO * n.distance]).reshape(-1, 2)
-
-
-def stereo_points(pair: StereoImages) -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """SIFT keypoints (n, 2) px of the left image, their points (n, 3) in its optical frame, descriptors (n, 128)."""
-    sift, camera = cv2.SIFT_create(3000), pair.stereo.camera
-    (left, about_left), (right, about_right) = (sift.detectAndCompute(i, None) for i in (pair.left, pair.right))
-    pairs = matches(about_left, about_right)
-    uv, partner = (np.array([k.pt for k in side])[pairs[:, c]] for c, side in enumerate((left, right)))
-    disparity = uv[:, 0] - partner[:, 0]
-    good = (np.abs(uv[:, 1] - partner[:, 1]) < _MOST_ROWS_APART) & (disparity > 3.0)
-    points = camera.unproject(uv[good], pair.stereo.depth_from_disparity(disparity[good]))
-    return uv[good], points, about_left[pairs[good, 0]]
 
 
 def steps_by_pnp(pairs: list[StereoImages]) -> FloatArray:
     """Motions T_previous_now (n - 1, 4, 4) of the left optical frame; NaN where too little agrees."""
     steps, K = np.full((len(pairs) - 1, 4, 4), np.nan), pairs[0].stereo.camera.K
-    before = stereo_points(pairs[0])
+    _, described, points = stereo_points(pairs[0])
     for k, pair in enumerate(pairs[1:]):
         now = stereo_points(pair)
-        index = matches(before[2], now[2])
-        points, pixels = before[1][index[:, 0]], now[0][index[:, 1]]
-        found, turn, shift, inliers = cv2.solvePnPRansac(points, pixels, K, None, None, None, False, 1000, 1.5, 0.999)
+        index = matches(described, now[1])
+        seen, pixels = points[index[:, 0]], now[0][index[:, 1]]
+        found, turn, shift, inliers = cv2.solvePnPRansac(seen, pixels, K, None, None, None, False, 1000, 1.5, 0.999)
         if found and len(inliers) >= _LEAST_INLIERS:
             chosen = inliers.ravel()
-            turn, shift = cv2.solvePnPRefineLM(points[chosen], pixels[chosen], K, None, turn, shift)
+            turn, shift = cv2.solvePnPRefineLM(seen[chosen], pixels[chosen], K, None, turn, shift)
             rotation = np.asarray(cv2.Rodrigues(turn)[0], np.float64)
             steps[k] = invert_transform(make_transform(rotation, np.asarray(shift, np.float64).ravel()))
-        before = now
+        _, described, points = now
     return steps
 
 

@@ -5,7 +5,8 @@
 
 Chained submaps alone, no loop closure. A gap is bridged if the frame after it is linked to the map of the frame before.
 ANEES up to the first lost frame: as it is, with the error of the ground truth itself, and with that of the calibration
-too (``doubt.py``). KITTI a second time without its first ten pairs: ``ground_truth.py`` shows why.
+too (``slam_experiments.benchmark.truth``). KITTI a second time without its first ten pairs: ``ground_truth.py`` shows
+why.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from doubt import TRUTH, doubted
 
 from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.results import EkfResult, TrackingState
@@ -33,6 +33,7 @@ from slam_core.geometry import (
 )
 from slam_core.trajectory import Trajectory
 from slam_core.types import StereoImages
+from slam_experiments.benchmark.truth import TRUTH, with_calibration_error
 from stereo_frontend.frontend import Frontend
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "features"))
@@ -99,7 +100,7 @@ def report(name: str, pairs: list[StereoImages], truth: FloatArray) -> None:
         print(f"  end error {np.linalg.norm(end[:3]):.2f} m = {100 * np.linalg.norm(end[:3]) / length:.2f} %")
     known = lost[0] if lost else len(results)
     trajectory = Trajectory.from_estimates([result.pose for result in results[:known]])
-    cases = ((trajectory, EXACT_TRUTH), (trajectory, TRUTH[name]), (doubted(trajectory), TRUTH[name]))
+    cases = ((trajectory, EXACT_TRUTH), (trajectory, TRUTH[name]), (with_calibration_error(trajectory), TRUTH[name]))
     exact, with_truth, with_both = (anees(poses, truth[:known], accuracy) for poses, accuracy in cases)
     print(
         f"  ANEES of the first {known} poses {exact:.1f}, with the truth's own error {with_truth:.1f}, "

@@ -40,7 +40,7 @@ class PlanarGraph:
     _edges: list[tuple[int, int, FloatArray, FloatArray, bool]] = field(default_factory=list)
 
     def add_edge(self, i: int, j: int, measured: FloatArray, covariance: FloatArray, *, loop: bool) -> None:
-        """Join two poses by the measured pose (3,) of ``j`` in ``i``; only loops may be doubted."""
+        """Join two poses by the measured pose (3,) of ``j`` in ``i``; only loops may be with_calibration_error."""
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
         self._edges.append((i, j, measured, whitening, loop))
 

@@ -43,7 +43,9 @@ EVERYTHING = (
 )  # fmt: skip
 Kept = tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]
 """Result of a job's function: values as JSON knows them, and arrays by name."""
-_VALUES, _ARRAYS = "result.json", "arrays.npz"
+VALUES = "result.json"
+"""File of a result's values in its folder."""
+_ARRAYS = "arrays.npz"
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class JobResult:
 def execute(job: Job, cache: Path) -> Path:
     """Run a job unless its result is kept; the folder of the result."""
     folder = job.folder(cache)
-    if (folder / _VALUES).exists():
+    if (folder / VALUES).exists():
         return folder
     module, _, name = job.function.partition(":")
     unfinished = folder.with_name(f"{folder.name}.{os.getpid()}.unfinished")
@@ -98,7 +100,7 @@ def execute(job: Job, cache: Path) -> Path:
     before = [earlier.folder(cache) for earlier in job.after]
     values, arrays = getattr(importlib.import_module(module), name)(unfinished, before, **job.arguments)
     np.savez_compressed(unfinished / _ARRAYS, **arrays)
-    (unfinished / _VALUES).write_text(json.dumps(values, indent=1), encoding="utf-8")
+    (unfinished / VALUES).write_text(json.dumps(values, indent=1), encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)
     return folder
@@ -108,7 +110,7 @@ def load(folder: Path) -> JobResult:
     """The result of a job that has been executed."""
     with np.load(folder / _ARRAYS) as stored:
         arrays = {name: stored[name] for name in stored.files}
-    return JobResult(folder, json.loads((folder / _VALUES).read_text(encoding="utf-8")), arrays)
+    return JobResult(folder, json.loads((folder / VALUES).read_text(encoding="utf-8")), arrays)
 
 
 def in_order(jobs: Sequence[Job]) -> list[Job]:

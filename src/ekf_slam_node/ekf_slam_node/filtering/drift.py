@@ -16,7 +16,7 @@ from slam_core.geometry import FloatArray, skew
 
 _SHARE = 1.0
 """Drift of a frame in its common error: with it errors of the filter's poses on recordings are nearest to what is
-claimed (``benchmarks/chain/robustness.py``).
+claimed (``slam benchmark``).
 """
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What else errs on recordings, beside the estimate: ground truth and calibration."""
+"""Errors of ground truth and calibration, which add to those of an estimate."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CALIBRATION = CalibrationErrorConfig(sigma_scale=0.005, sigma_mounting=float(np.
 """By as much as calibrations of one camera differ; the frame of the ground truth is another's."""
 
 
-def doubted(trajectory: Trajectory) -> Trajectory:
+def with_calibration_error(trajectory: Trajectory) -> Trajectory:
     """A trajectory with covariances that know of the calibration's error, the same in all poses of a run."""
     if trajectory.covariances is None:
         raise ValueError("a trajectory without covariances has none to widen")

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ORB-SLAM3 (stereo) over a folder of rectified pairs; ``orbslam3.py`` calls it with the interpreter that has it.
+"""ORB-SLAM3 over a folder of rectified pairs or of depth; ``orbslam3.py`` calls it with the interpreter that has it.
 
-    python orbslam3_run.py FOLDER      # stamps.txt, left/NNNN.png, right/NNNN.png, settings.yaml -> trajectory.npz
+    python -P orbslam3_program.py FOLDER   # stamps.txt, left/*.png, right/*.png or depth/*.npy (m), settings.yaml
+
+Writes FOLDER/trajectory.npz.
 
 Needs numpy, OpenCV and orbslam3-python alone. The published vocabulary is not in the package: one in DBoW2's text
 format (Galvez-Lopez and Tardos 2012: a tree of k-majority clusters, words weighted by how few pictures show them) is
@@ -16,7 +18,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import orbslam3
+import orbslam3  # type: ignore[import-not-found]
 
 BRANCHES, LEVELS, DEPTH = 10, 6, 4
 """Of the tree as it is declared, and levels that are made."""
@@ -24,32 +26,35 @@ _PICTURES, _FEATURES = 60, 600
 
 
 def main() -> None:
+    """Track the folder that is named on the command line."""
     folder = Path(sys.argv[1])
     stamps = np.loadtxt(folder / "stamps.txt", ndmin=1)
-    pictures = [f"{k:05d}.png" for k in range(len(stamps))]
-    chosen = pictures[:: max(1, len(pictures) // _PICTURES)]
-    write_vocabulary(folder / "vocabulary.txt", [folder / "left" / name for name in chosen])
-    system = orbslam3.System(str(folder / "vocabulary.txt"), str(folder / "settings.yaml"), orbslam3.Sensor.STEREO)
+    has_depth = (folder / "depth").exists()
+    chosen = sorted((folder / "left").iterdir())[:: max(1, len(stamps) // _PICTURES)]
+    write_vocabulary(folder / "vocabulary.txt", chosen)
+    sensor = orbslam3.Sensor.RGBD if has_depth else orbslam3.Sensor.STEREO
+    system = orbslam3.System(str(folder / "vocabulary.txt"), str(folder / "settings.yaml"), sensor)
     system.set_use_viewer(False)
     system.initialize()
-    wall, start, began = [], time.process_time(), time.perf_counter()
+    start, began = time.process_time(), time.perf_counter()
     loading = 0.0
-    for stamp, name in zip(stamps, pictures, strict=True):
+    for number, stamp in enumerate(stamps):
         before = time.process_time()
-        pair = [cv2.imread(str(folder / side / name), cv2.IMREAD_GRAYSCALE) for side in ("left", "right")]
+        left = cv2.imread(str(folder / "left" / f"{number:05d}.png"), cv2.IMREAD_GRAYSCALE)
+        if has_depth:
+            second = np.load(folder / "depth" / f"{number:05d}.npy")
+        else:
+            second = cv2.imread(str(folder / "right" / f"{number:05d}.png"), cv2.IMREAD_GRAYSCALE)
         loading += time.process_time() - before
         # As a camera gives them: the mapping threads work between pairs.
         time.sleep(max(0.0, began + (stamp - stamps[0]) - time.perf_counter()))
-        before_wall = time.perf_counter()
-        system.process_image_stereo(*pair, float(stamp))
-        wall.append(time.perf_counter() - before_wall)
+        (system.process_image_rgbd if has_depth else system.process_image_stereo)(left, second, float(stamp))
     cpu = time.process_time() - start - loading
     points = system.get_trajectory_points()
     np.savez(
         folder / "trajectory.npz",
         stamps=np.array([float(t) for t, _ in points]),
         T_camera_world=np.array([np.asarray(T, dtype=np.float64)[:3, :4] for _, T in points]),
-        wall_ms=1e3 * np.array(wall),
         cpu_ms=1e3 * cpu / len(stamps),
     )
     system.shutdown()
@@ -57,7 +62,7 @@ def main() -> None:
 
 def write_vocabulary(path: Path, pictures: list[Path]) -> None:
     """Train a tree on ORB descriptors of pictures and write it in DBoW2's text format."""
-    orb, rng = cv2.ORB_create(_FEATURES), np.random.default_rng(0)
+    orb, rng = cv2.ORB_create(_FEATURES), np.random.default_rng(0)  # type: ignore[attr-defined]
     described = [orb.detectAndCompute(cv2.imread(str(p), cv2.IMREAD_GRAYSCALE), None)[1] for p in pictures]
     described = [d for d in described if d is not None]
     bits = np.unpackbits(np.concatenate(described), axis=1).astype(np.float32)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cases of the benchmark as jobs: a recording, a variant of it, and a program that maps this."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from slam_bags.reading.sensor_bag import SensorBag
+from slam_bringup.pipeline.configuration import choose, load_system_config
+from slam_bringup.pipeline.offline import run_bag
+from slam_core.storage.files import read_json
+from slam_core.trajectory import Trajectory
+from slam_experiments.benchmark.figures import figures_of
+from slam_experiments.benchmark.orbslam3 import orbslam3
+from slam_experiments.benchmark.recording_sets import RecordingSet
+from slam_experiments.benchmark.variants import AS_IT_IS, write_variant
+from slam_experiments.benchmark.visual_odometry import frame_to_frame
+from slam_experiments.job import EVERYTHING, VALUES, Job, Kept
+
+MODULE = "slam_experiments.benchmark.cases"
+OURS = "ours"
+PNP = "SIFT + PnP"
+ORBSLAM3 = "ORB-SLAM3"
+_BAGS = ("slam_core.camera", "slam_core.geometry", "slam_core.messages", "slam_bags")
+_OWN = "slam_experiments.benchmark"
+_BAG = "bag.mcap"
+
+
+@dataclass(frozen=True)
+class Case:
+    """``program`` maps ``variant`` of a recording; ``run``: of ours, how ("alone", "ndt", "imu"), else ""."""
+
+    recording: str
+    variant: str
+    program: str
+    run: str
+    job: Job
+
+
+def cases_of(
+    recording: RecordingSet,
+    variants: Sequence[str],
+    *,
+    config: str = "",
+    peers: bool = False,
+    orbslam3_python: str = "",
+) -> Iterator[Case]:
+    """All cases of a recording.
+
+    ``config``: parameters of the nodes as YAML. ``peers``: others' programs too. ``orbslam3_python``: the interpreter
+    that has ORB-SLAM3, "" where there is none.
+    """
+    common = {"mode": recording.mode, "truth": recording.truth}
+    for variant in variants:
+        bag = _bag_job(recording, variant)
+        for run in recording.runs:
+            arguments = {**common, "run": run, "config": config}
+            yield Case(
+                recording.name, variant, OURS, run, Job(f"{MODULE}:ours", arguments, (*EVERYTHING, _OWN), (bag,))
+            )
+        if not peers:
+            continue
+        packages = tuple(f"{_OWN}.{name}" for name in ("figures", "truth", "visual_odometry"))
+        yield Case(recording.name, variant, PNP, "", Job(f"{MODULE}:pnp", common, packages, (bag,)))
+        if orbslam3_python:
+            packages = (*packages, f"{_OWN}.orbslam3", f"{_OWN}.orbslam3_program")
+            arguments = {**common, "python": orbslam3_python}
+            yield Case(recording.name, variant, ORBSLAM3, "", Job(f"{MODULE}:orbslam3_on", arguments, packages, (bag,)))
+
+
+def _bag_job(recording: RecordingSet, variant: str) -> Job:
+    whole = Job(f"{MODULE}:bag_of", {"recording": _as_text(recording)}, _BAGS)
+    if variant == AS_IT_IS:
+        return whole
+    return Job(f"{MODULE}:variant_of", {"variant": variant}, (*_BAGS, f"{_OWN}.variants"), (whole,))
+
+
+def _as_text(recording: RecordingSet) -> dict[str, Any]:
+    """Everything of a recording that its bag depends on, as JSON knows it; size and time stand for a bag's content."""
+    paths = {name: str(value) for name, value in asdict(recording).items() if isinstance(value, Path)}
+    state = recording.source.stat()
+    return {"kind": recording.kind, **paths, "state": [state.st_size, state.st_mtime_ns]}
+
+
+# ---- jobs
+def bag_of(folder: Path, before: list[Path], recording: dict[str, Any]) -> Kept:
+    """The bag of a recording: converted, or where it lies."""
+    del before
+    if not recording["kind"]:
+        return {"bag": recording["source"]}, {}
+    paths = {name: Path(recording[name]) for name in ("source", "calibration", "ground_truth") if name in recording}
+    RecordingSet("", recording["kind"], mode="", runs=(), truth="", **paths).write_bag(folder / _BAG)
+    return {"bag": ""}, {}
+
+
+def variant_of(folder: Path, before: list[Path], variant: str) -> Kept:
+    """A variant of the bag of the job before."""
+    return {"bag": "", "frames": write_variant(_bag_in(before), folder / _BAG, variant)}, {}
+
+
+def _bag_in(before: list[Path]) -> Path:
+    return Path(read_json(before[0] / VALUES)["bag"] or before[0] / _BAG)
+
+
+def ours(folder: Path, before: list[Path], mode: str, truth: str, run: str, config: str) -> Kept:
+    """Our own chain: the joined map, and the filter alone."""
+    bag = _bag_in(before)
+    (folder / "config.yaml").write_text(config, encoding="utf-8")
+    odometry = "ndt" if run == "ndt" else "none"
+    given = load_system_config(folder / "config.yaml" if config else None, bag)
+    system = choose(given, mode, "sjsam", odometry, "on" if run == "imu" else "off")
+    system = replace(system, dense_mapper=replace(system.dense_mapper, use_stereo=False, use_tof=False))
+    began = time.process_time()
+    try:
+        result, session = run_bag(bag, system, odometry=odometry)
+    except ValueError as error:
+        return {"failed": str(error)}, {}
+    agent = result.agents[0]
+    values = {
+        "ms_per_frame": 1e3 * (time.process_time() - began) / max(result.frames, 1),
+        "lost": result.rejections.get("frames_lost", 0),
+        "parts": result.map.components,
+        "contradiction": session.snapshot.overconfidence,
+        "filter": _figures(agent.filtered, bag, truth),
+    }
+    return values | _figures(agent.trajectory, bag, truth), {}
+
+
+def pnp(folder: Path, before: list[Path], mode: str, truth: str) -> Kept:
+    """SIFT and PnP from frame to frame."""
+    del folder
+    bag = _bag_in(before)
+    try:
+        trajectory, lost = frame_to_frame(bag, mode)
+    except ValueError as error:
+        return {"failed": str(error)}, {}
+    return {"lost": lost} | _figures(trajectory, bag, truth), {}
+
+
+def orbslam3_on(folder: Path, before: list[Path], mode: str, truth: str, python: str) -> Kept:
+    """ORB-SLAM3, stereo or RGB-D."""
+    bag = _bag_in(before)
+    with TemporaryDirectory(dir=folder) as scratch:
+        try:
+            trajectory, ms = orbslam3(bag, mode, "kitti" if truth == "kitti" else mode, python, Path(scratch))
+        except ValueError as error:
+            return {"failed": str(error)}, {}
+    return {"ms_per_frame": ms} | _figures(trajectory, bag, truth), {}
+
+
+def _figures(trajectory: Trajectory, bag: Path, known: str) -> dict[str, Any]:
+    """Figures by name, with the share of all frames that have a pose; what failed if there are none."""
+    with SensorBag(bag) as opened:
+        agent = opened.agents[0]
+        truth = opened.ground_truth(agent)
+        frames = max(opened.count(agent, "left"), opened.count(agent, "depth"))
+    if truth is None:
+        raise ValueError(f"{bag} has no ground truth")
+    try:
+        return {**asdict(figures_of(trajectory, truth, known)), "coverage": len(trajectory) / max(frames, 1)}
+    except ValueError as error:
+        return {"failed": str(error)}

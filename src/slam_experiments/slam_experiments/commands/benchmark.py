@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``slam benchmark``: every recording and its variants, beside other programs; the judge of a change."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from slam_bringup.terminal.console import progress_bar
+from slam_bringup.terminal.paths import UserPath, overwrite_option
+from slam_core.storage.files import atomic_text, read_json
+from slam_core.storage.output_folder import OutputFolder
+from slam_experiments.benchmark.cases import OURS, Case, cases_of
+from slam_experiments.benchmark.orbslam3 import INSTALL, is_there
+from slam_experiments.benchmark.recording_sets import RecordingSet, sets_of
+from slam_experiments.benchmark.summary import (
+    CHANGE_HEADINGS,
+    HEADINGS,
+    Comparison,
+    Row,
+    as_csv,
+    as_markdown,
+    compare,
+    table,
+)
+from slam_experiments.benchmark.variants import VARIANTS
+from slam_experiments.runner import run_jobs
+
+_RESULT = "benchmark.json"
+
+
+@click.command("benchmark")
+@click.argument("data", metavar="DATA_FOLDER", type=UserPath(exists=True, file_okay=False))
+@click.option("-o", "--output", metavar="OUT", required=True, type=UserPath(file_okay=False), help="folder to write")
+@click.option("--only", "names", multiple=True, metavar="NAME", help="only this recording (may be repeated)")
+@click.option(
+    "--variants", multiple=True, type=click.Choice(VARIANTS), help="only this variant of each (may be repeated)"
+)
+@click.option("--peers", is_flag=True, help="ORB-SLAM3 and SIFT + PnP on the same pictures too")
+@click.option(
+    "--orbslam3", "python", metavar="PYTHON", default=sys.executable, help="interpreter that has orbslam3-python"
+)
+@click.option(
+    "--config",
+    "config_file",
+    metavar="FILE",
+    type=UserPath(exists=True, dir_okay=False),
+    help="parameters of the nodes",
+)
+@click.option(
+    "--against", metavar="OLD.json", type=UserPath(exists=True, dir_okay=False),
+    help="benchmark.json of the state before: says what got better and worse; exit code 1 if the rule is broken",
+)  # fmt: skip
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="processes on this machine")
+@overwrite_option("results that were changed since they were written")
+def command(
+    data: Path, output: Path, names: tuple[str, ...], variants: tuple[str, ...], peers: bool, python: str,
+    config_file: Path | None, against: Path | None, workers: int, overwrite: bool,
+) -> None:  # fmt: skip
+    """Map every recording in DATA_FOLDER and its variants, and compare with ground truth.
+
+    DATA_FOLDER holds the public recordings that docs/results.md names, or bags with ground truth. OUT gets
+    benchmark.json and .csv (every case) and benchmark.md (median and worst); OUT/cache keeps bags and results, so that
+    a second run does only what is missing or what changed code asks for.
+    """
+    folder = OutputFolder(output, "benchmark", overwrite=overwrite, last=_RESULT)
+    old = None if against is None else _rows_in(against)
+    if peers and not is_there(python):
+        click.echo(f"slam: ORB-SLAM3 is left out, {python} has no orbslam3-python: {INSTALL}", err=True)
+        python = ""
+    config = "" if config_file is None else config_file.read_text(encoding="utf-8")
+    cases = [
+        case
+        for recording in _chosen(sets_of(data), names)
+        for case in cases_of(recording, variants or VARIANTS, config=config, peers=peers, orbslam3_python=python)
+    ]
+    with folder:
+        rows = _run(cases, output / "cache", workers)
+        comparison = None if old is None else compare(old, rows, OURS)
+        with folder.staged() as staged:
+            atomic_text(staged / _RESULT, json.dumps(rows, indent=1) + "\n")
+            atomic_text(staged / "benchmark.csv", as_csv(rows))
+            atomic_text(staged / "benchmark.md", _page(rows, comparison))
+    _show(rows, comparison)
+    if comparison is not None and not comparison.holds:
+        sys.exit(1)
+
+
+def _chosen(sets: dict[str, RecordingSet], names: Sequence[str]) -> list[RecordingSet]:
+    if unknown := [name for name in names if name not in sets]:
+        raise ValueError(f"no recording '{unknown[0]}' in the data folder; there are {', '.join(sets)}")
+    return [sets[name] for name in names or sets]
+
+
+def _rows_in(path: Path) -> list[Row]:
+    rows: Any = read_json(path)
+    if not isinstance(rows, list) or not all(
+        isinstance(r, dict) and {"recording", "variant"} <= r.keys() for r in rows
+    ):
+        raise ValueError(f"{path} is no benchmark.json of slam benchmark")
+    return rows
+
+
+def _run(cases: Sequence[Case], cache: Path, workers: int) -> list[Row]:
+    with progress_bar() as progress:
+        task = progress.add_task("recordings", total=len(cases))
+        wanted = {case.job for case in cases}
+        results = run_jobs(
+            [case.job for case in cases], cache, workers, None, lambda job: progress.advance(task, job in wanted)
+        )
+    return [
+        {"recording": c.recording, "variant": c.variant, "program": c.program, "run": c.run, **results[c.job].values}
+        for c in cases
+    ]
+
+
+def _page(rows: Sequence[Row], comparison: Comparison | None) -> str:
+    text = "Median, worst over the variants.\n\n" + as_markdown(HEADINGS, table(rows))
+    if comparison is None:
+        return text
+    return f"{text}\n{as_markdown(CHANGE_HEADINGS, comparison.lines)}\n{comparison.told}\n"
+
+
+def _show(rows: Sequence[Row], comparison: Comparison | None) -> None:
+    console = Console()
+    console.print(_table("recordings in variants: median, worst", HEADINGS, table(rows)))
+    if comparison is not None:
+        console.print(_table("before and after", CHANGE_HEADINGS, comparison.lines))
+        console.print(comparison.told)
+
+
+def _table(title: str, headings: Sequence[str], lines: Sequence[Sequence[str]]) -> Table:
+    shown = Table(title=title)
+    for heading in headings:
+        shown.add_column(heading, justify="left" if heading in ("recording", "program", "verdict") else "right")
+    for line in lines:
+        shown.add_row(*line)
+    return shown
