@@ -10,6 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import cv2
+
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
@@ -28,6 +30,7 @@ PNP = "SIFT + PnP"
 ORBSLAM3 = "ORB-SLAM3"
 _BAGS = ("slam_core.camera", "slam_core.geometry", "slam_core.messages", "slam_bags")
 _OWN = "slam_experiments.benchmark"
+_FIGURES = (f"{_OWN}.figures", f"{_OWN}.truth")
 _BAG = "bag.mcap"
 
 
@@ -61,16 +64,16 @@ def cases_of(
         for run in recording.runs:
             arguments = {**common, "run": run, "config": config}
             yield Case(
-                recording.name, variant, OURS, run, Job(f"{MODULE}:ours", arguments, (*EVERYTHING, _OWN), (bag,))
+                recording.name, variant, OURS, run, Job(f"{MODULE}:ours", arguments, (*EVERYTHING, *_FIGURES), (bag,))
             )
         if not peers:
             continue
-        packages = tuple(f"{_OWN}.{name}" for name in ("figures", "truth", "visual_odometry"))
+        packages = (*_FIGURES, f"{_OWN}.visual_odometry")
         yield Case(recording.name, variant, PNP, "", Job(f"{MODULE}:pnp", common, packages, (bag,)))
         if orbslam3_python:
-            packages = (*packages, f"{_OWN}.orbslam3", f"{_OWN}.orbslam3_program")
+            needed = (*packages, f"{_OWN}.orbslam3", f"{_OWN}.orbslam3_program")
             arguments = {**common, "python": orbslam3_python}
-            yield Case(recording.name, variant, ORBSLAM3, "", Job(f"{MODULE}:orbslam3_on", arguments, packages, (bag,)))
+            yield Case(recording.name, variant, ORBSLAM3, "", Job(f"{MODULE}:orbslam3_on", arguments, needed, (bag,)))
 
 
 def _bag_job(recording: RecordingSet, variant: str) -> Job:
@@ -120,15 +123,17 @@ def ours(folder: Path, before: list[Path], mode: str, truth: str, run: str, conf
         result, session = run_bag(bag, system, odometry=odometry)
     except ValueError as error:
         return {"failed": str(error)}, {}
+    if result.failure:
+        return {"failed": result.failure}, {}
     agent = result.agents[0]
     values = {
         "ms_per_frame": 1e3 * (time.process_time() - began) / max(result.frames, 1),
         "lost": result.rejections.get("frames_lost", 0),
         "parts": result.map.components,
         "contradiction": session.snapshot.overconfidence,
-        "filter": _figures(agent.filtered, bag, truth),
+        "filter": _figures(agent.filtered, bag, mode, truth),
     }
-    return values | _figures(agent.trajectory, bag, truth), {}
+    return values | _figures(agent.trajectory, bag, mode, truth), {}
 
 
 def pnp(folder: Path, before: list[Path], mode: str, truth: str) -> Kept:
@@ -137,9 +142,9 @@ def pnp(folder: Path, before: list[Path], mode: str, truth: str) -> Kept:
     bag = _bag_in(before)
     try:
         trajectory, lost = frame_to_frame(bag, mode)
-    except ValueError as error:
+    except (ValueError, RuntimeError, cv2.error) as error:
         return {"failed": str(error)}, {}
-    return {"lost": lost} | _figures(trajectory, bag, truth), {}
+    return {"lost": lost} | _figures(trajectory, bag, mode, truth), {}
 
 
 def orbslam3_on(folder: Path, before: list[Path], mode: str, truth: str, python: str) -> Kept:
@@ -148,17 +153,17 @@ def orbslam3_on(folder: Path, before: list[Path], mode: str, truth: str, python:
     with TemporaryDirectory(dir=folder) as scratch:
         try:
             trajectory, ms = orbslam3(bag, mode, "kitti" if truth == "kitti" else mode, python, Path(scratch))
-        except ValueError as error:
+        except (ValueError, RuntimeError, cv2.error) as error:
             return {"failed": str(error)}, {}
-    return {"ms_per_frame": ms} | _figures(trajectory, bag, truth), {}
+    return {"ms_per_frame": ms} | _figures(trajectory, bag, mode, truth), {}
 
 
-def _figures(trajectory: Trajectory, bag: Path, known: str) -> dict[str, Any]:
+def _figures(trajectory: Trajectory, bag: Path, mode: str, known: str) -> dict[str, Any]:
     """Figures by name, with the share of all frames that have a pose; what failed if there are none."""
     with SensorBag(bag) as opened:
         agent = opened.agents[0]
         truth = opened.ground_truth(agent)
-        frames = max(opened.count(agent, "left"), opened.count(agent, "depth"))
+        frames = opened.count(agent, "left" if mode == "stereo" else "depth")
     if truth is None:
         raise ValueError(f"{bag} has no ground truth")
     try:

@@ -7,6 +7,7 @@ stamps are mirrored and turn rates negated; accelerations stay as they are.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -67,17 +68,17 @@ def write_variant(source: Path, target: Path, variant: str) -> int:
 
 # ---- fewer frames
 def _from_later_on(readings: Sequence[Reading]) -> Iterator[Reading]:
-    start = [r.stamp_ns for r in readings if is_frame(r)][_FIRST:][:1]
-    return (r for r in readings if start and r.stamp_ns >= start[0])
+    stamps = sorted({r.stamp_ns for r in readings if is_frame(r)})
+    return (r for r in readings if len(stamps) > _FIRST and r.stamp_ns >= stamps[_FIRST])
 
 
 def _every(step: int) -> Callable[[Sequence[Reading]], Iterator[Reading]]:
     def chosen(readings: Sequence[Reading]) -> Iterator[Reading]:
-        frame = -1
+        seen: Counter[type[Reading]] = Counter()  # each camera by itself
         for reading in readings:
-            frame += is_frame(reading)
-            if not is_frame(reading) or frame % step == 0:
+            if not is_frame(reading) or seen[type(reading)] % step == 0:
                 yield reading
+            seen[type(reading)] += 1
 
     return chosen
 
