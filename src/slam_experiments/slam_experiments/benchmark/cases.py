@@ -92,34 +92,44 @@ def _as_text(recording: RecordingSet) -> dict[str, Any]:
 
 # ---- jobs
 def bag_of(folder: Path, before: list[Path], recording: dict[str, Any]) -> Kept:
-    """The bag of a recording: converted, or where it lies."""
+    """The bag of a recording: converted, or where it lies; or why there is none."""
     del before
     if not recording["kind"]:
         return {"bag": recording["source"]}, {}
     paths = {name: Path(recording[name]) for name in ("source", "calibration", "ground_truth") if name in recording}
-    RecordingSet("", recording["kind"], mode="", runs=(), truth="", **paths).write_bag(folder / _BAG)
+    try:
+        RecordingSet("", recording["kind"], mode="", runs=(), truth="", **paths).write_bag(folder / _BAG)
+    except ValueError as error:
+        return {"failed": str(error)}, {}
     return {"bag": ""}, {}
 
 
 def variant_of(folder: Path, before: list[Path], variant: str) -> Kept:
-    """A variant of the bag of the job before."""
-    return {"bag": "", "frames": write_variant(_bag_in(before), folder / _BAG, variant)}, {}
+    """A variant of the bag of the job before, or why there is none."""
+    try:
+        return {"bag": "", "frames": write_variant(_bag_in(before), folder / _BAG, variant)}, {}
+    except ValueError as error:
+        return {"failed": str(error)}, {}
 
 
 def _bag_in(before: list[Path]) -> Path:
-    return Path(read_json(before[0] / VALUES)["bag"] or before[0] / _BAG)
+    """The bag that the job before made; ValueError if it could not."""
+    values = read_json(before[0] / VALUES)
+    if "failed" in values:
+        raise ValueError(values["failed"])
+    return Path(values["bag"] or before[0] / _BAG)
 
 
 def ours(folder: Path, before: list[Path], mode: str, truth: str, run: str, config: str) -> Kept:
     """Our own chain: the joined map, and the filter alone."""
-    bag = _bag_in(before)
     (folder / "config.yaml").write_text(config, encoding="utf-8")
     odometry = "ndt" if run == "ndt" else "none"
-    given = load_system_config(folder / "config.yaml" if config else None, bag)
-    system = choose(given, mode, "sjsam", odometry, "on" if run == "imu" else "off")
-    system = replace(system, dense_mapper=replace(system.dense_mapper, use_stereo=False, use_tof=False))
-    began = time.process_time()
     try:
+        bag = _bag_in(before)
+        given = load_system_config(folder / "config.yaml" if config else None, bag)
+        system = choose(given, mode, "sjsam", odometry, "on" if run == "imu" else "off")
+        system = replace(system, dense_mapper=replace(system.dense_mapper, use_stereo=False, use_tof=False))
+        began = time.process_time()
         result, session = run_bag(bag, system, odometry=odometry)
     except ValueError as error:
         return {"failed": str(error)}, {}
@@ -139,8 +149,8 @@ def ours(folder: Path, before: list[Path], mode: str, truth: str, run: str, conf
 def pnp(folder: Path, before: list[Path], mode: str, truth: str) -> Kept:
     """SIFT and PnP from frame to frame."""
     del folder
-    bag = _bag_in(before)
     try:
+        bag = _bag_in(before)
         trajectory, lost = frame_to_frame(bag, mode)
     except (ValueError, RuntimeError, cv2.error) as error:
         return {"failed": str(error)}, {}
@@ -149,9 +159,9 @@ def pnp(folder: Path, before: list[Path], mode: str, truth: str) -> Kept:
 
 def orbslam3_on(folder: Path, before: list[Path], mode: str, truth: str, python: str) -> Kept:
     """ORB-SLAM3, stereo or RGB-D."""
-    bag = _bag_in(before)
     with TemporaryDirectory(dir=folder) as scratch:
         try:
+            bag = _bag_in(before)
             trajectory, ms = orbslam3(bag, mode, "kitti" if truth == "kitti" else mode, python, Path(scratch))
         except (ValueError, RuntimeError, cv2.error) as error:
             return {"failed": str(error)}, {}

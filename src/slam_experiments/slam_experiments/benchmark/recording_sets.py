@@ -59,12 +59,11 @@ def public_sets(folder: Path) -> dict[str, RecordingSet]:
         "calibration": folder / "euroc_v101_micro95/MicroEurocDataset",
         "ground_truth": folder / "traj_gt_openvins/euroc_mav/V1_01_easy.txt",
     }
-    early, late = (folder / name / "euroc_V1" for name in ("euroc_v101_visnav100", "euroc_v101_late50"))
+    early = folder / "euroc_v101_visnav100/euroc_V1"
     kitti = folder / "kitti_stereo_51x2"
     sets = (
         RecordingSet("mh01", "euroc", folder / "euroc_mh01_10hz", "stereo", ("imu", "alone"), "euroc"),
         RecordingSet("v101", "euroc", early, "stereo", ("alone",), "euroc", **v101),
-        RecordingSet("v101_late", "euroc", late, "stereo", ("alone",), "euroc", **v101),
         RecordingSet("kitti1", "kitti", kitti / "KITTI_sequence_1", "stereo", ("alone",), "kitti"),
         RecordingSet("kitti2", "kitti", kitti / "KITTI_sequence_2", "stereo", ("alone",), "kitti"),
         RecordingSet("hololens", "rgbd", folder / "hololens_office_120", "tof", _DEPTH_RUNS, "hololens"),

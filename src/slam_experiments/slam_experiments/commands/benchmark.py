@@ -13,9 +13,10 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from slam_bringup.pipeline.configuration import load_system_config
 from slam_bringup.terminal.console import progress_bar
 from slam_bringup.terminal.paths import UserPath, overwrite_option
-from slam_core.storage.files import atomic_text, read_json
+from slam_core.storage.files import atomic_text, read_json, read_text
 from slam_core.storage.output_folder import OutputFolder
 from slam_experiments.benchmark.cases import OURS, Case, cases_of
 from slam_experiments.benchmark.orbslam3 import INSTALL, is_there
@@ -75,7 +76,8 @@ def command(
     if peers and not is_there(python):
         click.echo(f"slam: ORB-SLAM3 is left out, {python} has no orbslam3-python: {INSTALL}", err=True)
         python = ""
-    config = "" if config_file is None else config_file.read_text(encoding="utf-8")
+    load_system_config(config_file)  # refuses what is wrong in it, before anything runs
+    config = "" if config_file is None else read_text(config_file)
     cases = [
         case
         for recording in _chosen(sets_of(data), names)
