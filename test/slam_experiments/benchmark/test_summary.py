@@ -49,10 +49,10 @@ def test_pages_and_sheets_have_every_case():
 def test_rule(after, holds, verdicts):
     before = [row("hall", "a", 1.0), row("attic", "a", 1.0)]
     comparison = compare(before, [row("hall", "a", after[0]), row("attic", "a", after[1])], "ours")
-    assert comparison.holds is holds
+    assert comparison.is_accepted is holds
     assert [change.verdict for change in comparison.changes] == verdicts
     assert comparison.mean == pytest.approx((after[0] * after[1]) ** 0.5)
-    assert ("holds" in comparison.told) is holds
+    assert ("holds" in comparison.conclusion) is holds
 
 
 def test_only_variants_that_both_have_are_compared_and_only_of_the_program():
@@ -66,6 +66,6 @@ def test_only_variants_that_both_have_are_compared_and_only_of_the_program():
 
 def test_what_fails_now_breaks_the_rule_and_what_failed_before_is_better():
     works = [row("hall", "c", 1.0)]
-    assert not compare(works, [FAILED], "ours").holds
-    assert compare([FAILED], works, "ours").holds
+    assert not compare(works, [FAILED], "ours").is_accepted
+    assert compare([FAILED], works, "ours").is_accepted
     assert compare([FAILED], [FAILED], "ours").changes[0].verdict == "same"

@@ -18,7 +18,7 @@ _TRUTH_GAP_S = 0.1
 
 @dataclass(frozen=True)
 class Figures:
-    """What a trajectory is worth; None where a figure has no meaning.
+    """Errors and honesty of one trajectory; None where a figure has no meaning.
 
     ``ate_mm`` after a rigid alignment, ``scale_percent`` by how much it is too large, ``sigma_over_ate`` claimed
     position sigma over ATE, ``anees_with_truth_errors`` with what ground truth and calibration err besides.

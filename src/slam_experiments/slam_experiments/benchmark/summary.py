@@ -130,18 +130,17 @@ class Comparison:
         return float(np.exp(np.mean([np.log(change.ratio) for change in self.changes])))
 
     @property
-    def holds(self) -> bool:
+    def is_accepted(self) -> bool:
         """True if the mean gets better, or nothing changes, and no recording gets worse by more than a tenth."""
         is_same = all(change.ratio == 1.0 for change in self.changes)
         return (self.mean < 1.0 or is_same) and all(change.ratio <= MOST_WORSE for change in self.changes)
 
     @property
-    def told(self) -> str:
+    def conclusion(self) -> str:
         """Conclusion in a line."""
         rule = f"mean below 1 and no recording above {MOST_WORSE:.2f}"
-        return (
-            f"geometric mean of the ratios {self.mean:.3f}: the rule ({rule}) {'holds' if self.holds else 'is BROKEN'}"
-        )
+        verdict = "holds" if self.is_accepted else "is BROKEN"
+        return f"geometric mean of the ratios {self.mean:.3f}: the rule ({rule}) {verdict}"
 
     @property
     def lines(self) -> list[list[str]]:

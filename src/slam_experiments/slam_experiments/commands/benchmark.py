@@ -35,6 +35,8 @@ from slam_experiments.benchmark.variants import VARIANTS
 from slam_experiments.runner import run_jobs
 
 _RESULT = "benchmark.json"
+_WIDTH = 140
+"""Of tables that no terminal shows."""
 
 
 @click.command("benchmark")
@@ -91,7 +93,7 @@ def command(
             atomic_text(staged / "benchmark.csv", as_csv(rows))
             atomic_text(staged / "benchmark.md", _page(rows, comparison))
     _show(rows, comparison)
-    if comparison is not None and not comparison.holds:
+    if comparison is not None and not comparison.is_accepted:
         sys.exit(1)
 
 
@@ -127,15 +129,15 @@ def _page(rows: Sequence[Row], comparison: Comparison | None) -> str:
     text = "Median, worst over the variants.\n\n" + as_markdown(HEADINGS, table(rows))
     if comparison is None:
         return text
-    return f"{text}\n{as_markdown(CHANGE_HEADINGS, comparison.lines)}\n{comparison.told}\n"
+    return f"{text}\n{as_markdown(CHANGE_HEADINGS, comparison.lines)}\n{comparison.conclusion}\n"
 
 
 def _show(rows: Sequence[Row], comparison: Comparison | None) -> None:
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else _WIDTH)
     console.print(_table("recordings in variants: median, worst", HEADINGS, table(rows)))
     if comparison is not None:
         console.print(_table("before and after", CHANGE_HEADINGS, comparison.lines))
-        console.print(comparison.told)
+        console.print(comparison.conclusion)
 
 
 def _table(title: str, headings: Sequence[str], lines: Sequence[Sequence[str]]) -> Table:
