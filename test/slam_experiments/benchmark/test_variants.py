@@ -118,6 +118,8 @@ def test_half_resolution_keeps_rays_and_does_not_average_over_an_edge(tmp_path):
     assert pair.left[3, 20] == 200
     before = CAMERA.normalised_from_pixels(np.array([[40.5, 10.5]]))
     np.testing.assert_allclose(small.normalised_from_pixels(np.array([[20.0, 5.0]])), before, atol=1e-12)
+    rectified = sensors.right.rectified.normalised_from_pixels(np.array([[20.0, 5.0]]))
+    np.testing.assert_allclose(rectified, before, atol=1e-12)
     assert sensors.right.baseline == pytest.approx(RIGHT.baseline)
     assert image[:, 16].max() == 0
     assert image[5, 15] == 1000
