@@ -38,7 +38,7 @@ COMMANDS = {
     "warmup": "compile all kernels once (./slam setup does it)",
     "calibrate": "camera_info with uncertainties from pictures of a board",
 }
-_IN_EXPERIMENTS = ("simulate", "experiment", "plane", "join")
+_IN_EXPERIMENTS = ("simulate", "experiment", "benchmark", "plane", "join")
 """Commands that the package slam_experiments registers, where it is installed."""
 
 
