@@ -111,7 +111,7 @@ def replay(submaps: list[Submap], arguments: argparse.Namespace, folder: Path) -
             if uplink.pose_is_due(now):
                 uplink.set_pose(pack_pose(PoseEstimate(round(now * 1e9), np.eye(4), 1e-4 * np.eye(6))))
             for message in uplink.due(now):
-                channel.send(now, name, "submap" if message.key else "pose", message.key, message.data)
+                channel.send(now, name, message.kind, message.key, message.data)
         for told in downlink.due(now):
             channel.send(now, told.agent, "ack", None, told.data)
         for at, name, kind, key, data in channel.arrived(now):
@@ -119,6 +119,8 @@ def replay(submaps: list[Submap], arguments: argparse.Namespace, folder: Path) -
                 uplinks[name].on_acknowledgement(unpack_acknowledgement(data), now)
             elif kind == "pose":
                 downlink.on_pose(name, data, now)
+            elif kind == "backlog":
+                downlink.on_backlog(name, data, now)
             else:
                 downlink.on_submap(name, key, data, now)  # type: ignore[arg-type]
                 if (name, key) not in took:

@@ -20,6 +20,7 @@ setup(
         "sjsam_node",
         "slam_bags",
         "slam_core",
+        "slam_radio",
         "stereo_frontend",
         "Jinja2",
         "matplotlib",

@@ -70,7 +70,9 @@ class World:
                 self.keys.append(message.key[1])
             if not self.arrives(True, now):
                 continue
-            if message.key is None:
+            if message.kind == "backlog":
+                self.downlink.on_backlog("one", message.data, now)
+            elif message.key is None:
                 self.poses.append((now, self.downlink.on_pose("one", message.data, now).stamp_ns))
             else:
                 self.passed_on += [s.index for s in self.downlink.on_submap("one", message.key, message.data, now)]

@@ -14,6 +14,7 @@ from slam_core.types import PoseEstimate, Submap
 from slam_radio.byte_budget import ByteBudget
 from slam_radio.inbox import Inbox
 from slam_radio.index_ranges import Key
+from slam_radio.link_report import Backlog, LinkReport, unpack_backlog
 from slam_radio.link_state import Hearing, LinkState
 from slam_radio.radio_messages import pack_acknowledgement, pack_correction, unpack_pose
 from slam_radio.uplink import OVERHEAD
@@ -41,6 +42,7 @@ class _Agent:
     def __init__(self, inbox: Inbox, silent_after_s: float) -> None:
         self.inbox = inbox
         self.hearing = Hearing(silent_after_s)
+        self.backlog: Backlog | None = None
         self.has_news = False
         self.told_at_s = float("-inf")
         self.correction: tuple[int, FloatArray] | None = None
@@ -85,6 +87,12 @@ class Downlink:
         agent.hearing.heard(now_s)
         return pose
 
+    def on_backlog(self, name: str, data: bytes, now_s: float) -> None:
+        """Take what waits at an agent; ValueError if it is damaged."""
+        agent = self._agents[name]
+        agent.backlog = unpack_backlog(data)
+        agent.hearing.heard(now_s)
+
     def set_correction(self, name: str, stamp_ns: int, T_map_odom: FloatArray) -> None:
         """The map knows where an agent's odometry is."""
         self._agents[name].correction = stamp_ns, T_map_odom
@@ -106,11 +114,26 @@ class Downlink:
                     out.append(Message(name, "correction", data))
         return out
 
+    def reports(self, now_s: float) -> dict[str, LinkReport]:
+        """State of the link to each agent."""
+        return {
+            name: LinkReport(agent.hearing.is_up(now_s), agent.hearing.heard_s_ago(now_s), agent.backlog)
+            for name, agent in self._agents.items()
+        }
+
     def state(self, now_s: float) -> LinkState:
-        """All agents up, or which of them are silent."""
+        """All agents up, or which are silent or have more than their link carries; and what waits at all of them."""
         silent = [text for name, a in self._agents.items() if (text := a.hearing.text(name, now_s))]
-        held = sum(agent.inbox.held for agent in self._agents.values())
-        return LinkState(State.DEGRADED if silent else State.OK, "; ".join(silent) or "all agents heard", held, 0.0)
+        known = {name: agent.backlog for name, agent in self._agents.items() if agent.backlog is not None}
+        crowded = [
+            f"more comes in at {name} ({b.came:.0f} bytes/s) than its link carries ({b.carried:.0f})"
+            for name, b in known.items()
+            if b.is_too_much
+        ]
+        size = sum(b.size for b in known.values())
+        seconds = max((b.seconds for b in known.values()), default=0.0)
+        faults = "; ".join(silent + crowded)
+        return LinkState(State.DEGRADED if faults else State.OK, faults or "all agents heard", size, seconds)
 
     def _take_budget(self, data: bytes, now_s: float) -> bool:
         size = len(data) + OVERHEAD

@@ -46,6 +46,10 @@ class Hearing:
         """Time since the last silence, 0 in silence."""
         return now_s - self._up_since_s if self.is_up(now_s) else 0.0
 
+    def heard_s_ago(self, now_s: float) -> float | None:
+        """Time since the last message; None where there was none."""
+        return None if self._last_s is None else now_s - self._last_s
+
     def text(self, who: str, now_s: float) -> str:
         """Complaint of silence, or ""."""
         if self._last_s is None:

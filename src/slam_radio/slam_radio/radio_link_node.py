@@ -3,7 +3,8 @@
 
 At the agent it reads ``submap/*`` and ``odom``; at the post it publishes them below each agent's name, as ``sjsam``
 reads them, and sends ``sjsam``'s ``map_to_odom`` back. Key expressions: ``slam/<agent>/pose``,
-``slam/<agent>/submap/<session>/<index>`` to the post, ``slam/<agent>/ack`` and ``slam/<agent>/correction`` from it.
+``slam/<agent>/submap/<session>/<index>`` and ``slam/<agent>/backlog`` to the post, ``slam/<agent>/ack`` and
+``slam/<agent>/correction`` from it.
 """
 
 # rclpy is annotated in part only.
@@ -140,8 +141,7 @@ class AgentEnd(_End):
             self.uplink.set_pose(pack_pose(estimate_from_message(self._odometry)))
             self._odometry = None
         for message in self.uplink.due(now_s):
-            path = "pose" if message.key is None else f"submap/{message.key[0]}/{message.key[1]}"
-            self.send(f"slam/{self.name}/{path}", message.data, urgent=message.key is None)
+            self.send(f"slam/{self.name}/{message.path}", message.data, urgent=message.key is None)
 
     def state(self, now_s: float) -> LinkState:
         """Health of the link."""
@@ -177,6 +177,7 @@ class PostEnd(_End):
         for agent in config.agents:
             self.hear(f"slam/{agent}/pose", partial(self.on_pose, agent))
             self.hear(f"slam/{agent}/submap/*/*", partial(self.on_submap, agent))
+            self.hear(f"slam/{agent}/backlog", partial(self.on_backlog, agent))
 
     def on_pose(self, agent: str, _: str, data: bytes) -> None:
         """Publish an agent's odometry."""
@@ -188,6 +189,10 @@ class PostEnd(_End):
     def on_submap(self, agent: str, name: str, data: bytes) -> None:
         """Keep a submap and publish what is in order."""
         self._pass_on(agent, self.downlink.on_submap(agent, _submap_key(name), data, time.monotonic()))
+
+    def on_backlog(self, agent: str, _: str, data: bytes) -> None:
+        """Keep what waits at an agent."""
+        self.downlink.on_backlog(agent, data, time.monotonic())
 
     def on_map_to_odom(self, agent: str, message: Message) -> None:
         """Keep the newest correction of an agent."""
@@ -216,6 +221,9 @@ class PostEnd(_End):
         self.node.health.take(
             {"submaps repeated": sum(i.repeated for i in inboxes), "submaps held": sum(i.held for i in inboxes)}
         )
+        for agent, report in self.downlink.reports(now_s).items():
+            for name, value in report.values(agent).items():
+                self.node.health.show(name, value)
         return self.downlink.state(now_s)
 
     def reset(self) -> None:

@@ -3,7 +3,8 @@
 
 The newest pose goes first and always, once a second. Submaps follow oldest first, as far as the budget allows and while
 the post is heard; few are under way at a time, so that a slow link does not fill with what poses would wait behind. One
-that is not acknowledged goes out again after a time that doubles from try to try.
+that is not acknowledged goes out again after a time that doubles from try to try. How much waits is told while it
+waits, and when nothing does any more.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 from slam_core.health import State
 from slam_radio.byte_budget import ByteBudget
 from slam_radio.index_ranges import Key, Range
+from slam_radio.link_report import Backlog, pack_backlog
 from slam_radio.link_state import Carriage, Hearing, LinkState
 from slam_radio.outbox import Outbox
 from slam_radio.radio_messages import pack_submap
@@ -24,14 +26,24 @@ _POSE_PERIOD_S = 1.0
 _WINDOW_S = 4.0
 """So many seconds of the budget, or one submap, may be under way."""
 _LONGEST_WAIT_S = 60.0
+_BACKLOG_PERIOD_S = 5.0
+_BACKLOG_REMINDER_S = 30.0
+_LEAST_WAIT_S = 2.0
+"""A shorter wait is not told: nearly every submap has one."""
 
 
 @dataclass(frozen=True)
 class Outgoing:
-    """A message to send: ``key`` of a submap, None for the pose."""
+    """A message to send: ``kind`` pose, submap or backlog, ``key`` of a submap."""
 
-    key: Key | None
+    kind: str
     data: bytes
+    key: Key | None = None
+
+    @property
+    def path(self) -> str:
+        """The end of its key expression."""
+        return self.kind if self.key is None else f"{self.kind}/{self.key[0]}/{self.key[1]}"
 
 
 @dataclass
@@ -68,6 +80,8 @@ class Uplink:
         self._pose_due_s = float("-inf")
         self._sent: dict[Key, _Sent] = {}
         self._since_s: dict[Key, float] = {}
+        self._told: Backlog | None = None
+        self._told_at_s = float("-inf")
 
     def set_pose(self, data: bytes) -> None:
         """Replace the pose that goes out next."""
@@ -103,27 +117,50 @@ class Uplink:
         """Messages to send now, in this order."""
         out = []
         if self._pose is not None and self.pose_is_due(now_s):
-            out.append(Outgoing(None, self._pose))
+            out.append(Outgoing("pose", self._pose))
             self._budget.spend(len(self._pose) + OVERHEAD)
             self._pose, self._pose_due_s = None, now_s + _POSE_PERIOD_S
         if self._hearing.is_up(now_s):
             out += self._due_submaps(now_s)
+            out += self._due_backlog(now_s)
         return out
+
+    def backlog(self, now_s: float) -> Backlog:
+        """Submaps that wait, and the rates of the last minute."""
+        waiting, size = self.outbox.waiting, self.outbox.bytes_waiting
+        seconds = (size + OVERHEAD * len(waiting)) / self._budget.bytes_per_second
+        too_much = self._carriage.is_too_much(self._oldest_s(now_s), self._hearing.up_for_s(now_s), now_s)
+        return Backlog(len(waiting), size, seconds, *self._carriage.rates(now_s), too_much)
 
     def state(self, now_s: float) -> LinkState:
         """Link up or silent, and what waits."""
-        waiting, backlog = self.outbox.waiting, self.outbox.bytes_waiting
-        backlog_s = (backlog + OVERHEAD * len(waiting)) / self._budget.bytes_per_second
-        waits = f"{len(waiting)} submaps ({backlog / 1e3:.1f} kB, {backlog_s:.0f} s) wait"
+        b = self.backlog(now_s)
+        waits = f"{b.submaps} submaps ({b.size / 1e3:.1f} kB, {b.seconds:.0f} s) wait"
         silence = self._hearing.text("the post", now_s)
         if silence:
-            return LinkState(State.DEGRADED, f"{silence}, {waits}", backlog, backlog_s)
-        oldest_s = max((now_s - self._since_s.setdefault(key, now_s) for key in waiting), default=0.0)
-        if self._carriage.is_too_much(oldest_s, self._hearing.up_for_s(now_s), now_s):
-            came, carried = self._carriage.rates(now_s)
-            why = f"more comes in ({came:.0f} bytes/s) than the link carries ({carried:.0f}): {waits}"
-            return LinkState(State.DEGRADED, why, backlog, backlog_s)
-        return LinkState(State.OK, "link up", backlog, backlog_s)
+            return LinkState(State.DEGRADED, f"{silence}, {waits}", b.size, b.seconds)
+        if b.is_too_much:
+            why = f"more comes in ({b.came:.0f} bytes/s) than the link carries ({b.carried:.0f}): {waits}"
+            return LinkState(State.DEGRADED, why, b.size, b.seconds)
+        return LinkState(State.OK, "link up", b.size, b.seconds)
+
+    def _oldest_s(self, now_s: float) -> float:
+        """Time that the oldest submap has waited."""
+        return max((now_s - self._since_s.setdefault(key, now_s) for key in self.outbox.waiting), default=0.0)
+
+    def _due_backlog(self, now_s: float) -> list[Outgoing]:
+        """The backlog, every few seconds while there is one, once when it is gone, and as a reminder."""
+        waits, told_s = self._oldest_s(now_s) > _LEAST_WAIT_S, now_s - self._told_at_s
+        ended = not self.outbox.waiting and self._told is not None and self._told.submaps > 0
+        if not (ended or told_s >= (_BACKLOG_PERIOD_S if waits else _BACKLOG_REMINDER_S)):
+            return []
+        backlog = self.backlog(now_s)
+        data = pack_backlog(backlog)
+        if not self._budget.allows(len(data) + OVERHEAD, now_s):
+            return []
+        self._budget.spend(len(data) + OVERHEAD)
+        self._told, self._told_at_s = backlog, now_s
+        return [Outgoing("backlog", data)]
 
     def _due_submaps(self, now_s: float) -> list[Outgoing]:
         out: list[Outgoing] = []
@@ -136,7 +173,7 @@ class Uplink:
             size = self.outbox.size(key) + OVERHEAD
             if (under_way and under_way + size > window) or not self._budget.allows(size, now_s):
                 break
-            out.append(Outgoing(key, pack_submap(*self.outbox.read(key))))
+            out.append(Outgoing("submap", pack_submap(*self.outbox.read(key)), key))
             self._budget.spend(size)
             under_way += size
             tries = sent.tries + 1 if sent is not None else 1

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -31,13 +31,16 @@ from slam_core.nodes.base_node import SlamNode
 from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.ros import below, run_node, sensor_qos
 from slam_core.types import ByteArray, PoseEstimate
-from slam_viewer.page.command_post import position_radius, radius_text, unseen, ways_out
+from slam_radio.link_report import LinkReport
+from slam_viewer.page.agent_link import link_text, link_warning, reach, reach_text
+from slam_viewer.page.command_post import has_place, position_radius, storey_at, unseen, ways_out
 from slam_viewer.page.page import ViewerPage
 from slam_viewer.page.panel import AgentRow
 
 _SILENT_S = 3.0
 _STOREYS = 4
 _STATES = ("OK", "DEGRADED", "LOST")
+_ABOVE_FLOOR_M = 0.04
 _POST_PERIOD_S = 2.0
 """Time from one look for ways out to the next, s."""
 
@@ -53,6 +56,9 @@ class ViewerConfig(Config):
         "address the page listens on; 0.0.0.0 lets other machines see it, who know the token in its address",
     )
     map_frame: str = parameter("map", "frame of the map")
+    walking_speed: float = parameter(
+        1.5, "the disc that an agent is in grows so fast while nothing is heard of it", unit="m/s", minimum=0.0
+    )
 
 
 @dataclass
@@ -67,6 +73,12 @@ class _Agent:
     heard_at_ns: int = 0
     picture_at_ns: int = 0
     path: FloatArray | None = None
+    link: LinkReport | None = None
+
+    def silent_s(self, now_ns: int) -> float:
+        """Time since the last odometry, 0 while that is short."""
+        silent_s = (now_ns - self.heard_at_ns) / 1e9
+        return silent_s if self.heard_at_ns and silent_s > _SILENT_S else 0.0
 
 
 class ViewerNode(SlamNode[ViewerConfig]):
@@ -189,10 +201,22 @@ class ViewerNode(SlamNode[ViewerConfig]):
 
     def _on_diagnostics(self, message: Message) -> None:
         for status in message.status:
+            if status.name == f"{self.get_namespace().rstrip('/')}/radio_link":
+                self._on_links({pair.key: pair.value for pair in status.values})
             for agent, own in self._agents.items():
                 if status.name == f"/{below(agent, 'ekf_slam')}":
                     level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
                     own.state, own.reason = _STATES[min(level, 2)], str(status.message)
+
+    def _on_links(self, values: Mapping[str, str]) -> None:
+        """Keep what the post's radio_link says of the link to each agent."""
+        try:
+            links = {agent: LinkReport.of(agent, values) for agent in self._agents}
+        except ValueError as error:
+            self._reject(f"/diagnostics: message of radio_link rejected: {error}")
+            return
+        for agent, link in links.items():
+            self._agents[agent].link = link
 
     # -- map -----------------------------------------------------------------------------------------------------------
 
@@ -248,8 +272,9 @@ class ViewerNode(SlamNode[ViewerConfig]):
 
     def _show_post(self) -> None:
         rows, poses, paths = [], {}, {}
-        for agent, own in self._agents.items():
+        for index, (agent, own) in enumerate(self._agents.items()):
             rows.append(self._row(agent, own))
+            self._show_reach(index, own)
             if own.T_odom_base is not None and own.path is not None:
                 covariance = np.zeros((6, 6)) if own.pose is None else own.pose.covariance
                 poses[agent] = PoseEstimate(0, own.T_map_odom @ own.T_odom_base, covariance)
@@ -263,12 +288,27 @@ class ViewerNode(SlamNode[ViewerConfig]):
         self.page.show_ways_text(texts)
 
     def _row(self, agent: str, own: _Agent) -> AgentRow:
-        silent_s = (self._now_ns() - own.heard_at_ns) / 1e9
-        state = f"silent for {silent_s:.0f} s" if own.heard_at_ns and silent_s > _SILENT_S else own.state
+        silent_s = own.silent_s(self._now_ns())
+        state = f"silent for {silent_s:.0f} s" if silent_s else own.state
         note = own.reason if own.reason not in ("", "OK") else ""
         if own.pose is not None:
-            note = " ".join(filter(None, (note, radius_text(position_radius(own.pose)))))
-        return AgentRow(agent, state, note)
+            where = reach_text(position_radius(own.pose), silent_s, self.config.walking_speed)
+            note = " ".join(filter(None, (note, where)))
+        if own.link is None:
+            return AgentRow(agent, state, note)
+        return AgentRow(agent, state, note, link_text(own.link), link_warning(own.link))
+
+    def _show_reach(self, index: int, own: _Agent) -> None:
+        """The disc that an agent is in, on the floor where that is known; none while the map does not say where."""
+        if own.pose is None or own.T_odom_base is None:
+            return
+        radius, point = position_radius(own.pose), (own.T_map_odom @ own.T_odom_base)[:3, 3]
+        plan = storey_at(tuple(self._plans.values()), point)
+        if plan is not None:
+            point = point - (float(plan.height_of(point[None])[0]) - _ABOVE_FLOOR_M) * plan.T_map_plan[:3, 2]
+        silent_s = own.silent_s(self._now_ns())
+        shown = reach(radius, silent_s, self.config.walking_speed) if has_place(radius) else np.inf
+        self.page.show_reach(index, point, shown)
 
     def _on_click(self, origin: FloatArray, direction: FloatArray) -> None:
         """Publish where the ray of a click meets the lowest floor plan, or the map's plane z = 0."""

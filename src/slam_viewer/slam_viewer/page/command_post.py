@@ -79,9 +79,14 @@ def position_radius(pose: PoseEstimate) -> float:
     return float(np.sqrt(chi_square_bound(ELLIPSE_PROBABILITY, 2) * largest))
 
 
+def has_place(radius: float) -> bool:
+    """True if something ties an agent whose position has this radius (m) to the map."""
+    return radius <= _NOWHERE_M
+
+
 def radius_text(radius: float) -> str:
     """Uncertainty of a position, in words."""
-    if radius > _NOWHERE_M:
+    if not has_place(radius):
         return "position not tied to the map"
     return f"position ±{radius:.2f} m (99.5 %)"
 

@@ -37,9 +37,11 @@ _LARGEST_ELLIPSOID_M = 1.5
 """An ellipsoid as large as a room says only that the landmark is far away, and hides the room."""
 _MOST_ELLIPSOIDS = 4000
 _MOST_FACES = 600_000
+_CORNERS = 64
+"""Of a disc."""
 _LAYERS = (
     "mesh", "dense points", "floor plan", "trajectories", "ground truth", "landmarks", "ellipsoids", "submaps",
-    "closures", "agents", "frontiers", "ways out", "marks", "camera image",
+    "closures", "agents", "where agents may be", "frontiers", "ways out", "marks", "camera image",
 )  # fmt: skip
 _SUBMAPS, _CLOSURES, _UNSEEN, _MARKS, _LANDMARKS = (
     (25, 100, 255), (255, 190, 0), (255, 80, 200), (20, 190, 60), (230, 140, 0)
@@ -50,6 +52,7 @@ _LEGEND = (
     (_MARKS, "ball: a marked place"),
     ((130, 130, 130), "thin line: the way walked; thick line on the floor: the way back out"),
     ((60, 60, 60), "dark line: ground truth, where there is some"),
+    ((130, 130, 130), "disc: where an agent may be (99.5 %); in silence it grows as one walks"),
     (_SUBMAPS, "submaps (off at first, see Layers)"),
     (_LANDMARKS, "landmarks, green where many submaps have them (off at first)"),
 )
@@ -188,6 +191,22 @@ class ViewerPage:
         self.server.scene.add_frame(name, axes_length=0.35, axes_radius=0.018, wxyz=wxyz, position=position)
         self.server.scene.add_icosphere(f"{name}/body", radius=0.09, color=colour)
         self.server.scene.add_label(f"{name}/name", agent or "rig", position=(0, 0, 0.12), anchor="bottom-center")
+
+    def show_reach(self, index: int, centre: FloatArray, radius: float) -> None:
+        """The disc that an agent is in, about a point (3,) m of the map; a radius that is not finite: none."""
+        name, colour = f"/where agents may be/{index}", COLOURS[index % len(COLOURS)]
+        if not np.isfinite(radius):
+            self.server.scene.remove_by_name(name)
+            return
+        angles = np.linspace(0.0, 2.0 * np.pi, _CORNERS, endpoint=False)
+        rim = radius * np.stack([np.cos(angles), np.sin(angles), np.zeros(_CORNERS)], axis=1)
+        k = np.arange(_CORNERS)
+        faces = np.stack([np.full(_CORNERS, _CORNERS), k, (k + 1) % _CORNERS], axis=1)
+        vertices = np.concatenate([rim, np.zeros((1, 3))]).astype(np.float32)
+        self.server.scene.add_mesh_simple(
+            name, vertices, faces.astype(np.uint32), color=colour, opacity=0.3, side="double", cast_shadow=False,
+            receive_shadow=False, position=centre,
+        )  # fmt: skip
 
     def show_landmarks(
         self, positions: FloatArray, covariances: FloatArray, sightings: npt.NDArray[np.int64] | None = None

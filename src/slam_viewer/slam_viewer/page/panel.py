@@ -24,7 +24,9 @@ _AGENTS = _ENVIRONMENT.from_string(
     "{% for row, colour, state_colour in rows %}<div style='margin:.35em 1em;overflow-wrap:anywhere'>"
     "<span style='color:rgb{{ colour }};font-size:1.4em'>&#9679;</span> {{ row.name or 'rig' }}: "
     "<b style='color:{{ state_colour }}'>{{ row.state }}</b>"
-    "{% if row.note %}<br><span style='opacity:.75;font-size:.85em'>{{ row.note }}</span>{% endif %}</div>{% endfor %}"
+    "{% for line in (row.note, row.link) if line %}<br><span style='opacity:.75;font-size:.85em'>{{ line }}</span>"
+    "{% endfor %}{% if row.warning %}<br><b style='color:#d98e04;font-size:.85em'>{{ row.warning }}</b>{% endif %}"
+    "</div>{% endfor %}"
 )
 _WAYS = _ENVIRONMENT.from_string(
     "<div style='margin:.6em 1em;font-size:.9em;overflow-wrap:anywhere'>{% if ways %}<b>Way back out</b>"
@@ -39,11 +41,16 @@ _LEGEND = _ENVIRONMENT.from_string(
 
 @dataclass(frozen=True)
 class AgentRow:
-    """Row of an agent in the overview: ``state`` OK, DEGRADED or LOST, or since when it is silent."""
+    """Row of an agent in the overview: ``state`` OK, DEGRADED or LOST, or since when it is silent.
+
+    ``link``: the radio link to it; ``warning``: what the leader must not miss. Both may be empty.
+    """
 
     name: str
     state: str
     note: str = ""
+    link: str = ""
+    warning: str = ""
 
 
 def headline(title: str, lines: Sequence[str]) -> str:
