@@ -30,6 +30,7 @@ from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap
 from slam_core.evaluation import align, associate, evaluate
 from slam_core.geometry import FloatArray
+from slam_core.runtime.memory import share_one_heap
 from slam_core.trajectory import Trajectory, read_trajectory
 from slam_core.types import PoseEstimate, Submap
 from slam_radio.compact_gaussian import compact_gaussian
@@ -61,6 +62,7 @@ def main() -> None:
     parser.add_argument("--rank", type=int, default=LightConfig().rank)
     parser.add_argument("--only", choices=("landmarks", "descriptors", "gaussian"))
     arguments = parser.parse_args()
+    share_one_heap()  # as nodes do
     table = Table(*_COLUMNS)
     for run in arguments.runs:
         submaps = [r.submap for r in storage.read(run / "map").state.graph.records]

@@ -7,8 +7,11 @@
 whitened covariance has identity blocks. ``U`` (m, r) is what unknowns have in common, by factor analysis: a submap's
 landmarks err together because the rig's poses between them do, and a few of these directions carry nearly all of it.
 ``D`` is what each has by itself; it follows from ``U``. Numbers are rounded first, ``t`` is chosen last: the least
-factor for which the difference to the given covariance is positive semidefinite. Whatever is left out or rounded
-can therefore only make the Gaussian less sure.
+factor, to 0.5 %, for which the difference to the given covariance is positive semidefinite, as its Cholesky
+factorization shows. Whatever is left out or rounded can therefore only make the Gaussian less sure.
+
+The only factorization of a matrix of full size is that one: directions are found by subspace iteration, the least
+factor by the Lanczos method (Golub and Van Loan, Matrix Computations, 8.2 and 10.1).
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
+from slam_core.types import Float32Array
 
 Int8Array = npt.NDArray[np.int8]
 Float16Array = npt.NDArray[np.float16]
@@ -28,8 +32,21 @@ Float16Array = npt.NDArray[np.float16]
 UNIT = 1e-3
 """Blocks are sent in mm and mrad."""
 _ITERATIONS = 2
+_POWERS = 3
+"""Products with the covariance in each iteration of the factor analysis."""
+_SPARE = 4
+"""Vectors that are iterated beside those that are wanted."""
+_KRYLOV = 20
+"""Products with the covariance for the largest eigenvalue."""
+_LEAST_STEP = 1e-5
+"""A vector that is this much shorter than the matrix is long is rounding: the eigenvalue is known."""
+_FACTOR_STEP = 5e-3
+"""Share by which the factor is above the eigenvalue at first; then it is doubled until it is enough."""
 _LEAST_OWN = 2e-3
 """Least share of an unknown's variance that is taken as its own: keeps ``D`` invertible."""
+_LEAST_SHARE = 1e-4
+"""Least singular value of a block of B with rows of length 1: its square, times what keeps D invertible, is well above
+the rounding of a sum of all unknowns."""
 _STEPS = 127.0
 _MARGIN = 1.0 + 1e-6
 """The factor ``t`` is enlarged by the rounding of the sum that it is checked with."""
@@ -46,7 +63,19 @@ class CompactGaussian:
     def covariance(self) -> FloatArray:
         """The covariance (6 + 3n, 6 + 3n), positive definite."""
         U = self.common.astype(np.float64) / _STEPS
-        return _factors(self.blocks).between(_sum(U @ U.T, self.inflation, _own(U)))
+        B = _factors(self.blocks)
+        V = B.times(U)
+        return _sum(V @ V.T, B.around(_own(U)).scaled(self.inflation))
+
+    def require_positive(self) -> None:
+        """Raise ``ValueError`` if rounding may leave the covariance not positive definite.
+
+        U U' + t D is far from singular whatever U and t are, so that this depends on the blocks of B alone.
+        """
+        for B in _factors(self.blocks):
+            length = np.linalg.norm(B, axis=-1, keepdims=True)
+            if not (length > 0.0).all() or np.linalg.svd(B / length, compute_uv=False).min(initial=1.0) < _LEAST_SHARE:
+                raise ValueError("a submap for the air has a covariance that is not positive definite")
 
     def end_covariance(self) -> FloatArray:
         """The pose's own covariance (6, 6)."""
@@ -68,19 +97,23 @@ def compact_gaussian(covariance: FloatArray, rank: int, rounding: float = 0.0) -
     Raises
     ------
     ValueError
-        If the covariance is not positive definite, or too large for the format (65 m).
+        If the covariance is not finite, not positive definite, or too large for the format (65 m).
     """
+    if not np.isfinite(covariance).all():
+        raise ValueError("a submap's covariance must be finite")
     S = covariance.copy()
     rows = np.arange(6, len(S))
     S[rows, rows] += rounding**2
     blocks = _rounded_factors(S)
-    whitened = _factors(blocks).inverse().between(S)
+    whiten = _factors(blocks).inverse()
+    whitened = np.asarray(whiten.times(whiten.times(S).T), dtype=np.float32)
     U = _common_directions(whitened, min(rank, len(S) - 1))
-    rounded = np.clip(np.rint(_STEPS * U), -_STEPS, _STEPS).astype(np.int8)
-    U = rounded.astype(np.float64) / _STEPS
-    excess = _own(U).cholesky().inverse().between(whitened - U @ U.T)
-    inflation = max(1.0, float(np.linalg.eigvalsh(excess)[-1]))
-    return CompactGaussian(blocks, rounded, float(np.nextafter(np.float32(inflation * _MARGIN), np.float32(np.inf))))
+    common = np.clip(np.rint(_STEPS * U), -_STEPS, _STEPS).astype(np.int8)
+    inflation = _least_factor(S, blocks, common, whitened)
+    up = float(np.nextafter(np.float32(inflation * _MARGIN), np.float32(np.inf)))
+    gaussian = CompactGaussian(blocks, common, up)
+    gaussian.require_positive()
+    return gaussian
 
 
 class _Blocks(NamedTuple):
@@ -103,6 +136,18 @@ class _Blocks(NamedTuple):
         """Inverses of the blocks."""
         return self._mapped(np.linalg.inv)
 
+    def transpose(self) -> _Blocks:
+        """Transposes of the blocks."""
+        return self._mapped(lambda blocks: np.swapaxes(blocks, -1, -2))
+
+    def coarse(self) -> _Blocks:
+        """The blocks in single precision."""
+        return self._mapped(lambda blocks: blocks.astype(np.float32))
+
+    def scaled(self, factor: float) -> _Blocks:
+        """All blocks times a factor."""
+        return self._mapped(lambda blocks: factor * blocks)
+
     def _mapped(self, function: Callable[[FloatArray], Any]) -> _Blocks:
         return _Blocks(function(self.pose), function(self.landmarks))
 
@@ -111,17 +156,16 @@ class _Blocks(NamedTuple):
         n, k = len(self.landmarks), M.shape[1]
         return np.concatenate([self.pose @ M[:6], (self.landmarks @ M[6:].reshape(n, 3, k)).reshape(3 * n, k)])
 
-    def between(self, S: FloatArray) -> FloatArray:
-        """A S A' for this matrix A and a symmetric one (6 + 3n, 6 + 3n)."""
-        W = self.times(self.times(S).T)
-        return np.asarray(0.5 * (W + W.T))
+    def around(self, other: _Blocks) -> _Blocks:
+        """A S A' for this matrix A and a symmetric one of the same blocks."""
+        return _Blocks(*(_symmetric(A @ S @ np.swapaxes(A, -1, -2)) for A, S in zip(self, other, strict=True)))
 
 
-def _sum(S: FloatArray, factor: float, blocks: _Blocks) -> FloatArray:
-    """S + factor * blocks; S is changed."""
-    S[:6, :6] += factor * blocks.pose
-    for k, block in enumerate(blocks.landmarks):
-        S[6 + 3 * k : 9 + 3 * k, 6 + 3 * k : 9 + 3 * k] += factor * block
+def _sum(S: FloatArray, blocks: _Blocks) -> FloatArray:
+    """S + blocks; S is changed."""
+    rows = 6 + np.arange(3 * len(blocks.landmarks)).reshape(-1, 3)
+    S[:6, :6] += blocks.pose
+    S[rows[:, :, None], rows[:, None, :]] += blocks.landmarks
     return S
 
 
@@ -155,19 +199,87 @@ def _own(U: FloatArray) -> _Blocks:
 
 
 def _floored(blocks: FloatArray) -> FloatArray:
+    try:
+        np.linalg.cholesky(blocks - _LEAST_OWN * np.eye(blocks.shape[-1]))
+    except np.linalg.LinAlgError:
+        pass
+    else:
+        return blocks
     values, vectors = np.linalg.eigh(blocks)
     return np.asarray((vectors * np.maximum(values, _LEAST_OWN)[..., None, :]) @ np.swapaxes(vectors, -1, -2))
 
 
-def _common_directions(C: FloatArray, rank: int) -> FloatArray:
-    """Factor analysis of a covariance with identity blocks: U (m, rank) by alternating between U and D."""
-    from scipy.linalg import eigh  # its own half second, which receivers need not spend
+def _common_directions(C: Float32Array, rank: int) -> FloatArray:
+    """Factor analysis of a covariance with identity blocks: U (m, rank) by alternating between U and D.
 
+    In single precision: a direction is rounded to 127ths, and whatever it leaves is found below.
+    """
     m = len(C)
+    V = _start(m, min(rank + _SPARE, m))
     U, D = np.zeros((m, rank)), _Blocks(0.5 * np.eye(6), np.tile(0.5 * np.eye(3), ((m - 6) // 3, 1, 1)))
     for _ in range(_ITERATIONS):
         L = D.cholesky()
-        values, vectors = eigh(L.inverse().between(C), subset_by_index=(m - rank, m - 1))
-        U = L.times(vectors * np.sqrt(np.maximum(values - 1.0, 0.0)))
+        left = L.inverse().coarse()
+        right = left.transpose()
+        for _ in range(_POWERS):
+            V = left.times(C @ right.times(V))
+        V = np.linalg.qr(V)[0]
+        values, turns = np.linalg.eigh(V.T @ left.times(C @ right.times(V)))
+        vectors = (V @ turns[:, -rank:]).astype(np.float64)
+        U = L.times(vectors * np.sqrt(np.maximum(values[-rank:] - 1.0, 0.0)))
         D = _own(U)
     return np.asarray(U)
+
+
+def _least_factor(S: FloatArray, blocks: Float16Array, common: Int8Array, whitened: Float32Array) -> float:
+    """The least t >= 1, to 0.5 % and never less, for which the Gaussian less S is positive definite.
+
+    ``whitened``: S between inverses of B, which gives a first t; it is tested on S itself.
+    """
+    U = common.astype(np.float64) / _STEPS
+    left = _own(U).cholesky().inverse().coarse()
+    coarse = U.astype(np.float32)
+    t = max(1.0, _largest_eigenvalue(left.times(left.times(whitened - coarse @ coarse.T).T)))
+    step = _FACTOR_STEP * t
+    gap = CompactGaussian(blocks, common, t + step).covariance() - S
+    while not _is_positive(gap):
+        t, step = t + step, 2.0 * step
+        gap = CompactGaussian(blocks, common, t + step).covariance() - S
+    return t + step
+
+
+def _largest_eigenvalue(C: Float32Array) -> float:
+    """Largest eigenvalue of a symmetric matrix by the Lanczos method, from below; all vectors are kept orthogonal."""
+    m = len(C)
+    count = min(_KRYLOV, m)
+    Q, T = np.zeros((count, m), dtype=np.float32), np.zeros((count, count))
+    v = _start(m, 1)[:, 0]
+    for k in range(count):
+        Q[k] = v
+        known, w = Q[: k + 1], C @ v
+        T[: k + 1, k] = along = known @ w
+        w -= along @ known
+        w -= (known @ w) @ known
+        length = np.linalg.norm(w)
+        if length < _LEAST_STEP * np.abs(T).max():
+            count = k + 1
+            break
+        v = w / length
+    return float(np.linalg.eigvalsh(T[:count, :count], UPLO="U")[-1])
+
+
+def _start(m: int, count: int) -> Float32Array:
+    """Vectors (m, count), orthonormal and the same for ever, that are like no direction of a submap."""
+    values = np.cos(np.arange(m * count, dtype=np.float64).reshape(m, count) ** 2)
+    return np.asarray(np.linalg.qr(values)[0], dtype=np.float32)
+
+
+def _symmetric(S: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (S + np.swapaxes(S, -1, -2)))
+
+
+def _is_positive(S: FloatArray) -> bool:
+    """True if a symmetric matrix is positive definite; it is lost."""
+    from scipy.linalg.lapack import dpotrf  # its own half second, which receivers need not spend
+
+    return bool(dpotrf(S.T, lower=0, clean=0, overwrite_a=1)[1] == 0)

@@ -32,6 +32,7 @@ class Inbox:
             self._next[session] = index
         self.repeated = 0
         self._newest: Key | None = None
+        self._unpacked: dict[Key, Submap] = {}
 
     def take(self, key: Key, data: bytes) -> list[Submap]:
         """Keep the submap of a message; returns what may be passed on now.
@@ -53,6 +54,7 @@ class Inbox:
             self._folder.add(key, light)
             self.received.add(key)
             self._held.add(key)
+            self._unpacked[key] = submap
         self._newest = key
         if floor > self._next.setdefault(key[0], 0) and floor > self._floors.get(key[0], 0):
             self._floors[key[0]] = floor
@@ -66,7 +68,7 @@ class Inbox:
             if key[1] <= max(self._next[key[0]], self._floors.get(key[0], 0)):
                 self._held.remove(key)
                 self._next[key[0]] = max(self._next[key[0]], key[1] + 1)
-                released.append(unpack(self._folder.read(key)))
+                released.append(self._unpacked.pop(key, None) or unpack(self._folder.read(key)))
         return released
 
     @property
@@ -85,6 +87,7 @@ class Inbox:
         for key in list(self._folder.sizes):
             self._folder.remove(key)
         self._held.clear()
+        self._unpacked.clear()
 
     def close(self) -> None:
         """Let another process have the folder."""

@@ -47,9 +47,10 @@ def rank_values(descriptors: Float32Array) -> FloatArray:
 
 def _is_crowded(points: FloatArray) -> npt.NDArray[np.bool_]:
     """Mask (n,) of points beside an earlier one that is not crowded itself."""
+    from scipy.spatial import cKDTree  # receivers need none
+
     reach = _APART * np.maximum(np.linalg.norm(points, axis=1), 1.0)
-    near = np.linalg.norm(points[:, None] - points[None], axis=2) < reach[:, None]
     crowded = np.zeros(len(points), dtype=bool)
-    for k in range(1, len(points)):
-        crowded[k] = bool((near[k, :k] & ~crowded[:k]).any())
+    for k, near in enumerate(cKDTree(points).query_ball_point(points, reach)):
+        crowded[k] = any(other < k and not crowded[other] for other in near)
     return crowded

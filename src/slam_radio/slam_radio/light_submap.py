@@ -146,8 +146,9 @@ def unpack(data: bytes) -> Submap:
     reader.require_end()
     if not 1.0 <= inflation < 1e6 or follows > 1 or len(np.unique(ids)) != n or (box[1] < 0).any() or end < start:
         raise ValueError("a submap for the air holds numbers that cannot be")
-    covariance = CompactGaussian(blocks, common, inflation).covariance()
-    _require_positive(covariance)
+    gaussian = CompactGaussian(blocks, common, inflation)
+    gaussian.require_positive()
+    covariance = gaussian.covariance()
     if any(not 0.0 <= factor < np.inf for _, _, factor in path):
         raise ValueError("a submap for the air has a pose with a negative covariance")
     poses = [PoseEstimate(stamp, T, max(factor, _LEAST_FACTOR) * covariance[:6, :6]) for stamp, T, factor in path]
@@ -242,10 +243,3 @@ def _pose(tangent: FloatArray) -> FloatArray:
     if not is_rigid_transform(T):
         raise ValueError("a submap for the air has a pose that is none")
     return T
-
-
-def _require_positive(covariance: FloatArray) -> None:
-    try:
-        np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError as error:
-        raise ValueError("a submap for the air has a covariance that is not positive definite") from error
