@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam_radio.compact_gaussian import compact_gaussian
+from slam_radio import compact_gaussian as module
+from slam_radio.compact_gaussian import CompactGaussian, compact_gaussian
 
 
 def largest_share(inner, outer) -> float:
@@ -20,6 +21,33 @@ def largest_share(inner, outer) -> float:
 def test_it_is_never_surer_in_any_direction(make_submap, rank, seed):
     S = make_submap(30, seed, common=6).covariance
     assert largest_share(S, compact_gaussian(S, rank).covariance()) <= 1.0
+
+
+def test_a_poor_first_guess_of_the_inflation_is_mended(make_submap, monkeypatch):
+    S = make_submap(30, common=6).covariance
+    good = compact_gaussian(S, 4)
+    monkeypatch.setattr(module, "_KRYLOV", 1)
+    mended = compact_gaussian(S, 4)
+    assert largest_share(S, mended.covariance()) <= 1.0
+    assert good.inflation <= mended.inflation < 2.0 * good.inflation
+
+
+def test_the_inflation_is_nearly_the_least(make_submap):
+    S = make_submap(30, common=6).covariance
+    found = compact_gaussian(S, 4)
+    assert found.inflation > 1.1
+    less = CompactGaussian(found.blocks, found.common, 0.99 * found.inflation)
+    assert largest_share(S, less.covariance()) > 1.0
+
+
+def test_blocks_that_are_nearly_singular_are_refused(make_submap):
+    found = compact_gaussian(make_submap(5).covariance, 4)
+    found.require_positive()
+    for rows, value in ((-1, 0.0), (-1, 1e-7), (slice(-3, None), 0.0)):
+        blocks = found.blocks.copy()
+        blocks[rows] = value
+        with pytest.raises(ValueError, match="positive definite"):
+            CompactGaussian(blocks, found.common, found.inflation).require_positive()
 
 
 def test_few_common_directions_are_found_and_little_is_lost(make_submap):
@@ -40,6 +68,8 @@ def test_a_covariance_that_is_none_or_too_large_is_refused(make_submap):
     S = make_submap(5).covariance
     with pytest.raises(ValueError, match="positive definite"):
         compact_gaussian(-S, 4)
+    with pytest.raises(ValueError, match="finite"):
+        compact_gaussian(np.where(np.eye(len(S), k=8) > 0, np.nan, S), 4)
     with pytest.raises(ValueError, match="too large"):
         compact_gaussian(1e8 * S, 4)
 

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
-from slam_core.types import Float32Array
+from slam_core.types import AnyArray, Float32Array
 
 Int8Array = npt.NDArray[np.int8]
 Float16Array = npt.NDArray[np.float16]
@@ -151,7 +151,7 @@ class _Blocks(NamedTuple):
     def _mapped(self, function: Callable[[FloatArray], Any]) -> _Blocks:
         return _Blocks(function(self.pose), function(self.landmarks))
 
-    def times(self, M: FloatArray) -> FloatArray:
+    def times(self, M: AnyArray) -> AnyArray:
         """The product with a matrix (6 + 3n, k)."""
         n, k = len(self.landmarks), M.shape[1]
         return np.concatenate([self.pose @ M[:6], (self.landmarks @ M[6:].reshape(n, 3, k)).reshape(3 * n, k)])
@@ -215,7 +215,7 @@ def _common_directions(C: Float32Array, rank: int) -> FloatArray:
     In single precision: a direction is rounded to 127ths, and whatever it leaves is found below.
     """
     m = len(C)
-    V = _start(m, min(rank + _SPARE, m))
+    V: AnyArray = _start(m, min(rank + _SPARE, m))
     U, D = np.zeros((m, rank)), _Blocks(0.5 * np.eye(6), np.tile(0.5 * np.eye(3), ((m - 6) // 3, 1, 1)))
     for _ in range(_ITERATIONS):
         L = D.cholesky()

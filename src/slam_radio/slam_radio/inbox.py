@@ -68,7 +68,8 @@ class Inbox:
             if key[1] <= max(self._next[key[0]], self._floors.get(key[0], 0)):
                 self._held.remove(key)
                 self._next[key[0]] = max(self._next[key[0]], key[1] + 1)
-                released.append(self._unpacked.pop(key, None) or unpack(self._folder.read(key)))
+                known = key in self._unpacked
+                released.append(self._unpacked.pop(key) if known else unpack(self._folder.read(key)))
         return released
 
     @property
