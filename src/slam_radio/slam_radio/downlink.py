@@ -60,11 +60,14 @@ class _Agent:
 
 
 class Downlink:
-    """Takes messages of agents, and decides what they are told. Times are those of any steady clock, s."""
+    """Takes messages of agents, and decides what they are told. Times are those of any steady clock, s.
 
-    def __init__(self, inboxes: Iterable[Inbox], bytes_per_second: float, silent_after_s: float = 10.0) -> None:
+    ``budget``: bytes a second on the wire, or one that several share.
+    """
+
+    def __init__(self, inboxes: Iterable[Inbox], budget: float | ByteBudget, silent_after_s: float = 10.0) -> None:
         self._agents = {inbox.agent: _Agent(inbox, silent_after_s) for inbox in inboxes}
-        self._budget = ByteBudget(bytes_per_second)
+        self._budget = budget if isinstance(budget, ByteBudget) else ByteBudget(budget)
 
     @property
     def inboxes(self) -> list[Inbox]:

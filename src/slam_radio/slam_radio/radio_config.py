@@ -16,9 +16,11 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 class RadioConfig(Config):
     """One end of the link between agents and a command post."""
 
-    role: str = parameter("agent", "end of the link", choices=("agent", "post"))
+    role: str = parameter("agent", "end of the link; peer: an agent among others", choices=("agent", "post", "peer"))
     agents: tuple[str, ...] = parameter(
-        ("agent",), "names of the agents on the link; with role agent one name, its own: the post knows it by that"
+        ("agent",),
+        "names of the agents on the link; with role agent one name, its own: the post knows it by that; "
+        "with role peer its own first",
     )
     connect: tuple[str, ...] = parameter((), "addresses to connect to, as tcp/192.168.1.10:7447")
     listen: tuple[str, ...] = parameter((), "addresses to listen at, as tcp/0.0.0.0:7447")
@@ -35,6 +37,7 @@ class RadioConfig(Config):
     correction_topic: str = parameter(
         "map_to_odom", "topic at the agent of the post's map_to_odom; empty: it is not published"
     )
+    source: str = parameter("", "with role peer: namespace of the agent's own topics, by default the node's")
     broadcast_tf: bool = parameter(True, "publish the correction at the agent on /tf too, unless sjsam runs there")
     map_frame: str = parameter("map", "frame of the post's map")
     odom_frame: str = parameter("odom", "frame of an agent's odometry; at the post below its name")
@@ -53,5 +56,7 @@ class RadioConfig(Config):
             raise ValueError(f"parameter 'agents' names an agent twice: {', '.join(self.agents)}")
         if self.role == "agent" and len(self.agents) != 1:
             raise ValueError(f"an agent has one name, parameter 'agents' has {len(self.agents)}")
+        if self.role == "peer" and len(self.agents) < 2:
+            raise ValueError(f"a peer needs others: parameter 'agents' has {len(self.agents)}")
         if self.user and not self.password_file:
             raise ValueError("parameter 'user' needs 'password_file'")

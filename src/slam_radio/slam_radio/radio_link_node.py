@@ -4,7 +4,8 @@
 At the agent it reads ``submap/*`` and ``odom``; at the post it publishes them below each agent's name, as ``sjsam``
 reads them, and sends ``sjsam``'s ``map_to_odom`` back. Key expressions: ``slam/<agent>/pose``,
 ``slam/<agent>/submap/<session>/<index>`` and ``slam/<agent>/backlog`` to the post, ``slam/<agent>/ack`` and
-``slam/<agent>/correction`` from it.
+``slam/<agent>/correction`` from it. With role peer an agent has such a link to every other one, under
+``slam/<agent>/to/<other>/...``, and publishes all submaps, its own too, as a post would have them.
 """
 
 # rclpy is annotated in part only.
@@ -13,234 +14,19 @@ reads them, and sends ``sjsam``'s ``map_to_odom`` back. Key expressions: ``slam/
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 
-from slam_core.geometry import FloatArray
-from slam_core.messages import (
-    SUBMAP_TOPICS,
-    estimate_from_message,
-    odometry_message,
-    stamp_ns,
-    submap_from_messages,
-    submap_messages,
-    transform_from_message,
-    transform_message,
-)
-from slam_core.messages.base import Message
-from slam_core.messages.submaps import SubmapMessages
 from slam_core.nodes.base_node import SlamNode
-from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.ros import run_node
 from slam_core.storage.files import state_folder
-from slam_core.types import Submap
-from slam_radio.downlink import Downlink
-from slam_radio.inbox import Inbox
-from slam_radio.index_ranges import Key
-from slam_radio.light_submap import pack
-from slam_radio.link_state import LinkState
-from slam_radio.outbox import Outbox
+from slam_radio.link_ends import AgentEnd, End, PeerEnd, PostEnd
 from slam_radio.radio_config import RadioConfig
-from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_correction
-from slam_radio.uplink import Uplink
 from slam_radio.zenoh_link import ZenohLink
 
 _PUMP_PERIOD_S = 0.1
 _STATE_PERIOD_S = 1.0
-
-
-class _End:
-    """One end of the link, around its node: ``pump`` sends what is due, ``state`` is its health."""
-
-    def __init__(self, node: RadioLinkNode) -> None:
-        self.node = node
-
-    def hear(self, key: str, handle: Callable[[str, bytes], None]) -> None:
-        """Have messages under a key handled in the node's own thread; damaged ones are counted."""
-
-        def run(name: str, data: bytes) -> None:
-            self.node.health.count("bytes_received", len(data))
-            try:
-                handle(name, data)
-            except (ValueError, OSError) as error:
-                self.node.health.count("damaged" if isinstance(error, ValueError) else "not_written")
-                self.node.get_logger().warning(f"{name}: message refused: {error}", throttle_duration_sec=1.0)
-
-        self.node.link.listen(key, lambda name, data: self.node.do_later("radio", partial(run, name, data)))
-
-    def send(self, key: str, data: bytes, *, urgent: bool = False) -> None:
-        """Send and count."""
-        self.node.health.count("bytes_sent", len(data))
-        self.node.link.send(key, data, urgent=urgent)
-
-
-class AgentEnd(_End):
-    """Submaps and poses out, acknowledgements and corrections in."""
-
-    def __init__(self, node: RadioLinkNode) -> None:
-        super().__init__(node)
-        config = node.config
-        self.name = config.agents[0]
-        outbox = Outbox(node.state_folder / "outbox" / self.name)
-        self.uplink = Uplink(outbox, config.bytes_per_second, config.resend_after_s, config.silent_after_s)
-        self._odometry: Message | None = None
-        self._T_map_odom: FloatArray | None = None
-        if waiting := outbox.waiting:
-            node.get_logger().info(f"{len(waiting)} submaps of before wait for the post")
-        node.listen_together(SUBMAP_TOPICS, self.on_submap, latched=True, required=False, stamps=StampPolicy.ANY)
-        node.listen("odom", "Odometry", self.on_odometry, required=False, stamps=StampPolicy.ANY)
-        if config.correction_topic:
-            node.advertise(config.correction_topic, "TransformStamped", latched=True, depth=1, alone=True)
-        self.hear(f"slam/{self.name}/ack", self.on_acknowledgement)
-        self.hear(f"slam/{self.name}/correction", self.on_correction)
-
-    def on_submap(self, *messages: Message) -> None:
-        """Pack a finished submap and keep it until the post has it."""
-        submap = submap_from_messages(SubmapMessages(*messages))
-        key = submap.session, submap.index
-        if self.uplink.outbox.knows(key):
-            self.node.health.count("submaps sent again")
-            return
-        light = pack(replace(submap, agent=self.name), self.node.config.light)
-        try:
-            self.uplink.add_submap(key, light, time.monotonic())
-        except OSError as error:
-            raise ValueError(f"submap {submap.index} cannot be kept for the post: {error}") from error
-        self.node.health.count("submaps packed")
-
-    def on_odometry(self, message: Message) -> None:
-        """Keep the newest pose; publish where the post's map has it."""
-        self._odometry = message
-        topic = self.node.config.correction_topic
-        if self._T_map_odom is not None and topic:
-            config = self.node.config
-            frames = config.map_frame, message.header.frame_id or config.odom_frame
-            correction = transform_message(self.node.types, stamp_ns(message), *frames, self._T_map_odom)
-            self.node.publish(topic, correction)
-            if config.broadcast_tf:
-                self.node.broadcast(correction)
-
-    def on_acknowledgement(self, _: str, data: bytes) -> None:
-        """The post is there and has some submaps."""
-        self.uplink.on_acknowledgement(unpack_acknowledgement(data), time.monotonic())
-
-    def on_correction(self, _: str, data: bytes) -> None:
-        """Publish where this agent's odometry is in the post's map."""
-        self._T_map_odom = unpack_correction(data)[1]
-        self.uplink.on_heard(time.monotonic())
-        self.node.health.count("corrections")
-        if self._odometry is not None:
-            self.on_odometry(self._odometry)
-
-    def pump(self, now_s: float) -> None:
-        """Send what is due."""
-        if self._odometry is not None and self.uplink.pose_is_due(now_s):
-            self.uplink.set_pose(pack_pose(estimate_from_message(self._odometry)))
-            self._odometry = None
-        for message in self.uplink.due(now_s):
-            self.send(f"slam/{self.name}/{message.path}", message.data, urgent=message.key is None)
-
-    def state(self, now_s: float) -> LinkState:
-        """Health of the link."""
-        self.node.health.take({"submaps waiting": len(self.uplink.outbox.waiting), "resent": self.uplink.resent})
-        return self.uplink.state(now_s)
-
-    def reset(self) -> None:
-        """Nothing to forget: what waits still has to go out."""
-
-    def close(self) -> None:
-        """Keep what waits for the next start."""
-        self.uplink.outbox.close()
-
-
-class PostEnd(_End):
-    """Submaps and poses in, acknowledgements and corrections out."""
-
-    def __init__(self, node: RadioLinkNode) -> None:
-        super().__init__(node)
-        config = node.config
-        inboxes = [Inbox(agent, node.state_folder / "inbox" / agent) for agent in config.agents]
-        self.downlink = Downlink(inboxes, config.bytes_per_second, config.silent_after_s)
-        for agent in config.agents:
-            for topic, kind in SUBMAP_TOPICS.items():
-                node.advertise(f"{agent}/{topic}", kind, latched=True)
-            node.advertise(f"{agent}/odom", "Odometry")
-            correction = partial(self.on_map_to_odom, agent)
-            node.listen(
-                f"{agent}/map_to_odom", "TransformStamped", correction,
-                latched=True, required=False, stamps=StampPolicy.ANY,
-            )  # fmt: skip
-        self._begun = False
-        for agent in config.agents:
-            self.hear(f"slam/{agent}/pose", partial(self.on_pose, agent))
-            self.hear(f"slam/{agent}/submap/*/*", partial(self.on_submap, agent))
-            self.hear(f"slam/{agent}/backlog", partial(self.on_backlog, agent))
-
-    def on_pose(self, agent: str, _: str, data: bytes) -> None:
-        """Publish an agent's odometry."""
-        pose, config = self.downlink.on_pose(agent, data, time.monotonic()), self.node.config
-        frames = f"{agent}/{config.odom_frame}", f"{agent}/{config.base_frame}"
-        self.node.publish(f"{agent}/odom", odometry_message(self.node.types, *frames, pose))
-        self.node.health.count("poses received")
-
-    def on_submap(self, agent: str, name: str, data: bytes) -> None:
-        """Keep a submap and publish what is in order."""
-        self._pass_on(agent, self.downlink.on_submap(agent, _submap_key(name), data, time.monotonic()))
-
-    def on_backlog(self, agent: str, _: str, data: bytes) -> None:
-        """Keep what waits at an agent."""
-        self.downlink.on_backlog(agent, data, time.monotonic())
-
-    def on_map_to_odom(self, agent: str, message: Message) -> None:
-        """Keep the newest correction of an agent."""
-        self.downlink.set_correction(agent, stamp_ns(message), transform_from_message(message)[2])
-
-    def _pass_on_again(self) -> None:
-        """Pass on what had come before this start, once all nodes of this process listen."""
-        self._begun = True
-        for inbox in self.downlink.inboxes:
-            if submaps := inbox.release():
-                self.node.get_logger().info(
-                    f"{len(submaps)} submaps of {inbox.agent} from before are passed on again (~/reset forgets them)"
-                )
-            self._pass_on(inbox.agent, submaps)
-
-    def pump(self, now_s: float) -> None:
-        """Send what is due."""
-        if not self._begun:
-            self._pass_on_again()
-        for agent, kind, data in self.downlink.due(now_s):
-            self.send(f"slam/{agent}/{kind}", data, urgent=True)
-
-    def state(self, now_s: float) -> LinkState:
-        """Health of the link."""
-        inboxes = self.downlink.inboxes
-        self.node.health.take(
-            {"submaps repeated": sum(i.repeated for i in inboxes), "submaps held": sum(i.held for i in inboxes)}
-        )
-        for agent, report in self.downlink.reports(now_s).items():
-            for name, value in report.values(agent).items():
-                self.node.health.show(name, value)
-        return self.downlink.state(now_s)
-
-    def reset(self) -> None:
-        """Forget what has come; it is not sent again."""
-        for inbox in self.downlink.inboxes:
-            inbox.forget()
-
-    def close(self) -> None:
-        """Keep what has come for the next start."""
-        for inbox in self.downlink.inboxes:
-            inbox.close()
-
-    def _pass_on(self, agent: str, submaps: list[Submap]) -> None:
-        for submap in submaps:
-            for topic, message in zip(SUBMAP_TOPICS, submap_messages(self.node.types, submap), strict=True):
-                self.node.publish(f"{agent}/{topic}", message)
-            self.node.health.count("submaps passed on")
+_ENDS: dict[str, type[End]] = {"agent": AgentEnd, "post": PostEnd, "peer": PeerEnd}
 
 
 class RadioLinkNode(SlamNode[RadioConfig]):
@@ -256,7 +42,7 @@ class RadioLinkNode(SlamNode[RadioConfig]):
             config.connect, config.listen, user=config.user, password_file=config.password_file,
             users_file=config.users_file, config_file=config.zenoh_config, scouting=config.scouting,
         )  # fmt: skip
-        self.end = AgentEnd(self) if config.role == "agent" else PostEnd(self)
+        self.end = _ENDS[config.role](self)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_PUMP_PERIOD_S, lambda: self.end.pump(time.monotonic()), clock=steady)
         self.create_timer(_STATE_PERIOD_S, self._show_state, clock=steady)
@@ -280,14 +66,6 @@ class RadioLinkNode(SlamNode[RadioConfig]):
         self.health.show("backlog_bytes", link.backlog_bytes)
         self.health.show("backlog_s", f"{link.backlog_s:.1f}")
         self._report_change()
-
-
-def _submap_key(name: str) -> Key:
-    """Session and index of ``slam/<agent>/submap/<session>/<index>``."""
-    session, index = name.split("/")[-2:]
-    if not (session.isdecimal() and index.isdecimal()):
-        raise ValueError(f"the key of a submap ends with session and index, got {name}")
-    return int(session), int(index)
 
 
 def main() -> None:

@@ -59,8 +59,8 @@ class Uplink:
     ----------
     outbox
         Submaps that wait.
-    bytes_per_second
-        Budget on the wire.
+    budget
+        Budget on the wire, bytes a second; or one that several share.
     resend_after_s
         A submap that is not acknowledged goes out again after so long, then after twice that, up to a minute.
     silent_after_s
@@ -68,11 +68,11 @@ class Uplink:
     """
 
     def __init__(
-        self, outbox: Outbox, bytes_per_second: float, resend_after_s: float = 5.0, silent_after_s: float = 10.0
+        self, outbox: Outbox, budget: float | ByteBudget, resend_after_s: float = 5.0, silent_after_s: float = 10.0
     ) -> None:
         self.outbox = outbox
         self.resent = 0
-        self._budget = ByteBudget(bytes_per_second)
+        self._budget = budget if isinstance(budget, ByteBudget) else ByteBudget(budget)
         self._resend_after_s = resend_after_s
         self._hearing = Hearing(silent_after_s)
         self._carriage = Carriage()

@@ -75,6 +75,24 @@ def test_a_rig_with_a_name_speaks_to_a_command_post(started: dict[str, Any]) -> 
     assert "__ns:=/anna" in started["radio_link"]
 
 
+def test_agents_without_a_post_have_a_map_of_their_own_together(started: dict[str, Any]) -> None:
+    words = ["live", "--topics", "--peer", "bert=tcp/10.0.0.2:7448", "--peer", "cleo"]
+    refused = CliRunner().invoke(slam, words)
+    assert "--agents NAME" in refused.output + str(refused.exception)
+    for wrong in ("bert", "=tcp/10.0.0.3:7448", "dora="):
+        refused = CliRunner().invoke(slam, [*words, "--agents", "anna", "--peer", wrong])
+        assert "NAME=ADDRESS" in refused.output + str(refused.exception)
+    assert not started
+    assert CliRunner().invoke(slam, [*words, "--agents", "anna"]).exit_code == 0
+    link, joined = started["radio_link"], started["sjsam"]
+    for part in ('role:="peer"', 'agents:=["anna", "bert", "cleo"]', 'connect:=["tcp/10.0.0.2:7448"]',
+                 "scouting:=true", 'listen:=["tcp/0.0.0.0:7448"]', 'source:="/anna"', "__ns:=/anna/peers"):  # fmt: skip
+        assert part in link
+    assert "__ns:=/anna/peers" in joined
+    assert 'agents:=["anna", "bert", "cleo"]' in joined
+    assert 'map_frame:="peers_map"' in joined
+
+
 def test_a_command_post_has_link_map_and_page(started: dict[str, Any]) -> None:
     result = CliRunner().invoke(slam, ["post", "--agents", "anna, bert", "--port", "0"])
     assert result.exit_code == 0, result.output

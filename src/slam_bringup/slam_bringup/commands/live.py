@@ -11,9 +11,10 @@ from pathlib import Path
 import click
 
 from slam_bringup.extras import GET_ROS
+from slam_bringup.pipeline.configuration import load_system_config
 from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.processes.launch_plan import plan_launch
-from slam_bringup.processes.node_graph import NodeSpec, radio_node
+from slam_bringup.processes.node_graph import NodeSpec, peer_nodes, radio_node
 from slam_bringup.terminal.mapping_options import map_folder, rig_options, tag_parameters
 
 
@@ -26,17 +27,25 @@ from slam_bringup.terminal.mapping_options import map_folder, rig_options, tag_p
 @click.option(
     "--post", multiple=True, help="address of a command post (slam post), as tcp/192.168.1.10:7447; several: all"
 )
+@click.option(
+    "--peer", "peers", multiple=True, metavar="NAME[=ADDRESS]",
+    help="another agent to exchange submaps with, as bert=tcp/192.168.1.12:7448; no address: searched by multicast",
+)  # fmt: skip
+@click.option("--peer-listen", multiple=True, default=("tcp/0.0.0.0:7448",), show_default=True,
+              help="address at which others reach this agent; several: all")  # fmt: skip
 @rig_options
 def command(
     camera: str | None, by_topics: bool, left_info: str | None, right_info: str | None, agents: str, mode: str | None,
     odometry: str, config: Path | None, topics: tuple[str, ...], calibrations: tuple[Path, ...], base_frame: str,
     old_map: Path | None, localize_only: bool, post: tuple[str, ...],
+    peers: tuple[str, ...], peer_listen: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Map live, until Ctrl-C: CAMERA is a side-by-side stereo camera (number or device), or --topics are there.
 
     The map is saved by the service ~/save_map of sjsam, as with separate nodes. With --map it goes on in the map of a
     finished run, with --localize-only the rig is only located in it. With --post and the rig's name (--agents) its
-    submaps and poses go to a command post too.
+    submaps and poses go to a command post too, with --peer to other agents, and theirs come: what all have together is
+    one map, that of /NAME/peers/sjsam, whether there is a post or not.
     """
     by_topics = by_topics or any(not topic.startswith("odometry=") for topic in topics)
     if by_topics == (camera is not None):
@@ -54,6 +63,9 @@ def command(
         nodes = tuple(_with_camera(spec, camera, left_info, right_info) for spec in nodes)
     if post:
         nodes = (*nodes, radio_node(_only(agents), post))
+    if peers:
+        given_config = load_system_config(config)
+        nodes = (*nodes, *peer_nodes(_only(agents), _addresses(peers), peer_listen, given_config))
     compile_kernels_once()
     remapped = [word for inner, outer in plan.remappings for word in ("-r", f"{inner}:={outer}")]
     run_in_one_process(nodes, ["--ros-args", *remapped])
@@ -69,10 +81,21 @@ def run_in_one_process(nodes: Iterable[NodeSpec], ros_arguments: Sequence[str] =
 
 
 def _only(agents: str) -> str:
-    """The agent that a command post knows this rig by."""
+    """The agent that a command post and other agents know this rig by."""
     if not agents or "," in agents:
-        raise ValueError("--post needs the rig's name, one, as the command post lists it: --agents NAME")
+        raise ValueError("--post and --peer need the rig's name, one, as the others list it: --agents NAME")
     return agents.strip()
+
+
+def _addresses(peers: Iterable[str]) -> dict[str, str]:
+    """Name and address, or "", of each peer."""
+    found: dict[str, str] = {}
+    for text in peers:
+        name, _, address = (part.strip() for part in text.partition("="))
+        if not name or name in found or ("=" in text and not address):
+            raise ValueError(f"--peer takes NAME or NAME=ADDRESS, each name once, got {text}")
+        found[name] = address
+    return found
 
 
 def _with_camera(spec: NodeSpec, camera: str, left_info: str | None, right_info: str | None) -> NodeSpec:

@@ -162,6 +162,29 @@ def radio_node(agent: str, addresses: Sequence[str]) -> NodeSpec:
     return NodeSpec("slam_radio", "radio_link", agent, parameters)
 
 
+def peer_nodes(agent: str, peers: Mapping[str, str], listen: Sequence[str], config: SystemConfig) -> list[NodeSpec]:
+    """The link of an agent to others without a post, and the map of all of them, in the namespace ``<agent>/peers``.
+
+    ``peers``: address of each other agent by its name; those without one are searched by multicast. Frames are others
+    than those of the agent's own map, so that both can be on ``/tf``.
+    """
+    namespace, names = f"{agent}/peers", (agent, *peers)
+    addresses = tuple(address for address in peers.values() if address)
+    link: dict[str, Any] = {
+        "role": "peer", "agents": names, "source": f"/{agent}", "odom_frame": "peers_odom", "listen": tuple(listen)
+    }  # fmt: skip
+    if addresses:
+        link["connect"] = addresses
+    if len(addresses) < len(peers):
+        link["scouting"] = True
+    frames = {"map_frame": "peers_map", "odom_frame": "peers_odom"}
+    joined = _spec("sjsam", config.sjsam, namespace, {}, agents=names)
+    return [
+        NodeSpec("slam_radio", "radio_link", namespace, link),
+        NodeSpec(joined.package, joined.executable, namespace, joined.parameters | frames),
+    ]
+
+
 def post_nodes(agents: Sequence[str], addresses: Sequence[str], port: int, config: SystemConfig) -> list[NodeSpec]:
     """The nodes of a command post that listens at ``addresses``, with a page at ``port``."""
     link = {"role": "post", "agents": tuple(agents), "listen": tuple(addresses)}

@@ -1,0 +1,383 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ends of a link: an agent's, a post's, and that of an agent among others without a post."""
+
+# The node's methods are annotated in part only.
+# mypy: allow-untyped-calls
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from slam_core.geometry import FloatArray
+from slam_core.messages import (
+    SUBMAP_TOPICS,
+    estimate_from_message,
+    odometry_message,
+    stamp_ns,
+    submap_from_messages,
+    submap_messages,
+    transform_from_message,
+    transform_message,
+)
+from slam_core.messages.base import Message
+from slam_core.messages.submaps import SubmapMessages
+from slam_core.nodes.stamp_guard import StampPolicy
+from slam_core.types import PoseEstimate, Submap
+from slam_radio.byte_budget import ByteBudget
+from slam_radio.downlink import Downlink
+from slam_radio.inbox import Inbox
+from slam_radio.index_ranges import Key
+from slam_radio.light_submap import pack
+from slam_radio.link_state import LinkState
+from slam_radio.outbox import Outbox
+from slam_radio.radio_messages import pack_pose, pack_submap, unpack_acknowledgement, unpack_correction, unpack_pose
+from slam_radio.uplink import Uplink
+
+if TYPE_CHECKING:
+    from slam_radio.radio_link_node import RadioLinkNode
+
+
+class End:
+    """One end of the link, around its node: ``pump`` sends what is due, ``state`` is its health."""
+
+    def __init__(self, node: RadioLinkNode) -> None:
+        self.node = node
+
+    def pump(self, now_s: float) -> None:
+        """Send what is due."""
+        raise NotImplementedError
+
+    def state(self, now_s: float) -> LinkState:
+        """Health of the link."""
+        raise NotImplementedError
+
+    def reset(self) -> None:
+        """Forget what has come (``~/reset``); what waits still has to go out."""
+
+    def close(self) -> None:
+        """Keep what waits and what has come for the next start."""
+
+    def hear(self, key: str, handle: Callable[[str, bytes], None]) -> None:
+        """Have messages under a key handled in the node's own thread; damaged ones are counted."""
+
+        def run(name: str, data: bytes) -> None:
+            self.node.health.count("bytes_received", len(data))
+            try:
+                handle(name, data)
+            except (ValueError, OSError) as error:
+                self.node.health.count("damaged" if isinstance(error, ValueError) else "not_written")
+                self.node.get_logger().warning(f"{name}: message refused: {error}", throttle_duration_sec=1.0)
+
+        self.node.link.listen(key, lambda name, data: self.node.do_later("radio", partial(run, name, data)))
+
+    def send(self, key: str, data: bytes, *, urgent: bool = False) -> None:
+        """Send and count."""
+        self.node.health.count("bytes_sent", len(data))
+        self.node.link.send(key, data, urgent=urgent)
+
+
+class AgentEnd(End):
+    """Submaps and poses out, acknowledgements and corrections in."""
+
+    def __init__(self, node: RadioLinkNode) -> None:
+        super().__init__(node)
+        config = node.config
+        self.name = config.agents[0]
+        outbox = Outbox(node.state_folder / "outbox" / self.name)
+        self.uplink = Uplink(outbox, config.bytes_per_second, config.resend_after_s, config.silent_after_s)
+        self._odometry: Message | None = None
+        self._T_map_odom: FloatArray | None = None
+        if waiting := outbox.waiting:
+            node.get_logger().info(f"{len(waiting)} submaps of before wait for the post")
+        node.listen_together(SUBMAP_TOPICS, self.on_submap, latched=True, required=False, stamps=StampPolicy.ANY)
+        node.listen("odom", "Odometry", self.on_odometry, required=False, stamps=StampPolicy.ANY)
+        if config.correction_topic:
+            node.advertise(config.correction_topic, "TransformStamped", latched=True, depth=1, alone=True)
+        self.hear(f"slam/{self.name}/ack", self.on_acknowledgement)
+        self.hear(f"slam/{self.name}/correction", self.on_correction)
+
+    def on_submap(self, *messages: Message) -> None:
+        """Pack a finished submap and keep it until the post has it."""
+        submap = submap_from_messages(SubmapMessages(*messages))
+        key = submap.session, submap.index
+        if self.uplink.outbox.knows(key):
+            self.node.health.count("submaps sent again")
+            return
+        light = pack(replace(submap, agent=self.name), self.node.config.light)
+        try:
+            self.uplink.add_submap(key, light, time.monotonic())
+        except OSError as error:
+            raise ValueError(f"submap {submap.index} cannot be kept for the post: {error}") from error
+        self.node.health.count("submaps packed")
+
+    def on_odometry(self, message: Message) -> None:
+        """Keep the newest pose; publish where the post's map has it."""
+        self._odometry = message
+        topic = self.node.config.correction_topic
+        if self._T_map_odom is not None and topic:
+            config = self.node.config
+            frames = config.map_frame, message.header.frame_id or config.odom_frame
+            correction = transform_message(self.node.types, stamp_ns(message), *frames, self._T_map_odom)
+            self.node.publish(topic, correction)
+            if config.broadcast_tf:
+                self.node.broadcast(correction)
+
+    def on_acknowledgement(self, _: str, data: bytes) -> None:
+        """The post is there and has some submaps."""
+        self.uplink.on_acknowledgement(unpack_acknowledgement(data), time.monotonic())
+
+    def on_correction(self, _: str, data: bytes) -> None:
+        """Publish where this agent's odometry is in the post's map."""
+        self._T_map_odom = unpack_correction(data)[1]
+        self.uplink.on_heard(time.monotonic())
+        self.node.health.count("corrections")
+        if self._odometry is not None:
+            self.on_odometry(self._odometry)
+
+    def pump(self, now_s: float) -> None:
+        """Send what is due."""
+        if self._odometry is not None and self.uplink.pose_is_due(now_s):
+            self.uplink.set_pose(pack_pose(estimate_from_message(self._odometry)))
+            self._odometry = None
+        for message in self.uplink.due(now_s):
+            self.send(f"slam/{self.name}/{message.path}", message.data, urgent=message.key is None)
+
+    def state(self, now_s: float) -> LinkState:
+        """Health of the link."""
+        self.node.health.take({"submaps waiting": len(self.uplink.outbox.waiting), "resent": self.uplink.resent})
+        return self.uplink.state(now_s)
+
+    def close(self) -> None:
+        """Keep what waits for the next start."""
+        self.uplink.outbox.close()
+
+
+class PostEnd(End):
+    """Submaps and poses in, acknowledgements and corrections out."""
+
+    def __init__(self, node: RadioLinkNode) -> None:
+        super().__init__(node)
+        config = node.config
+        inboxes = [Inbox(agent, node.state_folder / "inbox" / agent) for agent in config.agents]
+        self.downlink = Downlink(inboxes, config.bytes_per_second, config.silent_after_s)
+        self.publisher = SubmapPublisher(node, config.agents)
+        for agent in config.agents:
+            correction = partial(self.on_map_to_odom, agent)
+            node.listen(
+                f"{agent}/map_to_odom", "TransformStamped", correction,
+                latched=True, required=False, stamps=StampPolicy.ANY,
+            )  # fmt: skip
+        for agent in config.agents:
+            self.hear(f"slam/{agent}/pose", partial(self.on_pose, agent))
+            self.hear(f"slam/{agent}/submap/*/*", partial(self.on_submap, agent))
+            self.hear(f"slam/{agent}/backlog", partial(self.on_backlog, agent))
+
+    def on_pose(self, agent: str, _: str, data: bytes) -> None:
+        """Publish an agent's odometry."""
+        self.publisher.pass_on_pose(agent, self.downlink.on_pose(agent, data, time.monotonic()))
+
+    def on_submap(self, agent: str, name: str, data: bytes) -> None:
+        """Keep a submap and publish what is in order."""
+        self.publisher.pass_on(agent, self.downlink.on_submap(agent, _submap_key(name), data, time.monotonic()))
+
+    def on_backlog(self, agent: str, _: str, data: bytes) -> None:
+        """Keep what waits at an agent."""
+        self.downlink.on_backlog(agent, data, time.monotonic())
+
+    def on_map_to_odom(self, agent: str, message: Message) -> None:
+        """Keep the newest correction of an agent."""
+        self.downlink.set_correction(agent, stamp_ns(message), transform_from_message(message)[2])
+
+    def pump(self, now_s: float) -> None:
+        """Send what is due."""
+        self.publisher.pass_on_again(self.downlink.inboxes)
+        for agent, kind, data in self.downlink.due(now_s):
+            self.send(f"slam/{agent}/{kind}", data, urgent=True)
+
+    def state(self, now_s: float) -> LinkState:
+        """Health of the link."""
+        self.publisher.show(self.downlink, now_s)
+        return self.downlink.state(now_s)
+
+    def reset(self) -> None:
+        """Forget what has come; it is not sent again."""
+        for inbox in self.downlink.inboxes:
+            inbox.forget()
+
+    def close(self) -> None:
+        """Keep what has come for the next start."""
+        for inbox in self.downlink.inboxes:
+            inbox.close()
+
+
+class PeerEnd(End):
+    """An agent among others: a link to each of them, and all submaps published as a post would have them.
+
+    Its own go the same way as the others', through the bytes that are sent: whoever joins them has what a post has.
+    """
+
+    def __init__(self, node: RadioLinkNode) -> None:
+        super().__init__(node)
+        config = node.config
+        self.name, *others = config.agents
+        budget = ByteBudget(config.bytes_per_second)
+        self.own = Inbox(self.name, node.state_folder / "inbox" / self.name)
+        self.uplinks = {
+            other: Uplink(
+                Outbox(node.state_folder / "outbox" / other), budget, config.resend_after_s, config.silent_after_s
+            )
+            for other in others
+        }
+        inboxes = [Inbox(other, node.state_folder / "inbox" / other) for other in others]
+        self.downlink = Downlink(inboxes, budget, config.silent_after_s)
+        self.publisher = SubmapPublisher(node, config.agents)
+        self._pose: bytes | None = None
+        source = f"{config.source}/" if config.source else ""
+        own_topics = {f"{source}{topic}": kind for topic, kind in SUBMAP_TOPICS.items()}
+        node.listen_together(own_topics, self.on_own_submap, latched=True, required=False, stamps=StampPolicy.ANY)
+        node.listen(f"{source}odom", "Odometry", self.on_own_odometry, required=False, stamps=StampPolicy.ANY)
+        for other in others:
+            hears, sends = f"slam/{other}/to/{self.name}", f"slam/{self.name}/to/{other}"
+            self.hear(f"{hears}/pose", partial(self.on_pose, other))
+            self.hear(f"{hears}/submap/*/*", partial(self.on_submap, other))
+            self.hear(f"{hears}/backlog", partial(self.on_backlog, other))
+            self.hear(f"{sends}/ack", partial(self.on_acknowledgement, other))
+
+    def on_own_submap(self, *messages: Message) -> None:
+        """Pack a finished submap, pass it on as the others will have it, and keep it until all have it."""
+        submap = submap_from_messages(SubmapMessages(*messages))
+        key, now = (submap.session, submap.index), time.monotonic()
+        if key in self.own.received:
+            self.node.health.count("submaps sent again")
+            return
+        light = pack(replace(submap, agent=self.name), self.node.config.light)
+        try:
+            for uplink in self.uplinks.values():
+                if not uplink.outbox.knows(key):
+                    uplink.add_submap(key, light, now)
+            self.publisher.pass_on(self.name, self.own.take(key, pack_submap(submap.index, light)))
+        except OSError as error:
+            raise ValueError(f"submap {submap.index} cannot be kept for the others: {error}") from error
+        self.node.health.count("submaps packed")
+
+    def on_own_odometry(self, message: Message) -> None:
+        """Keep the newest pose, as it is sent, for those to whom one is due."""
+        now = time.monotonic()
+        due = [uplink for uplink in self.uplinks.values() if uplink.pose_is_due(now)]
+        if not due:
+            return
+        data = pack_pose(estimate_from_message(message))
+        for uplink in due:
+            uplink.set_pose(data)
+        self._pose = data
+
+    def on_pose(self, other: str, _: str, data: bytes) -> None:
+        """Publish another agent's odometry."""
+        self.publisher.pass_on_pose(other, self.downlink.on_pose(other, data, time.monotonic()))
+
+    def on_submap(self, other: str, name: str, data: bytes) -> None:
+        """Keep another agent's submap and publish what is in order."""
+        submaps = self.downlink.on_submap(other, _submap_key(name), data, time.monotonic())
+        self.publisher.pass_on(other, submaps)
+
+    def on_backlog(self, other: str, _: str, data: bytes) -> None:
+        """Keep what waits at another agent."""
+        self.downlink.on_backlog(other, data, time.monotonic())
+
+    def on_acknowledgement(self, other: str, _: str, data: bytes) -> None:
+        """Another agent is there and has some submaps."""
+        self.uplinks[other].on_acknowledgement(unpack_acknowledgement(data), time.monotonic())
+
+    def pump(self, now_s: float) -> None:
+        """Send what is due, and publish the own pose as often."""
+        self.publisher.pass_on_again((self.own, *self.downlink.inboxes))
+        if self._pose is not None:
+            self.publisher.pass_on_pose(self.name, unpack_pose(self._pose))
+            self._pose = None
+        for told in self.downlink.due(now_s):
+            self.send(f"slam/{told.agent}/to/{self.name}/{told.kind}", told.data, urgent=True)
+        for other, uplink in self.uplinks.items():
+            for message in uplink.due(now_s):
+                self.send(f"slam/{self.name}/to/{other}/{message.path}", message.data, urgent=message.kind == "pose")
+
+    def state(self, now_s: float) -> LinkState:
+        """Who is silent, and what waits for all of them together."""
+        self.publisher.show(self.downlink, now_s)
+        waiting = [uplink.backlog(now_s) for uplink in self.uplinks.values()]
+        self.node.health.take({
+            "submaps waiting": sum(b.submaps for b in waiting), "resent": sum(u.resent for u in self.uplinks.values())
+        })  # fmt: skip
+        heard = self.downlink.state(now_s)
+        return LinkState(heard.state, heard.reason, sum(b.size for b in waiting), sum(b.seconds for b in waiting))
+
+    def reset(self) -> None:
+        """Forget what has come; it is not sent again."""
+        for inbox in (self.own, *self.downlink.inboxes):
+            inbox.forget()
+
+    def close(self) -> None:
+        """Keep what has come, and what waits, for the next start."""
+        for inbox in (self.own, *self.downlink.inboxes):
+            inbox.close()
+        for uplink in self.uplinks.values():
+            uplink.outbox.close()
+
+
+class SubmapPublisher:
+    """Submaps and poses of agents as ``sjsam`` reads them, below their names."""
+
+    def __init__(self, node: RadioLinkNode, agents: Iterable[str]) -> None:
+        self.node = node
+        self._begun = False
+        for agent in agents:
+            for topic, kind in SUBMAP_TOPICS.items():
+                node.advertise(f"{agent}/{topic}", kind, latched=True)
+            node.advertise(f"{agent}/odom", "Odometry")
+
+    def pass_on(self, agent: str, submaps: Iterable[Submap]) -> None:
+        """Publish submaps of an agent."""
+        for submap in submaps:
+            for topic, message in zip(SUBMAP_TOPICS, submap_messages(self.node.types, submap), strict=True):
+                self.node.publish(f"{agent}/{topic}", message)
+            self.node.health.count("submaps passed on")
+
+    def pass_on_pose(self, agent: str, pose: PoseEstimate) -> None:
+        """Publish a pose of an agent as its odometry."""
+        config = self.node.config
+        frames = f"{agent}/{config.odom_frame}", f"{agent}/{config.base_frame}"
+        self.node.publish(f"{agent}/odom", odometry_message(self.node.types, *frames, pose))
+        self.node.health.count("poses passed on")
+
+    def pass_on_again(self, inboxes: Iterable[Inbox]) -> None:
+        """Publish, at the first call, what had come before this start: all nodes of this process listen by then."""
+        if self._begun:
+            return
+        self._begun = True
+        for inbox in inboxes:
+            if submaps := inbox.release():
+                self.node.get_logger().info(
+                    f"{len(submaps)} submaps of {inbox.agent} from before are passed on again (~/reset forgets them)"
+                )
+            self.pass_on(inbox.agent, submaps)
+
+    def show(self, downlink: Downlink, now_s: float) -> None:
+        """Counts of what has come, and the link to each agent, in the diagnostics."""
+        inboxes, health = downlink.inboxes, self.node.health
+        health.take(
+            {"submaps repeated": sum(i.repeated for i in inboxes), "submaps held": sum(i.held for i in inboxes)}
+        )
+        for agent, report in downlink.reports(now_s).items():
+            for name, value in report.values(agent).items():
+                health.show(name, value)
+
+
+def _submap_key(name: str) -> Key:
+    """Session and index of ``slam/<agent>/submap/<session>/<index>``."""
+    session, index = name.split("/")[-2:]
+    if not (session.isdecimal() and index.isdecimal()):
+        raise ValueError(f"the key of a submap ends with session and index, got {name}")
+    return int(session), int(index)
