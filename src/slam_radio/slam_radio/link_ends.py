@@ -305,7 +305,7 @@ class PeerEnd(End):
                 self.send(f"slam/{self.name}/to/{other}/{message.path}", message.data, urgent=message.kind == "pose")
 
     def state(self, now_s: float) -> LinkState:
-        """Who is silent, and what waits for all of them together."""
+        """Silent agents, and the backlog of all links together."""
         self.publisher.show(self.downlink, now_s)
         waiting = [uplink.backlog(now_s) for uplink in self.uplinks.values()]
         self.node.health.take({

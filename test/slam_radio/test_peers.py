@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two agents without a post: each has the map that a post would make of the same bytes, to the byte."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("zenoh")
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "sjsam_node"))  # submap_world
+
+from submap_world import Agent, circle, ring_world  # noqa: E402
+
+from ros_probe import Probe  # noqa: E402
+from sjsam_node import storage  # noqa: E402
+from sjsam_node.agents import in_order  # noqa: E402
+from sjsam_node.map_session import MapSession  # noqa: E402
+from sjsam_node.node_config import SjsamNodeConfig  # noqa: E402
+from slam_bringup.pipeline.configuration import SystemConfig  # noqa: E402
+from slam_bringup.processes.node_arguments import ros_arguments  # noqa: E402
+from slam_bringup.processes.node_graph import NodeSpec, peer_nodes  # noqa: E402
+from slam_bringup.processes.processes import PrivateDomain, find_executable, node_environment  # noqa: E402
+from slam_core.messages import SUBMAP_TOPICS, odometry_message, submap_messages  # noqa: E402
+from slam_core.ros import sensor_qos  # noqa: E402
+from slam_core.types import PoseEstimate, Submap  # noqa: E402
+from slam_radio.light_submap import pack, unpack  # noqa: E402
+
+
+class Peers:
+    """Nodes of ``slam live --peer`` without those of the cameras, and what they say of themselves."""
+
+    def __init__(self, probe: Probe, environment: dict[str, str], folder: Path, stack: ExitStack) -> None:
+        self.probe, self.environment, self.folder, self.stack = probe, environment, folder, stack
+        probe.listen("/diagnostics", probe.types.DiagnosticArray)
+        self.senders: dict[str, Any] = {}
+
+    def start(self, specs: list[NodeSpec]) -> None:
+        for spec in specs:
+            parameters = spec.parameters | ({"map_path": str(self.map_of(spec))} if spec.executable == "sjsam" else {})
+            command = [*find_executable(spec.package, spec.executable, []), *ros_arguments(parameters, spec.namespace)]
+            self.stack.enter_context(self._running(command))
+
+    def map_of(self, spec: NodeSpec) -> Path:
+        return self.folder / spec.namespace.replace("/", "_") / "map"
+
+    @contextmanager
+    def _running(self, command: list[str]) -> Iterator[None]:
+        with (self.folder / "nodes.log").open("ab") as output:
+            process = subprocess.Popen(command, env=self.environment, stdout=output, stderr=subprocess.STDOUT)
+        try:
+            yield
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0, self.log()
+
+    def log(self) -> str:
+        return (self.folder / "nodes.log").read_text(errors="replace")
+
+    def publish(self, submaps: list[Submap], name: str) -> None:
+        """Submaps as ``ekf_slam`` publishes them, in the agent's own namespace."""
+        types = self.probe.types
+        for topic, kind in SUBMAP_TOPICS.items():
+            self.senders[f"/{name}/{topic}"] = self.probe.node.create_publisher(
+                getattr(types, kind), f"/{name}/{topic}", sensor_qos(200, True)
+            )
+        for submap in submaps:
+            for topic, message in zip(SUBMAP_TOPICS, submap_messages(types, submap), strict=True):
+                self.senders[f"/{name}/{topic}"].publish(message)
+
+    def has(self, node: str, count: int) -> bool:
+        """True if the newest diagnostics of a sjsam say that it has received so many submaps."""
+        for message in reversed(self.probe.received["/diagnostics"]):
+            for status in message.status:
+                if status.name == node:
+                    values = {pair.key: pair.value for pair in status.values}
+                    return int(values.get("submaps received", 0)) == count
+        return False
+
+
+@pytest.fixture
+def peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Peers]:
+    with ExitStack() as stack:
+        environment = node_environment(stack.enter_context(PrivateDomain()))
+        environment |= {"XDG_STATE_HOME": str(tmp_path / "state")}
+        for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+            monkeypatch.setitem(os.environ, name, environment[name])
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=int(environment["ROS_DOMAIN_ID"]))
+        probe = Probe(context)
+        stack.callback(context.try_shutdown)
+        stack.callback(probe.node.destroy_node)
+        stack.callback(probe.executor.shutdown)
+        yield Peers(probe, environment, tmp_path, stack)
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+def test_two_agents_that_meet_have_the_map_that_a_post_would_have(
+    peers: Peers, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    world, path = ring_world(4.0, rng, 12.0), circle(4.0, 1.0)
+    own = {
+        "anna": Agent(world, path[:61], rng, "anna").submaps(),
+        "bert": Agent(world, path[45:], rng, "bert", stamp_ns=2_000_000_000).submaps(),
+    }
+    address, config = f"tcp/127.0.0.1:{free_port()}", SystemConfig()
+    specs = {
+        "anna": peer_nodes("anna", {"bert": ""}, (address,), config),
+        "bert": peer_nodes("bert", {"anna": address}, (), config),
+    }
+    specs["anna"][0].parameters.pop("scouting")  # nobody else's agents are to be found by a test
+    count = sum(map(len, own.values()))
+    peers.start(specs["anna"])
+    peers.publish(own["anna"], "anna")
+    peers.probe.wait(lambda: peers.has("/anna/peers/sjsam", len(own["anna"])), "anna alone has no map of her own")
+    peers.start(specs["bert"])
+    peers.publish(own["bert"], "bert")
+    for name in own:
+        peers.probe.wait(lambda n=name: peers.has(f"/{n}/peers/sjsam", count), f"{name} lacks submaps: {peers.log()}")
+    peers.probe.listen("/bert/peers/anna/odom", peers.probe.types.Odometry)
+
+    def pose_has_come() -> bool:
+        pose = PoseEstimate(10**9, np.eye(4), 1e-4 * np.eye(6))
+        peers.probe.send("/anna/odom", odometry_message(peers.probe.types, "odom", "base_link", pose))
+        return bool(peers.probe.received["/bert/peers/anna/odom"])
+
+    peers.probe.wait(pose_has_come, f"bert does not hear where anna is: {peers.log()}")
+    for name in own:
+        for service in ("finish", "save_map"):
+            assert peers.probe.call(f"/{name}/peers/sjsam/{service}").success
+
+    with MapSession(SjsamNodeConfig(agents=tuple(own), map_frame="peers_map")) as post:
+        for submap in in_order([unpack(pack(s)) for submaps in own.values() for s in submaps]):
+            post.add(submap)
+        post.finish().result()
+        post.save(tmp_path / "post").result()
+    graph = storage.read(tmp_path / "post").state.graph
+    ends = [(graph.records[k.first].key[0], graph.records[k.second].key[0]) for k in graph.links if k.is_closure]
+    assert any(first != second for first, second in ends), "the agents have not met"
+    folders = [tmp_path / "post", *(peers.map_of(nodes[1]) for nodes in specs.values())]
+    of_post, of_anna, of_bert = ({p.name: p.read_bytes() for p in folder.iterdir()} for folder in folders)
+    assert of_anna == of_bert
+    assert of_anna == of_post
+    assert "Traceback" not in peers.log()
