@@ -44,6 +44,8 @@ _FACTOR_STEP = 5e-3
 """Share by which the factor is above the eigenvalue at first; then it is doubled until it is enough."""
 _LEAST_OWN = 2e-3
 """Least share of an unknown's variance that is taken as its own: keeps ``D`` invertible."""
+_MANTISSA = 256.0
+"""Numbers of B have eight significant bits: the rest makes messages longer, and nothing surer."""
 _LEAST_SHARE = 1e-4
 """Least singular value of a block of B with rows of length 1: its square, times what keeps D invertible, is well above
 the rounding of a sum of all unknowns."""
@@ -177,9 +179,11 @@ def _rounded_factors(S: FloatArray) -> Float16Array:
         raise ValueError("a submap's covariance must be positive definite") from error
     rows, columns = np.tril_indices(3)
     values = np.concatenate([B.pose[np.tril_indices(6)], B.landmarks[:, rows, columns].ravel()]) / UNIT
-    if not np.abs(values).max() < np.finfo(np.float16).max:
+    mantissas, exponents = np.frexp(values)
+    rounded = np.ldexp(np.rint(mantissas * _MANTISSA) / _MANTISSA, exponents)
+    if not np.abs(rounded).max() <= np.finfo(np.float16).max:
         raise ValueError(f"a standard deviation of {UNIT * np.abs(values).max():.3g} m is too large to be sent")
-    return np.asarray(values, dtype=np.float16)
+    return np.asarray(rounded, dtype=np.float16)
 
 
 def _factors(blocks: Float16Array) -> _Blocks:
