@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ends of a link: an agent's, a post's, and that of an agent among others without a post."""
 
-# The node's methods are annotated in part only.
-# mypy: allow-untyped-calls
-
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any, Protocol
 
 from slam_core.geometry import FloatArray
+from slam_core.health import Health
 from slam_core.messages import (
     SUBMAP_TOPICS,
+    MessageTypes,
     estimate_from_message,
     odometry_message,
     stamp_ns,
@@ -34,17 +34,34 @@ from slam_radio.index_ranges import Key
 from slam_radio.light_submap import pack
 from slam_radio.link_state import LinkState
 from slam_radio.outbox import Outbox
+from slam_radio.radio_config import RadioConfig
 from slam_radio.radio_messages import pack_pose, pack_submap, unpack_acknowledgement, unpack_correction, unpack_pose
 from slam_radio.uplink import Uplink
+from slam_radio.zenoh_link import ZenohLink
 
-if TYPE_CHECKING:
-    from slam_radio.radio_link_node import RadioLinkNode
+
+class LinkNode(Protocol):
+    """The node of an end, as far as the end needs it: its topics, its health, and the link of bytes."""
+
+    config: RadioConfig
+    state_folder: Path
+    link: ZenohLink
+    health: Health
+    types: MessageTypes
+
+    def listen(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
+    def listen_together(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
+    def advertise(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
+    def publish(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
+    def broadcast(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
+    def do_later(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
+    def get_logger(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
 
 
 class End:
     """One end of the link, around its node: ``pump`` sends what is due, ``state`` is its health."""
 
-    def __init__(self, node: RadioLinkNode) -> None:
+    def __init__(self, node: LinkNode) -> None:
         self.node = node
 
     def pump(self, now_s: float) -> None:
@@ -83,7 +100,7 @@ class End:
 class AgentEnd(End):
     """Submaps and poses out, acknowledgements and corrections in."""
 
-    def __init__(self, node: RadioLinkNode) -> None:
+    def __init__(self, node: LinkNode) -> None:
         super().__init__(node)
         config = node.config
         self.name = config.agents[0]
@@ -159,7 +176,7 @@ class AgentEnd(End):
 class PostEnd(End):
     """Submaps and poses in, acknowledgements and corrections out."""
 
-    def __init__(self, node: RadioLinkNode) -> None:
+    def __init__(self, node: LinkNode) -> None:
         super().__init__(node)
         config = node.config
         inboxes = [Inbox(agent, node.state_folder / "inbox" / agent) for agent in config.agents]
@@ -220,7 +237,7 @@ class PeerEnd(End):
     Its own go the same way as the others', through the bytes that are sent: whoever joins them has what a post has.
     """
 
-    def __init__(self, node: RadioLinkNode) -> None:
+    def __init__(self, node: LinkNode) -> None:
         super().__init__(node)
         config = node.config
         self.name, *others = config.agents
@@ -330,7 +347,7 @@ class PeerEnd(End):
 class SubmapPublisher:
     """Submaps and poses of agents as ``sjsam`` reads them, below their names."""
 
-    def __init__(self, node: RadioLinkNode, agents: Iterable[str]) -> None:
+    def __init__(self, node: LinkNode, agents: Iterable[str]) -> None:
         self.node = node
         self._begun = False
         for agent in agents:
