@@ -60,7 +60,7 @@ class JoiningProblem:
         last: IntArray | None = None,
         constant: float = 0.0,
     ) -> None:
-        self.maps, self.model, self._constant = maps, model, constant
+        self.maps, self.model, self.fixed, self._constant = maps, model, fixed, constant
         self.rows = int(maps.mean_ptr[-1])
         dimension = state.translations.shape[1]
         self.layout: Layout = make_layout(maps, len(state.translations), len(state.landmarks), fixed, dimension, last)
