@@ -10,7 +10,7 @@ with none that show nothing new.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from sjsam_node.graph.links import Link, Prior, Status
 from sjsam_node.graph.map_graph import MapGraph
-from sjsam_node.loop_closure.association import Alignment, match
+from sjsam_node.loop_closure.association import Alignment, PointSet, match
 from sjsam_node.loop_closure.cycles import Hop, cycles_through
 from sjsam_node.loop_closure.near_pairs import NearPairs
 from sjsam_node.loop_closure.place_recognition import PlaceIndex
@@ -49,6 +49,25 @@ _BRIDGED_SIGMA = 0.08
 """A submap whose end is known no better than this (m) was carried on without images: the next is found by closures."""
 
 
+_AT_ONCE = 128
+"""Pairs that are compared elsewhere before what was found of them is looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two records to compare around a prior, by looks too where ``by_looks``; ``path_length``: of the way between."""
+
+    first: int
+    second: int
+    prior: Prior | None
+    path_length: float
+    by_looks: bool
+
+
+Found = tuple[Alignment | None, Status]
+Compare = Callable[[Sequence[Comparison]], Sequence[Found]]
+
+
 @dataclass
 class LoopDetector:
     """Finds and verifies the links of a new record; ``pending`` closures wait for others to close a cycle with."""
@@ -61,6 +80,8 @@ class LoopDetector:
     pending: list[Link] = field(default_factory=list)
     is_refuted: Callable[[int, int, Alignment], bool] = lambda first, second, found: False
     """True if something else than looks says that an alignment of two records is false."""
+    compare: Compare | None = None
+    """Compares many pairs at once, elsewhere; without it each is compared where it is asked for."""
     _alarms: dict[frozenset[int], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -159,39 +180,60 @@ class LoopDetector:
         threshold = config.association.descriptor_threshold
         return RedundancyCheck(state, MIN_NEAR_INLIERS, threshold, RANSAC_DISTANCE)
 
+    def verified(self, pairs: list[tuple[int, int]]) -> list[Link]:
+        """Links between pairs of records, as far as they tell something new and are supported; others wait."""
+        return self._verified(pairs, self._redundancy_check())
+
     def _verified(self, pairs: list[tuple[int, int]], known: RedundancyCheck, *, by_looks: bool = True) -> list[Link]:
         """Links between pairs of records that geometry and the map support; none that tell nothing new."""
         out: list[Link] = []
-        for old, new in pairs:
+        ahead: dict[tuple[int, int], Found] = {}
+        for k, (old, new) in enumerate(pairs):
+            if self.compare is not None and k % _AT_ONCE == 0:
+                ahead = self._ahead(self.compare, pairs[k : k + _AT_ONCE], known, by_looks)
             if known.is_all_known(old, new):
                 self.near.note(self.estimate.state, old, new)
                 continue
             prior = self.estimate.relative_pose(old, new)
             if prior is not None:
                 self.near.note(self.estimate.state, old, new)
-            link = self._compared(old, new, prior, by_looks)
+            link = self._compared(old, new, prior, by_looks, ahead.get((old, new)))
             if link is None:
                 continue
             if link.status is Status.CONSISTENT:
                 known.note(link)
-            out += self._judged(link) if link.status is Status.UNINFORMATIVE else [link]
+            out += self.judged(link) if link.status is Status.UNINFORMATIVE else [link]
         return out
 
-    def _compared(self, old: int, new: int, prior: Prior | None, by_looks: bool) -> Link | None:
-        """The closure between two records, if there is one."""
-        first, second = (at_start(self.graph.records[i]) for i in (old, new))
-        if not by_looks and prior is not None:
-            found, status = self.verifier.verify_near(first, second, prior), Status.CONSISTENT
-        else:
-            path_length = self.graph.path_length_between(old, new)
-            found, status = self.verifier.verify(first, second, prior, path_length, old, new)
+    def _ahead(
+        self, compare: Compare, pairs: list[tuple[int, int]], known: RedundancyCheck, by_looks: bool
+    ) -> dict[tuple[int, int], Found]:
+        """Comparisons of those of some pairs that may tell something new."""
+        left = [pair for pair in pairs if not known.is_all_known(*pair)]
+        wanted = [self._comparison(*pair, self.estimate.relative_pose(*pair), by_looks) for pair in left]
+        return dict(zip(left, compare(wanted), strict=True))
+
+    def _comparison(self, old: int, new: int, prior: Prior | None, by_looks: bool) -> Comparison:
+        return Comparison(old, new, prior, self.graph.path_length_between(old, new), by_looks or prior is None)
+
+    def _compared(
+        self, old: int, new: int, prior: Prior | None, by_looks: bool, ahead: Found | None = None
+    ) -> Link | None:
+        """The closure between two records, if there is one; ``ahead``: what comparing them has found already."""
+        if ahead is None:
+            first, second = (at_start(self.graph.records[i]) for i in (old, new))
+            ahead = compared(self.verifier, first, second, self._comparison(old, new, prior, by_looks))
+        return self.link(old, new, prior, *ahead)
+
+    def link(self, old: int, new: int, prior: Prior | None, found: Alignment | None, status: Status) -> Link | None:
+        """The closure between two records of which an alignment was found, unless something else refutes it."""
         if found is None or self.is_refuted(old, new, found):
             return None
         may_move = status is not Status.INCONSISTENT and prior is not None
         error = self.verifier.error_against(found, prior, 0.0) if may_move and prior is not None else 0.0
         return Link(old, new, found.pairs, found.T, found.covariance, True, error, status)
 
-    def _judged(self, link: Link) -> list[Link]:
+    def judged(self, link: Link) -> list[Link]:
         """The link if it is evident, or if a cycle with others that wait is, with these; otherwise it waits."""
         self.pending = [k for k in self.pending if k.ends != link.ends]
         self._alarms.pop(frozenset(link.ends), None)
@@ -262,6 +304,13 @@ class LoopDetector:
     def _reach(self, record: int) -> float:
         """Distance of the landmarks of a record from its start, their median, m."""
         return float(np.median(np.linalg.norm(self.graph.records[record].submap.landmarks, axis=1)))
+
+
+def compared(verifier: Verifier, first: PointSet, second: PointSet, wanted: Comparison) -> Found:
+    """The alignment of two records' landmarks, if geometry supports one, and what the prior says of it."""
+    if not wanted.by_looks:
+        return verifier.verify_near(first, second, wanted.prior), Status.CONSISTENT
+    return verifier.verify(first, second, wanted.prior, wanted.path_length, wanted.first, wanted.second)
 
 
 def _middle(state: EstimateState, record: int) -> FloatArray:

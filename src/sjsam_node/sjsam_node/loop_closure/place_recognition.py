@@ -125,7 +125,7 @@ class PlaceIndex:
             known = [place for place in self._descriptors if place not in excluded]
         else:
             known = self._proposed(self._tree.words(descriptors), excluded)
-        direct = {place: _likeness(self._descriptors[place], descriptors) for place in known}
+        direct = {place: likeness(self._descriptors[place], descriptors) for place in known}
         return sorted(known, key=lambda p: (-direct[p], p))[: self.config.candidates]
 
     def _proposed(self, words: IntArray, excluded: set[int]) -> list[int]:
@@ -144,7 +144,7 @@ class PlaceIndex:
         return [int(place) for place in ranked[: _PROPOSALS_PER_CANDIDATE * self.config.candidates]]
 
 
-def _likeness(first: Descriptors, second: Descriptors) -> float:
+def likeness(first: Descriptors, second: Descriptors) -> float:
     """Likeness of two places: how well the second one's descriptors find a counterpart in the first."""
     if not len(first) or not len(second):
         return 0.0

@@ -18,17 +18,21 @@ from sjsam_node.graph.links import Link, Prior
 from sjsam_node.graph.map_graph import ALL, MapGraph, Record
 from sjsam_node.smoothing.condensing import condense
 from sjsam_node.smoothing.marginals import prior_of_pair, relative_pose, seen_from
-from sjsam_node.smoothing.solver import SmootherConfig, optimize_full, relinearized, simplified
+from sjsam_node.smoothing.solver import Optimize, SmootherConfig, optimize_full, relinearized, simplified
 from sjsam_node.smoothing.state import EstimateState, with_links, with_submap
 from slam_core.geometry import FloatArray, compose_covariance
 from slam_core.types import Submap
 
 
 class MapEstimate:
-    """The state that holds, and what replaces it."""
+    """The state that holds, and what replaces it.
+
+    ``optimize``: what solves the whole map in the end instead of its own factor (:mod:`sjsam_node.regions`).
+    """
 
     def __init__(self, config: SmootherConfig | None = None, state: EstimateState | None = None) -> None:
         self.config = config or SmootherConfig()
+        self.optimize: Optimize | None = None
         self._state = state or EstimateState()
 
     @property
@@ -85,7 +89,8 @@ class MapEstimate:
         And where they do not contradict each other: then fewer say more. ``coarse``: as near to it as an update does.
         """
         self._state = simplified(self._state, self.config)  # the problem and factor of before are as large as the new
-        self._state = optimize_full(self._state, self.config, coarse=coarse)
+        optimize = None if coarse else self.optimize
+        self._state = optimize_full(self._state, self.config, coarse=coarse, optimize=optimize)
 
     def relinearize(self) -> None:
         """Keep nothing but the graph and its estimate, which is at its optimum: after loading as after saving."""

@@ -11,7 +11,7 @@ Every update joins in batch, warm from the estimate, without the old submaps tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -20,7 +20,7 @@ import numpy as np
 from sjsam_node.graph.links import Link
 from sjsam_node.graph.map_graph import ALL
 from sjsam_node.joint_problem import kernels
-from sjsam_node.joint_problem.joining import joint_errors, map_residual
+from sjsam_node.joint_problem.joining import JoiningProblem, joint_errors, map_residual
 from sjsam_node.joint_problem.problem import JoiningState, LocalMap, flatten, split
 from sjsam_node.joint_problem.robust import RobustConfig, RobustJoining, closing_rows, predicted
 from sjsam_node.smoothing.assembly import assemble, observations_of, with_component
@@ -86,13 +86,25 @@ class SmootherConfig(Config):
     region: RegionConfig = group(RegionConfig)
 
 
-def solve(state: EstimateState, component: int, config: SmootherConfig, *, coarse: bool = True) -> EstimateState:
-    """The state with a component at its optimum; condensed submaps that this bends take part again."""
+Optimize = Callable[[JoiningProblem, JoiningState, LevenbergMarquardtConfig], tuple[JoiningState, LeastSquaresResult]]
+"""Brings a problem from a state to its optimum."""
+
+
+def solve(
+    state: EstimateState, component: int, config: SmootherConfig, *, coarse: bool = True,
+    optimize: Optimize | None = None,
+) -> EstimateState:  # fmt: skip
+    """The state with a component at its optimum; condensed submaps that this bends take part again.
+
+    ``optimize``: what solves the problem instead of its own factor.
+    """
     while True:
         state = replace(state, frozen=state.frozen.still_tied(state.component_of))
         frozen = state.frozen.of_component(component, state.component_of)
         state, condensed = valid_submaps(state, component)
-        state, problem, found, bent = optimized(state, component, config, condensed, frozen, coarse=coarse)
+        state, problem, found, bent = optimized(
+            state, component, config, condensed, frozen, coarse=coarse, optimize=optimize
+        )
         if not bent:
             break
         state = expanded(state, bent)
@@ -131,10 +143,12 @@ def simplified(state: EstimateState, config: SmootherConfig) -> EstimateState:
     return replace(fully_expanded(_with_budget(state, config)), solved={}, frozen=FrozenSubmaps())
 
 
-def optimize_full(state: EstimateState, config: SmootherConfig, *, coarse: bool = False) -> EstimateState:
+def optimize_full(
+    state: EstimateState, config: SmootherConfig, *, coarse: bool = False, optimize: Optimize | None = None
+) -> EstimateState:
     """The simplified state with all components at their optimum; ``coarse``: as near to it as an update comes."""
     for component in state.components():
-        state = solve(state, component, config, coarse=coarse)
+        state = solve(state, component, config, coarse=coarse, optimize=optimize)
     return state
 
 
@@ -194,6 +208,7 @@ def optimized(
     frozen: FrozenSubmaps,
     *,
     coarse: bool,
+    optimize: Optimize | None = None,
 ) -> tuple[EstimateState, ComponentProblem, LeastSquaresResult, list[CondensedSubmap]]:
     """The state with a component at its optimum but for what is ``frozen``, the problem, and how it was solved.
 
@@ -202,7 +217,10 @@ def optimized(
     estimator, graph = config.estimator, state.graph
     problem = assemble(state, component, estimator.rows, estimator.solver, condensed, frozen)
     optimizer = estimator.optimizer(coarse=coarse)
-    optimum, result = problem.problem.optimize(problem.optimum, optimizer, keep_factor=coarse)
+    if optimize is None:
+        optimum, result = problem.problem.optimize(problem.optimum, optimizer, keep_factor=coarse)
+    else:
+        optimum, result = optimize(problem.problem, problem.optimum, optimizer)
     if estimator.robust.loss != "none":
         optimum, result, problem = _robust(problem, optimum, optimizer, estimator.robust)
     problem = replace(problem, optimum=optimum)
