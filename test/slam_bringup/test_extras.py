@@ -36,7 +36,8 @@ def said_without(module: str, *arguments: object, cwd: Path) -> str:
         ("rclpy", ("record", "-o", "bag"), "ros"),
         ("rclpy", ("demo", "--rate", "1"), "ros"),
         ("rclpy", ("live", "--topics"), "ros"),
-        ("distributed", ("experiment", "planar", "--quick", "--workers", "2", "-o", "page"), "experiments"),
+        ("distributed", ("experiment", "planar", "--quick", "--workers", "2", "-o", "page"), "scale"),
+        ("distributed", ("merge", DEMO, "--workers", "2", "-o", "merged"), "scale"),
     ],
 )
 def test_a_command_whose_extra_is_missing_says_what_to_install(tmp_path, module, arguments, extra):

@@ -24,6 +24,7 @@ use_one_blas_thread()
 
 COMMANDS = {
     "run": "offline pipeline: a bag to a map and a trajectory",
+    "merge": "finished maps, and bags, of any agents and days to one map",
     "nodes": "the same through the real ROS nodes: starts them, plays the bag, records",
     "demo": "the demo: the real nodes, in one process, on the bag that comes with the program",
     "live": "map live: all nodes in one process, on a camera or on topics",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 
-EXTRA_OF = {"rclpy": "ros", "dask": "experiments", "distributed": "experiments", "filterpy": "experiments"}
+EXTRA_OF = {"rclpy": "ros", "dask": "scale", "distributed": "scale", "filterpy": "experiments"}
 """Extra that brings a module."""
 GET_ROS = "source an installation, use ./slam of a checkout, or pip install 'indoor-slam[ros]'"
 

@@ -11,6 +11,7 @@ Functions are pure and give the same bytes wherever they run, as long as the wor
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -54,8 +55,10 @@ class OnCluster:
         self._client = client
 
     def hold(self, value: Any) -> Any:
-        """A future of a value that is sent to the cluster once."""
-        return self._client.submit(_same, value, pure=False)
+        """A future of a value that is sent to the cluster once; the scheduler sends it again if its worker is lost."""
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Sending large graph")
+            return self._client.submit(_same, value, pure=False)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """A future of the result of a function."""
