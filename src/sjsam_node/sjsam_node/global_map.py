@@ -287,11 +287,6 @@ class GlobalMap:
         """Every landmark once, with covariance, descriptor and id."""
         return self.snapshot().landmarks()
 
-    def join_closures(self, found: list[Link], newest: int) -> None:
-        """Join verified closures as far as the map can live with them; ``newest``: a record of what they tie."""
-        self._account(self.closures.join_closures(found, newest), len(found))
-        self._is_settled = False
-
     def settle(self) -> None:
         """Do now what was put off: compare what has come near, let go what does not fit, and join in batch.
 
@@ -303,7 +298,7 @@ class GlobalMap:
         for _ in range(_PASSES):
             missed = self.detector.missed(self.agents.chained, _COMPARED_AT_SETTLING * len(self.estimate.graph.records))
             for found in grouped(missed, self.config.joined_at_once):
-                self.join_closures(found, newest)
+                self._account(self.closures.join_closures(found, newest), len(found))
             if not missed:
                 break
         for _ in range(_PASSES):
@@ -328,14 +323,18 @@ class GlobalMap:
         if self._was_settled_before or ordered != submaps:
             rebuilt = GlobalMap(self.config)
             for submap in ordered:
-                if submap.agent == BUILDING:
-                    rebuilt._place(submap)
-                else:
-                    rebuilt.add(submap)
+                rebuilt.add_again(submap)
             rebuilt.counters = self.counters
             rebuilt.marks = self.marks_in(rebuilt)
         rebuilt.settle()
         return rebuilt
+
+    def add_again(self, submap: Submap) -> None:
+        """Join a submap that was in a map before; the tags of the building are placed as they were."""
+        if submap.agent == BUILDING:
+            self._place(submap)
+        else:
+            self.add(submap)
 
     def marks_in(self, other: GlobalMap) -> Marks:
         """The marks of this map, on the nodes of another one of the same submaps."""
@@ -379,17 +378,13 @@ class GlobalMap:
     @classmethod
     def load(cls, path: Path | str, config: GlobalMapConfig | None = None) -> GlobalMap:
         """The map that :meth:`save` wrote; ``ValueError`` if the folder is no such map."""
-        return cls.of(storage.read(Path(path)), config)
-
-    @classmethod
-    def of(cls, stored: StoredMap, config: GlobalMapConfig | None = None) -> GlobalMap:
-        """The map that :meth:`stored` gave, which stays as it is."""
+        stored = storage.read(Path(path))
         loaded, graph = cls(config), stored.state.graph
         loaded._take(stored.state)
         loaded._is_settled = not graph.records
-        loaded.marks, loaded.closures.refused = stored.marks, stored.refused
-        loaded.detector.pending = stored.pending
-        loaded.detector.near.compared = replace(stored.compared, seen=stored.compared.seen.copy())
+        loaded.marks = stored.marks
+        loaded.closures.refused = stored.refused
+        loaded.detector.pending, loaded.detector.near.compared = stored.pending, stored.compared
         for i, record in enumerate(graph.records):
             loaded.agents.add(i)
             loaded.tags.add(i)

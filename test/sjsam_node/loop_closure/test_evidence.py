@@ -68,7 +68,7 @@ def test_chance_does_not_make_an_alignment_of_two_places_evident() -> None:
             points = rng.uniform(-3.0, 3.0, (60, 3)) * [1.0, 1.0, 0.4]
             looks = unit(rng.normal(size=(60, 8))).astype(np.float32)  # so few elements that most look alike
             sets.append(PointSet(points, 0.03**2 * np.eye(180), looks))
-        found = verifier._by_looks(*sets, (seed,))
+        found = verifier.by_looks(*sets, (seed,))
         alarms.append(0.0 if found is None else verifier.log10_false_alarms(*sets, found))
     assert np.mean(np.array(alarms) < 0.0) < 0.05
     assert min(alarms) > -3.0

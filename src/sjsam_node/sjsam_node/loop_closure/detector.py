@@ -180,10 +180,6 @@ class LoopDetector:
         threshold = config.association.descriptor_threshold
         return RedundancyCheck(state, MIN_NEAR_INLIERS, threshold, RANSAC_DISTANCE)
 
-    def verified(self, pairs: list[tuple[int, int]]) -> list[Link]:
-        """Links between pairs of records, as far as they tell something new and are supported; others wait."""
-        return self._verified(pairs, self._redundancy_check())
-
     def _verified(self, pairs: list[tuple[int, int]], known: RedundancyCheck, *, by_looks: bool = True) -> list[Link]:
         """Links between pairs of records that geometry and the map support; none that tell nothing new."""
         out: list[Link] = []
@@ -202,7 +198,7 @@ class LoopDetector:
                 continue
             if link.status is Status.CONSISTENT:
                 known.note(link)
-            out += self.judged(link) if link.status is Status.UNINFORMATIVE else [link]
+            out += self._judged(link) if link.status is Status.UNINFORMATIVE else [link]
         return out
 
     def _ahead(
@@ -223,17 +219,14 @@ class LoopDetector:
         if ahead is None:
             first, second = (at_start(self.graph.records[i]) for i in (old, new))
             ahead = compared(self.verifier, first, second, self._comparison(old, new, prior, by_looks))
-        return self.link(old, new, prior, *ahead)
-
-    def link(self, old: int, new: int, prior: Prior | None, found: Alignment | None, status: Status) -> Link | None:
-        """The closure between two records of which an alignment was found, unless something else refutes it."""
+        found, status = ahead
         if found is None or self.is_refuted(old, new, found):
             return None
         may_move = status is not Status.INCONSISTENT and prior is not None
         error = self.verifier.error_against(found, prior, 0.0) if may_move and prior is not None else 0.0
         return Link(old, new, found.pairs, found.T, found.covariance, True, error, status)
 
-    def judged(self, link: Link) -> list[Link]:
+    def _judged(self, link: Link) -> list[Link]:
         """The link if it is evident, or if a cycle with others that wait is, with these; otherwise it waits."""
         self.pending = [k for k in self.pending if k.ends != link.ends]
         self._alarms.pop(frozenset(link.ends), None)

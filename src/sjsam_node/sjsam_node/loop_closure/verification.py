@@ -8,6 +8,7 @@ two poses.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -80,9 +81,13 @@ class ClosureConfig(Config):
 
 @dataclass
 class Verifier:
-    """Compares two submaps, landmark by landmark."""
+    """Compares two submaps, landmark by landmark.
+
+    ``looks``: alignments by looks alone that were found ahead, by the key that seeds them; others are found when asked.
+    """
 
     config: ClosureConfig = field(default_factory=ClosureConfig)
+    looks: Mapping[tuple[int, ...], Alignment | None] = field(default_factory=dict)
 
     def verify(
         self, first: PointSet, second: PointSet, prior: Prior | None, path_length: float, *key: int
@@ -115,7 +120,7 @@ class Verifier:
         self, first: PointSet, second: PointSet, prior: Prior | None, path_length: float, *key: int
     ) -> tuple[Alignment | None, Status]:
         """The alignment of two submaps by their looks, if geometry supports it, and what the prior says of it."""
-        guess = self._by_looks(first, second, key)
+        guess = self.looks[key] if key in self.looks else self.by_looks(first, second, key)
         if guess is None or not self._is_supported(first, second, guess):
             return None, Status.UNINFORMATIVE
         if prior is None or not self.is_against(guess, prior, path_length):
@@ -135,8 +140,8 @@ class Verifier:
         more = match(first, second, Prior(found.T, loose), self.config.association)
         return more if len(more.pairs) > len(found.pairs) else found
 
-    def _by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
-        """Alignment from descriptors alone, refined with all landmarks around it."""
+    def by_looks(self, first: PointSet, second: PointSet, key: tuple[int, ...]) -> Alignment | None:
+        """Alignment from descriptors alone, refined with all landmarks around it; ``key`` seeds the random samples."""
         pairs = self._distinct_pairs(first, second)
         if len(pairs) < _MIN_ALIKE_PAIRS:
             return None

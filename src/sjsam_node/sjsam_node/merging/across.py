@@ -2,7 +2,7 @@
 """Place recognition across maps and comparison of submaps, as tasks.
 
 The index of descriptors is sharded: each map is a shard that a worker holds. Every submap is looked up in the shards of
-the other maps before its own; the best of what all propose is compared, landmark by landmark, where the two maps are.
+the maps before its own; the best of what all propose are aligned, landmark by landmark, where the two maps are held.
 """
 
 from __future__ import annotations
@@ -15,15 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from sjsam_node.graph.links import Status
-from sjsam_node.graph.map_graph import MapGraph
-from sjsam_node.loop_closure.association import PointSet
+from sjsam_node.loop_closure.association import Alignment, PointSet
 from sjsam_node.loop_closure.detector import Comparison, Found, compared
 from sjsam_node.loop_closure.place_recognition import Descriptors, PlaceIndex, PlaceRecognitionConfig, likeness
-from sjsam_node.loop_closure.point_sets import at_start
 from sjsam_node.loop_closure.verification import ALIKE_CANDIDATES, ClosureConfig, Verifier
+from sjsam_node.merging.union import Union
 from sjsam_node.regions.tasks import Tasks
-from slam_core.linear_algebra.block_pattern import IntArray
+from slam_core.types import Submap
 
 _BATCH = 8
 """Pairs of submaps that one task compares, at most."""
@@ -48,20 +46,11 @@ class Shard:
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A submap of an earlier map that looks like one of a later map, and how much."""
+    """Submaps of two maps that look alike, and how much."""
 
     first: int
     second: int
     likeness: float
-
-
-@dataclass(frozen=True, eq=False)
-class Alike:
-    """Two submaps of different maps that geometry supports as one place, by looks alone."""
-
-    ends: tuple[int, int]
-    found: Found
-    log10_false_alarms: float
 
 
 # -- tasks: pure functions ---------------------------------------------------------------------------------------------
@@ -85,82 +74,71 @@ def _compared(
     return [compared(verifier, earlier[w.first], later[w.second], w) for w in wanted]
 
 
-def _alike(
+def _looked_at(
     earlier: dict[int, PointSet], later: dict[int, PointSet], pairs: list[tuple[int, int]], config: ClosureConfig
-) -> list[Alike]:
-    """Those of some pairs of submaps that geometry supports, without any prior."""
-    verifier, out = Verifier(config), []
-    for first, second in pairs:
-        a, b = earlier[first], later[second]
-        found, status = verifier.verify_alike(a, b, None, 0.0, first, second) if verifier.is_alike(a, b) else _NOTHING
-        if found is not None:
-            out.append(Alike((first, second), (found, status), verifier.log10_false_alarms(a, b, found)))
-    return out
-
-
-_NOTHING: Found = (None, Status.UNINFORMATIVE)
+) -> list[Alignment | None]:
+    """How some pairs of submaps of two maps align by looks."""
+    verifier = Verifier(config)
+    return [verifier.by_looks(earlier[first], later[second], (first, second)) for first, second in pairs]
 
 
 # -- the maps of a merge on the workers --------------------------------------------------------------------------------
 
 
 class AcrossMaps:
-    """The submaps of several maps in one graph, held where tasks compare them.
+    """The submaps of several maps, held where tasks compare them; numbered in the order in which they are joined.
 
     Parameters
     ----------
-    graph
+    union
         All submaps.
-    source
-        The map (records,) that each is of.
-    redundant
-        Mask (records,) of those that show nothing new.
     config
         Of closures.
     tasks
         Where they run.
     """
 
-    def __init__(
-        self, graph: MapGraph, source: IntArray, redundant: np.ndarray, config: ClosureConfig, tasks: Tasks
-    ) -> None:
-        self._source, self._config, self._tasks = source.tolist(), config, tasks
-        self._count = max(self._source) + 1
+    def __init__(self, union: Union, config: ClosureConfig, tasks: Tasks) -> None:
+        self._source, self._config, self._tasks = union.source, config, tasks
+        self._submaps, self._count = union.submaps, len(union.names)
         own: list[list[int]] = [[] for _ in range(self._count)]
-        for record, number in enumerate(self._source):
-            own[number].append(record)
-        self._shards = [
-            tasks.hold(_shard(graph, [i for i in records if not redundant[i]], config.places)) for records in own
-        ]
-        self._sets = [tasks.hold({i: _copied(at_start(graph.records[i])) for i in records}) for records in own]
+        for number, source in enumerate(union.source):
+            own[source].append(number)
+        self._shards = [tasks.hold(self._shard(numbers)) for numbers in own]
+        self._sets = [tasks.hold({i: _points(union.submaps[i]) for i in numbers}) for numbers in own]
 
-    def alike(self) -> list[Alike]:
-        """Submaps of different maps that are one place by their looks, the surest first."""
+    def _shard(self, numbers: list[int]) -> Shard:
+        return Shard(
+            tuple(numbers), tuple(np.array(self._submaps[i].descriptors) for i in numbers), self._config.places
+        )
+
+    def looks(self) -> dict[tuple[int, ...], Alignment | None]:
+        """Alignments by looks of the submaps of different maps that look most alike, as ``Verifier.looks``."""
         pairs = list(combinations(range(self._count), 2))
         handles = [self._tasks.submit(_proposed, self._shards[a], self._shards[b]) for a, b in pairs]
         best: dict[int, list[Proposal]] = {}
         for proposals in self._tasks.gather(handles):
             for one in proposals:
-                best.setdefault(one.second, []).append(one)
+                best.setdefault(max(one.first, one.second), []).append(one)
         wanted = [
-            (one.first, second)
-            for second, proposals in best.items()
-            for one in sorted(proposals, key=lambda p: (-p.likeness, p.first))[:ALIKE_CANDIDATES]
+            (min(one.first, one.second), later)
+            for later, proposals in sorted(best.items())
+            for one in sorted(proposals, key=lambda p: (-p.likeness, p.first, p.second))[:ALIKE_CANDIDATES]
         ]
+        wanted = list(dict.fromkeys(wanted))
         batches = self._batches(wanted)
-        found = self._run(_alike, [(maps, [wanted[i] for i in batch]) for maps, batch in batches])
-        every = [one for part in found for one in part]
-        return sorted(every, key=lambda one: (one.log10_false_alarms, one.ends))
+        results = self._run(_looked_at, [(maps, [wanted[i] for i in batch]) for maps, batch in batches])
+        places = [i for _, batch in batches for i in batch]
+        found = [one for part in results for one in part]
+        return {wanted[i]: one for i, one in zip(places, found, strict=True)}
 
     def compare(self, wanted: Sequence[Comparison]) -> list[Found]:
         """Comparisons, as :attr:`LoopDetector.compare` asks for them."""
         batches = self._batches([(w.first, w.second) for w in wanted])
         results = self._run(_compared, [(maps, [wanted[i] for i in batch]) for maps, batch in batches])
-        out: list[Found] = [_NOTHING] * len(wanted)
-        for (_, batch), found in zip(batches, results, strict=True):
-            for i, one in zip(batch, found, strict=True):
-                out[i] = one
-        return out
+        places = [i for _, batch in batches for i in batch]
+        found = [one for part in results for one in part]
+        return [found[k] for k in np.argsort(np.array(places, dtype=np.int64))]
 
     def _batches(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[tuple[int, int], list[int]]]:
         """Pairs of the same two maps together, at most :data:`_BATCH`: the maps, and places in ``pairs``."""
@@ -178,10 +156,7 @@ class AcrossMaps:
         return self._tasks.gather(handles)
 
 
-def _shard(graph: MapGraph, records: list[int], config: PlaceRecognitionConfig) -> Shard:
-    return Shard(tuple(records), tuple(np.array(graph.records[i].submap.descriptors) for i in records), config)
-
-
-def _copied(points: PointSet) -> PointSet:
-    """The same in memory: what a map keeps on disk is read once, and sent."""
-    return PointSet(np.array(points.points), np.array(points.covariance), np.array(points.descriptors))
+def _points(submap: Submap) -> PointSet:
+    """Landmarks in the frame of the start, in memory: what a map keeps on disk is read once, and sent."""
+    covariance = np.array(submap.covariance[6:, 6:])
+    return PointSet(np.array(submap.landmarks), covariance, np.array(submap.descriptors))

@@ -22,9 +22,6 @@ from slam_core.version import VERSION
 from slam_viewer.report.output import write_results
 from slam_viewer.report.summary_table import summary_table
 
-_STEPS = 4
-"""Steps of merging that are told."""
-
 
 @click.command()
 @click.argument("inputs", nargs=-1, required=True, metavar="MAP|BAG...", type=UserPath(exists=True))
@@ -58,11 +55,11 @@ def command(
     results, transcript = OutputFolder(output, "merge", source, overwrite=overwrite), Transcript(VERSION)
     with results, transcript, results.staged() as folder:
         with cluster(scheduler, workers) as tasks, progress_bar() as progress:
-            task = progress.add_task("reading and mapping", total=len(paths) + _STEPS)
+            task = progress.add_task("reading and mapping", total=len(paths))
             maps = read_inputs(paths, own, tasks, lambda: progress.advance(task))
 
-            def on_step(step: str) -> None:
-                progress.update(task, description=step, advance=1)
+            def on_step(step: str, done: int, total: int) -> None:
+                progress.update(task, description=step, completed=done, total=total)
 
             merged = merge(maps, system.sjsam, tasks, on_step)
         result = merged_result(merged, [path.name for path in paths], time.perf_counter() - began)
