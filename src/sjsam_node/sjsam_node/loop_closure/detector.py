@@ -183,17 +183,17 @@ class LoopDetector:
     def _verified(self, pairs: list[tuple[int, int]], known: RedundancyCheck, *, by_looks: bool = True) -> list[Link]:
         """Links between pairs of records that geometry and the map support; none that tell nothing new."""
         out: list[Link] = []
-        ahead: dict[tuple[int, int], Found] = {}
+        results: dict[tuple[int, int], Found] = {}
         for k, (old, new) in enumerate(pairs):
             if self.compare is not None and k % _AT_ONCE == 0:
-                ahead = self._ahead(self.compare, pairs[k : k + _AT_ONCE], known, by_looks)
+                results = self._compared_at_once(self.compare, pairs[k : k + _AT_ONCE], known, by_looks)
             if known.is_all_known(old, new):
                 self.near.note(self.estimate.state, old, new)
                 continue
             prior = self.estimate.relative_pose(old, new)
             if prior is not None:
                 self.near.note(self.estimate.state, old, new)
-            link = self._compared(old, new, prior, by_looks, ahead.get((old, new)))
+            link = self._compared(old, new, prior, by_looks, results.get((old, new)))
             if link is None:
                 continue
             if link.status is Status.CONSISTENT:
@@ -201,7 +201,7 @@ class LoopDetector:
             out += self._judged(link) if link.status is Status.UNINFORMATIVE else [link]
         return out
 
-    def _ahead(
+    def _compared_at_once(
         self, compare: Compare, pairs: list[tuple[int, int]], known: RedundancyCheck, by_looks: bool
     ) -> dict[tuple[int, int], Found]:
         """Comparisons of those of some pairs that may tell something new."""
@@ -213,13 +213,13 @@ class LoopDetector:
         return Comparison(old, new, prior, self.graph.path_length_between(old, new), by_looks or prior is None)
 
     def _compared(
-        self, old: int, new: int, prior: Prior | None, by_looks: bool, ahead: Found | None = None
+        self, old: int, new: int, prior: Prior | None, by_looks: bool, known: Found | None = None
     ) -> Link | None:
-        """The closure between two records, if there is one; ``ahead``: what comparing them has found already."""
-        if ahead is None:
+        """The closure between two records, if there is one; ``known``: what comparing them has found already."""
+        if known is None:
             first, second = (at_start(self.graph.records[i]) for i in (old, new))
-            ahead = compared(self.verifier, first, second, self._comparison(old, new, prior, by_looks))
-        found, status = ahead
+            known = compared(self.verifier, first, second, self._comparison(old, new, prior, by_looks))
+        found, status = known
         if found is None or self.is_refuted(old, new, found):
             return None
         may_move = status is not Status.INCONSISTENT and prior is not None

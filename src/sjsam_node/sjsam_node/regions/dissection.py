@@ -25,7 +25,7 @@ _LEAST_SHARE = 0.35
 
 
 @dataclass(frozen=True, eq=False)
-class Region:
+class MapRegion:
     """A region: its maps, own variables, separator, and the two regions that it was cut into, if it was.
 
     maps (k,), own (o,) and separator (s,) are numbers, ascending.
@@ -34,14 +34,14 @@ class Region:
     maps: IntArray
     own: IntArray
     separator: IntArray
-    children: tuple[Region, ...] = ()
+    children: tuple[MapRegion, ...] = ()
 
     @property
     def variables(self) -> IntArray:
         """Variables of the front in its order: own ones, then the separator."""
         return np.concatenate([self.own, self.separator])
 
-    def regions(self) -> Iterator[Region]:
+    def regions(self) -> Iterator[MapRegion]:
         """The region and all those inside it, children first."""
         for child in self.children:
             yield from child.regions()
@@ -89,20 +89,20 @@ class Variables:
         return items[free], owner[free]
 
 
-def dissect(variables: Variables, places: FloatArray, leaf_maps: int = LEAF_MAPS) -> Region:
+def dissect(variables: Variables, places: FloatArray, leaf_maps: int = LEAF_MAPS) -> MapRegion:
     """The tree of regions of all maps; ``places`` (maps, 2 or 3) are where they are, m."""
     return _dissect(variables, places, np.arange(len(places)), leaf_maps)[0]
 
 
 def _dissect(
     variables: Variables, places: FloatArray, maps: IntArray, leaf_maps: int
-) -> tuple[Region, IntArray, IntArray]:
+) -> tuple[MapRegion, IntArray, IntArray]:
     """A region of some maps, the variables that it has left for its parent, and how many of its maps know each."""
     items, owner = variables.of_maps(maps)
     if len(maps) <= leaf_maps:
         pairs = np.unique(items * len(maps) + owner)
         left, counts = np.unique(pairs // len(maps), return_counts=True)
-        children: tuple[Region, ...] = ()
+        children: tuple[MapRegion, ...] = ()
     else:
         halves = _cut(variables, places[maps], items, owner)
         parts = [_dissect(variables, places, maps[half], leaf_maps) for half in halves]
@@ -110,7 +110,7 @@ def _dissect(
         left, back = np.unique(np.concatenate([part[1] for part in parts]), return_inverse=True)
         counts = np.bincount(back.ravel(), weights=np.concatenate([part[2] for part in parts])).astype(np.int64)
     is_outside = counts < variables.known[left]
-    region = Region(maps, left[~is_outside], left[is_outside], children)
+    region = MapRegion(maps, left[~is_outside], left[is_outside], children)
     return region, left[is_outside], counts[is_outside]
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from typing import Any, Protocol
 
@@ -65,8 +66,25 @@ class OnCluster:
         return self._client.submit(function, *arguments, pure=False)
 
     def gather(self, handles: Sequence[Any]) -> list[Any]:
-        """The results, once all are there."""
-        return list(self._client.gather(list(handles)))
+        """The results, once all are there.
+
+        Raises
+        ------
+        ValueError
+            If the cluster was lost, or the same task took several workers with it.
+        """
+        from distributed import KilledWorker
+        from distributed.comm import CommClosedError
+
+        try:
+            return list(self._client.gather(list(handles)))
+        except KilledWorker as error:
+            raise ValueError(
+                "several workers ended at the same task, most likely for want of memory: start workers with more "
+                f"(--memory-limit), or fewer a host: {error}"
+            ) from error
+        except (CommClosedError, CancelledError) as error:
+            raise ValueError(f"the Dask cluster was lost: start it again, then the same command: {error}") from error
 
 
 def _same(value: Any) -> Any:

@@ -22,7 +22,7 @@ import numpy as np
 
 from sjsam_node.joint_problem import kernels
 from sjsam_node.joint_problem.problem import FlatMaps, JoiningState
-from sjsam_node.regions.dissection import LEAF_MAPS, Region, Variables, dissect
+from sjsam_node.regions.dissection import LEAF_MAPS, MapRegion, Variables, dissect
 from sjsam_node.regions.fronts import (
     Front,
     Reduced,
@@ -49,7 +49,7 @@ class _Piece:
     """
 
     model: int
-    region: Region
+    region: MapRegion
     maps: FlatMaps
     items: Variables
     poses: IntArray
@@ -98,7 +98,7 @@ def _eliminate_piece(piece: _Piece, state: JoiningState, damping: float) -> _Eli
     return _eliminate_inside(piece, piece.region, state, damping)
 
 
-def _eliminate_inside(piece: _Piece, region: Region, state: JoiningState, damping: float) -> _Eliminated:
+def _eliminate_inside(piece: _Piece, region: MapRegion, state: JoiningState, damping: float) -> _Eliminated:
     width = piece.items.width
     children = tuple(_eliminate_inside(piece, child, state, damping) for child in region.children)
     start = pointers(width[region.variables])
@@ -129,7 +129,7 @@ def _step_inside(piece: _Piece, eliminated: _Eliminated, separator: FloatArray) 
     start = pointers(piece.items.width)
     out = np.zeros(int(start[-1]))
 
-    def go(region: Region, part: _Eliminated, known: FloatArray) -> None:
+    def go(region: MapRegion, part: _Eliminated, known: FloatArray) -> None:
         step = np.concatenate([substitute(part.front, known), known])
         out[_scalars(start, piece.items.width, region.variables)] = step
         for child, inside in zip(region.children, part.children, strict=True):
@@ -148,7 +148,7 @@ def _blocks_inside(piece: _Piece, eliminated: _Eliminated, separator: FloatArray
     width = piece.items.width
     out = np.zeros((len(width), 6, 6))
 
-    def go(region: Region, part: _Eliminated, known: FloatArray) -> None:
+    def go(region: MapRegion, part: _Eliminated, known: FloatArray) -> None:
         joint = joint_covariance(part.front, known)
         _take_blocks(region.own, width, joint, out)
         for child, inside in zip(region.children, part.children, strict=True):
@@ -185,7 +185,7 @@ def _scalars(start: IntArray, width: IntArray, variables: IntArray) -> IntArray:
     return np.asarray(first + np.arange(int(sizes.sum())))
 
 
-def _scalars_in(region: Region, child: Region, width: IntArray) -> IntArray:
+def _scalars_in(region: MapRegion, child: MapRegion, width: IntArray) -> IntArray:
     """Scalars of a child's separator in its parent's front."""
     variables = region.variables
     order = np.argsort(variables)
@@ -207,7 +207,7 @@ def _runs(ptr: IntArray, chosen: IntArray) -> IntArray:
     return np.asarray(np.repeat(ptr[chosen] - pointers(counts)[:-1], counts) + np.arange(int(counts.sum())))
 
 
-def _piece(model: int, region: Region, maps: FlatMaps, every: Variables) -> _Piece:
+def _piece(model: int, region: MapRegion, maps: FlatMaps, every: Variables) -> _Piece:
     """A region with all that its task needs, numbered by itself."""
     poses_at, landmarks_at = _runs(maps.pose_ptr, region.maps), _runs(maps.landmark_ptr, region.maps)
     means, values = _runs(maps.mean_ptr, region.maps), _runs(maps.information_ptr, region.maps)
@@ -227,10 +227,10 @@ def _piece(model: int, region: Region, maps: FlatMaps, every: Variables) -> _Pie
     return _Piece(model, _renumbered(region, region.maps, variables), own, inside, poses, landmarks)
 
 
-def _renumbered(region: Region, maps: IntArray, variables: IntArray) -> Region:
+def _renumbered(region: MapRegion, maps: IntArray, variables: IntArray) -> MapRegion:
     own, separator = np.searchsorted(variables, region.own), np.searchsorted(variables, region.separator)
     children = tuple(_renumbered(child, maps, variables) for child in region.children)
-    return Region(np.searchsorted(maps, region.maps), own, separator, children)
+    return MapRegion(np.searchsorted(maps, region.maps), own, separator, children)
 
 
 # -- the tree ----------------------------------------------------------------------------------------------------------
@@ -240,7 +240,7 @@ def _renumbered(region: Region, maps: IntArray, variables: IntArray) -> Region:
 class _Node:
     """A region above the pieces (``piece`` is -1), or that of a piece; ``below``: nodes of its children."""
 
-    region: Region
+    region: MapRegion
     piece: int
     below: tuple[int, ...]
 
@@ -285,7 +285,7 @@ class RegionTree:
         self._held = [self._tasks.hold(piece) for piece in self._pieces]
         self._eliminated: list[Any] = []
 
-    def _add(self, region: Region, maps: FlatMaps, model: int, task_maps: int) -> int:
+    def _add(self, region: MapRegion, maps: FlatMaps, model: int, task_maps: int) -> int:
         """Number of the node of a region, after those below it."""
         if len(region.maps) <= task_maps or not region.children:
             self._pieces.append(_piece(model, region, maps, self.variables))

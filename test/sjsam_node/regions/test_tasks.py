@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks on Dask's workers: the same bytes as in process, also when a worker dies, and clear lines where none can be."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+
+import numpy as np
+import pytest
+from random_joining import MODELS, random_problem
+
+from sjsam_node.joint_problem.problem import flatten
+from sjsam_node.regions.tasks import InProcess, OnCluster, cluster
+from sjsam_node.regions.tree import RegionTree
+
+
+def solved(tasks, between=lambda: None):
+    maps, state = random_problem(MODELS["tangent"], np.random.default_rng(3), maps=40, landmarks=60)
+    tree = RegionTree(flatten(maps), state, np.array([0]), MODELS["tangent"], tasks, leaf_maps=2, task_maps=6)
+    tree.eliminate(state)
+    between()
+    return [tree.step(), *tree.covariances()]
+
+
+@pytest.fixture(scope="module")
+def client():
+    distributed = pytest.importorskip("distributed")
+    here = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.LocalCluster(**here) as local, distributed.Client(local) as client:
+        yield client
+
+
+@pytest.mark.slow
+def test_what_a_task_raises_is_raised_where_its_result_is_asked_for(client):
+    tasks = OnCluster(client)
+    with pytest.raises(ValueError, match="too small"):
+        tasks.gather([tasks.submit(int, "too small")])
+
+
+@pytest.mark.slow
+def test_workers_give_the_same_bytes_also_when_one_is_killed_half_way(client):
+    expected = [part.tobytes() for part in solved(InProcess())]
+    assert [part.tobytes() for part in solved(OnCluster(client))] == expected
+    killed = []
+
+    def kill_one():
+        """Kill a worker that holds factors, so that these have to be made again."""
+        holders = [worker for worker, keys in client.has_what().items() if any("_eliminate" in str(k) for k in keys)]
+        while not holders:
+            holders = [w for w, keys in client.has_what().items() if any("_eliminate" in str(k) for k in keys)]
+        killed.append(client.run(os.getpid, workers=holders[:1])[holders[0]])
+        os.kill(killed[0], signal.SIGKILL)
+
+    assert [part.tobytes() for part in solved(OnCluster(client), kill_one)] == expected
+    assert killed
+
+
+def test_a_lost_cluster_and_a_task_that_kills_workers_are_told():
+    distributed = pytest.importorskip("distributed")
+
+    class Lost:
+        def __init__(self, error):
+            self.error = error
+
+        def gather(self, handles):
+            raise self.error
+
+    with pytest.raises(ValueError, match="cluster was lost"):
+        OnCluster(Lost(distributed.comm.CommClosedError("closed"))).gather([])
+    with pytest.raises(ValueError, match="want of memory"):
+        OnCluster(Lost(distributed.KilledWorker("task", None, 3))).gather([])
+
+
+def test_without_distributed_everything_runs_in_process_unless_workers_are_asked_for(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with cluster() as tasks:
+        assert isinstance(tasks, InProcess)
+    with pytest.raises(ModuleNotFoundError), cluster(workers=2):
+        pass
+    with pytest.raises(ValueError, match="not both"), cluster("tcp://host:8786", 2):
+        pass
