@@ -68,7 +68,7 @@ def test_imports_point_down_and_ros_stays_in_nodes(path):
 @pytest.mark.parametrize("package", sorted(LAYER.keys() - NOT_SHIPPED))
 @pytest.mark.parametrize("name", ["setup.py", "package.xml"])
 def test_what_is_shipped_requires_nothing_that_is_not(package, name):
-    text = (SRC / package / name).read_text(encoding="utf-8")
+    text = re.sub(r"extras_require={.*?}", "", (SRC / package / name).read_text(encoding="utf-8"))
     assert not [other for other in (*NOT_SHIPPED, "dask", "distributed") if re.search(rf"\b{other}\b", text)]
 
 

@@ -34,7 +34,7 @@ FROM_ROS = re.compile(r"rclpy|launch(_ros)?|ament_index_python|std_srvs|rcl_inte
 PEERS = {"gtsam"}
 """What results are compared with, where it is installed."""
 
-OPTIONAL = {"pyopencl"}
+OPTIONAL = {"pyopencl", "distributed"}
 """What is used where it is installed; one of the extras of setup.py brings it."""
 
 BROUGHT_BY_ANOTHER = {"llvmlite": "numba", "mpl_toolkits": "matplotlib", "dask": "distributed", "websockets": "viser"}
@@ -62,7 +62,7 @@ def test_setup_and_package_xml_name_every_import(package: str) -> None:
     for name in imported(package):
         if FROM_ROS.fullmatch(name):
             assert name in named, f"package.xml of {package} lacks {name}"
-        elif name in OPTIONAL:
+        elif name in OPTIONAL - required:
             assert name in optional, f"no extra of setup.py of {package} brings {name}"
         elif name not in BROUGHT_BY_ANOTHER and name not in PEERS:
             assert PIP_NAME.get(name, name) in required, f"setup.py of {package} lacks {name}"

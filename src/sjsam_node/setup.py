@@ -21,6 +21,7 @@ setup(
         "numpy",
         "scipy",
     ],
+    extras_require={"scale": ["distributed"]},
     zip_safe=False,
     maintainer="Indoor SLAM maintainers",
     maintainer_email="maintainers@indoor-slam.org",

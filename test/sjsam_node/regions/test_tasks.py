@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -67,10 +68,11 @@ def test_a_lost_cluster_and_a_task_that_kills_workers_are_told():
         def gather(self, handles):
             raise self.error
 
+    killed = distributed.KilledWorker("task", SimpleNamespace(address="tcp://host:1"), 3)
     with pytest.raises(ValueError, match="cluster was lost"):
         OnCluster(Lost(distributed.comm.CommClosedError("closed"))).gather([])
     with pytest.raises(ValueError, match="want of memory"):
-        OnCluster(Lost(distributed.KilledWorker("task", None, 3))).gather([])
+        OnCluster(Lost(killed)).gather([])
 
 
 def test_without_distributed_everything_runs_in_process_unless_workers_are_asked_for(monkeypatch):

@@ -74,7 +74,7 @@ class OnCluster:
             If the cluster was lost, or the same task took several workers with it.
         """
         from distributed import KilledWorker
-        from distributed.comm import CommClosedError
+        from distributed.comm.core import CommClosedError
 
         try:
             return list(self._client.gather(list(handles)))
