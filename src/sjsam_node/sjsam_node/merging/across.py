@@ -77,7 +77,7 @@ def _compared(
 def _looked_at(
     earlier: dict[int, PointSet], later: dict[int, PointSet], pairs: list[tuple[int, int]], config: ClosureConfig
 ) -> list[Alignment | None]:
-    """How some pairs of submaps of two maps align by looks."""
+    """Alignments by looks of some pairs of submaps of two maps."""
     verifier = Verifier(config)
     return [verifier.by_looks(earlier[first], later[second], (first, second)) for first, second in pairs]
 

@@ -100,7 +100,7 @@ def _key(submap: Submap) -> Key:
 
 @dataclass
 class _Taken:
-    """What is taken over of each map so far; ``submaps`` by key, with the map that each is of."""
+    """Holds what was taken over of each map so far; ``submaps`` by key, with the map that each is of."""
 
     submaps: dict[Key, tuple[Submap, int]] = field(default_factory=dict)
     digests: dict[Key, bytes] = field(default_factory=dict)

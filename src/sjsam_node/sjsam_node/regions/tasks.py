@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where tasks run: in this process, or on the workers of a Dask cluster; the caller is the same.
+"""Runs tasks in this process, or on the workers of a Dask cluster; the caller is the same.
 
     with cluster(scheduler, workers) as tasks:
         handle = tasks.submit(function, argument, other_handle)
@@ -93,7 +93,7 @@ def _same(value: Any) -> Any:
 
 @contextmanager
 def cluster(scheduler: str | None = None, workers: int | None = None) -> Iterator[Tasks]:
-    """Where tasks run: on the cluster of a ``scheduler``, on ``workers`` processes of this machine, or here.
+    """Tasks run on the cluster of a ``scheduler``, on ``workers`` processes of this machine, or here.
 
     Without either there is one process for each processor, or none where ``distributed`` is not installed.
 

@@ -61,7 +61,7 @@ class _Piece:
         return JoiningState(state.rotations[self.poses], state.translations[self.poses], landmarks)
 
     def rows_of(self, maps: IntArray, scalar: IntArray) -> tuple[IntArray, IntArray]:
-        """Where the rows of each map's own equations are among scalars: ``scalar`` (v,) is a variable's first, or -1.
+        """Places of the rows of each map's own equations among scalars: ``scalar`` (v,) is a variable's first, or -1.
 
         row_ptr (k + 1,) and rows.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``slam merge`` does: bags are mapped by tasks, maps are read, all become one, with the results of a run."""
+"""The work of ``slam merge``: bags are mapped by tasks, maps are read, all become one, with the results of a run."""
 
 from __future__ import annotations
 
