@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ekf_slam_node.association.pair_kernels import PairErrors, gated, normal_equations, pair_errors
-from ekf_slam_node.filtering.candidates import Candidates, innovation_covariance, predict, squared_distances
+from ekf_slam_node.association.pair_kernels import PairErrors, gated, normal_equations, pair_errors, readout_equations
+from ekf_slam_node.filtering.candidates import Candidates, innovation_covariance, predict
 from ekf_slam_node.filtering.models import Frame, Observation, frame_from_features, relative_motion, rig_points
 from feature_world import T_RIG_OPTICAL, room
 
@@ -60,7 +60,8 @@ def test_errors_covariances_and_jacobians(
 
 def test_gate(filled: PairErrors) -> None:
     scale = np.array([1.5, 1.5, 0.8])
-    distance = squared_distances(filled.error, scaled(filled, scale))
+    whitened = np.linalg.solve(scaled(filled, scale), filled.error[:, :, None])[:, :, 0]
+    distance = np.einsum("ni,ni->n", filled.error, whitened)
     gate = float(np.median(distance))
     inside = gated(filled.error, filled.S, filled.depth, scale, gate)
     np.testing.assert_array_equal(inside, (distance < gate) & (filled.depth > 0.05))
@@ -75,3 +76,21 @@ def test_normal_equations(filled: PairErrors) -> None:
     J, weight = filled.J[chosen], np.linalg.inv(scaled(filled, scale)[chosen])
     np.testing.assert_allclose(information, np.einsum("nki,nkl,nlj->ij", J, weight, J), rtol=1e-9)
     np.testing.assert_allclose(gradient, np.einsum("nki,nkl,nl->i", J, weight, filled.error[chosen]), rtol=1e-8)
+
+
+def test_equations_of_a_readout_with_far_off_pairs_weighed_less(filled: PairErrors, rng: np.random.Generator) -> None:
+    error, S, J = filled.error[1:], filled.S[1:], filled.J[1:]  # the first is behind the camera
+    scale, x = np.array([1.2, 1.2, 2.0]), 1e-3 * rng.normal(size=7)
+    slope = rng.normal(size=(len(error), 3))
+    H, weight = np.concatenate([J, -slope[:, :, None]], axis=2), np.linalg.inv(S * np.outer(scale, scale))
+    left = error - H @ x
+    size = np.sqrt(np.einsum("ni,nij,nj->n", left, weight, left))
+    huber = float(np.median(size))
+    share = 1.0 / np.maximum(1.0, size / huber)
+    information, gradient = np.empty((7, 7)), np.empty(7)
+    readout_equations(error, S, J, slope, scale, x, huber, information, gradient)
+    for found, expected in (
+        (information, np.einsum("n,nki,nkl,nlj->ij", share, H, weight, H)),
+        (gradient, np.einsum("n,nki,nkl,nl->i", share, H, weight, error)),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max())

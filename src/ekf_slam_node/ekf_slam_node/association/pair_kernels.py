@@ -130,6 +130,38 @@ def normal_equations(error, S, J, chosen, scale):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
+def readout_equations(error, S, J, slope, scale, x, huber, information, gradient):  # type: ignore[no-untyped-def]
+    """Fill ``sum w H' S^-1 H`` (7, 7) and ``sum w H' S^-1 error`` (7,) of all pairs, H = (J, -slope), at x (7,).
+
+    S is scaled as in :func:`gated`; w falls where ``error - H x`` is beyond ``huber`` standard deviations (Huber 1964).
+    """
+    information[:], gradient[:] = 0.0, 0.0
+    L, W = np.zeros((3, 3)), np.empty((3, 8))
+    for n in range(len(error)):
+        _factor(S[n], scale, L)
+        for k in range(8):
+            for i in range(3):
+                value = error[n, i] if k == 7 else (-slope[n, i] if k == 6 else J[n, i, k])
+                for j in range(i):
+                    value -= L[i, j] * W[j, k]
+                W[i, k] = value / L[i, i]
+        distance = 0.0
+        for i in range(3):
+            left = W[i, 7]
+            for k in range(7):
+                left -= W[i, k] * x[k]
+            distance += left * left
+        weight = 1.0 / max(1.0, np.sqrt(distance) / huber)
+        for p in range(7):
+            for q in range(p + 1):
+                information[p, q] += weight * (W[0, p] * W[0, q] + W[1, p] * W[1, q] + W[2, p] * W[2, q])
+            gradient[p] += weight * (W[0, p] * W[0, 7] + W[1, p] * W[1, 7] + W[2, p] * W[2, 7])
+    for p in range(7):
+        for q in range(p):
+            information[q, p] = information[p, q]
+
+
+@njit(cache=True, nogil=True)
 def first_of_both(rows, columns, row_count, column_count):  # type: ignore[no-untyped-def]
     """Mask (n,) of the pairs whose row and column no pair before them has taken."""
     row_taken, column_taken = np.zeros(row_count, np.bool_), np.zeros(column_count, np.bool_)

@@ -22,13 +22,12 @@ from math import isfinite
 
 import numpy as np
 
-from slam_core.geometry import FloatArray, skew, so3_exp
+from ekf_slam_node.odometry.preintegration_kernels import preintegrated
+from slam_core.geometry import FloatArray
 from slam_core.types import LONGEST_IMU_STEP_S, ImuSample
 
 _EDGE_S = np.linspace(0.0025, 0.0175, 4)
 """Rates at an edge are means before and after it: a single reading's noise would be taken for a change of the rates."""
-_HELD_NS = 1_500_000
-"""The first and the last reading hold for twice as long beyond them."""
 _LONGEST_S = 10.0
 """Nothing is integrated over longer times, and readings are kept for twice as long."""
 
@@ -44,6 +43,11 @@ class ImuNoise:
     accelerometer: float
     unknown_turn: float
     unknown_force: float
+
+    @property
+    def values(self) -> FloatArray:
+        """The four, (4,)."""
+        return np.array([self.gyro, self.accelerometer, self.unknown_turn, self.unknown_force])
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,86 +106,24 @@ class ImuReadings:
             return None
         if not 0 < end_ns - start_ns <= _LONGEST_S * 1e9:
             return None
-        inside = (stamps > start_ns) & (stamps < end_ns)
-        edges = np.concatenate([[start_ns], stamps[inside], [end_ns]])
-        middle = 0.5 * (edges[1:] + edges[:-1]) - start_ns
-        turn_rates = np.array([sample.angular_velocity for sample in self._samples])
-        forces = np.array([sample.linear_acceleration for sample in self._samples])
-        times = (stamps - start_ns).astype(np.float64)
-        columns = (*turn_rates.T, *forces.T)
-        at_middle = np.column_stack([np.interp(middle, times, column) for column in columns])
+        rates = np.array([sample.angular_velocity for sample in self._samples], dtype=np.float64)
+        forces = np.array([sample.linear_acceleration for sample in self._samples], dtype=np.float64)
+        R, v, p, J, covariance = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty((9, 7)), np.empty((9, 9))
+        size = preintegrated(
+            stamps, rates, forces, np.array([start_ns, end_ns]), biases, noise.values, LONGEST_IMU_STEP_S,
+            R, v, p, J[:, :6], covariance,
+        )  # fmt: skip
+        dt = 1e-9 * (end_ns - start_ns)
         around = np.array([0.0, end_ns - start_ns])[:, None] + 1e9 * np.array([-_EDGE_S, _EDGE_S])[:, None]
-        at_edges = np.stack([np.interp(around, times, column).mean(axis=2) for column in columns], axis=2)
-        silent = np.clip(np.diff(edges) * 1e-9 - LONGEST_IMU_STEP_S, 0.0, None) > 0.0
-        silent |= np.maximum(times[0] - middle, middle - times[-1]) > _HELD_NS
-        return _integrated(at_middle, at_edges, biases, np.diff(edges) * 1e-9, silent, noise)
-
-
-def _integrated(
-    readings: FloatArray, at_edges: FloatArray, biases: FloatArray, dt: FloatArray, silent: np.ndarray, noise: ImuNoise
-) -> Preintegral:
-    """Preintegral of readings (n, 6), each held for dt (n,) s; ``at_edges`` (2, 2, 6) before and after both ends."""
-    size = float(np.linalg.norm(readings[:, 3:], axis=1).mean())
-    readings = readings - biases
-    rates = readings[:, :3]
-    turns, half = np.split(so3_exp(np.concatenate([rates * dt[:, None], 0.5 * rates * dt[:, None]])), 2)
-    R, before = np.eye(3), np.empty_like(turns)
-    for k, turn in enumerate(turns):
-        before[k] = R
-        R = R @ turn
-    middle = before @ half
-    force = np.einsum("nij,nj->ni", middle, readings[:, 3:])
-    step, until = dt[:, None], dt.sum() - np.cumsum(dt)
-    v = np.cumsum(force * step, axis=0)
-    p = np.cumsum((v - force * step) * step + 0.5 * force * step**2, axis=0)
-    clock = [
-        _clock_jacobian(R, v[-1], p[-1], part - biases, float(dt.sum())) for part in (*at_edges, at_edges.mean(axis=0))
-    ]
-    return Preintegral(
-        float(dt.sum()),
-        R,
-        v[-1],
-        p[-1],
-        np.column_stack([_bias_jacobian(middle, force, dt), clock[2]]),
-        np.array(clock)[:2, :3],
-        _noise_covariance(v, p, dt, until, silent, noise),
-        v[-1] / dt.sum(),
-        size,
-    )
-
-
-def _bias_jacobian(middle: FloatArray, force: FloatArray, dt: FloatArray) -> FloatArray:
-    """Derivative (9, 6), with turns taken as small within one interval."""
-    width = dt[:, None, None]
-    turn = -np.cumsum(middle * width, axis=0)
-    # What the turn has gone wrong by at the middle of each interval turns the force of it.
-    at_middle = turn + 0.5 * middle * width
-    rates = np.concatenate([-skew(force) @ at_middle, -middle], axis=2)
-    v = np.cumsum(rates * width, axis=0)
-    p = np.sum((v - rates * width) * width + 0.5 * rates * width**2, axis=0)
-    J = np.zeros((9, 6))
-    J[:3, :3], J[3:6], J[6:] = turn[-1], v[-1], p
-    return J
+        times = (stamps - start_ns).astype(np.float64)
+        columns = [np.interp(around, times, column).mean(axis=2) for column in (*rates.T, *forces.T)]
+        before, after = np.stack(columns, axis=2) - biases
+        J[:, 6] = _clock_jacobian(R, v, p, 0.5 * (before + after), dt)
+        clock_turns = np.array([_clock_jacobian(R, v, p, part, dt)[:3] for part in (before, after)])
+        return Preintegral(dt, R, v, p, J, clock_turns, covariance, v / dt, size)
 
 
 def _clock_jacobian(R: FloatArray, v: FloatArray, p: FloatArray, at_edges: FloatArray, dt: float) -> FloatArray:
-    """Derivative (9,) with respect to what is to be added to the stamps."""
+    """Derivative (9,) with respect to what is to be added to the stamps; ``at_edges`` (2, 6): readings at both ends."""
     (w0, f0), (w1, f1) = np.split(at_edges[0], 2), np.split(at_edges[1], 2)
     return np.concatenate([w0 - R @ w1, np.cross(w0, v) + f0 - R @ f1, np.cross(w0, p) + f0 * dt - v])
-
-
-def _noise_covariance(
-    v: FloatArray, p: FloatArray, dt: FloatArray, until: FloatArray, silent: np.ndarray, noise: ImuNoise
-) -> FloatArray:
-    """Covariance (9, 9): each interval's noise is fresh and acts on all that follows it."""
-    gyro = np.where(silent, (noise.unknown_turn * dt) ** 2, noise.gyro**2 * dt)
-    force = np.where(silent, (noise.unknown_force * dt) ** 2, noise.accelerometer**2 * dt)
-    n = len(dt)
-    of_turn, of_force = np.zeros((n, 9, 3)), np.zeros((n, 9, 3))
-    of_turn[:, :3] = np.eye(3)
-    of_turn[:, 3:6] = -skew(v[-1] - v)
-    of_turn[:, 6:] = -skew(p[-1] - p - v * until[:, None])
-    of_force[:, 3:6] = np.eye(3)
-    of_force[:, 6:] = np.eye(3) * (until + 0.5 * dt)[:, None, None]
-    C = np.einsum("nij,n,nkj->ik", of_turn, gyro, of_turn) + np.einsum("nij,n,nkj->ik", of_force, force, of_force)
-    return np.asarray(0.5 * (C + C.T))

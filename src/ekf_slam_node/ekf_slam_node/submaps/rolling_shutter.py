@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ekf_slam_node.association.motion_guess import refine_motion
-from ekf_slam_node.association.pair_kernels import PairErrors, pair_errors
+from ekf_slam_node.association.pair_kernels import PairErrors, pair_errors, readout_equations
 from ekf_slam_node.filtering.candidates import Candidates
 from ekf_slam_node.filtering.measurement_kernels import moved_measurements, rolling_rates
 from ekf_slam_node.filtering.models import Frame, rig_points, velocity_of_motion
@@ -213,21 +213,14 @@ def _solve(pairs: PairErrors, slope: FloatArray, variance_scale: FloatArray) -> 
 
     ``slope`` (n, 3): what a second of readout adds to the errors.
     """
-    root = np.sqrt(variance_scale)
-    S = pairs.S * root[:, None] * root
-    H = np.concatenate([pairs.J, -slope[:, :, None]], axis=2)
-    WH = np.linalg.solve(S, H)
-    x = np.zeros(7)
+    x, N, gradient = np.zeros(7), np.empty((7, 7)), np.empty(7)
     for _ in range(3):
-        error = pairs.error - H @ x
-        distance = np.einsum("ni,ni->n", error, np.linalg.solve(S, error[:, :, None])[:, :, 0])
-        weight = 1.0 / np.maximum(1.0, np.sqrt(distance) / _HUBER)
-        N = np.einsum("n,nik,nil->kl", weight, H, WH)
+        readout_equations(pairs.error, pairs.S, pairs.J, slope, np.sqrt(variance_scale), x, _HUBER, N, gradient)
         try:
             covariance = np.linalg.inv(N)
         except np.linalg.LinAlgError:
             return None
-        x = covariance @ np.einsum("n,nik,ni->k", weight, WH, pairs.error)
+        x = covariance @ gradient
     readout, variance = float(x[6]), float(covariance[6, 6])
     return (readout, np.sqrt(variance)) if abs(readout) < _LONGEST_READOUT_S and variance > 0.0 else None
 
