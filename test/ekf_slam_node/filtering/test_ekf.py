@@ -12,7 +12,17 @@ from ekf_slam_node.filtering.covariance import Covariance, whiten
 from ekf_slam_node.filtering.ekf import Ekf
 from feature_world import CAMERA, T_RIG_OPTICAL, PointWorld, room, wander
 from slam_core.evaluation import anees_bounds, nees
-from slam_core.geometry import FloatArray, boxminus, boxplus, invert_transform, transform_points
+from slam_core.geometry import (
+    FloatArray,
+    boxminus,
+    boxplus,
+    invert_transform,
+    make_transform,
+    skew,
+    so3_exp,
+    so3_left_jacobian,
+    transform_points,
+)
 
 
 def random_covariance(size: int, rng: np.random.Generator) -> FloatArray:
@@ -105,15 +115,58 @@ def test_agrees_with_filterpy(rng: np.random.Generator) -> None:
     assert report.nis == pytest.approx((z - seen.z).ravel() @ np.linalg.solve(S, (z - seen.z).ravel()), rel=1e-8)
 
 
-def test_innovation_blocks_are_those_of_the_joint_covariance(rng: np.random.Generator) -> None:
+def test_sightings_are_worth_what_the_joint_covariance_says(rng: np.random.Generator) -> None:
+    """Innovation at the predicted mean, NIS and information, a prediction linearised at another motion included."""
     ekf, _, _, _ = seen_room(rng, 6)
-    seen = models.observe(ekf.T, T_RIG_OPTICAL, ekf.landmarks[:3], CAMERA)
-    S = ekf.innovation_blocks(seen, np.arange(3), np.full((3, 3), 0.25))
-    P = ekf.covariance.dense()
-    for i in range(3):
+    ekf.apply_time_update(ekf.time_update(0.1, np.full(6, 0.5), models.relative_motion(np.full(6, 0.3), 0.1)))
+    slots, common = np.array([4, 0, 2]), rng.uniform(0.01, 0.1, 6)
+    seen = models.observe(ekf.T, T_RIG_OPTICAL, ekf.landmarks[slots], CAMERA)
+    variance = rng.uniform([0.1, 0.1, 1e-5], [0.3, 0.3, 1e-4], (3, 3))
+    z = seen.z + rng.normal(size=(3, 3)) * np.sqrt(variance)
+    found = ekf.sighted(z, variance, slots, T_RIG_OPTICAL, CAMERA, common)
+    P, offset = ekf.covariance.dense(), ekf._offset
+    assert np.abs(offset[:12]).max() > 0.01
+    for name in ("z", "depth", "J_pose", "J_point"):
+        np.testing.assert_allclose(getattr(found.seen, name), getattr(seen, name), rtol=1e-12)
+    for i, slot in enumerate(slots):
         H = np.zeros((3, len(P)))
-        H[:, :6], H[:, 12 + 3 * i : 15 + 3 * i] = seen.J_pose[i], seen.J_point[i]
-        np.testing.assert_allclose(S[i], H @ P @ H.T + 0.25 * np.eye(3), rtol=1e-9)
+        H[:, :6], H[:, 12 + 3 * slot : 15 + 3 * slot] = seen.J_pose[i], seen.J_point[i]
+        S = H @ P @ H.T + np.diag(variance[i]) + seen.J_pose[i] @ np.diag(common**2) @ seen.J_pose[i].T
+        innovation = z[i] - seen.z[i] - H @ offset
+        np.testing.assert_allclose(found.innovation[i], innovation, rtol=1e-9)
+        assert found.nis[i] == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-7)
+        told = np.linalg.slogdet(S)[1] - np.sum(np.log(variance[i]))
+        assert found.information[i] == pytest.approx(told, rel=1e-7)
+
+
+@pytest.mark.parametrize("invariant", [True, False])
+@pytest.mark.parametrize("landmarks", [0, 5, 70])
+@pytest.mark.parametrize("turn", [0.0, 0.2])
+def test_an_update_is_applied_as_numpy_has_it(
+    invariant: bool, landmarks: int, turn: float, rng: np.random.Generator
+) -> None:
+    """Mean, covariance and, in the right-invariant error, its coordinates at the new estimate; strips of any size."""
+    n = 12 + 3 * landmarks
+    P, W, y = random_covariance(n, rng), 0.1 * rng.normal(size=(n, 9)), 0.3 * rng.normal(size=9)
+    W[3:6] *= turn
+    ekf = Ekf(rng.normal(size=6), P, invariant, landmarks=rng.normal(size=(landmarks, 3)))
+    ekf.T = make_transform(so3_exp(rng.normal(size=3)), rng.normal(size=3))
+    before, R, velocity = np.vstack([ekf.T[:3, 3], ekf.landmarks]), ekf.T[:3, :3].copy(), ekf.velocity.copy()
+    ekf._apply(np.asfortranarray(W), y)
+    delta, expected = W @ y, P - W @ W.T
+    shift = np.vstack([delta[:3], delta[12:].reshape(-1, 3)])
+    moved = shift
+    if invariant:
+        V = so3_left_jacobian(delta[3:6])
+        moved = before @ (so3_exp(delta[3:6]) - np.eye(3)).T + (shift - np.cross(delta[3:6], before)) @ V.T
+        A = np.zeros((n, 3))
+        A[:3], A[12:] = -skew(moved[0]), -skew(moved[1:]).reshape(-1, 3)
+        B = expected[:, 3:6].copy()
+        expected = expected + A @ B.T + B @ A.T + A @ B[3:6] @ A.T
+    np.testing.assert_allclose(ekf.covariance.dense(), expected, atol=1e-10 * np.abs(P).max())
+    np.testing.assert_allclose(np.vstack([ekf.T[:3, 3], ekf.landmarks]), before + moved, atol=1e-12)
+    np.testing.assert_allclose(ekf.T[:3, :3], so3_exp(delta[3:6]) @ R, atol=1e-12)
+    np.testing.assert_allclose(ekf.velocity, velocity + delta[6:12], atol=1e-12)
 
 
 def seen_room(

@@ -161,9 +161,6 @@ def test_a_right_invariant_error_moves_points(rng: np.random.Generator) -> None:
     kernels.moved_points(points, shift, turn, change, V, moved)
     expected = points @ so3_exp(turn).T + (shift - np.cross(turn, points)) @ V.T
     np.testing.assert_allclose(points + moved, expected, rtol=1e-9, atol=1e-12)
-    stacked = np.zeros((3 * M, 3), order="F")
-    kernels.crossed(moved, stacked)
-    np.testing.assert_array_equal(stacked, -skew(moved).reshape(-1, 3))
 
 
 def test_features_become_measurements_with_floors_on_their_noise(rng: np.random.Generator) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ekf_slam_node.filtering.measurement_kernels import add_of_points, add_of_pose, squared_lengths
+from ekf_slam_node.filtering.measurement_kernels import add_of_points, add_of_pose
 from ekf_slam_node.filtering.models import Frame, Observation, increment_jacobian, observe, relative_motion
 from slam_core.geometry import FloatArray
 from slam_core.types import Float32Array
@@ -75,10 +75,3 @@ def innovation_covariance(
     if motion_covariance is not None:
         add_of_pose(seen.J_pose, motion_covariance, S)
     return S
-
-
-def squared_distances(innovation: FloatArray, S: FloatArray) -> FloatArray:
-    """NIS (n,) of innovations (n, 3) with covariances S (n, 3, 3)."""
-    out = np.empty(len(S))
-    squared_lengths(innovation, S, out)
-    return out

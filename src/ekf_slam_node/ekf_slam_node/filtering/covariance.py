@@ -107,6 +107,11 @@ class Covariance:
         self._state[:] = initial
 
     @property
+    def buffer(self) -> FloatArray:
+        """The matrix for compiled kernels: its first ``size`` rows and columns count, of these the lower triangle."""
+        return self._P
+
+    @property
     def _state(self) -> FloatArray:
         """The part of the buffer that is in use."""
         return self._P[: self.size, : self.size]

@@ -18,15 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ekf_slam_node.filtering.covariance import Covariance, IndexArray, whiten
-from ekf_slam_node.filtering.measurement_kernels import (
-    add_of_points,
-    add_of_pose,
-    crossed,
-    lower_innovation,
-    mixed_terms,
-    moved_points,
-    seen_from_rig,
-)
+from ekf_slam_node.filtering.measurement_kernels import lower_innovation, seen_from_rig
 from ekf_slam_node.filtering.models import (
     CORE_DIM,
     Observation,
@@ -36,7 +28,9 @@ from ekf_slam_node.filtering.models import (
     relative_motion,
     velocity_of_motion,
 )
-from slam_core.geometry import FloatArray, make_transform, so3_exp, so3_left_jacobian
+from ekf_slam_node.filtering.update_kernels import applied, sighted
+from slam_core.camera import Camera
+from slam_core.geometry import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +59,20 @@ class TimeUpdate:
     increment: FloatArray
     increment_covariance: FloatArray
     increment_offset: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Sighted:
+    """Landmarks as they are predicted beside what is measured of them.
+
+    innovation: (k, 3), ``z - h(x)``. nis: (k,), NaN where its covariance S is not positive. information: (k,), log
+    det S less that of the measurement's noise: how much it tells of landmark and rig.
+    """
+
+    seen: Observation
+    innovation: FloatArray
+    nis: FloatArray
+    information: FloatArray
 
 
 class Ekf:
@@ -159,30 +167,26 @@ class Ekf:
 
     def move_to_mean(self) -> None:
         """Move the state from where it was linearised to its mean."""
-        self._move(np.zeros(self.covariance.size))
+        self._apply(np.zeros((self.covariance.size, 0), order="F"), np.zeros(0))
 
     # --------------------------------------------------------------------------------------------------- measurement
-    def innovation_blocks(
-        self, seen: Observation, slots: IndexArray, variance: FloatArray, common: FloatArray | None = None
-    ) -> FloatArray:
-        """Each observation's own innovation covariance S (m, 3, 3), correlations of rig and landmark included.
+    def sighted(
+        self, z: FloatArray, variance: FloatArray, slots: IndexArray, T_rig_optical: FloatArray, camera: Camera,
+        common: FloatArray,
+    ) -> Sighted:  # fmt: skip
+        """Measurements z (k, 3) of variances (k, 3) of landmarks ``slots`` (k,) beside what is predicted of them.
 
-        ``common``: as in :meth:`update`.
+        At the predicted mean, also where the prediction was linearised elsewhere. ``common``: as in :meth:`update`.
         """
-        rows = CORE_DIM + 3 * np.asarray(slots)
-        head = self.covariance.head(6)
-        pose = head[:6] if common is None else head[:6] + np.diag(common**2)
-        S = np.zeros((len(rows), 3, 3))
-        add_of_pose(seen.J_pose, pose, S)
-        add_of_points(seen.J_point, self.covariance.blocks(rows), S)
-        mixed_terms(seen.J_pose, seen.J_point, head, rows, S)
-        S[:, np.arange(3), np.arange(3)] += variance
-        return S
-
-    def innovation(self, z: FloatArray, seen: Observation, slots: IndexArray) -> FloatArray:
-        """``z - h(x)`` (m, 3) at the predicted mean, also when the prediction was linearised elsewhere."""
-        points = self._offset[CORE_DIM:].reshape(-1, 3)[slots]
-        return np.asarray(z - seen.z - seen.J_pose @ self._offset[:6] - np.einsum("mij,mj->mi", seen.J_point, points))
+        k = len(slots)
+        seen = Observation(np.empty((k, 3)), np.empty(k), np.empty((k, 3, 6)), np.empty((k, 3, 3)))
+        found = Sighted(seen, np.empty((k, 3)), np.empty(k), np.empty(k))
+        sighted(
+            self.covariance.buffer, self._offset, self.T, self.T @ T_rig_optical, self.landmarks,
+            np.asarray(slots, dtype=np.int64), z, variance, common**2, camera.lens, seen.z, seen.depth, seen.J_pose,
+            seen.J_point, found.innovation, found.nis, found.information,
+        )  # fmt: skip
+        return found
 
     def update(
         self,
@@ -207,7 +211,9 @@ class Ekf:
         S = np.empty((3 * len(rows),) * 2, order="F")
         shared = np.zeros(6) if common is None else common**2
         lower_innovation(seen.J_pose, seen.J_point, cross, rows, variance, shared, S)
-        return self._update(S, cross, self.innovation(z, seen, slots).ravel())
+        points = self._offset[CORE_DIM:].reshape(-1, 3)[slots]
+        innovation = z - seen.z - seen.J_pose @ self._offset[:6] - np.einsum("mij,mj->mi", seen.J_point, points)
+        return self._update(S, cross, innovation.ravel())
 
     def _update(self, S: FloatArray, cross: FloatArray, innovation: FloatArray, stay: bool = False) -> UpdateReport:
         whitened = whiten(S, cross, innovation)
@@ -216,36 +222,18 @@ class Ekf:
                 self.move_to_mean()
             return UpdateReport(np.nan, len(innovation), False)
         W, y = whitened
-        self.covariance.subtract_square(W)
-        delta = W @ y
         if stay:
-            self._offset = self._offset + delta
+            self.covariance.subtract_square(W)
+            self._offset = self._offset + W @ y
         else:
-            self._move(delta)
+            self._apply(W, y)
         return UpdateReport(float(y @ y), len(y), True)
 
-    def _move(self, delta: FloatArray) -> None:
-        delta = delta + self._offset
-        self._offset = np.zeros(len(delta))
-        self.velocity = self.velocity + delta[6:12]
-        old = np.vstack([self.T[:3, 3], self.landmarks])
-        shift = np.vstack([delta[:3], delta[CORE_DIM:].reshape(-1, 3)])
-        turn, moved = so3_exp(delta[3:6]), shift
-        if self._invariant:
-            moved = np.empty_like(shift)
-            moved_points(old, shift, delta[3:6], turn - np.eye(3), so3_left_jacobian(delta[3:6]), moved)
-        self.T = make_transform(turn @ self.T[:3, :3], old[0] + moved[0])
-        self.landmarks = old[1:] + moved[1:]
-        if self._invariant:
-            self._change_coordinates(moved)
-
-    def _change_coordinates(self, moved: FloatArray) -> None:
-        """Error coordinates at points that an update has moved by (1 + m, 3), the rig's place first; see the module."""
-        A = np.zeros((self.covariance.size, 3), order="F")
-        crossed(moved[:1], A[:3])
-        crossed(moved[1:], A[CORE_DIM:])
-        B = self.covariance.columns(np.array([3, 4, 5]))
-        self.covariance.add_product(A, B + 0.5 * A @ B[3:6])
+    def _apply(self, W: FloatArray, y: FloatArray) -> None:
+        """Move to the updated estimate; where errors rotate with the rig's, change coordinates, see the module."""
+        self.T, self.velocity, self.landmarks = self.T.copy(), self.velocity.copy(), self.landmarks.copy()
+        applied(self.covariance.buffer, W, y, self._offset, self.T, self.velocity, self.landmarks, self._invariant)
+        self._offset = np.zeros(self.covariance.size)
 
     # -------------------------------------------------------------------------------------------------- augmentation
     def augment(self, points: FloatArray, covariances: FloatArray) -> IndexArray:

@@ -247,13 +247,3 @@ def moved_points(points, shift, turn, change, V, out):  # type: ignore[no-untype
         for i in range(3):
             moved = change[i, 0] * x + change[i, 1] * y + change[i, 2] * z
             out[n, i] = moved + V[i, 0] * a + V[i, 1] * b + V[i, 2] * c
-
-
-@in_place()
-def crossed(moved, out):  # type: ignore[no-untyped-def]
-    """Fill out (3 n, 3) with ``-[v]x`` of each of moved (n, 3)."""
-    for n in range(len(moved)):
-        x, y, z = moved[n, 0], moved[n, 1], moved[n, 2]
-        out[3 * n, 1], out[3 * n, 2] = z, -y
-        out[3 * n + 1, 0], out[3 * n + 1, 2] = -z, x
-        out[3 * n + 2, 0], out[3 * n + 2, 1] = y, -x

@@ -13,10 +13,10 @@ import numpy as np
 
 from ekf_slam_node.association.linking import FrameLink
 from ekf_slam_node.config import MAX_UPDATE_LANDMARKS, EkfSlamConfig
-from ekf_slam_node.filtering.candidates import Candidates, squared_distances
+from ekf_slam_node.filtering.candidates import Candidates
 from ekf_slam_node.filtering.covariance import IndexArray
 from ekf_slam_node.filtering.drift import Drift
-from ekf_slam_node.filtering.ekf import Ekf, TimeUpdate, UpdateReport
+from ekf_slam_node.filtering.ekf import Ekf, Sighted, TimeUpdate, UpdateReport
 from ekf_slam_node.filtering.landmarks import CandidateLandmarks, LandmarkTable, spread_choice
 from ekf_slam_node.filtering.models import CORE_DIM, Frame, observe, relative_motion, rig_points
 from ekf_slam_node.odometry.relative_poses import RELATIVE_POSE_GATE, RelativePoseMeasurement, relative_pose_error
@@ -250,17 +250,23 @@ class OpenSubmap:
         if closes:
             self._ekf.add_pose_noise(common)
             common = np.zeros(6)
-        seen = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks[sight.slots], frame.camera)
         z, claimed = frame.z[sight.columns], frame.variance[sight.columns]
         variance = claimed * self._noise_factors(sight)
-        S = self._ekf.innovation_blocks(seen, sight.slots, variance, common)
-        innovation = self._ekf.innovation(z, seen, sight.slots)
-        distance = squared_distances(innovation, S)
-        good = np.flatnonzero((distance < self._config.association.gate) & (seen.depth > MIN_DEPTH))
-        report = self._ekf.update(z[good], variance[good], seen.select(good), sight.slots[good], common)
+        found = self._ekf.sighted(z, variance, sight.slots, self._T_rig_optical, frame.camera, common)
+        good = np.flatnonzero((found.nis < self._config.association.gate) & (found.seen.depth > MIN_DEPTH))
+        used = good if 2 * np.sum(frame.tracks[sight.columns] > 0) <= len(sight) else self._telling(found, good)
+        report = self._ekf.update(z[used], variance[used], found.seen.select(used), sight.slots[used], common)
         after = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks[sight.slots], frame.camera)
         self.table.noise.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
         return report, sight.select(good)
+
+    def _telling(self, found: Sighted, good: IndexArray) -> IndexArray:
+        """Those of the sightings ``good`` that tell most, as many as a frame of followed features measures at most.
+
+        Their errors last as long as the patch that is followed, so that all of a frame's tell little more.
+        """
+        order = np.argsort(-found.information[good], kind="stable")
+        return np.asarray(np.sort(good[order[: self._config.landmark.most_measured]]))
 
     def measure_tags(self, frame: Frame, common: FloatArray) -> TagReport:
         """Measure the corners of fiducial tags after a frame's features; new tags become landmarks.
@@ -287,10 +293,9 @@ class OpenSubmap:
 
     def _distances(self, frame: Frame, slots: IndexArray, columns: IndexArray, common: FloatArray) -> FloatArray:
         """NIS (k,) of sightings; infinite behind the camera."""
-        seen = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks[slots], frame.camera)
-        S = self._ekf.innovation_blocks(seen, slots, frame.variance[columns], common)
-        distance = squared_distances(self._ekf.innovation(frame.z[columns], seen, slots), S)
-        return np.where(seen.depth > MIN_DEPTH, distance, np.inf)
+        z, variance = frame.z[columns], frame.variance[columns]
+        found = self._ekf.sighted(z, variance, slots, self._T_rig_optical, frame.camera, common)
+        return np.where(found.seen.depth > MIN_DEPTH, found.nis, np.inf)
 
     def _tags_missed(self, first_corners: IndexArray, is_far: np.ndarray) -> int:
         """Note tags that were seen elsewhere several times in a row, to be removed; returns how many."""
