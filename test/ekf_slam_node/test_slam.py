@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ekf_slam_node.config import EkfSlamConfig
+from ekf_slam_node.config import EkfSlamConfig, LandmarkConfig
 from ekf_slam_node.filtering.ekf import Ekf
 from ekf_slam_node.filtering.models import Observation
 from ekf_slam_node.results import EkfResult, TrackingState
@@ -354,3 +354,21 @@ def test_a_rig_that_creeps_is_not_held_back(world: PointWorld, rng: np.random.Ge
     results = run(slam, world, poses, rng)
     errors = [np.linalg.norm(error_of(result, poses, k)[:3]) for k, result in enumerate(results)]
     assert max(errors) < 0.01
+
+
+@pytest.mark.parametrize("followed", [True, False])
+def test_a_followed_frame_is_measured_by_the_landmarks_that_tell_most(rng: np.random.Generator, followed: bool) -> None:
+    """All landmarks in sight count as seen; frames without tracks are measured by all of them."""
+    world, config = room(rng, 400), EkfSlamConfig(landmark=LandmarkConfig(most_measured=20))
+    slam = EkfSlam(config)
+    results = []
+    for k in range(8):
+        pose = make_transform(np.eye(3), np.array([0.05 * k, 0.0, 0.0]))
+        features, index = world.features(pose, 100_000_000 * k, rng, max_features=90)
+        tracks = (index + 1).astype(np.int32) if followed else np.zeros(len(index), np.int32)
+        results.append(slam.process(dataclasses.replace(features, track_ids=tracks)))
+    for result in results[2:]:
+        seen = len(result.landmark_ids)
+        assert seen > 40
+        assert result.nis_dof == (60 if followed else 3 * seen)
+    assert boxminus(results[-1].pose.T, pose)[:3] == pytest.approx(np.zeros(3), abs=0.03)

@@ -54,3 +54,17 @@ def test_nothing_to_eliminate_is_no_error() -> None:
     blas_kernels.solve_right(nothing, np.empty((3, 0)))
     blas_kernels.subtract_square(np.empty((3, 0)), C)
     assert np.array_equal(C, np.eye(3))
+
+
+@pytest.mark.parametrize(("k", "m"), [(150, 3), (5, 0), (0, 3)])
+def test_a_covariance_loses_a_square_and_takes_a_product(k: int, m: int, rng: np.random.Generator) -> None:
+    """In the lower triangle of the part in use; the rest of the buffer is neither read nor written."""
+    n = 120
+    P, W = np.asfortranarray(rng.normal(size=(n + 9, n + 9))), np.asfortranarray(rng.normal(size=(n, k)))
+    A, B, before = rng.normal(size=(m, n)), rng.normal(size=(m, n)), P.copy()
+    blas_kernels.subtract_square_and_add_product(W, A, B, P)
+    expected = before[:n, :n] - W @ W.T + A.T @ B + B.T @ A
+    np.testing.assert_allclose(np.tril(P[:n, :n]), np.tril(expected), atol=1e-10)
+    kept = np.triu(np.ones_like(P), 1).astype(bool)
+    kept[n:] = kept[:, n:] = True
+    np.testing.assert_array_equal(P[kept], before[kept])

@@ -84,14 +84,14 @@ def applied(P, W, y, offset, T, velocity, landmarks, invariant):  # type: ignore
     """Apply a whitened update: ``x += offset + W y``, ``P -= W W'``, and the error's coordinates at the new estimate.
 
     W (n, k), y (k,). T (4, 4), velocity (6,) and landmarks (m, 3) are moved in place; see ``Ekf._change_coordinates``
-    for the last step, which is a product of rank three. One pass over P does both.
+    for the last step, which is a product of rank three.
     """
     n, k = W.shape
     delta = offset.copy()
     for column in range(k):
         _add_scaled(delta, W[:, column], y[column])
-    A, B = np.zeros((3, n)), np.zeros((3, n))
     moved = _moved(T, velocity, landmarks, delta, invariant)
+    A, B = np.zeros((3 if invariant else 0, n)), np.zeros((3 if invariant else 0, n))
     if invariant:
         _turned_coordinates(P, W, moved, A, B)
     subtract_square_and_add_product(W, A, B, P)

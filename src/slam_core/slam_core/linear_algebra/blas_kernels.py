@@ -18,7 +18,6 @@ from numba import njit, types
 from scipy.linalg import cython_blas, cython_lapack
 
 from slam_core.linear_algebra.blas import address_of
-from slam_core.runtime.in_place import in_place
 
 # Addresses do not keep an array alive: what is behind them are constants, or arguments, which the caller holds.
 _LETTERS = np.frombuffer(b"ULTNR", dtype=np.uint8)
@@ -27,8 +26,6 @@ _LOWER = _LEFT
 _FACTORS = np.array([1.0, -1.0])
 _BLOCK = 48
 """Columns that :func:`whiten` solves for at once."""
-_STRIP = 96
-"""Columns of a covariance that are updated at once."""
 
 
 def _known(module: Any, name: str, arguments: int) -> Any:
@@ -41,6 +38,7 @@ def _known(module: Any, name: str, arguments: int) -> Any:
 _dpotrf = _known(cython_lapack, "dpotrf", 5)
 _dtrsm = _known(cython_blas, "dtrsm", 11)
 _dsyrk = _known(cython_blas, "dsyrk", 10)
+_dsyr2k = _known(cython_blas, "dsyr2k", 12)
 _dgemm = _known(cython_blas, "dgemm", 13)
 _dtrtrs = _known(cython_lapack, "dtrtrs", 10)
 
@@ -108,35 +106,17 @@ def _solve_block(L, B, first, sizes):
 
 @njit(cache=True, nogil=True)
 def subtract_square_and_add_product(W, A, B, P):
-    """``P <- P - W W^T + A^T B + B^T A`` for W (n, k), A and B (3, n), in the first n rows and columns of P.
+    """``P <- P - W W^T + A^T B + B^T A`` for W (n, k), A and B (m, n), in the first n rows and columns of P.
 
-    W and P in Fortran order, of P the lower triangle; A and B row by row. Strips of P are read once for both.
+    W and P in Fortran order, of P the lower triangle; A and B row by row.
     """
     n, k = W.shape
-    sizes = np.array([k, n, P.strides[1] // P.itemsize, 0, 0], np.int32)
-    count, rows, stride = sizes.ctypes.data, sizes[1:].ctypes.data, sizes[2:].ctypes.data
-    width, below = sizes[3:].ctypes.data, sizes[4:].ctypes.data
+    sizes = np.array([k, n, len(A), P.strides[1] // P.itemsize], np.int32)
+    count, rows, few, stride = sizes.ctypes.data, sizes[1:].ctypes.data, sizes[2:].ctypes.data, sizes[3:].ctypes.data
     lower, plain = _LETTERS[_LOWER:].ctypes.data, _LETTERS[_PLAIN:].ctypes.data
-    transposed = _LETTERS[_TRANSPOSED:].ctypes.data
     one, minus = _FACTORS.ctypes.data, _FACTORS[1:].ctypes.data
-    for first in range(0, n, _STRIP):
-        last = min(first + _STRIP, n)
-        sizes[3], sizes[4] = last - first, n - last
-        own, out = W[first:].ctypes.data, P[first:, first:].ctypes.data
-        _dsyrk(lower, plain, width, count, minus, own, rows, one, out, stride)
-        if last < n:
-            rest, out = W[last:].ctypes.data, P[last:, first:].ctypes.data
-            _dgemm(plain, transposed, below, width, count, minus, rest, rows, own, rows, one, out, stride)
-        for j in range(first, last):
-            _add_two_by_three(A, B, j, P[:, j])
-
-
-@in_place(fastmath={"contract"})
-def _add_two_by_three(A, B, j, column):
-    """Add column j of ``A^T B + B^T A`` from its diagonal on."""
-    a0, a1, a2, b0, b1, b2 = A[0, j], A[1, j], A[2, j], B[0, j], B[1, j], B[2, j]
-    for i in range(j, A.shape[1]):
-        column[i] += A[0, i] * b0 + A[1, i] * b1 + A[2, i] * b2 + B[0, i] * a0 + B[1, i] * a1 + B[2, i] * a2
+    _dsyrk(lower, plain, rows, count, minus, W.ctypes.data, rows, one, P.ctypes.data, stride)
+    _dsyr2k(lower, plain, rows, few, one, A.ctypes.data, rows, B.ctypes.data, rows, one, P.ctypes.data, stride)
 
 
 @njit(cache=True, nogil=True)
