@@ -194,3 +194,23 @@ def test_few_features_are_not_linked(world: PointWorld, rng: np.random.Generator
     candidates, _, now, _ = two_views(world, SMALL_STEP, rng)
     prior = MotionPrior(SMALL_STEP, 1e-4 * np.eye(6))
     assert Linker(FeatureAssociationConfig(), T_RIG_OPTICAL).link(candidates, now.select(np.arange(5)), prior) is None
+
+
+@pytest.mark.parametrize("shape", [(30, 45), (45, 30), (2, 2), (1, 9), (9, 1), (0, 4)])
+def test_mutual_best_pairs_are_those_of_arrays(shape: tuple[int, int], rng: np.random.Generator) -> None:
+    cosines = np.round(rng.uniform(-1.0, 1.0, shape), 1).astype(np.float32)  # many are equal
+    for threshold, ratio in ((0.75, 0.85), (0.6, 1.0), (-2.0, 10.0)):
+        rows, columns = association.match_descriptors(cosines).clear(threshold, ratio)
+        expected_rows, expected_columns = by_arrays(cosines.astype(np.float64), threshold, ratio)
+        np.testing.assert_array_equal(rows, expected_rows)
+        np.testing.assert_array_equal(columns, expected_columns)
+
+
+def by_arrays(cosines: FloatArray, threshold: float, ratio: float) -> tuple[np.ndarray, np.ndarray]:
+    if min(cosines.shape) < 2:
+        return np.zeros(0), np.zeros(0)
+    best, rows = np.argmax(cosines, axis=1), np.arange(len(cosines))
+    value, second = cosines[rows, best], np.partition(cosines, -2, axis=1)[:, -2]
+    mutual = (np.argmax(cosines, axis=0)[best] == rows) & (value >= threshold)
+    rows = rows[mutual & (1.0 - value <= ratio**2 * (1.0 - second))]
+    return rows, best[rows]

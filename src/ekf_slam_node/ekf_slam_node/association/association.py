@@ -8,6 +8,8 @@ Among the pairs that pass, the cheapest come first and every feature and candida
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit
@@ -197,23 +199,55 @@ def _distances(
     return np.asarray(np.linalg.norm(candidates.points[:, None] - moved[None], axis=2))
 
 
-def match_descriptors(similarity: Similarity, threshold: float, ratio: float) -> tuple[IndexArray, IndexArray]:
-    """Mutual best pairs without any motion.
+@dataclass(frozen=True, eq=False)
+class DescriptorMatches:
+    """Mutual best pairs (k,) of candidates ``rows`` and features ``columns``, without any motion.
 
-    Better than ``threshold`` and clearly better than each one's second best.
+    value: (k,) cosine of their descriptors; second: (k,) that of the candidate's second best feature.
     """
-    if min(similarity.shape) < 2:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    similarity = similarity.astype(np.float64)
-    best = np.argmax(similarity, axis=1)
-    rows = np.arange(len(similarity))
-    value = similarity[rows, best]
-    mutual = (np.argmax(similarity, axis=0)[best] == rows) & (value >= threshold)
-    second = np.partition(similarity, -2, axis=1)[:, -2]
-    # Distances of unit vectors: |a - b|^2 = 2 - 2 cos.
-    distinct = (1.0 - value) <= ratio**2 * (1.0 - second)
-    rows = rows[mutual & distinct]
-    return rows, best[rows]
+
+    rows: IndexArray
+    columns: IndexArray
+    value: FloatArray
+    second: FloatArray
+
+    def clear(self, threshold: float, ratio: float) -> tuple[IndexArray, IndexArray]:
+        """Rows and columns of the pairs better than ``threshold`` and clearly better than the second best."""
+        # Distances of unit vectors: |a - b|^2 = 2 - 2 cos.
+        kept = (self.value >= threshold) & ((1.0 - self.value) <= ratio**2 * (1.0 - self.second))
+        return self.rows[kept], self.columns[kept]
+
+
+def match_descriptors(similarity: Similarity) -> DescriptorMatches:
+    """The mutual best pairs by cosines (m, n) of candidates and features; none of fewer than two of either."""
+    m, n = similarity.shape
+    best, value, second, row_of = np.zeros(m, np.int64), np.empty(m), np.empty(m), np.zeros(n, np.int64)
+    if min(m, n) >= 2:
+        _best_two(similarity, best, value, second, row_of)
+    rows = np.flatnonzero(row_of[best] == np.arange(m)) if min(m, n) >= 2 else best[:0]
+    return DescriptorMatches(rows, best[rows], value[rows], second[rows])
+
+
+@njit(cache=True, nogil=True)
+def _best_two(similarity, best, value, second, row_of):  # type: ignore[no-untyped-def]
+    """Fill for each row its best column, that value and the second best one, for each column its best row.
+
+    Of equal values the first counts as the better one.
+    """
+    m, n = similarity.shape
+    highest = np.full(n, -np.inf, similarity.dtype)
+    for i in range(m):
+        first, other, at = -np.inf, -np.inf, 0
+        for j in range(n):
+            cosine = similarity[i, j]
+            if cosine > other:
+                if cosine > first:
+                    first, other, at = cosine, first, j
+                else:
+                    other = cosine
+            if cosine > highest[j]:
+                highest[j], row_of[j] = cosine, i
+        best[i], value[i], second[i] = at, first, other
 
 
 def associate_jcbb(

@@ -212,9 +212,9 @@ class Linker:
     ) -> FrameLink | None:
         """First with the descriptors that agree well, then with all that agree at all."""
         config = self._config
-        similarity = candidates.descriptors @ frame.descriptors.T
-        strict = match_descriptors(similarity, config.descriptor_threshold, _GUESS_RATIO)
-        loose = match_descriptors(similarity, _GUESS_DESCRIPTOR_THRESHOLD, 1.0)
+        matches = match_descriptors(candidates.descriptors @ frame.descriptors.T)
+        strict = matches.clear(config.descriptor_threshold, _GUESS_RATIO)
+        loose = matches.clear(_GUESS_DESCRIPTOR_THRESHOLD, 1.0)
         for rows, columns in (strict, loose):
             guess = guess_motion(
                 candidates.places(rows),
