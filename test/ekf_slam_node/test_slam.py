@@ -14,6 +14,7 @@ from ekf_slam_node.filtering.ekf import Ekf
 from ekf_slam_node.filtering.models import Observation
 from ekf_slam_node.results import EkfResult, TrackingState
 from ekf_slam_node.slam import EkfSlam
+from ekf_slam_node.submaps.open_submap import most_telling
 from feature_world import PointWorld, loop, room
 from slam_core.config import from_mapping
 from slam_core.geometry import FloatArray, boxminus, invert_transform, make_transform, so3_exp
@@ -372,3 +373,9 @@ def test_a_followed_frame_is_measured_by_the_landmarks_that_tell_most(rng: np.ra
         assert seen > 40
         assert result.nis_dof == (60 if followed else 3 * seen)
     assert boxminus(results[-1].pose.T, pose)[:3] == pytest.approx(np.zeros(3), abs=0.03)
+
+
+def test_those_that_tell_most_are_chosen_among_the_good() -> None:
+    information = np.array([1.0, 5.0, 3.0, 4.0, 9.0, 4.0])
+    assert most_telling(information, np.array([0, 1, 2, 3, 5]), 2).tolist() == [1, 3]
+    assert most_telling(information, np.array([5, 0]), 9).tolist() == [0, 5]

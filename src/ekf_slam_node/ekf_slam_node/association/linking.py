@@ -173,8 +173,9 @@ class Linker:
         self, candidates: Candidates, frame: Frame, guess: MotionGuess, rows: IndexArray, columns: IndexArray
     ) -> tuple[IndexArray, IndexArray]:
         """Pairs of candidates and features of no common track, which a new track may have in sight again."""
-        free_rows = np.setdiff1d(np.flatnonzero(~self._moving.marks(candidates.tracks)), rows)
-        free_columns = np.setdiff1d(np.flatnonzero(~self._moving.marks(frame.tracks)), columns)
+        is_free_row, is_free_column = ~self._moving.marks(candidates.tracks), ~self._moving.marks(frame.tracks)
+        is_free_row[rows], is_free_column[columns] = False, False
+        free_rows, free_columns = np.flatnonzero(is_free_row), np.flatnonzero(is_free_column)
         if min(len(free_rows), len(free_columns)) == 0:
             return rows[:0], columns[:0]
         noisier = frame.select(free_columns).with_larger_noise(np.maximum(guess.variance_scale, 1.0))

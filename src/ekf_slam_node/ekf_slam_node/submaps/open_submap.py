@@ -16,7 +16,7 @@ from ekf_slam_node.config import MAX_UPDATE_LANDMARKS, EkfSlamConfig
 from ekf_slam_node.filtering.candidates import Candidates
 from ekf_slam_node.filtering.covariance import IndexArray
 from ekf_slam_node.filtering.drift import Drift
-from ekf_slam_node.filtering.ekf import Ekf, Sighted, TimeUpdate, UpdateReport
+from ekf_slam_node.filtering.ekf import Ekf, TimeUpdate, UpdateReport
 from ekf_slam_node.filtering.landmarks import CandidateLandmarks, LandmarkTable, spread_choice
 from ekf_slam_node.filtering.models import CORE_DIM, Frame, observe, relative_motion, rig_points
 from ekf_slam_node.odometry.relative_poses import RELATIVE_POSE_GATE, RelativePoseMeasurement, relative_pose_error
@@ -254,19 +254,12 @@ class OpenSubmap:
         variance = claimed * self._noise_factors(sight)
         found = self._ekf.sighted(z, variance, sight.slots, self._T_rig_optical, frame.camera, common)
         good = np.flatnonzero((found.nis < self._config.association.gate) & (found.seen.depth > MIN_DEPTH))
-        used = good if 2 * np.sum(frame.tracks[sight.columns] > 0) <= len(sight) else self._telling(found, good)
+        is_followed = 2 * np.sum(frame.tracks[sight.columns] > 0) > len(sight)
+        used = most_telling(found.information, good, self._config.landmark.most_measured) if is_followed else good
         report = self._ekf.update(z[used], variance[used], found.seen.select(used), sight.slots[used], common)
         after = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks[sight.slots], frame.camera)
         self.table.noise.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
         return report, sight.select(good)
-
-    def _telling(self, found: Sighted, good: IndexArray) -> IndexArray:
-        """Those of the sightings ``good`` that tell most, as many as a frame of followed features measures at most.
-
-        Their errors last as long as the patch that is followed, so that all of a frame's tell little more.
-        """
-        order = np.argsort(-found.information[good], kind="stable")
-        return np.asarray(np.sort(good[order[: self._config.landmark.most_measured]]))
 
     def measure_tags(self, frame: Frame, common: FloatArray) -> TagReport:
         """Measure the corners of fiducial tags after a frame's features; new tags become landmarks.
@@ -350,6 +343,15 @@ class OpenSubmap:
         for slot in self.table.unreliable(self._frames, self._config.landmark):
             self._remove(slot)
         self._remove_moved_tags()
+
+
+def most_telling(information: FloatArray, good: IndexArray, most: int) -> IndexArray:
+    """Those of the sightings ``good`` (k,) that tell most, ``most`` at most; ``information`` is that of all (n,).
+
+    For frames whose features were followed: their errors last as long as the patch, so that all tell little more.
+    """
+    order = np.argsort(-information[good], kind="stable")
+    return np.asarray(np.sort(good[order[:most]]))
 
 
 def candidate_landmarks(frame: Frame, T_rig_optical: FloatArray) -> CandidateLandmarks:
