@@ -196,9 +196,10 @@ def test_few_features_are_not_linked(world: PointWorld, rng: np.random.Generator
     assert Linker(FeatureAssociationConfig(), T_RIG_OPTICAL).link(candidates, now.select(np.arange(5)), prior) is None
 
 
+@pytest.mark.parametrize("digits", [1, 6], ids=["many are equal", "all differ"])
 @pytest.mark.parametrize("shape", [(30, 45), (45, 30), (2, 2), (1, 9), (9, 1), (0, 4)])
-def test_mutual_best_pairs_are_those_of_arrays(shape: tuple[int, int], rng: np.random.Generator) -> None:
-    cosines = np.round(rng.uniform(-1.0, 1.0, shape), 1).astype(np.float32)  # many are equal
+def test_mutual_best_pairs_are_those_of_arrays(shape: tuple[int, int], digits: int, rng: np.random.Generator) -> None:
+    cosines = np.round(rng.uniform(-1.0, 1.0, shape), digits).astype(np.float32)
     for threshold, ratio in ((0.75, 0.85), (0.6, 1.0), (-2.0, 10.0)):
         rows, columns = association.match_descriptors(cosines).clear(threshold, ratio)
         expected_rows, expected_columns = by_arrays(cosines.astype(np.float64), threshold, ratio)
