@@ -61,7 +61,7 @@ def preintegrated(stamps, rates, forces, span, biases, noise, longest_step, R, v
 
 @in_place()
 def _interpolate(stamps, rates, forces, begin, end, reading):  # type: ignore[no-untyped-def]
-    """Fill the reading (6,) at the middle of an interval; True if that lies long before the first reading or after the last.
+    """Fill the reading (6,) at the middle of an interval; True if that lies far outside the readings.
 
     There the nearest reading is taken.
     """
