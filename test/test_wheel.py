@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = sorted(path.name for path in (ROOT / "src").iterdir() if (path / "setup.py").exists())
 DATA = {
     "slam_bringup/demo/demo.mcap", "slam_simulation/scenarios/demo.yaml", "slam_simulation/expected.yaml",
-    "slam_core/fastdds.xml", "slam_radio/surf128_basis.npy", "slam_viewer/report/report.html.j2",
+    "slam_core/fastdds.xml", "slam_radio/packing/surf128_basis.npy", "slam_viewer/report/report.html.j2",
     "slam_experiments/experiments.html.j2", "stereo_frontend/surf/surf_detector.cl", "slam_core/py.typed",
 }  # fmt: skip
 BUILD_TOOLS = {"colcon-common-extensions", "colcon-ros", "setuptools"}

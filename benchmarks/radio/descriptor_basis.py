@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the directions of ``slam_radio.descriptor_code`` anew: principal directions of a simulated map's descriptors.
+"""Finds the directions of ``slam_radio.packing.descriptor_code`` anew: principal ones of a simulated map's descriptors.
 
     python benchmarks/radio/descriptor_basis.py MAP [-o surf128_basis.npy]
 
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from sjsam_node import storage
-from slam_radio.descriptor_code import DIRECTIONS
+from slam_radio.packing.descriptor_code import DIRECTIONS
 
 
 def main() -> None:

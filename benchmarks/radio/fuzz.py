@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from sjsam_node import storage
-from slam_radio.light_submap import MAGIC, VERSION, LightConfig, pack, unpack
+from slam_radio.packing.light_submap import MAGIC, VERSION, LightConfig, pack, unpack
 
 _ENVELOPE_BYTES = 9
 

@@ -33,10 +33,10 @@ from slam_core.geometry import FloatArray
 from slam_core.runtime.memory import share_one_heap
 from slam_core.trajectory import Trajectory, read_trajectory
 from slam_core.types import PoseEstimate, Submap
-from slam_radio.compact_gaussian import compact_gaussian
-from slam_radio.descriptor_code import decode, encode
-from slam_radio.landmark_choice import choose_landmarks
-from slam_radio.light_submap import LightConfig, pack, unpack
+from slam_radio.packing.compact_gaussian import compact_gaussian
+from slam_radio.packing.descriptor_code import decode, encode
+from slam_radio.packing.landmark_choice import choose_landmarks
+from slam_radio.packing.light_submap import LightConfig, pack, unpack
 
 _COLUMNS = ("run", "landmarks", "kB", "kB/m", "pack", "unpack", "closures", "of whole", "parts", "mm", "ANEES",
             "sigma", "least")  # fmt: skip

@@ -38,7 +38,7 @@ from slam_bags.storage.bag import BagReader
 from slam_core.geometry import boxminus
 from slam_core.messages import stamp_ns
 from slam_core.trajectory import read_trajectory
-from slam_radio.light_submap import pack
+from slam_radio.packing.light_submap import pack
 
 _ORB = 32
 _VECTOR, _MATRIX, _PAIR = 8, 8, 16

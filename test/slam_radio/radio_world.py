@@ -12,8 +12,8 @@ import numpy as np
 from slam_core.types import PoseEstimate, Submap
 from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox
-from slam_radio.light_submap import LightConfig, pack
 from slam_radio.outbox import Outbox
+from slam_radio.packing.light_submap import LightConfig, pack
 from slam_radio.radio_messages import pack_pose, unpack_acknowledgement
 from slam_radio.uplink import OVERHEAD, Uplink
 

@@ -8,7 +8,7 @@ import pytest
 from radio_world import World
 
 from slam_core.health import State
-from slam_radio.light_submap import pack
+from slam_radio.packing.light_submap import pack
 from slam_radio.radio_messages import pack_submap
 
 

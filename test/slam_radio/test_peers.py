@@ -36,7 +36,7 @@ from slam_bringup.processes.processes import PrivateDomain, find_executable, nod
 from slam_core.messages import SUBMAP_TOPICS, odometry_message, submap_messages  # noqa: E402
 from slam_core.ros import sensor_qos  # noqa: E402
 from slam_core.types import PoseEstimate, Submap  # noqa: E402
-from slam_radio.light_submap import pack, unpack  # noqa: E402
+from slam_radio.packing.light_submap import pack, unpack  # noqa: E402
 
 
 class Peers:

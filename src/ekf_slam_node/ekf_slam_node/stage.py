@@ -214,7 +214,7 @@ class FilterStage:
         slam = self._filter(features)
         self._give_aids(slam, features.stamp_ns)
         result = slam.process(features)
-        self._awaited.is_late(IMU, round(1e9 * self._imu_late[0]))
+        self._awaited.is_late(IMU, self._late_ns(slam))
         if result.state is TrackingState.OK and (diagnostic := self._awaited.diagnostic() or slam.diagnostic):
             result = replace(result, state=TrackingState.DEGRADED, reason=diagnostic)
         return FrameResult(result, len(features))
@@ -227,6 +227,12 @@ class FilterStage:
             self._slam = EkfSlam(self._config, T_base_optical, session)
         return self._slam
 
+    @staticmethod
+    def _late_ns(slam: EkfSlam) -> int:
+        """Time by which the IMU's stamps are late; less is bridged by holding the last reading."""
+        late = slam.imu_late_s[0]
+        return round(1e9 * late) if abs(late) >= _SIGNIFICANT_LATE_S else 0
+
     def _give_aids(self, slam: EkfSlam, stamp_ns: int) -> None:
         """The motions that began before the frame, and readings up to the first that is not older.
 
@@ -234,7 +240,7 @@ class FilterStage:
         """
         while self._motions and self._motions[0].start_stamp_ns < stamp_ns:
             slam.process_motion(self._motions.popleft())
-        late_ns = round(1e9 * self._imu_late[0])
+        late_ns = self._late_ns(slam)
         while self._samples and self._last_sample_ns + late_ns < stamp_ns:
             sample = self._samples.popleft()
             self._last_sample_ns = sample.stamp_ns

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from slam_core.types import Submap
 from slam_radio.index_ranges import IndexRanges, Key, Range, read_ranges, write_ranges
-from slam_radio.light_submap import unpack
+from slam_radio.packing.light_submap import unpack
 from slam_radio.radio_messages import MOST_RANGES, unpack_submap
 from slam_radio.submap_folder import SubmapFolder
 

@@ -31,9 +31,9 @@ from slam_radio.byte_budget import ByteBudget
 from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox
 from slam_radio.index_ranges import Key
-from slam_radio.light_submap import pack
 from slam_radio.link_state import LinkState
 from slam_radio.outbox import Outbox
+from slam_radio.packing.light_submap import pack
 from slam_radio.radio_config import RadioConfig
 from slam_radio.radio_messages import pack_pose, pack_submap, unpack_acknowledgement, unpack_correction, unpack_pose
 from slam_radio.uplink import Uplink

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 
 from slam_core.config import Config, group, parameter
-from slam_radio.light_submap import LightConfig
+from slam_radio.packing.light_submap import LightConfig
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 

@@ -11,7 +11,7 @@ correction       32 bytes: i64 stamp ns; 3 x f32 position m, 3 x f32 rotation ve
 acknowledgement  b"SA", u8 version, u32 CRC-32 of the rest; then ranges of 3 x u32: session, first index, the
                  index behind the last
 submap           u32: the lowest index of this session that its agent still has to send; then a submap for the
-                 air (:mod:`slam_radio.light_submap`)
+                 air (:mod:`slam_radio.packing.light_submap`)
 ===============  =============================================================================================
 """
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from slam_core.storage.files import PathLock, atomic_path, read_bytes
 from slam_radio.index_ranges import Key
-from slam_radio.light_submap import MOST_BYTES, unpack
+from slam_radio.packing.light_submap import MOST_BYTES, unpack
 
 _NAME = re.compile(r"(\d{1,10})-(\d{1,10})\.submap")
 

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from sjsam_node import storage
 from slam_bags.storage.bag import BagReader, BagWriter
 from slam_bringup.cli import slam
-from slam_bringup.commands.merged_run import map_of_bag
+from slam_bringup.jobs.merged_run import map_of_bag
 from slam_bringup.pipeline.overrides import Overrides
 from slam_viewer.page.run_folder import RunFolder
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ekf_slam_node.odometry.preintegration import Preintegral
+from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray
 
 _SIGMA_S = 0.05
@@ -19,6 +20,9 @@ _FORGETTING = 0.999
 """Weight of the past at every turn: clocks drift."""
 _SIGMAS = 5.0
 """A difference is believed beyond so many standard deviations."""
+FARTHEST_S = 0.15
+"""Clocks that are further apart are not to be found: readings of so long ago are kept."""
+_GATE = chi_square_bound(0.999, 3)
 _LEAST_S = 2e-3
 """And from here on: less is in the noise of what a driver calls the time of an image."""
 
@@ -27,26 +31,43 @@ class ClockWatch:
     """Fits (bias rad/s, time offset s) to turns; ``gyroscope_bias``: standard deviation of the bias beforehand."""
 
     def __init__(self, gyroscope_bias: float) -> None:
-        self._information = np.diag(1.0 / np.square([*3 * [max(gyroscope_bias, 1e-6)], _SIGMA_S]))
-        self._vector = np.zeros(4)
+        self._prior = np.diag(1.0 / np.square([*3 * [max(gyroscope_bias, 1e-6)], _SIGMA_S]))
+        self._information, self._vector = np.zeros((4, 4)), np.zeros(4)
 
     def add(self, pre: Preintegral, turn: FloatArray, covariance: FloatArray) -> None:
         """Take a turn (3,) beyond that of readings without bias and offset, with its covariance (3, 3).
 
-        Readings before and after the edges of the step have noise of their own: one's derivative is the regressor, the
-        other's the instrument, so that noise is not taken for information.
+        One half of the readings at the edges gives the regressor, the other half, with noise of its own, the
+        instrument, so that noise is not taken for information. A turn that contradicts those before is left out.
         """
-        before, after = (np.column_stack([pre.J[:3, :3], clock]) for clock in pre.clock_turns)
+        first, second = (np.column_stack([pre.J[:3, :3], clock]) for clock in pre.clock_turns)
+        fit = self._fit()
+        if fit is None:
+            return
+        J = 0.5 * (first + second)
+        error = turn - J @ fit[0]
+        if not float(error @ np.linalg.solve(covariance + J @ fit[1] @ J.T, error)) < _GATE:
+            return
         inverse = np.linalg.inv(covariance)
-        information = before.T @ inverse @ after
+        information = first.T @ inverse @ second
         self._information = _FORGETTING * self._information + 0.5 * (information + information.T)
-        self._vector = _FORGETTING * self._vector + 0.5 * (before + after).T @ inverse @ turn
+        self._vector = _FORGETTING * self._vector + J.T @ inverse @ turn
 
     def contradicted(self, time_offset: float, sigma: float) -> float:
         """Variance (s2) to be added to that of a time offset +- sigma, s, so that it may become the one found; or 0."""
-        P = np.linalg.inv(self._information)
-        if not P[3, 3] > 0.0:
+        fit = self._fit()
+        if fit is None or abs(fit[0][3]) > FARTHEST_S:
             return 0.0
-        apart = float(P[3] @ self._vector) - time_offset
-        bound = max(_SIGMAS * float(np.sqrt(P[3, 3])), _LEAST_S, _SIGMAS * sigma)
+        apart = float(fit[0][3]) - time_offset
+        bound = max(_SIGMAS * float(np.sqrt(fit[1][3, 3])), _LEAST_S, _SIGMAS * sigma)
         return apart**2 if abs(apart) > bound else 0.0
+
+    def _fit(self) -> tuple[FloatArray, FloatArray] | None:
+        """The solution (4,) and its covariance (4, 4); None where the halves' noise makes it indefinite."""
+        try:
+            L = np.linalg.cholesky(self._prior + self._information)
+        except np.linalg.LinAlgError:
+            return None
+        inverse = np.linalg.inv(L)
+        P = inverse.T @ inverse
+        return P @ self._vector, P

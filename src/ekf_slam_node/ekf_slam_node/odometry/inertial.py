@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ekf_slam_node.config import InertialConfig, MotionConfig
-from ekf_slam_node.odometry.clock_watch import ClockWatch
+from ekf_slam_node.odometry.clock_watch import FARTHEST_S, ClockWatch
 from ekf_slam_node.odometry.preintegration import ImuNoise, Preintegral
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxminus, make_transform, skew, so3_exp
@@ -218,18 +218,15 @@ class InertialFilter:
         """The prediction, its clock as uncertain as the turns of all frames so far show it to be."""
         if self._clock is None:
             return step
-        pre, J = step.pre, step.pre.J[:3, 6]
-        known = pre.J[:3, :3] @ self.biases[:3] + J * self.time_offset
+        pre = step.pre
+        known = pre.J[:3, :3] @ self.biases[:3] + pre.J[:3, 6] * self.time_offset
         self._clock.add(pre, turn_error + known, covariance + pre.covariance[:3, :3])
         wider = self._clock.contradicted(self.time_offset, self.sigma_time_offset)
         if not wider:
             return step
-        P = step.covariance.copy()
-        P[18, 18] += wider
-        P[3:6, 3:6] += wider * np.outer(J, J)
-        P[3:6, 18] += wider * J
-        P[18, 3:6] = P[3:6, 18]
-        return replace(step, covariance=P)
+        change = np.zeros(19)
+        change[:3], change[3:6], change[6:9], change[18] = pre.J[6:, 6], pre.J[:3, 6], pre.J[3:6, 6], 1.0
+        return replace(step, covariance=step.covariance + wider * np.outer(change, change))
 
     def check_specific_force(self, pre: Preintegral) -> None:
         """Judge the specific force of the first second: gravity is the most of it, whatever a hand does."""
@@ -288,7 +285,8 @@ class InertialFilter:
         self.covariance = self.covariance - np.outer(cross, cross) / S
 
     def _correct_sensor(self, delta: FloatArray) -> None:
-        self.biases, self.time_offset = self.biases + delta[:6], self.time_offset + float(delta[6])
+        self.biases = self.biases + delta[:6]
+        self.time_offset = float(np.clip(self.time_offset + delta[6], -FARTHEST_S, FARTHEST_S))
 
 
 def _followed(mean: float, normalised: float) -> float:

@@ -24,10 +24,13 @@ import numpy as np
 
 from ekf_slam_node.odometry.preintegration_kernels import preintegrated
 from slam_core.geometry import FloatArray
+from slam_core.tags import IntArray
 from slam_core.types import LONGEST_IMU_STEP_S, ImuSample
 
-_EDGE_S = np.linspace(0.0025, 0.0175, 4)
-"""Rates at an edge are means before and after it: a single reading's noise would be taken for a change of the rates."""
+_EDGE_NS = 20_000_000
+"""Readings at an edge are means over so long before it: one's noise would be taken for a change, and later ones may not
+have come.
+"""
 _LONGEST_S = 10.0
 """Nothing is integrated over longer times, and readings are kept for twice as long."""
 
@@ -56,7 +59,7 @@ class Preintegral:
 
     J: (9, 7) derivative of the errors of (turn, v, p) with respect to the biases (gyroscope, accelerometer) and to
     what is to be added to the stamps, s.
-    clock_turns: (2, 3) derivative of the turn with respect to these, by readings before and after the edges alone.
+    clock_turns: (2, 3) derivative of the turn with respect to these, by either half of the readings at the edges.
     covariance: (9, 9) of the errors' noise. force: (3,) mean specific force along the axes of the start, m/s2. reading:
     mean size of it as it was read, biases included.
     """
@@ -114,13 +117,20 @@ class ImuReadings:
             R, v, p, J[:, :6], covariance,
         )  # fmt: skip
         dt = 1e-9 * (end_ns - start_ns)
-        around = np.array([0.0, end_ns - start_ns])[:, None] + 1e9 * np.array([-_EDGE_S, _EDGE_S])[:, None]
-        times = (stamps - start_ns).astype(np.float64)
-        columns = [np.interp(around, times, column).mean(axis=2) for column in (*rates.T, *forces.T)]
-        before, after = np.stack(columns, axis=2) - biases
-        J[:, 6] = _clock_jacobian(R, v, p, 0.5 * (before + after), dt)
-        clock_turns = np.array([_clock_jacobian(R, v, p, part, dt)[:3] for part in (before, after)])
+        both = np.column_stack([rates, forces]) - biases
+        halves = np.stack([_at_edge(stamps, both, edge_ns) for edge_ns in (start_ns, end_ns)], axis=1)
+        J[:, 6] = _clock_jacobian(R, v, p, halves.mean(axis=0), dt)
+        clock_turns = np.array([_clock_jacobian(R, v, p, half, dt)[:3] for half in halves])
         return Preintegral(dt, R, v, p, J, clock_turns, covariance, v / dt, size)
+
+
+def _at_edge(stamps: IntArray, readings: FloatArray, edge_ns: int) -> FloatArray:
+    """Two means (2, 6) of readings (n, 6) at an edge that share none; the nearest for both where they are sparse."""
+    chosen = np.flatnonzero((stamps > edge_ns - _EDGE_NS) & (stamps <= edge_ns))
+    if len(chosen) < 2:
+        nearest = readings[np.argmin(np.abs(stamps - edge_ns))]
+        return np.array([nearest, nearest])
+    return np.array([readings[chosen[half::2]].mean(axis=0) for half in (0, 1)])
 
 
 def _clock_jacobian(R: FloatArray, v: FloatArray, p: FloatArray, at_edges: FloatArray, dt: float) -> FloatArray:

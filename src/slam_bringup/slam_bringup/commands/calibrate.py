@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_bags.reading.extrinsics import EXTRINSICS, URDF, extrinsics_text, extrinsics_urdf
 from slam_bags.storage.bag_calibration import FILE_NAME
-from slam_bringup.commands.refine import refine, write_refined
+from slam_bringup.jobs.refine import refine, write_refined
 from slam_bringup.terminal.console import progress_bar
 from slam_bringup.terminal.paths import UserPath, overwrite_option
 from slam_calibration.board import Board, parse_board

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from sjsam_node.merging.merge import merge
 from sjsam_node.regions.tasks import cluster
-from slam_bringup.commands.merged_run import merged_result, parts_text, read_inputs
+from slam_bringup.jobs.merged_run import merged_result, parts_text, read_inputs
 from slam_bringup.pipeline.configuration import system_config
 from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.terminal.console import LOG_NAME, Transcript, is_quiet, progress_bar, show

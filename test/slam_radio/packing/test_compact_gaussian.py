@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam_radio import compact_gaussian as module
-from slam_radio.compact_gaussian import CompactGaussian, compact_gaussian
+from slam_radio.packing import compact_gaussian as module
+from slam_radio.packing.compact_gaussian import CompactGaussian, compact_gaussian
 
 
 def largest_share(inner, outer) -> float:

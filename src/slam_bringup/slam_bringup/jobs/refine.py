@@ -34,7 +34,7 @@ _TIMES = (
     ("rows are read out within", "measurement.readout", "measurement.sigma_readout"),
     ("to be added to the IMU's stamps:", "imu.time_offset", "imu.sigma_time_offset"),
 )
-"""What is found, and its parameters of the filter."""
+"""Words for a finding, and its parameters of the filter."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from slam_core.geometry import FloatArray
 from slam_core.tags import is_tag_corner
 from slam_core.types import Float32Array, Submap
-from slam_radio.descriptor_code import basis
+from slam_radio.packing.descriptor_code import basis
 
 _COLUMN = 1
 """Of the basis: the direction in which SURF-128 descriptors differ most from each other; all share the first one."""

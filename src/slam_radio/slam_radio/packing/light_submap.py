@@ -27,10 +27,10 @@ u16, u16, u8        dimension of descriptors, c, k
 n x 3 x u16         positions, in 65535ths of the box
 (21 + 6n) x f16     Cholesky factors of the unknowns' own blocks, mm and mrad: all low bytes, then all high bytes
 f32                 inflation t
-(6 + 3n) x r x i8   common directions U, in 127ths (:mod:`slam_radio.compact_gaussian`)
+(6 + 3n) x r x i8   common directions U, in 127ths (:mod:`slam_radio.packing.compact_gaussian`)
 n x varint          ids, each less the one before (LEB128)
 n x u8              sightings, at most 255
-n x c x i8          descriptors (:mod:`slam_radio.descriptor_code`)
+n x c x i8          descriptors (:mod:`slam_radio.packing.descriptor_code`)
 k x (i64, 6 x f32,  poses of the path: stamp, tangent of T_start_rig, and the factor by which the end pose's
 f16)                covariance covers the pose's own
 ==================  ===================================================================================
@@ -50,10 +50,10 @@ import numpy.typing as npt
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus, boxplus, is_rigid_transform
 from slam_core.types import PoseEstimate, Submap
-from slam_radio.byte_reader import ByteReader, read_varints, write_varints
-from slam_radio.compact_gaussian import CompactGaussian, compact_gaussian
-from slam_radio.descriptor_code import decode, encode
-from slam_radio.landmark_choice import choose_landmarks
+from slam_radio.packing.byte_reader import ByteReader, read_varints, write_varints
+from slam_radio.packing.compact_gaussian import CompactGaussian, compact_gaussian
+from slam_radio.packing.descriptor_code import decode, encode
+from slam_radio.packing.landmark_choice import choose_landmarks
 
 MAGIC, VERSION = b"SL", 2
 MOST_BYTES = 2**17

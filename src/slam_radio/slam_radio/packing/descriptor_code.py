@@ -28,7 +28,7 @@ _LEAST_LIKENESS = 0.9
 @cache
 def basis() -> Float32Array:
     """Orthonormal directions (128, DIRECTIONS)."""
-    with resources.files("slam_radio").joinpath("surf128_basis.npy").open("rb") as file:
+    with resources.files("slam_radio.packing").joinpath("surf128_basis.npy").open("rb") as file:
         return np.asarray(np.load(file, allow_pickle=False), dtype=np.float32)
 
 

@@ -15,7 +15,7 @@ from judging import ate, errors, join
 from submap_world import Agent, Sensor, World, circle, path_through, ring_world, room
 
 from slam_core.types import Submap
-from slam_radio.light_submap import LightConfig, pack, unpack
+from slam_radio.packing.light_submap import LightConfig, pack, unpack
 
 
 def sent(submaps: list[Submap]) -> list[Submap]:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from slam_core.geometry import boxminus
-from slam_radio.descriptor_code import DIRECTIONS, basis, decode, encode
-from slam_radio.landmark_choice import choose_landmarks, rank_values
-from slam_radio.light_submap import LightConfig, pack, unpack
+from slam_radio.packing.descriptor_code import DIRECTIONS, basis, decode, encode
+from slam_radio.packing.landmark_choice import choose_landmarks, rank_values
+from slam_radio.packing.light_submap import LightConfig, pack, unpack
 
 
 def test_what_is_sent_comes_out(make_submap):
