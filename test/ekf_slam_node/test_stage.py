@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from imu_world import carried, readings
 
 from ekf_slam_node.results import TrackingState
 from ekf_slam_node.stage import IMU, MOTION, FilterConfig, FilterStage, FrameResult
@@ -104,3 +106,23 @@ def test_a_source_of_motions_that_never_lived_delays_only_the_first_frames(frame
 def test_an_unknown_stream_is_refused() -> None:
     with pytest.raises(ValueError, match="may hold motion, imu, odometry, got wheels"):
         FilterConfig(wait_for=("wheels",))
+
+
+@pytest.mark.parametrize("late_ns", [20_000_000, -20_000_000])
+def test_an_imu_with_another_clock_is_waited_for_and_told_of(late_ns: int) -> None:
+    """Readings before and after the frames, in any order, give the same poses, and the offset is found."""
+    rng = np.random.default_rng(5)
+    world = room(rng)
+    frames = [world.features(carried(0.1 * k), k * STEP_NS, rng, max_features=80)[0] for k in range(1, 61)]
+    samples = [replace(s, stamp_ns=s.stamp_ns - late_ns, frame_id="imu_link") for s in readings(6.2, rng)]
+    items: list[Features | RelativeMotion | ImuSample] = [*frames, *samples]
+    results, findings = [], []
+    for delay_ns in (0, 3 * STEP_NS, -3 * STEP_NS):
+        filter_stage = stage(frames[0].frame_id, IMU)
+        order = sorted(items, key=lambda i: stamp_of(i) + delay_ns * isinstance(i, ImuSample))
+        results.append([r.estimate.pose.T for r in run(filter_stage, order)])
+        findings.append(filter_stage.clock_finding)
+        assert filter_stage.imu_late_s[0] == pytest.approx(1e-9 * late_ns, abs=3e-3)
+    assert "ms off, corrected" in findings[0]
+    for other in results[1:]:
+        np.testing.assert_array_equal(np.array(other), np.array(results[0]))

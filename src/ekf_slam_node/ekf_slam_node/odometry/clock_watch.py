@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the turns that the images show come later or earlier than those of a gyroscope.
+"""Watch over a gyroscope's clock: its turns have to come when the images show them.
 
 A filter that thinks its clocks far apart to begin with knows gravity less well for many seconds. So the filter begins
 with clocks that agree, and this says when they do not: by a least-squares fit of the gyroscope's bias and of the

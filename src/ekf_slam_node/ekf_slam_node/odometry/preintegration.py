@@ -28,9 +28,8 @@ from slam_core.tags import IntArray
 from slam_core.types import LONGEST_IMU_STEP_S, ImuSample
 
 _EDGE_NS = 20_000_000
-"""Readings at an edge are means over so long before it: one's noise would be taken for a change, and later ones may not
-have come.
-"""
+"""Readings at an edge are means over so long: one's noise would be taken for a change of the rates."""
+_AROUND_NS = 0.5 * _EDGE_NS * np.linspace(-1.0, 1.0, 9)
 _LONGEST_S = 10.0
 """Nothing is integrated over longer times, and readings are kept for twice as long."""
 
@@ -117,15 +116,20 @@ class ImuReadings:
             R, v, p, J[:, :6], covariance,
         )  # fmt: skip
         dt = 1e-9 * (end_ns - start_ns)
-        both = np.column_stack([rates, forces]) - biases
-        halves = np.stack([_at_edge(stamps, both, edge_ns) for edge_ns in (start_ns, end_ns)], axis=1)
-        J[:, 6] = _clock_jacobian(R, v, p, halves.mean(axis=0), dt)
+        both, edges = np.column_stack([rates, forces]) - biases, np.array([start_ns, end_ns])
+        around, times = (edges - start_ns)[:, None] + _AROUND_NS, (stamps - start_ns).astype(np.float64)
+        at_edges = np.stack([np.interp(around, times, column).mean(axis=1) for column in both.T], axis=1)
+        J[:, 6] = _clock_jacobian(R, v, p, at_edges, dt)
+        halves = np.stack([_halves_before(stamps, both, edge_ns) for edge_ns in edges.tolist()], axis=1)
         clock_turns = np.array([_clock_jacobian(R, v, p, half, dt)[:3] for half in halves])
         return Preintegral(dt, R, v, p, J, clock_turns, covariance, v / dt, size)
 
 
-def _at_edge(stamps: IntArray, readings: FloatArray, edge_ns: int) -> FloatArray:
-    """Two means (2, 6) of readings (n, 6) at an edge that share none; the nearest for both where they are sparse."""
+def _halves_before(stamps: IntArray, readings: FloatArray, edge_ns: int) -> FloatArray:
+    """Two means (2, 6) of readings (n, 6) before an edge that share none; the nearest for both where they are sparse.
+
+    Later readings may not have come yet at the end; by a common lag both edges tell of a window that much earlier.
+    """
     chosen = np.flatnonzero((stamps > edge_ns - _EDGE_NS) & (stamps <= edge_ns))
     if len(chosen) < 2:
         nearest = readings[np.argmin(np.abs(stamps - edge_ns))]
