@@ -13,6 +13,8 @@ from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray
 from slam_core.imu_config import ImuConfig
 
+_GATE_PROBABILITY = 0.999
+"""Share of true pairs inside the chi-square gate of one feature."""
 MAX_FRAME_FEATURES = 800
 """The strongest features of a frame that are looked at."""
 MAX_UPDATE_LANDMARKS = 120
@@ -110,9 +112,6 @@ class FeatureAssociationConfig(Config):
     method: str = parameter(
         "mahalanobis", "how a feature chooses among its candidates", choices=("nearest", "mahalanobis", "jcbb", "ccda")
     )
-    probability: float = parameter(
-        0.999, "share of true pairs inside the chi-square gate of one feature", minimum=0.5, maximum=1.0 - 1e-9
-    )
     descriptor_threshold: float = parameter(0.75, "least cosine of the descriptors", minimum=-1.0, maximum=1.0)
     descriptor_weight: float = parameter(
         40.0,
@@ -142,7 +141,7 @@ class FeatureAssociationConfig(Config):
     @property
     def gate(self) -> float:
         """Gate on the squared Mahalanobis distance of one feature, three coordinates."""
-        return chi_square_bound(self.probability, 3)
+        return chi_square_bound(_GATE_PROBABILITY, 3)
 
 
 @dataclass(frozen=True)

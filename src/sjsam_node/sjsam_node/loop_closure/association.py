@@ -30,6 +30,9 @@ _JOINT_PAIRS = 64
 MAX_VARIANCE_FACTOR = 16.0
 """Submaps too sure of themselves by up to this factor are matched all the same."""
 
+GATE_PROBABILITY = 0.999
+"""Share of true pairs of landmarks inside the chi-square gate."""
+
 
 @dataclass(frozen=True)
 class AssociationConfig(Config):
@@ -38,8 +41,6 @@ class AssociationConfig(Config):
     method: str = parameter("joint", "how landmarks are matched", choices=METHODS)
     descriptor_threshold: float = 0.6
     """Least scalar product of two descriptors (7.5)."""
-    probability: float = 0.999
-    """Share of true pairs inside a chi-square gate."""
     nearest_gate: float = parameter(0.3, "distance below which the nearest neighbour is taken", unit="m", minimum=0.0)
     position_noise: float = 0.005
     """Standard deviation added to each landmark when gating: submaps are linearised (m)."""
@@ -96,7 +97,7 @@ def candidate_pairs(first: PointSet, second: PointSet, prior: Prior, config: Ass
         inside = distance < config.nearest_gate
         return mutual_best(i[inside], j[inside], distance[inside])
     own, other = first.variances() + config.position_noise**2 * np.eye(3), variances_seen(second, prior)
-    return mutual_best(*_gated(alike, first.points, seen, own, other, chi_square_bound(config.probability, 3)))
+    return mutual_best(*_gated(alike, first.points, seen, own, other, chi_square_bound(GATE_PROBABILITY, 3)))
 
 
 @njit(cache=True, nogil=True)
@@ -168,7 +169,7 @@ def jointly_compatible(
     found, scale = _compatible(first, second, pairs[sample], prior, config)
     others = np.delete(pairs, sample, axis=0)
     nis = nis_one_by_one(first, second, others, Prior(found.T, found.covariance), config)
-    fitting = others[nis <= scale * chi_square_bound(config.probability, 3)]
+    fitting = others[nis <= scale * chi_square_bound(GATE_PROBABILITY, 3)]
     kept = np.concatenate([found.pairs, fitting])
     return replace(found, pairs=kept[np.argsort(kept[:, 0], kind="stable")])
 
@@ -181,8 +182,8 @@ def _compatible(
     while True:
         solved = _solve(first, second, pairs, prior, config)
         scale = min(max(scale, variance_factor(solved.nis)), MAX_VARIANCE_FACTOR)
-        bound = scale * chi_square_bound(config.probability, max(solved.dof, 1))
-        outlier = solved.nis > scale * chi_square_bound(config.probability, 3)
+        bound = scale * chi_square_bound(GATE_PROBABILITY, max(solved.dof, 1))
+        outlier = solved.nis > scale * chi_square_bound(GATE_PROBABILITY, 3)
         if len(pairs) == 0 or (solved.chi2 <= bound and not outlier.any()):
             return replace(solved.alignment(pairs), covariance=scale * solved.covariance), scale
         # Those that stand out together are dropped together, but never more than a tenth at once: bad ones spoil

@@ -22,6 +22,7 @@ from scipy.special import betainc, gammaln
 from sjsam_node.graph.links import Prior
 from sjsam_node.graph.map_graph import BoolArray
 from sjsam_node.loop_closure.association import (
+    GATE_PROBABILITY,
     MAX_VARIANCE_FACTOR,
     Alignment,
     AssociationConfig,
@@ -73,7 +74,7 @@ def evidence_of(
         return ClosureEvidence(len(pairs), 0, 1.0)
     alignment = Prior(found.T, found.covariance)
     own = variance_factor(nis_one_by_one(first, second, found.pairs, alignment, config))
-    bound = min(own, MAX_VARIANCE_FACTOR) * chi_square_bound(config.probability, 3)
+    bound = min(own, MAX_VARIANCE_FACTOR) * chi_square_bound(GATE_PROBABILITY, 3)
     S = (
         first.variances()[None]
         + config.position_noise**2 * np.eye(3)

@@ -28,6 +28,8 @@ _MOTION_RATE = 0.3
 _MAPPING_SIGMA = 0.1
 """Standard deviation of the mapping into the ToF image, px."""
 
+_GATE_PROBABILITY = 0.9973
+"""Share of true pairs of stereo and ToF depth inside the gate: three sigma."""
 _ITERATIONS = 8
 _STANDS_STILL = 1e-6
 """A depth (m) that an iteration moves by less is at its place."""
@@ -37,18 +39,12 @@ _STANDS_STILL = 1e-6
 class FusionConfig(Config):
     """Fusion of ToF depth and stereo features."""
 
-    probability: float = parameter(
-        0.9973,
-        "share of true pairs of stereo and ToF depth inside the gate",
-        minimum=0.5,
-        maximum=1.0 - 1e-9,
-    )
     max_age: float = parameter(0.06, "greatest time between the stereo pair and the depth image", unit="s", minimum=0.0)
 
     @property
     def gate(self) -> float:
         """Gate on the squared difference of both depths over its variance."""
-        return chi_square_bound(self.probability, 1)
+        return chi_square_bound(_GATE_PROBABILITY, 1)
 
 
 @dataclass(frozen=True, eq=False)
