@@ -86,6 +86,20 @@ def test_against_the_state_before(data, finished, tmp_path):
         assert f"geometric mean of the ratios {1 / factor:.3f}" in " ".join(result.output.split())
 
 
+def test_what_cannot_be_compared_is_refused_before_anything_runs(data, finished, tmp_path):
+    rows = json.loads((finished[0] / "benchmark.json").read_text())
+    keys = ("recording", "variant", "program", "run", "ate_mm")
+    broken = [[{k: v for k, v in row.items() if k != key} for row in rows] for key in keys]
+    others = [{**row, "recording": "hall"} for row in rows]
+    for old, told in (*((b, "is no benchmark.json") for b in broken), (others, "nothing to compare")):
+        path, output = tmp_path / "old.json", tmp_path / "out"
+        path.write_text(json.dumps(old))
+        result = benchmark(data, "-o", output, *finished[2], "--against", path)
+        assert result.exit_code != 0
+        assert told in f"{result.output} {result.exception}"
+        assert not output.exists()
+
+
 def test_wrong_input_is_one_clear_line(data, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()

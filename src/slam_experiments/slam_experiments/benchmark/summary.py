@@ -17,8 +17,9 @@ Row = Mapping[str, Any]
 MOST_WORSE = 1.10
 """Ratio of median errors up to which a recording may get worse."""
 _LARGEST_RATIO = 10.0
+_CASE = ("recording", "variant", "program", "run")
 _COLUMNS = (
-    "recording", "variant", "program", "run", "ate_mm", "end_mm", "scale_percent", "sigma_over_ate", "anees",
+    *_CASE, "ate_mm", "end_mm", "scale_percent", "sigma_over_ate", "anees",
     "anees_with_truth_errors", "frames", "coverage", "lost", "parts", "ms_per_frame", "failed",
 )  # fmt: skip
 HEADINGS = ("recording", "program", "variants", "ATE mm", "ANEES", "sigma / ATE", "poses %", "parts", "failed")
@@ -166,14 +167,29 @@ def compare(before: Sequence[Row], after: Sequence[Row], program: str) -> Compar
         If they have none in common.
     """
     known = {_name(row): row for row in before if row["program"] == program}
-    pairs = [row for row in after if row["program"] == program and _name(row) in known]
-    if not pairs:
-        raise ValueError("the two results have no recording and variant in common: nothing to compare")
+    pairs = in_common(before, after, program)
     changes = []
     for (recording, name), group in _groups(pairs).items():
         old = [_ate(known[_name(row)]) for row in group]
         changes.append(Change(recording, name, len(group), _median(old), _median([_ate(row) for row in group])))
     return Comparison(tuple(changes))
+
+
+def in_common(before: Sequence[Row], after: Sequence[Row], program: str) -> list[Row]:
+    """Rows of ``after``, of a program, whose case is in ``before``; neither needs figures. ValueError if none is."""
+    known = {_name(row) for row in before if row["program"] == program}
+    pairs = [row for row in after if row["program"] == program and _name(row) in known]
+    if not pairs:
+        raise ValueError("the two results have no recording and variant in common: nothing to compare")
+    return pairs
+
+
+def is_row(value: Any) -> bool:
+    """True for a case as ``benchmark.json`` has it: named, and with an error of its trajectory or why there is none."""
+    if not isinstance(value, dict) or not all(isinstance(value.get(name), str) for name in _CASE):
+        return False
+    ate = value.get("ate_mm")
+    return "failed" in value or (isinstance(ate, int | float) and not isinstance(ate, bool))
 
 
 def _name(row: Row) -> tuple[str, str, str]:

@@ -29,6 +29,8 @@ from slam_experiments.benchmark.summary import (
     as_csv,
     as_markdown,
     compare,
+    in_common,
+    is_row,
     table,
 )
 from slam_experiments.benchmark.variants import VARIANTS
@@ -85,13 +87,14 @@ def command(
         for recording in _chosen(sets_of(data), names)
         for case in cases_of(recording, variants or VARIANTS, config=config, peers=peers, orbslam3_python=python)
     ]
+    if old is not None:
+        in_common(old, [_row(case) for case in cases], OURS)  # refused before anything runs
     with folder:
         rows = _run(cases, output / "cache", workers)
+        _write(folder, rows, None)  # what took the time is kept, whatever the comparison says
         comparison = None if old is None else compare(old, rows, OURS)
-        with folder.staged() as staged:
-            atomic_text(staged / _RESULT, json.dumps(rows, indent=1) + "\n")
-            atomic_text(staged / "benchmark.csv", as_csv(rows))
-            atomic_text(staged / "benchmark.md", _page(rows, comparison))
+        if comparison is not None:
+            _write(folder, rows, comparison)
     _show(rows, comparison)
     if comparison is not None and not comparison.is_accepted:
         sys.exit(1)
@@ -105,9 +108,7 @@ def _chosen(sets: dict[str, RecordingSet], names: Sequence[str]) -> list[Recordi
 
 def _rows_in(path: Path) -> list[Row]:
     rows: Any = read_json(path)
-    if not isinstance(rows, list) or not all(
-        isinstance(r, dict) and {"recording", "variant"} <= r.keys() for r in rows
-    ):
+    if not isinstance(rows, list) or not all(map(is_row, rows)):
         raise ValueError(f"{path} is no benchmark.json of slam benchmark")
     return rows
 
@@ -119,10 +120,18 @@ def _run(cases: Sequence[Case], cache: Path, workers: int) -> list[Row]:
         results = run_jobs(
             [case.job for case in cases], cache, workers, None, lambda job: progress.advance(task, job in wanted)
         )
-    return [
-        {"recording": c.recording, "variant": c.variant, "program": c.program, "run": c.run, **results[c.job].values}
-        for c in cases
-    ]
+    return [{**_row(case), **results[case.job].values} for case in cases]
+
+
+def _row(case: Case) -> Row:
+    return {"recording": case.recording, "variant": case.variant, "program": case.program, "run": case.run}
+
+
+def _write(folder: OutputFolder, rows: Sequence[Row], comparison: Comparison | None) -> None:
+    with folder.staged() as staged:
+        atomic_text(staged / _RESULT, json.dumps(rows, indent=1) + "\n")
+        atomic_text(staged / "benchmark.csv", as_csv(rows))
+        atomic_text(staged / "benchmark.md", _page(rows, comparison))
 
 
 def _page(rows: Sequence[Row], comparison: Comparison | None) -> str:
