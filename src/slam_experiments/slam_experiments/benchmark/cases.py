@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import cv2
 
 from slam_bags.reading.sensor_bag import SensorBag
+from slam_bags.storage.bag_calibration import calibration_file
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_core.storage.files import read_json
@@ -84,10 +86,21 @@ def _bag_job(recording: RecordingSet, variant: str) -> Job:
 
 
 def _as_text(recording: RecordingSet) -> dict[str, Any]:
-    """Everything of a recording that its bag depends on, as JSON knows it; size and time stand for a bag's content."""
-    paths = {name: str(value) for name, value in asdict(recording).items() if isinstance(value, Path)}
-    state = recording.source.stat()
-    return {"kind": recording.kind, **paths, "state": [state.st_size, state.st_mtime_ns]}
+    """Everything of a recording that its results depend on, as JSON knows it."""
+    paths = {name: value for name, value in asdict(recording).items() if isinstance(value, Path)}
+    state = _state_of([*paths.values(), calibration_file(recording.source)])
+    return {"kind": recording.kind, **{name: str(path) for name, path in paths.items()}, "state": state}
+
+
+def _state_of(paths: Iterable[Path]) -> str:
+    """Digest of all files at some places and below them; size and time stand for a file's content."""
+    state = sha256()
+    for path in paths:
+        for file in sorted(f for f in (path, *path.rglob("*")) if f.is_file()):
+            known = file.stat()
+            state.update(f"{file.relative_to(path)} {known.st_size} {known.st_mtime_ns}\n".encode())
+        state.update(b"\n")
+    return state.hexdigest()[:16]
 
 
 # ---- jobs
