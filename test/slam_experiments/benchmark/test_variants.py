@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,9 @@ import pytest
 from slam_bags.reading.readings import DepthReading, ImuReading, StereoReading
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.storage.bag import BagWriter
+from slam_bags.storage.bag_calibration import calibration_file
 from slam_bags.storage.sensor_writer import IMU_FRAME, LEFT_FRAME, T_BASE_OPTICAL, TOF_FRAME, SensorWriter
+from slam_bringup.pipeline.configuration import load_system_config
 from slam_core.camera import Camera, CameraInfo
 from slam_core.geometry import make_transform
 from slam_core.types import ImuSample
@@ -137,6 +141,25 @@ def test_jpeg_loses_a_little(bag, tmp_path, rng):
     readings, _, _ = read(path, "JPEG quality 50", tmp_path)
     off = np.abs(readings[0].pair.left.astype(int) - grey).mean()
     assert 1.0 < off < 40.0
+
+
+@pytest.mark.parametrize(("variant", "sign"), [("gap of 3 s", 1.0), ("half resolution", 1.0), ("backwards", -1.0)])
+def test_the_calibration_of_a_bag_is_that_of_its_variants(bag, tmp_path, variant, sign):
+    """Backwards, the last row is read first, and an IMU that was late is early."""
+    source, target = tmp_path / "hall.mcap", tmp_path / "variant.mcap"
+    shutil.copy(bag, source)
+    calibration_file(source).write_text(
+        "/**: {ros__parameters: {imu.time_offset: 0.02, calibration.sigma_scale: 0.004}}\n"
+        "ekf_slam: {measurement: {readout: 0.01, sigma_readout: 0.001}}\n"
+    )
+    write_variant(source, target, variant)
+    before, after = (load_system_config(None, path).ekf_slam for path in (source, target))
+    assert before.imu.time_offset == 0.02
+    assert before.measurement.readout == 0.01
+    assert after.imu.time_offset == sign * 0.02
+    assert after.measurement.readout == sign * 0.01
+    imu = replace(before.imu, time_offset=sign * 0.02)
+    assert after == replace(before, imu=imu, measurement=replace(before.measurement, readout=sign * 0.01))
 
 
 def test_what_is_too_short_is_refused(tmp_path):

@@ -82,7 +82,12 @@ def _bag_job(recording: RecordingSet, variant: str) -> Job:
     whole = Job(f"{MODULE}:bag_of", {"recording": _as_text(recording)}, _BAGS)
     if variant == AS_IT_IS:
         return whole
-    return Job(f"{MODULE}:variant_of", {"variant": variant}, (*_BAGS, f"{_OWN}.variants"), (whole,))
+    return Job(
+        f"{MODULE}:variant_of",
+        {"variant": variant},
+        (*_BAGS, "slam_bringup.pipeline.overrides", f"{_OWN}.variants"),
+        (whole,),
+    )
 
 
 def _as_text(recording: RecordingSet) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Variants of a recording: the same pictures later, fewer, backwards, worse. Each is a bag that any program can read.
 
-Pictures, depth, IMU, mounting and ground truth are kept; colours, wheels, laser scans and masks are not. Backwards,
-stamps are mirrored and turn rates negated; accelerations stay as they are.
+Pictures, depth, IMU, mounting, ground truth and the bag's ``calibration.yaml`` are kept; colours, wheels, laser scans
+and masks are not. Backwards, stamps are mirrored, turn rates and known times negated; accelerations stay as they are.
 """
 
 from __future__ import annotations
@@ -14,11 +14,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 
 from slam_bags.reading.readings import AgentSensors, DepthReading, ImuReading, Reading, StereoReading
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.storage.bag import BagWriter
+from slam_bags.storage.bag_calibration import calibration_file
 from slam_bags.storage.sensor_writer import IMU_FRAME, LEFT_FRAME, TOF_FRAME, SensorWriter
+from slam_bringup.pipeline.overrides import read_overrides
 from slam_core.camera import CameraInfo
 from slam_core.trajectory import Trajectory
 from slam_core.types import AnyArray
@@ -29,6 +32,8 @@ _QUALITY = 50
 _GAMMA = 0.6
 _GAP_S = 3.0
 _GAP_AT = 0.4
+_TIMES = ("measurement.readout", "imu.time_offset")
+"""Parameters of a calibration that change their sign when time runs backwards."""
 _SAME_SURFACE = 0.02
 """Pixels whose depths differ by a larger share are not averaged."""
 
@@ -48,9 +53,10 @@ def write_variant(source: Path, target: Path, variant: str) -> int:
     Raises
     ------
     ValueError
-        If no frame is left, or the bag has no ground truth.
+        If no frame is left, the bag has no ground truth, or its ``calibration.yaml`` is none.
     """
-    with SensorBag(source) as bag, BagWriter(target) as written:
+    calibration = _calibration_of(source, is_backwards=variant == "backwards")
+    with SensorBag(source) as bag, BagWriter(target, calibration=calibration) as written:
         agent = bag.agents[0]
         sensors, truth = bag.sensors[agent], bag.ground_truth(agent)
         if truth is None:
@@ -64,6 +70,17 @@ def write_variant(source: Path, target: Path, variant: str) -> int:
         if variant == "half resolution":
             rig = _Rig(*(None if info is None else _halved_info(info) for info in (rig.left, rig.right, rig.tof)))
         return _write(SensorWriter(written), sensors, rig, readings, truth, _PICTURES.get(variant, _unchanged))
+
+
+def _calibration_of(source: Path, *, is_backwards: bool) -> str:
+    """The file of a bag's calibration as YAML, "" if it has none."""
+    file = calibration_file(source)
+    if not file.is_file():
+        return ""
+    rules = {node: {"ros__parameters": values} for node, values in read_overrides(file).rules}
+    for values in (rule["ros__parameters"] for rule in rules.values() if is_backwards):
+        values |= {name: -v for name, v in values.items() if name in _TIMES and isinstance(v, int | float)}
+    return str(yaml.safe_dump(rules, sort_keys=False))
 
 
 # ---- fewer frames
