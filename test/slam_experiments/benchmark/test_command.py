@@ -8,13 +8,19 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from slam_bags.storage.bag import BagWriter
+from slam_bags.storage.sensor_writer import LEFT_FRAME, T_BASE_OPTICAL, SensorWriter
 from slam_bringup.cli import slam
+from slam_core.camera import Camera, CameraInfo
+from slam_experiments.benchmark.recording_sets import sets_of
 from slam_experiments.benchmark.variants import write_variant
 
 DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
+INFO = CameraInfo(Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
 
 
 def benchmark(*arguments: object):
@@ -98,6 +104,28 @@ def test_what_cannot_be_compared_is_refused_before_anything_runs(data, finished,
         assert result.exit_code != 0
         assert told in f"{result.output} {result.exception}"
         assert not output.exists()
+
+
+def test_a_bad_recording_fails_alone(data, finished, tmp_path):
+    folder, output = tmp_path / "data", tmp_path / "out"
+    folder.mkdir()
+    shutil.copy(data / "demo.mcap", folder)
+    (folder / "broken.mcap").write_bytes(b"no bag")
+    with BagWriter(folder / "aimless.mcap") as bag:
+        writer, grey = SensorWriter(bag), np.zeros((48, 64), dtype=np.uint8)
+        writer.extrinsics(1, {LEFT_FRAME: T_BASE_OPTICAL})
+        writer.stereo(10**9, grey, grey, (INFO, INFO))
+    result = benchmark(folder, "-o", output, "--variants", "as it is")
+    assert result.exit_code == 0, result.output
+    rows = {row["recording"]: row for row in json.loads((output / "benchmark.json").read_text())}
+    assert "no ground truth" in rows["aimless"]["failed"]
+    assert "broken" in rows["broken"]["failed"]
+    assert rows["demo"]["ate_mm"] == json.loads((finished[0] / "benchmark.json").read_text())[0]["ate_mm"]
+    opened = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("slam_experiments.benchmark.recording_sets._bag", lambda path: opened.append(path.stem))
+        sets_of(folder, ["demo"])
+    assert opened == ["demo"]
 
 
 def test_wrong_input_is_one_clear_line(data, tmp_path):

@@ -174,5 +174,12 @@ def test_what_is_too_short_is_refused(tmp_path):
         write_variant(path, tmp_path / "none.mcap", "from frame 7")
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_bag_of_broken_messages_is_too_short_for_every_variant(bag, tmp_path, monkeypatch, variant):
+    monkeypatch.setattr(SensorBag, "readings", lambda self: iter(()))
+    with pytest.raises(ValueError, match="too short"):
+        write_variant(bag, tmp_path / "none.mcap", variant)
+
+
 def test_every_variant_has_a_name_of_its_own():
     assert len(set(VARIANTS)) == len(VARIANTS) == 9

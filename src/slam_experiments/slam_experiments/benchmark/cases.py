@@ -94,7 +94,8 @@ def _as_text(recording: RecordingSet) -> dict[str, Any]:
     """Everything of a recording that its results depend on, as JSON knows it."""
     paths = {name: value for name, value in asdict(recording).items() if isinstance(value, Path)}
     state = _state_of([*paths.values(), calibration_file(recording.source)])
-    return {"kind": recording.kind, **{name: str(path) for name, path in paths.items()}, "state": state}
+    places = {name: str(path) for name, path in paths.items()}
+    return {"kind": recording.kind, "failed": recording.failed, **places, "state": state}
 
 
 def _state_of(paths: Iterable[Path]) -> str:
@@ -112,12 +113,15 @@ def _state_of(paths: Iterable[Path]) -> str:
 def bag_of(folder: Path, before: list[Path], recording: dict[str, Any]) -> Kept:
     """The bag of a recording: converted, or where it lies; or why there is none."""
     del before
+    if recording["failed"]:
+        return {"failed": recording["failed"]}, {}
     if not recording["kind"]:
         return {"bag": recording["source"]}, {}
-    paths = {name: Path(recording[name]) for name in ("source", "calibration", "ground_truth") if name in recording}
+    names = [name for name in ("source", "calibration", "ground_truth") if name in recording]
+    paths: dict[str, Any] = {name: Path(recording[name]) for name in names}
     try:
         RecordingSet("", recording["kind"], mode="", runs=(), truth="", **paths).write_bag(folder / _BAG)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         return {"failed": str(error)}, {}
     return {"bag": ""}, {}
 
@@ -193,7 +197,7 @@ def _figures(trajectory: Trajectory, bag: Path, mode: str, known: str) -> dict[s
         truth = opened.ground_truth(agent)
         frames = opened.count(agent, "left" if mode == "stereo" else "depth")
     if truth is None:
-        raise ValueError(f"{bag} has no ground truth")
+        return {"failed": f"{bag} has no ground truth"}
     try:
         return {**asdict(figures_of(trajectory, truth, known)), "coverage": len(trajectory) / max(frames, 1)}
     except ValueError as error:

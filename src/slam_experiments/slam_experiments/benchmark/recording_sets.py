@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.storage.bag import BagWriter
@@ -34,6 +36,8 @@ class RecordingSet:
         Name in ``slam_experiments.benchmark.truth.TRUTH``; "": exact.
     calibration, ground_truth
         Where the source itself has none.
+    failed
+        Why it cannot be mapped or compared, else "".
     """
 
     name: str
@@ -44,6 +48,7 @@ class RecordingSet:
     truth: str
     calibration: Path | None = None
     ground_truth: Path | None = None
+    failed: str = ""
 
     def write_bag(self, target: Path) -> None:
         """Convert the source to a bag."""
@@ -55,7 +60,7 @@ class RecordingSet:
 
 def public_sets(folder: Path) -> dict[str, RecordingSet]:
     """The public recordings that are known, by name, whether they are in the folder or not."""
-    v101 = {
+    v101: dict[str, Any] = {
         "calibration": folder / "euroc_v101_micro95/MicroEurocDataset",
         "ground_truth": folder / "traj_gt_openvins/euroc_mav/V1_01_easy.txt",
     }
@@ -72,29 +77,38 @@ def public_sets(folder: Path) -> dict[str, RecordingSet]:
     return {s.name: s for s in sets}
 
 
-def sets_of(folder: Path) -> dict[str, RecordingSet]:
-    """The public recordings and the bags that lie in a folder, by name.
+def sets_of(folder: Path, names: Sequence[str] = ()) -> dict[str, RecordingSet]:
+    """The public recordings and the bags that lie in a folder, by name; only those of ``names`` if there are any.
 
     Raises
     ------
     ValueError
-        If it holds neither, or a bag of several agents or without ground truth.
+        If it holds neither, or nothing of a name.
     """
-    found = {name: s for name, s in public_sets(folder).items() if s.source.exists()}
+    public = public_sets(folder)
+    found: dict[str, Path | None] = {name: None for name, s in public.items() if s.source.exists()}
     for path in sorted(folder.iterdir()):
         if path.suffix in (".mcap", ".db3", ".bag") or (path / "metadata.yaml").exists():
-            found[path.stem] = _bag(path)
+            found[path.stem] = path
     if not found:
-        raise ValueError(f"{folder} holds neither a bag nor a public recording ({', '.join(public_sets(folder))})")
-    return found
+        raise ValueError(f"{folder} holds neither a bag nor a public recording ({', '.join(public)})")
+    if unknown := [name for name in names if name not in found]:
+        raise ValueError(f"no recording '{unknown[0]}' in the data folder; there are {', '.join(found)}")
+    chosen = [(name, found[name]) for name in names or found]
+    return {name: public[name] if bag is None else _bag(bag) for name, bag in chosen}
 
 
 def _bag(path: Path) -> RecordingSet:
-    with SensorBag(path) as bag:
-        if len(bag.agents) > 1:
-            raise ValueError(f"{path} holds {len(bag.agents)} agents: only bags of one are compared")
-        sensors = bag.sensors[bag.agents[0]]
-    if "ground_truth" not in sensors.topics:
-        raise ValueError(f"{path} has no ground truth (ground_truth/pose)")
+    """A bag, or one that has failed: of several agents, without ground truth, or one that does not open."""
+    try:
+        with SensorBag(path) as bag:
+            agents, sensors = bag.agents, bag.sensors[bag.agents[0]]
+    except ValueError as error:
+        return RecordingSet(path.stem, "", path, "stereo", ("alone",), "", failed=str(error))
+    failed = ""
+    if len(agents) > 1:
+        failed = f"{path} holds {len(agents)} agents: only bags of one are compared"
+    elif "ground_truth" not in sensors.topics:
+        failed = f"{path} has no ground truth (ground_truth/pose)"
     mode = "tof" if sensors.left is None else "stereo"
-    return RecordingSet(path.stem, "", path, mode, _DEPTH_RUNS if mode == "tof" else ("alone",), "")
+    return RecordingSet(path.stem, "", path, mode, _DEPTH_RUNS if mode == "tof" else ("alone",), "", failed=failed)

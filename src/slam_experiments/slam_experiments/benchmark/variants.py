@@ -103,6 +103,8 @@ def _every(step: int) -> Callable[[Sequence[Reading]], Iterator[Reading]]:
 def _with_gap(readings: Sequence[Reading]) -> Iterator[Reading]:
     """Without the frames of three seconds; the IMU goes on."""
     stamps = [r.stamp_ns for r in readings if is_frame(r)]
+    if not stamps:
+        return iter(())
     begin = stamps[0] + _GAP_AT * (stamps[-1] - stamps[0])
     return (r for r in readings if not is_frame(r) or not begin <= r.stamp_ns < begin + 1e9 * _GAP_S)
 
@@ -122,6 +124,8 @@ _FEWER: dict[str, Callable[[Sequence[Reading]], Iterator[Reading]]] = {
 
 # ---- backwards
 def _backwards(readings: list[Reading], truth: Trajectory) -> tuple[Iterator[Reading], Trajectory]:
+    if not readings:
+        return iter(()), truth
     turn = min(r.stamp_ns for r in readings) + max(r.stamp_ns for r in readings)
     mirrored = Trajectory(turn - truth.stamps_ns[::-1], truth.poses[::-1])
     return (_mirrored(r, turn) for r in reversed(readings)), mirrored

@@ -20,7 +20,7 @@ from slam_core.storage.files import atomic_text, read_json, read_text
 from slam_core.storage.output_folder import OutputFolder
 from slam_experiments.benchmark.cases import OURS, Case, cases_of
 from slam_experiments.benchmark.orbslam3 import INSTALL, is_there
-from slam_experiments.benchmark.recording_sets import RecordingSet, sets_of
+from slam_experiments.benchmark.recording_sets import sets_of
 from slam_experiments.benchmark.summary import (
     CHANGE_HEADINGS,
     HEADINGS,
@@ -84,7 +84,7 @@ def command(
     config = "" if config_file is None else read_text(config_file)
     cases = [
         case
-        for recording in _chosen(sets_of(data), names)
+        for recording in sets_of(data, names).values()
         for case in cases_of(recording, variants or VARIANTS, config=config, peers=peers, orbslam3_python=python)
     ]
     if old is not None:
@@ -98,12 +98,6 @@ def command(
     _show(rows, comparison)
     if comparison is not None and not comparison.is_accepted:
         sys.exit(1)
-
-
-def _chosen(sets: dict[str, RecordingSet], names: Sequence[str]) -> list[RecordingSet]:
-    if unknown := [name for name in names if name not in sets]:
-        raise ValueError(f"no recording '{unknown[0]}' in the data folder; there are {', '.join(sets)}")
-    return [sets[name] for name in names or sets]
 
 
 def _rows_in(path: Path) -> list[Row]:
