@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ends of a link: an agent's, a post's, and that of an agent among others without a post."""
+"""The ends of a link: an agent's and a post's."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ from slam_core.messages.base import Message
 from slam_core.messages.submaps import SubmapMessages
 from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.types import PoseEstimate, Submap
-from slam_radio.byte_budget import ByteBudget
 from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox
 from slam_radio.index_ranges import Key
@@ -35,7 +34,7 @@ from slam_radio.link_state import LinkState
 from slam_radio.outbox import Outbox
 from slam_radio.packing.light_submap import pack
 from slam_radio.radio_config import RadioConfig
-from slam_radio.radio_messages import pack_pose, pack_submap, unpack_acknowledgement, unpack_correction, unpack_pose
+from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_correction
 from slam_radio.uplink import Uplink
 from slam_radio.zenoh_link import ZenohLink
 
@@ -199,7 +198,7 @@ class PostEnd(End):
 
     def on_submap(self, agent: str, name: str, data: bytes) -> None:
         """Keep a submap and publish what is in order."""
-        self.publisher.pass_on(agent, self.downlink.on_submap(agent, _submap_key(name), data, time.monotonic()))
+        self.publisher.pass_on(agent, self.downlink.on_submap(agent, submap_key(name), data, time.monotonic()))
 
     def on_backlog(self, agent: str, _: str, data: bytes) -> None:
         """Keep what waits at an agent."""
@@ -229,119 +228,6 @@ class PostEnd(End):
         """Keep what has come for the next start."""
         for inbox in self.downlink.inboxes:
             inbox.close()
-
-
-class PeerEnd(End):
-    """An agent among others: a link to each of them, and all submaps published as a post would have them.
-
-    Its own go the same way as the others', through the bytes that are sent: whoever joins them has what a post has.
-    """
-
-    def __init__(self, node: LinkNode) -> None:
-        super().__init__(node)
-        config = node.config
-        self.name, *others = config.agents
-        budget = ByteBudget(config.bytes_per_second)
-        self.own = Inbox(self.name, node.state_folder / "inbox" / self.name)
-        self.uplinks = {
-            other: Uplink(
-                Outbox(node.state_folder / "outbox" / other), budget, config.resend_after_s, config.silent_after_s
-            )
-            for other in others
-        }
-        inboxes = [Inbox(other, node.state_folder / "inbox" / other) for other in others]
-        self.downlink = Downlink(inboxes, budget, config.silent_after_s)
-        self.publisher = SubmapPublisher(node, config.agents)
-        self._pose: bytes | None = None
-        source = f"{config.source}/" if config.source else ""
-        own_topics = {f"{source}{topic}": kind for topic, kind in SUBMAP_TOPICS.items()}
-        node.listen_together(own_topics, self.on_own_submap, latched=True, required=False, stamps=StampPolicy.ANY)
-        node.listen(f"{source}odom", "Odometry", self.on_own_odometry, required=False, stamps=StampPolicy.ANY)
-        for other in others:
-            hears, sends = f"slam/{other}/to/{self.name}", f"slam/{self.name}/to/{other}"
-            self.hear(f"{hears}/pose", partial(self.on_pose, other))
-            self.hear(f"{hears}/submap/*/*", partial(self.on_submap, other))
-            self.hear(f"{hears}/backlog", partial(self.on_backlog, other))
-            self.hear(f"{sends}/ack", partial(self.on_acknowledgement, other))
-
-    def on_own_submap(self, *messages: Message) -> None:
-        """Pack a finished submap, pass it on as the others will have it, and keep it until all have it."""
-        submap = submap_from_messages(SubmapMessages(*messages))
-        key, now = (submap.session, submap.index), time.monotonic()
-        if key in self.own.received:
-            self.node.health.count("submaps sent again")
-            return
-        light = pack(replace(submap, agent=self.name), self.node.config.light)
-        try:
-            for uplink in self.uplinks.values():
-                if not uplink.outbox.knows(key):
-                    uplink.add_submap(key, light, now)
-            self.publisher.pass_on(self.name, self.own.take(key, pack_submap(submap.index, light)))
-        except OSError as error:
-            raise ValueError(f"submap {submap.index} cannot be kept for the others: {error}") from error
-        self.node.health.count("submaps packed")
-
-    def on_own_odometry(self, message: Message) -> None:
-        """Keep the newest pose, as it is sent, for those to whom one is due."""
-        now = time.monotonic()
-        due = [uplink for uplink in self.uplinks.values() if uplink.pose_is_due(now)]
-        if not due:
-            return
-        data = pack_pose(estimate_from_message(message))
-        for uplink in due:
-            uplink.set_pose(data)
-        self._pose = data
-
-    def on_pose(self, other: str, _: str, data: bytes) -> None:
-        """Publish another agent's odometry."""
-        self.publisher.pass_on_pose(other, self.downlink.on_pose(other, data, time.monotonic()))
-
-    def on_submap(self, other: str, name: str, data: bytes) -> None:
-        """Keep another agent's submap and publish what is in order."""
-        submaps = self.downlink.on_submap(other, _submap_key(name), data, time.monotonic())
-        self.publisher.pass_on(other, submaps)
-
-    def on_backlog(self, other: str, _: str, data: bytes) -> None:
-        """Keep what waits at another agent."""
-        self.downlink.on_backlog(other, data, time.monotonic())
-
-    def on_acknowledgement(self, other: str, _: str, data: bytes) -> None:
-        """Another agent is there and has some submaps."""
-        self.uplinks[other].on_acknowledgement(unpack_acknowledgement(data), time.monotonic())
-
-    def pump(self, now_s: float) -> None:
-        """Send what is due, and publish the own pose as often."""
-        self.publisher.pass_on_again((self.own, *self.downlink.inboxes))
-        if self._pose is not None:
-            self.publisher.pass_on_pose(self.name, unpack_pose(self._pose))
-            self._pose = None
-        for told in self.downlink.due(now_s):
-            self.send(f"slam/{told.agent}/to/{self.name}/{told.kind}", told.data, urgent=True)
-        for other, uplink in self.uplinks.items():
-            for message in uplink.due(now_s):
-                self.send(f"slam/{self.name}/to/{other}/{message.path}", message.data, urgent=message.kind == "pose")
-
-    def state(self, now_s: float) -> LinkState:
-        """Silent agents, and the backlog of all links together."""
-        self.publisher.show(self.downlink, now_s)
-        waiting = [uplink.backlog(now_s) for uplink in self.uplinks.values()]
-        self.node.health.take({
-            "submaps waiting": sum(b.submaps for b in waiting), "resent": sum(u.resent for u in self.uplinks.values())
-        })  # fmt: skip
-        heard = self.downlink.state(now_s)
-        return LinkState(heard.state, heard.reason, sum(b.size for b in waiting), sum(b.seconds for b in waiting))
-
-    def reset(self) -> None:
-        """Forget what has come; it is not sent again."""
-        for inbox in (self.own, *self.downlink.inboxes):
-            inbox.forget()
-
-    def close(self) -> None:
-        """Keep what has come, and what waits, for the next start."""
-        for inbox in (self.own, *self.downlink.inboxes):
-            inbox.close()
-        for uplink in self.uplinks.values():
-            uplink.outbox.close()
 
 
 class SubmapPublisher:
@@ -392,7 +278,7 @@ class SubmapPublisher:
                 health.show(name, value)
 
 
-def _submap_key(name: str) -> Key:
+def submap_key(name: str) -> Key:
     """Session and index of ``slam/<agent>/submap/<session>/<index>``."""
     session, index = name.split("/")[-2:]
     if not (session.isdecimal() and index.isdecimal()):

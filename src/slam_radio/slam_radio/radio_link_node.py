@@ -20,7 +20,8 @@ from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from slam_core.nodes.base_node import SlamNode
 from slam_core.ros import run_node
 from slam_core.storage.files import state_folder
-from slam_radio.link_ends import AgentEnd, End, PeerEnd, PostEnd
+from slam_radio.link_ends import AgentEnd, End, PostEnd
+from slam_radio.peer_end import PeerEnd
 from slam_radio.radio_config import RadioConfig
 from slam_radio.zenoh_link import ZenohLink
 

@@ -115,15 +115,60 @@ class Uplink:
 
     def due(self, now_s: float) -> list[Outgoing]:
         """Messages to send now, in this order."""
-        out = []
-        if self._pose is not None and self.pose_is_due(now_s):
-            out.append(Outgoing("pose", self._pose))
-            self._budget.spend(len(self._pose) + OVERHEAD)
-            self._pose, self._pose_due_s = None, now_s + _POSE_PERIOD_S
-        if self._hearing.is_up(now_s):
-            out += self._due_submaps(now_s)
-            out += self._due_backlog(now_s)
+        out = self.due_pose(now_s)
+        while (key := self.ready(now_s)) is not None and self.affords(key, now_s):
+            out.append(self.take(key, now_s))
+        return out + self.due_backlog(now_s)
+
+    def due_pose(self, now_s: float) -> list[Outgoing]:
+        """The newest pose, where it is to go out now."""
+        if self._pose is None or not self.pose_is_due(now_s):
+            return []
+        out = [Outgoing("pose", self._pose)]
+        self._budget.spend(len(self._pose) + OVERHEAD)
+        self._pose, self._pose_due_s = None, now_s + _POSE_PERIOD_S
         return out
+
+    def ready(self, now_s: float) -> Key | None:
+        """The submap that goes out next, as soon as the budget allows; None while there is none or the post is away."""
+        if not self._hearing.is_up(now_s):
+            return None
+        under_way = self._under_way(now_s)
+        waits = (key for key in self.outbox.waiting if key not in self._sent or self._sent[key].due_s <= now_s)
+        key = next(waits, None)
+        window = _WINDOW_S * self._budget.bytes_per_second
+        return None if key is None or (under_way and under_way + self._wire_size(key) > window) else key
+
+    def affords(self, key: Key, now_s: float) -> bool:
+        """True if the budget allows a submap."""
+        return self._budget.allows(self._wire_size(key), now_s)
+
+    def take(self, key: Key, now_s: float) -> Outgoing:
+        """The message of a submap, which goes out now."""
+        message = Outgoing("submap", pack_submap(*self.outbox.read(key)), key)
+        self._budget.spend(self._wire_size(key))
+        under_way = self._under_way(now_s) + self._wire_size(key)
+        tries = self._sent[key].tries + 1 if key in self._sent else 1
+        self.resent += tries > 1
+        wait = min(self._resend_after_s * 2.0 ** (tries - 1), _LONGEST_WAIT_S)
+        self._sent[key] = _Sent(tries, now_s + wait + under_way / self._budget.bytes_per_second)
+        return message
+
+    def due_backlog(self, now_s: float) -> list[Outgoing]:
+        """The backlog, every few seconds while there is one, once when it is gone, and as a reminder."""
+        if not self._hearing.is_up(now_s):
+            return []
+        waits, told_s = self._oldest_s(now_s) > _LEAST_WAIT_S, now_s - self._told_at_s
+        ended = not self.outbox.waiting and self._told is not None and self._told.submaps > 0
+        if not (ended or told_s >= (_BACKLOG_PERIOD_S if waits else _BACKLOG_REMINDER_S)):
+            return []
+        backlog = self.backlog(now_s)
+        data = pack_backlog(backlog)
+        if not self._budget.allows(len(data) + OVERHEAD, now_s):
+            return []
+        self._budget.spend(len(data) + OVERHEAD)
+        self._told, self._told_at_s = backlog, now_s
+        return [Outgoing("backlog", data)]
 
     def backlog(self, now_s: float) -> Backlog:
         """Submaps that wait, and the rates of the last minute."""
@@ -148,36 +193,33 @@ class Uplink:
         """Time that the oldest submap has waited."""
         return max((now_s - self._since_s.setdefault(key, now_s) for key in self.outbox.waiting), default=0.0)
 
-    def _due_backlog(self, now_s: float) -> list[Outgoing]:
-        """The backlog, every few seconds while there is one, once when it is gone, and as a reminder."""
-        waits, told_s = self._oldest_s(now_s) > _LEAST_WAIT_S, now_s - self._told_at_s
-        ended = not self.outbox.waiting and self._told is not None and self._told.submaps > 0
-        if not (ended or told_s >= (_BACKLOG_PERIOD_S if waits else _BACKLOG_REMINDER_S)):
-            return []
-        backlog = self.backlog(now_s)
-        data = pack_backlog(backlog)
-        if not self._budget.allows(len(data) + OVERHEAD, now_s):
-            return []
-        self._budget.spend(len(data) + OVERHEAD)
-        self._told, self._told_at_s = backlog, now_s
-        return [Outgoing("backlog", data)]
+    def _under_way(self, now_s: float) -> int:
+        """Bytes of submaps whose acknowledgement may still come."""
+        return sum(self._wire_size(key) for key, sent in self._sent.items() if sent.due_s > now_s)
 
-    def _due_submaps(self, now_s: float) -> list[Outgoing]:
-        out: list[Outgoing] = []
-        window = _WINDOW_S * self._budget.bytes_per_second
-        under_way = sum(self.outbox.size(k) for k, sent in self._sent.items() if sent.due_s > now_s)
-        for key in self.outbox.waiting:
-            sent = self._sent.get(key)
-            if sent is not None and sent.due_s > now_s:
-                continue
-            size = self.outbox.size(key) + OVERHEAD
-            if (under_way and under_way + size > window) or not self._budget.allows(size, now_s):
-                break
-            out.append(Outgoing("submap", pack_submap(*self.outbox.read(key)), key))
-            self._budget.spend(size)
-            under_way += size
-            tries = sent.tries + 1 if sent is not None else 1
-            self.resent += tries > 1
-            wait = min(self._resend_after_s * 2.0 ** (tries - 1), _LONGEST_WAIT_S)
-            self._sent[key] = _Sent(tries, now_s + wait + under_way / self._budget.bytes_per_second)
-        return out
+    def _wire_size(self, key: Key) -> int:
+        return self.outbox.size(key) + OVERHEAD
+
+
+class UplinkTurns:
+    """Uplinks that share a budget: a submap of one, then it is the others' turn."""
+
+    def __init__(self, uplinks: dict[str, Uplink]) -> None:
+        self._uplinks = uplinks
+        self._order = list(uplinks)
+
+    def due(self, now_s: float) -> list[tuple[str, Outgoing]]:
+        """Messages to send now, each with the name of its link."""
+        out = [(name, pose) for name in self._order for pose in self._uplinks[name].due_pose(now_s)]
+        while (turn := self._turn(now_s)) is not None:
+            name, key = turn
+            if not self._uplinks[name].affords(key, now_s):
+                break  # nor may another one: a link of smaller submaps would always be sooner
+            out.append((name, self._uplinks[name].take(key, now_s)))
+            self._order.remove(name)
+            self._order.append(name)
+        return out + [(name, told) for name in self._order for told in self._uplinks[name].due_backlog(now_s)]
+
+    def _turn(self, now_s: float) -> tuple[str, Key] | None:
+        ready = ((name, self._uplinks[name].ready(now_s)) for name in self._order)
+        return next(((name, key) for name, key in ready if key is not None), None)
