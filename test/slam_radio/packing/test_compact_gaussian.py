@@ -74,6 +74,34 @@ def test_a_covariance_that_is_none_or_too_large_is_refused(make_submap):
         compact_gaussian(1e8 * S, 4)
 
 
+@pytest.mark.parametrize("share", [1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8])
+def test_what_is_sent_of_a_landmark_known_in_two_directions_is_taken(make_submap, share):
+    """Never surer, with a factor that the other side takes; or refused."""
+    S = make_submap(5).covariance
+    L = 0.02 * np.array([[1.0, 0.0, 0.0], [0.7, share, 0.0], [0.3, 0.3, 0.1]])
+    S[6:] = S[:, 6:] = 0.0
+    S[6:, 6:] = np.kron(np.eye(5), L @ L.T)
+    if share < 1e-3:
+        with pytest.raises(ValueError, match="positive definite"):
+            compact_gaussian(S, 4)
+    else:
+        found = compact_gaussian(S, 4)
+        assert 1.0 <= found.inflation < module.MOST_INFLATION
+        assert largest_share(S, found.covariance()) <= 1.0
+
+
+def test_a_factor_that_the_other_side_would_refuse_is_refused(make_submap, monkeypatch):
+    S = make_submap(30, common=6).covariance
+    needed = compact_gaussian(S, 4).inflation
+    monkeypatch.setattr(module, "MOST_INFLATION", needed * (1.0 - 1e-3))
+    with pytest.raises(ValueError, match="times too large"):
+        compact_gaussian(S, 4)
+    monkeypatch.setattr(module, "_is_positive", lambda S: False)
+    monkeypatch.setattr(module, "MOST_INFLATION", 1e6)
+    with pytest.raises(ValueError, match="times too large"):
+        compact_gaussian(S, 4)
+
+
 def test_a_submap_without_landmarks_has_its_pose(make_submap):
     S = make_submap(4).covariance[:6, :6]
     found = compact_gaussian(S, 8).covariance()

@@ -50,6 +50,8 @@ _LEAST_SHARE = 1e-4
 """Least singular value of a block of B with rows of length 1: its square, times what keeps D invertible, is well above
 the rounding of a sum of all unknowns."""
 _STEPS = 127.0
+MOST_INFLATION = 1e6
+"""Factors ``t`` from here on are not sent, nor taken: such a covariance says nothing."""
 _MARGIN = 1.0 + 1e-6
 """The factor ``t`` is enlarged by the rounding of the sum that it is checked with."""
 
@@ -99,7 +101,8 @@ def compact_gaussian(covariance: FloatArray, rank: int, rounding: float = 0.0) -
     Raises
     ------
     ValueError
-        If the covariance is not finite, not positive definite, or too large for the format (65 m).
+        If the covariance is not finite, not positive definite, or too large for the format (65 m), or if it would take
+        a factor of ``MOST_INFLATION``.
     """
     if not np.isfinite(covariance).all():
         raise ValueError("a submap's covariance must be finite")
@@ -107,15 +110,14 @@ def compact_gaussian(covariance: FloatArray, rank: int, rounding: float = 0.0) -
     rows = np.arange(6, len(S))
     S[rows, rows] += rounding**2
     blocks = _rounded_factors(S)
+    CompactGaussian(blocks, np.zeros((len(S), 0), dtype=np.int8), 1.0).require_positive()
     whiten = _factors(blocks).inverse()
     whitened = np.asarray(whiten.times(whiten.times(S).T), dtype=np.float32)
     U = _common_directions(whitened, min(rank, len(S) - 1))
     common = np.clip(np.rint(_STEPS * U), -_STEPS, _STEPS).astype(np.int8)
     inflation = _least_factor(S, blocks, common, whitened)
     up = float(np.nextafter(np.float32(inflation * _MARGIN), np.float32(np.inf)))
-    gaussian = CompactGaussian(blocks, common, up)
-    gaussian.require_positive()
-    return gaussian
+    return CompactGaussian(blocks, common, up)
 
 
 class _Blocks(NamedTuple):
@@ -245,11 +247,11 @@ def _least_factor(S: FloatArray, blocks: Float16Array, common: Int8Array, whiten
     coarse = U.astype(np.float32)
     t = max(1.0, _largest_eigenvalue(left.times(left.times(whitened - coarse @ coarse.T).T)))
     step = _FACTOR_STEP * t
-    gap = CompactGaussian(blocks, common, t + step).covariance() - S
-    while not _is_positive(gap):
+    while t + step < MOST_INFLATION / _MARGIN**2:
+        if _is_positive(CompactGaussian(blocks, common, t + step).covariance() - S):
+            return t + step
         t, step = t + step, 2.0 * step
-        gap = CompactGaussian(blocks, common, t + step).covariance() - S
-    return t + step
+    raise ValueError(f"a submap's covariance would have to be sent {MOST_INFLATION:.0e} times too large")
 
 
 def _largest_eigenvalue(C: Float32Array) -> float:

@@ -51,7 +51,7 @@ from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray, boxminus, boxplus, is_rigid_transform
 from slam_core.types import PoseEstimate, Submap
 from slam_radio.packing.byte_reader import ByteReader, read_varints, write_varints
-from slam_radio.packing.compact_gaussian import CompactGaussian, compact_gaussian
+from slam_radio.packing.compact_gaussian import MOST_INFLATION, CompactGaussian, compact_gaussian
 from slam_radio.packing.descriptor_code import decode, encode
 from slam_radio.packing.landmark_choice import choose_landmarks
 
@@ -86,7 +86,7 @@ def pack(submap: Submap, config: LightConfig | None = None) -> bytes:
     Raises
     ------
     ValueError
-        If its covariance is not positive definite or a number is too large for the format.
+        If its covariance is not positive definite, or nearly so, or a number is too large for the format.
     """
     config = config or LightConfig()
     rows = choose_landmarks(submap, config.landmarks)
@@ -144,7 +144,13 @@ def unpack(data: bytes) -> Submap:
     codes = reader.array("i1", (n, width))
     path = [(*reader.numbers("<q"), _pose(reader.floats("<f4", (6,))), *reader.floats("<f2", (1,))) for _ in range(k)]
     reader.require_end()
-    if not 1.0 <= inflation < 1e6 or follows > 1 or len(np.unique(ids)) != n or (box[1] < 0).any() or end < start:
+    if (
+        not 1.0 <= inflation < MOST_INFLATION
+        or follows > 1
+        or len(np.unique(ids)) != n
+        or (box[1] < 0).any()
+        or end < start
+    ):
         raise ValueError("a submap for the air holds numbers that cannot be")
     gaussian = CompactGaussian(blocks, common, inflation)
     gaussian.require_positive()
