@@ -44,6 +44,10 @@ class Node:
         pass
 
 
+def full_disk(*_):
+    raise OSError("no space left on device")
+
+
 @pytest.fixture
 def now(monkeypatch):
     """Seconds of the steady clock, to be set."""
@@ -87,3 +91,38 @@ def test_at_overload_all_others_get_as_much(tmp_path, make_submap, now):
     counts = [len(had) for had in agent.had.values()]
     assert 10 < min(counts) <= max(counts) <= min(counts) + 1
     assert max(counts) < 99
+
+
+def test_a_submap_that_only_some_outboxes_took_is_kept_for_the_others_when_it_comes_again(
+    tmp_path, make_submap, now, monkeypatch
+):
+    agent = Agent(tmp_path, make_submap, now)
+    with monkeypatch.context() as patch:
+        patch.setattr(agent.end.uplinks["cleo"].outbox, "add", full_disk)
+        with pytest.raises(ValueError, match="cannot be kept for the others"):
+            agent.submap(0)
+    agent.submap(0)
+    agent.submap(0)
+    assert agent.node.health.counters["submaps sent again"] == 1
+    assert agent.node.published["anna/submap/info"] == 1
+    agent.run(5.0)
+    assert agent.had == {"bert": [0], "cleo": [0]}
+
+
+def test_who_joins_later_gets_what_was_there_before(tmp_path, make_submap, now):
+    before = Agent(tmp_path, make_submap, now)
+    for index in range(3):
+        before.submap(index)
+    before.run(20.0)
+    before.end.close()
+    after = Agent(tmp_path, make_submap, now, agents=("anna", "bert", "cleo", "dora"))
+    after.run(20.0)
+    assert after.had == {"bert": [], "cleo": [], "dora": [0, 1, 2]}
+
+
+def test_what_no_other_could_unpack_is_kept_for_none(tmp_path, make_submap, now, monkeypatch):
+    agent = Agent(tmp_path, make_submap, now)
+    monkeypatch.setattr("slam_radio.peer_end.pack", lambda *_: b"nonsense")
+    with pytest.raises(ValueError, match="submap for the air"):
+        agent.submap(0)
+    assert not any(uplink.outbox.waiting for uplink in agent.end.uplinks.values())

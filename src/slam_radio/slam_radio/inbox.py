@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from slam_core.types import Submap
@@ -71,6 +72,11 @@ class Inbox:
                 known = key in self._unpacked
                 released.append(self._unpacked.pop(key) if known else unpack(self._folder.read(key)))
         return released
+
+    def kept(self) -> Iterator[tuple[Key, bytes]]:
+        """What lies on disk, oldest first: keys and submaps for the air."""
+        for key in sorted(self._folder.sizes):
+            yield key, self._folder.read(key)
 
     @property
     def held(self) -> int:

@@ -14,6 +14,7 @@ from slam_core.nodes.stamp_guard import StampPolicy
 from slam_radio.byte_budget import ByteBudget
 from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox
+from slam_radio.index_ranges import Key
 from slam_radio.link_ends import End, LinkNode, SubmapPublisher, submap_key
 from slam_radio.link_state import LinkState
 from slam_radio.outbox import Outbox
@@ -41,6 +42,9 @@ class PeerEnd(End):
             for other in others
         }
         self.turns = UplinkTurns(self.uplinks)
+        for key, light in self.own.kept():  # for who is new since, or could not be written for
+            for uplink in self._lacking(key):
+                uplink.outbox.add(key, light)
         inboxes = [Inbox(other, node.state_folder / "inbox" / other) for other in others]
         self.downlink = Downlink(inboxes, budget, config.silent_after_s)
         self.publisher = SubmapPublisher(node, config.agents)
@@ -60,18 +64,24 @@ class PeerEnd(End):
         """Pack a finished submap, pass it on as the others will have it, and keep it until all have it."""
         submap = submap_from_messages(SubmapMessages(*messages))
         key, now = (submap.session, submap.index), time.monotonic()
-        if key in self.own.received:
+        lacking = self._lacking(key)
+        is_new = key not in self.own.received
+        if not (lacking or is_new):
             self.node.health.count("submaps sent again")
             return
         light = pack(replace(submap, agent=self.name), self.node.config.light)
         try:
-            for uplink in self.uplinks.values():
-                if not uplink.outbox.knows(key):
-                    uplink.add_submap(key, light, now)
-            self.publisher.pass_on(self.name, self.own.take(key, pack_submap(submap.index, light)))
+            if is_new:  # first: what cannot be unpacked here is for no other either
+                self.publisher.pass_on(self.name, self.own.take(key, pack_submap(submap.index, light)))
+            for uplink in lacking:
+                uplink.add_submap(key, light, now)
         except OSError as error:
             raise ValueError(f"submap {submap.index} cannot be kept for the others: {error}") from error
         self.node.health.count("submaps packed")
+
+    def _lacking(self, key: Key) -> list[Uplink]:
+        """Links to those for whom an own submap is neither kept nor done."""
+        return [uplink for uplink in self.uplinks.values() if not uplink.outbox.knows(key)]
 
     def on_own_odometry(self, message: Message) -> None:
         """Keep the newest pose, as it is sent, for those to whom one is due."""
