@@ -8,6 +8,7 @@ import pytest
 from radio_world import World
 
 from slam_core.health import State
+from slam_radio.link_report import Backlog, pack_backlog
 from slam_radio.packing.light_submap import pack
 from slam_radio.radio_messages import pack_submap
 
@@ -133,6 +134,12 @@ def test_too_much_for_the_link_is_said(world):
     assert state.state is State.DEGRADED
     assert "more comes in" in state.reason
     assert state.backlog_s > 30.0
+
+
+def test_what_a_silent_agent_said_of_its_link_is_not_repeated(world):
+    world.downlink.on_backlog("one", pack_backlog(Backlog(9, 900, 9.0, 90.0, 50.0, True)), 0.0)
+    assert "more comes in at one" in world.downlink.state(1.0).reason
+    assert world.downlink.state(60.0).reason == "one silent for 60 s"
 
 
 def test_damaged_submaps_are_refused_and_not_acknowledged(world, make_submap, rng):

@@ -9,8 +9,9 @@ import pytest
 from radio_world import STEP_S
 
 from slam_bags.storage.bag_types import BagTypes
-from slam_core.health import Health
+from slam_core.health import Health, State
 from slam_core.messages import submap_messages
+from slam_radio.link_report import Backlog, pack_backlog
 from slam_radio.packing.light_submap import LightConfig
 from slam_radio.peer_end import PeerEnd
 from slam_radio.radio_config import RadioConfig
@@ -91,6 +92,25 @@ def test_at_overload_all_others_get_as_much(tmp_path, make_submap, now):
     counts = [len(had) for had in agent.had.values()]
     assert 10 < min(counts) <= max(counts) <= min(counts) + 1
     assert max(counts) < 99
+
+
+def test_own_submaps_that_are_too_many_for_the_links_are_said(tmp_path, make_submap, now):
+    agent = Agent(tmp_path, make_submap, now)
+    agent.run(1.0)
+    for other in agent.had:
+        agent.end.on_backlog(other, "", pack_backlog(Backlog(0, 0, 0.0, 0.0, 0.0, False)))
+    agent.submap(0)
+    agent.run(5.0)
+    assert agent.end.state(now[0]).state is State.OK
+    for index in range(1, 150):
+        agent.submap(index)
+        agent.run(0.3)
+        for other in agent.had:
+            agent.end.on_backlog(other, "", pack_backlog(Backlog(0, 0, 0.0, 0.0, 0.0, False)))
+    state = agent.end.state(now[0])
+    assert state.state is State.DEGRADED
+    assert "more comes in for bert" in state.reason
+    assert "more comes in for cleo" in state.reason
 
 
 def test_a_submap_that_only_some_outboxes_took_is_kept_for_the_others_when_it_comes_again(

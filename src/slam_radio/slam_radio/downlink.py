@@ -131,7 +131,7 @@ class Downlink:
         crowded = [
             f"more comes in at {name} ({b.came:.0f} bytes/s) than its link carries ({b.carried:.0f})"
             for name, b in known.items()
-            if b.is_too_much
+            if b.is_too_much and self._agents[name].hearing.is_up(now_s)  # what a silent one said is old
         ]
         size = sum(b.size for b in known.values())
         seconds = max((b.seconds for b in known.values()), default=0.0)

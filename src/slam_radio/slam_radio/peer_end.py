@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 from functools import partial
 
+from slam_core.health import State
 from slam_core.messages import SUBMAP_TOPICS, estimate_from_message, submap_from_messages
 from slam_core.messages.base import Message
 from slam_core.messages.submaps import SubmapMessages
@@ -123,14 +124,22 @@ class PeerEnd(End):
             self.send(f"slam/{self.name}/to/{other}/{message.path}", message.data, urgent=message.kind == "pose")
 
     def state(self, now_s: float) -> LinkState:
-        """Silent agents, and the backlog of all links together."""
+        """Silent agents, links that carry too little either way, and the backlog of all links together."""
         self.publisher.show(self.downlink, now_s)
-        waiting = [uplink.backlog(now_s) for uplink in self.uplinks.values()]
+        waiting = {other: uplink.backlog(now_s) for other, uplink in self.uplinks.items()}
+        size, seconds = sum(b.size for b in waiting.values()), sum(b.seconds for b in waiting.values())
         self.node.health.take({
-            "submaps waiting": sum(b.submaps for b in waiting), "resent": sum(u.resent for u in self.uplinks.values())
+            "submaps waiting": sum(b.submaps for b in waiting.values()),
+            "resent": sum(uplink.resent for uplink in self.uplinks.values()),
         })  # fmt: skip
         heard = self.downlink.state(now_s)
-        return LinkState(heard.state, heard.reason, sum(b.size for b in waiting), sum(b.seconds for b in waiting))
+        faults = [heard.reason] if heard.state is not State.OK else []
+        faults += [
+            f"more comes in for {other} ({b.came:.0f} bytes/s) than the link carries ({b.carried:.0f})"
+            for other, b in waiting.items()
+            if b.is_too_much
+        ]
+        return LinkState(State.DEGRADED if faults else State.OK, "; ".join(faults) or heard.reason, size, seconds)
 
     def reset(self) -> None:
         """Forget what has come; it is not sent again."""
