@@ -8,8 +8,8 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,9 @@ from slam_core.ros import sensor_qos  # noqa: E402
 from slam_core.types import PoseEstimate, Submap  # noqa: E402
 from slam_radio.packing.light_submap import pack, unpack  # noqa: E402
 
+_PORTS = 5
+"""Ports that are tried: one that was free may be taken a moment later."""
+
 
 class Peers:
     """Nodes of ``slam live --peer`` without those of the cameras, and what they say of themselves."""
@@ -49,22 +52,48 @@ class Peers:
 
     def start(self, specs: list[NodeSpec]) -> None:
         for spec in specs:
-            parameters = spec.parameters | ({"map_path": str(self.map_of(spec))} if spec.executable == "sjsam" else {})
-            command = [*find_executable(spec.package, spec.executable, []), *ros_arguments(parameters, spec.namespace)]
-            self.stack.enter_context(self._running(command))
+            self.stack.callback(self._end, self._begun(spec))
+
+    def start_link_at_a_free_port(
+        self, specs_at: Callable[[str], dict[str, list[NodeSpec]]]
+    ) -> dict[str, list[NodeSpec]]:
+        """Specs by agent, without the first one's radio_link, which runs: another process may be sooner at a port."""
+        for _ in range(_PORTS):
+            specs = specs_at(f"tcp/127.0.0.1:{free_port()}")
+            nodes = next(iter(specs.values()))
+            link = next(spec for spec in nodes if spec.executable == "radio_link")
+            process = self._begun(link)
+            try:
+                name = f"/{link.namespace}/radio_link"
+                self.probe.wait(lambda p=process, n=name: p.poll() is not None or self.says(n), f"{name} says nothing")
+            except BaseException:
+                process.kill()
+                raise
+            if process.poll() is None:
+                self.stack.callback(self._end, process)
+                nodes.remove(link)
+                return specs
+        pytest.fail(f"no radio_link opens at any of {_PORTS} ports: {self.log()}")
 
     def map_of(self, spec: NodeSpec) -> Path:
         return self.folder / spec.namespace.replace("/", "_") / "map"
 
-    @contextmanager
-    def _running(self, command: list[str]) -> Iterator[None]:
+    def _begun(self, spec: NodeSpec) -> subprocess.Popen[bytes]:
+        parameters = spec.parameters | ({"map_path": str(self.map_of(spec))} if spec.executable == "sjsam" else {})
+        command = [*find_executable(spec.package, spec.executable, []), *ros_arguments(parameters, spec.namespace)]
         with (self.folder / "nodes.log").open("ab") as output:
-            process = subprocess.Popen(command, env=self.environment, stdout=output, stderr=subprocess.STDOUT)
+            return subprocess.Popen(command, env=self.environment, stdout=output, stderr=subprocess.STDOUT)
+
+    def _end(self, process: subprocess.Popen[bytes]) -> None:
+        """End a node; one that does not end by itself is killed, so that it is in no other test's way."""
+        process.send_signal(signal.SIGINT)
         try:
-            yield
-        finally:
-            process.send_signal(signal.SIGINT)
-            assert process.wait(30) == 0, self.log()
+            code = process.wait(30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            pytest.fail(f"{process.args} does not end: {self.log()}")
+        assert code == 0, self.log()
 
     def log(self) -> str:
         return (self.folder / "nodes.log").read_text(errors="replace")
@@ -79,6 +108,10 @@ class Peers:
         for submap in submaps:
             for topic, message in zip(SUBMAP_TOPICS, submap_messages(types, submap), strict=True):
                 self.senders[f"/{name}/{topic}"].publish(message)
+
+    def says(self, node: str) -> bool:
+        """True if a node has told of itself."""
+        return any(status.name == node for m in self.probe.received["/diagnostics"] for status in m.status)
 
     def has(self, node: str, count: int) -> bool:
         """True if the newest diagnostics of a sjsam say that it has received so many submaps."""
@@ -120,13 +153,16 @@ def test_two_agents_that_meet_have_the_map_that_a_post_would_have(
         "anna": Agent(world, path[:61], rng, "anna").submaps(),
         "bert": Agent(world, path[45:], rng, "bert", stamp_ns=2_000_000_000).submaps(),
     }
-    address, config = f"tcp/127.0.0.1:{free_port()}", SystemConfig()
-    specs = {
-        "anna": peer_nodes("anna", {"bert": ""}, (address,), config),
-        "bert": peer_nodes("bert", {"anna": address}, (), config),
-    }
-    specs["anna"][0].parameters.pop("scouting")  # nobody else's agents are to be found by a test
-    count = sum(map(len, own.values()))
+
+    def specs_at(address: str) -> dict[str, list[NodeSpec]]:
+        specs = {
+            "anna": peer_nodes("anna", {"bert": ""}, (address,), SystemConfig()),
+            "bert": peer_nodes("bert", {"anna": address}, (), SystemConfig()),
+        }
+        specs["anna"][0].parameters.pop("scouting")  # nobody else's agents are to be found by a test
+        return specs
+
+    specs, count = peers.start_link_at_a_free_port(specs_at), sum(map(len, own.values()))
     peers.start(specs["anna"])
     peers.publish(own["anna"], "anna")
     peers.probe.wait(lambda: peers.has("/anna/peers/sjsam", len(own["anna"])), "anna alone has no map of her own")
@@ -154,7 +190,7 @@ def test_two_agents_that_meet_have_the_map_that_a_post_would_have(
     graph = storage.read(tmp_path / "post").state.graph
     ends = [(graph.records[k.first].key[0], graph.records[k.second].key[0]) for k in graph.links if k.is_closure]
     assert any(first != second for first, second in ends), "the agents have not met"
-    folders = [tmp_path / "post", *(peers.map_of(nodes[1]) for nodes in specs.values())]
+    folders = [tmp_path / "post", *(peers.map_of(nodes[-1]) for nodes in specs.values())]
     of_post, of_anna, of_bert = ({p.name: p.read_bytes() for p in folder.iterdir()} for folder in folders)
     assert of_anna == of_bert
     assert of_anna == of_post
