@@ -74,7 +74,7 @@ class Inbox:
         return released
 
     def kept(self) -> Iterator[tuple[Key, bytes]]:
-        """What lies on disk, oldest first: keys and submaps for the air."""
+        """Keys and bytes of the submaps that lie on disk, oldest first."""
         for key in sorted(self._folder.sizes):
             yield key, self._folder.read(key)
 
