@@ -11,6 +11,7 @@ from submap_world import Agent, circle, ring_world
 
 from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
+from sjsam_node.marks import Marks
 from sjsam_node.merging.across import AcrossMaps
 from sjsam_node.merging.merge import merge
 from sjsam_node.merging.union import NamedMap, united
@@ -133,6 +134,68 @@ def test_a_map_that_was_extended_from_another_is_taken_once(days):
     assert len(merged.map.snapshot()) == len(days[0].records) + len(days[1].records)
     assert any("day 1: all its submaps" in note for note in merged.notes)
     assert len(merged.parts) == 1
+
+
+def built_of(name: str, *parts: NamedMap) -> NamedMap:
+    """The map of the submaps of some maps, as one that was extended from another has them."""
+    built = GlobalMap()
+    for record in (record for part in parts for record in part.records):
+        assert built.add(record.submap).accepted
+    return NamedMap(name, built.stored())
+
+
+def marked(one: NamedMap, record: int, name: str) -> NamedMap:
+    """The map with a mark near the end of a record."""
+    marks = Marks(list(one.stored.marks.marks))
+    state = one.stored.state
+    marks.add(state.poses, state.end(record)[:3, 3] + [0.3, 0.2, 0.1], name)
+    return NamedMap(one.name, replace(one.stored, marks=marks))
+
+
+def moved_in_time(one: NamedMap, seconds: int, keep: slice = slice(None)) -> NamedMap:
+    """The map of some of the same submaps at another time: another rig's, for a merge."""
+    built = GlobalMap()
+    for record in one.records[keep]:
+        s, by = record.submap, seconds * 10**9
+        assert built.add(replace(s, start_stamp_ns=s.start_stamp_ns + by, end_stamp_ns=s.end_stamp_ns + by)).accepted
+    return NamedMap("another rig", built.stored())
+
+
+def test_what_was_renamed_is_taken_once_with_its_marks(days):
+    """Another rig's map first, then one that was extended from the third: its agent is renamed in the second."""
+    rig, first = moved_in_time(days[0], -100), marked(days[0], 2, "door")
+    extended = built_of("extended", days[0], days[1])
+    union = united([first, extended, rig])
+    assert union.names == ("another rig", "extended", "day 1")
+    assert len(union.submaps) == len(rig.records) + len(extended.records)
+    assert {s.agent for s in union.submaps if s.session == 2} == {"rig_2"}  # one rig's days keep one name
+    (mark,) = union.marks
+    assert (mark.key, mark.at_end) == (("rig_2", *days[0].records[2].key[1:]), True)
+
+
+def test_a_merged_map_and_one_of_its_maps_share_what_the_merge_renamed(days):
+    rig = moved_in_time(days[0], -100)
+    merged = NamedMap("merged", merge([days[0], rig], GlobalMapConfig(), InProcess()).map.stored())
+    assert len(united([merged, days[0]]).submaps) == len(merged.records)
+
+
+def test_a_session_that_goes_on_keeps_the_name_that_its_beginning_has(days):
+    half, rig = moved_in_time(days[0], 0, slice(3)), moved_in_time(days[0], -100)
+    union = united([half, days[0], rig])
+    assert len(union.submaps) == 2 * len(days[0].records)
+    assert {s.agent for s in union.submaps} == {"", "rig_2"}
+
+
+def test_a_mark_on_a_shared_submap_stays_where_another_session_is_renamed(days):
+    """The second map shares session 1 with the first one, which has another session 2."""
+    other = built_of("other", days[0], moved_in_time(days[1], -50))
+    second = marked(built_of("second", days[0], days[1]), 1, "door")
+    union = united([other, second])
+    assert {(s.agent, s.session) for s in union.submaps} == {("", 1), ("", 2), ("rig_2", 2)}
+    (mark,) = union.marks
+    assert mark.key == days[0].records[1].key
+    (joined,) = merge([other, second], GlobalMapConfig(), InProcess()).map.marks.marks
+    assert joined.name == "door"
 
 
 def test_maps_of_other_features_and_no_map_are_refused(days):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Submaps of several finished maps in one order, which does not depend on the order in which the maps are named.
 
-A submap that several of them hold, because one was extended from another, is taken once. An agent is renamed where
-another map has other submaps of the same session of an agent of that name.
+A submap that several of them hold, because one was extended or merged from another, is taken once, whatever its agent
+is called. An agent is renamed where another map has other submaps of the same session of an agent of that name.
 """
 
 from __future__ import annotations
@@ -83,12 +83,14 @@ def _canonical(one: NamedMap) -> tuple[int, int, bytes]:
     """Sort key: when it began, the larger one first, and a digest of what is in it."""
     submaps, content = [r.submap for r in one.records], hashlib.sha256()
     for submap in submaps:
-        content.update(_digest(submap))
+        content.update(repr(_key(submap)).encode() + _digest(submap))
     return min(s.start_stamp_ns for s in submaps), -len(submaps), content.digest()
 
 
 def _digest(submap: Submap) -> bytes:
-    digest = hashlib.sha256(repr((_key(submap), submap.start_stamp_ns, submap.end_stamp_ns)).encode())
+    """Of what is in a submap, whatever its agent is called: a merge before may have renamed it."""
+    what = submap.session, submap.index, submap.start_stamp_ns, submap.end_stamp_ns
+    digest = hashlib.sha256(repr(what).encode())
     digest.update(np.ascontiguousarray(submap.end_pose).tobytes())
     digest.update(np.ascontiguousarray(submap.landmarks).tobytes())
     return digest.digest()
@@ -100,48 +102,56 @@ def _key(submap: Submap) -> Key:
 
 @dataclass
 class _Taken:
-    """Holds what was taken over of each map so far; ``submaps`` by key, with the map that each is of."""
+    """Holds what was taken over of each map so far.
+
+    submaps: by key, with the map that each is of; keys: under which the submap of each digest is there.
+    """
 
     submaps: dict[Key, tuple[Submap, int]] = field(default_factory=dict)
-    digests: dict[Key, bytes] = field(default_factory=dict)
+    keys: dict[bytes, Key] = field(default_factory=dict)
     marks: list[PlacedMark] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def add(self, number: int, one: NamedMap) -> None:
         """Take a map over."""
         digests = {r.key: _digest(r.submap) for r in one.records}
-        shared = {key for key, digest in digests.items() if self.digests.get(key) == digest}
+        shared = {key: self.keys[digest] for key, digest in digests.items() if digest in self.keys}
         if len(shared) == len(one.records):
             self.notes.append(f"{one.name}: all its submaps are in the others; it adds nothing")
         names = self._renamed(one, shared)
         at: dict[int, tuple[Key, bool]] = {}
         for record in one.records:
-            submap = replace(record.submap, agent=names.get(record.submap.agent, record.submap.agent))
-            key = _key(submap)
+            submap = replace(record.submap, agent=names.get(record.key[:2], record.submap.agent))
+            key = shared.get(record.key, _key(submap))
             at[record.start], at[record.end] = at.get(record.start, (key, False)), (key, True)
             if record.key in shared:
                 continue
             if key in self.submaps:
                 raise ValueError(f"{one.name} has another submap {key} than a map that it shares others with")
-            self.submaps[key], self.digests[key] = (submap, number), digests[record.key]
+            self.submaps[key], self.keys[digests[record.key]] = (submap, number), key
         for mark in one.stored.marks.marks:
             name = _free(mark.name, {placed.mark.name for placed in self.marks})
             self.marks.append(PlacedMark(replace(mark, name=name), *at[mark.node]))
 
-    def _renamed(self, one: NamedMap, shared: set[Key]) -> dict[str, str]:
-        """New names of agents whose session another map holds other submaps of."""
-        taken, known = {key[:2] for key in self.submaps}, {key[:2] for key in shared}
-        clashes = ({r.key[:2] for r in one.records} & taken) - known
-        if any(agent == BUILDING for agent, _ in clashes):
+    def _renamed(self, one: NamedMap, shared: dict[Key, Key]) -> dict[tuple[str, int], str]:
+        """Names of agents by session, where they change.
+
+        A session of which submaps are there goes on under the name that they have. Where another map holds other
+        submaps of a session, all sessions of that agent that are not there get a new name.
+        """
+        taken = {key[:2] for key in self.submaps}
+        known = {key[:2]: there[0] for key, there in shared.items()}
+        new = {r.key[:2] for r in one.records} - known.keys()
+        clashes = {agent for agent, _ in new & taken}
+        if BUILDING in clashes:
             raise ValueError(f"{one.name} knows other tags of the building than another map")
-        names, renamed = {agent for agent, _ in taken} | {r.submap.agent for r in one.records}, dict[str, str]()
-        for agent in sorted({agent for agent, _ in clashes}):
-            renamed[agent] = _free(agent or "rig", names | {agent or "rig"})
-            names.add(renamed[agent])
-            self.notes.append(
-                f"{one.name}: its agent '{agent}' is called '{renamed[agent]}', since another map has one"
-            )
-        return renamed
+        names = {agent for agent, _ in taken} | {r.submap.agent for r in one.records}
+        for agent in sorted(clashes):
+            name = _free(agent or "rig", names | {agent or "rig"})
+            names.add(name)
+            known |= {(other, session): name for other, session in new if other == agent}
+            self.notes.append(f"{one.name}: its agent '{agent}' is called '{name}', since another map has one")
+        return known
 
 
 def _free(name: str, taken: set[str]) -> str:
