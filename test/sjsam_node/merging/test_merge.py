@@ -11,11 +11,17 @@ from submap_world import Agent, circle, ring_world
 
 from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
+from sjsam_node.graph.map_graph import BUILDING
+from sjsam_node.loop_closure.detector import Comparison
+from sjsam_node.loop_closure.point_sets import at_start
+from sjsam_node.loop_closure.verification import Verifier
 from sjsam_node.marks import Marks
 from sjsam_node.merging.across import AcrossMaps
+from sjsam_node.merging.by_records import ByRecords
 from sjsam_node.merging.merge import merge
 from sjsam_node.merging.union import NamedMap, united
 from sjsam_node.regions.tasks import InProcess, cluster
+from sjsam_node.tags.known_tags import KnownTagsConfig
 
 RADIUS = 4.0
 
@@ -108,6 +114,75 @@ def test_what_was_found_ahead_changes_nothing(days):
             np.testing.assert_allclose(other, value, rtol=1e-5, atol=1e-6, err_msg=name)
         else:
             np.testing.assert_array_equal(other, value, err_msg=name)
+
+
+def assert_same_ways(merged: GlobalMap, other: GlobalMap):
+    """The same poses, but for the frame and a last optimum from elsewhere."""
+    for agent, path in other.path().items():
+        ways = [np.array([e.T for e in p]) for p in (merged.path()[agent], path)]
+        first, second = (np.linalg.inv(T[0]) @ T for T in ways)
+        np.testing.assert_allclose(first, second, atol=1e-3)
+
+
+def with_known_tags(folder) -> GlobalMapConfig:
+    file = folder / "known.yaml"
+    tag = "{id: 1, position: [0, 0, 0], quaternion: [0, 0, 0, 1]}"
+    file.write_text(f"size: 0.2\nsigma: 0.01\nsigma_angle: 0.01\ntags: [{tag}]\n")
+    return replace(GlobalMapConfig(), tags=KnownTagsConfig(known=str(file)))
+
+
+def test_known_tags_of_the_building_change_no_part_closure_or_way(days, tmp_path):
+    plain = merge(days, GlobalMapConfig(), InProcess())
+    merged = merge(days, with_known_tags(tmp_path), InProcess())
+    assert merged.map.state.graph.records[0].submap.agent == BUILDING
+    assert (merged.parts, merged.closures, merged.notes) == (plain.parts, plain.closures, ())
+    assert_same_ways(merged.map, plain.map)
+
+
+def test_what_was_found_ahead_is_of_the_records_that_it_is_asked_for(days, tmp_path):
+    """With a record that the map has placed itself, and a submap that it refused."""
+    union, config = united([with_bent_submap(days[0]), *days[1:]]), with_known_tags(tmp_path)
+    joined = GlobalMap(config)
+    ahead = ByRecords(joined, union, AcrossMaps(union, config.closure, InProcess()))
+    for submap in union.submaps:
+        joined.add_again(submap)
+    records, verifier = joined.state.graph.records, Verifier(config.closure)
+    assert len(records) == len(union.submaps)  # one more, one less
+    assert len(ahead) >= 10
+    for (first, second), found in ahead.items():
+        seed = ahead.number(first), ahead.number(second)
+        expected = verifier.by_looks(at_start(records[first]), at_start(records[second]), seed)
+        assert (found is None) == (expected is None)
+        assert found is None or found.T.tobytes() == expected.T.tobytes()
+    wanted = [Comparison(*pair, None, 0.0, True) for pair in [*list(ahead)[:5], (0, 1), list(ahead)[5]]]
+    for one, (found, _) in zip(wanted, ahead.compare(wanted), strict=True):
+        seed = [one.first if ahead.number(one.first) is None else ahead.number(i) for i in (one.first, one.second)]
+        points = at_start(records[one.first]), at_start(records[one.second])
+        expected, _ = verifier.verify(*points, None, 0.0, *seed)
+        assert (found is None) == (expected is None)
+        assert found is None or found.T.tobytes() == expected.T.tobytes()
+
+
+def with_bent_submap(one: NamedMap) -> NamedMap:
+    """The map with a submap before its last one that no map takes."""
+    state, place = one.stored.state, len(one.records) - 2
+    record = one.records[place]
+    bent = replace(record, submap=replace(record.submap, end_pose=2.0 * record.submap.end_pose))
+    graph = replace(state.graph, records=(*one.records[:place], bent, *one.records[place + 1 :]))
+    return NamedMap("faulty", replace(one.stored, state=replace(state, graph=graph)))
+
+
+def test_a_submap_that_is_refused_changes_no_other_alignment(days):
+    faulty = with_bent_submap(days[0])
+    merged = merge([faulty, *days[1:]], GlobalMapConfig(), InProcess())
+    assert any("1 submaps could not be joined" in note and "rigid" in note for note in merged.notes)
+    plain = GlobalMap()
+    for submap in united([faulty, *days[1:]]).submaps:
+        plain.add(submap)
+    plain.settle()
+    assert merged.map.snapshot().keys == plain.snapshot().keys
+    assert len(merged.parts) == plain.components == 1
+    assert_same_ways(merged.map, plain)
 
 
 def test_maps_that_share_no_place_stay_parts(days):

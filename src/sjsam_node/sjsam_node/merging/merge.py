@@ -15,6 +15,7 @@ from functools import partial
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.marks import Marks
 from sjsam_node.merging.across import AcrossMaps
+from sjsam_node.merging.by_records import ByRecords
 from sjsam_node.merging.union import NamedMap, Union, united
 from sjsam_node.regions.tasks import Tasks
 from sjsam_node.regions.tree_problem import optimized_by_tree
@@ -50,22 +51,26 @@ def merge(
     union = united(maps)
     count, merged = len(union.submaps), GlobalMap(config)
     on_step("recognising places", 0, count)
-    across = AcrossMaps(union, config.closure, tasks)
-    merged.detector.verifier.looks = across.looks()
+    ahead = ByRecords(merged, union, AcrossMaps(union, config.closure, tasks))
+    merged.detector.verifier.looks = ahead
     for k, submap in enumerate(union.submaps):
         on_step("joining", k, count)
         merged.add_again(submap)
     on_step("settling", count, count)
-    merged.detector.compare = across.compare
+    merged.detector.compare = ahead.compare
     merged.estimate.optimize = partial(optimized_by_tree, tasks=tasks)
     merged.settle()
+    merged.detector.verifier.looks = {}
     merged.detector.compare = merged.estimate.optimize = None
     merged.marks = _marks(merged, union)
-    refused = count - len(merged.state.graph.records)
+    numbers = [ahead.number(record) for record in range(len(merged.state.graph.records))]
+    refused = count - sum(number is not None for number in numbers)
     notes = union.notes + (f"{refused} submaps could not be joined: {dict(merged.counters.counts)}",) * bool(refused)
-    source = {(s.agent, s.session, s.index): number for s, number in zip(union.submaps, union.source, strict=True)}
-    own = [source[record.key] for record in merged.state.graph.records]
-    between = sum(k.is_closure and own[k.first] != own[k.second] for k in merged.state.graph.links)
+    own = [None if number is None else union.source[number] for number in numbers]
+    between = sum(
+        k.is_closure and own[k.first] != own[k.second] and None not in (own[k.first], own[k.second])
+        for k in merged.state.graph.links
+    )
     return Merged(merged, _parts(merged, own, union.names), between, notes)
 
 
@@ -80,9 +85,10 @@ def _marks(merged: GlobalMap, union: Union) -> Marks:
     return Marks(out)
 
 
-def _parts(merged: GlobalMap, source: list[int], names: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
-    """Names of the maps of each part; a map that is in several parts is named in each."""
+def _parts(merged: GlobalMap, source: list[int | None], names: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
+    """Names of the maps of each part; a map that is in several parts is named in each, one of no map is none."""
     state = merged.state
     members = [state.records_in(component) for component in state.components()]
     ordered = sorted(members, key=lambda records: (-len(records), records[0]))
-    return tuple(tuple(names[k] for k in sorted({source[i] for i in records})) for records in ordered)
+    sources = [sorted({k for i in records if (k := source[i]) is not None}) for records in ordered]
+    return tuple(tuple(names[k] for k in of_part) for of_part in sources if of_part)
