@@ -139,15 +139,17 @@ def test_known_tags_of_the_building_change_no_part_closure_or_way(days, tmp_path
     assert_same_ways(merged.map, plain.map)
 
 
-def test_what_was_found_ahead_is_of_the_records_that_it_is_asked_for(days, tmp_path):
+@pytest.mark.parametrize(("has_known_tags", "is_one_bent"), [(True, False), (False, True), (True, True)])
+def test_what_was_found_ahead_is_of_the_records_that_it_is_asked_for(days, tmp_path, has_known_tags, is_one_bent):
     """With a record that the map has placed itself, and a submap that it refused."""
-    union, config = united([with_bent_submap(days[0]), *days[1:]]), with_known_tags(tmp_path)
+    union = united([with_bent_submap(days[0]) if is_one_bent else days[0], *days[1:]])
+    config = with_known_tags(tmp_path) if has_known_tags else GlobalMapConfig()
     joined = GlobalMap(config)
     ahead = ByRecords(joined, union, AcrossMaps(union, config.closure, InProcess()))
     for submap in union.submaps:
         joined.add_again(submap)
     records, verifier = joined.state.graph.records, Verifier(config.closure)
-    assert len(records) == len(union.submaps)  # one more, one less
+    assert len(records) == len(union.submaps) + has_known_tags - is_one_bent
     assert len(ahead) >= 10
     for (first, second), found in ahead.items():
         seed = ahead.number(first), ahead.number(second)
@@ -164,15 +166,15 @@ def test_what_was_found_ahead_is_of_the_records_that_it_is_asked_for(days, tmp_p
 
 
 def with_bent_submap(one: NamedMap) -> NamedMap:
-    """The map with a submap before its last one that no map takes."""
-    state, place = one.stored.state, len(one.records) - 2
+    """The map with a second submap that no map takes."""
+    state, place = one.stored.state, 1
     record = one.records[place]
     bent = replace(record, submap=replace(record.submap, end_pose=2.0 * record.submap.end_pose))
     graph = replace(state.graph, records=(*one.records[:place], bent, *one.records[place + 1 :]))
     return NamedMap("faulty", replace(one.stored, state=replace(state, graph=graph)))
 
 
-def test_a_submap_that_is_refused_changes_no_other_alignment(days):
+def test_a_submap_that_is_refused_is_said_and_the_others_are_joined(days):
     faulty = with_bent_submap(days[0])
     merged = merge([faulty, *days[1:]], GlobalMapConfig(), InProcess())
     assert any("1 submaps could not be joined" in note and "rigid" in note for note in merged.notes)
@@ -271,6 +273,21 @@ def test_a_mark_on_a_shared_submap_stays_where_another_session_is_renamed(days):
     assert mark.key == days[0].records[1].key
     (joined,) = merge([other, second], GlobalMapConfig(), InProcess()).map.marks.marks
     assert joined.name == "door"
+
+
+def test_a_mark_that_two_maps_have_on_a_shared_submap_is_taken_once(days):
+    first = marked(days[0], 2, "door")
+    extended = built_of("extended", days[0], days[1])  # its first nodes are those of the first map
+    extended = marked(replace(extended, stored=replace(extended.stored, marks=first.stored.marks)), 1, "door")
+    union = united([first, extended])
+    assert sorted((m.mark.name, m.key) for m in union.marks) == [
+        ("door", days[0].records[2].key),
+        ("door_2", days[0].records[1].key),
+    ]
+    # A merge before has called one of them by a new name.
+    rig = marked(moved_in_time(days[0], -100), 1, "door")
+    merged = NamedMap("merged", merge([first, rig], GlobalMapConfig(), InProcess()).map.stored())
+    assert sorted(m.mark.name for m in united([merged, first, rig]).marks) == ["door", "door_2"]
 
 
 def test_maps_of_other_features_and_no_map_are_refused(days):

@@ -129,9 +129,22 @@ class _Taken:
             if key in self.submaps:
                 raise ValueError(f"{one.name} has another submap {key} than a map that it shares others with")
             self.submaps[key], self.keys[digests[record.key]] = (submap, number), key
+        self._add_marks(one, at)
+
+    def _add_marks(self, one: NamedMap, at: dict[int, tuple[Key, bool]]) -> None:
+        """Take the marks of a map over, but for those that an earlier map has in the same place by the same name.
+
+        Or by the name that a merge before has given it.
+        """
+        names = {placed.mark.name for placed in self.marks}
+        there = [(_place(placed), placed.mark.name) for placed in self.marks]
         for mark in one.stored.marks.marks:
-            name = _free(mark.name, {placed.mark.name for placed in self.marks})
-            self.marks.append(PlacedMark(replace(mark, name=name), *at[mark.node]))
+            placed = PlacedMark(mark, *at[mark.node])
+            if any(place == _place(placed) and _is_called(name, mark.name) for place, name in there):
+                continue
+            name = _free(mark.name, names)
+            names.add(name)
+            self.marks.append(replace(placed, mark=replace(mark, name=name)))
 
     def _renamed(self, one: NamedMap, shared: dict[Key, Key]) -> dict[tuple[str, int], str]:
         """Names of agents by session, where they change.
@@ -152,6 +165,16 @@ class _Taken:
             known |= {(other, session): name for other, session in new if other == agent}
             self.notes.append(f"{one.name}: its agent '{agent}' is called '{name}', since another map has one")
         return known
+
+
+def _place(placed: PlacedMark) -> tuple[Key, bool, tuple[float, ...]]:
+    return placed.key, placed.at_end, tuple(placed.mark.point.tolist())
+
+
+def _is_called(there: str, name: str) -> bool:
+    """True if a mark has a name, or that name with a number as :func:`_free` gives it."""
+    stem, _, number = there.rpartition("_")
+    return there == name or (stem == name and number.isdigit())
 
 
 def _free(name: str, taken: set[str]) -> str:
