@@ -6,6 +6,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -48,14 +50,29 @@ def test_workers_give_the_same_bytes_also_when_one_is_killed_half_way(client):
 
     def kill_one():
         """Kill a worker that holds factors, so that these have to be made again."""
-        holders = [worker for worker, keys in client.has_what().items() if any("_eliminate" in str(k) for k in keys)]
+        deadline, holders = time.monotonic() + 60.0, list[str]()
         while not holders:
+            assert time.monotonic() < deadline, f"no worker holds a factor: {client.has_what()}"
+            time.sleep(0.05)
             holders = [w for w, keys in client.has_what().items() if any("_eliminate" in str(k) for k in keys)]
         killed.append(client.run(os.getpid, workers=holders[:1])[holders[0]])
         os.kill(killed[0], signal.SIGKILL)
 
     assert [part.tobytes() for part in solved(OnCluster(client), kill_one)] == expected
     assert killed
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_has_ended_is_told_where_a_task_is_given():
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=":0") as local:
+        client = distributed.Client(local)
+        tasks = OnCluster(client)
+        assert tasks.gather([tasks.hold(1)]) == [1]
+        client.close()
+        for call in (partial(tasks.hold, 1), partial(tasks.submit, int)):
+            with pytest.raises(ValueError, match="cluster was lost"):
+                call()
 
 
 def test_a_lost_cluster_and_a_task_that_kills_workers_are_told():
@@ -68,9 +85,15 @@ def test_a_lost_cluster_and_a_task_that_kills_workers_are_told():
         def gather(self, handles):
             raise self.error
 
+        def submit(self, *arguments, pure):
+            raise self.error
+
     killed = distributed.KilledWorker("task", SimpleNamespace(address="tcp://host:1"), 3)
-    with pytest.raises(ValueError, match="cluster was lost"):
-        OnCluster(Lost(distributed.comm.CommClosedError("closed"))).gather([])
+    for error in (distributed.comm.CommClosedError("closed"), distributed.client.ClosedClientError("closed")):
+        tasks = OnCluster(Lost(error))
+        for call in (partial(tasks.gather, []), partial(tasks.hold, 1), partial(tasks.submit, int)):
+            with pytest.raises(ValueError, match="cluster was lost"):
+                call()
     with pytest.raises(ValueError, match="want of memory"):
         OnCluster(Lost(killed)).gather([])
 

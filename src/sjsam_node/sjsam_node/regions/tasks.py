@@ -57,13 +57,14 @@ class OnCluster:
 
     def hold(self, value: Any) -> Any:
         """A future of a value that is sent to the cluster once; the scheduler sends it again if its worker is lost."""
-        with warnings.catch_warnings():
+        with _told(), warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Sending large graph")
             return self._client.submit(_same, value, pure=False)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """A future of the result of a function."""
-        return self._client.submit(function, *arguments, pure=False)
+        with _told():
+            return self._client.submit(function, *arguments, pure=False)
 
     def gather(self, handles: Sequence[Any]) -> list[Any]:
         """The results, once all are there.
@@ -71,20 +72,29 @@ class OnCluster:
         Raises
         ------
         ValueError
-            If the cluster was lost, or the same task took several workers with it.
+            If the cluster was lost, which ``hold`` and ``submit`` raise too, or the same task took several workers with
+            it.
         """
-        from distributed import KilledWorker
-        from distributed.comm.core import CommClosedError
-
-        try:
+        with _told():
             return list(self._client.gather(list(handles)))
-        except KilledWorker as error:
-            raise ValueError(
-                "several workers ended at the same task, most likely for want of memory: start workers with more "
-                f"(--memory-limit), or fewer a host: {error}"
-            ) from error
-        except (CommClosedError, CancelledError) as error:
-            raise ValueError(f"the Dask cluster was lost: start it again, then the same command: {error}") from error
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Says in one line that the cluster was lost, or that a task takes workers with it."""
+    from distributed import KilledWorker
+    from distributed.client import ClosedClientError
+    from distributed.comm.core import CommClosedError
+
+    try:
+        yield
+    except KilledWorker as error:
+        raise ValueError(
+            "several workers ended at the same task, most likely for want of memory: start workers with more "
+            f"(--memory-limit), or fewer a host: {error}"
+        ) from error
+    except (CommClosedError, CancelledError, ClosedClientError) as error:
+        raise ValueError(f"the Dask cluster was lost: start it again, then the same command: {error}") from error
 
 
 def _same(value: Any) -> Any:
