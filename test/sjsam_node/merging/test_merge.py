@@ -12,7 +12,7 @@ from submap_world import Agent, circle, ring_world
 from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.graph.map_graph import BUILDING
-from sjsam_node.loop_closure.detector import Comparison
+from sjsam_node.loop_closure.detector import RecordPair
 from sjsam_node.loop_closure.point_sets import at_start
 from sjsam_node.loop_closure.verification import Verifier
 from sjsam_node.marks import Marks
@@ -156,7 +156,7 @@ def test_what_was_found_ahead_is_of_the_records_that_it_is_asked_for(days, tmp_p
         expected = verifier.by_looks(at_start(records[first]), at_start(records[second]), seed)
         assert (found is None) == (expected is None)
         assert found is None or found.T.tobytes() == expected.T.tobytes()
-    wanted = [Comparison(*pair, None, 0.0, True) for pair in [*list(ahead)[:5], (0, 1), list(ahead)[5]]]
+    wanted = [RecordPair(*pair, None, 0.0, True) for pair in [*list(ahead)[:5], (0, 1), list(ahead)[5]]]
     for one, (found, _) in zip(wanted, ahead.compare(wanted), strict=True):
         seed = [one.first if ahead.number(one.first) is None else ahead.number(i) for i in (one.first, one.second)]
         points = at_start(records[one.first]), at_start(records[one.second])

@@ -346,7 +346,7 @@ class OpenSubmap:
 
 
 def most_telling(information: FloatArray, good: IndexArray, most: int) -> IndexArray:
-    """Those of the sightings ``good`` (k,) that tell most, ``most`` at most; ``information`` is that of all (n,).
+    """Select of the sightings ``good`` (k,) the ``most`` that tell most; ``information`` is that of all (n,).
 
     For frames whose features were followed: their errors last as long as the patch, so that all tell little more.
     """

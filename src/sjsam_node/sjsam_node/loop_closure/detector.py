@@ -54,7 +54,7 @@ _AT_ONCE = 128
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class RecordPair:
     """Two records to compare around a prior, by looks too where ``by_looks``; ``path_length``: of the way between."""
 
     first: int
@@ -65,7 +65,7 @@ class Comparison:
 
 
 Found = tuple[Alignment | None, Status]
-Compare = Callable[[Sequence[Comparison]], Sequence[Found]]
+Compare = Callable[[Sequence[RecordPair]], Sequence[Found]]
 
 
 @dataclass
@@ -209,8 +209,8 @@ class LoopDetector:
         wanted = [self._comparison(*pair, self.estimate.relative_pose(*pair), by_looks) for pair in left]
         return dict(zip(left, compare(wanted), strict=True))
 
-    def _comparison(self, old: int, new: int, prior: Prior | None, by_looks: bool) -> Comparison:
-        return Comparison(old, new, prior, self.graph.path_length_between(old, new), by_looks or prior is None)
+    def _comparison(self, old: int, new: int, prior: Prior | None, by_looks: bool) -> RecordPair:
+        return RecordPair(old, new, prior, self.graph.path_length_between(old, new), by_looks or prior is None)
 
     def _compared(
         self, old: int, new: int, prior: Prior | None, by_looks: bool, known: Found | None = None
@@ -299,7 +299,7 @@ class LoopDetector:
         return float(np.median(np.linalg.norm(self.graph.records[record].submap.landmarks, axis=1)))
 
 
-def compared(verifier: Verifier, first: PointSet, second: PointSet, wanted: Comparison) -> Found:
+def compared(verifier: Verifier, first: PointSet, second: PointSet, wanted: RecordPair) -> Found:
     """The alignment of two records' landmarks, if geometry supports one, and what the prior says of it."""
     if not wanted.by_looks:
         return verifier.verify_near(first, second, wanted.prior), Status.CONSISTENT

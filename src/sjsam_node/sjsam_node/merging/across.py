@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sjsam_node.loop_closure.association import Alignment, PointSet
-from sjsam_node.loop_closure.detector import Comparison, Found, compared
+from sjsam_node.loop_closure.detector import Found, RecordPair, compared
 from sjsam_node.loop_closure.place_recognition import Descriptors, PlaceIndex, PlaceRecognitionConfig, likeness
 from sjsam_node.loop_closure.verification import ALIKE_CANDIDATES, ClosureConfig, Verifier
 from sjsam_node.merging.union import Union
@@ -67,7 +67,7 @@ def _proposed(earlier: Shard, later: Shard) -> list[Proposal]:
 
 
 def _compared(
-    earlier: dict[int, PointSet], later: dict[int, PointSet], wanted: list[Comparison], config: ClosureConfig
+    earlier: dict[int, PointSet], later: dict[int, PointSet], wanted: list[RecordPair], config: ClosureConfig
 ) -> list[Found]:
     """Comparisons of submaps of two maps."""
     verifier = Verifier(config)
@@ -132,7 +132,7 @@ class AcrossMaps:
         found = [one for part in results for one in part]
         return {wanted[i]: one for i, one in zip(places, found, strict=True)}
 
-    def compare(self, wanted: Sequence[Comparison]) -> list[Found]:
+    def compare(self, wanted: Sequence[RecordPair]) -> list[Found]:
         """Comparisons, as :attr:`LoopDetector.compare` asks for them."""
         batches = self._batches([(w.first, w.second) for w in wanted])
         results = self._run(_compared, [(maps, [wanted[i] for i in batch]) for maps, batch in batches])

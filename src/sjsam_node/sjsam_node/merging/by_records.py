@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.loop_closure.association import Alignment
-from sjsam_node.loop_closure.detector import Comparison, Found, compared
+from sjsam_node.loop_closure.detector import Found, RecordPair, compared
 from sjsam_node.loop_closure.point_sets import at_start
 from sjsam_node.merging.across import AcrossMaps
 from sjsam_node.merging.union import Union
@@ -52,10 +52,10 @@ class ByRecords(Looks):
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
-    def compare(self, wanted: Sequence[Comparison]) -> list[Found]:
+    def compare(self, wanted: Sequence[RecordPair]) -> list[Found]:
         """Comparisons, as :attr:`LoopDetector.compare` asks for them; of what the map has placed itself, here."""
         found: dict[int, Found] = {}
-        elsewhere: dict[int, Comparison] = {}
+        elsewhere: dict[int, RecordPair] = {}
         for k, one in enumerate(wanted):
             first, second = self.number(one.first), self.number(one.second)
             if first is None or second is None:

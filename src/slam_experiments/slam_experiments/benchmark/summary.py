@@ -120,7 +120,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class BeforeAndAfter:
     """All changes of our own program."""
 
     changes: tuple[Change, ...]
@@ -158,7 +158,7 @@ class Comparison:
 CHANGE_HEADINGS = ("recording", "program", "variants", "median ATE mm before", "after", "ratio", "verdict")
 
 
-def compare(before: Sequence[Row], after: Sequence[Row], program: str) -> Comparison:
+def compare(before: Sequence[Row], after: Sequence[Row], program: str) -> BeforeAndAfter:
     """Two results of a program on the cases that both have.
 
     Raises
@@ -172,7 +172,7 @@ def compare(before: Sequence[Row], after: Sequence[Row], program: str) -> Compar
     for (recording, name), group in _groups(pairs).items():
         old = [_ate(known[_name(row)]) for row in group]
         changes.append(Change(recording, name, len(group), _median(old), _median([_ate(row) for row in group])))
-    return Comparison(tuple(changes))
+    return BeforeAndAfter(tuple(changes))
 
 
 def in_common(before: Sequence[Row], after: Sequence[Row], program: str) -> list[Row]:

@@ -24,7 +24,7 @@ from slam_experiments.benchmark.recording_sets import sets_of
 from slam_experiments.benchmark.summary import (
     CHANGE_HEADINGS,
     HEADINGS,
-    Comparison,
+    BeforeAndAfter,
     Row,
     as_csv,
     as_markdown,
@@ -121,21 +121,21 @@ def _row(case: Case) -> Row:
     return {"recording": case.recording, "variant": case.variant, "program": case.program, "run": case.run}
 
 
-def _write(folder: OutputFolder, rows: Sequence[Row], comparison: Comparison | None) -> None:
+def _write(folder: OutputFolder, rows: Sequence[Row], comparison: BeforeAndAfter | None) -> None:
     with folder.staged() as staged:
         atomic_text(staged / _RESULT, json.dumps(rows, indent=1) + "\n")
         atomic_text(staged / "benchmark.csv", as_csv(rows))
         atomic_text(staged / "benchmark.md", _page(rows, comparison))
 
 
-def _page(rows: Sequence[Row], comparison: Comparison | None) -> str:
+def _page(rows: Sequence[Row], comparison: BeforeAndAfter | None) -> str:
     text = "Median, worst over the variants.\n\n" + as_markdown(HEADINGS, table(rows))
     if comparison is None:
         return text
     return f"{text}\n{as_markdown(CHANGE_HEADINGS, comparison.lines)}\n{comparison.conclusion}\n"
 
 
-def _show(rows: Sequence[Row], comparison: Comparison | None) -> None:
+def _show(rows: Sequence[Row], comparison: BeforeAndAfter | None) -> None:
     console = Console(width=None if sys.stdout.isatty() else _WIDTH)
     console.print(_table("recordings in variants: median, worst", HEADINGS, table(rows)))
     if comparison is not None:
