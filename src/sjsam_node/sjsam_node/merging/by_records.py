@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tasks find of the submaps of a union, by the records of the map that these are joined to.
+"""Findings of tasks about the submaps of a union, by the records of the map that these are joined to.
 
 The numbers differ: the map may have a record of the building's tags that no map brought, and may refuse a submap.
 """
