@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import os
-import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -24,15 +22,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "sjsam_node"))  # submap_worl
 
 from submap_world import Agent, circle, ring_world  # noqa: E402
 
+from node_process import begin_node, end_node, free_port  # noqa: E402
 from ros_probe import Probe  # noqa: E402
 from sjsam_node import storage  # noqa: E402
 from sjsam_node.agents import in_order  # noqa: E402
 from sjsam_node.map_session import MapSession  # noqa: E402
 from sjsam_node.node_config import SjsamNodeConfig  # noqa: E402
 from slam_bringup.pipeline.configuration import SystemConfig  # noqa: E402
-from slam_bringup.processes.node_arguments import ros_arguments  # noqa: E402
 from slam_bringup.processes.node_graph import NodeSpec, peer_nodes  # noqa: E402
-from slam_bringup.processes.processes import PrivateDomain, find_executable, node_environment  # noqa: E402
+from slam_bringup.processes.processes import PrivateDomain, node_environment  # noqa: E402
 from slam_core.messages import SUBMAP_TOPICS, odometry_message, submap_messages  # noqa: E402
 from slam_core.ros import sensor_qos  # noqa: E402
 from slam_core.types import PoseEstimate, Submap  # noqa: E402
@@ -80,20 +78,12 @@ class Peers:
 
     def _begun(self, spec: NodeSpec) -> subprocess.Popen[bytes]:
         parameters = spec.parameters | ({"map_path": str(self.map_of(spec))} if spec.executable == "sjsam" else {})
-        command = [*find_executable(spec.package, spec.executable, []), *ros_arguments(parameters, spec.namespace)]
-        with (self.folder / "nodes.log").open("ab") as output:
-            return subprocess.Popen(command, env=self.environment, stdout=output, stderr=subprocess.STDOUT)
+        return begin_node(
+            self.environment, spec.package, spec.executable, self.folder / "nodes.log", spec.namespace, **parameters
+        )
 
     def _end(self, process: subprocess.Popen[bytes]) -> None:
-        """End a node; one that does not end by itself is killed, so that it is in no other test's way."""
-        process.send_signal(signal.SIGINT)
-        try:
-            code = process.wait(30)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            pytest.fail(f"{process.args} does not end: {self.log()}")
-        assert code == 0, self.log()
+        end_node(process, self.folder / "nodes.log")
 
     def log(self) -> str:
         return (self.folder / "nodes.log").read_text(errors="replace")
@@ -137,12 +127,6 @@ def peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Peers]:
         stack.callback(probe.node.destroy_node)
         stack.callback(probe.executor.shutdown)
         yield Peers(probe, environment, tmp_path, stack)
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
 
 
 def test_two_agents_that_meet_have_the_map_that_a_post_would_have(

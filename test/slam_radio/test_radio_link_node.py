@@ -4,12 +4,9 @@
 from __future__ import annotations
 
 import os
-import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +17,7 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.ros
 
+from node_process import free_port, node  # noqa: E402
 from ros_probe import Probe  # noqa: E402
 from slam_bringup.processes.node_arguments import ros_arguments  # noqa: E402
 from slam_bringup.processes.processes import PrivateDomain, find_executable, node_environment  # noqa: E402
@@ -58,23 +56,8 @@ def probe(environment: dict[str, str]) -> Iterator[Probe]:
         os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
-@contextmanager
-def radio_link(environment: dict[str, str], log: Path, namespace: str = "", **parameters: Any) -> Iterator[Any]:
-    command = [*find_executable("slam_radio", "radio_link", []), *ros_arguments(parameters, namespace)]
-    with log.open("ab") as output:
-        process = subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT)
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-            assert process.wait(30) == 0, log.read_text()
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
+def radio_link(environment: dict[str, str], log: Path, namespace: str = "", **parameters: Any) -> Any:
+    return node(environment, "slam_radio", "radio_link", log, namespace, **parameters)
 
 
 def test_submaps_poses_and_corrections_cross_the_link_and_survive_its_silence(

@@ -4,9 +4,6 @@
 from __future__ import annotations
 
 import os
-import signal
-import socket
-import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -98,34 +95,13 @@ def test_the_disc_is_drawn_grows_and_goes():
         page.stop()
 
 
-@contextmanager
-def node(environment: dict[str, str], package: str, executable: str, log: Path, **parameters: Any) -> Iterator[None]:
-    from slam_bringup.processes.node_arguments import ros_arguments
-    from slam_bringup.processes.processes import find_executable
-
-    namespace = parameters.pop("namespace", "")
-    command = [*find_executable(package, executable, []), *ros_arguments(parameters, namespace)]
-    with log.open("ab") as output:
-        process = subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT)
-    try:
-        yield
-    finally:
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0, log.read_text()
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
-
-
 @pytest.mark.ros
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine (apt install chromium)")
 def test_the_leader_sees_the_link_and_where_a_silent_agent_may_be(tmp_path: Path, monkeypatch) -> None:
     rclpy = pytest.importorskip("rclpy")
     pytest.importorskip("zenoh")
+    from node_process import free_port, node
     from ros_probe import Probe
     from slam_bringup.processes.processes import PrivateDomain, node_environment
     from slam_core.messages import odometry_message, pose_with_covariance_message

@@ -88,7 +88,7 @@ def _canonical(one: NamedMap) -> tuple[int, int, bytes]:
 
 
 def _digest(submap: Submap) -> bytes:
-    """Of what is in a submap, whatever its agent is called: a merge before may have renamed it."""
+    """Digest of a submap, whatever its agent is called, since a merge may have renamed it."""
     what = submap.session, submap.index, submap.start_stamp_ns, submap.end_stamp_ns
     digest = hashlib.sha256(repr(what).encode())
     digest.update(np.ascontiguousarray(submap.end_pose).tobytes())
