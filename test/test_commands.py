@@ -103,7 +103,7 @@ def test_benchmarks_have_the_options_that_pages_give_them():
     for command in given:
         script, *rest = command.split()
         text = (ROOT / script).read_text(encoding="utf-8")
-        for option in re.findall(r"--[a-z][a-z-]*", " ".join(rest)):
+        for option in re.findall(r"--[a-z][a-z0-9-]*", " ".join(rest)):
             assert f'"{option}"' in text, f"{command}: no {option}"
 
 

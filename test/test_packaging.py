@@ -31,7 +31,7 @@ NO_ROSDEP_KEY = {"threadpoolctl", "viser", "eclipse-zenoh", "distributed"}
 """Projects that rosdep does not know; README says how to get them, and each manifest that it lacks them."""
 
 FROM_ROS = re.compile(r"rclpy|launch(_ros)?|ament_index_python|std_srvs|rcl_interfaces|\w+_msgs|builtin_interfaces")
-PEERS = {"gtsam"}
+PEERS = {"gtsam", "orbslam3"}
 """What results are compared with, where it is installed."""
 
 OPTIONAL = {"pyopencl", "distributed"}

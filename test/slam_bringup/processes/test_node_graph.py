@@ -13,8 +13,6 @@ from slam_bringup.processes.node_graph import live_nodes, plan_nodes
 from slam_bringup.processes.start_map import StartMap
 from slam_core.frame_tree import FrameTree
 
-CONFIG_FILES = sorted((Path(__file__).resolve().parents[3] / "src" / "slam_bringup" / "config").glob("*.yaml"))
-
 
 def sensors(agent: str = "") -> AgentSensors:
     below = f"/{agent}" if agent else ""
@@ -121,8 +119,3 @@ def test_the_frames_of_an_agent_are_those_of_its_bag_or_lie_below_its_name() -> 
 def test_the_stereo_mode_leaves_the_depth_camera_alone() -> None:
     graph = plan_nodes(choose(load_system_config(None), "stereo", "sjsam", "none"), {"": sensors()}, False, "map")
     assert not [topic for topic in graph.played.values() if "tof" in topic]
-
-
-@pytest.mark.parametrize("path", CONFIG_FILES, ids=lambda p: p.name)
-def test_every_shipped_configuration_loads_and_overrides(path: Path) -> None:
-    assert load_system_config(path) != load_system_config(None)

@@ -143,8 +143,7 @@ def test_the_leader_sees_the_link_and_where_a_silent_agent_may_be(tmp_path: Path
             assert "position ±" in text
         browser.wait("document.body.textContent.includes('link: silent for')")
         browser.wait("document.body.textContent.includes('of it if walking')")
-        before = reddish(browser)
-        wait_for_red(browser, before + 1000, 10**7)
+        wait_for_red(browser, 1000, 10**7)
         assert "Traceback" not in log.read_text()
 
 

@@ -31,7 +31,7 @@ class TreeProblem:
     """
 
     def __init__(self, problem: JoiningProblem, state: JoiningState, tasks: Tasks) -> None:
-        self._problem, self._state = problem, state
+        self._problem, self._linearised_at = problem, state
         self.tree = RegionTree(problem.maps, state, problem.fixed, problem.model, tasks)
 
     def cost(self, state: JoiningState) -> float:
@@ -40,7 +40,7 @@ class TreeProblem:
 
     def linearize(self, state: JoiningState) -> FloatArray:
         """The gradient at ``state``, at which the next step is linearised."""
-        self._state = state
+        self._linearised_at = state
         tree = self.tree
         first = np.concatenate(tree.offsets)
         items, item_ptr = tree.variables.items, tree.variables.item_ptr
@@ -59,7 +59,7 @@ class TreeProblem:
     def solve(self, damping: float) -> FloatArray | None:
         """Damped step, or None where the matrix is not positive definite."""
         try:
-            self.tree.eliminate(self._state, damping)
+            self.tree.eliminate(self._linearised_at, damping)
             return self.tree.step()
         except NotDetermined:
             return None
