@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -12,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
 
+from ros_probe import Probe
 from slam_bringup.processes.node_arguments import ros_arguments
-from slam_bringup.processes.processes import find_executable
+from slam_bringup.processes.processes import PrivateDomain, find_executable, node_environment
 
 
 def free_port() -> int:
@@ -43,6 +46,24 @@ def end_node(process: subprocess.Popen[bytes], log: Path) -> None:
         process.wait()
         pytest.fail(f"{process.args} does not end: {log.read_text(errors='replace')}")
     assert code == 0, log.read_text(errors="replace")
+
+
+@contextmanager
+def private_probe(folder: Path) -> Iterator[tuple[dict[str, str], Probe]]:
+    """Environment of nodes that no other test hears, whose state lies below a folder, and a probe among them."""
+    with PrivateDomain() as domain, pytest.MonkeyPatch.context() as patch:
+        environment = node_environment(domain) | {"XDG_STATE_HOME": str(folder / "state")}
+        for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+            patch.setitem(os.environ, name, environment[name])
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=int(environment["ROS_DOMAIN_ID"]))
+        probe = Probe(context)
+        try:
+            yield environment, probe
+        finally:
+            probe.executor.shutdown()
+            probe.node.destroy_node()
+            context.try_shutdown()
 
 
 @contextmanager

@@ -47,6 +47,8 @@ NOT_RUN = {
     r"\./slam nodes": "starts processes; test/integration/test_executables.py runs it",
     r"\./slam view": "serves a page until Ctrl-C; test/slam_viewer/page looks at it",
     r"\./slam live ": "needs a camera",
+    r"\./slam merge ": "takes finished maps; test/slam_bringup/commands/test_merge.py makes some and merges them",
+    r"(\S*/)?dask ": "serves a cluster until Ctrl-C; test/sjsam_node/regions/test_tasks.py starts one",
     r"\./slam post ": "runs until Ctrl-C; test/slam_bringup/commands/test_live.py looks at what it starts",
     r"docker ": "needs a Docker daemon",
     r"source |rosdep |colcon |python3? -m (venv|colcon)|(\.venv/bin/)?pip |ros2 bag ": "needs ROS or the network",
@@ -77,6 +79,7 @@ TYPED = [(page, line) for page in PAGES if page.name != "tutorial.md" for line i
 @pytest.mark.parametrize("page", sorted({page for page, _ in TYPED}), ids=lambda page: page.name)
 def test_the_commands_of_a_page_run_as_typed(page, tmp_path, monkeypatch, request):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "docs").symlink_to(ROOT / "docs")  # configuration.yaml
     with SensorBag(DEMO) as demo:
         write_tum(tmp_path / "truth.tum", demo.ground_truth(""))
     for line in lines_of(page):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -22,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "sjsam_node"))  # submap_worl
 
 from submap_world import Agent, circle, ring_world  # noqa: E402
 
-from node_process import begin_node, end_node, free_port  # noqa: E402
+from node_process import begin_node, end_node, free_port, private_probe  # noqa: E402
 from ros_probe import Probe  # noqa: E402
 from sjsam_node import storage  # noqa: E402
 from sjsam_node.agents import in_order  # noqa: E402
@@ -30,7 +29,6 @@ from sjsam_node.map_session import MapSession  # noqa: E402
 from sjsam_node.node_config import SjsamNodeConfig  # noqa: E402
 from slam_bringup.pipeline.configuration import SystemConfig  # noqa: E402
 from slam_bringup.processes.node_graph import NodeSpec, peer_nodes  # noqa: E402
-from slam_bringup.processes.processes import PrivateDomain, node_environment  # noqa: E402
 from slam_core.messages import SUBMAP_TOPICS, odometry_message, submap_messages  # noqa: E402
 from slam_core.ros import sensor_qos  # noqa: E402
 from slam_core.types import PoseEstimate, Submap  # noqa: E402
@@ -114,18 +112,8 @@ class Peers:
 
 
 @pytest.fixture
-def peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Peers]:
-    with ExitStack() as stack:
-        environment = node_environment(stack.enter_context(PrivateDomain()))
-        environment |= {"XDG_STATE_HOME": str(tmp_path / "state")}
-        for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
-            monkeypatch.setitem(os.environ, name, environment[name])
-        context = rclpy.Context()
-        rclpy.init(context=context, domain_id=int(environment["ROS_DOMAIN_ID"]))
-        probe = Probe(context)
-        stack.callback(context.try_shutdown)
-        stack.callback(probe.node.destroy_node)
-        stack.callback(probe.executor.shutdown)
+def peers(tmp_path: Path) -> Iterator[Peers]:
+    with private_probe(tmp_path) as (environment, probe), ExitStack() as stack:
         yield Peers(probe, environment, tmp_path, stack)
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -17,10 +16,10 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("zenoh")
 pytestmark = pytest.mark.ros
 
-from node_process import free_port, node  # noqa: E402
+from node_process import free_port, node, private_probe  # noqa: E402
 from ros_probe import Probe  # noqa: E402
 from slam_bringup.processes.node_arguments import ros_arguments  # noqa: E402
-from slam_bringup.processes.processes import PrivateDomain, find_executable, node_environment  # noqa: E402
+from slam_bringup.processes.processes import find_executable  # noqa: E402
 from slam_core.geometry import boxplus  # noqa: E402
 from slam_core.messages import (  # noqa: E402
     SUBMAP_TOPICS,
@@ -36,24 +35,19 @@ from slam_core.types import PoseEstimate  # noqa: E402
 
 
 @pytest.fixture
-def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
-    with PrivateDomain() as domain:
-        yield node_environment(domain) | {"XDG_STATE_HOME": str(tmp_path / "state")}
+def nodes(tmp_path: Path) -> Iterator[tuple[dict[str, str], Probe]]:
+    with private_probe(tmp_path) as found:
+        yield found
 
 
 @pytest.fixture
-def probe(environment: dict[str, str]) -> Iterator[Probe]:
-    context = rclpy.Context()
-    before = {name: os.environ.get(name) for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
-    os.environ |= {name: environment[name] for name in before}
-    rclpy.init(context=context, domain_id=int(environment["ROS_DOMAIN_ID"]))
-    probe = Probe(context)
-    yield probe
-    probe.executor.shutdown()
-    probe.node.destroy_node()
-    context.try_shutdown()
-    for name, value in before.items():
-        os.environ.pop(name) if value is None else os.environ.update({name: value})
+def environment(nodes: tuple[dict[str, str], Probe]) -> dict[str, str]:
+    return nodes[0]
+
+
+@pytest.fixture
+def probe(nodes: tuple[dict[str, str], Probe]) -> Probe:
+    return nodes[1]
 
 
 def radio_link(environment: dict[str, str], log: Path, namespace: str = "", **parameters: Any) -> Any:

@@ -150,7 +150,9 @@ class LandmarkConfig(Config):
 
     target_in_view: int = parameter(80, "new landmarks are added until so many are observed", minimum=6)
     most_measured: int = parameter(
-        120, "landmarks that a frame of followed features measures at most, those of which it tells most", minimum=6
+        MAX_UPDATE_LANDMARKS,
+        "landmarks that a frame of followed features measures at most, those of which it tells most",
+        minimum=6,
     )
     min_sightings: int = parameter(3, "s_min of section 4.4", minimum=1)
     probation_frames: int = parameter(6, "N of section 4.4: frames a landmark has to reach min_sightings", minimum=1)

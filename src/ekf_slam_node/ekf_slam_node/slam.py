@@ -173,7 +173,7 @@ class EkfSlam:
         return self._shutter.readout_s, self._shutter.sigma_s
 
     @property
-    def imu_late_s(self) -> tuple[float, float]:
+    def imu_time_offset_s(self) -> tuple[float, float]:
         """Time to be added to the IMU's stamps, as learnt, and its standard deviation, s; zeros without an IMU."""
         inertial = self._aids.inertial
         return (inertial.time_offset, inertial.sigma_time_offset) if self._aids.newest_stamp_ns >= 0 else (0.0, 0.0)

@@ -23,7 +23,7 @@ from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams
 from slam_core.types import Counters, Features, ImuSample, OdometryReading, RelativeMotion, Submap
 
 MOTION, IMU, ODOMETRY = STREAMS = "motion", "imu", "odometry"
-_SIGNIFICANT_LATE_S, _SIGNIFICANT_SIGMAS = 3e-3, 4.0
+_SIGNIFICANT_OFFSET_S, _SIGNIFICANT_SIGMAS = 3e-3, 4.0
 """A difference of the clocks so large is told."""
 
 
@@ -146,22 +146,18 @@ class FilterStage:
         return f"rolling shutter: {abs(readout):.1f} +- {sigma:.1f} ms from the {rows}, corrected" if readout else ""
 
     @property
-    def imu_late_s(self) -> tuple[float, float]:
-        """Time to be added to the IMU's stamps and its standard deviation, s; zeros where nothing is to be changed."""
-        late, sigma = self._imu_late
-        return (self._config.imu.time_offset + late, sigma) if sigma else (0.0, 0.0)
-
-    @property
-    def _imu_late(self) -> tuple[float, float]:
-        """Time to be added beyond the parameter, and its standard deviation, s; zeros where it is not significant."""
-        late, sigma = (0.0, 0.0) if self._slam is None else self._slam.imu_late_s
-        return (late, sigma) if abs(late) >= max(_SIGNIFICANT_SIGMAS * sigma, _SIGNIFICANT_LATE_S) else (0.0, 0.0)
+    def imu_time_offset_s(self) -> tuple[float, float]:
+        """Time to be added to the IMU's stamps and its standard deviation, s; zeros where the parameter is right."""
+        beyond, sigma = (0.0, 0.0) if self._slam is None else self._slam.imu_time_offset_s
+        if abs(beyond) < max(_SIGNIFICANT_SIGMAS * sigma, _SIGNIFICANT_OFFSET_S):
+            return 0.0, 0.0
+        return self._config.imu.time_offset + beyond, sigma
 
     @property
     def clock_finding(self) -> str:
         """Finding about the IMU's clock, or ""."""
-        late, sigma = (1e3 * s for s in self.imu_late_s)
-        return f"IMU: its stamps are {-late:+.1f} +- {sigma:.1f} ms off, corrected" if sigma else ""
+        offset, sigma = (1e3 * s for s in self.imu_time_offset_s)
+        return f"IMU: its stamps are {-offset:+.1f} +- {sigma:.1f} ms off, corrected" if sigma else ""
 
     @property
     def odometry_finding(self) -> str:
@@ -214,7 +210,7 @@ class FilterStage:
         slam = self._filter(features)
         self._give_aids(slam, features.stamp_ns)
         result = slam.process(features)
-        self._awaited.is_late(IMU, self._late_ns(slam))
+        self._awaited.set_time_offset(IMU, self._offset_ns(slam))
         if result.state is TrackingState.OK and (diagnostic := self._awaited.diagnostic() or slam.diagnostic):
             result = replace(result, state=TrackingState.DEGRADED, reason=diagnostic)
         return FrameResult(result, len(features))
@@ -228,10 +224,10 @@ class FilterStage:
         return self._slam
 
     @staticmethod
-    def _late_ns(slam: EkfSlam) -> int:
-        """Time by which the IMU's stamps are late; less is bridged by holding the last reading."""
-        late = slam.imu_late_s[0]
-        return round(1e9 * late) if abs(late) >= _SIGNIFICANT_LATE_S else 0
+    def _offset_ns(slam: EkfSlam) -> int:
+        """Time to be added to stamps of the IMU that are waited for; a small one is bridged by the last reading."""
+        offset = slam.imu_time_offset_s[0]
+        return round(1e9 * offset) if abs(offset) >= _SIGNIFICANT_OFFSET_S else 0
 
     def _give_aids(self, slam: EkfSlam, stamp_ns: int) -> None:
         """The motions that began before the frame, and readings up to the first that is not older.
@@ -240,8 +236,8 @@ class FilterStage:
         """
         while self._motions and self._motions[0].start_stamp_ns < stamp_ns:
             slam.process_motion(self._motions.popleft())
-        late_ns = self._late_ns(slam)
-        while self._samples and self._last_sample_ns + late_ns < stamp_ns:
+        offset_ns = self._offset_ns(slam)
+        while self._samples and self._last_sample_ns + offset_ns < stamp_ns:
             sample = self._samples.popleft()
             self._last_sample_ns = sample.stamp_ns
             slam.process_imu(sample)

@@ -105,7 +105,7 @@ def followed(
     aids = RelativePoseBuffer(MotionConfig(), config or InertialConfig())
     coming = iter(samples)
     for k in range(1, round(10 * seconds) + 1):
-        while aids.newest_stamp_ns < k * STEP_NS - aids.imu_late_ns:
+        while aids.newest_stamp_ns < k * STEP_NS - aids.time_offset_ns:
             aids.add_imu(next(coming))
         T = invert_transform(carried(0.1 * (k - 1))) @ carried(0.1 * k)
         aids.moved((k - 1) * STEP_NS, k * STEP_NS, boxplus(T, SEEN * rng.standard_normal(6)), np.diag(SEEN**2))

@@ -28,10 +28,10 @@ def test_a_frame_waits_until_every_stream_has_reached_its_stamp() -> None:
     assert streams.diagnostic() == ""
 
 
-@pytest.mark.parametrize(("late", "enough"), [(20, 80), (-20, 120)])
-def test_stamps_of_another_clock_are_waited_for_by_that_clock(late: int, enough: int) -> None:
+@pytest.mark.parametrize(("offset", "enough"), [(20, 80), (-20, 120)])
+def test_stamps_of_another_clock_are_waited_for_by_that_clock(offset: int, enough: int) -> None:
     streams = AwaitedStreams(["imu"])
-    streams.is_late("imu", late)
+    streams.set_time_offset("imu", offset)
     streams.frame(100)
     streams.heard("imu", enough - 1)
     assert streams.must_wait(100)

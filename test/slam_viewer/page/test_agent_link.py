@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -99,22 +97,14 @@ def test_the_disc_is_drawn_grows_and_goes():
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine (apt install chromium)")
 def test_the_leader_sees_the_link_and_where_a_silent_agent_may_be(tmp_path: Path, monkeypatch) -> None:
-    rclpy = pytest.importorskip("rclpy")
+    pytest.importorskip("rclpy")
     pytest.importorskip("zenoh")
-    from node_process import free_port, node
-    from ros_probe import Probe
-    from slam_bringup.processes.processes import PrivateDomain, node_environment
+    from node_process import free_port, node, private_probe
     from slam_core.messages import odometry_message, pose_with_covariance_message
 
     address, port = f"tcp/127.0.0.1:{free_port()}", free_port()
     with ExitStack() as stack:
-        environment = node_environment(stack.enter_context(PrivateDomain()))
-        environment |= {"XDG_STATE_HOME": str(tmp_path / "state")}
-        for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):
-            monkeypatch.setitem(os.environ, name, environment[name])
-        context = rclpy.Context()
-        rclpy.init(context=context, domain_id=int(environment["ROS_DOMAIN_ID"]))
-        probe = stack.enter_context(closing(Probe(context), context))
+        environment, probe = stack.enter_context(private_probe(tmp_path))
         log = tmp_path / "nodes.log"
         post = {"role": "post", "agents": ("anna",), "listen": (address,), "silent_after_s": 3.0}
         stack.enter_context(node(environment, "slam_radio", "radio_link", log, **post))
@@ -141,15 +131,8 @@ def test_the_leader_sees_the_link_and_where_a_silent_agent_may_be(tmp_path: Path
                     break
             assert "link: up" in text, log.read_text()
             assert "position ±" in text
+            before = reddish(browser)
         browser.wait("document.body.textContent.includes('link: silent for')")
         browser.wait("document.body.textContent.includes('of it if walking')")
-        wait_for_red(browser, 1000, 10**7)
+        wait_for_red(browser, before + 1000, 10**7)
         assert "Traceback" not in log.read_text()
-
-
-@contextmanager
-def closing(probe: Any, context: Any) -> Iterator[Any]:
-    yield probe
-    probe.executor.shutdown()
-    probe.node.destroy_node()
-    context.try_shutdown()

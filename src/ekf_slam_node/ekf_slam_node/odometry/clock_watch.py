@@ -32,7 +32,9 @@ class ClockWatch:
 
     def __init__(self, gyroscope_bias: float) -> None:
         self._prior = np.diag(1.0 / np.square([*3 * [max(gyroscope_bias, 1e-6)], _SIGMA_S]))
-        self._information, self._vector = np.zeros((4, 4)), np.zeros(4)
+        self._information: FloatArray = np.zeros((4, 4))
+        self._vector: FloatArray = np.zeros(4)
+        self._fit = self._fitted()
 
     def add(self, pre: Preintegral, turn: FloatArray, covariance: FloatArray) -> None:
         """Take a turn (3,) beyond that of readings without bias and offset, with its covariance (3, 3).
@@ -41,33 +43,32 @@ class ClockWatch:
         instrument, so that noise is not taken for information. A turn that contradicts those before is left out.
         """
         first, second = (np.column_stack([pre.J[:3, :3], clock]) for clock in pre.clock_turns)
-        fit = self._fit()
-        if fit is None:
-            return
         J = 0.5 * (first + second)
-        error = turn - J @ fit[0]
-        if not float(error @ np.linalg.solve(covariance + J @ fit[1] @ J.T, error)) < _GATE:
+        x, P = self._fit
+        error = turn - J @ x
+        if not float(error @ np.linalg.solve(covariance + J @ P @ J.T, error)) < _GATE:
             return
         inverse = np.linalg.inv(covariance)
         information = first.T @ inverse @ second
         self._information = _FORGETTING * self._information + 0.5 * (information + information.T)
         self._vector = _FORGETTING * self._vector + J.T @ inverse @ turn
+        self._fit = self._fitted()
 
     def contradicted(self, time_offset: float, sigma: float) -> float:
         """Variance (s2) to be added to that of a time offset +- sigma, s, so that it may become the one found; or 0."""
-        fit = self._fit()
-        if fit is None or abs(fit[0][3]) > FARTHEST_S:
+        x, P = self._fit
+        if abs(x[3]) > FARTHEST_S:
             return 0.0
-        apart = float(fit[0][3]) - time_offset
-        bound = max(_SIGMAS * float(np.sqrt(fit[1][3, 3])), _LEAST_S, _SIGMAS * sigma)
+        apart = float(x[3]) - time_offset
+        bound = max(_SIGMAS * float(np.sqrt(P[3, 3])), _LEAST_S, _SIGMAS * sigma)
         return apart**2 if abs(apart) > bound else 0.0
 
-    def _fit(self) -> tuple[FloatArray, FloatArray] | None:
-        """The solution (4,) and its covariance (4, 4); None where the halves' noise makes it indefinite."""
+    def _fitted(self) -> tuple[FloatArray, FloatArray]:
+        """The solution (4,) and its covariance (4, 4); the prior where the halves' noise outweighs all."""
         try:
             L = np.linalg.cholesky(self._prior + self._information)
         except np.linalg.LinAlgError:
-            return None
+            return np.zeros_like(self._vector), np.diag(1.0 / np.diagonal(self._prior))
         inverse = np.linalg.inv(L)
         P = inverse.T @ inverse
         return P @ self._vector, P

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ekf_slam_node.config import ExternalOdometryConfig, InertialConfig, MotionConfig
+from ekf_slam_node.odometry.clock_watch import FARTHEST_S
 from ekf_slam_node.odometry.external_odometry import ExternalOdometry, Reckoning
 from ekf_slam_node.odometry.inertial import InertialFilter, at_place
 from ekf_slam_node.odometry.odometry import UpDirection
@@ -26,8 +27,8 @@ from slam_core.types import ImuSample, OdometryReading, RelativeMotion
 
 _AID_STAMP_TOLERANCE = 0.005
 """Largest difference of the stamps of a motion aid and of the frames it joins."""
-_KEPT_BEFORE_NS = 200_000_000
-"""Readings so much older than a frame may still be those of its time, once the clocks' difference is known."""
+_KEPT_BEFORE_NS = round(1e9 * FARTHEST_S) + 50_000_000
+"""Readings so much older than a frame may still be those of its time, or of the edge before it."""
 MEAN_TURN_RATE_SIGMA = 0.02
 """Noise (rad/s) of an IMU's mean turn rate between two frames, of clocks and mounting too."""
 _SIGMA_TURN_RATE = 0.1
@@ -271,11 +272,11 @@ class RelativePoseBuffer:
         return self._newest[2]
 
     def _integrated(self, start_stamp_ns: int, end_stamp_ns: int) -> Preintegral | None:
-        start_ns, end_ns = start_stamp_ns - self.imu_late_ns, end_stamp_ns - self.imu_late_ns
+        start_ns, end_ns = start_stamp_ns - self.time_offset_ns, end_stamp_ns - self.time_offset_ns
         return self._readings.integrate(start_ns, end_ns, self.inertial.biases, self.inertial.noise)
 
     @property
-    def imu_late_ns(self) -> int:
+    def time_offset_ns(self) -> int:
         """Time to be added to the IMU's stamps, as it was learnt, ns."""
         return round(1e9 * self.inertial.time_offset)
 

@@ -107,7 +107,7 @@ def _learnt(source: SensorBag, agent: str, mode: str) -> tuple[FrontendReport, d
                     stage.add_imu(value)
                 for _ in stage.ready():
                     pass
-    found = (stages[0].readout_s, stages[-1].imu_late_s)
+    found = (stages[0].readout_s, stages[-1].imu_time_offset_s)
     learnt = [zip(names, times, strict=True) for (_, *names), times in zip(_TIMES, found, strict=True) if times[0]]
     return pipeline.front_end(), {name: value for times in learnt for name, value in times}
 

@@ -38,11 +38,11 @@ class AwaitedStreams:
         self._newest: dict[str, int | None] = dict.fromkeys(self._expected)
         self._frames: deque[int] = deque(maxlen=self._patience + 1)
         self._given_up: set[str] = set()
-        self._late_ns: dict[str, int] = {}
+        self._offsets_ns: dict[str, int] = {}
 
-    def is_late(self, stream: str, late_ns: int) -> None:
-        """From now on ``late_ns`` is added to the stamps of a stream: those of its clock, not of the frames'."""
-        self._late_ns[stream] = late_ns
+    def set_time_offset(self, stream: str, offset_ns: int) -> None:
+        """From now on add ``offset_ns`` to the stamps of a stream, whose clock is not that of the frames."""
+        self._offsets_ns[stream] = offset_ns
 
     def heard(self, stream: str, stamp_ns: int) -> None:
         """A message of a stream has come."""
@@ -81,8 +81,8 @@ class AwaitedStreams:
         return "so far" if newest is None else f"since {newest / 1e9:.3f} s"
 
     def _missing(self, stamp_ns: int) -> set[str]:
-        late = self._late_ns
-        return {n for n, newest in self._newest.items() if newest is None or newest + late.get(n, 0) < stamp_ns}
+        offset = self._offsets_ns
+        return {n for n, newest in self._newest.items() if newest is None or newest + offset.get(n, 0) < stamp_ns}
 
     def _is_silent(self, name: str, newest: int | None) -> bool:
         if name in self._given_up:
