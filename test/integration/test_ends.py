@@ -85,7 +85,7 @@ def test_a_killed_run_leaves_no_nodes(run: Run) -> None:
     assert wait_for(lambda: is_playing(run)), run.process.poll()
     assert len(run.nodes()) >= 5
     run.process.kill()
-    assert wait_for(lambda: not run.nodes(), 30.0), run.nodes()
+    assert wait_for(lambda: not run.nodes(), 30.0), [log.read_text()[-3000:] for log in run.out.glob("logs/*.log")]
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])

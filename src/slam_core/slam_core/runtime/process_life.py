@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import faulthandler
 import os
 import signal
 import time
@@ -21,11 +22,19 @@ PARENT = "SLAM_PARENT_PID"
 """Environment variable with the process that started this one and without which it is of no use."""
 
 _PR_SET_PDEATHSIG = 1
+_ORPHAN_ENDS_S = 10.0
+"""Longest that a process whose starter has died takes to end, as long as a starter that lives waits for it."""
+_parent: list[int] = []
+"""The process that this one ends with, once it is known."""
+
 _Handler = Callable[[int, FrameType | None], None]
 
 
 def end_with_parent() -> None:
     """Have the kernel send SIGTERM when the process named by :data:`PARENT` ends, however it does (Linux).
+
+    What does not end by itself within ten seconds of that writes where each thread stands to its log and is ended.
+    Nobody is left to do it from outside.
 
     Raises
     ------
@@ -35,9 +44,14 @@ def end_with_parent() -> None:
     parent = os.environ.pop(PARENT, "")
     if not parent:
         return
+    _parent[:] = [int(parent)]
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != int(parent):
+    if _is_orphan():
         raise ValueError(f"the process {parent} that started this node has ended")
+
+
+def _is_orphan() -> bool:
+    return bool(_parent) and os.getppid() != _parent[0]
 
 
 def on_request_to_end(handler: _Handler) -> dict[signal.Signals, object]:
@@ -50,4 +64,10 @@ def on_request_to_end(handler: _Handler) -> dict[signal.Signals, object]:
     if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
     atexit.register(lambda: [signal.signal(number, signal.SIG_IGN) for number in numbers])
-    return {number: signal.signal(number, handler) for number in numbers}
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if _is_orphan():
+            faulthandler.dump_traceback_later(_ORPHAN_ENDS_S, exit=True)
+        handler(number, frame)
+
+    return {number: signal.signal(number, handle) for number in numbers}
