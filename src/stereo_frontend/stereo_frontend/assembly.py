@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,31 +43,52 @@ class DepthEstimate:
         return DepthEstimate(np.full(n, np.nan), np.full(n, np.nan), np.full(n, FeatureSource.STEREO, np.uint8))
 
 
-def make_features(
-    stamp_ns: int,
-    keypoints: Keypoints,
-    estimate: DepthEstimate,
-    sigma_uv: Float32Array,
-    camera: Camera,
-    frame_id: str,
-    max_relative_sigma: float,
-    track_ids: npt.NDArray[np.int32] | None = None,
+@dataclass(frozen=True, eq=False)
+class MeasuredKeypoints:
+    """Keypoints (n) with their depth, sigma_uv (n, 2) px, and track_ids (n,), 0 of those that are not followed."""
+
+    keypoints: Keypoints
+    estimate: DepthEstimate
+    sigma_uv: Float32Array
+    track_ids: npt.NDArray[np.int32]
+
+    @staticmethod
+    def untracked(keypoints: Keypoints, estimate: DepthEstimate, sigma: Float32Array) -> MeasuredKeypoints:
+        """Keypoints (n) of one picture alone, with the standard deviation (n,) px of either coordinate."""
+        return MeasuredKeypoints(
+            keypoints, estimate, np.repeat(sigma[:, None], 2, axis=1), np.zeros(len(keypoints), np.int32)
+        )
+
+    @property
+    def number_with_depth(self) -> int:
+        """Number of keypoints with a known depth."""
+        return int(np.isfinite(self.estimate.depth).sum())
+
+    def features(self, stamp_ns: int, camera: Camera, frame_id: str, max_relative_sigma: float) -> Features:
+        """The keypoints with a positive depth known to better than ``max_relative_sigma`` of itself, in their order."""
+        depth, sigma = self.estimate.depth, self.estimate.sigma
+        known = np.isfinite(depth) & np.isfinite(sigma) & (depth > 0.0)
+        keep = np.flatnonzero(known & (np.nan_to_num(sigma) <= max_relative_sigma * np.nan_to_num(depth)))
+        uv = self.keypoints.uv[keep]
+        return Features(
+            stamp_ns=stamp_ns,
+            xyz=camera.unproject(uv.astype(np.float64), depth[keep]).astype(np.float32),
+            uv=uv,
+            depth=depth[keep].astype(np.float32),
+            sigma_uv=self.sigma_uv[keep].astype(np.float32),
+            sigma_depth=sigma[keep].astype(np.float32),
+            response=self.keypoints.response[keep],
+            source=self.estimate.source[keep],
+            descriptors=self.keypoints.descriptors[keep],
+            camera=camera,
+            frame_id=frame_id,
+            track_ids=self.track_ids[keep],
+        )
+
+
+def joined_features(
+    parts: Sequence[MeasuredKeypoints], stamp_ns: int, camera: Camera, frame_id: str, max_relative_sigma: float
 ) -> Features:
-    """The keypoints with a positive depth known to better than ``max_relative_sigma`` of itself, in their order."""
-    known = np.isfinite(estimate.depth) & np.isfinite(estimate.sigma) & (estimate.depth > 0.0)
-    keep = np.flatnonzero(known & (np.nan_to_num(estimate.sigma) <= max_relative_sigma * np.nan_to_num(estimate.depth)))
-    uv, depth = keypoints.uv[keep], estimate.depth[keep]
-    return Features(
-        stamp_ns=stamp_ns,
-        xyz=camera.unproject(uv.astype(np.float64), depth).astype(np.float32),
-        uv=uv,
-        depth=depth.astype(np.float32),
-        sigma_uv=sigma_uv[keep].astype(np.float32),
-        sigma_depth=estimate.sigma[keep].astype(np.float32),
-        response=keypoints.response[keep],
-        source=estimate.source[keep],
-        descriptors=keypoints.descriptors[keep],
-        camera=camera,
-        frame_id=frame_id,
-        track_ids=np.zeros(len(keep), np.int32) if track_ids is None else track_ids[keep],
-    )
+    """Features of one frame from all ``parts`` of its keypoints; see :meth:`MeasuredKeypoints.features`."""
+    features = [part.features(stamp_ns, camera, frame_id, max_relative_sigma) for part in parts]
+    return functools.reduce(Features.joined, features)

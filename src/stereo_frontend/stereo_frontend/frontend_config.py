@@ -55,7 +55,7 @@ class FrontendReport:
     rectification: figures of the stereo pair; ranges: of the depth camera beside it; advice: to the user, a sentence
     each; picture: what features are searched in: "stereo", "amplitude", "intensity", "range" or "" before the first
     image; correction: what the right image's rectification is wrong by, where disparities are corrected for it; device:
-    where SURF is computed; device_complaint: why not where it was asked for, or "", also one of ``advice``.
+    where SURF is computed; device_diagnostic: why not where it was asked for, or "", also one of ``advice``.
     """
 
     rectification: Mapping[str, float | str] = field(default_factory=dict)
@@ -64,4 +64,4 @@ class FrontendReport:
     correction: RectificationError | None = None
     ranges: Mapping[str, float | str] = field(default_factory=dict)
     device: str = CPU
-    device_complaint: str = ""
+    device_diagnostic: str = ""

@@ -156,7 +156,7 @@ class FeatureNode(StageNode[FrontendConfig]):
 
     def _report(self, number: int) -> None:
         report = self.stage.report()
-        fallbacks = {"gpu_fallbacks": int(report.device_complaint != "")}
+        fallbacks = {"gpu_fallbacks": int(report.device_diagnostic != "")}
         self.health.take(self.stage.counters | self.pairs.counters | fallbacks)
         for name, value in report.rectification.items():
             self.health.show(f"rectification_{name}", value)
@@ -165,8 +165,8 @@ class FeatureNode(StageNode[FrontendConfig]):
         self.health.show("correction", report.correction.text if report.correction else "")
         self.health.show("picture", report.picture)
         self.health.show("device", report.device)
-        if report.device_complaint:
-            self.get_logger().warning(report.device_complaint, once=True)
+        if report.device_diagnostic:
+            self.get_logger().warning(report.device_diagnostic, once=True)
         self.health.show("advice", "; ".join(report.advice))
         few = f"only {number} features" if number < FEW_FEATURES else ""
         diagnostic = few or self.stage.diagnostic

@@ -16,14 +16,14 @@ import numpy as np
 from slam_core.config import Config, parameter
 from slam_core.runtime.in_place import in_place
 from slam_core.types import ByteArray, DepthImage, Features, FeatureSource, Float32Array
-from stereo_frontend.assembly import DepthEstimate, make_features
+from stereo_frontend.assembly import DepthEstimate, MeasuredKeypoints, joined_features
 from stereo_frontend.depth.depth_lookup import sample_depth
 from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.stereo.pixel_noise import PixelNoise, PixelNoiseConfig
 from stereo_frontend.surf.surf_device import SurfDevice
-from stereo_frontend.tracking.tracked_features import MeasuredKeypoints, follow_or_detect
-from stereo_frontend.tracking.tracker import Followed, Tracker
+from stereo_frontend.tracking.tracked_features import begun, followed
+from stereo_frontend.tracking.tracker import Tracker
 
 CLIP = 0.005
 """Share of pixels beyond the black and the white point each."""
@@ -73,39 +73,31 @@ class TofFeatures:
         before, pictures = self.used, self._pictures(image)
         if self._tracker is None or len(pictures) > 1:
             keypoints = _joined([self._extractors[name](picture, image.mask) for name, picture in pictures.items()])
-            sigma_uv = np.repeat(self._noise.sigma(keypoints.size)[:, None], 2, axis=1)
             parts = [
-                MeasuredKeypoints(keypoints, _depth_at(image, keypoints), sigma_uv, np.zeros(len(keypoints), np.int32))
+                MeasuredKeypoints.untracked(keypoints, _depth_at(image, keypoints), self._noise.sigma(keypoints.size))
             ]
         else:
             if self.used != before:
                 self._tracker.forget()
-            parts = self._followed(self._tracker, image, *pictures.popitem())
-        features = [
-            make_features(
-                image.stamp_ns, p.keypoints, p.estimate, p.sigma_uv, image.camera, "tof_optical_frame",
-                max_relative_sigma, p.track_ids,
-            )
-            for p in parts
-        ]  # fmt: skip
-        return features[0] if len(features) == 1 else features[0].joined(features[1])
+            parts = self._tracked(self._tracker, image, *pictures.popitem())
+        return joined_features(parts, image.stamp_ns, image.camera, "tof_optical_frame", max_relative_sigma)
 
-    def _followed(self, tracker: Tracker, image: DepthImage, name: str, picture: ByteArray) -> list[MeasuredKeypoints]:
+    def _tracked(self, tracker: Tracker, image: DepthImage, name: str, picture: ByteArray) -> list[MeasuredKeypoints]:
         """Tracks in the picture of that name, and new keypoints where they are few.
 
         Of tracks without a measured depth the direction counts, with the depth that the motion predicts.
         """
-
-        def measure(followed: Followed) -> DepthEstimate:
-            return _depth_at(image, followed.keypoints).completed(followed.depth, _PREDICTED_SIGMA)
-
-        def detect() -> tuple[Keypoints, DepthEstimate]:
+        parts = []
+        tracks = tracker.follow(picture, image.camera, image.stamp_ns, image.mask)
+        if tracks is not None:
+            estimate = _depth_at(image, tracks.keypoints).completed(tracks.depth, _PREDICTED_SIGMA)
+            parts.append(followed(tracker, tracks, estimate, image.camera, self._noise.sigma))
+        number = parts[0].number_with_depth if parts else 0
+        if tracker.needs_key_frame(number):
             keypoints = self._extractors[name](picture, image.mask)
-            return keypoints, _depth_at(image, keypoints)
-
-        return follow_or_detect(
-            tracker, picture, image.camera, image.stamp_ns, measure, detect, self._noise.sigma, image.mask
-        )
+            estimate = _depth_at(image, keypoints)
+            parts.append(begun(tracker, number, picture, keypoints, estimate, image.camera, self._noise.sigma))
+        return parts
 
     @property
     def masked(self) -> int:

@@ -32,7 +32,7 @@ class SurfDevice:
     Parameters
     ----------
     wanted
-        "cpu"; "gpu", the first GPU; "auto", the same, but without a complaint where there is none; else a part of the
+        "cpu"; "gpu", the first GPU; "auto", the same, but without a word where there is none; else a part of the
         name of an OpenCL device of any kind, or of its platform.
     """
 

@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from slam_core.camera import Camera
 from slam_core.types import ByteArray, Float32Array
-from stereo_frontend.assembly import DepthEstimate
+from stereo_frontend.assembly import DepthEstimate, MeasuredKeypoints
 from stereo_frontend.keypoints import Keypoints
-from stereo_frontend.tracking.tracker import Followed, IdArray, Tracker
+from stereo_frontend.tracking.tracker import Followed, Tracker
 
 _SHARE = 0.5
 """Share of the keypoints' noise in that of their tracks.
@@ -22,47 +22,35 @@ submaps are joined: landmarks as sure as the patch contradict each other (two_ro
 """
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredKeypoints:
-    """Keypoints (n) with their depth, sigma_uv (n, 2) px, and track_ids (n,), 0 of those that are not followed."""
-
-    keypoints: Keypoints
-    estimate: DepthEstimate
-    sigma_uv: Float32Array
-    track_ids: IdArray
+Noise = Callable[[Float32Array], Float32Array]
+"""Standard deviations (n,) px of keypoints by their size (n,) px."""
 
 
-def follow_or_detect(
+def followed(
+    tracker: Tracker, tracks: Followed, estimate: DepthEstimate, camera: Camera, noise: Noise
+) -> MeasuredKeypoints:
+    """Features of the ``tracks`` (n), which have the depths of ``estimate`` (n); the tracker learns these."""
+    tracker.measured(tracks, estimate.depth, camera)
+    sigma = np.hypot(tracks.sigma_uv, _SHARE * noise(tracks.keypoints.size)[:, None])
+    return MeasuredKeypoints(tracks.keypoints, estimate, sigma.astype(np.float32), tracks.ids)
+
+
+def begun(
     tracker: Tracker,
+    number: int,
     picture: ByteArray,
+    keypoints: Keypoints,
+    estimate: DepthEstimate,
     camera: Camera,
-    stamp_ns: int,
-    measure: Callable[[Followed], DepthEstimate],
-    detect: Callable[[], tuple[Keypoints, DepthEstimate]],
-    noise: Callable[[Float32Array], Float32Array],
-    mask: ByteArray | None = None,
-) -> list[MeasuredKeypoints]:
-    """Features that were followed into a picture, and where that is too little, what is new in it.
+    noise: Noise,
+) -> MeasuredKeypoints:
+    """Features of the keypoints of a key frame where nothing is followed yet; tracks begin there.
 
-    ``measure`` gives the depth of what was followed, ``detect`` keypoints with depth, ``noise`` the
-    standard deviations (n,) px of keypoints by their size (n,) px. Nothing is followed where ``mask`` is not zero.
+    ``number`` of tracks were measured in it: where that is too few to go on, keypoints without a track count, too.
     """
-    parts = []
-    number = 0
-    followed = tracker.follow(picture, camera, stamp_ns, mask)
-    if followed is not None:
-        estimate = measure(followed)
-        tracker.measured(followed, estimate.depth, camera)
-        number = int(np.isfinite(estimate.depth).sum())
-        sigma = np.hypot(followed.sigma_uv, _SHARE * noise(followed.keypoints.size)[:, None])
-        parts.append(MeasuredKeypoints(followed.keypoints, estimate, sigma.astype(np.float32), followed.ids))
-    if tracker.needs_key_frame(number):
-        keypoints, estimate = detect()
-        free = np.flatnonzero(tracker.is_free(keypoints.uv))
-        keypoints, estimate = keypoints.select(free), estimate.select(free)
-        ids = tracker.begin(picture, keypoints, estimate.depth, camera)
-        if not tracker.has_lost_sight(number):
-            estimate.depth[ids == 0] = np.nan
-        sigma = np.repeat(noise(keypoints.size)[:, None], 2, axis=1)
-        parts.append(MeasuredKeypoints(keypoints, estimate, sigma, ids))
-    return parts
+    free = np.flatnonzero(tracker.is_free(keypoints.uv))
+    keypoints, estimate = keypoints.select(free), estimate.select(free)
+    ids = tracker.begin(picture, keypoints, estimate.depth, camera)
+    if not tracker.has_lost_sight(number):
+        estimate.depth[ids == 0] = np.nan
+    return dataclasses.replace(MeasuredKeypoints.untracked(keypoints, estimate, noise(keypoints.size)), track_ids=ids)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth of the features of a pair: matched, disparity refined, ``d = f b / (u_left - u_right)`` (Eqs. 4.3-4.4)."""
+
+from __future__ import annotations
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from slam_core.geometry import FloatArray
+from slam_core.types import Counters, Float32Array, StereoImages
+from stereo_frontend.assembly import DepthEstimate
+from stereo_frontend.frontend_config import FrontendConfig
+from stereo_frontend.keypoints import Keypoints
+from stereo_frontend.stereo.disparity import RefinedDisparity, refine_disparity
+from stereo_frontend.stereo.matching import (
+    Matches,
+    disparity_bounds,
+    has_consistent_neighbour,
+    match_stereo,
+    swapped_share,
+)
+from stereo_frontend.stereo.pixel_noise import PixelNoise
+from stereo_frontend.stereo.self_calibration import StereoSelfCalibration
+from stereo_frontend.stereo.two_view_consistency import StereoView
+from stereo_frontend.tracking.tracker import Followed
+
+_NEIGHBOURS = 16
+"""A match must share its disparity with one of so many neighbours; 0 switches it off."""
+_FEW_TRUSTED = 0.1
+"""Share of keypoints with a trusted disparity below which the sign of the disparities is questioned."""
+_SWAPPED_SHARE = 0.6
+_SWAPPED_MATCHES = 30
+
+
+class StereoDepth:
+    """Measures depths in rectified pairs, and learns from them the noise of pixels and the rectification's error."""
+
+    def __init__(self, config: FrontendConfig, pool: ThreadPoolExecutor, counters: Counters) -> None:
+        self._config = config
+        self._pool = pool
+        self.counters = counters
+        self.noise = PixelNoise(config.noise)
+        self.calibration = StereoSelfCalibration(config.self_calibration)
+        self._wide = self.calibration.widened(config.matching)
+
+    def reset(self) -> None:
+        """Forget noise and the rectification's error."""
+        self.noise.reset()
+        self.calibration.reset()
+
+    def learn(self, images: StereoImages, left: Keypoints, refined: RefinedDisparity) -> None:
+        """Learn the rectification's error from left keypoints (n), described, and their disparities (n)."""
+        self.calibration.learn(self._view(images, left, refined))
+
+    def of_keypoints(
+        self, images: StereoImages, left: Keypoints, right: Keypoints
+    ) -> tuple[DepthEstimate, RefinedDisparity]:
+        """Depth of the left keypoints, and the disparities of those that have one."""
+        focal_baseline = images.stereo.camera.fx * images.stereo.baseline
+        bounds = disparity_bounds(self._config.matching, focal_baseline)
+        matches = self._match(images, left, right, bounds)
+        found = left.select(matches.left)
+        disparity, sigma, refined = self._disparities(images, found.uv, right.uv[matches.right], found.size)
+        if refined.valid.sum() < _FEW_TRUSTED * len(left):
+            self._reject_swapped(left, right, bounds)
+        estimate = DepthEstimate.unknown(len(left))
+        estimate.depth[matches.left] = images.stereo.depth_from_disparity(disparity)
+        estimate.sigma[matches.left] = focal_baseline / disparity**2 * sigma
+        self._count(left, right, len(matches), int(np.isfinite(disparity).sum()))
+        return estimate, refined.select(np.flatnonzero(np.isfinite(disparity)))
+
+    def of_tracks(self, images: StereoImages, followed: Followed) -> DepthEstimate:
+        """Depth by stereo of what was followed, looked for near the predicted depths."""
+        uv, disparity = followed.keypoints.uv, images.stereo.camera.fx * images.stereo.baseline / followed.depth
+        partner = np.column_stack([uv[:, 0] - disparity, uv[:, 1]]).astype(np.float32)
+        disparity, sigma, _ = self._disparities(images, uv, partner)
+        self.counters.add("frames")
+        self.counters.add("tracks", len(uv))
+        estimate = DepthEstimate.unknown(len(uv))
+        estimate.depth[:] = images.stereo.depth_from_disparity(disparity)
+        estimate.sigma[:] = images.stereo.camera.fx * images.stereo.baseline / disparity**2 * sigma
+        return estimate
+
+    def _match(self, images: StereoImages, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> Matches:
+        """Matches along the rows as they are; those of a first pair are found out with a wider band."""
+        calibration = self.calibration
+        if not calibration.knows(images.stereo.camera):
+            wide = match_stereo(left, right, self._wide, bounds)
+            calibration.acquire(self._view_of_keypoints(images, left.select(wide.left), right.select(wide.right)))
+        error = calibration.rows(right.uv, np.zeros(len(right)))
+        aligned = dataclasses.replace(right, uv=right.uv - np.column_stack([np.zeros_like(error), error]))
+        return match_stereo(left, aligned, self._config.matching, bounds)
+
+    def _disparities(
+        self, images: StereoImages, uv: Float32Array, partner: Float32Array, size: Float32Array | None = None
+    ) -> tuple[FloatArray, FloatArray, RefinedDisparity]:
+        """Disparities (n,) px of left pixels whose partners are near ``partner`` (n, 2) px, NaN where not trusted.
+
+        Corrected for what is known of the rectification's error, with their standard deviations; and as measured.
+        ``size`` (n,) px is that of keypoints that were found in both images: their rows tell the noise.
+        """
+        calibration = self.calibration
+        bounds = disparity_bounds(self._config.matching, images.stereo.camera.fx * images.stereo.baseline)
+        row_error = calibration.rows(partner, uv[:, 0] - partner[:, 0])
+        refined = self._refine(images, uv, partner[:, 0], row_error)
+        if size is not None:
+            trusted = refined.valid
+            self.noise.learn((uv - partner)[trusted, 1] + row_error[trusted], size[trusted])
+            self.noise.learn_rectification((refined.row_shift - row_error)[trusted], refined.row_sigma[trusted])
+        correction, correction_sigma = calibration.columns(partner)
+        disparity = refined.disparity + correction
+        disparity[~(disparity >= bounds[0])] = np.nan
+        disparity[~has_consistent_neighbour(uv, disparity, _NEIGHBOURS)] = np.nan
+        sigma = np.sqrt(refined.sigma**2 + self.noise.rectification_sigma**2 + correction_sigma**2)
+        return disparity, sigma, refined
+
+    def _refine(
+        self, images: StereoImages, uv: Float32Array, u_right: Float32Array, row_error: Float32Array
+    ) -> RefinedDisparity:
+        """Half of the matches on each of two threads."""
+
+        def part(which: slice) -> RefinedDisparity:
+            return refine_disparity(
+                images.left, images.right, uv[which], u_right[which], self._config.disparity, row_error[which]
+            )
+
+        half = len(uv) // 2
+        later = self._pool.submit(part, slice(half, None))
+        first = part(slice(half))
+        return RefinedDisparity.joined(first, later.result())
+
+    def _view(self, images: StereoImages, left: Keypoints, refined: RefinedDisparity) -> StereoView:
+        """View that self-calibration learns from."""
+        r = refined
+        measured = (left.uv, r.disparity, r.sigma, r.row_shift, r.row_sigma, self.noise.sigma(left.size))
+        return StereoView(images.stereo, left.descriptors, *(np.asarray(v, np.float64) for v in measured))
+
+    def _view_of_keypoints(self, images: StereoImages, left: Keypoints, right: Keypoints) -> StereoView:
+        """View by keypoints alone, before any alignment of patches."""
+        difference, sigma = left.uv - right.uv, self.noise.sigma(left.size)
+        unaligned = RefinedDisparity(difference[:, 0], sigma, np.ones_like(sigma), -difference[:, 1], sigma)
+        return self._view(images, left, unaligned)
+
+    def _reject_swapped(self, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> None:
+        share, matches = swapped_share(left, right, self._config.matching, bounds)
+        if matches >= _SWAPPED_MATCHES and share > _SWAPPED_SHARE:
+            self.counters.add("swapped")
+            raise ValueError(
+                f"left and right images are swapped: {share:.0%} of {matches} matches have a negative disparity"
+            )
+
+    def _count(self, left: Keypoints, right: Keypoints, matched: int, refined: int) -> None:
+        self.counters.add("frames")
+        self.counters.add("keypoints_left", len(left))
+        self.counters.add("keypoints_right", len(right))
+        self.counters.add("matched", matched)
+        self.counters.add("disparity_rejected", matched - refined)
