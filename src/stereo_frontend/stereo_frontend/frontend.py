@@ -17,14 +17,14 @@ import numpy.typing as npt
 from slam_core.geometry import FloatArray
 from slam_core.types import Counters, DepthImage, Features, StereoImages
 from stereo_frontend.assembly import DepthEstimate, MeasuredKeypoints, joined_features
-from stereo_frontend.depth.tof_depth import TofDepth
 from stereo_frontend.depth.tof_features import TofFeatures
 from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.stereo.matching import is_distinct
 from stereo_frontend.stereo.self_calibration import StereoSelfCalibration
-from stereo_frontend.stereo.stereo_depth import StereoDepth
+from stereo_frontend.stereo_depth import StereoDepth
+from stereo_frontend.tof_depth import TofDepth
 from stereo_frontend.tracking.tracked_features import begun, followed
 from stereo_frontend.tracking.tracker import Tracker
 
@@ -147,7 +147,7 @@ class Frontend:
     def _tracked(
         self, tracker: Tracker, images: StereoImages, depth: DepthImage | None, T_left_tof: FloatArray | None
     ) -> list[MeasuredKeypoints]:
-        """What was followed into the pair; in a frame that has little of it what is new, too."""
+        """Tracks that were followed into the pair; in a frame that has few of them new keypoints, too."""
         camera, sigma, parts = images.stereo.camera, self._stereo_depth.noise.sigma, []
         tracks = tracker.follow(images.left, camera, images.stamp_ns, images.mask)
         if tracks is not None:
@@ -163,7 +163,7 @@ class Frontend:
 
     @property
     def self_calibration(self) -> StereoSelfCalibration:
-        """What is known of the rectification's error."""
+        """The estimate of the rectification's error."""
         return self._stereo_depth.calibration
 
     def reset(self) -> None:
