@@ -95,6 +95,22 @@ def test_backwards_is_what_a_rig_measures_that_goes_the_way_back(bag, tmp_path):
     np.testing.assert_allclose([s.linear_acceleration[2] for s in samples], 9.81)
 
 
+def test_backwards_has_no_time_below_zero(tmp_path):
+    """A recording whose clock begins at 0, with a truth that goes on after the last picture."""
+    path, grey = tmp_path / "zero.mcap", np.zeros((48, 64), dtype=np.uint8)
+    with BagWriter(path) as file:
+        writer = SensorWriter(file)
+        writer.extrinsics(0, {LEFT_FRAME: T_BASE_OPTICAL})
+        for k in range(3):
+            writer.stereo(k * STEP_NS, grey, grey, (CameraInfo(CAMERA), RIGHT))
+        for k in range(6):
+            writer.ground_truth(k * STEP_NS, make_transform(np.eye(3), np.array([float(k), 0.0, 0.0])))
+    readings, _, truth = read(path, "backwards", tmp_path)
+    assert [r.stamp_ns for r in readings] == [3 * STEP_NS, 4 * STEP_NS, 5 * STEP_NS]
+    assert list(truth.stamps_ns) == [k * STEP_NS for k in range(6)]
+    np.testing.assert_array_equal(truth.poses[:, 0, 3], np.arange(6)[::-1])
+
+
 def test_gamma_brightens_pictures_and_leaves_depth(bag, tmp_path):
     readings, _, _ = read(bag, "gamma 0.6", tmp_path)
     pairs, depths = ([r for r in readings if isinstance(r, kind)] for kind in (StereoReading, DepthReading))
