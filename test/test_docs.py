@@ -15,6 +15,7 @@ from pathlib import Path
 import click
 import pytest
 
+import indoor_slam
 from slam_bringup.cli import slam
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -118,3 +119,6 @@ def test_the_site_builds_without_warnings(tmp_path):
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert (tmp_path / "nodes" / "index.html").exists()
+    library = (tmp_path / "library" / "index.html").read_text(encoding="utf-8")
+    assert [name for name in indoor_slam.__all__ if f'id="indoor_slam.{name}"' not in library] == []
+    assert ":class:" not in library
