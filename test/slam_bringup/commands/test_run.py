@@ -128,7 +128,7 @@ def test_who_gives_up_keeps_the_map(tmp_path, monkeypatch):
         run_bag(bag, system, session=session, stopped=lambda: next(asked) >= 20)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("slam_bringup.commands.run.run_bag", given_up)
+    monkeypatch.setattr("slam_bringup.jobs.recording_run.run_bag", given_up)
     result = run(str(DEMO), "-o", str(tmp_path / "out"))
     assert result.exit_code == INTERRUPTED
     assert f"the map is in {tmp_path / 'out' / 'map'}" in result.output

@@ -11,10 +11,12 @@ Functions are pure and give the same bytes wherever they run, as long as the wor
 from __future__ import annotations
 
 import os
+import uuid
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from slam_core.runtime.blas_threads import use_one_blas_thread
@@ -32,6 +34,12 @@ class Tasks(Protocol):
     def gather(self, handles: Sequence[Any]) -> list[Any]:
         """The results; what a task raised is raised here."""
 
+    def channel(self, handler: Callable[[Any], None]) -> Callable[[Any], None]:
+        """A function that tasks may be given to tell ``handler`` something while they run, numbers and texts alone.
+
+        A task's first call comes from its own thread, later ones from any. What several tasks tell comes in any order.
+        """
+
 
 class InProcess:
     """Runs each function at once; a handle is the result itself."""
@@ -47,6 +55,10 @@ class InProcess:
     def gather(self, handles: Sequence[Any]) -> list[Any]:
         """The handles, which are the results."""
         return list(handles)
+
+    def channel(self, handler: Callable[[Any], None]) -> Callable[[Any], None]:
+        """The handler itself."""
+        return handler
 
 
 class OnCluster:
@@ -77,6 +89,28 @@ class OnCluster:
         """
         with _told():
             return list(self._client.gather(list(handles)))
+
+    def channel(self, handler: Callable[[Any], None]) -> Callable[[Any], None]:
+        """A function that logs an event of Dask's, which ``handler`` is told on a thread of the client."""
+        topic = f"slam-{uuid.uuid4().hex}"
+        with _told():
+            self._client.subscribe_topic(topic, lambda event: handler(event[1]))
+        return _Channel(topic)
+
+
+@dataclass
+class _Channel:
+    """Tells the process that made it something from a worker."""
+
+    topic: str
+    _worker: Any = None
+
+    def __call__(self, value: Any) -> None:
+        if self._worker is None:  # only the task's own thread knows it
+            from distributed import get_worker
+
+            self._worker = get_worker()  # type: ignore[no-untyped-call]
+        self._worker.log_event(self.topic, value)
 
 
 @contextmanager

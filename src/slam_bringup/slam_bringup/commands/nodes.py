@@ -35,7 +35,7 @@ _PAGE_PORT = 8080
 
 
 @click.command()
-@mapping_options
+@mapping_options()
 @click.option("--rate", type=click.FloatRange(min=0.0), default=0.0, help="speed of the replay [as fast as it goes]")
 @click.option("--view", is_flag=True, help="show the nodes at work on a page in the browser")
 @click.option("--composed", is_flag=True, help="all nodes in one process, on a thread each")

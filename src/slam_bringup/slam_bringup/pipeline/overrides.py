@@ -58,6 +58,10 @@ class Overrides:
             name: value for pattern, values in self.rules if pattern == _EVERY_NODE for name, value in values.items()
         }
 
+    def with_values(self, content: Mapping[Any, Any], origin: str) -> Overrides:
+        """These rules, and after them those of a mapping."""
+        return Overrides(self.origin, (*self.rules, *overrides_of(content, origin).rules))
+
 
 def read_overrides(path: Path) -> Overrides:
     """The rules of a YAML file.

@@ -10,8 +10,6 @@ from __future__ import annotations
 import io
 import logging
 import platform
-import shlex
-import sys
 import time
 from pathlib import Path
 from types import TracebackType
@@ -31,7 +29,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from slam_core.runtime.process_life import STARTED_S
+from slam_core.runtime.process_life import STARTED_S, command_line
 from slam_core.storage.files import atomic_text
 
 LOG_NAME = "slam.log"
@@ -39,7 +37,7 @@ LOG_NAME = "slam.log"
 
 _VERBOSITY, _HANDLER = "slam.verbosity", "slam.handler"
 _LEVELS = (logging.ERROR, logging.WARNING, logging.INFO, logging.DEBUG)
-_FOREIGN = ("matplotlib", "numba", "PIL", "trimesh", "websockets", "asyncio", "viser")
+_FOREIGN = ("matplotlib", "numba", "PIL", "trimesh", "websockets", "asyncio", "viser", "distributed", "tornado")
 """Libraries whose own messages help nobody here."""
 
 
@@ -109,7 +107,7 @@ class Transcript:
     def __init__(self, version: str) -> None:
         self._lines = [
             f"slam {version}, Python {platform.python_version()}, {platform.platform()}",
-            f"command: {shlex.join(['slam', *sys.argv[1:]])}",
+            f"command: {command_line()}",
             time.strftime("started: %Y-%m-%d %H:%M:%S %z"),
         ]
         self._handler = _Keeper(self._lines)

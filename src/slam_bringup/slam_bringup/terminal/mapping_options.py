@@ -13,7 +13,7 @@ import click
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import ROLES
 from slam_bringup.pipeline.configuration import MAPPERS, ODOMETRIES
-from slam_bringup.pipeline.overrides import Overrides, overrides_of, read_overrides
+from slam_bringup.pipeline.overrides import Overrides, read_overrides
 from slam_bringup.terminal.paths import UserPath, calibration_option, overwrite_option
 from slam_viewer.results import RunResult
 from stereo_frontend.fiducials.detector import DICTIONARIES
@@ -58,12 +58,11 @@ def tag_parameters() -> dict[str, dict[str, Any]]:
 def own_overrides(config: Path | None) -> Overrides:
     """Overrides of the user: those of a file, then those of options with a name of their own."""
     own = Overrides() if config is None else read_overrides(config)
-    return Overrides(own.origin, (*own.rules, *overrides_of(tag_parameters(), "command line").rules))
+    return own.with_values(tag_parameters(), "command line")
 
 
 # fmt: off
 _BAG_OPTIONS = (
-    click.argument("bag", type=UserPath(exists=True)),
     click.option(
         "-o", "--output", type=UserPath(file_okay=False), required=True, help="folder to write"
     ),
@@ -119,9 +118,26 @@ def rig_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return reduce(lambda decorated, option: option(decorated), reversed(_RIG_OPTIONS), command)
 
 
-def mapping_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the argument BAG and the options of mapping one."""
-    return reduce(lambda decorated, option: option(decorated), reversed(_BAG_OPTIONS), rig_options(command))
+def mapping_options(*, many: bool = False) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Give a command the argument BAG, or one or ``many`` of them, and the options of mapping."""
+    bag = click.argument("bag", type=UserPath(exists=True))
+    bags = click.argument("bags", nargs=-1, required=True, metavar="BAG...", type=UserPath(exists=True))
+    options = (bags if many else bag, *_BAG_OPTIONS)
+    return lambda command: reduce(lambda made, option: option(made), reversed(options), rig_options(command))
+
+
+def worker_options(what: str = "") -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Give a command the options that say where its tasks run; ``what`` begins their help."""
+    scheduler = click.option(
+        "--scheduler", metavar="ADDRESS",
+        help=f"{what}run on the Dask cluster of this scheduler, tcp://HOST:8786 or tls://...",
+    )  # fmt: skip
+    workers = click.option(
+        "--workers", type=click.IntRange(min=0), metavar="N",
+        help=f"{what}processes on this machine; 0: in this one alone "
+        "[as many as processors; 0 without the package distributed]",
+    )  # fmt: skip
+    return lambda command: scheduler(workers(command))
 
 
 def map_folder(old: Path | None, *, localize_only: bool) -> Path | None:

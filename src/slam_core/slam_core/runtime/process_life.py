@@ -7,13 +7,20 @@ import atexit
 import ctypes
 import faulthandler
 import os
+import shlex
 import signal
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import FrameType
 
 STARTED_S = time.monotonic()
 """Start of this program; whoever measures it imports this module first."""
+
+_FOR = ContextVar[tuple[tuple[str, ...], float] | None]("slam_works_for", default=None)
+"""Arguments of the command that this process works for and when it began to, where that is not its own command."""
 
 INTERRUPTED = 130
 """Exit code of a program that Ctrl-C has ended."""
@@ -28,6 +35,28 @@ _parent: list[int] = []
 """The process that this one ends with, once it is known."""
 
 _Handler = Callable[[int, FrameType | None], None]
+
+
+@contextmanager
+def working_for(arguments: Sequence[str]) -> Iterator[None]:
+    """Work for the command ``arguments`` of another process from here to the end of the block, as a worker does."""
+    token = _FOR.set((tuple(arguments), time.monotonic()))
+    try:
+        yield
+    finally:
+        _FOR.reset(token)
+
+
+def command_line() -> str:
+    """The command that this process works for, as a user types it."""
+    other = _FOR.get()
+    return shlex.join(["slam", *(sys.argv[1:] if other is None else other[0])])
+
+
+def seconds_since_start() -> float:
+    """Time since that command, or a worker's part of it, has begun, s."""
+    other = _FOR.get()
+    return time.monotonic() - (STARTED_S if other is None else other[1])
 
 
 def end_with_parent() -> None:

@@ -10,8 +10,6 @@ own ``trajectory_<agent>.tum``; ``trajectory.tum`` is then the first one's.
 from __future__ import annotations
 
 import json
-import shlex
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ from dense_mapping.plans.floor_plan import FloorPlan
 from dense_mapping.plans.plan_io import plan_names, write_plan
 from dense_mapping.reconstruction.surface_io import write_glb, write_mesh, write_points
 from slam_core.runtime.memory import leave_libraries
-from slam_core.runtime.process_life import STARTED_S
+from slam_core.runtime.process_life import command_line, seconds_since_start
 from slam_core.storage.files import atomic_text
 from slam_core.version import VERSION
 from slam_viewer.report.figures import map_figure, save_png
@@ -68,13 +66,12 @@ def write_results(
 
 def _made() -> dict[str, str]:
     """By what, how and when the results were made."""
-    command = shlex.join(["slam", *sys.argv[1:]])
-    return {"version": VERSION, "command": command, "date": time.strftime("%Y-%m-%d %H:%M:%S %z")}
+    return {"version": VERSION, "command": command_line(), "date": time.strftime("%Y-%m-%d %H:%M:%S %z")}
 
 
 def _in_all(result: RunResult) -> dict[str, float]:
     """The time that the user waits: from the start of the program until now, dense model and files included."""
-    total_s = time.monotonic() - STARTED_S
+    total_s = seconds_since_start()
     return {"total_s": total_s, "total_real_time_factor": result.sensor_s / total_s}
 
 
