@@ -47,6 +47,7 @@ NOT_RUN = {
     r"\./slam nodes": "starts processes; test/integration/test_executables.py runs it",
     r"\./slam view": "serves a page until Ctrl-C; test/slam_viewer/page looks at it",
     r"\./slam live ": "needs a camera",
+    r"\./slam run .*--scheduler ": "needs a cluster; test_run_many.py maps bags on workers",
     r"\./slam merge ": "takes finished maps; test/slam_bringup/commands/test_merge.py makes some and merges them",
     r"(\S*/)?dask ": "serves a cluster until Ctrl-C; test/sjsam_node/regions/test_tasks.py starts one",
     r"\./slam post ": "runs until Ctrl-C; test/slam_bringup/commands/test_live.py looks at what it starts",

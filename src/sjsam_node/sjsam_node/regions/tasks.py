@@ -10,16 +10,20 @@ Functions are pure and give the same bytes wherever they run, as long as the wor
 
 from __future__ import annotations
 
+import logging
 import os
+import time
 import uuid
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, Protocol, TypeVar
 
-from slam_core.runtime.blas_threads import use_one_blas_thread
+_LOG = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 class Tasks(Protocol):
@@ -61,41 +65,106 @@ class InProcess:
         return handler
 
 
-class OnCluster:
-    """Runs functions on the workers of a Dask client; a lost worker's tasks run again on another one."""
+class ClusterLost(ValueError):
+    """The scheduler, or the link to it, is gone, and with it all results."""
 
-    def __init__(self, client: Any) -> None:
-        self._client = client
+
+@dataclass(eq=False)
+class _Task:
+    """A function and its arguments, other tasks among them; kept so that it can be given to a cluster once more.
+
+    future: of the result, on the cluster of ``client``.
+    """
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    future: Any = None
+    client: Any = None
+
+
+class OnCluster:
+    """Runs functions on the workers of a Dask client; a lost worker's tasks run again on another one.
+
+    Parameters
+    ----------
+    client
+        A client of the cluster.
+    again
+        Gives a client of the cluster that was started again after it was lost: all tasks whose results may still be
+        asked for run once more there. Without it a lost cluster ends the work.
+    """
+
+    def __init__(self, client: Any, again: Callable[[], Any] | None = None) -> None:
+        self._client, self._again = client, again
+        self._channels: list[tuple[str, Callable[[Any], None]]] = []
 
     def hold(self, value: Any) -> Any:
-        """A future of a value that is sent to the cluster once; the scheduler sends it again if its worker is lost."""
-        with _told(), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Sending large graph")
-            return self._client.submit(_same, value, pure=False)
+        """A handle of a value that is sent to the cluster once; it is sent again if its worker is lost."""
+        return self.submit(_same, value)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """A future of the result of a function."""
-        with _told():
-            return self._client.submit(function, *arguments, pure=False)
+        """A handle of the result of a function."""
+        task = _Task(function, arguments)
+        self._surviving(lambda: self._future(task))
+        return task
 
     def gather(self, handles: Sequence[Any]) -> list[Any]:
         """The results, once all are there.
 
         Raises
         ------
+        ClusterLost
+            If the cluster was lost for good, which ``hold`` and ``submit`` raise too.
         ValueError
-            If the cluster was lost, which ``hold`` and ``submit`` raise too, or the same task took several workers with
-            it.
+            If the same task took several workers with it.
         """
-        with _told():
-            return list(self._client.gather(list(handles)))
+        return self._surviving(lambda: list(self._client.gather([self._future(task) for task in handles])))
 
     def channel(self, handler: Callable[[Any], None]) -> Callable[[Any], None]:
         """A function that logs an event of Dask's, which ``handler`` is told on a thread of the client."""
-        topic = f"slam-{uuid.uuid4().hex}"
-        with _told():
-            self._client.subscribe_topic(topic, lambda event: handler(event[1]))
-        return _Channel(topic)
+        self._channels.append((f"slam-{uuid.uuid4().hex}", handler))
+        self._surviving(lambda: self._listen(*self._channels[-1]))
+        return _Channel(self._channels[-1][0])
+
+    def close(self) -> None:
+        """Leave the cluster."""
+        self._client.close()
+
+    def _listen(self, topic: str, handler: Callable[[Any], None]) -> None:
+        self._client.subscribe_topic(topic, lambda event: handler(event[1]))
+
+    def _future(self, task: _Task) -> Any:
+        """The future of a task; it is given to the cluster first if this one does not know it."""
+        if task.client is not self._client:
+            arguments = [self._future(a) if isinstance(a, _Task) else a for a in task.arguments]
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Sending large graph")
+                task.future = self._client.submit(task.function, *arguments, pure=False)
+            task.client = self._client
+        return task.future
+
+    def _surviving(self, ask: Callable[[], T]) -> T:
+        """The result of asking the cluster, also if it is started again meanwhile."""
+        while True:
+            try:
+                with _told():
+                    return ask()
+            except ClusterLost as lost:
+                if self._again is None:
+                    raise
+                _LOG.warning("the Dask cluster was lost; its work is done again once it is back")
+                self._client = self._go_on(self._again, lost)
+                for topic, handler in self._channels:
+                    self._listen(topic, handler)
+
+    def _go_on(self, again: Callable[[], Any], lost: ClusterLost) -> Any:
+        """A client of the cluster as it is now, in the place of the one that lost it."""
+        with suppress(Exception):  # what is lost cannot always be left in good order
+            self._client.close(timeout=1)
+        try:
+            return again()
+        except ValueError as error:
+            raise lost from error
 
 
 @dataclass
@@ -128,7 +197,7 @@ def _told() -> Iterator[None]:
             f"(--memory-limit), or fewer a host: {error}"
         ) from error
     except (CommClosedError, CancelledError, ClosedClientError) as error:
-        raise ValueError(f"the Dask cluster was lost: start it again, then the same command: {error}") from error
+        raise ClusterLost(f"the Dask cluster was lost: start it again, then the same command: {error}") from error
 
 
 def _same(value: Any) -> Any:
@@ -155,8 +224,8 @@ def cluster(scheduler: str | None = None, workers: int | None = None) -> Iterato
     if workers == 0:
         yield InProcess()
         return
-    with _client(scheduler, workers or 0) as client:
-        yield OnCluster(client)
+    with _of_this_machine(workers or 0) if scheduler is None else _of_scheduler(scheduler) as tasks:
+        yield tasks
 
 
 def _has_distributed() -> bool:
@@ -168,30 +237,76 @@ def _has_distributed() -> bool:
 
 
 @contextmanager
-def _client(scheduler: str | None, workers: int) -> Iterator[Any]:
-    import dask
+def _of_this_machine(workers: int) -> Iterator[OnCluster]:
     from distributed import Client, LocalCluster  # a second to import, and needed here alone
 
-    if scheduler is None:
-        here = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
-        with LocalCluster(**here) as local, Client(local) as client:  # type: ignore[no-untyped-call]
-            client.run(use_one_blas_thread)
-            yield client
-        return
-    try:
-        client = Client(scheduler, timeout=_PATIENCE)  # type: ignore[no-untyped-call]
-    except (OSError, TimeoutError, ValueError) as error:
-        raise ValueError(f"no Dask scheduler answers at {scheduler}: {error}") from error
-    with client, dask.config.set({"distributed.comm.timeouts.connect": _PATIENCE}):
+    from sjsam_node.regions.worker_setup import OneBlasThread
+
+    here = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    with LocalCluster(**here) as local, Client(local) as client:  # type: ignore[no-untyped-call]
+        client.register_plugin(OneBlasThread())
+        yield OnCluster(client)
+
+
+@contextmanager
+def _of_scheduler(address: str) -> Iterator[OnCluster]:
+    import dask
+
+    with dask.config.set({"distributed.comm.timeouts.connect": f"{_PATIENCE_S} s"}):
+        tasks = OnCluster(_connected(address), partial(_connected_again, address))
         try:
-            client.get_versions(check=True)  # type: ignore[no-untyped-call]
-        except ValueError as error:
-            raise ValueError(f"the cluster at {scheduler} has other versions than this program: {error}") from error
+            yield tasks
+        finally:
+            tasks.close()
+
+
+def _connected(address: str) -> Any:
+    """A client of the scheduler at an address, whose workers are set up.
+
+    Raises
+    ------
+    ValueError
+        If nobody answers there, it has no workers, or other versions.
+    """
+    from distributed import Client
+
+    from sjsam_node.regions.worker_setup import OneBlasThread
+
+    try:
+        client = Client(address, timeout=_PATIENCE_S)  # type: ignore[no-untyped-call]
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ValueError(f"no Dask scheduler answers at {address}: {error}") from error
+    try:
+        client.get_versions(check=True)  # type: ignore[no-untyped-call]
         if not client.scheduler_info()["workers"]:  # type: ignore[no-untyped-call]
-            raise ValueError(f"the scheduler at {scheduler} has no workers: start them with 'dask worker {scheduler}'")
-        client.run(use_one_blas_thread)  # type: ignore[no-untyped-call]
-        yield client
+            raise NoWorkers(f"the scheduler at {address} has no workers: start them with 'dask worker {address}'")
+        client.register_plugin(OneBlasThread())
+    except NoWorkers:
+        client.close()  # type: ignore[no-untyped-call]
+        raise
+    except ValueError as error:
+        client.close()  # type: ignore[no-untyped-call]
+        raise ValueError(f"the cluster at {address} has other versions than this program: {error}") from error
+    return client
 
 
-_PATIENCE = "10s"
-"""Time that a scheduler has to answer."""
+class NoWorkers(ValueError):
+    """A scheduler has no workers."""
+
+
+def _connected_again(address: str) -> Any:
+    """A client of the scheduler at an address as soon as it and a worker are there again."""
+    deadline = time.monotonic() + _RETURN_S
+    while True:
+        try:
+            return _connected(address)
+        except (ValueError, OSError, TimeoutError):
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.2)
+
+
+_PATIENCE_S = 10
+"""Time that a scheduler has to answer, s."""
+_RETURN_S = 60.0
+"""Time within which a cluster that was lost has to be back, s."""
