@@ -173,6 +173,11 @@ class EkfSlam:
         return self._shutter.readout_s, self._shutter.sigma_s
 
     @property
+    def readout_seen_s(self) -> tuple[float, float]:
+        """That time as the frames alone show it, certain or not, and its standard error, s; zeros for too few."""
+        return self._shutter.seen_s
+
+    @property
     def imu_time_offset_s(self) -> tuple[float, float]:
         """Time to be added to the IMU's stamps, as learnt, and its standard deviation, s; zeros without an IMU."""
         inertial = self._aids.inertial

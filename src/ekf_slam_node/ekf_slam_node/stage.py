@@ -134,6 +134,11 @@ class FilterStage:
         return (0.0, 0.0) if self._slam is None else self._slam.readout_s
 
     @property
+    def readout_seen_s(self) -> tuple[float, float]:
+        """That time as the frames alone show it, certain or not, and its standard error, s; zeros for too few."""
+        return (0.0, 0.0) if self._slam is None else self._slam.readout_seen_s
+
+    @property
     def diagnostic(self) -> str:
         """Findings about camera and odometry that a user should know of, or ""."""
         return "; ".join(filter(None, [self.shutter_finding, self.clock_finding, self.odometry_finding]))

@@ -42,6 +42,8 @@ class AgentResult:
     """Findings about the images."""
     lost_share: float = 0.0
     """Share of its frames at which it was lost."""
+    readout_seen_s: tuple[float, float] = (0.0, 0.0)
+    """Time from a picture's first row to its last as its frames alone show it, and its standard error, s."""
     sensors: tuple[str, ...] = ()
     """Sensors that its map is made of, in words."""
     frames: tuple[LoggedFrame, ...] = ()

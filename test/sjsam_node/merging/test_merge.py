@@ -193,6 +193,19 @@ def test_maps_that_share_no_place_stay_parts(days):
     assert merged.closures == 0
 
 
+def test_maps_whose_submaps_are_too_sure_of_themselves_stay_one_map():
+    """Maps of one submap each contradict nothing once their closures are gone: that does not speak against these."""
+    short = [day(k, turns=(0.03 * k, 0.03 * k + 0.1)).records[0].submap for k in range(1, 6)]
+    maps = []
+    for k, submap in enumerate(short):
+        built = GlobalMap()
+        built.add(replace(submap, covariance=submap.covariance / 25.0))
+        maps.append(NamedMap(f"day {k}", built.stored()))
+    merged = merge(maps, GlobalMapConfig(), InProcess())
+    assert len(merged.parts) == 1
+    assert "contradict each other" in merged.map.snapshot().overconfidence
+
+
 def test_an_agent_whose_session_another_map_has_is_renamed_and_that_is_said(days):
     other = day(1, turns=(0.3, 1.0))
     shifted = NamedMap("other", other.stored)

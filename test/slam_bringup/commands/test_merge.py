@@ -69,7 +69,7 @@ def test_a_map_and_a_bag_become_one_map_of_the_same_bytes_with_any_number_of_wor
 def test_a_bag_is_mapped_as_slam_run_maps_it(days, tmp_path):
     done = call("run", days[1], "-o", tmp_path / "second")
     assert done.exit_code == 0, done.output
-    mapped = storage.pack(map_of_bag(days[1], Overrides()))
+    mapped = storage.pack(map_of_bag(days[1], Overrides()).stored)
     of_run = storage.pack(storage.read(tmp_path / "second" / "map"))
     assert mapped.manifest == of_run.manifest
     assert {n: v.tobytes() for n, v in mapped.arrays.items()} == {n: v.tobytes() for n, v in of_run.arrays.items()}

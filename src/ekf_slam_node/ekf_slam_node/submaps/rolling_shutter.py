@@ -91,6 +91,7 @@ class RollingShutter:
         self._evidence: deque[tuple[float, float]] = deque(maxlen=_MAX_FRAME_PAIRS)
         self._known = known
         self._readout_s, self._sigma_s = known
+        self._seen_s = 0.0, 0.0
         self._frames = 0
 
     @property
@@ -102,6 +103,11 @@ class RollingShutter:
     def sigma_s(self) -> float:
         """Standard deviation of the readout, s; 0 while nothing is known."""
         return self._sigma_s
+
+    @property
+    def seen_s(self) -> tuple[float, float]:
+        """Readout as the frames alone show it, certain or not, and its standard error, s; zeros for too few frames."""
+        return self._seen_s
 
     def corrected(self, frame: Frame, dt: float, T_previous_now: FloatArray | None = None) -> Frame:
         """The frame, dt (s) after the last, with its features where the middle row's instant has them.
@@ -143,7 +149,8 @@ class RollingShutter:
         """Take in the readout of one pair of frames and its standard deviation, s."""
         self._evidence.append((readout, np.hypot(sigma, _PAIR_SIGMA_S)))
         if len(self._evidence) >= _MIN_PAIRS:
-            mean, standard_error = self._with_known(*_robust_mean(*np.array(self._evidence).T))
+            self._seen_s = _robust_mean(*np.array(self._evidence).T)
+            mean, standard_error = self._with_known(*self._seen_s)
             # What was once beyond doubt is not given up for being a little less so: the map rests on it.
             least = _CERTAIN if self._readout_s == 0.0 else _DOUBTED
             self._readout_s = mean if abs(mean) > least * standard_error else 0.0

@@ -3,7 +3,9 @@
 
 Such a part is optimised with few of the landmarks that its submaps share, and keeps the variance factor that all of
 them had. If the submaps contradict each other still, closures are removed, the worst ones first, if that helps. If it
-does not, the matches between neighbours are: the filter's own chain of submaps stays.
+does not, the matches between neighbours are: the filter's own chain of submaps stays. Closures without which the part
+falls apart are kept: of two maps that nothing else ties neither can contradict the other any more, so that their
+removal always helps and says nothing.
 """
 
 from __future__ import annotations
@@ -40,8 +42,9 @@ class OverconfidenceTest:
         return worst_closures(state, closures, state.component(record), self.window)
 
     def helps(self, before: EstimateState, after: EstimateState, record: int) -> bool:
-        """True if what was removed between two states was the cause of the contradictions."""
-        return reduced_chi2(after, record) <= _RELIEF * reduced_chi2(before, record)
+        """True if what was removed between two states was the cause of the contradictions, and ties nothing alone."""
+        is_whole = len(after.components()) == len(before.components())
+        return is_whole and reduced_chi2(after, record) <= _RELIEF * reduced_chi2(before, record)
 
     def _is_over(self, state: EstimateState, component: int) -> bool:
         return state.result(component).reduced_chi2 > self.config.max_variance_factor

@@ -15,7 +15,7 @@ from slam_bringup.jobs.merged_run import merged_result, parts_text, read_inputs
 from slam_bringup.pipeline.configuration import system_config
 from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.terminal.console import LOG_NAME, Transcript, is_quiet, progress_bar, show
-from slam_bringup.terminal.mapping_options import own_overrides
+from slam_bringup.terminal.mapping_options import own_overrides, worker_options
 from slam_bringup.terminal.paths import UserPath, overwrite_option
 from slam_core.storage.output_folder import LOGS, OutputFolder
 from slam_core.version import VERSION
@@ -26,13 +26,7 @@ from slam_viewer.report.summary_table import summary_table
 @click.command()
 @click.argument("inputs", nargs=-1, required=True, metavar="MAP|BAG...", type=UserPath(exists=True))
 @click.option("-o", "--output", type=UserPath(file_okay=False), required=True, help="folder to write")
-@click.option(
-    "--scheduler", metavar="ADDRESS", help="run on the Dask cluster of this scheduler, tcp://HOST:8786 or tls://..."
-)
-@click.option(
-    "--workers", type=click.IntRange(min=0), metavar="N",
-    help="processes on this machine; 0: in this one alone [as many as processors; 0 without the package distributed]",
-)  # fmt: skip
+@worker_options()
 @click.option(
     "--config", type=UserPath(exists=True, dir_okay=False), help="YAML, one group per node, as in docs/parameters.md"
 )
@@ -56,16 +50,16 @@ def command(
     with results, transcript, results.staged() as folder:
         with cluster(scheduler, workers) as tasks, progress_bar() as progress:
             task = progress.add_task("reading and mapping", total=len(paths))
-            maps = read_inputs(paths, own, tasks, lambda: progress.advance(task))
 
             def on_step(step: str, done: int, total: int) -> None:
                 progress.update(task, description=step, completed=done, total=total)
 
-            merged = merge(maps, system.sjsam, tasks, on_step)
-        result = merged_result(merged, [path.name for path in paths], time.perf_counter() - began)
+            read = read_inputs(paths, own, tasks, on_step)
+            merged = merge(read.maps, system.sjsam, tasks, on_step)
+        result = merged_result(merged, [path.name for path in paths], time.perf_counter() - began, read.notes)
         with Console(stderr=True, quiet=is_quiet()).status(f"writing {output}"):
             summary = write_results(folder, result, lambda path: merged.map.save(path))
             transcript.write(folder / LOGS / LOG_NAME, summary_table(summary, output))
-    for line in filter(None, (*merged.notes, parts_text(merged))):
+    for line in filter(None, (*read.notes, *merged.notes, parts_text(merged))):
         click.echo(f"slam: {line}", err=True)
     show(summary_table(summary, output))

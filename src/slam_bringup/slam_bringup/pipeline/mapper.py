@@ -75,6 +75,7 @@ class Mapper:
             self._process_waiting(agent)
             for text in filter(None, (stage.diagnostic, stage.moving_objects)):
                 self._events.append(f"{agent}: {text}" if agent else text)
+            self._diaries[agent].readout_seen_s = stage.readout_seen_s
             last += stage.start_session()  # which no frame begins: the filter forgets its state
         self._hand_over(in_order(last))
         self.session.finish().result()
@@ -193,6 +194,7 @@ class _Diary:
     def __init__(self) -> None:
         self.poses: list[PoseEstimate] = []
         self.scans: list[PoseEstimate] = []
+        self.readout_seen_s = 0.0, 0.0
         self._features: list[int] = []
         self._changes = StateChanges()
 
@@ -203,4 +205,7 @@ class _Diary:
         self._changes.add(estimate.stamp_ns, estimate.state.value, estimate.reason)
 
     def record(self) -> AgentRecord:
-        return AgentRecord(self.poses, self.scans, self._features, self._changes.events, self._changes.lost_share)
+        changes = self._changes
+        return AgentRecord(
+            self.poses, self.scans, self._features, changes.events, changes.lost_share, self.readout_seen_s
+        )

@@ -70,8 +70,9 @@ BACKLOG = ("received", "joined", "waiting", "waiting_at_most")
 class AgentRecord:
     """Estimates of one agent, frame by frame.
 
-    ``events`` are changes of its filter's state, ``lost_share`` how much of the time it was lost, ``front_end`` what
-    its images told, ``frames`` some of its pictures.
+    ``events`` are changes of its filter's state, ``lost_share`` how much of the time it was lost, ``readout_seen_s``
+    the time in which its pictures are read out and its standard error, ``front_end`` what its images told, ``frames``
+    some of its pictures.
     """
 
     filtered: Sequence[PoseEstimate] = field(default_factory=list)
@@ -79,6 +80,7 @@ class AgentRecord:
     feature_counts: Sequence[int] = field(default_factory=list)
     events: Sequence[str] = field(default_factory=list)
     lost_share: float = 0.0
+    readout_seen_s: tuple[float, float] = (0.0, 0.0)
     front_end: FrontendReport = field(default_factory=FrontendReport)
     frames: Sequence[LoggedFrame] = ()
 
@@ -224,6 +226,7 @@ def _agent_result(
         feature_counts=np.array(record.feature_counts, dtype=np.int64),
         front_end=record.front_end,
         lost_share=record.lost_share,
+        readout_seen_s=record.readout_seen_s,
         sensors=_sensors(bag, config, agent, odometry),
         frames=tuple(record.frames),
         base_frame=bag.sensors[agent].base_frame,
