@@ -104,7 +104,7 @@ def test_what_was_found_ahead_changes_nothing(days):
     plain = GlobalMap()
     for submap in union.submaps:
         plain.add(submap)
-    looks = AcrossMaps(union, GlobalMapConfig().closure, InProcess()).looks()
+    looks = AcrossMaps(union, GlobalMapConfig().closure, InProcess()).looks
     assert any(found is not None for found in looks.values())
     plain.settle()
     merged = merge(days, GlobalMapConfig(), InProcess()).map

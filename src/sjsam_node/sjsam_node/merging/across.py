@@ -19,6 +19,7 @@ from sjsam_node.loop_closure.association import Alignment, PointSet
 from sjsam_node.loop_closure.detector import Found, RecordPair, compared
 from sjsam_node.loop_closure.place_recognition import Descriptors, PlaceIndex, PlaceRecognitionConfig, likeness
 from sjsam_node.loop_closure.verification import ALIKE_CANDIDATES, ClosureConfig, Verifier
+from sjsam_node.merging.moved import Moved, moved_between
 from sjsam_node.merging.union import Union
 from sjsam_node.regions.tasks import Tasks
 from slam_core.types import Submap
@@ -82,6 +83,17 @@ def _looked_at(
     return [verifier.by_looks(earlier[first], later[second], (first, second)) for first, second in pairs]
 
 
+def _moved(
+    earlier: dict[int, PointSet],
+    later: dict[int, PointSet],
+    places: list[tuple[tuple[int, int], Alignment | None]],
+    config: ClosureConfig,
+) -> list[Moved | None]:
+    """Things that stood elsewhere, between some pairs of submaps of two maps, which align so."""
+    verifier = Verifier(config)
+    return [moved_between(verifier, earlier[pair[0]], later[pair[1]], place, pair) for pair, place in places]
+
+
 # -- the maps of a merge on the workers --------------------------------------------------------------------------------
 
 
@@ -112,7 +124,8 @@ class AcrossMaps:
             tuple(numbers), tuple(np.array(self._submaps[i].descriptors) for i in numbers), self._config.places
         )
 
-    def looks(self) -> dict[tuple[int, ...], Alignment | None]:
+    @cached_property
+    def looks(self) -> dict[tuple[int, int], Alignment | None]:
         """Alignments by looks of the submaps of different maps that look most alike, as ``Verifier.looks``."""
         pairs = list(combinations(range(self._count), 2))
         handles = [self._tasks.submit(_proposed, self._shards[a], self._shards[b]) for a, b in pairs]
@@ -131,6 +144,16 @@ class AcrossMaps:
         places = [i for _, batch in batches for i in batch]
         found = [one for part in results for one in part]
         return {wanted[i]: one for i, one in zip(places, found, strict=True)}
+
+    def moved(self) -> list[Moved]:
+        """Things of earlier submaps that later ones show elsewhere, between submaps that look alike."""
+        pairs = list(self.looks)
+        batches = self._batches(pairs)
+        work = [(maps, [(pairs[i], self.looks[pairs[i]]) for i in batch]) for maps, batch in batches]
+        places = [i for _, batch in batches for i in batch]
+        found = [one for part in self._run(_moved, work) for one in part]
+        ordered = [one for _, one in sorted(zip(places, found, strict=True), key=lambda pair: pair[0])]
+        return [one for one in ordered if one is not None]
 
     def compare(self, wanted: Sequence[RecordPair]) -> list[Found]:
         """Comparisons, as :attr:`LoopDetector.compare` asks for them."""

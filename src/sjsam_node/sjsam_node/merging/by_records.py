@@ -31,7 +31,7 @@ class ByRecords(Looks):
     """
 
     def __init__(self, merged: GlobalMap, union: Union, across: AcrossMaps) -> None:
-        self._merged, self._across, self._looks = merged, across, across.looks()
+        self._merged, self._across, self._looks = merged, across, across.looks
         self._number = {(s.agent, s.session, s.index): number for number, s in enumerate(union.submaps)}
         self._record = {number: key for key, number in self._number.items()}
 
@@ -40,8 +40,10 @@ class ByRecords(Looks):
         return self._number.get(self._merged.state.graph.records[record].key)
 
     def __getitem__(self, key: tuple[int, ...]) -> Alignment | None:
-        numbers = tuple(number for record in key if (number := self.number(record)) is not None)
-        return self._looks[numbers]
+        first, second = (self.number(record) for record in key)
+        if first is None or second is None:
+            raise KeyError(key)
+        return self._looks[first, second]
 
     def __iter__(self) -> Iterator[tuple[int, ...]]:
         for numbers in self._looks:

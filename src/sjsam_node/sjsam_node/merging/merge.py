@@ -16,6 +16,7 @@ from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.marks import Marks
 from sjsam_node.merging.across import AcrossMaps
 from sjsam_node.merging.by_records import ByRecords
+from sjsam_node.merging.moved import without
 from sjsam_node.merging.union import NamedMap, Union, united
 from sjsam_node.regions.tasks import Tasks
 from sjsam_node.regions.tree_problem import optimized_by_tree
@@ -51,7 +52,12 @@ def merge(
     union = united(maps)
     count, merged = len(union.submaps), GlobalMap(config)
     on_step("recognising places", 0, count)
-    ahead = ByRecords(merged, union, AcrossMaps(union, config.closure, tasks))
+    across = AcrossMaps(union, config.closure, tasks)
+    if moved := across.moved():
+        on_step("recognising places without what was moved", 0, count)
+        union = without(union, moved)
+        across = AcrossMaps(union, config.closure, tasks)
+    ahead = ByRecords(merged, union, across)
     merged.detector.verifier.looks = ahead
     for k, submap in enumerate(union.submaps):
         on_step("joining", k, count)

@@ -17,6 +17,7 @@ from sjsam_node.agents import Key, in_order
 from sjsam_node.graph.map_graph import BUILDING, Record
 from sjsam_node.marks import Mark
 from sjsam_node.storage import StoredMap
+from slam_core.linear_algebra.block_pattern import IntArray
 from slam_core.types import Submap
 
 
@@ -46,12 +47,14 @@ class PlacedMark:
 class Union:
     """All submaps, in the order in which they are joined.
 
-    names: of the maps, in their canonical order; source: the map that each submap is of; notes: lines for the user
-    about what was renamed or left out.
+    names: of the maps, in their canonical order; source: the map that each submap is of; landmarks: of each submap,
+    the landmark of that map that each of its landmarks is there, (n,); notes: lines for the user about what was renamed
+    or left out.
     """
 
     submaps: tuple[Submap, ...]
     source: tuple[int, ...]
+    landmarks: tuple[IntArray, ...]
     names: tuple[str, ...]
     marks: tuple[PlacedMark, ...]
     notes: tuple[str, ...]
@@ -75,8 +78,11 @@ def united(maps: Sequence[NamedMap]) -> Union:
     for number, one in enumerate(ordered):
         taken.add(number, one)
     submaps = in_order(submap for submap, _ in taken.submaps.values())
-    source = tuple(taken.submaps[s.agent, s.session, s.index][1] for s in submaps)
-    return Union(tuple(submaps), source, tuple(m.name for m in ordered), tuple(taken.marks), tuple(taken.notes))
+    source = tuple(taken.submaps[_key(s)][1] for s in submaps)
+    landmarks = tuple(taken.landmarks[_key(s)] for s in submaps)
+    return Union(
+        tuple(submaps), source, landmarks, tuple(m.name for m in ordered), tuple(taken.marks), tuple(taken.notes)
+    )
 
 
 def _canonical(one: NamedMap) -> tuple[int, int, bytes]:
@@ -104,10 +110,12 @@ def _key(submap: Submap) -> Key:
 class _Taken:
     """Holds what was taken over of each map so far.
 
-    submaps: by key, with the map that each is of; keys: under which the submap of each digest is there.
+    submaps: by key, with the map that each is of; landmarks: by key, as that map has joined them; keys: under which the
+    submap of each digest is there.
     """
 
     submaps: dict[Key, tuple[Submap, int]] = field(default_factory=dict)
+    landmarks: dict[Key, IntArray] = field(default_factory=dict)
     keys: dict[bytes, Key] = field(default_factory=dict)
     marks: list[PlacedMark] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -120,7 +128,7 @@ class _Taken:
             self.notes.append(f"{one.name}: all its submaps are in the others; it adds nothing")
         names = self._renamed(one, shared)
         at: dict[int, tuple[Key, bool]] = {}
-        for record in one.records:
+        for k, record in enumerate(one.records):
             submap = replace(record.submap, agent=names.get(record.key[:2], record.submap.agent))
             key = shared.get(record.key, _key(submap))
             at[record.start], at[record.end] = at.get(record.start, (key, False)), (key, True)
@@ -129,6 +137,7 @@ class _Taken:
             if key in self.submaps:
                 raise ValueError(f"{one.name} has another submap {key} than a map that it shares others with")
             self.submaps[key], self.keys[digests[record.key]] = (submap, number), key
+            self.landmarks[key] = one.stored.state.graph.landmarks_of(k)
         self._add_marks(one, at)
 
     def _add_marks(self, one: NamedMap, at: dict[int, tuple[Key, bool]]) -> None:
