@@ -23,7 +23,7 @@ _TOLD_EVERY_S = 0.5
 
 @dataclass(frozen=True, eq=False)
 class RunOutcome:
-    """What became of one recording: its summary, or the reason for which there is none."""
+    """Summary of one recording, or the reason for which there is none."""
 
     bag: Path
     output: Path
@@ -32,7 +32,7 @@ class RunOutcome:
 
     @property
     def reason(self) -> str:
-        """Why it failed, also half-way; empty where it did not."""
+        """Reason for which it failed, also half-way; empty where it did not."""
         return self.failure or (str(self.summary["failure"] or "") if self.summary else "")
 
 

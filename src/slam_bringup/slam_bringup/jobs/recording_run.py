@@ -29,7 +29,7 @@ from slam_viewer.results import STOPPED
 
 @dataclass(frozen=True, eq=False)
 class RunOptions:
-    """How recordings are mapped, as the options of ``slam run`` say; own: overrides of the user."""
+    """Options of mapping recordings, those of ``slam run``; own: overrides of the user."""
 
     mode: str | None = None
     mapper: str = "sjsam"

@@ -59,7 +59,7 @@ class Overrides:
         }
 
     def with_values(self, content: Mapping[Any, Any], origin: str) -> Overrides:
-        """These rules, and after them those of a mapping."""
+        """All rules, those of a mapping last."""
         return Overrides(self.origin, (*self.rules, *overrides_of(content, origin).rules))
 
 
