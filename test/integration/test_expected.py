@@ -31,6 +31,7 @@ def test_every_scenario_of_the_thesis_has_bounds():
         "fifty_rooms",
         "tagged_corridor",
         "tagged_corridor_2",
+        "untriggered_pair",
     }
 
 

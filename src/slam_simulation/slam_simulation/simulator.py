@@ -109,6 +109,7 @@ class Simulator:
             height = scenario.agents[agent].height
             self.wheels = WheelSensor(scenario.suite.wheels, self.path, height, (scenario.seed, 10, agent))
         self.threads = threads or os.cpu_count() or 1
+        self._right_late_s = 1e-3 * scenario.suite.stereo.right_late_ms
         self._truth_rays = camera_rays(self.stereo.stereo.camera) if truth else None
 
     @property
@@ -150,7 +151,7 @@ class Simulator:
         scenario, t = self.scenario, k / self.scenario.rate
         T = self.path.pose(t)
         world = self._moving.at(self.world, t)
-        left, right = self._stereo(k, t, T, world, pool)
+        left, right = self._stereo(k, t, world, pool)
         tof = None
         if "tof" in scenario.sensors:
             tof = self.tof.capture(world, T, self._rng(k, 3), pool)
@@ -173,12 +174,13 @@ class Simulator:
         return np.random.default_rng([self.scenario.seed, 5, self.agent, k, sensor])
 
     def _stereo(
-        self, k: int, t: float, T: FloatArray, world: SurfaceTable, pool: ThreadPoolExecutor | None
+        self, k: int, t: float, world: SurfaceTable, pool: ThreadPoolExecutor | None
     ) -> tuple[ByteArray | None, ByteArray | None]:
         if "stereo" not in self.scenario.sensors:
             return None, None
         rng = self._rng(k, 2)
-        pair = self.stereo.capture(world, T, rig_twist(self.path, t), rng, pool)
+        left, right = ((self.path.pose(at), rig_twist(self.path, at)) for at in (t, t + self._right_late_s))
+        pair = self.stereo.capture(world, (left, right), rng, pool)
         return (None, None) if rng.random() < self.scenario.suite.stereo.drop_probability else pair
 
     def _imu_samples(self, previous: float, t: float) -> tuple[ImuSample, ...]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -28,6 +29,8 @@ from slam_simulation.sensors.profiles import RealismConfig
 from slam_simulation.world.surface_table import SurfaceTable
 
 SIDES = ("left", "right")
+Motion: TypeAlias = tuple[FloatArray, FloatArray]
+"""Pose ``T_world_rig`` (4, 4) and velocity (6,) of a rig, m/s and rad/s, rig axes."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,9 @@ class StereoSensorConfig(Config):
     stamp_jitter_us: float = parameter(
         0.0, "standard deviation of the right image's stamp about the left's", unit="us", minimum=0.0
     )
+    right_late_ms: float = parameter(
+        0.0, "by how much the right image is taken after the left one, of which its stamp says nothing", unit="ms"
+    )
 
 
 class StereoSensor:
@@ -99,13 +105,12 @@ class StereoSensor:
     def capture(
         self,
         world: SurfaceTable,
-        T_world_rig: FloatArray,
-        twist: FloatArray,
+        motion: tuple[Motion, Motion],
         rng: np.random.Generator,
         pool: ThreadPoolExecutor | None,
     ) -> tuple[ByteArray, ByteArray]:
-        """One raw pair at the middle of the exposure; ``twist`` = rig velocity (6,), m/s and rad/s, rig axes."""
-        light = [self._light(k, world, T_world_rig, twist, pool) for k in range(2)]
+        """One raw pair of a rig that moves so in the middle of the exposure of the left and of the right image."""
+        light = [self._light(k, world, *motion[k], pool) for k in range(2)]
         wanted = self.config.brightness / max(float(light[0].mean()), 1e-6)
         lag = self.config.exposure_lag if self._gain > 0.0 else 0.0
         self._gain = lag * self._gain + (1.0 - lag) * wanted
