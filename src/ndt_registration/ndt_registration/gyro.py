@@ -19,6 +19,13 @@ class GyroConfig(GyroscopeConfig):
     """Gyroscope beside scan odometry."""
 
     enabled: bool = parameter(False, "predict the turn between scans from an IMU: for rigs that turn abruptly")
+    time_offset: float = parameter(
+        0.0,
+        "added to the IMU's stamps, so that they mean the same time as the scans'; calibrate refine writes it",
+        unit="s",
+        minimum=-1.0,
+        maximum=1.0,
+    )
 
 
 class Gyro:

@@ -79,8 +79,9 @@ class ScanOdometryStage:
     def add_imu(self, sample: ImuSample) -> None:
         """Take an IMU's reading; without the parameter ``imu.enabled`` nothing comes of it."""
         if self._config.imu.enabled:
-            self._samples.append(sample)
-            self._awaited.heard(IMU, sample.stamp_ns)
+            stamp_ns = sample.stamp_ns + round(1e9 * self._config.imu.time_offset)
+            self._samples.append(replace(sample, stamp_ns=stamp_ns))
+            self._awaited.heard(IMU, stamp_ns)
 
     def ready(self) -> Iterator[ScanEstimate]:
         """Estimates of the scans that need not wait, oldest first.
