@@ -142,6 +142,14 @@ def test_a_tof_camera_that_errs_by_an_offset_is_corrected_to_agree_with_stereo(s
     assert found["auto"][1] > found["off"][1]
 
 
+def test_how_old_a_depth_image_may_be_is_a_parameter(stereo_pair):
+    pair = stereo_pair()
+    for max_age, count in ((0.06, "tof_too_old"), (2.0, "fused")):
+        front = frontend("fuse", **{"fusion.max_age": max_age})
+        front.process(pair, tof_image(pair, stamp_ns=2_000_000_000), IDENTITY)
+        assert front.counters.counts[count] > 0
+
+
 @pytest.mark.parametrize(("stamp_ns", "count"), [(2_000_000_000, "tof_too_old"), (None, "tof_missing")])
 def test_without_a_fresh_depth_image_stereo_stands_alone(stereo_pair, stamp_ns, count):
     pair = stereo_pair()

@@ -22,6 +22,7 @@ from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.stereo.matching import is_distinct
+from stereo_frontend.stereo.pair_clock import PairClock
 from stereo_frontend.stereo.self_calibration import StereoSelfCalibration
 from stereo_frontend.stereo_depth import StereoDepth
 from stereo_frontend.tof_depth import TofDepth
@@ -151,11 +152,13 @@ class Frontend:
         camera, sigma, parts = images.stereo.camera, self._stereo_depth.noise.sigma, []
         tracks = tracker.follow(images.left, camera, images.stamp_ns, images.mask)
         if tracks is not None:
+            self.pair_clock.move(images.stamp_ns, *tracker.motion)
             stereo = self._stereo_depth.of_tracks(images, tracks)
             estimate = self._tof_depth.added_to(stereo, tracks.keypoints.uv, images, depth, T_left_tof)
             parts.append(followed(tracker, tracks, estimate, camera, sigma))
         number = parts[0].number_with_depth if parts else 0
         if tracker.needs_key_frame(number):
+            self.pair_clock.move(images.stamp_ns, None, 0.0)
             self.counters.add("key_frames")
             left, estimate = self._detected(images, self._extract(images), depth, T_left_tof)
             parts.append(begun(tracker, number, images.left, left, estimate, camera, sigma))
@@ -165,6 +168,11 @@ class Frontend:
     def self_calibration(self) -> StereoSelfCalibration:
         """The estimate of the rectification's error."""
         return self._stereo_depth.calibration
+
+    @property
+    def pair_clock(self) -> PairClock:
+        """The estimate of the time between a pair's images."""
+        return self._stereo_depth.clock
 
     def reset(self) -> None:
         """Forget thresholds, noise and counts."""
@@ -181,12 +189,18 @@ class Frontend:
 
     def report(self) -> FrontendReport:
         """Findings about the images so far."""
-        stereo, ranges, device = self.self_calibration, self._tof_depth.calibration, self._device
-        advice = tuple(filter(None, (device.diagnostic, stereo.advice(), ranges.advice(), self._tof.advice())))
-        picture = "+".join(self._tof.used) if self.config.mode == "tof" else "stereo"
-        error = stereo.error if stereo.corrects else None
+        stereo, clock, device = self.self_calibration, self.pair_clock, self._device
+        ranges = self._tof_depth.calibration
+        said = (device.diagnostic, stereo.advice(), clock.advice(), ranges.advice(), self._tof.advice())
         return FrontendReport(
-            stereo.figures(), advice, picture, error, ranges.figures(), device.name, device.diagnostic
+            rectification=stereo.figures() | clock.figures(),
+            advice=tuple(filter(None, said)),
+            picture="+".join(self._tof.used) if self.config.mode == "tof" else "stereo",
+            correction=stereo.error if stereo.corrects else None,
+            ranges=ranges.figures(),
+            device=device.name,
+            device_diagnostic=device.diagnostic,
+            right_late_s=clock.finding,
         )
 
     def _described(self, images: StereoImages, left: Keypoints, needed: npt.NDArray[np.bool_]) -> Keypoints:

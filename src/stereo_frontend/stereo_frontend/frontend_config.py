@@ -15,6 +15,7 @@ from stereo_frontend.fiducials.detector import TagConfig
 from stereo_frontend.masks import MaskingConfig
 from stereo_frontend.stereo.disparity import DisparityConfig
 from stereo_frontend.stereo.matching import MatchingConfig
+from stereo_frontend.stereo.pair_clock import PairClockConfig
 from stereo_frontend.stereo.pixel_noise import PixelNoiseConfig
 from stereo_frontend.stereo.rectification_error import RectificationError
 from stereo_frontend.stereo.self_calibration import SelfCalibrationConfig
@@ -35,6 +36,7 @@ class FrontendConfig(Config):
     disparity: DisparityConfig = group(DisparityConfig)
     noise: PixelNoiseConfig = group(PixelNoiseConfig)
     self_calibration: SelfCalibrationConfig = group(SelfCalibrationConfig)
+    pair: PairClockConfig = group(PairClockConfig)
     fusion: FusionConfig = group(FusionConfig)
     range_calibration: RangeSelfCalibrationConfig = group(RangeSelfCalibrationConfig)
     tof: TofFeatureConfig = group(TofFeatureConfig)
@@ -52,10 +54,12 @@ class FrontendConfig(Config):
 class FrontendReport:
     """Findings of the front end about its images.
 
-    rectification: figures of the stereo pair; ranges: of the depth camera beside it; advice: to the user, a sentence
-    each; picture: what features are searched in: "stereo", "amplitude", "intensity", "range" or "" before the first
-    image; correction: what the right image's rectification is wrong by, where disparities are corrected for it; device:
-    where SURF is computed; device_diagnostic: why not where it was asked for, or "", also one of ``advice``.
+    rectification: figures of the stereo pair and of the time between its images; ranges: of the depth camera beside it;
+    advice: to the user, a sentence each; picture: what features are searched in: "stereo", "amplitude", "intensity",
+    "range" or "" before the first image; correction: what the right image's rectification is wrong by, where
+    disparities are corrected for it; device: where SURF is computed; device_diagnostic: why not where it was asked for,
+    or "", also one of ``advice``; right_late_s: time of the right image after the left one and its standard deviation,
+    zeros where none is seen.
     """
 
     rectification: Mapping[str, float | str] = field(default_factory=dict)
@@ -65,3 +69,4 @@ class FrontendReport:
     ranges: Mapping[str, float | str] = field(default_factory=dict)
     device: str = CPU
     device_diagnostic: str = ""
+    right_late_s: tuple[float, float] = (0.0, 0.0)

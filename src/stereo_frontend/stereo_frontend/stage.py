@@ -129,8 +129,9 @@ class FeatureStage:
 
     @property
     def diagnostic(self) -> str:
-        """Reason for which features lack depth or a mask that they should have, or ""."""
-        return "; ".join(filter(None, (self._pairing.diagnostic, self._masking.diagnostic)))
+        """Reason for which features lack depth or a mask that they should have, or have bad depth, or ""."""
+        clock = self._frontend.pair_clock.diagnostic
+        return "; ".join(filter(None, (self._pairing.diagnostic, self._masking.diagnostic, clock)))
 
     @property
     def oldest_waiting_ns(self) -> int | None:

@@ -21,6 +21,7 @@ from stereo_frontend.stereo.matching import (
     match_stereo,
     swapped_share,
 )
+from stereo_frontend.stereo.pair_clock import PairClock
 from stereo_frontend.stereo.pixel_noise import PixelNoise
 from stereo_frontend.stereo.self_calibration import StereoSelfCalibration
 from stereo_frontend.stereo.two_view_consistency import StereoView
@@ -35,7 +36,7 @@ _SWAPPED_MATCHES = 30
 
 
 class StereoDepth:
-    """Measures depths in rectified pairs, and learns from them the noise of pixels and the rectification's error."""
+    """Measures depths in pairs; learns their noise, the error of their rectification and the time between images."""
 
     def __init__(self, config: FrontendConfig, pool: ThreadPoolExecutor, counters: Counters) -> None:
         self._config = config
@@ -43,12 +44,14 @@ class StereoDepth:
         self.counters = counters
         self.noise = PixelNoise(config.noise)
         self.calibration = StereoSelfCalibration(config.self_calibration)
+        self.clock = PairClock(config.pair)
         self._wide = self.calibration.widened(config.matching)
 
     def reset(self) -> None:
-        """Forget noise and the rectification's error."""
+        """Forget noise, the rectification's error and the time between the images."""
         self.noise.reset()
         self.calibration.reset()
+        self.clock.reset()
 
     def learn(self, images: StereoImages, left: Keypoints, refined: RefinedDisparity) -> None:
         """Learn the rectification's error from left keypoints (n), described, and their disparities (n)."""
@@ -62,7 +65,9 @@ class StereoDepth:
         bounds = disparity_bounds(self._config.matching, focal_baseline)
         matches = self._match(images, left, right, bounds)
         found = left.select(matches.left)
-        disparity, sigma, refined = self._disparities(images, found.uv, right.uv[matches.right], found.size)
+        partner = right.uv[matches.right]
+        partner = partner - self.clock.shift(images.stereo, partner, found.uv[:, 0] - partner[:, 0]).uv
+        disparity, sigma, refined = self._disparities(images, found.uv, partner, found.size)
         if refined.valid.sum() < _FEW_TRUSTED * len(left):
             self._reject_swapped(left, right, bounds)
         estimate = DepthEstimate.unknown(len(left))
@@ -90,21 +95,26 @@ class StereoDepth:
             wide = match_stereo(left, right, self._wide, bounds)
             calibration.acquire(self._view_of_keypoints(images, left.select(wide.left), right.select(wide.right)))
         error = calibration.rows(right.uv, np.zeros(len(right)))
-        aligned = dataclasses.replace(right, uv=right.uv - np.column_stack([np.zeros_like(error), error]))
+        late = self.clock.shift(images.stereo, right.uv).uv
+        aligned = dataclasses.replace(right, uv=right.uv - np.column_stack([np.zeros_like(error), error]) - late)
         return match_stereo(left, aligned, self._config.matching, bounds)
 
     def _disparities(
         self, images: StereoImages, uv: Float32Array, partner: Float32Array, size: Float32Array | None = None
     ) -> tuple[FloatArray, FloatArray, RefinedDisparity]:
-        """Disparities (n,) px of left pixels whose partners are near ``partner`` (n, 2) px, NaN where not trusted.
+        """Disparities (n,) px of left pixels whose partners would be near ``partner`` (n, 2) px at the left's moment.
 
-        Corrected for what is known of the rectification's error, with their standard deviations; and as measured.
-        ``size`` (n,) px is that of keypoints that were found in both images: their rows tell the noise.
+        NaN where not trusted. Corrected for what is known of the rectification's error, with their standard deviations;
+        and without that correction. ``size`` (n,) px is that of keypoints that were found in both images: their rows
+        tell the noise. What was tracked tells the clock.
         """
-        calibration = self.calibration
-        bounds = disparity_bounds(self._config.matching, images.stereo.camera.fx * images.stereo.baseline)
-        row_error = calibration.rows(partner, uv[:, 0] - partner[:, 0])
-        refined = self._refine(images, uv, partner[:, 0], row_error)
+        calibration, clock, stereo = self.calibration, self.clock, images.stereo
+        bounds = disparity_bounds(self._config.matching, stereo.camera.fx * stereo.baseline)
+        guess = uv[:, 0] - partner[:, 0]
+        row_error, late = calibration.rows(partner, guess), clock.shift(stereo, partner, guess)
+        seen = self._refine(images, uv, partner[:, 0] + late.uv[:, 0], row_error + late.uv[:, 1])
+        late = clock.shift(stereo, partner, late.without(seen).disparity)
+        refined = late.without(seen)
         if size is not None:
             trusted = refined.valid
             self.noise.learn((uv - partner)[trusted, 1] + row_error[trusted], size[trusted])
@@ -113,7 +123,10 @@ class StereoDepth:
         disparity = refined.disparity + correction
         disparity[~(disparity >= bounds[0])] = np.nan
         disparity[~has_consistent_neighbour(uv, disparity, _NEIGHBOURS)] = np.nan
-        sigma = np.sqrt(refined.sigma**2 + self.noise.rectification_sigma**2 + correction_sigma**2)
+        rectification = self.noise.rectification_sigma
+        sigma = np.sqrt(refined.sigma**2 + rectification**2 + correction_sigma**2 + late.sigma**2)
+        if size is None and clock.learn(stereo, uv, seen, disparity):
+            calibration.reset()
         return disparity, sigma, refined
 
     def _refine(

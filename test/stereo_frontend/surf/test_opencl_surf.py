@@ -273,8 +273,8 @@ def test_a_device_that_fails_leaves_the_same_frames_to_the_cpu_and_one_complaint
     assert next(calls) <= after + 2, "it was tried again, not only for the other image of the pair"
     report = frontend.report()
     assert report.device == "cpu"
-    assert report.advice == (report.device_complaint,)
-    assert device.name.strip() in report.device_complaint
+    assert report.advice == (report.device_diagnostic,)
+    assert device.name.strip() in report.device_diagnostic
 
 
 def test_other_errors_are_not_swallowed(on_device):

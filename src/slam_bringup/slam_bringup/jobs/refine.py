@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """``slam calibrate refine``: what a recording shows of its cameras without a board.
 
-A stereo pair that is not quite rectified is corrected; the readout of a rolling shutter and the difference of the IMU's
-clock and the images' are written down, so that the next run knows them from its first frame on.
+A stereo pair that is not quite rectified is corrected; the readout of a rolling shutter, the time between the images of
+a pair and the difference of the IMU's clock and the images' are written down, so that the next run knows them from its
+first frame on.
 """
 
 from __future__ import annotations
@@ -33,13 +34,14 @@ from stereo_frontend.stereo.corrected_info import corrected_right
 _TIMES = (
     ("rows are read out within", "measurement.readout", "measurement.sigma_readout"),
     ("to be added to the IMU's stamps:", "imu.time_offset", "imu.sigma_time_offset"),
+    ("the right image is taken later by", "pair.time_offset", "pair.sigma_time_offset"),
 )
-"""Words for a finding, and its parameters of the filter."""
+"""Words for a finding, and its parameters of the nodes."""
 
 
 @dataclass(frozen=True)
 class Refined:
-    """Findings of a recording: its cameras' infos, corrected or as they were, the filter's parameters, figures."""
+    """Findings of a recording: its cameras' infos, corrected or as they were, the nodes' parameters, figures."""
 
     infos: Mapping[str, CameraInfo]
     is_corrected: bool
@@ -107,9 +109,10 @@ def _learnt(source: SensorBag, agent: str, mode: str) -> tuple[FrontendReport, d
                     stage.add_imu(value)
                 for _ in stage.ready():
                     pass
-    found = (stages[0].readout_s, stages[-1].imu_time_offset_s)
+    front_end = pipeline.front_end()
+    found = (stages[0].readout_s, stages[-1].imu_time_offset_s, front_end.right_late_s)
     learnt = [zip(names, times, strict=True) for (_, *names), times in zip(_TIMES, found, strict=True) if times[0]]
-    return pipeline.front_end(), {name: value for times in learnt for name, value in times}
+    return front_end, {name: value for times in learnt for name, value in times}
 
 
 def write_refined(folder: Path, bag: Path, found: Refined) -> None:

@@ -32,7 +32,7 @@ _QUALITY = 50
 _GAMMA = 0.6
 _GAP_S = 3.0
 _GAP_AT = 0.4
-_TIMES = ("measurement.readout", "imu.time_offset")
+_TIMES = ("measurement.readout", "imu.time_offset", "pair.time_offset")
 """Parameters of a calibration that change their sign when time runs backwards."""
 _SAME_SURFACE = 0.02
 """Pixels whose depths differ by a larger share are not averaged."""

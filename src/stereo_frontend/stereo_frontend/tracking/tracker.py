@@ -116,6 +116,11 @@ class Tracker:
         self._motion: tuple[FloatArray, float] | None = None
         self._stamp_ns = 0
 
+    @property
+    def motion(self) -> tuple[FloatArray | None, float]:
+        """``T_now_before`` (4, 4) of the two newest pictures, None if it is not known, and the time between them, s."""
+        return (None, 0.0) if self._motion is None else self._motion
+
     # ---- one picture, in order
     def follow(
         self, picture: ByteArray, camera: Camera, stamp_ns: int, mask: ByteArray | None = None
