@@ -27,7 +27,7 @@ ROSDEP_KEY = {
     "filterpy": "python3-filterpy-pip",
 }
 """Keys of rosdep/python.yaml in ros/rosdistro (August 2026)."""
-NO_ROSDEP_KEY = {"threadpoolctl", "viser", "eclipse-zenoh", "distributed"}
+NO_ROSDEP_KEY = {"threadpoolctl", "viser", "eclipse-zenoh", "constriction", "distributed"}
 """Projects that rosdep does not know; README says how to get them, and each manifest that it lacks them."""
 
 FROM_ROS = re.compile(r"rclpy|launch(_ros)?|ament_index_python|std_srvs|rcl_interfaces|\w+_msgs|builtin_interfaces")

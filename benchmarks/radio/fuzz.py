@@ -11,16 +11,12 @@ accepted; any other error than ValueError ends it.
 from __future__ import annotations
 
 import argparse
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from sjsam_node import storage
-from slam_radio.packing.light_submap import MAGIC, VERSION, LightConfig, pack, unpack
-
-_ENVELOPE_BYTES = 9
+from slam_radio.packing.light_submap import ENVELOPE, MAGIC, VERSION, LightConfig, pack, sealed, unpack
 
 
 def main() -> None:
@@ -61,11 +57,10 @@ def damaged(packed: list[bytes], rng: np.random.Generator) -> bytes:
 
 def forged(packed: list[bytes], rng: np.random.Generator) -> bytes:
     """A message whose content was changed, with a checksum that fits."""
-    rest = bytearray(zlib.decompress(packed[rng.integers(len(packed))][_ENVELOPE_BYTES:]))
+    rest = bytearray(packed[rng.integers(len(packed))][ENVELOPE.size :])
     for at in rng.integers(len(rest), size=rng.integers(1, 9)):
         rest[at] = int(rng.integers(256))
-    body = zlib.compress(bytes(rest), 1)
-    return struct.pack("<2sBIH", MAGIC, VERSION, zlib.crc32(body), len(rest)) + body
+    return sealed(MAGIC, VERSION, bytes(rest))
 
 
 if __name__ == "__main__":

@@ -110,7 +110,12 @@ def partly(submap: Submap, only: str, config: LightConfig) -> Submap:
     if only == "descriptors":
         return replace(submap, descriptors=decode(encode(submap.descriptors), submap.descriptors.shape[1]))
     if only == "gaussian":
-        return replace(submap, covariance=compact_gaussian(submap.covariance, config.rank).covariance())
+        return replace(
+            submap,
+            covariance=compact_gaussian(
+                submap.covariance, submap.landmarks - 0.5 * submap.end_pose[:3, 3], config.rank
+            ).covariance(),
+        )
     rows = choose_landmarks(submap, config.landmarks)
     unknowns = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).ravel()])
     return replace(

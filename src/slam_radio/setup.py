@@ -17,7 +17,9 @@ setup(
     install_requires=[
         "setuptools",
         "slam_core",
+        "constriction",
         "eclipse-zenoh",
+        "numba",
         "numpy",
         "scipy",
     ],

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "sjsam_node"))  # judging, submap_world
+sys.path.insert(0, str(Path(__file__).parents[2] / "sjsam_node"))  # judging, submap_world
 
 from judging import ate, errors, join
 from submap_world import Agent, Sensor, World, circle, path_through, ring_world, room

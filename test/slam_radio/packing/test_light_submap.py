@@ -23,7 +23,9 @@ def test_what_is_sent_comes_out(make_submap):
     for name in ("agent", "index", "session", "start_stamp_ns", "end_stamp_ns", "follows_previous"):
         assert getattr(light, name) == getattr(submap, name)
     np.testing.assert_array_equal(light.landmark_ids, submap.landmark_ids[order])
-    np.testing.assert_allclose(light.landmarks, submap.landmarks[order], atol=8.0 / 65535)
+    own = submap.covariance[6:, 6:].reshape(60, 3, 60, 3)[np.arange(60), :, np.arange(60), :]
+    quarter = 0.25 * np.median(np.sqrt(np.linalg.eigvalsh(own)[:, 0]))
+    np.testing.assert_allclose(light.landmarks, submap.landmarks[order], atol=quarter)
     np.testing.assert_array_equal(light.sightings, np.minimum(submap.sightings[order], 255))
     np.testing.assert_allclose(boxminus(light.end_pose, submap.end_pose), 0.0, atol=1e-6)
     assert np.einsum("nd,nd->n", light.descriptors, submap.descriptors[order]).min() > 0.99  # random: sent whole
@@ -47,7 +49,7 @@ def test_same_submap_same_bytes_of_the_promised_size(make_submap, rng):
     submap = replace(make_submap(200), descriptors=looks.astype(np.float32))
     data = pack(submap, LightConfig(landmarks=96))
     assert data == pack(submap, LightConfig(landmarks=96))
-    assert len(data) < 6500
+    assert len(data) < 5000
 
 
 def test_descriptors_of_the_basis_take_its_bytes_and_keep_their_likeness(rng):
@@ -55,7 +57,8 @@ def test_descriptors_of_the_basis_take_its_bytes_and_keep_their_likeness(rng):
     inside = (inside / np.linalg.norm(inside, axis=1, keepdims=True)).astype(np.float32)
     codes = encode(inside)
     assert codes.shape == (50, DIRECTIONS)
-    np.testing.assert_allclose(decode(codes, 128) @ decode(codes, 128).T, inside @ inside.T, atol=0.02)
+    np.testing.assert_allclose(decode(codes, 128) @ decode(codes, 128).T, inside @ inside.T, atol=0.1)
+    assert np.einsum("nd,nd->n", decode(codes, 128), inside).min() > 0.97
     other = rng.normal(size=(50, 128)).astype(np.float32)
     assert encode(other / np.linalg.norm(other, axis=1, keepdims=True)).shape == (50, 128)
     assert encode(np.eye(64, dtype=np.float32)).shape == (64, 64)
@@ -107,15 +110,14 @@ def test_damaged_messages_are_refused(make_submap, rng):
 
 
 def test_forged_messages_with_a_good_checksum_are_refused_or_a_submap(make_submap, rng):
-    rest = zlib.decompress(pack(make_submap(12), LightConfig(landmarks=12))[9:])
+    rest = pack(make_submap(12), LightConfig(landmarks=12))[7:]
     refused = 0
     for _ in range(500):
         forged = bytearray(rest)
         forged[rng.integers(len(forged))] = int(rng.integers(256))
-        forged[rng.integers(90)] = int(rng.integers(256))  # among counts, stamps, end pose and box
-        body = zlib.compress(bytes(forged))
+        forged[rng.integers(90)] = int(rng.integers(256))  # among counts, stamps and end pose
         try:
-            light = unpack(struct.pack("<2sBIH", b"SL", 2, zlib.crc32(body), len(forged)) + body)
+            light = unpack(struct.pack("<2sBI", b"SL", 3, zlib.crc32(forged)) + forged)
         except ValueError:
             refused += 1
         else:
@@ -124,7 +126,17 @@ def test_forged_messages_with_a_good_checksum_are_refused_or_a_submap(make_subma
     assert 50 < refused < 500
 
 
-def test_a_message_that_inflates_to_more_than_it_says_is_refused():
-    body = zlib.compress(bytes(10**7))
-    with pytest.raises(ValueError, match="must inflate to 1000 bytes"):
-        unpack(struct.pack("<2sBIH", b"SL", 2, zlib.crc32(body), 1000) + body)
+def test_a_message_of_more_landmarks_than_can_be_is_refused(make_submap):
+    rest = bytearray(pack(make_submap(12, agent="one"), LightConfig(landmarks=12))[7:])
+    at = 1 + 3 + 9 + 16
+    assert struct.unpack_from("<H", rest, at)[0] == 12
+    struct.pack_into("<H", rest, at, 60000)
+    with pytest.raises(ValueError, match="cannot have 60000 landmarks"):
+        unpack(struct.pack("<2sBI", b"SL", 3, zlib.crc32(rest)) + rest)
+
+
+def test_an_older_version_is_refused_by_name(make_submap):
+    data = bytearray(pack(make_submap(12)))
+    data[2] = 2
+    with pytest.raises(ValueError, match="not a submap for the air of version 3"):
+        unpack(bytes(data))

@@ -8,7 +8,6 @@ from math import prod
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray
@@ -20,8 +19,9 @@ class ByteReader:
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data, 0
 
-    def bytes(self, count: int) -> bytes:
-        """The next ``count`` bytes."""
+    def bytes(self, count: int | None = None) -> bytes:
+        """The next ``count`` bytes, or all that are left."""
+        count = len(self._data) - self._at if count is None else count
         if count > len(self._data) - self._at:
             raise ValueError(f"a message of {len(self._data)} bytes ends too early")
         self._at += count
@@ -59,30 +59,3 @@ class ByteReader:
         """Raise ``ValueError`` if bytes are left."""
         if self._at != len(self._data):
             raise ValueError(f"a message has {len(self._data) - self._at} bytes too many")
-
-
-def write_varints(values: npt.NDArray[np.int64]) -> bytes:
-    """Whole numbers from 0 on, seven bits a byte, the lowest first; the highest bit says that more follow."""
-    out = bytearray()
-    for value in values.tolist():
-        if value < 0:
-            raise ValueError(f"ids must not be negative, got a step of {value}")
-        while value > 0x7F:
-            out.append(value & 0x7F | 0x80)
-            value >>= 7
-        out.append(value)
-    return bytes(out)
-
-
-def read_varints(reader: ByteReader, count: int) -> npt.NDArray[np.int64]:
-    """``count`` numbers that :func:`write_varints` wrote, below 2^56."""
-    values = np.zeros(count, dtype=np.int64)
-    for i in range(count):
-        shift, more = 0, True
-        while more:
-            byte = reader.bytes(1)[0]
-            if shift > 49:
-                raise ValueError("an id is too large")
-            values[i] |= (byte & 0x7F) << shift
-            shift, more = shift + 7, byte > 0x7F
-    return values

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A joint Gaussian of one pose and many landmarks in a few hundred bytes, never surer than the one it stands for.
 
-    covariance = B (U U' + t D) B',    D = I - blocks of U U'
+    covariance = B (s U U' + t D) B',    D = I - blocks of U U'
 
-``B`` holds the Cholesky factor of each unknown's own block (6 x 6 of the pose, 3 x 3 of a landmark), so that the
-whitened covariance has identity blocks. ``U`` (m, r) is what unknowns have in common, by factor analysis: a submap's
-landmarks err together because the rig's poses between them do, and a few of these directions carry nearly all of it.
-``D`` is what each has by itself; it follows from ``U``. Numbers are rounded first, ``t`` is chosen last: the least
-factor, to 0.5 %, for which the difference to the given covariance is positive semidefinite, as its Cholesky
-factorization shows. Whatever is left out or rounded can therefore only make the Gaussian less sure.
+``B`` holds a factor of each unknown's own block: the Cholesky factor of the pose (6 x 6), and of a landmark (3 x 3) the
+one in a frame whose third axis points at it from the middle of the submap, where it is nearly diagonal. The whitened
+covariance has identity blocks. ``U`` (m, r) is what unknowns have in common, by factor analysis: a submap's landmarks
+err together because the rig's poses between them do, and a few of these directions carry nearly all of it. ``D`` is
+what each has by itself; it follows from ``U``. Numbers are rounded first. ``s`` is 5 % more than 1: what rounding does
+to the common directions lies mostly along them. ``t`` is chosen last: the least factor, to 0.5 %, for which the
+difference to the given covariance is positive semidefinite, as its Cholesky factorization shows. Whatever is left out
+or rounded can therefore only make the Gaussian less sure.
 
 The only factorization of a matrix of full size is that one: directions are found by subspace iteration, the least
 factor by the Lanczos method (Golub and Van Loan, Matrix Computations, 8.2 and 10.1).
@@ -17,7 +19,7 @@ factor by the Lanczos method (Golub and Van Loan, Matrix Computations, 8.2 and 1
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,12 +27,12 @@ import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, Float32Array
+from slam_radio.packing import gaussian_kernels
 
-Int8Array = npt.NDArray[np.int8]
-Float16Array = npt.NDArray[np.float16]
+IntArray = npt.NDArray[np.int64]
 
 UNIT = 1e-3
-"""Blocks are sent in mm and mrad."""
+"""Factors are sent in mm and mrad."""
 _ITERATIONS = 2
 _POWERS = 3
 """Products with the covariance in each iteration of the factor analysis."""
@@ -44,12 +46,18 @@ _FACTOR_STEP = 5e-3
 """Share by which the factor is above the eigenvalue at first; then it is doubled until it is enough."""
 _LEAST_OWN = 2e-3
 """Least share of an unknown's variance that is taken as its own: keeps ``D`` invertible."""
-_MANTISSA = 256.0
-"""Numbers of B have eight significant bits: the rest makes messages longer, and nothing surer."""
+_OCTAVE = 45
+"""Steps of a standard deviation from one value to its double: 1.5 % each."""
+_RATIO = 64
+"""Steps of the numbers beside the diagonal, over that of their row."""
+_MOST_OCTAVES = 24
 _LEAST_SHARE = 1e-4
 """Least singular value of a block of B with rows of length 1: its square, times what keeps D invertible, is well above
 the rounding of a sum of all unknowns."""
-_STEPS = 127.0
+_STEPS = 64.0
+"""Steps of U from 0 to 1."""
+_COMMON = 1.05
+"""The factor ``s``."""
 MOST_INFLATION = 1e6
 """Factors ``t`` from here on are not sent, nor taken: such a covariance says nothing."""
 _MARGIN = 1.0 + 1e-6
@@ -58,41 +66,79 @@ _MARGIN = 1.0 + 1e-6
 
 @dataclass(frozen=True, eq=False)
 class CompactGaussian:
-    """A covariance as it is sent: ``blocks`` (21 + 6n,) of B in mm and mrad, ``common`` (6 + 3n, r) of U, and t."""
+    """A covariance as it is sent.
 
-    blocks: Float16Array
-    common: Int8Array
+    Attributes
+    ----------
+    pose
+        Lower triangle of the pose's factor in mm and mrad, (21,) float16.
+    factors
+        Of each landmark (n, 6): logarithms of the diagonal of its factor, in 45ths of an octave above 1 mm, and the
+        three numbers beside it, in 64ths of their rows' diagonals.
+    rays
+        Of each landmark, from the middle of the submap, (n, 3); of any length.
+    common
+        U in 64ths, (6 + 3n, r).
+    inflation
+        The factor t.
+    """
+
+    pose: npt.NDArray[np.float16]
+    factors: IntArray
+    rays: FloatArray
+    common: IntArray
     inflation: float
 
     def covariance(self) -> FloatArray:
         """The covariance (6 + 3n, 6 + 3n), positive definite."""
         U = self.common.astype(np.float64) / _STEPS
-        B = _factors(self.blocks)
-        V = B.times(U)
+        B = self.blocks()
+        V = np.sqrt(_COMMON) * B.times(U)
         return _sum(V @ V.T, B.around(_own(U)).scaled(self.inflation))
+
+    def blocks(self) -> _Blocks:
+        """The blocks of B."""
+        pose = np.zeros((6, 6))
+        pose[np.tril_indices(6)] = UNIT * self.pose.astype(np.float64)
+        return _Blocks(pose, _ray_frames(self.rays) @ _factors(self.factors))
 
     def require_positive(self) -> None:
         """Raise ``ValueError`` if rounding may leave the covariance not positive definite.
 
-        U U' + t D is far from singular whatever U and t are, so that this depends on the blocks of B alone.
+        s U U' + t D is far from singular whatever U and t are, so that this depends on the blocks of B alone.
         """
-        for B in _factors(self.blocks):
-            length = np.linalg.norm(B, axis=-1, keepdims=True)
-            if not (length > 0.0).all() or np.linalg.svd(B / length, compute_uv=False).min(initial=1.0) < _LEAST_SHARE:
+        if not np.isfinite(self.pose).all():
+            raise ValueError("a submap for the air holds numbers that are not finite")
+        if (np.abs(self.factors[:, :3]) // _OCTAVE).max(initial=0) >= _MOST_OCTAVES:
+            raise ValueError("a submap for the air has a covariance that cannot be")
+        pose = np.zeros((6, 6))
+        pose[np.tril_indices(6)] = self.pose
+        for L in (pose, _factors(self.factors)):
+            length = np.linalg.norm(L, axis=-1, keepdims=True)
+            if not (length > 0.0).all() or np.linalg.svd(L / length, compute_uv=False).min(initial=1.0) < _LEAST_SHARE:
                 raise ValueError("a submap for the air has a covariance that is not positive definite")
 
     def end_covariance(self) -> FloatArray:
         """The pose's own covariance (6, 6)."""
-        return CompactGaussian(self.blocks[:21], self.common[:6], self.inflation).covariance()
+        return replace(self, factors=self.factors[:0], rays=self.rays[:0], common=self.common[:6]).covariance()
+
+    def followed_by(self, factors: IntArray, rays: FloatArray, common: IntArray, inflation: float) -> CompactGaussian:
+        """The Gaussian with more landmarks, and another factor t."""
+        return CompactGaussian(
+            self.pose, np.concatenate([self.factors, factors]), np.concatenate([self.rays, rays]),
+            np.concatenate([self.common, common]), inflation,
+        )  # fmt: skip
 
 
-def compact_gaussian(covariance: FloatArray, rank: int, rounding: float = 0.0) -> CompactGaussian:
+def compact_gaussian(covariance: FloatArray, rays: FloatArray, rank: int, rounding: float = 0.0) -> CompactGaussian:
     """The Gaussian of a pose and n landmarks with ``rank`` common directions.
 
     Parameters
     ----------
     covariance
         Shape (6 + 3n, 6 + 3n), positive definite, m and rad.
+    rays
+        Of each landmark as the other side will know it, (n, 3).
     rank
         Number of common directions.
     rounding
@@ -104,20 +150,44 @@ def compact_gaussian(covariance: FloatArray, rank: int, rounding: float = 0.0) -
         If the covariance is not finite, not positive definite, or too large for the format (65 m), or if it would take
         a factor of ``MOST_INFLATION``.
     """
-    if not np.isfinite(covariance).all():
-        raise ValueError("a submap's covariance must be finite")
-    S = covariance.copy()
-    rows = np.arange(6, len(S))
-    S[rows, rows] += rounding**2
-    blocks = _rounded_factors(S)
-    CompactGaussian(blocks, np.zeros((len(S), 0), dtype=np.int8), 1.0).require_positive()
-    whiten = _factors(blocks).inverse()
-    whitened = np.asarray(whiten.times(whiten.times(S).T), dtype=np.float32)
+    S = _with_rounding(covariance, rounding)
+    rounded = CompactGaussian(*_rounded_factors(S, rays), rays, np.zeros((len(S), 0), dtype=np.int64), 1.0)
+    rounded.require_positive()
+    whitened = _whitened(S, rounded)
     U = _common_directions(whitened, min(rank, len(S) - 1))
-    common = np.clip(np.rint(_STEPS * U), -_STEPS, _STEPS).astype(np.int8)
-    inflation = _least_factor(S, blocks, common, whitened)
-    up = float(np.nextafter(np.float32(inflation * _MARGIN), np.float32(np.inf)))
-    return CompactGaussian(blocks, common, up)
+    return _with_least_factor(S, replace(rounded, common=_rounded(U)), whitened)
+
+
+def extended(
+    gaussian: CompactGaussian, covariance: FloatArray, rays: FloatArray, rounding: float = 0.0
+) -> CompactGaussian:
+    """A Gaussian with more landmarks behind its own, by the common directions that it has.
+
+    Parameters
+    ----------
+    gaussian
+        Of the pose and the first landmarks.
+    covariance
+        Of the pose and all landmarks.
+    rays, rounding
+        As above, of the landmarks that are new.
+
+    Raises
+    ------
+    ValueError
+        As :func:`compact_gaussian`.
+    """
+    known = len(gaussian.common)
+    S = _with_rounding(covariance, rounding)
+    _, factors = _rounded_factors(S, np.concatenate([gaussian.rays, rays]))
+    none = np.zeros((len(S) - known, gaussian.common.shape[1]), dtype=np.int64)
+    rounded = gaussian.followed_by(factors[len(gaussian.factors) :], rays, none, 1.0)
+    rounded.require_positive()
+    whitened = _whitened(S, rounded)
+    U = gaussian.common / _STEPS
+    weighted = _own(U).mapped(np.linalg.inv).times(U)
+    more = np.linalg.lstsq(U.T @ weighted, weighted.T @ whitened[:known, known:], rcond=None)[0].T
+    return _with_least_factor(S, replace(rounded, common=np.concatenate([gaussian.common, _rounded(more)])), whitened)
 
 
 class _Blocks(NamedTuple):
@@ -134,25 +204,22 @@ class _Blocks(NamedTuple):
 
     def cholesky(self) -> _Blocks:
         """Cholesky factors of the blocks."""
-        return self._mapped(np.linalg.cholesky)
+        return self.mapped(np.linalg.cholesky)
 
     def inverse(self) -> _Blocks:
         """Inverses of the blocks."""
-        return self._mapped(np.linalg.inv)
-
-    def transpose(self) -> _Blocks:
-        """Transposes of the blocks."""
-        return self._mapped(lambda blocks: np.swapaxes(blocks, -1, -2))
+        return self.mapped(np.linalg.inv)
 
     def coarse(self) -> _Blocks:
         """The blocks in single precision."""
-        return self._mapped(lambda blocks: blocks.astype(np.float32))
+        return self.mapped(lambda blocks: blocks.astype(np.float32))
 
     def scaled(self, factor: float) -> _Blocks:
         """All blocks times a factor."""
-        return self._mapped(lambda blocks: factor * blocks)
+        return self.mapped(lambda blocks: factor * blocks)
 
-    def _mapped(self, function: Callable[[FloatArray], Any]) -> _Blocks:
+    def mapped(self, function: Callable[[FloatArray], Any]) -> _Blocks:
+        """The blocks that a function makes of stacks of these."""
         return _Blocks(function(self.pose), function(self.landmarks))
 
     def times(self, M: AnyArray) -> AnyArray:
@@ -173,29 +240,71 @@ def _sum(S: FloatArray, blocks: _Blocks) -> FloatArray:
     return S
 
 
-def _rounded_factors(S: FloatArray) -> Float16Array:
-    """Lower triangles of the blocks' Cholesky factors in mm and mrad, the pose's first."""
+def _with_rounding(covariance: FloatArray, rounding: float) -> FloatArray:
+    """A copy of a covariance in which the landmarks' variances have the square of an error more."""
+    if not np.isfinite(covariance).all():
+        raise ValueError("a submap's covariance must be finite")
+    S = covariance.copy()
+    rows = np.arange(6, len(S))
+    S[rows, rows] += rounding**2
+    return S
+
+
+def _rounded_factors(S: FloatArray, rays: FloatArray) -> tuple[npt.NDArray[np.float16], IntArray]:
+    """The pose's factor (21,) and the landmarks' (n, 6), as they are sent."""
+    R = _ray_frames(rays)
     try:
-        B = _Blocks.of(S).cholesky()
+        pose, landmarks = _Blocks.of(S)
+        L = np.linalg.cholesky(pose), np.linalg.cholesky(np.swapaxes(R, 1, 2) @ landmarks @ R)
     except np.linalg.LinAlgError as error:
         raise ValueError("a submap's covariance must be positive definite") from error
-    rows, columns = np.tril_indices(3)
-    values = np.concatenate([B.pose[np.tril_indices(6)], B.landmarks[:, rows, columns].ravel()]) / UNIT
-    mantissas, exponents = np.frexp(values)
-    rounded = np.ldexp(np.rint(mantissas * _MANTISSA) / _MANTISSA, exponents)
-    if not np.abs(rounded).max() <= np.finfo(np.float16).max:
-        raise ValueError(f"a standard deviation of {UNIT * np.abs(values).max():.3g} m is too large to be sent")
-    return np.asarray(rounded, dtype=np.float16)
+    values = L[0][np.tril_indices(6)] / UNIT
+    if not max(np.abs(values).max(), np.abs(L[1]).max(initial=0.0) / UNIT) <= np.finfo(np.float16).max:
+        raise ValueError(f"a standard deviation of {np.abs(L[1]).max(initial=0.0):.3g} m is too large to be sent")
+    sigmas = L[1][:, np.arange(3), np.arange(3)]
+    ratios = L[1][:, *_BESIDE] / sigmas[:, _BESIDE[0]]
+    logarithms = np.rint(_OCTAVE * np.log2(sigmas / UNIT))
+    return values.astype(np.float16), np.concatenate([logarithms, np.rint(_RATIO * ratios)], axis=1).astype(np.int64)
 
 
-def _factors(blocks: Float16Array) -> _Blocks:
-    """Inverse of :func:`_rounded_factors`."""
-    values = UNIT * blocks.astype(np.float64)
-    B = _Blocks(np.zeros((6, 6)), np.zeros(((len(values) - 21) // 6, 3, 3)))
-    B.pose[np.tril_indices(6)] = values[:21]
-    rows, columns = np.tril_indices(3)
-    B.landmarks[:, rows, columns] = values[21:].reshape(-1, 6)
-    return B
+_BESIDE = np.tril_indices(3, -1)
+
+
+def _factors(codes: IntArray) -> FloatArray:
+    """Landmarks' factors (n, 3, 3), m, in the frames of their rays."""
+    L = np.zeros((len(codes), 3, 3))
+    sigmas = UNIT * np.exp2(codes[:, :3] / _OCTAVE)
+    L[:, np.arange(3), np.arange(3)] = sigmas
+    L[:, *_BESIDE] = codes[:, 3:] / _RATIO * sigmas[:, _BESIDE[0]]
+    return L
+
+
+def _ray_frames(rays: FloatArray) -> FloatArray:
+    """Rotations (n, 3, 3) whose third columns are along rays (n, 3), or along z where there is none."""
+    length = np.linalg.norm(rays, axis=1, keepdims=True)
+    z = np.where(length > 0.0, rays / np.maximum(length, np.finfo(np.float64).tiny), [0.0, 0.0, 1.0])
+    other = np.where(np.abs(z[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    x = np.cross(other, z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=2)
+
+
+def _whitened(S: FloatArray, rounded: CompactGaussian) -> Float32Array:
+    """B^-1 S B'^-1 in single precision."""
+    out = np.empty(S.shape, dtype=np.float32)
+    gaussian_kernels.between(*rounded.blocks().inverse(), S, out)
+    return out
+
+
+def _scaled(left: _Blocks, C: Float32Array) -> Float32Array:
+    """A C A' in single precision."""
+    out = np.empty_like(C)
+    gaussian_kernels.between(*left.coarse(), C, out)
+    return out
+
+
+def _rounded(U: AnyArray) -> IntArray:
+    return np.clip(np.rint(_STEPS * U), -_STEPS, _STEPS).astype(np.int64)
 
 
 def _own(U: FloatArray) -> _Blocks:
@@ -218,38 +327,40 @@ def _floored(blocks: FloatArray) -> FloatArray:
 def _common_directions(C: Float32Array, rank: int) -> FloatArray:
     """Factor analysis of a covariance with identity blocks: U (m, rank) by alternating between U and D.
 
-    In single precision: a direction is rounded to 127ths, and whatever it leaves is found below.
+    In single precision: a direction is rounded to 64ths, and whatever it leaves is found below.
     """
     m = len(C)
     V: AnyArray = _start(m, min(rank + _SPARE, m))
     U, D = np.zeros((m, rank)), _Blocks(0.5 * np.eye(6), np.tile(0.5 * np.eye(3), ((m - 6) // 3, 1, 1)))
     for _ in range(_ITERATIONS):
         L = D.cholesky()
-        left = L.inverse().coarse()
-        right = left.transpose()
+        scaled = _scaled(L.inverse(), C)
         for _ in range(_POWERS):
-            V = left.times(C @ right.times(V))
+            V = scaled @ V
         V = np.linalg.qr(V)[0]
-        values, turns = np.linalg.eigh(V.T @ left.times(C @ right.times(V)))
+        values, turns = np.linalg.eigh(V.T @ (scaled @ V))
         vectors = (V @ turns[:, -rank:]).astype(np.float64)
         U = L.times(vectors * np.sqrt(np.maximum(values[-rank:] - 1.0, 0.0)))
         D = _own(U)
     return np.asarray(U)
 
 
-def _least_factor(S: FloatArray, blocks: Float16Array, common: Int8Array, whitened: Float32Array) -> float:
-    """The least t >= 1, to 0.5 % and never less, for which the Gaussian less S is positive definite.
+def _with_least_factor(S: FloatArray, rounded: CompactGaussian, whitened: Float32Array) -> CompactGaussian:
+    """The Gaussian with the least t >= 1, to 0.5 % and never less, for which it less S is positive definite.
 
     ``whitened``: S between inverses of B, which gives a first t; it is tested on S itself.
     """
-    U = common.astype(np.float64) / _STEPS
-    left = _own(U).cholesky().inverse().coarse()
-    coarse = U.astype(np.float32)
-    t = max(1.0, _largest_eigenvalue(left.times(left.times(whitened - coarse @ coarse.T).T)))
-    step = _FACTOR_STEP * t
+    U = rounded.common / _STEPS
+    own, coarse = _own(U), (np.sqrt(_COMMON) * U).astype(np.float32)
+    t = max(1.0, _largest_eigenvalue(_scaled(own.cholesky().inverse(), whitened - coarse @ coarse.T)))
+    B, step = rounded.blocks(), _FACTOR_STEP * t
+    V, own = np.sqrt(_COMMON) * B.times(U), B.around(own)
     while t + step < MOST_INFLATION / _MARGIN**2:
-        if _is_positive(CompactGaussian(blocks, common, t + step).covariance() - S):
-            return t + step
+        gap = V @ V.T
+        gaussian_kernels.with_blocks(*own.scaled(t + step), S, gap)
+        if _is_positive(gap):
+            up = float(np.nextafter(np.float32((t + step) * _MARGIN), np.float32(np.inf)))
+            return replace(rounded, inflation=up)
         t, step = t + step, 2.0 * step
     raise ValueError(f"a submap's covariance would have to be sent {MOST_INFLATION:.0e} times too large")
 
@@ -285,7 +396,7 @@ def _symmetric(S: FloatArray) -> FloatArray:
 
 
 def _is_positive(S: FloatArray) -> bool:
-    """True if a symmetric matrix is positive definite; it is lost."""
+    """True if a symmetric matrix, of which the lower triangle is read, is positive definite; it is lost."""
     from scipy.linalg.lapack import dpotrf  # its own half second, which receivers need not spend
 
     return bool(dpotrf(S.T, lower=0, clean=0, overwrite_a=1)[1] == 0)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Descriptors in 24 numbers of 81 values: their coordinates along the directions in which SURF-128 descriptors differ.
+"""Descriptors in 24 numbers: their coordinates along the directions in which SURF-128 descriptors differ, in 20ths.
 
 SURF-128 descriptors fill few of their 128 dimensions: 24 principal directions hold 92 % of their squares. The
-directions were found on simulated rooms (``benchmarks/radio/descriptor_basis.py``) and are part of the format.
-Descriptors of another kind, whose likeness this would spoil, go out whole, a number for each of theirs. Few of the 81
-values are frequent: deflated, a descriptor has about 15 bytes.
+directions were found on simulated rooms (``benchmarks/radio/descriptor_basis.py``) and are part of the format. A step
+of 0.05 adds an error that is as large in each direction as what is left out in the others. Descriptors of another kind,
+whose likeness this would spoil, go out whole, a number for each of theirs. Range coded, a descriptor has about 9 bytes.
 """
 
 from __future__ import annotations
@@ -17,10 +17,13 @@ import numpy.typing as npt
 
 from slam_core.types import Float32Array
 
-Int8Array = npt.NDArray[np.int8]
+IntArray = npt.NDArray[np.int64]
 
 DIRECTIONS = 24
-_STEPS = 40.0
+_STEPS = 20.0
+"""Of a coordinate from 0 to 1."""
+_WHOLE_STEPS = 100.0
+"""The same of a descriptor that goes out whole."""
 _LEAST_LIKENESS = 0.9
 """Median scalar product of descriptors and their codes below which they go out whole."""
 
@@ -32,26 +35,24 @@ def basis() -> Float32Array:
         return np.asarray(np.load(file, allow_pickle=False), dtype=np.float32)
 
 
-def encode(descriptors: Float32Array) -> Int8Array:
-    """Codes (n, DIRECTIONS), or (n, d) where directions would not do, of unit descriptors (n, d)."""
-    if descriptors.shape[1:] == (len(basis()),):
-        codes = _steps(descriptors @ basis())
+def encode(descriptors: Float32Array, width: int = 0) -> IntArray:
+    """Codes (n, DIRECTIONS), or (n, d) where directions would not do, of unit descriptors (n, d).
+
+    ``width``: number of columns, where it is decided already.
+    """
+    dimension = descriptors.shape[1]
+    if dimension == len(basis()) and width in (0, DIRECTIONS):
+        codes = np.rint(_STEPS * (descriptors @ basis())).astype(np.int64)
         likeness = np.einsum("nd,nd->n", descriptors, decode(codes, len(basis())))
-        if not len(codes) or np.median(likeness) >= _LEAST_LIKENESS:
-            return codes
-    return _steps(descriptors)
+        if width or not len(codes) or np.median(likeness) >= _LEAST_LIKENESS:
+            return np.asarray(codes)
+    return np.asarray(np.rint(_WHOLE_STEPS * descriptors), dtype=np.int64)
 
 
-def decode(codes: Int8Array, dimension: int) -> Float32Array:
+def decode(codes: IntArray, dimension: int) -> Float32Array:
     """Unit descriptors (n, dimension) of what :func:`encode` made."""
     values = codes.astype(np.float32)
     if codes.shape[1] == DIRECTIONS and dimension == len(basis()):
         values = values @ basis().T
     length = np.linalg.norm(values, axis=1, keepdims=True)
     return np.asarray(values / np.maximum(length, np.finfo(np.float32).tiny), dtype=np.float32)
-
-
-def _steps(values: Float32Array) -> Int8Array:
-    """Rows as multiples of a step of their own: the largest element is 40 steps."""
-    largest = np.abs(values).max(axis=1, keepdims=True, initial=np.finfo(np.float32).tiny)
-    return np.asarray(np.rint(_STEPS * (values / largest)), dtype=np.int8)
