@@ -28,26 +28,24 @@ from sjsam_node.loop_closure.consistency import ConsistencyConfig, Verdict
 from sjsam_node.loop_closure.detector import LoopDetector
 from sjsam_node.loop_closure.verification import LINKED_SUBMAPS, ClosureConfig
 from sjsam_node.marks import Marks
+from sjsam_node.refining import lacking, refined
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.smoothing.map_snapshot import InnerPaths, MapLandmarks, MapSnapshot
 from sjsam_node.smoothing.solver import SmootherConfig
 from sjsam_node.smoothing.state import EstimateState
 from sjsam_node.storage import StoredMap
+from sjsam_node.submap_check import fault_of
 from sjsam_node.tags.known_tags import KnownTagsConfig, building_submap
 from sjsam_node.tags.tag_links import TagLinks, is_against_tags, with_tag_links
 from slam_core.config import Config, group, parameter
 from slam_core.estimation.calibration_error import CalibrationErrorConfig
-from slam_core.geometry import FloatArray, invert_transform, is_rigid_transform
-from slam_core.messages.poses import FARTHEST_M
+from slam_core.geometry import FloatArray, invert_transform
 from slam_core.types import Counters, PoseEstimate, Submap
 
 ALREADY_JOINED = "already joined"
 
 _PASSES = 2
 """Times that settling looks for closures, and lets go what the map contradicts: one finding lets another follow."""
-
-SMALLEST_VARIANCE = 1e-15
-"""Of a landmark (m2) or an end pose (m2, rad2); no camera is that sure of anything."""
 
 _COMPARED_AT_ONCE = 2
 """Pairs of submaps that a closure has brought near each other, compared with each new submap."""
@@ -83,7 +81,8 @@ class JoinReport:
     accepted with reason otherwise; matched: its landmarks already in the map; new_landmarks; closures: links accepted
     now, as (agent, index) of the older submap; dropped: matches let go; components: parts of the map that hang
     together; chi2, variance_factor, iterations, converged and solver of the update; redundant: it shows nothing new;
-    is_strained: the submaps contradict each other by more than ``consistency.max_variance_factor``.
+    is_strained: the submaps contradict each other by more than ``consistency.max_variance_factor``; is_refined: further
+    landmarks of one that was joined.
     """
 
     accepted: bool
@@ -100,6 +99,7 @@ class JoinReport:
     solver: str = ""
     redundant: bool = False
     is_strained: bool = False
+    is_refined: bool = False
 
 
 class GlobalMap:
@@ -150,6 +150,8 @@ class GlobalMap:
     def add(self, submap: Submap) -> JoinReport:
         """Join one submap; a faulty one is refused with the reason, counted, and changes nothing."""
         reason = self._rejection(submap)
+        if reason == ALREADY_JOINED and (known := lacking(self.estimate.graph, submap)) is not None:
+            return self._refine(known, submap)
         if reason:
             self.counters.add(f"refused: {reason}")
             return JoinReport(False, reason)
@@ -179,6 +181,18 @@ class GlobalMap:
             self.components, result.cost, result.variance_factor, result.iterations, result.converged, result.solver,
             is_redundant, result.variance_factor > self.config.consistency.max_variance_factor,
         )  # fmt: skip
+
+    def _refine(self, record: int, submap: Submap) -> JoinReport:
+        """Take further landmarks of a submap in, and compare it anew with what it may be the same place as."""
+        before = len(self.estimate.graph.records[record].submap.landmarks)
+        self._restore(refined(self.stored(), record, submap))
+        self._was_settled_before = True  # settled, all is joined anew, with what came now in its place
+        found = self.detector.again(record, self.agents.chain(record))
+        verdict = self.closures.join_closures(found, len(self.estimate.graph.records) - 1)
+        self._account(verdict, len(found))
+        self._has_moved |= bool(verdict.accepted)
+        return JoinReport(True, "", 0, len(submap.landmarks) - before, self._named(verdict.accepted),
+                          components=self.components, is_refined=True)  # fmt: skip
 
     def _judge_redundancy(self, new: int, found: list[Link]) -> None:
         """A submap of a place that the map knows well adds few unknowns, and nothing is compared with it later."""
@@ -222,20 +236,8 @@ class GlobalMap:
 
     def _rejection(self, submap: Submap) -> str:
         """Reason for which a submap cannot be joined; empty if it can."""
-        if submap.agent == BUILDING:
-            return f"no agent may be called {BUILDING}"
-        if not (np.all(np.isfinite(submap.covariance)) and np.all(np.isfinite(submap.landmarks))):
-            return "not finite"
-        if np.abs(submap.landmarks).max(initial=0.0) > FARTHEST_M:
-            return f"landmarks beyond {FARTHEST_M:g} m"
-        if np.diag(submap.covariance).min() < SMALLEST_VARIANCE:
-            return f"variances below {SMALLEST_VARIANCE:g}, less than any sensor's"
-        if not is_rigid_transform(submap.end_pose):
-            return "end pose is not a rigid transform"
-        try:
-            np.linalg.cholesky(submap.covariance)
-        except np.linalg.LinAlgError:
-            return "covariance is not positive definite"
+        if fault := fault_of(submap):
+            return fault
         known = self.estimate.graph.records[0].submap.descriptors.shape[1] if self.estimate.graph.records else None
         if known is not None and submap.descriptors.shape[1] != known and len(submap.landmarks):
             return f"descriptors of {submap.descriptors.shape[1]} columns in a map of {known}"
@@ -378,18 +380,21 @@ class GlobalMap:
     @classmethod
     def load(cls, path: Path | str, config: GlobalMapConfig | None = None) -> GlobalMap:
         """The map that :meth:`save` wrote; ``ValueError`` if the folder is no such map."""
-        stored = storage.read(Path(path))
-        loaded, graph = cls(config), stored.state.graph
-        loaded._take(stored.state)
-        loaded._is_settled = not graph.records
-        loaded.marks = stored.marks
-        loaded.closures.refused = stored.refused
-        loaded.detector.pending, loaded.detector.near.compared = stored.pending, stored.compared
-        for i, record in enumerate(graph.records):
-            loaded.agents.add(i)
-            loaded.tags.add(i)
-            if not stored.state.is_redundant(i):
-                loaded.detector.index.add(i, record.submap.descriptors)
-            loaded._page_out(i)
-        loaded.estimate.relinearize()
+        loaded = cls(config)
+        loaded._restore(storage.read(Path(path)))
         return loaded
+
+    def _restore(self, stored: StoredMap) -> None:
+        """Go on from a map that was put away."""
+        self._take(stored.state)
+        self._is_settled = not stored.state.graph.records
+        self.marks = stored.marks
+        self.closures.refused = stored.refused
+        self.detector.pending, self.detector.near.compared = stored.pending, stored.compared
+        for i, record in enumerate(stored.state.graph.records):
+            self.agents.add(i)
+            self.tags.add(i)
+            if not stored.state.is_redundant(i):
+                self.detector.index.add(i, record.submap.descriptors)
+            self._page_out(i)
+        self.estimate.relinearize()

@@ -32,6 +32,7 @@ from sjsam_node.autosave import Autosave
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
 from sjsam_node.localization import Localizer
 from sjsam_node.marks import Mark, Marks
+from sjsam_node.refining import undecided
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate, Submap
@@ -55,7 +56,8 @@ class Outcome:
     """Result of handing a submap of an agent over.
 
     end: the pose at its end in the map, None where it was refused or is not known; closures: places recognised;
-    duration_s: what it took. Of one that was joined or refused: report, and in_odom, its end in its agent's odometry.
+    duration_s: what it took. Of one that was joined or refused: report, in_odom, its end in its agent's odometry, and
+    undecided, agent, session and index of submaps whose closures wait (:mod:`sjsam_node.refining`).
     Of one that was to be located: path, the poses inside it in the map, empty where its place is not known.
     """
 
@@ -66,6 +68,7 @@ class Outcome:
     in_odom: PoseEstimate | None = None
     path: tuple[PoseEstimate, ...] = ()
     duration_s: float = 0.0
+    undecided: frozenset[tuple[str, int, int]] = frozenset()
 
 
 class MapSession:
@@ -176,7 +179,9 @@ class MapSession:
         end = self._map.end_pose(submap.agent) if report.accepted else None
         if report.accepted:
             self._publish()
-        return Outcome(submap.agent, end, len(report.closures), report, self._map.odometry_pose(submap.agent))
+        waits = undecided(self._map.estimate.graph, self._map.detector.pending)
+        in_odom = self._map.odometry_pose(submap.agent)
+        return Outcome(submap.agent, end, len(report.closures), report, in_odom, undecided=waits)
 
     def _locate(self, submap: Submap) -> Outcome:
         """Thread: the place of a submap in the map."""

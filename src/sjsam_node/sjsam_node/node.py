@@ -17,17 +17,11 @@ import numpy as np
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
+from sjsam_node import map_messages
 from sjsam_node.agents import separate_parts
 from sjsam_node.autosave import Autosave
 from sjsam_node.correction import MapToOdom
 from sjsam_node.global_map import ALREADY_JOINED, JoinReport
-from sjsam_node.map_messages import (
-    cloud_message,
-    ellipsoids_message,
-    graph_message,
-    landmarks_message,
-    marks_message,
-)  # fmt: skip
 from sjsam_node.map_session import MapSession, Mode, Outcome
 from sjsam_node.node_config import SjsamNodeConfig, copy_path
 from sjsam_node.pose_tracker import PoseTracker
@@ -46,6 +40,7 @@ from slam_core.messages import (
     transform_message,
 )
 from slam_core.messages.base import Message
+from slam_core.messages.submap_keys import submap_keys_message
 from slam_core.messages.submaps import SubmapMessages
 from slam_core.nodes.awaiting import until
 from slam_core.nodes.base_node import SlamNode
@@ -123,9 +118,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
                 self.get_logger().error(f"the autosaved map cannot be used, a new one begins: {error}")
                 self.map.reset()
                 return
-            known = (
-                f"{len(self.map.snapshot)} submaps of {time.ctime((copy / 'manifest.json').stat().st_mtime)} in {copy}"
-            )
+            written = time.ctime((copy / "manifest.json").stat().st_mtime)
+            known = f"{len(self.map.snapshot)} submaps of {written} in {copy}"
             self.get_logger().warning(f"a node was killed: going on from {known} (~/reset forgets them)")
 
     def _start_trackers(self) -> None:
@@ -138,6 +132,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def _advertise_outputs(self) -> None:
         for name in ("map/landmarks", "map/cloud"):
             self.advertise(name, "PointCloud2", latched=True, depth=1)
+        self.advertise("map/undecided", "DiagnosticArray", latched=True, depth=1)
         for name in ("map/ellipsoids", "map/graph", "map/marks"):
             self.advertise(name, "MarkerArray", latched=True, depth=1)
         for agent in self.config.agents:
@@ -202,6 +197,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         if joined.end is None:
             raise ValueError(f"submap {submap.frame_id}: {report.reason}")
         self.health.processed(joined.duration_s, is_frame=False)
+        self.publish("map/undecided", submap_keys_message(self.types, self._stamp_ns, joined.undecided))
         self._count(report)
         self._follow(agent, joined.end, joined.in_odom)
 
@@ -270,7 +266,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             tracker.add_submap(end, in_odom)
 
     def _count(self, report: JoinReport) -> None:
-        self.health.count("submaps joined")
+        self.health.count("submaps refined" if report.is_refined else "submaps joined")
         self.health.count("closures", len(report.closures))
         self.health.take(self.map.counts | {"components": report.components})
         reasons = [separate_parts(self.map.snapshot)] if report.components > 1 else []
@@ -319,7 +315,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def _mark(self, point: FloatArray) -> str:
         mark = self.map.mark(point)
         header = header_message(self.types, self._stamp_ns, self.config.map_frame)
-        self.publish("map/marks", marks_message(self.types, header, self.map.snapshot.mark_positions()))
+        self.publish("map/marks", map_messages.marks_message(self.types, header, self.map.snapshot.mark_positions()))
         return mark.name
 
     def _size(self, done: str) -> str:
@@ -365,13 +361,13 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         if said := tags_text(map_tags(snapshot, landmarks)):
             self.do_later("tags", lambda: self.health.show("tags", said))
         messages = {
-            "map/landmarks": landmarks_message(self.types, header, landmarks),
-            "map/cloud": cloud_message(self.types, header, landmarks),
-            "map/graph": graph_message(self.types, header, snapshot),
-            "map/marks": marks_message(self.types, header, snapshot.mark_positions()),
+            "map/landmarks": map_messages.landmarks_message(self.types, header, landmarks),
+            "map/cloud": map_messages.cloud_message(self.types, header, landmarks),
+            "map/graph": map_messages.graph_message(self.types, header, snapshot),
+            "map/marks": map_messages.marks_message(self.types, header, snapshot.mark_positions()),
         }
         if self.has_listeners("map/ellipsoids"):
-            messages["map/ellipsoids"] = ellipsoids_message(self.types, header, landmarks)
+            messages["map/ellipsoids"] = map_messages.ellipsoids_message(self.types, header, landmarks)
         for agent in self.config.agents:
             poses = paths.get(agent, [])
             messages[below(agent, "map/path")] = path_message(self.types, self._stamp_ns, self.config.map_frame, poses)

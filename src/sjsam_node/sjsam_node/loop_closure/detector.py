@@ -135,6 +135,17 @@ class LoopDetector:
         alike = [old for old in looks if self.verifier.is_alike(at_start(graph.records[old]), second)]
         return found + self._verified([(old, new) for old in alike[:ALIKE_CANDIDATES]], known)
 
+    def again(self, record: int, chain: list[int]) -> list[Link]:
+        """Links of a record that has further landmarks now: with what it waits to be tied to, and as if it were new."""
+        waits = [k.ends for k in self.pending if record in k.ends]
+        self.pending = [k for k in self.pending if record not in k.ends]
+        self._alarms = {ends: alarms for ends, alarms in self._alarms.items() if record not in ends}
+        self.near.forget({record})
+        held = {frozenset(k.ends) for k in self.graph.links}
+        found = self._verified(waits, self._redundancy_check())
+        known = held | {frozenset(k.ends) for k in found}
+        return found + [k for k in self.closures(chain, record) if frozenset(k.ends) not in known]
+
     def _around(self, near: list[int], new: int, known: RedundancyCheck) -> list[Link]:
         """Links of record ``new`` to those near it, as long as they tell of landmarks that none has told of yet."""
         found: list[Link] = []
