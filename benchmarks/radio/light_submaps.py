@@ -10,7 +10,7 @@ between whole submaps too, parts of the map, position error (mm, all agents alig
 that are sent, and the claimed sigma of the submaps' ends over that of whole submaps (median and least).
 
 ``--only``: what is done to submaps, to find what a loss is due to: ``landmarks`` are chosen, ``descriptors`` coded,
-the ``gaussian`` compacted, and nothing else.
+the ``gaussian`` compacted, and nothing else. ``--details``: with the details of all submaps, which count too.
 """
 
 from __future__ import annotations
@@ -33,10 +33,12 @@ from slam_core.geometry import FloatArray
 from slam_core.runtime.memory import share_one_heap
 from slam_core.trajectory import Trajectory, read_trajectory
 from slam_core.types import PoseEstimate, Submap
+from slam_radio.packing import submap_details
 from slam_radio.packing.compact_gaussian import compact_gaussian
 from slam_radio.packing.descriptor_code import decode, encode
 from slam_radio.packing.landmark_choice import choose_landmarks
-from slam_radio.packing.light_submap import LightConfig, pack, unpack
+from slam_radio.packing.light_submap import LightConfig, lightened, pack, unpack, write
+from slam_radio.packing.submap_details import pack_details
 
 _COLUMNS = ("run", "landmarks", "kB", "kB/m", "pack", "unpack", "closures", "of whole", "parts", "mm", "ANEES",
             "sigma", "least")  # fmt: skip
@@ -61,6 +63,7 @@ def main() -> None:
     parser.add_argument("--landmarks", type=int, nargs="+", default=(64, 96, 128, 160))
     parser.add_argument("--rank", type=int, default=LightConfig().rank)
     parser.add_argument("--only", choices=("landmarks", "descriptors", "gaussian"))
+    parser.add_argument("--details", action="store_true")
     arguments = parser.parse_args()
     share_one_heap()  # as nodes do
     table = Table(*_COLUMNS)
@@ -76,25 +79,39 @@ def main() -> None:
             if arguments.only:
                 light, figures = [partly(s, arguments.only, config) for s in submaps], [""] * 4
             else:
-                light, figures = packed(submaps, config)
+                light, figures = packed(submaps, config, with_details=arguments.details)
             found = joined(light)
             cells = (*figures, *compared(found, whole, accuracy(found, truth, stamps)))
             table.add_row(run.name, str(landmarks), *cells)
     Console(width=140).print(table)
 
 
-def packed(submaps: Sequence[Submap], config: LightConfig) -> tuple[list[Submap], list[str]]:
+def packed(
+    submaps: Sequence[Submap], config: LightConfig, *, with_details: bool = False
+) -> tuple[list[Submap], list[str]]:
     """Submaps as they arrive, and kB, kB a metre, and ms of packing and of unpacking."""
     spent: tuple[list[float], list[float]] = ([], [])
-    data = [timed(lambda s=s: pack(s, config), spent[0]) for s in submaps]  # type: ignore[misc]
-    light = [timed(lambda d=d: unpack(d), spent[1]) for d in data]  # type: ignore[misc]
+    data = [timed(lambda s=s: messages(s, config, with_details), spent[0]) for s in submaps]  # type: ignore[misc]
+    light = [timed(lambda d=d: unpacked(*d), spent[1]) for d in data]  # type: ignore[misc]
     way = sum(float(np.linalg.norm(s.end_pose[:3, 3])) for s in submaps)
-    size = sum(map(len, data))
+    size = sum(len(message) for both in data for message in both if message)
     return light, [
         f"{size / len(submaps) / 1e3:.2f}",
         f"{size / way / 1e3:.2f}",
         *(f"{np.median(s):.1f}" for s in spent),
     ]
+
+
+def messages(submap: Submap, config: LightConfig, with_details: bool) -> tuple[bytes, bytes | None]:
+    """The message of a submap, and that of its details."""
+    light = lightened(submap, config)
+    message = write(light)
+    return message, pack_details(submap, light, message) if with_details else None
+
+
+def unpacked(message: bytes, details: bytes | None) -> Submap:
+    """The submap of its messages."""
+    return unpack(message) if details is None else submap_details.with_details(message, details)
 
 
 def timed(call: Callable[[], T], spent: list[float]) -> T:

@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from slam_core.types import PoseEstimate, Submap
+from slam_radio.detail_store import DetailStore
 from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox
 from slam_radio.outbox import Outbox
-from slam_radio.packing.light_submap import LightConfig, pack
-from slam_radio.radio_messages import pack_pose, unpack_acknowledgement
+from slam_radio.packing.light_submap import LightConfig, lightened, write
+from slam_radio.packing.submap_details import pack_details
+from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_want
 from slam_radio.uplink import OVERHEAD, Uplink
 
 SIZE = LightConfig(landmarks=5, rank=1)
@@ -30,6 +32,9 @@ class World:
     arrives: Callable[[bool, float], bool] = lambda to_post, now_s: True
     bytes_per_second: float = 2000.0
     now_s: float = 0.0
+    landmarks: int = 5
+    detailed: list[Submap] = field(default_factory=list)
+    detail_keys: list[int] = field(default_factory=list)
     passed_on: list[int] = field(default_factory=list)
     sent: list[tuple[float, int]] = field(default_factory=list)
     keys: list[int] = field(default_factory=list)
@@ -42,7 +47,9 @@ class World:
     def start_agent(self) -> None:
         if hasattr(self, "uplink"):
             self.uplink.outbox.close()
-        self.uplink = Uplink(Outbox(self.folder / "out"), self.bytes_per_second)
+            self.uplink.details.folder.close()
+        details = DetailStore(self.folder / "details")
+        self.uplink = Uplink(Outbox(self.folder / "out"), self.bytes_per_second, details=details)
 
     def start_post(self) -> list[int]:
         """Start the post anew; the indices that it passes on again."""
@@ -53,7 +60,16 @@ class World:
         return [s.index for s in self.inbox.release()]
 
     def submap(self, index: int) -> None:
-        self.uplink.add_submap((2, index), pack(self.make(5, seed=index, index=index), SIZE), self.now_s)
+        submap = self.whole(index)
+        light = lightened(submap, SIZE)
+        message = write(light)
+        if (details := pack_details(submap, light, message)) is not None:
+            self.uplink.details.folder.add((2, index), details)
+        self.uplink.add_submap((2, index), message, self.now_s)
+
+    def whole(self, index: int) -> Submap:
+        """A submap as its agent has it."""
+        return self.make(self.landmarks, seed=index, index=index)
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP_S)):
@@ -66,7 +82,9 @@ class World:
             self.uplink.set_pose(pack_pose(PoseEstimate(round(now * 1e9), np.eye(4), 1e-4 * np.eye(6))))
         for message in self.uplink.due(now):
             self.sent.append((now, len(message.data) + OVERHEAD))
-            if message.key is not None:
+            if message.kind == "details":
+                self.detail_keys.append(message.key[1])
+            elif message.key is not None:
                 self.keys.append(message.key[1])
             if not self.arrives(True, now):
                 continue
@@ -74,8 +92,14 @@ class World:
                 self.downlink.on_backlog("one", message.data, now)
             elif message.key is None:
                 self.poses.append((now, self.downlink.on_pose("one", message.data, now).stamp_ns))
+            elif message.kind == "details":
+                self.detailed += self.downlink.on_details("one", message.key, message.data, now)
             else:
                 self.passed_on += [s.index for s in self.downlink.on_submap("one", message.key, message.data, now)]
         for told in self.downlink.due(now):
-            if told.kind == "ack" and self.arrives(False, now):
+            if not self.arrives(False, now):
+                continue
+            if told.kind == "ack":
                 self.uplink.on_acknowledgement(unpack_acknowledgement(told.data), now)
+            elif told.kind == "want":
+                self.uplink.details.want(unpack_want(told.data))

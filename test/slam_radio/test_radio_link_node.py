@@ -29,6 +29,7 @@ from slam_core.messages import (  # noqa: E402
     transform_from_message,
     transform_message,
 )
+from slam_core.messages.submap_keys import submap_keys_message  # noqa: E402
 from slam_core.messages.submaps import SubmapMessages  # noqa: E402
 from slam_core.ros import sensor_qos  # noqa: E402
 from slam_core.types import PoseEstimate  # noqa: E402
@@ -104,6 +105,11 @@ def test_submaps_poses_and_corrections_cross_the_link_and_survive_its_silence(
 
             probe.wait(is_corrected, f"no correction at the agent: {logs()}")
             correction = probe.received["/helmet/map_to_odom"][-1]
+            probe.send("/map/undecided", submap_keys_message(types, 10**9, [("anna", 2, 1), ("bert", 2, 0)]))
+            wait_for(3)
+            detailed = submap_from_messages(SubmapMessages(*received()[-1]))
+            assert probe.call("/radio_link/request_details").message == "details of 1 submaps asked for"
+            wait_for(4)
         publish(2)  # the post is away
         publish(3)
         waiting = tmp_path / "state" / "indoor_slam" / "helmet" / "radio" / "outbox" / "anna"
@@ -119,12 +125,13 @@ def test_submaps_poses_and_corrections_cross_the_link_and_survive_its_silence(
         probe.wait(lambda: not list(waiting.glob("*.submap")), "what was received still waits")
     found = [submap_from_messages(SubmapMessages(*messages)) for messages in received()]
     assert [s.index for s in found] == list(range(5))
+    assert (detailed.index, len(detailed.landmarks)) == (1, 40)
+    assert [len(s.landmarks) for s in found] == [40, 40, 20, 20, 20]
     for light, whole in zip(found, submaps, strict=True):
         assert light.agent == "anna"
         assert light.session == whole.session
-        assert len(light.landmarks) == 20
         rows = [int(np.nonzero(whole.landmark_ids == i)[0][0]) for i in light.landmark_ids]
-        np.testing.assert_allclose(light.landmarks, whole.landmarks[rows], atol=1e-3)
+        np.testing.assert_allclose(light.landmarks, whole.landmarks[rows], atol=5e-3)  # a quarter of their sigma
     parent, child, found_T = transform_from_message(correction)
     assert (parent, child) == ("map", "odom")
     np.testing.assert_allclose(found_T, T, atol=1e-6)

@@ -13,10 +13,10 @@ from slam_core.health import State
 from slam_core.types import PoseEstimate, Submap
 from slam_radio.byte_budget import ByteBudget
 from slam_radio.inbox import Inbox
-from slam_radio.index_ranges import Key
+from slam_radio.index_ranges import Key, Range
 from slam_radio.link_report import Backlog, LinkReport, unpack_backlog
 from slam_radio.link_state import Hearing, LinkState
-from slam_radio.radio_messages import pack_acknowledgement, pack_correction, unpack_pose
+from slam_radio.radio_messages import pack_acknowledgement, pack_correction, pack_want, unpack_pose
 from slam_radio.uplink import OVERHEAD
 
 _BEACON_PERIOD_S = 3.0
@@ -29,7 +29,7 @@ _LEAST_CHANGE = np.repeat([1e-3, 2e-4], 3)
 
 
 class Message(NamedTuple):
-    """A message for an agent, ``kind`` being ``ack`` or ``correction``."""
+    """A message for an agent, ``kind`` being ``ack``, ``want`` or ``correction``."""
 
     agent: str
     kind: str
@@ -45,9 +45,17 @@ class _Agent:
         self.backlog: Backlog | None = None
         self.has_news = False
         self.told_at_s = float("-inf")
+        self.wants: list[Range] | None = []
+        self.wanted_at_s = float("-inf")
         self.correction: tuple[int, FloatArray] | None = None
         self.corrected_by: FloatArray | None = None
         self.corrected_at_s = float("-inf")
+
+    def want_is_due(self, now_s: float) -> bool:
+        """True if the agent does not know what is wanted, or may have to be told again."""
+        lacking = self.inbox.lacking()
+        pause_s = now_s - self.wanted_at_s
+        return pause_s >= _LEAST_PERIOD_S if self.wants != lacking else bool(lacking) and pause_s >= _BEACON_PERIOD_S
 
     def correction_is_due(self, now_s: float) -> bool:
         """True if there is a correction that the agent does not have, or has not had for long."""
@@ -82,6 +90,14 @@ class Downlink:
         agent.has_news = True
         return submaps
 
+    def on_details(self, name: str, key: Key, data: bytes, now_s: float) -> list[Submap]:
+        """Take details of a submap; returns what may be passed on. Raises as :meth:`Inbox.take_details`."""
+        agent = self._agents[name]
+        agent.hearing.heard(now_s)
+        submaps = agent.inbox.take_details(key, data)
+        agent.wants = None  # the agent is to know that they have come
+        return submaps
+
     def on_pose(self, name: str, data: bytes, now_s: float) -> PoseEstimate:
         """Take a pose; ValueError if it is damaged."""
         agent = self._agents[name]
@@ -110,6 +126,12 @@ class Downlink:
                 if self._take_budget(data, now_s):
                     agent.told_at_s, agent.has_news = now_s, False
                     out.append(Message(name, "ack", data))
+            if agent.want_is_due(now_s) and agent.hearing.is_up(now_s):
+                lacking = agent.inbox.lacking()
+                data = pack_want(lacking)
+                if self._take_budget(data, now_s):
+                    agent.wanted_at_s, agent.wants = now_s, lacking
+                    out.append(Message(name, "want", data))
             if agent.correction_is_due(now_s) and agent.hearing.is_up(now_s):
                 data = pack_correction(*agent.correction)  # type: ignore[misc]
                 if self._take_budget(data, now_s):

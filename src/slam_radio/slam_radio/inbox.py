@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from slam_core.types import Submap
 from slam_radio.index_ranges import IndexRanges, Key, Range, read_ranges, write_ranges
 from slam_radio.packing.light_submap import unpack
+from slam_radio.packing.submap_details import key_of_details, with_details
 from slam_radio.radio_messages import MOST_RANGES, unpack_submap
 from slam_radio.submap_folder import SubmapFolder
 
@@ -28,6 +29,10 @@ class Inbox:
         self._held = set(self._folder.sizes)
         self._floors_file = path / "floors.json"
         self._floors = {session: end for session, _, end in read_ranges(self._floors_file)}
+        self._details = SubmapFolder(path / "details", key_of_details)
+        self._wanted_file = path / "wanted.json"
+        asked = IndexRanges(read_ranges(self._wanted_file))
+        self.wanted = {key for key in self._folder.sizes if key in asked and key not in self._details.sizes}
         self._next: dict[int, int] = {}
         for session, index in sorted(self._held, reverse=True):
             self._next[session] = index
@@ -69,9 +74,51 @@ class Inbox:
             if key[1] <= max(self._next[key[0]], self._floors.get(key[0], 0)):
                 self._held.remove(key)
                 self._next[key[0]] = max(self._next[key[0]], key[1] + 1)
-                known = key in self._unpacked
-                released.append(self._unpacked.pop(key) if known else unpack(self._folder.read(key)))
+                released.append(self._submap(key))
         return released
+
+    def _submap(self, key: Key) -> Submap:
+        """A submap that has come, with its details if they have."""
+        light = self._unpacked.pop(key, None)
+        if key in self._details.sizes:
+            return with_details(self._folder.read(key), self._details.read(key))
+        return light or unpack(self._folder.read(key))
+
+    def ask(self, keys: Iterable[Key] | None = None) -> int:
+        """Want the details of some submaps that have come, or of all; returns of how many more than before."""
+        asked = set(self._folder.sizes if keys is None else keys) & set(self._folder.sizes)
+        new = asked - set(self._details.sizes) - self.wanted
+        if new:
+            self._set_wanted(self.wanted | new)
+        return len(new)
+
+    def take_details(self, key: Key, data: bytes) -> list[Submap]:
+        """Keep the details of a submap; returns the submap with them, unless it waits or has them already.
+
+        Raises
+        ------
+        ValueError
+            If they are damaged, or of another submap, or of one that is not here.
+        OSError
+            If they cannot be written; they are then still wanted.
+        """
+        if key not in self._folder.sizes:
+            raise ValueError(f"details of submap {self.agent} {key}, which is not here")
+        submap = with_details(self._folder.read(key), data)
+        if key in self._details.sizes:
+            self.repeated += 1
+            return []
+        self._details.add(key, data)
+        self._set_wanted(self.wanted - {key})
+        return [] if key in self._held else [submap]
+
+    def _set_wanted(self, wanted: set[Key]) -> None:
+        self.wanted = wanted
+        write_ranges(self._wanted_file, self.lacking())
+
+    def lacking(self) -> list[Range]:
+        """Ranges of the submaps whose details are wanted."""
+        return list(IndexRanges((session, index, index + 1) for session, index in self.wanted))
 
     def kept(self) -> Iterator[tuple[Key, bytes]]:
         """Keys and bytes of the submaps that lie on disk, oldest first."""
@@ -93,9 +140,13 @@ class Inbox:
         """Remove what has come from disk; it stays acknowledged while this process lives."""
         for key in list(self._folder.sizes):
             self._folder.remove(key)
+        for key in list(self._details.sizes):
+            self._details.remove(key)
+        self._set_wanted(set())
         self._held.clear()
         self._unpacked.clear()
 
     def close(self) -> None:
         """Let another process have the folder."""
         self._folder.close()
+        self._details.close()

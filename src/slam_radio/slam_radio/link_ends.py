@@ -24,17 +24,20 @@ from slam_core.messages import (
     transform_message,
 )
 from slam_core.messages.base import Message
+from slam_core.messages.submap_keys import submap_keys_from_message
 from slam_core.messages.submaps import SubmapMessages
 from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.types import PoseEstimate, Submap
+from slam_radio.detail_store import DetailStore
 from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox
 from slam_radio.index_ranges import Key
 from slam_radio.link_state import LinkState
 from slam_radio.outbox import Outbox
-from slam_radio.packing.light_submap import pack
+from slam_radio.packing.light_submap import lightened, write
+from slam_radio.packing.submap_details import pack_details
 from slam_radio.radio_config import RadioConfig
-from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_correction
+from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_correction, unpack_want
 from slam_radio.uplink import Uplink
 from slam_radio.zenoh_link import ZenohLink
 
@@ -54,6 +57,7 @@ class LinkNode(Protocol):
     def publish(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
     def broadcast(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
     def do_later(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
+    def serve(self, name: str, action: Callable[[], str]) -> None: ...  # noqa: D102
     def get_logger(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
 
 
@@ -104,7 +108,10 @@ class AgentEnd(End):
         config = node.config
         self.name = config.agents[0]
         outbox = Outbox(node.state_folder / "outbox" / self.name)
-        self.uplink = Uplink(outbox, config.bytes_per_second, config.resend_after_s, config.silent_after_s)
+        self.details = DetailStore(node.state_folder / "details" / self.name, config.resend_after_s)
+        self.uplink = Uplink(
+            outbox, config.bytes_per_second, config.resend_after_s, config.silent_after_s, self.details
+        )
         self._odometry: Message | None = None
         self._T_map_odom: FloatArray | None = None
         if waiting := outbox.waiting:
@@ -114,6 +121,7 @@ class AgentEnd(End):
         if config.correction_topic:
             node.advertise(config.correction_topic, "TransformStamped", latched=True, depth=1, alone=True)
         self.hear(f"slam/{self.name}/ack", self.on_acknowledgement)
+        self.hear(f"slam/{self.name}/want", self.on_want)
         self.hear(f"slam/{self.name}/correction", self.on_correction)
 
     def on_submap(self, *messages: Message) -> None:
@@ -123,9 +131,14 @@ class AgentEnd(End):
         if self.uplink.outbox.knows(key):
             self.node.health.count("submaps sent again")
             return
-        light = pack(replace(submap, agent=self.name), self.node.config.light)
+        submap = replace(submap, agent=self.name)
+        light = lightened(submap, self.node.config.light)
+        message = write(light)
+        details = pack_details(submap, light, message)
         try:
-            self.uplink.add_submap(key, light, time.monotonic())
+            if details is not None:
+                self.details.folder.add(key, details)
+            self.uplink.add_submap(key, message, time.monotonic())
         except OSError as error:
             raise ValueError(f"submap {submap.index} cannot be kept for the post: {error}") from error
         self.node.health.count("submaps packed")
@@ -146,6 +159,11 @@ class AgentEnd(End):
         """The post is there and has some submaps."""
         self.uplink.on_acknowledgement(unpack_acknowledgement(data), time.monotonic())
 
+    def on_want(self, _: str, data: bytes) -> None:
+        """The post lacks the details of some submaps."""
+        self.details.want(unpack_want(data))
+        self.uplink.on_heard(time.monotonic())
+
     def on_correction(self, _: str, data: bytes) -> None:
         """Publish where this agent's odometry is in the post's map."""
         self._T_map_odom = unpack_correction(data)[1]
@@ -164,12 +182,14 @@ class AgentEnd(End):
 
     def state(self, now_s: float) -> LinkState:
         """Health of the link."""
-        self.node.health.take({"submaps waiting": len(self.uplink.outbox.waiting), "resent": self.uplink.resent})
+        self.node.health.take({"submaps waiting": len(self.uplink.outbox.waiting), "resent": self.uplink.resent,
+                               "details sent": self.details.sent})  # fmt: skip
         return self.uplink.state(now_s)
 
     def close(self) -> None:
         """Keep what waits for the next start."""
         self.uplink.outbox.close()
+        self.details.folder.close()
 
 
 class PostEnd(End):
@@ -187,9 +207,13 @@ class PostEnd(End):
                 f"{agent}/map_to_odom", "TransformStamped", correction,
                 latched=True, required=False, stamps=StampPolicy.ANY,
             )  # fmt: skip
+        node.listen("map/undecided", "DiagnosticArray", self.on_undecided, latched=True, required=False,
+                    stamps=StampPolicy.ANY)  # fmt: skip
+        node.serve("~/request_details", self.request_details)
         for agent in config.agents:
             self.hear(f"slam/{agent}/pose", partial(self.on_pose, agent))
             self.hear(f"slam/{agent}/submap/*/*", partial(self.on_submap, agent))
+            self.hear(f"slam/{agent}/details/*/*", partial(self.on_details, agent))
             self.hear(f"slam/{agent}/backlog", partial(self.on_backlog, agent))
 
     def on_pose(self, agent: str, _: str, data: bytes) -> None:
@@ -199,6 +223,22 @@ class PostEnd(End):
     def on_submap(self, agent: str, name: str, data: bytes) -> None:
         """Keep a submap and publish what is in order."""
         self.publisher.pass_on(agent, self.downlink.on_submap(agent, submap_key(name), data, time.monotonic()))
+
+    def on_details(self, agent: str, name: str, data: bytes) -> None:
+        """Keep details and publish their submap once more, with them."""
+        submaps = self.downlink.on_details(agent, submap_key(name), data, time.monotonic())
+        self.publisher.pass_on(agent, submaps)
+        self.node.health.count("details received")
+
+    def on_undecided(self, message: Message) -> None:
+        """The map cannot tell if some submaps are of one place: ask for all that their agents know of them."""
+        keys = submap_keys_from_message(message)
+        for inbox in self.downlink.inboxes:
+            inbox.ask((session, index) for agent, session, index in keys if agent == inbox.agent)
+
+    def request_details(self) -> str:
+        """Ask for the details of all submaps that have come."""
+        return f"details of {sum(inbox.ask() for inbox in self.downlink.inboxes)} submaps asked for"
 
     def on_backlog(self, agent: str, _: str, data: bytes) -> None:
         """Keep what waits at an agent."""
@@ -217,6 +257,7 @@ class PostEnd(End):
     def state(self, now_s: float) -> LinkState:
         """Health of the link."""
         self.publisher.show(self.downlink, now_s)
+        self.node.health.take({"details wanted": sum(len(inbox.wanted) for inbox in self.downlink.inboxes)})
         return self.downlink.state(now_s)
 
     def reset(self) -> None:

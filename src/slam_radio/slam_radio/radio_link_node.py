@@ -4,8 +4,9 @@
 At the agent it reads ``submap/*`` and ``odom``; at the post it publishes them below each agent's name, as ``sjsam``
 reads them, and sends ``sjsam``'s ``map_to_odom`` back. Key expressions: ``slam/<agent>/pose``,
 ``slam/<agent>/submap/<session>/<index>`` and ``slam/<agent>/backlog`` to the post, ``slam/<agent>/ack`` and
-``slam/<agent>/correction`` from it. With role peer an agent has such a link to every other one, under
-``slam/<agent>/to/<other>/...``, and publishes all submaps, its own too, as a post would have them.
+``slam/<agent>/correction`` from it; ``slam/<agent>/want`` from it asks for ``slam/<agent>/details/<session>/<index>``.
+With role peer an agent has such a link to every other one, under ``slam/<agent>/to/<other>/...``, and publishes all
+submaps, its own too, as a post would have them.
 """
 
 # rclpy is annotated in part only.
@@ -14,8 +15,11 @@ reads them, and sends ``sjsam``'s ``map_to_odom`` back. Key expressions: ``slam/
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from typing import Any
 
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
+from std_srvs.srv import Trigger
 
 from slam_core.nodes.base_node import SlamNode
 from slam_core.ros import run_node
@@ -47,6 +51,16 @@ class RadioLinkNode(SlamNode[RadioConfig]):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_PUMP_PERIOD_S, lambda: self.end.pump(time.monotonic()), clock=steady)
         self.create_timer(_STATE_PERIOD_S, self._show_state, clock=steady)
+
+    def serve(self, name: str, action: Callable[[], str]) -> None:
+        """Offer a std_srvs/Trigger service that says what was done."""
+
+        def answer(_: Any, response: Any) -> Any:
+            response.success, response.message = True, action()
+            self.get_logger().info(f"{name}: {response.message}")
+            return response
+
+        self.create_service(Trigger, name, answer)
 
     def on_reset(self) -> None:
         """Forget what has come; what waits to go out stays."""

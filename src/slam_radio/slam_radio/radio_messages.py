@@ -10,6 +10,7 @@ pose             30 bytes: i64 stamp ns; 3 x f32 position m; 3 x i16 rotation ve
 correction       32 bytes: i64 stamp ns; 3 x f32 position m, 3 x f32 rotation vector of T_map_odom
 acknowledgement  b"SA", u8 version, u32 CRC-32 of the rest; then ranges of 3 x u32: session, first index, the
                  index behind the last
+want             as an acknowledgement, with b"SW": submaps whose details the post lacks, all of them; none: no ranges
 submap           u32: the lowest index of this session that its agent still has to send; then a submap for the
                  air (:mod:`slam_radio.packing.light_submap`)
 ===============  =============================================================================================
@@ -34,7 +35,7 @@ MOST_RANGES = 64
 _ACKNOWLEDGEMENT = struct.Struct("<2sBI")
 _RANGE = struct.Struct("<III")
 _FLOOR = struct.Struct("<I")
-_MAGIC, _VERSION = b"SA", 1
+_MAGIC, _WANT_MAGIC, _VERSION = b"SA", b"SW", 1
 _TURN = np.pi / 32767
 _LEAST_SIGMA, _LARGEST_SIGMA = 1e-4, 6e4
 _FARTHEST_M = 1e6
@@ -72,20 +73,38 @@ def unpack_correction(data: bytes) -> tuple[int, FloatArray]:
 
 def pack_acknowledgement(ranges: Iterable[Range]) -> bytes:
     """An acknowledgement of the first :data:`MOST_RANGES` of some ranges."""
-    body = b"".join(_RANGE.pack(*entry) for entry in list(ranges)[:MOST_RANGES])
-    return _ACKNOWLEDGEMENT.pack(_MAGIC, _VERSION, zlib.crc32(body)) + body
+    return _pack_ranges(_MAGIC, ranges)
 
 
 def unpack_acknowledgement(data: bytes) -> list[Range]:
     """The ranges of an acknowledgement; ValueError if it is damaged."""
+    return _unpack_ranges(_MAGIC, data, "an acknowledgement")
+
+
+def pack_want(ranges: Iterable[Range]) -> bytes:
+    """The first :data:`MOST_RANGES` ranges of submaps whose details the post lacks."""
+    return _pack_ranges(_WANT_MAGIC, ranges)
+
+
+def unpack_want(data: bytes) -> list[Range]:
+    """Inverse of :func:`pack_want`; ValueError if it is damaged."""
+    return _unpack_ranges(_WANT_MAGIC, data, "a want")
+
+
+def _pack_ranges(magic: bytes, ranges: Iterable[Range]) -> bytes:
+    body = b"".join(_RANGE.pack(*entry) for entry in list(ranges)[:MOST_RANGES])
+    return _ACKNOWLEDGEMENT.pack(magic, _VERSION, zlib.crc32(body)) + body
+
+
+def _unpack_ranges(magic: bytes, data: bytes, name: str) -> list[Range]:
     body = data[_ACKNOWLEDGEMENT.size :]
     if len(data) < _ACKNOWLEDGEMENT.size or len(body) % _RANGE.size or len(body) > MOST_RANGES * _RANGE.size:
-        raise ValueError(f"an acknowledgement cannot have {len(data)} bytes")
-    if _ACKNOWLEDGEMENT.unpack_from(data) != (_MAGIC, _VERSION, zlib.crc32(body)):
-        raise ValueError(f"not an acknowledgement of version {_VERSION}, or damaged")
+        raise ValueError(f"{name} cannot have {len(data)} bytes")
+    if _ACKNOWLEDGEMENT.unpack_from(data) != (magic, _VERSION, zlib.crc32(body)):
+        raise ValueError(f"not {name} of version {_VERSION}, or damaged")
     ranges = [(session, first, end) for session, first, end in _RANGE.iter_unpack(body)]
     if any(first >= end for _, first, end in ranges):
-        raise ValueError("an acknowledgement has an empty range")
+        raise ValueError(f"{name} has an empty range")
     return ranges
 
 

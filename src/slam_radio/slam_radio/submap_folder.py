@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of submaps for the air, one file each, that survives its process."""
+"""A folder of submaps for the air, or of their details, one file each, that survives its process."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 from slam_core.storage.files import PathLock, atomic_path, read_bytes
@@ -16,6 +17,7 @@ _NAME = re.compile(r"(\d{1,10})-(\d{1,10})\.submap")
 class SubmapFolder:
     """The submaps of one agent on disk: ``sizes`` has their keys and bytes.
 
+    ``key_of``: session and index of what the bytes of a file hold, by default of a submap; ValueError if damaged.
     Files that it did not write, or that are damaged, are neither read nor removed; ``strangers`` counts them.
 
     Raises
@@ -24,8 +26,8 @@ class SubmapFolder:
         If another process keeps the folder, or it cannot be read or written.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, key_of: Callable[[bytes], Key] | None = None) -> None:
+        self.path, self._key_of = path, key_of or _submap_key
         self._lock = PathLock(path)
         self.sizes: dict[Key, int] = {}
         self.strangers = 0
@@ -62,10 +64,13 @@ class SubmapFolder:
     def _file(self, key: Key) -> Path:
         return self.path / f"{key[0]}-{key[1]}.submap"
 
-    @staticmethod
-    def _is_ours(file: Path, key: Key) -> bool:
+    def _is_ours(self, file: Path, key: Key) -> bool:
         try:
-            submap = unpack(read_bytes(file, MOST_BYTES))
+            return self._key_of(read_bytes(file, MOST_BYTES)) == key
         except (ValueError, OSError):
             return False
-        return (submap.session, submap.index) == key
+
+
+def _submap_key(data: bytes) -> Key:
+    submap = unpack(data)
+    return submap.session, submap.index

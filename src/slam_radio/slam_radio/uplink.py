@@ -4,7 +4,7 @@
 The newest pose goes first and always, once a second. Submaps follow oldest first, as far as the budget allows and while
 the post is heard; few are under way at a time, so that a slow link does not fill with what poses would wait behind. One
 that is not acknowledged goes out again after a time that doubles from try to try. How much waits is told while it
-waits, and when nothing does any more.
+waits, and when nothing does any more. Details that the post wants come last, when no submap waits.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 from slam_core.health import State
 from slam_radio.byte_budget import ByteBudget
+from slam_radio.detail_store import DetailStore
 from slam_radio.index_ranges import Key, Range
 from slam_radio.link_report import Backlog, pack_backlog
 from slam_radio.link_state import Carriage, Hearing, LinkState
@@ -34,7 +35,7 @@ _LEAST_WAIT_S = 2.0
 
 @dataclass(frozen=True)
 class Outgoing:
-    """A message to send: ``kind`` pose, submap or backlog, ``key`` of a submap."""
+    """A message to send: ``kind`` pose, submap, details or backlog, ``key`` of a submap."""
 
     kind: str
     data: bytes
@@ -65,12 +66,15 @@ class Uplink:
         A submap that is not acknowledged goes out again after so long, then after twice that, up to a minute.
     silent_after_s
         The post counts as silent when nothing came from it for so long.
+    details
+        What the post may ask for.
     """
 
     def __init__(
-        self, outbox: Outbox, budget: float | ByteBudget, resend_after_s: float = 5.0, silent_after_s: float = 10.0
-    ) -> None:
-        self.outbox = outbox
+        self, outbox: Outbox, budget: float | ByteBudget, resend_after_s: float = 5.0, silent_after_s: float = 10.0,
+        details: DetailStore | None = None,
+    ) -> None:  # fmt: skip
+        self.outbox, self.details = outbox, details
         self.resent = 0
         self._budget = budget if isinstance(budget, ByteBudget) else ByteBudget(budget)
         self._resend_after_s = resend_after_s
@@ -102,6 +106,8 @@ class Uplink:
         if not self._hearing.is_up(now_s):  # what is under way may have been lost: it need not wait for long any more
             for sent in self._sent.values():
                 sent.due_s, sent.tries = min(sent.due_s, now_s + self._resend_after_s), 1
+            if self.details is not None:
+                self.details.hurry(now_s)
         self.on_heard(now_s)
         sizes = {key: self.outbox.size(key) for key in self.outbox.waiting}
         for key in self.outbox.acknowledge(ranges):
@@ -118,7 +124,20 @@ class Uplink:
         out = self.due_pose(now_s)
         while (key := self.ready(now_s)) is not None and self.affords(key, now_s):
             out.append(self.take(key, now_s))
-        return out + self.due_backlog(now_s)
+        return out + self.due_backlog(now_s) + self.due_details(now_s)
+
+    def due_details(self, now_s: float) -> list[Outgoing]:
+        """Details that the post wants, while no submap waits."""
+        out: list[Outgoing] = []
+        if self.details is None or self.outbox.waiting or not self._hearing.is_up(now_s):
+            return out
+        while (key := self.details.ready(now_s)) is not None:
+            size = self.details.folder.sizes[key] + OVERHEAD
+            if not self._budget.allows(size, now_s):
+                break
+            self._budget.spend(size)
+            out.append(Outgoing("details", self.details.take(key, now_s), key))
+        return out
 
     def due_pose(self, now_s: float) -> list[Outgoing]:
         """The newest pose, where it is to go out now."""

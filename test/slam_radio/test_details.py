@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Details on request: they come when they are asked for, once, after all submaps, and never make a submap surer."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from radio_world import SIZE, World
+
+from slam_core.types import Submap
+from slam_radio.packing.light_submap import lightened, write
+from slam_radio.packing.submap_details import key_of_details, pack_details, with_details
+
+
+@pytest.fixture
+def world(tmp_path, make_submap):
+    return World(tmp_path, make_submap, landmarks=12)
+
+
+def packed(submap: Submap) -> tuple[bytes, bytes]:
+    light = lightened(submap, SIZE)
+    message = write(light)
+    details = pack_details(submap, light, message)
+    assert details is not None
+    return message, details
+
+
+def test_nothing_goes_out_unasked_and_what_is_asked_for_goes_out_once(world):
+    world.run(5.0)
+    for index in range(4):
+        world.submap(index)
+    world.run(20.0)
+    assert world.detail_keys == []
+    assert world.inbox.ask([(2, 1), (2, 3), (9, 9)]) == 2
+    world.run(20.0)
+    assert world.detail_keys == [1, 3]
+    assert [s.index for s in world.detailed] == [1, 3]
+    assert world.inbox.wanted == set()
+    assert world.inbox.ask() == 2
+    world.run(20.0)
+    assert sorted(world.detail_keys) == [0, 1, 2, 3]
+    assert sorted(world.keys) == [0, 1, 2, 3]
+
+
+def test_with_details_a_submap_has_all_landmarks_and_is_not_surer(make_submap):
+    submap = make_submap(12)
+    found = with_details(*packed(submap))
+    assert sorted(found.landmark_ids) == sorted(submap.landmark_ids)
+    rows = np.array([int(np.nonzero(submap.landmark_ids == i)[0][0]) for i in found.landmark_ids])
+    unknowns = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).ravel()])
+    L = np.linalg.inv(np.linalg.cholesky(found.covariance))
+    assert np.linalg.eigvalsh(L @ submap.covariance[np.ix_(unknowns, unknowns)] @ L.T)[-1] <= 1.0
+    np.testing.assert_allclose(found.landmarks, submap.landmarks[rows], atol=0.01)
+    assert np.einsum("nd,nd->n", found.descriptors, submap.descriptors[rows]).min() > 0.99
+
+
+def test_submaps_go_out_before_details(world):
+    world.bytes_per_second = 1000.0
+    world.start_agent()
+    world.run(5.0)
+    world.submap(0)
+    world.run(10.0)
+    world.inbox.ask()
+    for index in range(1, 6):
+        world.submap(index)
+    world.run(1.0)
+    assert world.detail_keys == []
+    world.run(60.0)
+    assert world.keys == list(range(6))
+    assert world.detail_keys == [0]
+
+
+def test_a_silence_and_restarts_of_both_sides_lose_no_details_and_send_none_twice(world):
+    world.run(5.0)
+    for index in range(3):
+        world.submap(index)
+    world.run(15.0)
+    world.arrives = lambda to_post, now_s: now_s > 80.0
+    world.inbox.ask()
+    world.run(30.0)
+    assert world.detailed == []
+    world.start_agent()
+    assert world.start_post() == [0, 1, 2]
+    assert len(world.inbox.wanted) == 3
+    world.run(70.0)
+    assert sorted(s.index for s in world.detailed) == [0, 1, 2]
+    assert sorted(world.detail_keys) == [0, 1, 2]
+    assert world.start_post() == [0, 1, 2]
+    assert world.inbox.wanted == set()
+    again = {s.index: len(s.landmarks) for s in [world.inbox._submap((2, k)) for k in range(3)]}
+    assert again == {0: 12, 1: 12, 2: 12}
+
+
+def test_a_fifth_of_all_messages_may_be_lost(world, rng):
+    world.arrives = lambda to_post, now_s: bool(rng.random() > 0.2)
+    for index in range(10):
+        world.submap(index)
+    world.run(90.0)
+    world.inbox.ask()
+    world.run(180.0)
+    assert sorted(s.index for s in world.detailed) == list(range(10))
+
+
+def test_damaged_ones_and_those_of_another_message_are_refused_and_still_wanted(world, make_submap, rng):
+    world.run(5.0)
+    world.submap(1)
+    world.run(10.0)
+    world.inbox.ask()
+    message, details = packed(world.whole(1))
+    for _ in range(100):
+        spoilt = bytearray(details)
+        spoilt[rng.integers(len(details))] ^= int(rng.integers(1, 256))
+        with pytest.raises(ValueError, match=r"."):
+            world.downlink.on_details("one", (2, 1), bytes(spoilt), world.now_s)
+    with pytest.raises(ValueError, match="not of this submap"):
+        with_details(message, packed(make_submap(13, seed=1, index=1))[1])
+    with pytest.raises(ValueError, match="which is not here"):
+        world.downlink.on_details("one", (2, 7), details, world.now_s)
+    assert world.inbox.wanted == {(2, 1)}
+    assert key_of_details(details) == (2, 1)
+
+
+def test_forged_details_are_refused_or_of_a_submap(make_submap, rng):
+    message, details = packed(make_submap(12))
+    refused = 0
+    for _ in range(300):
+        forged = bytearray(details[7:])
+        for at in rng.integers(len(forged), size=2):
+            forged[at] = int(rng.integers(256))
+        try:
+            found = with_details(message, struct.pack("<2sBI", b"SD", 1, zlib.crc32(forged)) + forged)
+        except ValueError:
+            refused += 1
+        else:
+            np.linalg.cholesky(found.covariance)
+    assert refused > 20
+
+
+def test_a_submap_that_was_sent_whole_has_none(make_submap):
+    submap = make_submap(5)
+    light = lightened(submap, SIZE)
+    assert pack_details(submap, light, write(light)) is None
