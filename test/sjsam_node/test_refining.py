@@ -53,11 +53,9 @@ def test_a_closure_that_too_little_spoke_for_is_found_with_them(agent: Agent) ->
     joined = GlobalMap()
     for submap in whole:
         joined.add(part(submap, 6))
-    joined.settle()
     few = sum(k.is_closure for k in joined.estimate.graph.links)
     for submap in whole:
         assert joined.add(submap).is_refined
-    joined.settle()
     assert sum(k.is_closure for k in joined.estimate.graph.links) > few
 
 

@@ -73,6 +73,19 @@ def test_submaps_go_out_before_details(world):
     assert world.detail_keys == [0]
 
 
+def test_a_submap_that_is_not_acknowledged_yet_holds_details_back(world):
+    world.run(5.0)
+    world.submap(0)
+    world.run(10.0)
+    world.uplink.details.want([(2, 0, 1)])
+    world.submap(1)
+    kinds = [[m.kind for m in world.uplink.due(world.now_s + k)] for k in (0.1, 0.2)]
+    assert "submap" in kinds[0]
+    assert not any("details" in sent for sent in kinds)
+    world.uplink.on_acknowledgement([(2, 0, 2)], world.now_s + 0.3)
+    assert [m.kind for m in world.uplink.due(world.now_s + 0.3)] == ["details"]
+
+
 def test_a_silence_and_restarts_of_both_sides_lose_no_details_and_send_none_twice(world):
     world.run(5.0)
     for index in range(3):

@@ -158,11 +158,12 @@ def test_what_cannot_be_is_refused_in_one_line(
     assert "Traceback" not in done.stderr
 
 
-def test_without_zenoh_a_line_says_what_to_install(environment: dict[str, str]) -> None:
-    code = "import sys; sys.modules['zenoh'] = None; from slam_radio.radio_link_node import main; main()"
+@pytest.mark.parametrize(("module", "project"), [("zenoh", "eclipse-zenoh"), ("constriction", "constriction")])
+def test_without_a_library_a_line_says_what_to_install(environment: dict[str, str], module: str, project: str) -> None:
+    code = f"import sys; sys.modules['{module}'] = None; from slam_radio.radio_link_node import main; main()"
     arguments = ros_arguments({"connect": ("tcp/127.0.0.1:1",)})
     done = subprocess.run(
         [sys.executable, "-c", code, *arguments], env=environment, capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 2
-    assert "pip install eclipse-zenoh" in done.stderr
+    assert f"pip install {project}" in done.stderr

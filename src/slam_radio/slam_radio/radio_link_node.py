@@ -25,6 +25,7 @@ from slam_core.nodes.base_node import SlamNode
 from slam_core.ros import run_node
 from slam_core.storage.files import state_folder
 from slam_radio.link_ends import AgentEnd, End, PostEnd
+from slam_radio.packing.symbol_code import coder_library
 from slam_radio.peer_end import PeerEnd
 from slam_radio.radio_config import RadioConfig
 from slam_radio.zenoh_link import ZenohLink
@@ -42,6 +43,7 @@ class RadioLinkNode(SlamNode[RadioConfig]):
         config = self.config
         if not (config.connect or config.listen or config.scouting or config.zenoh_config):
             raise ValueError("say where the other end is: parameter 'connect' or 'listen', as tcp/192.168.1.10:7447")
+        coder_library()  # refuses to start without it
         self.state_folder = state_folder(config.state_path, self.get_namespace())
         self.link = ZenohLink(
             config.connect, config.listen, user=config.user, password_file=config.password_file,

@@ -75,7 +75,7 @@ def test_the_curves_are_the_same_on_every_machine():
 
 def test_without_the_coder_a_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "constriction", None)
-    symbol_code._constriction.cache_clear()
+    symbol_code.coder_library.cache_clear()
     with pytest.raises(ValueError, match="pip install constriction"):
         SymbolWriter()
-    symbol_code._constriction.cache_clear()
+    symbol_code.coder_library.cache_clear()

@@ -37,7 +37,7 @@ class SymbolWriter:
     """Takes columns of numbers; ``bytes`` are those that a :class:`SymbolReader` reads."""
 
     def __init__(self) -> None:
-        self._coder: Any = _constriction().stream.queue.RangeEncoder()
+        self._coder: Any = coder_library().stream.queue.RangeEncoder()
 
     def columns(self, values: IntArray) -> None:
         """Columns (n, k) of numbers around zero, from -127 to 127, each with a curve of its own."""
@@ -74,7 +74,7 @@ class SymbolWriter:
         return bytes(self._coder.get_compressed().astype("<u4").tobytes())
 
     def _even(self, values: AnyArray, size: int) -> None:
-        self._coder.encode(np.ascontiguousarray(values, dtype=np.int32), _constriction().stream.model.Uniform(size))
+        self._coder.encode(np.ascontiguousarray(values, dtype=np.int32), coder_library().stream.model.Uniform(size))
 
 
 class SymbolReader:
@@ -83,7 +83,7 @@ class SymbolReader:
     def __init__(self, data: bytes) -> None:
         if len(data) % 4:
             raise ValueError(f"coded numbers come in groups of 4 bytes, got {len(data)}")
-        self._coder: Any = _constriction().stream.queue.RangeDecoder(np.frombuffer(data, "<u4").astype(np.uint32))
+        self._coder: Any = coder_library().stream.queue.RangeDecoder(np.frombuffer(data, "<u4").astype(np.uint32))
 
     def columns(self, n: int, k: int) -> IntArray:
         """Columns (n, k) of numbers from -127 to 127."""
@@ -111,7 +111,7 @@ class SymbolReader:
             raise ValueError("a message holds more coded numbers than it says")
 
     def _even(self, n: int, size: int) -> IntArray:
-        return self._decoded(_constriction().stream.model.Uniform(size), n)
+        return self._decoded(coder_library().stream.model.Uniform(size), n)
 
     def _decoded(self, model: Any, n: int) -> IntArray:
         try:
@@ -149,12 +149,13 @@ def _logarithms() -> npt.NDArray[np.float64]:
 
 @cache
 def _models() -> list[Any]:
-    categorical = _constriction().stream.model.Categorical
+    categorical = coder_library().stream.model.Categorical
     return [categorical(curve, perfect=False) for curve in _probabilities()]
 
 
 @cache
-def _constriction() -> Any:
+def coder_library() -> Any:
+    """The package constriction; ``ValueError`` that says what to install where it is not."""
     try:
         import constriction
     except ImportError as error:
