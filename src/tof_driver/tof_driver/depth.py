@@ -108,7 +108,8 @@ class DepthProcessor:
         reason, sigma = self._believable(distance, amplitude)
         depth = np.empty_like(distance)
         counts = np.zeros(len(Reason), np.int64)
-        _along_z(distance, reason, self._ray_length, depth, sigma, counts)
+        flat = (a.reshape(-1) for a in (distance, reason, self._ray_length, depth, sigma))
+        _along_z(*flat, counts)
         depth, sigma = self._rectified(depth, sigma)
         self._count(counts, depth)
         return DepthImage(
@@ -128,8 +129,8 @@ class DepthProcessor:
     def _metres(self, image: AnyArray) -> Float32Array:
         self._check_shape("image", image)
         if image.dtype == np.uint16:
-            metres = image.astype(np.float32) * np.float32(0.001)
-            metres[image == MILLIMETRES_INVALID] = np.nan
+            metres = np.empty(image.shape, np.float32)
+            _metres_of_millimetres(np.ascontiguousarray(image, np.uint16).ravel(), metres.reshape(-1))
             return metres
         if not np.issubdtype(image.dtype, np.floating):
             raise ValueError(f"range image must be uint16 (mm) or float (m), got {image.dtype}")
@@ -155,7 +156,8 @@ class DepthProcessor:
         reason = judge_pixels(mask, distance, amplitude)
         if noise.model == "quadratic":
             sigma = np.empty_like(distance)
-            _quadratic_sigma(distance, self._ray_length, np.float32(noise.constant), np.float32(noise.quadratic), sigma)
+            flat = (a.reshape(-1) for a in (distance, self._ray_length, sigma))
+            _quadratic_sigma(*flat, np.float32(noise.constant), np.float32(noise.quadratic))
         else:
             sigma = range_sigma(noise, distance, amplitude)
         if mask.flying_pixels:
@@ -181,27 +183,32 @@ class DepthProcessor:
                 self.counters.add(Reason(value).name.lower(), int(amount))
 
 
+@in_place()
+def _metres_of_millimetres(millimetres, out):  # type: ignore[no-untyped-def]
+    for i in range(len(millimetres)):
+        known = millimetres[i] != MILLIMETRES_INVALID
+        out[i] = np.float32(millimetres[i]) * np.float32(0.001) if known else np.float32(np.nan)
+
+
 @in_place(error_model="numpy")
-def _quadratic_sigma(distance, ray_length, constant, quadratic, out):  # type: ignore[no-untyped-def]
+def _quadratic_sigma(distance, ray_length, out, constant, quadratic):  # type: ignore[no-untyped-def]
     """Fill ``out`` with the standard deviation along the ray of a camera whose noise grows with depth squared."""
-    for v in range(distance.shape[0]):
-        for u in range(distance.shape[1]):
-            z = distance[v, u] / ray_length[v, u]
-            out[v, u] = (constant + quadratic * z * z) * ray_length[v, u]
+    for i in range(len(out)):
+        z = distance[i] / ray_length[i]
+        out[i] = (constant + quadratic * z * z) * ray_length[i]
 
 
 @in_place(error_model="numpy")
 def _along_z(distance, reason, ray_length, depth, sigma, counts):  # type: ignore[no-untyped-def]
     """Fill ``depth``, and turn ``sigma`` into that of depth; NaN where a pixel is not valid. Counts the reasons."""
-    for v in range(distance.shape[0]):
-        for u in range(distance.shape[1]):
-            valid = reason[v, u] == VALID
-            depth[v, u] = distance[v, u] / ray_length[v, u] if valid else np.float32(np.nan)
-            sigma[v, u] = sigma[v, u] / ray_length[v, u] if valid else np.float32(np.nan)
-    for v in range(reason.shape[0]):
-        for u in range(reason.shape[1]):
-            if reason[v, u] != VALID:
-                counts[reason[v, u]] += 1
+    for i in range(len(depth)):
+        z, s = distance[i] / ray_length[i], sigma[i] / ray_length[i]
+        valid = reason[i] == VALID
+        depth[i] = z if valid else np.float32(np.nan)
+        sigma[i] = s if valid else np.float32(np.nan)
+    for i in range(len(reason)):
+        if reason[i] != VALID:
+            counts[reason[i]] += 1
     counts[VALID] = reason.size - counts.sum()
 
 

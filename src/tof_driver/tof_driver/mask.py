@@ -120,54 +120,74 @@ def reject_flying_pixels(distance: Float32Array, sigma: Float32Array, reason: By
     pixel_angle
         Angle between the rays of neighbouring pixels, rad.
     """
-    height, width = distance.shape
+    width = distance.shape[1]
     # Half of the noise of a difference: sqrt(a^2 + b^2) is taken as (a + b) / sqrt(2).
     half = np.float32(NOISE_MULTIPLE / np.sqrt(2.0))
     slope = np.float32(pixel_angle * np.tan(np.radians(MAXIMUM_INCIDENCE_DEG)))
-    surrounded, noise = np.empty((2, height + 2, width + 2), np.float32)
-    _surround(distance, sigma, reason, half, surrounded, noise)
+    readings, noise = np.empty((2, 3, width + 2), np.float32)
     jumps, same_surface = np.empty((2, width), np.float32)
-    _mark_flying(surrounded, noise, slope, MINIMUM_NEIGHBOURS, jumps, same_surface, reason)
+    _mark_flying(distance, sigma, half, slope, MINIMUM_NEIGHBOURS, readings, noise, jumps, same_surface, reason)
 
 
 @in_place()
-def _surround(distance, sigma, reason, factor, surrounded, noise):  # type: ignore[no-untyped-def]
-    """Readings in a frame of NaN, and their noise: no comparison with NaN holds, so no border has to be tested for."""
-    height, width = distance.shape
-    surrounded[:] = np.float32(np.nan)
-    noise[:] = np.float32(0.0)
-    for v in range(height):
-        for u in range(width):
-            noise[v + 1, u + 1] = sigma[v, u] * factor
-            if reason[v, u] != NO_READING and reason[v, u] != SATURATED:
-                surrounded[v + 1, u + 1] = distance[v, u]
+def _mark_flying(  # type: ignore[no-untyped-def]
+    distance, sigma, factor, slope, minimum_neighbours, readings, noise, jumps, same_surface, reason
+):
+    """Row by row; ``readings`` and ``noise`` (3, width + 2) are room for three rows in a frame of NaN.
 
-
-@in_place()
-def _mark_flying(distance, noise, slope, minimum_neighbours, jumps, same_surface, reason):  # type: ignore[no-untyped-def]
-    """``jumps`` and ``same_surface`` (width,) are room to count the neighbours of a row's pixels."""
+    No comparison with NaN holds, so that no border has to be tested for. ``jumps`` and ``same_surface`` (width,) are
+    room to count the neighbours of a row's pixels.
+    """
     height, width = reason.shape
+    readings[:] = np.float32(np.nan)
+    noise[:] = np.float32(0.0)
+    _take_row(distance, sigma, reason, factor, 0, readings[1], noise[1])
     for v in range(height):
-        jumps[:] = np.float32(0.0)
-        same_surface[:] = np.float32(0.0)
-        row, half = distance[v + 1, 1 : width + 1], noise[v + 1, 1 : width + 1]
-        for dv in range(3):
-            for du in range(3):
-                if dv == 1 and du == 1:
-                    continue
-                steps = np.float32(1.4142) if dv != 1 and du != 1 else np.float32(1.0)
-                others, noises = distance[v + dv, du : du + width], noise[v + dv, du : du + width]
-                _compare(row, half, others, noises, steps * slope, jumps, same_surface)
+        above, here, below = v % 3, (v + 1) % 3, (v + 2) % 3
+        if v + 1 < height:
+            _take_row(distance, sigma, reason, factor, v + 1, readings[below], noise[below])
+        else:
+            readings[below] = np.float32(np.nan)
+        _compare(
+            readings[above], readings[here], readings[below], noise[above], noise[here], noise[below], slope, jumps,
+            same_surface,
+        )  # fmt: skip
         for u in range(width):
             if jumps[u] > 0 or same_surface[u] < minimum_neighbours:
                 reason[v, u] = FLYING if reason[v, u] == VALID else reason[v, u]
 
 
 @in_place()
-def _compare(row, half, others, noises, slope, jumps, same_surface):  # type: ignore[no-untyped-def]
+def _take_row(distance, sigma, reason, factor, v, readings, noise):  # type: ignore[no-untyped-def]
+    for u in range(reason.shape[1]):
+        is_read = reason[v, u] != NO_READING and reason[v, u] != SATURATED
+        readings[u + 1] = distance[v, u] if is_read else np.float32(np.nan)
+        noise[u + 1] = sigma[v, u] * factor
+
+
+@in_place()
+def _compare(above, here, below, noise_above, noise_here, noise_below, slope, jumps, same_surface):  # type: ignore[no-untyped-def]
+    """Count the eight neighbours of a row's pixels that are on another surface and on the same one."""
+    width = len(jumps)
+    oblique = np.float32(1.4142) * slope
+    for u in range(width):
+        r, n = here[u + 1], noise_here[u + 1]
+        a, b = _judged(r, n, above[u], noise_above[u], oblique)
+        c, d = _judged(r, n, above[u + 1], noise_above[u + 1], slope)
+        e, f = _judged(r, n, above[u + 2], noise_above[u + 2], oblique)
+        g, h = _judged(r, n, here[u], noise_here[u], slope)
+        i, j = _judged(r, n, here[u + 2], noise_here[u + 2], slope)
+        k, m = _judged(r, n, below[u], noise_below[u], oblique)
+        o, p = _judged(r, n, below[u + 1], noise_below[u + 1], slope)
+        q, s = _judged(r, n, below[u + 2], noise_below[u + 2], oblique)
+        jumps[u] = a + c + e + g + i + k + o + q
+        same_surface[u] = b + d + f + h + j + m + p + s
+
+
+@in_place()
+def _judged(reading, noise, other, other_noise, slope):  # type: ignore[no-untyped-def]
+    """1 in the first place for a neighbour on another surface, in the second for one on the same, else 0 (NaN)."""
     one, zero = np.float32(1.0), np.float32(0.0)
-    for u in range(len(row)):
-        difference = abs(others[u] - row[u])
-        limit = slope * min(row[u], others[u]) + half[u] + noises[u]
-        jumps[u] += one if difference > limit else zero
-        same_surface[u] += one if difference <= limit else zero
+    difference = abs(other - reading)
+    limit = slope * min(reading, other) + noise + other_noise
+    return one if difference > limit else zero, one if difference <= limit else zero

@@ -161,12 +161,25 @@ def normalised_picture(values: Float32Array, clip: float, gamma: float) -> ByteA
     low, high = np.quantile(finite[:: max(1, finite.size // 20000)], [clip, 1.0 - clip])
     if not high > low:
         return np.zeros(values.shape, np.uint8)
-    unit = np.empty(values.size, np.float32)
-    _normalise(np.asarray(values, np.float32).ravel(), np.float32(low), np.float32(high - low), unit)
-    lifted = np.sqrt(unit, out=unit) if gamma == 0.5 else unit ** np.float32(gamma)
     picture = np.empty(values.shape, np.uint8)
-    _to_grey(lifted, picture.reshape(-1))
+    flat, span = np.asarray(values, np.float32).ravel(), np.float32(high - low)
+    if gamma == 0.5:
+        _to_lifted_grey(flat, np.float32(low), span, picture.reshape(-1))
+    else:
+        unit = np.empty(values.size, np.float32)
+        _normalise(flat, np.float32(low), span, unit)
+        _to_grey(unit ** np.float32(gamma), picture.reshape(-1))
     return picture
+
+
+@in_place(error_model="numpy")
+def _to_lifted_grey(values, low, span, out):  # type: ignore[no-untyped-def]
+    """What :func:`_normalise`, the square root and :func:`_to_grey` do one after the other."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    for i in range(len(values)):
+        share = (values[i] - low) / span
+        unit = max(share, zero) if share < one else one
+        out[i] = np.uint8(np.int32(np.float32(255.0) * np.sqrt(unit) + np.float32(0.5)))
 
 
 @in_place(error_model="numpy")
