@@ -102,7 +102,11 @@ class DepthImage:
         c = self.camera
         u = (np.arange(c.width, dtype=np.float32) - np.float32(c.cx)) / np.float32(c.fx)
         v = (np.arange(c.height, dtype=np.float32) - np.float32(c.cy)) / np.float32(c.fy)
-        return np.stack([self.depth * u[None, :], self.depth * v[:, None], self.depth], axis=-1)
+        points = np.empty((*self.depth.shape, 3), np.float32)
+        np.multiply(self.depth, u[None, :], out=points[..., 0])
+        np.multiply(self.depth, v[:, None], out=points[..., 1])
+        points[..., 2] = self.depth
+        return points
 
 
 @dataclass(frozen=True, eq=False)

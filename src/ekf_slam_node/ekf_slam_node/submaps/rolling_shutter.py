@@ -198,7 +198,9 @@ class RollingShutter:
     def _rates(self, frame: Frame, velocity: FloatArray) -> FloatArray:
         """By what (n, 3) m the points of a frame move in the optical frame per second of readout."""
         R, place = self._T_rig_optical[:3, :3], self._T_rig_optical[:3, 3]
-        turn, shift = R.T @ velocity[3:], R.T @ (velocity[:3] + np.cross(velocity[3:], place))
+        a, b = velocity[3:], place
+        around = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+        turn, shift = R.T @ a, R.T @ (velocity[:3] + around)
         rates = np.empty((len(frame), 3))
         rolling_rates(frame.z, frame.camera.lens, frame.camera.height, turn, shift, rates)
         return rates

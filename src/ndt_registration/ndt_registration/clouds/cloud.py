@@ -15,6 +15,7 @@ from ndt_registration.clouds.visibility import mean_spacing, range_image
 from slam_core.estimation.least_squares import median
 from slam_core.geometry import FloatArray
 from slam_core.runtime.in_place import in_place
+from slam_core.types import AnyArray
 
 _COVERAGE_SIZE = 64
 """Size of the range image from which the part of the sphere that a scan covers is measured."""
@@ -66,7 +67,9 @@ def finite_points(points: npt.ArrayLike) -> FloatArray:
     ValueError
         If the last dimension is neither 2 nor 3.
     """
-    array = np.asarray(points, dtype=np.float64)
+    array = np.asarray(points)
+    if array.dtype != np.float32:
+        array = np.asarray(array, dtype=np.float64)
     if array.size == 0:
         return np.empty((0, 3))
     if array.ndim < 2 or array.shape[-1] not in (2, 3):
@@ -75,12 +78,12 @@ def finite_points(points: npt.ArrayLike) -> FloatArray:
 
 
 @njit(cache=True, nogil=True)
-def _finite_rows(points: FloatArray) -> FloatArray:
-    """Rows (n, 3) of an array (m, 2) or (m, 3) without NaN and infinity, z 0 where there is none."""
+def _finite_rows(points: AnyArray) -> FloatArray:
+    """Rows (n, 3) of float32 or float64 (m, 2) or (m, 3) without NaN and infinity, z 0 where there is none."""
     out, used = np.empty((points.shape[0], 3)), 0
     for i in range(points.shape[0]):
-        x, y = points[i, 0], points[i, 1]
-        z = points[i, 2] if points.shape[1] == 3 else 0.0
+        x, y = float(points[i, 0]), float(points[i, 1])
+        z = float(points[i, 2]) if points.shape[1] == 3 else 0.0
         if np.isfinite(x) and np.isfinite(y) and np.isfinite(z):
             out[used, 0], out[used, 1], out[used, 2] = x, y, z
             used += 1
