@@ -17,7 +17,7 @@ import numpy.typing as npt
 from slam_core.geometry import FloatArray
 from slam_core.types import Counters, DepthImage, Features, StereoImages
 from stereo_frontend.assembly import DepthEstimate, MeasuredKeypoints, joined_features
-from stereo_frontend.depth.tof_features import TofFeatures
+from stereo_frontend.depth.tof_features import TOF_LONGEST_STEP_S, TofFeatures
 from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.keypoints import Keypoints
@@ -27,7 +27,7 @@ from stereo_frontend.stereo.self_calibration import StereoSelfCalibration
 from stereo_frontend.stereo_depth import StereoDepth
 from stereo_frontend.tof_depth import TofDepth
 from stereo_frontend.tracking.tracked_features import begun, followed
-from stereo_frontend.tracking.tracker import Tracker
+from stereo_frontend.tracking.tracker import LONGEST_STEP_S, Tracker
 
 _MAX_RELATIVE_SIGMA = 0.35
 """Features whose depth sigma exceeds this share of their depth are dropped."""
@@ -59,7 +59,8 @@ class Frontend:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="second_core")
         self._stereo_depth = StereoDepth(self.config, self._pool, self.counters)
         self._tof_depth = TofDepth(self.config, self.counters)
-        self._tracker = Tracker(features.max_tracks) if self.config.tracks else None
+        longest_step_s = TOF_LONGEST_STEP_S if self.config.mode == "tof" else LONGEST_STEP_S
+        self._tracker = Tracker(features.max_tracks, longest_step_s) if self.config.tracks else None
         self._tof = TofFeatures(self.config.tof, features, self.config.noise, self._tracker, self._device)
 
     def process(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slam_core.config import from_mapping
-from slam_core.types import DepthImage, StereoImages
+from slam_core.types import DepthImage, Features, StereoImages
 from stereo_frontend.detection.features import TRACKING
 from stereo_frontend.frontend import Frontend
 from stereo_frontend.frontend_config import MODES, FrontendConfig
@@ -72,16 +72,15 @@ def test_the_same_frames_give_the_same_bytes(stereo_pair):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
+def depth_image(frame: StereoImages) -> DepthImage:
+    """The left image as that of a depth camera, of a wall at 2 m."""
+    depth, grey = np.full(frame.left.shape, 2.0, np.float32), frame.left.astype(np.float32)
+    return DepthImage(frame.stamp_ns, depth, np.full_like(depth, 0.004), frame.stereo.camera, grey)
+
+
 def test_a_depth_camera_is_tracked_too(stereo_pair):
     frontend, pair = tracking_frontend("tof"), stereo_pair()
-    depth = np.full(pair.left.shape, 2.0, np.float32)
-    counts = []
-    for k in range(3):
-        frame = moved(pair, k)
-        image = DepthImage(
-            frame.stamp_ns, depth, np.full_like(depth, 0.004), pair.stereo.camera, frame.left.astype(np.float32)
-        )
-        counts.append(frontend.process(None, image))
+    counts = [frontend.process(None, depth_image(moved(pair, k))) for k in range(3)]
     common = np.intersect1d(counts[0].track_ids, counts[2].track_ids)
     assert (common > 0).sum() > 60
     np.testing.assert_allclose(counts[2].depth, 2.0, atol=0.01)
@@ -179,9 +178,16 @@ def test_tracks_of_another_camera_are_forgotten(stereo_pair):
     assert len(np.intersect1d(first.track_ids[first.track_ids > 0], other.track_ids)) == 0
 
 
-def test_pictures_far_apart_in_time_are_detected_anew(stereo_pair):
-    frontend, pair = tracking_frontend(), stereo_pair()
-    first = frontend.process(pair)
-    now = frontend.process(dataclasses.replace(moved(pair, 1), stamp_ns=pair.stamp_ns + 500_000_000))
-    assert len(np.intersect1d(first.track_ids, now.track_ids[now.track_ids > 0])) == 0
-    assert len(now) > 0.9 * len(first)
+@pytest.mark.parametrize(("mode", "step_s", "is_followed"), [
+    ("stereo", 0.2, True), ("stereo", 0.5, False), ("tof", 0.1, True), ("tof", 0.2, False),
+])  # fmt: skip
+def test_pictures_far_apart_in_time_are_detected_anew(stereo_pair, mode, step_s, is_followed):
+    def features(frame: StereoImages) -> Features:
+        return frontend.process(None, depth_image(frame)) if mode == "tof" else frontend.process(frame)
+
+    frontend, pair = tracking_frontend(mode), stereo_pair()
+    first = features(pair)
+    now = features(dataclasses.replace(moved(pair, 1), stamp_ns=pair.stamp_ns + round(1e9 * step_s)))
+    followed = np.intersect1d(first.track_ids, now.track_ids[now.track_ids > 0])
+    assert (len(followed) > 60) == is_followed
+    assert is_followed or (len(followed) == 0 and len(now) > 0.9 * len(first))

@@ -36,6 +36,11 @@ It says next to nothing, so that such a track measures a direction alone. Withou
 beside missing pixels, nearly half of all with a head-mounted depth camera, comes and goes from frame to frame.
 """
 
+TOF_LONGEST_STEP_S = 0.15
+"""Time between images beyond which nothing is followed: half of a stereo camera's. At 5 Hz a head-mounted depth camera
+loses so many tracks in a turn that frames stay without a pose.
+"""
+
 
 @dataclass(frozen=True)
 class TofFeatureConfig(Config):

@@ -41,7 +41,7 @@ _SIGMA_SCALE, _SIGMA_FLOOR = 1.15, 0.04
 _MAX_SIGMA = 0.5
 _MAX_STRETCH = 2.0
 """Greatest change of a patch's size since its key frame."""
-_LONGEST_STEP_S = 0.3
+LONGEST_STEP_S = 0.3
 """Time between pictures beyond which nothing is followed: what little is found again displaces what can be detected."""
 _MAX_MISSED = 5
 """Frames for which a track is looked for where the motion predicts it."""
@@ -96,10 +96,11 @@ class Followed:
 
 
 class Tracker:
-    """Follows at most ``wanted`` tracks through the pictures of one camera."""
+    """Follows at most ``wanted`` tracks through pictures of one camera that are at most ``longest_step_s`` apart."""
 
-    def __init__(self, wanted: int) -> None:
+    def __init__(self, wanted: int, longest_step_s: float = LONGEST_STEP_S) -> None:
         self._wanted = wanted
+        self._longest_step_s = longest_step_s
         self.reset()
 
     def reset(self) -> None:
@@ -131,7 +132,7 @@ class Tracker:
         shape, is not zero count as not found.
         """
         dt = 1e-9 * (stamp_ns - self._stamp_ns)
-        if camera != self._camera or dt > _LONGEST_STEP_S:
+        if camera != self._camera or dt > self._longest_step_s:
             self.forget()
             self._camera = camera
         before, tracks = self._half, self._tracks
