@@ -179,7 +179,7 @@ def normalised_picture(values: Float32Array, clip: float, gamma: float) -> ByteA
 
 @in_place(error_model="numpy")
 def _to_lifted_grey(values, low, span, out):  # type: ignore[no-untyped-def]
-    """What :func:`_normalise`, the square root and :func:`_to_grey` do one after the other."""
+    """Do at once what :func:`_normalise`, the square root and :func:`_to_grey` do one after the other."""
     one, zero = np.float32(1.0), np.float32(0.0)
     for i in range(len(values)):
         share = (values[i] - low) / span
