@@ -59,4 +59,4 @@ def test_the_demo_is_mapped_offline_without_ros(monkeypatch, tmp_path):
     assert "mapped offline" in result.stderr
     (options,) = given
     assert options.keys() == {parameter.name for parameter in run.command.params if parameter.expose_value}
-    assert (options["bag"], options["mode"], options["odometry"], options["imu"]) == (DEMO, "fuse", "ndt", "off")
+    assert (options["bags"], options["mode"], options["odometry"], options["imu"]) == ((DEMO,), "fuse", "ndt", "off")

@@ -18,15 +18,16 @@ _OF_NODES_ALONE = ("rate", "view", "composed")
 def _demo(**options: Any) -> None:
     if not DEMO.is_dir():
         raise ValueError(f"{DEMO} is missing: install slam_bringup again from a whole clone")
-    command = nodes.command
+    command: click.Command = nodes.command
+    given: dict[str, Any] = {"bag": DEMO}
     if not has_ros():
         if options["rate"] or options["view"]:
             require_ros("--rate and --view: the demo with nodes")
         click.echo("no ROS 2 here: the demo is mapped offline, as by slam run", err=True)
-        command = run.command
+        command, given = run.command, {"bags": (DEMO,), "scheduler": None, "workers": None}
         options = {name: value for name, value in options.items() if name not in _OF_NODES_ALONE}
     assert command.callback is not None
-    command.callback(bag=DEMO, **options)
+    command.callback(**given, **options)
 
 
 command = click.Command(
