@@ -10,6 +10,7 @@ import pytest
 
 from slam_core.camera import Camera
 from slam_core.config import from_mapping
+from slam_core.geometry import make_transform, so3_exp
 from slam_core.types import DepthImage, FeatureSource, StereoImages
 from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.frontend import Frontend
@@ -218,3 +219,46 @@ def test_missing_inputs_are_named(stereo_pair):
         frontend("fuse").process(None, tof_image(pair), IDENTITY)
     with pytest.raises(ValueError, match="T_left_tof"):
         frontend("fuse").process(pair, tof_image(pair))
+
+
+LATE = {"features.tracking": "always", "pair.time_offset": 0.01, "pair.sigma_time_offset": 0.0}
+
+
+def pitched(front: Frontend, row: float) -> None:
+    """Tell the clock of a turn by which an image's middle moves by ``row`` px in 10 ms."""
+    turn = make_transform(so3_exp(np.array([-0.1 * row / 0.01 / 200.0, 0.0, 0.0])), np.zeros(3))
+    front.pair_clock.move(1_000_000_000, turn, 0.1)
+
+
+def test_motion_between_the_images_is_not_taken_for_an_error_of_the_rectification(stereo_pair):
+    pair, front = stereo_pair(row=3.0), frontend(**LATE)
+    pitched(front, 3.0)
+    assert len(front.process(pair)) > 100
+    assert front.self_calibration.error.row_rms() < 1.0
+
+
+def test_rows_that_were_learnt_in_unknown_motion_are_learnt_anew(stereo_pair):
+    front = frontend(**LATE)
+    front.process(stereo_pair(row=3.0))
+    assert front.self_calibration.error.row_rms() == pytest.approx(3.0, abs=0.5)
+    found = [len(front._detected(p, front._extract(p), None, None)[0]) for p in [stereo_pair(row=0.0)] * 4]
+    assert found[-1] > 0
+    assert front.self_calibration.error.row_rms() < 1.0
+
+
+def test_an_offset_of_a_pair_counts_where_features_are_tracked_and_is_told_elsewhere(stereo_pair):
+    pair, known = stereo_pair(), {"pair.time_offset": 0.01}
+    plain = frontend(**{"features.tracking": "never"}).process(pair)
+    front = frontend(**known, **{"features.tracking": "never"})
+    np.testing.assert_array_equal(front.process(pair).sigma_depth, plain.sigma_depth)
+    assert any("pair.time_offset, 10.0 ms, is left out" in text for text in front.report().advice)
+    tracked = frontend(**known, **{"features.tracking": "always"})
+    assert np.median(tracked.process(pair).sigma_depth) > 2.0 * np.median(plain.sigma_depth)
+    assert not any("left out" in text for text in tracked.report().advice)
+
+
+def test_a_reset_forgets_the_time_between_the_images(stereo_pair):
+    front = frontend(**{"features.tracking": "always"})
+    front.pair_clock.is_believed = True
+    front.reset()
+    assert not front.pair_clock.is_believed

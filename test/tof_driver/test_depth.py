@@ -174,3 +174,16 @@ def test_cloud_is_organised_with_sigma() -> None:
     np.testing.assert_array_equal(np.stack([cloud[k] for k in "xyz"], axis=-1), image.points())
     np.testing.assert_array_equal(cloud["sigma"], image.sigma)
     assert np.isnan(cloud[4, 5]["x"])
+
+
+@pytest.mark.parametrize("measurement", ["range", "depth"])
+def test_the_order_of_a_picture_in_memory_does_not_matter(measurement):
+    rng = np.random.default_rng(0)
+    image = rng.uniform(1.0, 3.0, (PLAIN.height, PLAIN.width)).astype(np.float32)
+    amplitude = 100.0 * image
+    processor = DepthProcessor(replace(DepthConfig(), measurement=measurement), PLAIN)
+    expected, found = (
+        processor.process(0, a, b) for a, b in ((image, amplitude), map(np.asfortranarray, (image, amplitude)))
+    )
+    np.testing.assert_array_equal(found.depth, expected.depth)
+    np.testing.assert_array_equal(found.sigma, expected.sigma)

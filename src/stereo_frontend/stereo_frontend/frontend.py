@@ -45,7 +45,8 @@ def _more(config: FeatureConfig, factor: float) -> FeatureConfig:
 class Frontend:
     """Processes frames one by one.
 
-    Its state is the detector thresholds and the noise factor, so the same frames in the same order give the same bytes.
+    Its state are detector thresholds, tracks and what is learnt of the cameras (noise, rectification, ranges, the time
+    between a pair's images), so the same frames in the same order give the same bytes.
     ``counters`` tells what was accepted and rejected since the start.
     """
 
@@ -176,7 +177,7 @@ class Frontend:
         return self._stereo_depth.clock
 
     def reset(self) -> None:
-        """Forget thresholds, noise and counts."""
+        """Forget everything since the start."""
         for part in (self._left, self._right, self._stereo_depth, self._tof_depth, self._tof):
             part.reset()
         if self._tracker is not None:

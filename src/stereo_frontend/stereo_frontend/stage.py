@@ -193,7 +193,9 @@ class FeatureStage:
         if self._tags is None:
             return features
         if images is not None:
-            return self._tags.with_tags(features, self._tags.of_pair(images, self._frontend.self_calibration))
+            return self._tags.with_tags(
+                features, self._tags.of_pair(images, self._frontend.self_calibration, self._frontend.pair_clock)
+            )
         grey = None if depth is None else next((g for g in (depth.intensity, depth.amplitude) if g is not None), None)
         if depth is None or grey is None:
             return features

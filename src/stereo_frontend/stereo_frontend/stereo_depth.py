@@ -33,6 +33,8 @@ _FEW_TRUSTED = 0.1
 """Share of keypoints with a trusted disparity below which the sign of the disparities is questioned."""
 _SWAPPED_SHARE = 0.6
 _SWAPPED_MATCHES = 30
+_FEW_MATCHES, _POOR_PAIRS = 30, 2
+"""Matches of a pair, and pairs with fewer in a row, from which on rows are doubted where the images' times differ."""
 
 
 class StereoDepth:
@@ -44,7 +46,8 @@ class StereoDepth:
         self.counters = counters
         self.noise = PixelNoise(config.noise)
         self.calibration = StereoSelfCalibration(config.self_calibration)
-        self.clock = PairClock(config.pair)
+        self.clock = PairClock(config.pair, tracks=config.tracks)
+        self._poor_pairs = 0
         self._wide = self.calibration.widened(config.matching)
 
     def reset(self) -> None:
@@ -52,6 +55,7 @@ class StereoDepth:
         self.noise.reset()
         self.calibration.reset()
         self.clock.reset()
+        self._poor_pairs = 0
 
     def learn(self, images: StereoImages, left: Keypoints, refined: RefinedDisparity) -> None:
         """Learn the rectification's error from left keypoints (n), described, and their disparities (n)."""
@@ -89,15 +93,23 @@ class StereoDepth:
         return estimate
 
     def _match(self, images: StereoImages, left: Keypoints, right: Keypoints, bounds: tuple[float, float]) -> Matches:
-        """Matches along the rows as they are; those of a first pair are found out with a wider band."""
+        """Matches along the rows as they are; those of a first pair are found out with a wider band.
+
+        Rows that were learnt while an image's motion was not known may hide all matches: they are learnt anew then.
+        """
         calibration = self.calibration
+        late = self.clock.shift(images.stereo, right.uv).uv
+        right = dataclasses.replace(right, uv=right.uv - late)
+        if self._poor_pairs >= _POOR_PAIRS and self.clock.time_offset != 0.0:
+            calibration.reset()
         if not calibration.knows(images.stereo.camera):
             wide = match_stereo(left, right, self._wide, bounds)
             calibration.acquire(self._view_of_keypoints(images, left.select(wide.left), right.select(wide.right)))
         error = calibration.rows(right.uv, np.zeros(len(right)))
-        late = self.clock.shift(images.stereo, right.uv).uv
-        aligned = dataclasses.replace(right, uv=right.uv - np.column_stack([np.zeros_like(error), error]) - late)
-        return match_stereo(left, aligned, self._config.matching, bounds)
+        aligned = dataclasses.replace(right, uv=right.uv - np.column_stack([np.zeros_like(error), error]))
+        matches = match_stereo(left, aligned, self._config.matching, bounds)
+        self._poor_pairs = self._poor_pairs + 1 if len(matches) < _FEW_MATCHES else 0
+        return matches
 
     def _disparities(
         self, images: StereoImages, uv: Float32Array, partner: Float32Array, size: Float32Array | None = None

@@ -134,13 +134,13 @@ class DepthProcessor:
             return metres
         if not np.issubdtype(image.dtype, np.floating):
             raise ValueError(f"range image must be uint16 (mm) or float (m), got {image.dtype}")
-        return image.astype(np.float32)
+        return np.array(image, np.float32, order="C")
 
     def _picture(self, name: str, image: AnyArray | None) -> Float32Array | None:
         if image is None:
             return None
         self._check_shape(name, image)
-        return image.astype(np.float32)
+        return np.array(image, np.float32, order="C")
 
     def _check_shape(self, name: str, image: AnyArray) -> None:
         expected = (self.camera.height, self.camera.width)

@@ -53,10 +53,27 @@ def test_the_covariance_of_predictions_follows_their_errors() -> None:
     still = [Step(0.1, np.zeros(6))] * 4
     sigma = np.array([0.02, 0.03, 0.04, 0.01, 0.02, 0.03])
     for _ in range(300):
-        predicted.learn(still, sigma * rng.standard_normal(6), np.zeros(6))
+        predicted.learn(still, sigma * rng.standard_normal(6))
+    predicted(still)
     ratio = np.sqrt(np.diagonal(predicted.covariance)) / sigma
     assert ratio.min() > 0.4
     assert ratio.max() < 2.0
+
+
+def test_each_way_to_predict_has_its_own_covariance() -> None:
+    """After a gap the mean of one step is all there is, and the line after a step of another length is no better."""
+    found, velocity = steps(0.1 * np.arange(120))
+    predicted = PredictedVelocity()
+    for k in range(4, 119):
+        predicted.learn(found[:k], velocity[k] * np.eye(6)[0])
+    long = [*found[:100], Step(0.2, found[100].increment + found[101].increment)]
+    sigmas = []
+    for given in (found[:100], found[98:100], found[99:100], long):
+        predicted(given)
+        sigmas.append(np.sqrt(predicted.covariance[0, 0]))
+    assert sigmas[0] < sigmas[1] < sigmas[2] < 0.6 * sigmas[3]
+    errors = [abs(predicted(found[k - 1 : k])[0] - velocity[k]) for k in range(60, 119)]
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) / sigmas[2] < 1.5
 
 
 def test_a_steady_acceleration_is_predicted() -> None:
@@ -75,7 +92,7 @@ def test_the_steps_of_a_walker_are_learnt() -> None:
     for k in range(4, 79):
         both = predicted(found[:k]), PredictedVelocity()(found[:k])
         errors.append([abs(guess[0] - velocity[k]) for guess in both])
-        predicted.learn(found[:k], both[0], velocity[k] * np.eye(6)[0])
+        predicted.learn(found[:k], velocity[k] * np.eye(6)[0])
     learnt, linear = np.mean(errors[-20:], axis=0)
     assert learnt < 0.3 * linear
     # Steps of uneven length are not those that the weights are for.

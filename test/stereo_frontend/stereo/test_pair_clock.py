@@ -158,3 +158,30 @@ def test_what_moves_far_between_the_images_is_degraded() -> None:
     clock.move(round(5e9), make_transform(so3_exp(np.array([0.0, 0.2, 0.0])), np.zeros(3)), 0.1)
     clock.shift(STEREO, np.full((3, 2), 300.0))
     assert "between the images" in clock.diagnostic
+
+
+def test_a_known_offset_is_as_unsure_as_an_unknown_one_of_that_size() -> None:
+    """Velocities that are wrong by a share make the whole offset wrong by it, however much was known before."""
+    found, _ = followed(0.02)
+    known, _ = followed(0.02, PairClockConfig(time_offset=0.02, sigma_time_offset=0.02))
+    assert known.learnt[1] == pytest.approx(found.learnt[1], rel=0.1)
+    assert known.advice() == ""
+    wrong, _ = followed(0.02, PairClockConfig(time_offset=0.01, sigma_time_offset=0.02))
+    assert "refine again" in wrong.advice()
+
+
+def test_a_warning_ends_with_its_cause() -> None:
+    clock, _ = followed(0.02)
+    clock.move(round(5e9), make_transform(so3_exp(np.array([0.0, 0.2, 0.0])), np.zeros(3)), 0.1)
+    clock.shift(STEREO, np.full((3, 2), 300.0))
+    clock.move(round(5.1e9), np.eye(4), 0.1)
+    clock.is_believed = False
+    clock.shift(STEREO, np.full((3, 2), 300.0))
+    assert clock.diagnostic == ""
+
+
+def test_without_tracks_no_offset_counts() -> None:
+    clock = PairClock(PairClockConfig(time_offset=0.008), tracks=False)
+    clock.move(1, None, 0.0)
+    assert not clock.shift(STEREO, np.full((3, 2), 300.0), np.full(3, 12.0)).sigma.any()
+    assert "8.0 ms, is left out" in clock.advice()

@@ -127,7 +127,7 @@ def _backwards(readings: list[Reading], truth: Trajectory) -> tuple[Iterator[Rea
     if not readings:
         return iter(()), truth
     stamps = [r.stamp_ns for r in readings]
-    last = max(*stamps, *truth.stamps_ns.tolist())  # truth may go on after the recording, and no time is below 0
+    last = max([*stamps, *truth.stamps_ns.tolist()])  # truth may go on after the recording, and no time is below 0
     turn = min(stamps) + last
     mirrored = Trajectory(turn - truth.stamps_ns[::-1], truth.poses[::-1])
     return (_mirrored(r, turn) for r in reversed(readings)), mirrored

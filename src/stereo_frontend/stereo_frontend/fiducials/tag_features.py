@@ -20,6 +20,7 @@ from slam_core.types import ByteArray, Counters, DepthImage, Features, FeatureSo
 from stereo_frontend.depth.depth_lookup import sample_depth
 from stereo_frontend.fiducials.detector import TagConfig, TagDetector
 from stereo_frontend.fiducials.tag_pose import TagPose, TagView, estimate_tag_pose
+from stereo_frontend.stereo.pair_clock import PairClock
 from stereo_frontend.stereo.self_calibration import StereoSelfCalibration
 
 _SHARED = 2.0
@@ -58,11 +59,14 @@ class TagFeatures:
             return features
         return features.joined(self._features(features, tags))
 
-    def of_pair(self, images: StereoImages, calibration: StereoSelfCalibration) -> list[SeenTag]:
-        """The tags of the left image; by both images where the right one shows them too."""
+    def of_pair(self, images: StereoImages, calibration: StereoSelfCalibration, clock: PairClock) -> list[SeenTag]:
+        """The tags of the left image; by both images where the right one shows them too.
+
+        Corrected for what ``calibration`` and ``clock`` know of the rectification and of the time between the images.
+        """
         left = self._detect(images.left)
         right = self._detect(images.right) if left else {}
-        views = {n: self._pair_view(images.stereo, c, right.get(n), calibration) for n, c in left.items()}
+        views = {n: self._pair_view(images.stereo, c, right.get(n), calibration, clock) for n, c in left.items()}
         return self._fitting(views)
 
     def of_depth(self, image: DepthImage, picture: ByteArray) -> list[SeenTag]:
@@ -94,17 +98,24 @@ class TagFeatures:
         return out
 
     def _pair_view(
-        self, stereo: StereoCamera, left: FloatArray, right: FloatArray | None, calibration: StereoSelfCalibration
+        self,
+        stereo: StereoCamera,
+        left: FloatArray,
+        right: FloatArray | None,
+        calibration: StereoSelfCalibration,
+        clock: PairClock,
     ) -> TagView:
         view = TagView(stereo.camera, left, self.config.sigma)
         if right is None or not np.all(left[:, 0] > right[:, 0]):
             return view
+        late = clock.shift(stereo, right, left[:, 0] - right[:, 0])
+        right = right - late.uv
         as_seen = right.astype(np.float32)
         correction, sigma = calibration.columns(as_seen)
         rows = calibration.rows(as_seen, left[:, 0] - right[:, 0])
         partner = right + np.column_stack([-correction, rows])
         self._learn_size(stereo.camera, left, stereo.depth_from_disparity(left[:, 0] - partner[:, 0]))
-        spread = np.sqrt(self.config.sigma**2 + sigma**2 + _RECTIFICATION_SIGMA**2)
+        spread = np.sqrt(self.config.sigma**2 + sigma**2 + late.sigma**2 + _RECTIFICATION_SIGMA**2)
         return replace(view, right=partner, right_sigma=spread, baseline=stereo.baseline)
 
     def _depth_view(self, image: DepthImage, corners: FloatArray) -> TagView:

@@ -24,6 +24,10 @@ _EVEN = 1.2
 _FIRST_SIGMA: FloatArray = np.array([0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
 """Standard deviation of a predicted velocity before any was compared, m/s and rad/s."""
 
+_MEAN, _LINE, _WEIGHTS = _WAYS = ("mean of the last step", "line", "line and weights")
+"""Ways to predict a velocity."""
+_LEAST_DT_S = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class Step:
@@ -58,27 +62,50 @@ class PredictedVelocity:
     """Predicts the velocity at the newest frame from the steps before it, and learns how well.
 
     Beyond linear extrapolation each axis has three weights of the last changes of the velocity, by least squares: a
-    walker's steps come back again and again.
+    walker's steps come back again and again. After one step its mean velocity is all there is, after two the line; each
+    of these ways has a covariance of its own, learnt from all frames. ``covariance`` (6, 6) is that of the newest one.
     """
 
     def __init__(self) -> None:
-        self.covariance: FloatArray = np.diag(_FIRST_SIGMA**2)
+        self._covariances = dict.fromkeys(_WAYS, np.diag(_FIRST_SIGMA**2))
+        self.covariance: FloatArray = self._covariances[_LINE]
+        self._usual_dt = 0.0
         self._information: FloatArray = np.zeros((6, _CHANGES, _CHANGES))
         self._vector: FloatArray = np.zeros((6, _CHANGES))
 
     def __call__(self, steps: list[Step]) -> FloatArray:
         """Velocity (6,) after the last step."""
-        linear, changes = _extrapolated(steps)
-        return linear if changes is None else linear + np.einsum("ai,ia->a", self._weights(), changes)
+        predictions = self._predictions(steps)
+        way = next(reversed(predictions))
+        self.covariance = self._covariances[way]
+        if _is_uneven(steps):
+            # The line through steps of other lengths was never compared: no better than the mean of the longest step.
+            longest = max(s.dt for s in steps[-_CHANGES - 1 :])
+            self.covariance = self._covariances[_MEAN] * max(1.0, longest / max(self._usual_dt, _LEAST_DT_S)) ** 2
+        return predictions[way]
 
-    def learn(self, steps: list[Step], predicted: FloatArray, velocity: FloatArray) -> None:
-        """Compare a prediction (6,) after the last step with what was the velocity (6,)."""
-        error = predicted - velocity
-        self.covariance = _SMOOTHING * self.covariance + (1.0 - _SMOOTHING) * np.outer(error, error)
+    def learn(self, steps: list[Step], velocity: FloatArray) -> None:
+        """Compare predictions after the last step, by each way, with what was the velocity (6,)."""
         linear, changes = _extrapolated(steps)
+        if not _is_uneven(steps):
+            self._usual_dt = steps[-1].dt
+            for way, predicted in self._predictions(steps).items():
+                error = predicted - velocity
+                new = (1.0 - _SMOOTHING) * np.outer(error, error)
+                self._covariances[way] = _SMOOTHING * self._covariances[way] + new
         if changes is not None:
             self._information = _FORGETTING * self._information + np.einsum("ia,ja->aij", changes, changes)
             self._vector = _FORGETTING * self._vector + ((velocity - linear) * changes).T
+
+    def _predictions(self, steps: list[Step]) -> dict[str, FloatArray]:
+        """Velocity (6,) after the last step by each way that the steps allow, the best one last."""
+        linear, changes = _extrapolated(steps)
+        found = {_MEAN: steps[-1].velocity}
+        if len(steps) > 1:
+            found[_LINE] = linear
+        if changes is not None:
+            found[_WEIGHTS] = linear + np.einsum("ai,ia->a", self._weights(), changes)
+        return found
 
     def _weights(self) -> FloatArray:
         """Weights (6, 3); drawn towards none by the evidence of some frames."""
@@ -91,6 +118,11 @@ class PredictedVelocity:
         )
 
 
+def _is_uneven(steps: list[Step]) -> bool:
+    lengths = [s.dt for s in steps[-_CHANGES - 1 :]]
+    return max(lengths) >= _EVEN * min(lengths)
+
+
 def _extrapolated(steps: list[Step]) -> tuple[FloatArray, FloatArray | None]:
     """Linear extrapolation (6,) of the velocity to the end of the last step, and its last changes (3, 6).
 
@@ -101,9 +133,8 @@ def _extrapolated(steps: list[Step]) -> tuple[FloatArray, FloatArray | None]:
     velocities = np.array([s.velocity for s in steps[: -_CHANGES - 2 : -1]])
     last, before = steps[-1].dt, steps[-2].dt
     linear = velocities[0] + last / (last + before) * (velocities[0] - velocities[1])
-    lengths = [s.dt for s in steps[: -_CHANGES - 2 : -1]]
-    even = len(lengths) == _CHANGES + 1 and max(lengths) < _EVEN * min(lengths)
-    return linear, velocities[:-1] - velocities[1:] if even else None
+    is_enough = len(velocities) == _CHANGES + 1 and not _is_uneven(steps)
+    return linear, velocities[:-1] - velocities[1:] if is_enough else None
 
 
 def right_flow(stereo: StereoCamera, uv_right: AnyArray, disparity: AnyArray) -> FloatArray:

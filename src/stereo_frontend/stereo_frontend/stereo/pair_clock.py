@@ -35,7 +35,7 @@ _AHEAD_SIGMA = 0.01
 """By how much the right camera may stand ahead of the left one beforehand, in baselines."""
 _SIGMAS = 5.0
 """An offset is believed beyond so many standard deviations."""
-_LEAST_S = 1e-3
+_LEAST_S = 5e-4
 """And from here on: less moves matches by less than their noise."""
 _HYSTERESIS = 0.5
 """An offset stays until it falls below this share of what it took to be believed."""
@@ -46,6 +46,8 @@ _MUCH_PX = 3.0
 _ANY_VELOCITY: FloatArray = np.diag([0.5, 0.5, 0.5, 0.5, 0.5, 0.5]) ** 2
 """Covariance of a velocity of which nothing is known, m/s and rad/s."""
 _LEAST_FRAMES = 5
+_MANY_FRAMES = 100
+"""Frames of evidence from which on one in ``_GROUP`` is enough to notice a change."""
 _LEAST_FLOW_PX = 10.0
 """Median motion of the image, px/s, below which a frame says nothing."""
 _MIN_MATCHES = 30
@@ -103,11 +105,14 @@ class _Rows:
 class PairClock:
     """Time of the right image after the left one: :attr:`time_offset` is used, :meth:`figures` tells what was learnt.
 
-    For every frame first :meth:`move`, then any number of :meth:`shift`, then :meth:`learn`.
+    For every frame first :meth:`move`, then any number of :meth:`shift`, then :meth:`learn`. Without ``tracks``, which
+    tell the motion, a time offset is of no use: none is taken into account, and :meth:`advice` says so.
     """
 
-    def __init__(self, config: PairClockConfig | None = None) -> None:
-        self.config = config or PairClockConfig()
+    def __init__(self, config: PairClockConfig | None = None, *, tracks: bool = True) -> None:
+        given = config or PairClockConfig()
+        self._unused_s = 0.0 if tracks else given.time_offset
+        self.config = given if tracks else PairClockConfig(time_offset=0.0, sigma_time_offset=0.0)
         self.reset()
 
     def reset(self) -> None:
@@ -117,12 +122,12 @@ class PairClock:
         self._evidence = EvidenceWindow(_GROUP, _PIECES)
         self._prediction = PredictedVelocity()
         self._parameters: FloatArray = np.zeros(len(PRIOR_SIGMA) + 2)
-        self._disparity, self._stamp_ns = 0.0, -1
+        self._disparity, self._stamp_ns, self._turn = 0.0, -1, 0
         self._forget_motion()
 
     def _forget_motion(self) -> None:
         self._steps: deque[Step] = deque(maxlen=2 * REACH + 1)
-        self._frames: deque[tuple[FloatArray | None, _Rows | None]] = deque(maxlen=REACH)
+        self._frames: deque[_Rows | None] = deque(maxlen=REACH)
         self._velocity: FloatArray | None = None
         self._moved_px = 0.0
         self._rows: _Rows | None = None
@@ -132,7 +137,8 @@ class PairClock:
     def learnt(self) -> tuple[float, float]:
         """The time offset as the images show it and its standard deviation, s."""
         beyond, sigma = self._estimate
-        return self.config.time_offset + beyond, float(np.hypot(sigma, _VELOCITY_ERROR * beyond))
+        offset = self.config.time_offset + beyond
+        return offset, min(float(np.hypot(sigma, _VELOCITY_ERROR * offset)), self.config.sigma_time_offset)
 
     @property
     def time_offset(self) -> float:
@@ -181,12 +187,22 @@ class PairClock:
 
     def advice(self) -> str:
         """Advice to the user, or ""."""
-        if not self.is_believed:
+        if self._unused_s != 0.0:
+            return (
+                f"pair.time_offset, {1e3 * self._unused_s:.1f} ms, is left out: it needs the motion of features that "
+                "are followed (features.tracking: always)"
+            )
+        (offset, sigma), known = self.learnt, self.config.time_offset
+        if not self.is_believed or abs(offset - known) < max(_SIGMAS * sigma, _LEAST_S):
             return ""
-        offset, sigma = (1e3 * value for value in self.learnt)
-        return (
-            f"the right image is taken {abs(offset):.1f} +- {sigma:.1f} ms {'after' if offset > 0.0 else 'before'} the "
-            "left one, corrected as far as the motion is smooth: trigger both together, or slam calibrate refine"
+        said = (
+            f"the right image is taken {1e3 * abs(offset):.1f} +- {1e3 * sigma:.1f} ms "
+            f"{'after' if offset > 0.0 else 'before'} the left one, corrected as far as the motion is smooth"
+        )
+        return said + (
+            ": trigger both together, or slam calibrate refine"
+            if known == 0.0
+            else f"; pair.time_offset says {1e3 * known:.1f} ms: slam calibrate refine again"
         )
 
     # ---- one frame, in order
@@ -195,13 +211,13 @@ class PairClock:
 
         What is said first of a frame counts.
         """
-        if stamp_ns == self._stamp_ns:
+        if stamp_ns == self._stamp_ns or self._is_off:
             return
-        self._stamp_ns = stamp_ns
+        self._stamp_ns, self._moved_px = stamp_ns, 0.0
         if T_now_before is None or not dt > 0.0:
             self._forget_motion()
             return
-        self._frames.append((self._velocity, self._rows))
+        self._frames.append(self._rows)
         self._steps.append(Step.between(T_now_before, dt))
         self._take_middle()
         self._rows = None
@@ -213,6 +229,8 @@ class PairClock:
         True if the offset has become one to be corrected, or is one no longer, so that what was learnt of rows and
         disparities before was learnt of others.
         """
+        if self._is_off:
+            return False
         known = np.isfinite(disparity) & np.isfinite(seen.row_shift)
         if known.sum() >= _MIN_MATCHES:
             self._disparity = float(np.median(disparity[known]))
@@ -228,12 +246,13 @@ class PairClock:
         steps = list(self._steps)
         if len(steps) < 2 * REACH:
             return
-        predicted, rows = self._frames[0]
+        rows = self._frames[0]
         before, after = steps[:-REACH], steps[-REACH:]
         velocity = central_velocity(before[-REACH:], after)
-        if predicted is not None:
-            self._prediction.learn(before, predicted, velocity)
-        if rows is None or self.config.sigma_time_offset == 0.0:
+        self._prediction.learn(before, velocity)
+        self._turn += 1
+        is_left_out = len(self._evidence) >= _MANY_FRAMES and not self.is_believed and self._turn % _GROUP > 0
+        if rows is None or is_left_out or self.config.sigma_time_offset == 0.0:
             return
         flow = right_flow(rows.stereo, rows.uv_right, rows.disparity)[:, 1] @ velocity
         if np.median(np.abs(flow)) >= _LEAST_FLOW_PX:
@@ -256,6 +275,11 @@ class PairClock:
             sums = evidence.information + prior, evidence.vector + prior @ self._parameters
             theta = np.asarray(np.linalg.solve(*sums))
         return evidence
+
+    @property
+    def _is_off(self) -> bool:
+        """True if there is no offset to correct and none to learn."""
+        return self.config.time_offset == 0.0 and self.config.sigma_time_offset == 0.0
 
     def _prior_sigma(self) -> FloatArray:
         return np.append(PRIOR_SIGMA, [_AHEAD_SIGMA, self.config.sigma_time_offset])

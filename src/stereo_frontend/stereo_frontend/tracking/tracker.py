@@ -132,13 +132,14 @@ class Tracker:
         shape, is not zero count as not found.
         """
         dt = 1e-9 * (stamp_ns - self._stamp_ns)
-        if camera != self._camera or dt > self._longest_step_s:
+        if camera != self._camera or abs(dt) > self._longest_step_s:
             self.forget()
             self._camera = camera
         before, tracks = self._half, self._tracks
         half = np.asarray(cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         self._half, self._stamp_ns = half, stamp_ns
         if tracks is None or before is None or len(tracks) == 0:
+            self._motion = None
             return None
         expected = (
             np.eye(4) if self._motion is None or dt <= 0.0 else scaled_motion(self._motion[0], dt / self._motion[1])
