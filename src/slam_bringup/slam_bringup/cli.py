@@ -30,6 +30,7 @@ COMMANDS = {
     "live": "map live: all nodes in one process, on a camera or on topics",
     "post": "a command post: joins what agents send over a radio link",
     "convert": "a public data set (EuRoC, KITTI, RGB-D) to a bag",
+    "anchor": "a finished map in the frame of its building, by points on the floor plan",
     "view": "show a finished run, or the nodes at work, in the browser",
     "play": "publish a bag's topics over ROS",
     "record": "record ROS topics to a bag",

@@ -53,7 +53,7 @@ class RunFolder:
         return cls(
             path=path,
             summary=summary,
-            trajectories=_trajectories(path),
+            trajectories=read_trajectories(path),
             map=snapshot,
             surface=read_mesh(mesh) if mesh.is_file() else Surface.empty(),
             plans=tuple(read_plan(file) for file in sorted(path.glob("floor_plan*.yaml"))),
@@ -90,9 +90,9 @@ def _map(path: Path) -> tuple[MapSnapshot, str]:
         return GlobalMap().snapshot(), f"landmarks and submaps are not shown: {error}"
 
 
-def _trajectories(path: Path) -> dict[str, Trajectory]:
-    """By agent; with their covariances where they are there."""
-    several = sorted(p for p in path.glob("trajectory_*.tum"))
+def read_trajectories(path: Path) -> dict[str, Trajectory]:
+    """Those of the folder of a run in the map frame, by agent; with their covariances where they are there."""
+    several = sorted(p for p in path.glob("trajectory_*.tum") if not _is_anchored(p))
     files = {p.stem.removeprefix("trajectory_"): p for p in several} or {"": path / "trajectory.tum"}
     out = {}
     for agent, file in files.items():
@@ -104,3 +104,9 @@ def _trajectories(path: Path) -> dict[str, Trajectory]:
                 trajectory = Trajectory(stamps, trajectory.poses, P)
         out[agent] = trajectory
     return out
+
+
+def _is_anchored(path: Path) -> bool:
+    """True for ``trajectory_building*.tum``, which ``slam anchor`` writes beside the trajectory in the map frame."""
+    rest = path.name.removeprefix("trajectory_building")
+    return rest != path.name and path.with_name(f"trajectory{rest}").is_file()
