@@ -43,8 +43,8 @@ def command(
 ) -> None:  # fmt: skip
     """Place the map of OUT in the frame of its building, by two or more points that the image PLAN shows too.
 
-    OUT is a finished run or its folder map; PLAN a PNG, PGM or JPG, or a map_server YAML that names one. Pixels count from
-    the upper left corner. Without points a page is written on which they are clicked.
+    OUT is a finished run or its folder map; PLAN a PNG, PGM or JPG, or a map_server YAML that names one. Pixels count
+    from the upper left corner. Without points a page is written on which they are clicked.
     """
     pairs = [parse_pair(text, sigma_px) for text in given] + (read_pairs(points, sigma_px) if points else [])
     building, mapped = read_building_plan(plan, resolution), MapFromAbove.read(out, storey)

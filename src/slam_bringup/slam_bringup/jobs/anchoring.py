@@ -93,7 +93,7 @@ def anchor_map(mapped: MapFromAbove, plan: BuildingPlan, pairs: Sequence[Pair], 
     Raises
     ------
     ValueError
-        If the pairs do not say it: too few, off the plan, or as :func:`~slam_core.estimation.plane_alignment.align_plane`.
+        If the pairs do not say it: too few, off the plan, coincident, mirrored, or contradicting each other.
     """
     pixels = np.array([pair.plan for pair in pairs], dtype=np.float64).reshape(-1, 2)
     places = np.array([pair.map for pair in pairs], dtype=np.float64).reshape(-1, 2)
@@ -112,12 +112,8 @@ def anchor_map(mapped: MapFromAbove, plan: BuildingPlan, pairs: Sequence[Pair], 
     T_floor_map = invert_transform(mapped.T_map_floor)
     J, _ = compose_jacobians(T, T_floor_map)
     P = J @ _with_height_and_tilt(fit.covariance, has_floor=mapped.plan is not None) @ J.T
-    said = {
-        "image": str(plan.path.resolve()), "resolution": plan.resolution, "resolution_sigma": fit.scale_sigma * fit.scale,
-        "origin": [float(v) for v in plan.origin],
-    }  # fmt: skip
-    if is_known:
-        del said["resolution_sigma"]
+    said = {"image": str(plan.path.resolve()), "resolution": plan.resolution, "origin": [float(v) for v in plan.origin]}
+    said |= {} if is_known else {"resolution_sigma": fit.scale_sigma * fit.scale}
     points = [
         {"map": list(pair.map), "plan": list(pair.plan), "sigma_px": pair.sigma_px,
          "residual": [float(v) for v in residual], "used": bool(used)}
@@ -144,8 +140,8 @@ def report(anchored: Anchored) -> str:
     assert plan.resolution is not None
     found = f" +- {100.0 * fit.scale_sigma:.2g} %, from the points" if fit.scale_sigma else ""
     lines = [
-        f"building <- map: x {x:.3f} +- {sigma[0]:.3f} m, y {y:.3f} +- {sigma[1]:.3f} m, z {z:.3f} +- {sigma[2]:.3f} m, "
-        f"yaw {yaw:.2f} +- {np.degrees(sigma[5]):.2f} deg",
+        f"building <- map: x {x:.3f} +- {sigma[0]:.3f} m, y {y:.3f} +- {sigma[1]:.3f} m, "
+        f"z {z:.3f} +- {sigma[2]:.3f} m, yaw {yaw:.2f} +- {np.degrees(sigma[5]):.2f} deg",
         f"plan: {plan.resolution:.5g} m/px{found}",
     ]
     for number, (residual, used) in enumerate(zip(fit.residuals, fit.inliers, strict=True), 1):

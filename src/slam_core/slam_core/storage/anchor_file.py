@@ -22,9 +22,8 @@ _WRITER = "slam anchor"
 class Anchor:
     """``T`` = T_building_map (4, 4) with its covariance (6, 6), translation first, about the building's axes.
 
-    ``frame`` and ``map_frame`` are the names of the two; ``plan`` the building's floor plan and how it lies in that frame;
-    ``points`` what the transform comes from; ``files`` digests of what was written with it. These three are for people
-    and for the command.
+    ``frame`` and ``map_frame`` are the names of the two; ``plan`` the building's floor plan and how it lies in that
+    frame; ``points`` what the transform comes from; ``files`` digests of what was written with it.
     """
 
     T: FloatArray
