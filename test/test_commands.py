@@ -120,6 +120,9 @@ def lines_of(page: Path) -> list[str]:
 def prepare(line: str, request: pytest.FixtureRequest) -> None:
     """What a command reads and no command before it has made."""
     words = shlex.split(line)
+    if "anchor" in words and not Path("out/demo").exists():
+        write_bag(Path("demo.bag"), {})
+        assert CliRunner().invoke(slam, ["run", "demo.bag", "-o", "out/demo"]).exit_code == 0
     topics = dict(words[i + 1].split("=") for i, word in enumerate(words) if word == "--topic")
     for path in (Path(word) for word in words if re.fullmatch(r"\w+\.bag", word)):
         write_bag(path, topics)

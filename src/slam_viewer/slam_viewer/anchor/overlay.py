@@ -78,8 +78,9 @@ class Overlay:
         self._write(f"{length:g} m", (left, bottom - 14), _TEXT)
 
     def _write(self, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
-        cv2.putText(self.image, text, at, _FONT, 0.7, (255, 255, 255), 5, cv2.LINE_AA)
-        cv2.putText(self.image, text, at, _FONT, 0.7, colour, 2, cv2.LINE_AA)
+        size = max(self.image.shape) / 1800.0
+        cv2.putText(self.image, text, at, _FONT, size, (255, 255, 255), 6, cv2.LINE_AA)
+        cv2.putText(self.image, text, at, _FONT, size, colour, 2, cv2.LINE_AA)
 
     def _metres_a_pixel(self) -> float:
         assert self._plan.resolution is not None
