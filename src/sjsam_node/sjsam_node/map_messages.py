@@ -3,17 +3,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from sjsam_node.smoothing.map_snapshot import MapLandmarks, MapSnapshot
 from slam_core.geometry import FloatArray
-from slam_core.messages import ellipsoid_markers, landmark_cloud, path_marker, points_message
+from slam_core.messages import ellipsoid_markers, landmark_cloud, path_marker, points_message, transform_message
 from slam_core.messages.base import Message, MessageTypes
+from slam_core.storage.anchor_file import read_anchor
 
 _SKELETON = (0.1, 0.4, 1.0, 1.0)
 _CLOSURE = (0.9, 0.1, 0.1, 1.0)
 _MARK = (0.1, 0.8, 0.2, 1.0)
 _LINE_LIST, _SPHERE_LIST = 5, 7
+
+
+def anchor_message(types: MessageTypes, path: str, map_frame: str) -> Message:
+    """The static transform from the map to its building, from the ``anchor.yaml`` of ``slam anchor``."""
+    anchor = read_anchor(Path(path).expanduser())
+    return transform_message(types, 0, anchor.frame, map_frame, anchor.T)
 
 
 def landmarks_message(types: MessageTypes, header: Message, landmarks: MapLandmarks) -> Message:

@@ -140,6 +140,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
             self.advertise(below(agent, "pose"), "PoseWithCovarianceStamped")
             self.advertise(below(agent, "map_to_odom"), "TransformStamped", latched=True, depth=1)
             self.advertise(below(agent, "map_to_odom_pose"), "PoseWithCovarianceStamped", latched=True, depth=1)
+        if self.config.anchor_path:
+            self.broadcast_static(
+                map_messages.anchor_message(self.types, self.config.anchor_path, self.config.map_frame)
+            )
 
     def _listen_to(self, agent: str) -> None:
         topics = {below(agent, topic): kind for topic, kind in SUBMAP_TOPICS.items()}

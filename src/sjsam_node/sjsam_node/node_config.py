@@ -22,6 +22,10 @@ class SjsamNodeConfig(GlobalMapConfig):
     initial_map: str = parameter(
         "", "folder of the map to begin with, which is only read; empty: none, with localize_only that of map_path"
     )
+    anchor_path: str = parameter(
+        "",
+        "anchor.yaml of slam anchor: its transform from map_frame to the building is sent on /tf_static; empty: none",
+    )
     ply_path: str = parameter("map_landmarks.ply", "file that export_ply writes")
     localize_only: bool = parameter(False, "locate the agents in the loaded map without changing it")
     autosave_period_s: float = parameter(

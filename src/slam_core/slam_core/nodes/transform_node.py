@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node's transforms: static ones in, ``/tf`` out."""
+"""A node's transforms: static ones in and out, ``/tf`` out."""
 
 # rclpy is annotated in part only.
 # mypy: allow-untyped-calls, disable-error-code="attr-defined,union-attr,arg-type,misc"
@@ -42,6 +42,17 @@ class TransformNode(ListeningNode):
         """Send TransformStamped messages on /tf."""
         if self._tf is not None:
             self._tf.publish(self._ros_types.TFMessage(transforms=as_ros(list(transforms))))
+
+    def broadcast_static(self, transform: Message) -> None:
+        """Send a TransformStamped message once, for all who come later too: on /tf_static."""
+        profile, kind = sensor_qos(LATCHED_DEPTH, latched=True), self._tf_class()
+        if kind is not None:
+            self._static_output = self.create_publisher(kind, "/tf_static", profile)
+            self._static_output.publish(self._ros_types.TFMessage(transforms=as_ros([transform])))
+        else:
+            kind = self._ros_types.TransformStamped
+            self._static_output = self.create_publisher(kind, STATIC_TRANSFORMS_TOPIC, profile)
+            self._static_output.publish(as_ros(transform))
 
     def _reject(self, why: str, number: int = 1) -> None:
         self.health.count("rejected", number)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a map lies in the frame of its building: the file ``anchor.yaml`` that ``slam anchor`` writes."""
+"""Place of a map in the frame of its building: the file ``anchor.yaml`` that ``slam anchor`` writes."""
 
 from __future__ import annotations
 

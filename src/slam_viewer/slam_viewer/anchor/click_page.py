@@ -14,7 +14,7 @@ from slam_viewer.anchor.building_plan import BuildingPlan
 from slam_viewer.anchor.map_from_above import MapPicture
 
 GENERATOR = '<meta name="generator" content="slam anchor">'
-"""What a page of ours has in its head."""
+"""Mark of a page of ours, in its head."""
 
 
 def click_page(title: str, command: str, picture: MapPicture, plan: BuildingPlan) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a finished map is laid on a floor plan: walls, free floor and paths, in the plane of its floor."""
+"""Walls, free floor and paths of a finished map, in the plane of its floor, to be laid on a floor plan."""
 
 from __future__ import annotations
 

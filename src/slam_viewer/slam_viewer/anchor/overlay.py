@@ -15,7 +15,7 @@ from slam_viewer.anchor.map_from_above import PATH_COLOURS
 _LONG_SIDE = 1400
 _PALER = 0.55
 _MOST_BEYOND = 1.0
-"""How far the picture goes beyond the plan where the map does, as a share of the plan's size."""
+"""Largest reach of the picture beyond the plan where the map goes there, as a share of the plan's size."""
 _WALL, _GOOD, _BAD, _TEXT = (60, 60, 230), (30, 140, 30), (0, 110, 255), (40, 40, 40)
 _BEYOND = (225, 225, 225)
 _SHIFT = 4
