@@ -70,7 +70,7 @@ class PlanePoints:
                 raise ValueError("standard deviations of points must be positive")
 
     def mirrored(self) -> PlanePoints:
-        """The same with the target in a mirror."""
+        """Copy with the target in a mirror."""
         flipped = self.target * np.array([-1.0, 1.0])
         return PlanePoints(self.source, flipped, self.source_sigma, self.target_sigma, self.is_scale_known)
 
@@ -130,7 +130,7 @@ def _fit(points: PlanePoints, used: Mask) -> PlaneAlignment | None:
 
 
 def _jacobian(points: PlanePoints, R: FloatArray, scale: float) -> FloatArray:
-    """Of the residuals (n, 2, 3 or 4) by x, y, yaw and, where it is unknown, the logarithm of the scale."""
+    """Derivative of the residuals (n, 2, 3 or 4) by x, y, yaw and, where it is unknown, the logarithm of the scale."""
     turned = points.source @ R.T
     J = np.zeros((len(turned), 2, 3 if points.is_scale_known else 4))
     J[:, 0, 0] = J[:, 1, 1] = -1.0

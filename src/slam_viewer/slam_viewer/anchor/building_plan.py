@@ -37,7 +37,7 @@ class BuildingPlan:
         return self.image.shape[1], self.image.shape[0]
 
     def with_resolution(self, resolution: float) -> BuildingPlan:
-        """The same plan with a resolution in m/px."""
+        """Copy with a resolution in m/px."""
         return replace(self, resolution=resolution)
 
     def from_lower_left(self, pixels: FloatArray) -> FloatArray:

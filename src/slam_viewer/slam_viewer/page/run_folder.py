@@ -91,7 +91,7 @@ def _map(path: Path) -> tuple[MapSnapshot, str]:
 
 
 def read_trajectories(path: Path) -> dict[str, Trajectory]:
-    """Those of the folder of a run in the map frame, by agent; with their covariances where they are there."""
+    """Trajectories of a run in the map frame, by agent, with their covariances where they are there."""
     several = sorted(p for p in path.glob("trajectory_*.tum") if not _is_anchored(p))
     files = {p.stem.removeprefix("trajectory_"): p for p in several} or {"": path / "trajectory.tum"}
     out = {}
