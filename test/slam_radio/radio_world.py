@@ -15,7 +15,6 @@ from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox
 from slam_radio.outbox import Outbox
 from slam_radio.packing.light_submap import LightConfig, lightened, write
-from slam_radio.packing.submap_details import pack_details
 from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_want
 from slam_radio.uplink import OVERHEAD, Uplink
 
@@ -63,8 +62,7 @@ class World:
         submap = self.whole(index)
         light = lightened(submap, SIZE)
         message = write(light)
-        if (details := pack_details(submap, light, message)) is not None:
-            self.uplink.details.folder.add((2, index), details)
+        self.uplink.details.keep((2, index), submap, light, message)
         self.uplink.add_submap((2, index), message, self.now_s)
 
     def whole(self, index: int) -> Submap:

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from radio_world import SIZE, World
 
 from slam_core.types import Submap
+from slam_radio.detail_store import DetailStore
 from slam_radio.packing.light_submap import lightened, write
 from slam_radio.packing.submap_details import key_of_details, pack_details, with_details
 
@@ -156,3 +158,30 @@ def test_a_submap_that_was_sent_whole_has_none(make_submap):
     submap = make_submap(5)
     light = lightened(submap, SIZE)
     assert pack_details(submap, light, write(light)) is None
+
+
+def test_a_landmark_that_cannot_be_sent_costs_the_details_and_not_the_submap(tmp_path, make_submap):
+    submap = make_submap(40)
+    light = lightened(submap, SIZE)
+    message = write(light)
+    left_out = int(np.flatnonzero(~np.isin(submap.landmark_ids, light.landmarks.ids))[0])
+    covariance = submap.covariance.copy()
+    own = slice(6 + 3 * left_out, 9 + 3 * left_out)
+    covariance[own, own] += 1e12 * np.eye(3)
+    store = DetailStore(tmp_path)
+    assert not store.keep((2, 0), replace(submap, covariance=covariance), light, message)
+    assert store.folder.sizes == {}
+    assert store.keep((2, 0), submap, light, message)
+    assert list(store.folder.sizes) == [(2, 0)]
+
+
+def test_details_whose_file_is_gone_are_left_out(world):
+    world.run(5.0)
+    for index in range(3):
+        world.submap(index)
+    world.run(20.0)
+    for path in world.uplink.details.folder.path.iterdir():
+        path.unlink()
+    world.inbox.ask([(2, 1)])
+    world.run(20.0)
+    assert world.detail_keys == []

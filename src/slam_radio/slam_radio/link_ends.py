@@ -35,7 +35,6 @@ from slam_radio.index_ranges import Key
 from slam_radio.link_state import LinkState
 from slam_radio.outbox import Outbox
 from slam_radio.packing.light_submap import lightened, write
-from slam_radio.packing.submap_details import pack_details
 from slam_radio.radio_config import RadioConfig
 from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_correction, unpack_want
 from slam_radio.uplink import Uplink
@@ -134,10 +133,9 @@ class AgentEnd(End):
         submap = replace(submap, agent=self.name)
         light = lightened(submap, self.node.config.light)
         message = write(light)
-        details = pack_details(submap, light, message)
         try:
-            if details is not None:
-                self.details.folder.add(key, details)
+            if not self.details.keep(key, submap, light, message):
+                self.node.health.count("submaps whose details cannot be sent")
             self.uplink.add_submap(key, message, time.monotonic())
         except OSError as error:
             raise ValueError(f"submap {submap.index} cannot be kept for the post: {error}") from error

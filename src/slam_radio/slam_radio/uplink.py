@@ -135,8 +135,9 @@ class Uplink:
             size = self.details.folder.sizes[key] + OVERHEAD
             if not self._budget.allows(size, now_s):
                 break
-            self._budget.spend(size)
-            out.append(Outgoing("details", self.details.take(key, now_s), key))
+            if (data := self.details.take(key, now_s)) is not None:
+                self._budget.spend(size)
+                out.append(Outgoing("details", data, key))
         return out
 
     def due_pose(self, now_s: float) -> list[Outgoing]:

@@ -104,6 +104,17 @@ def test_a_worker_that_is_lost_fails_its_recording_alone(tmp_path, monkeypatch):
     assert text.count("12.3") == text.count("50%") == 2
 
 
+def test_a_fault_of_the_program_fails_its_recording_alone(tmp_path, monkeypatch):
+    class Broken:
+        def __init__(self, bag, output, options):
+            raise RuntimeError(f"no {bag.name}")
+
+    monkeypatch.setattr(many_runs, "RecordingRun", Broken)
+    bags = [tmp_path / name for name in ("one", "two")]
+    outcomes = run_many(bags, tmp_path / "out", RunOptions(), InProcess(), lambda *at: None)
+    assert [one.reason for one in outcomes] == ["RuntimeError: no one", "RuntimeError: no two"]
+
+
 def test_workers_for_one_recording_are_refused(tmp_path):
     done = call("run", DEMO, "-o", tmp_path / "out", "--workers", 2)
     assert "several recordings" in str(done.exception)

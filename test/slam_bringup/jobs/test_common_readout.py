@@ -65,3 +65,10 @@ def test_cameras_are_told_apart_by_their_calibration():
     ):
         assert camera_key(other) != KEY
     assert camera_key(None) == ""
+
+
+def test_the_order_of_recordings_does_not_matter():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        given = [seen(*values) for values in rng.uniform([8.0, 0.5], [12.0, 2.0], (5, 2))]
+        assert readouts_of_others(given) == readouts_of_others(given[::-1])[::-1]

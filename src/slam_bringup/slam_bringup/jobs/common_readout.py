@@ -66,6 +66,7 @@ def _of_others(k: int, seen: Sequence[SeenReadout]) -> SeenReadout | None:
     others = [s for i, s in enumerate(seen) if i != k and s.camera == own.camera and s.sigma_s > 0.0]
     if not others or not own.camera:
         return None
+    others.sort(key=lambda s: (s.value_s, s.sigma_s))  # the same sum in any order of the recordings
     values, weights = np.array([s.value_s for s in others]), np.array([s.sigma_s for s in others]) ** -2.0
     mean, sigma = float(weights @ values / weights.sum()), float(weights.sum() ** -0.5)
     contradicts = abs(own.value_s - mean) > _CONTRADICTION * np.hypot(own.sigma_s, sigma) and own.sigma_s > 0.0

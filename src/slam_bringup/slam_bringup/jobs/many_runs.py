@@ -111,6 +111,8 @@ def run_task(task: RunTask, number: int, tell: Callable[[Any], None]) -> RunOutc
             summary, _ = run.write(_Told(number, tell))
         except (ValueError, OSError) as error:
             return RunOutcome(task.bag, task.output, None, str(error) or type(error).__name__)
+        except Exception as error:  # a fault of the program stops no other recording
+            return RunOutcome(task.bag, task.output, None, f"{type(error).__name__}: {error}")
     return RunOutcome(task.bag, task.output, summary)
 
 
