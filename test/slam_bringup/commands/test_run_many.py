@@ -115,6 +115,17 @@ def test_a_fault_of_the_program_fails_its_recording_alone(tmp_path, monkeypatch)
     assert [one.reason for one in outcomes] == ["RuntimeError: no one", "RuntimeError: no two"]
 
 
+def test_paths_of_a_task_do_not_depend_on_the_workers_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    given = []
+    monkeypatch.setattr(
+        many_runs, "run_task", lambda task, *_: given.append(task) or RunOutcome(task.bag, task.output, {})
+    )
+    run_many([Path("a"), Path("b")], Path("out"), RunOptions(old_map=Path("old")), InProcess(), lambda *at: None)
+    assert [task.options.old_map for task in given] == [tmp_path / "old"] * 2
+    assert [task.output for task in given] == [tmp_path / "out" / "a", tmp_path / "out" / "b"]
+
+
 def test_workers_for_one_recording_are_refused(tmp_path):
     done = call("run", DEMO, "-o", tmp_path / "out", "--workers", 2)
     assert "several recordings" in str(done.exception)

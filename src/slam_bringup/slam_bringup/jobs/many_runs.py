@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +89,8 @@ def run_many(
         known[int(value[0])] = int(value[1]), int(value[2])
         on_progress(sum(done for done, _ in known.values()), sum(total for _, total in known.values()))
 
+    if options.old_map is not None:  # a worker of a cluster runs in a folder of its own
+        options = replace(options, old_map=options.old_map.resolve())
     tell, handles = tasks.channel(on_told), list[tuple[RunTask, Any]]()
     for number, (bag, name) in enumerate(zip(bags, folder_names(bags), strict=True)):
         task = RunTask(bag.resolve(), output.resolve() / name, options, tuple(sys.argv[1:]))
