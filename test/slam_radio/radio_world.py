@@ -62,7 +62,8 @@ class World:
         submap = self.whole(index)
         light = lightened(submap, SIZE)
         message = write(light)
-        self.uplink.details.keep((2, index), submap, light, message)
+        if self.uplink.details is not None:
+            self.uplink.details.keep((2, index), submap, light, message)
         self.uplink.add_submap((2, index), message, self.now_s)
 
     def whole(self, index: int) -> Submap:
