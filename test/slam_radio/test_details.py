@@ -15,6 +15,7 @@ from slam_core.types import Submap
 from slam_radio.detail_store import DetailStore
 from slam_radio.packing.light_submap import lightened, write
 from slam_radio.packing.submap_details import key_of_details, pack_details, with_details
+from slam_radio.radio_messages import MOST_RANGES
 
 
 @pytest.fixture
@@ -185,3 +186,17 @@ def test_details_whose_file_is_gone_are_left_out(world):
     world.inbox.ask([(2, 1)])
     world.run(20.0)
     assert world.detail_keys == []
+
+
+def test_many_that_an_agent_lacks_do_not_keep_others_waiting(world):
+    """A message names 64 ranges; of more wanted ones others come each time."""
+    world.run(5.0)
+    scattered = range(0, 2 * (MOST_RANGES + 2), 2)
+    for index in range(scattered[-1] + 1):
+        world.submap(index)
+    world.run(150.0)
+    for index in scattered[:-1]:
+        world.uplink.details.folder.remove((2, index))
+    assert world.inbox.ask([(2, index) for index in scattered]) == len(scattered)
+    world.run(30.0)
+    assert world.detail_keys == [scattered[-1]]

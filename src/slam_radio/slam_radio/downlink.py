@@ -16,7 +16,7 @@ from slam_radio.inbox import Inbox
 from slam_radio.index_ranges import Key, Range
 from slam_radio.link_report import Backlog, LinkReport, unpack_backlog
 from slam_radio.link_state import Hearing, LinkState
-from slam_radio.radio_messages import pack_acknowledgement, pack_correction, pack_want, unpack_pose
+from slam_radio.radio_messages import MOST_RANGES, pack_acknowledgement, pack_correction, pack_want, unpack_pose
 from slam_radio.uplink import OVERHEAD
 
 _BEACON_PERIOD_S = 3.0
@@ -47,13 +47,13 @@ class _Agent:
         self.told_at_s = float("-inf")
         self.wants: list[Range] | None = []
         self.wanted_at_s = float("-inf")
+        self.first_want = 0
         self.correction: tuple[int, FloatArray] | None = None
         self.corrected_by: FloatArray | None = None
         self.corrected_at_s = float("-inf")
 
-    def want_is_due(self, now_s: float) -> bool:
+    def want_is_due(self, lacking: list[Range], now_s: float) -> bool:
         """True if the agent does not know what is wanted, or may have to be told again."""
-        lacking = self.inbox.lacking()
         pause_s = now_s - self.wanted_at_s
         return pause_s >= _LEAST_PERIOD_S if self.wants != lacking else bool(lacking) and pause_s >= _BEACON_PERIOD_S
 
@@ -126,11 +126,12 @@ class Downlink:
                 if self._take_budget(data, now_s):
                     agent.told_at_s, agent.has_news = now_s, False
                     out.append(Message(name, "ack", data))
-            if agent.want_is_due(now_s) and agent.hearing.is_up(now_s):
-                lacking = agent.inbox.lacking()
-                data = pack_want(lacking)
+            lacking = agent.inbox.lacking()
+            if agent.want_is_due(lacking, now_s) and agent.hearing.is_up(now_s):
+                first = agent.first_want % len(lacking) if len(lacking) > MOST_RANGES else 0
+                data = pack_want(lacking[first:] + lacking[:first])  # of many, others each time
                 if self._take_budget(data, now_s):
-                    agent.wanted_at_s, agent.wants = now_s, lacking
+                    agent.wanted_at_s, agent.wants, agent.first_want = now_s, lacking, first + MOST_RANGES
                     out.append(Message(name, "want", data))
             if agent.correction_is_due(now_s) and agent.hearing.is_up(now_s):
                 data = pack_correction(*agent.correction)  # type: ignore[misc]

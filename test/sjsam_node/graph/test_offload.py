@@ -58,3 +58,12 @@ def _mapped_mib() -> float:
     """Resident memory of this process that files hold, MiB."""
     (line,) = (row for row in Path("/proc/self/status").read_text().splitlines() if row.startswith("RssFile"))
     return int(line.split()[1]) / 1024
+
+
+def test_what_is_on_disk_is_not_written_again(rng: np.random.Generator) -> None:
+    disk, other = Offload(), Offload()
+    stored = disk.put(rng.normal(size=(40, 40)))
+    assert disk.put(stored) is stored
+    part = stored[:10]
+    assert disk.put(part) is part
+    assert other.put(stored) is not stored

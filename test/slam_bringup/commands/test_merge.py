@@ -6,30 +6,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
+from demo_parts import DEMO, call, cut
 from sjsam_node import storage
-from slam_bags.storage.bag import BagReader, BagWriter
-from slam_bringup.cli import slam
 from slam_bringup.jobs.merged_run import map_of_bag
 from slam_bringup.pipeline.overrides import Overrides
 from slam_viewer.page.run_folder import RunFolder
-
-DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
-
-
-def call(*arguments: object):
-    return CliRunner().invoke(slam, [str(a) for a in arguments], catch_exceptions=True)
-
-
-def cut(path: Path, start: float, end: float) -> Path:
-    """A part of the demo, by share of its time."""
-    with BagReader(DEMO) as bag, BagWriter(path) as part:
-        for message in bag.raw():
-            info, since = bag.topics[message.topic], (message.stamp_ns - bag.start_ns) * 1e-9 / bag.duration_s
-            if start <= since <= end or info.count == 1 or "tf" in message.topic:
-                part.write_raw(message.topic, info.type_name, message.data, message.stamp_ns)
-    return path
 
 
 @pytest.fixture(scope="module")

@@ -8,32 +8,14 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from rich.console import Console
 
+from demo_parts import DEMO, call, cut
 from sjsam_node.regions.tasks import InProcess
-from slam_bags.storage.bag import BagReader, BagWriter
-from slam_bringup.cli import slam
 from slam_bringup.jobs import many_runs
 from slam_bringup.jobs.many_runs import RunOutcome, folder_names, outcomes_table, run_many
 from slam_bringup.jobs.recording_run import RunOptions
 from slam_bringup.terminal.run_end import FAILED
-
-DEMO = Path(__file__).resolve().parents[3] / "bags" / "demo"
-
-
-def call(*arguments: object):
-    return CliRunner().invoke(slam, [str(a) for a in arguments], catch_exceptions=True)
-
-
-def cut(path: Path, start: float, end: float) -> Path:
-    """A part of the demo, by share of its time."""
-    with BagReader(DEMO) as bag, BagWriter(path) as part:
-        for message in bag.raw():
-            info, since = bag.topics[message.topic], (message.stamp_ns - bag.start_ns) * 1e-9 / bag.duration_s
-            if start <= since <= end or info.count == 1 or "tf" in message.topic:
-                part.write_raw(message.topic, info.type_name, message.data, message.stamp_ns)
-    return path
 
 
 def result_bytes(out: Path) -> dict[str, bytes]:

@@ -22,13 +22,17 @@ _ALIGNMENT = 64
 
 def forget(array: AnyArray) -> None:
     """Leave an array that :meth:`Offload.put` returned, and its neighbours, to the operating system; others stay."""
+    if (owner := _mapping_of(array)) is not None:
+        owner.madvise(mmap.MADV_DONTNEED)
+
+
+def _mapping_of(array: AnyArray) -> mmap.mmap | None:
     owner: Any = array
     while isinstance(owner, np.ndarray):
         owner = owner.base
     if isinstance(owner, memoryview):
         owner = owner.obj
-    if isinstance(owner, mmap.mmap):
-        owner.madvise(mmap.MADV_DONTNEED)
+    return owner if isinstance(owner, mmap.mmap) else None
 
 
 @dataclass
@@ -46,9 +50,14 @@ class Offload:
         for segment in self._mapped:
             segment.madvise(mmap.MADV_DONTNEED)
 
+    def _holds(self, array: AnyArray) -> bool:
+        """True if an array is a view of one that :meth:`put` returned."""
+        owner = _mapping_of(array)
+        return any(owner is segment for segment in self._mapped)
+
     def put(self, array: AnyArray) -> AnyArray:
-        """Array with these values, on disk and read only."""
-        if not array.size:
+        """Array with these values, on disk and read only; one that is there already is returned as it is."""
+        if not array.size or self._holds(array):
             return array
         if self._end + array.nbytes > self._first + len(self._segment):
             self._first += len(self._segment)

@@ -139,7 +139,6 @@ class LoopDetector:
         """Links of a record that has further landmarks now: with what it waits to be tied to, and as if it were new."""
         waits = [k.ends for k in self.pending if record in k.ends]
         self.pending = [k for k in self.pending if record not in k.ends]
-        self._alarms = {ends: alarms for ends, alarms in self._alarms.items() if record not in ends}
         self.near.forget({record})
         held = {frozenset(k.ends) for k in self.graph.links}
         found = self._verified(waits, self._redundancy_check())

@@ -18,9 +18,7 @@ factor by the Lanczos method (Golub and Van Loan, Matrix Computations, 8.2 and 1
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +26,7 @@ import numpy.typing as npt
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, Float32Array
 from slam_radio.packing import gaussian_kernels
+from slam_radio.packing.block_diagonal import BlockDiagonal
 
 IntArray = npt.NDArray[np.int64]
 
@@ -96,11 +95,11 @@ class CompactGaussian:
         V = np.sqrt(_COMMON) * B.times(U)
         return _sum(V @ V.T, B.around(_own(U)).scaled(self.inflation))
 
-    def blocks(self) -> _Blocks:
+    def blocks(self) -> BlockDiagonal:
         """The blocks of B."""
         pose = np.zeros((6, 6))
         pose[np.tril_indices(6)] = UNIT * self.pose.astype(np.float64)
-        return _Blocks(pose, _ray_frames(self.rays) @ _factors(self.factors))
+        return BlockDiagonal(pose, _ray_frames(self.rays) @ _factors(self.factors))
 
     def require_positive(self) -> None:
         """Raise ``ValueError`` if rounding may leave the covariance not positive definite.
@@ -190,49 +189,7 @@ def extended(
     return _with_least_factor(S, replace(rounded, common=np.concatenate([gaussian.common, _rounded(more)])), whitened)
 
 
-class _Blocks(NamedTuple):
-    """A block-diagonal matrix: the pose's block (6, 6) and the landmarks' (n, 3, 3)."""
-
-    pose: FloatArray
-    landmarks: FloatArray
-
-    @classmethod
-    def of(cls, S: FloatArray) -> _Blocks:
-        """The blocks of a matrix (6 + 3n, 6 + 3n)."""
-        n = (len(S) - 6) // 3
-        return cls(S[:6, :6], S[6:, 6:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :])
-
-    def cholesky(self) -> _Blocks:
-        """Cholesky factors of the blocks."""
-        return self.mapped(np.linalg.cholesky)
-
-    def inverse(self) -> _Blocks:
-        """Inverses of the blocks."""
-        return self.mapped(np.linalg.inv)
-
-    def coarse(self) -> _Blocks:
-        """The blocks in single precision."""
-        return self.mapped(lambda blocks: blocks.astype(np.float32))
-
-    def scaled(self, factor: float) -> _Blocks:
-        """All blocks times a factor."""
-        return self.mapped(lambda blocks: factor * blocks)
-
-    def mapped(self, function: Callable[[FloatArray], Any]) -> _Blocks:
-        """The blocks that a function makes of stacks of these."""
-        return _Blocks(function(self.pose), function(self.landmarks))
-
-    def times(self, M: AnyArray) -> AnyArray:
-        """The product with a matrix (6 + 3n, k)."""
-        n, k = len(self.landmarks), M.shape[1]
-        return np.concatenate([self.pose @ M[:6], (self.landmarks @ M[6:].reshape(n, 3, k)).reshape(3 * n, k)])
-
-    def around(self, other: _Blocks) -> _Blocks:
-        """A S A' for this matrix A and a symmetric one of the same blocks."""
-        return _Blocks(*(_symmetric(A @ S @ np.swapaxes(A, -1, -2)) for A, S in zip(self, other, strict=True)))
-
-
-def _sum(S: FloatArray, blocks: _Blocks) -> FloatArray:
+def _sum(S: FloatArray, blocks: BlockDiagonal) -> FloatArray:
     """S + blocks; S is changed."""
     rows = 6 + np.arange(3 * len(blocks.landmarks)).reshape(-1, 3)
     S[:6, :6] += blocks.pose
@@ -254,7 +211,7 @@ def _rounded_factors(S: FloatArray, rays: FloatArray) -> tuple[npt.NDArray[np.fl
     """The pose's factor (21,) and the landmarks' (n, 6), as they are sent."""
     R = _ray_frames(rays)
     try:
-        pose, landmarks = _Blocks.of(S)
+        pose, landmarks = BlockDiagonal.of(S)
         L = np.linalg.cholesky(pose), np.linalg.cholesky(np.swapaxes(R, 1, 2) @ landmarks @ R)
     except np.linalg.LinAlgError as error:
         raise ValueError("a submap's covariance must be positive definite") from error
@@ -296,7 +253,7 @@ def _whitened(S: FloatArray, rounded: CompactGaussian) -> Float32Array:
     return out
 
 
-def _scaled(left: _Blocks, C: Float32Array) -> Float32Array:
+def _scaled(left: BlockDiagonal, C: Float32Array) -> Float32Array:
     """A C A' in single precision."""
     out = np.empty_like(C)
     gaussian_kernels.between(*left.coarse(), C, out)
@@ -307,10 +264,10 @@ def _rounded(U: AnyArray) -> IntArray:
     return np.clip(np.rint(_STEPS * U), -_STEPS, _STEPS).astype(np.int64)
 
 
-def _own(U: FloatArray) -> _Blocks:
+def _own(U: FloatArray) -> BlockDiagonal:
     """I less the blocks of U U', with eigenvalues of at least ``_LEAST_OWN``."""
     V = U[6:].reshape(-1, 3, U.shape[1])
-    return _Blocks(_floored(np.eye(6) - U[:6] @ U[:6].T), _floored(np.eye(3) - V @ V.transpose(0, 2, 1)))
+    return BlockDiagonal(_floored(np.eye(6) - U[:6] @ U[:6].T), _floored(np.eye(3) - V @ V.transpose(0, 2, 1)))
 
 
 def _floored(blocks: FloatArray) -> FloatArray:
@@ -331,7 +288,7 @@ def _common_directions(C: Float32Array, rank: int) -> FloatArray:
     """
     m = len(C)
     V: AnyArray = _start(m, min(rank + _SPARE, m))
-    U, D = np.zeros((m, rank)), _Blocks(0.5 * np.eye(6), np.tile(0.5 * np.eye(3), ((m - 6) // 3, 1, 1)))
+    U, D = np.zeros((m, rank)), BlockDiagonal(0.5 * np.eye(6), np.tile(0.5 * np.eye(3), ((m - 6) // 3, 1, 1)))
     for _ in range(_ITERATIONS):
         L = D.cholesky()
         scaled = _scaled(L.inverse(), C)
@@ -389,10 +346,6 @@ def _start(m: int, count: int) -> Float32Array:
     """Vectors (m, count), orthonormal and the same for ever, that are like no direction of a submap."""
     values = np.cos(np.arange(m * count, dtype=np.float64).reshape(m, count) ** 2)
     return np.asarray(np.linalg.qr(values)[0], dtype=np.float32)
-
-
-def _symmetric(S: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (S + np.swapaxes(S, -1, -2)))
 
 
 def _is_positive(S: FloatArray) -> bool:
