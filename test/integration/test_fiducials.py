@@ -29,9 +29,9 @@ def slam(folder: Path, *words: str) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which the commands of the page that start with ./slam have run."""
+    """A folder in which the page's first two commands have run: those of the corridor with a tag."""
     folder = tmp_path_factory.mktemp("fiducials")
-    lines = re.findall(r"^\./slam (.*)$", (ROOT / "docs/fiducials.md").read_text(), flags=re.M)
+    lines = re.findall(r"^\./slam ((?:simulate|run) .*)$", (ROOT / "docs/fiducials.md").read_text(), flags=re.M)
     assert len(lines) == 2
     for line in lines:
         slam(folder, *shlex.split(line))

@@ -71,13 +71,15 @@ class Bench:
 
 @contextmanager
 def running(*parameters: str) -> Iterator[Bench]:
-    """A bench whose node has these parameters (``name:=value``)."""
+    """A bench whose node has these parameters (``name:=value``); rclpy is shut down too where the node refuses them."""
     rclpy.init(args=["--ros-args", *(word for p in parameters for word in ("-p", p))])
-    bench = Bench(SjsamNode())
     try:
-        yield bench
+        bench = Bench(SjsamNode())
+        try:
+            yield bench
+        finally:
+            bench.executor.shutdown()
+            bench.node.destroy_node()
+            bench.neighbour.destroy_node()
     finally:
-        bench.executor.shutdown()
-        bench.node.destroy_node()
-        bench.neighbour.destroy_node()
         rclpy.shutdown()
