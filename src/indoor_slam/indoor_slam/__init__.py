@@ -1,13 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The chain as a library: NumPy arrays in, poses with covariances and maps out. No ROS is needed.
 
-from indoor_slam import CameraInfo, StereoSlam
-
-with StereoSlam(left_info, right_info) as slam:
-for stamp_ns, left, right in pairs:
-for frame in slam.add_pair(stamp_ns, left, right):
-print(frame.stamp_ns, frame.state, frame.pose.T, frame.pose.covariance)
-joined = slam.finish()
+Docs, with an example: docs/library.md.
 """
 
 from indoor_slam.slam import DepthSlam, StereoSlam

@@ -27,6 +27,7 @@ from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.camera import CameraInfo
 from slam_core.frame_tree import FrameTree
 from slam_core.geometry import FloatArray, make_transform
+from slam_core.runtime.blas_threads import use_one_blas_thread
 from slam_core.types import AnyArray, ByteArray, ImuSample, Submap
 from stereo_frontend.sources import RawPair
 from tof_driver.stage import RawDepth
@@ -42,6 +43,7 @@ class _Slam:
     """SLAM of one rig, whatever its camera."""
 
     def __init__(self, config: SystemConfig, sensors: AgentSensors, odometry: str) -> None:
+        use_one_blas_thread()
         self._pipeline = SensorPipeline(config, sensors, odometry != "none", StageTimes())
         self._filter = FilterStage(filter_config(config.ekf_slam, sensors), sensors.frames, _BASE)
         self._session = MapSession(config.sjsam)

@@ -45,6 +45,18 @@ module.{name}([])
     assert printed(script, {}) == "[1]"
 
 
+def test_a_rig_of_the_library_has_one_blas_thread() -> None:
+    if (os.cpu_count() or 1) < 2:
+        pytest.skip("OpenBLAS has one thread on one core")
+    script = """
+from indoor_slam import Camera, CameraInfo, DepthSlam
+from threadpoolctl import threadpool_info
+DepthSlam(CameraInfo(Camera(64, 48, 50.0, 50.0, 31.5, 23.5)))
+print(sorted({pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}))
+"""
+    assert printed(script, {}) == "[1]"
+
+
 def printed(script: str, own: dict[str, str]) -> str:
     environment = {k: v for k, v in os.environ.items() if k != VARIABLE} | own
     done = subprocess.run(

@@ -20,9 +20,10 @@ FAILED = {"recording": "hall", "variant": "c", "program": "ours", "run": "alone"
 
 def test_median_and_worst():
     rows = [
-        row("hall", v, ate, coverage=c, parts=p) for v, ate, c, p in (("a", 3, 1, 1), ("b", 1, 0.5, 2), ("c", 2, 1, 1))
+        row("hall", v, ate, coverage=c, parts=p, ms_per_frame=ms)
+        for v, ate, c, p, ms in (("a", 3, 1, 1, 40.2), ("b", 1, 0.5, 2, 90.0), ("c", 2, 1, 1, 30.0))
     ]
-    assert table(rows) == [["hall", "ours, alone", "3", "2.0, 3.0", "1.00, 1.00", "1.00, 1.00", "50", "2", ""]]
+    assert table(rows) == [["hall", "ours, alone", "3", "2.0, 3.0", "1.00, 1.00", "1.00, 1.00", "50", "2", "40", ""]]
 
 
 def test_a_failure_is_the_worst_and_is_counted():

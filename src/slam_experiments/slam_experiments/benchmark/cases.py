@@ -173,10 +173,12 @@ def pnp(folder: Path, before: list[Path], mode: str, truth: str) -> Kept:
     del folder
     try:
         bag = _bag_in(before)
+        began = time.process_time()
         trajectory, lost = frame_to_frame(bag, mode)
     except (ValueError, RuntimeError, cv2.error) as error:
         return {"failed": str(error)}, {}
-    return {"lost": lost} | _figures(trajectory, bag, mode, truth), {}
+    ms = 1e3 * (time.process_time() - began) / max(len(trajectory), 1)
+    return {"ms_per_frame": ms, "lost": lost} | _figures(trajectory, bag, mode, truth), {}
 
 
 def orbslam3_on(folder: Path, before: list[Path], mode: str, truth: str, python: str) -> Kept:

@@ -22,8 +22,10 @@ _COLUMNS = (
     *_CASE, "ate_mm", "end_mm", "scale_percent", "sigma_over_ate", "anees",
     "anees_with_truth_errors", "frames", "coverage", "lost", "parts", "ms_per_frame", "failed",
 )  # fmt: skip
-HEADINGS = ("recording", "program", "variants", "ATE mm", "ANEES", "sigma / ATE", "poses %", "parts", "failed")
-"""Of the table: median and worst over the variants."""
+HEADINGS = (
+    "recording", "program", "variants", "ATE mm", "ANEES", "sigma / ATE", "poses %", "parts", "CPU ms", "failed",
+)  # fmt: skip
+"""Of the table: median and worst over the variants; of processor time per frame the median."""
 
 
 def table(rows: Sequence[Row]) -> list[list[str]]:
@@ -43,6 +45,7 @@ def _line(key: tuple[str, str], rows: Sequence[Row]) -> list[str]:
     failed = sum("failed" in row for row in rows)
     coverage = [100.0 * row.get("coverage", 0.0) for row in rows]
     parts = [row["parts"] for row in rows if "parts" in row]
+    ms = _known(rows, "ms_per_frame")
     return [
         *key,
         str(len(rows)),
@@ -51,6 +54,7 @@ def _line(key: tuple[str, str], rows: Sequence[Row]) -> list[str]:
         _median_and_worst(_known(rows, "sigma_over_ate"), 2, min),
         f"{min(coverage):.0f}",
         str(max(parts)) if parts else "",
+        f"{_median(ms):.0f}" if ms else "",
         str(failed) if failed else "",
     ]
 
