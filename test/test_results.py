@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/results.md shows what commands printed, and nothing else in figures."""
+"""docs/results.md and docs/others.md show what commands printed, and nothing else in figures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from types import ModuleType
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = (ROOT / "docs/results.md").read_text(encoding="utf-8")
 
 
 def load() -> ModuleType:
@@ -27,12 +26,14 @@ def load() -> ModuleType:
 
 
 results = load()
-BLOCKS = list(results.blocks(PAGE))
+PAGES = {path.name: path.read_text(encoding="utf-8") for path in results.PAGES}
+BLOCKS = [block for page in PAGES.values() for block in results.blocks(page)]
 
 
-def test_every_figure_of_the_page_was_printed():
-    assert len(BLOCKS) == PAGE.count("<!-- measured:") == PAGE.count("```console")
-    assert "\n|" not in PAGE, "a table that no command printed"
+@pytest.mark.parametrize("page", PAGES.values(), ids=PAGES)
+def test_every_figure_of_the_page_was_printed(page):
+    assert len(list(results.blocks(page))) == page.count("<!-- measured:") == page.count("```console") > 0
+    assert "\n|" not in page, "a table that no command printed"
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.command[:60])

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps docs/results.md true: each block there is what a command printed, and this runs the command again.
+"""Keeps docs/results.md and docs/others.md true: each block there is what a command printed, and this runs the command again.
 
     python benchmarks/house/results.py             # lists the blocks: when, at which commit, what they cost
     python benchmarks/house/results.py --run grid  # runs the commands that hold "grid", puts their output in place
 
-Commands see BAGS, a folder of bags by scenario (``slam simulate NAME -o $BAGS/NAME --profile ideal``), and
-INDOOR_SLAM_DATA, the folder of the recordings. A digest beside each block tells whether somebody wrote into it by hand.
+Commands see BAGS, a folder of bags by scenario (``slam simulate NAME -o $BAGS/NAME --profile ideal``),
+INDOOR_SLAM_DATA, the folder of the recordings, and what else the pages name. A digest beside each block tells whether somebody wrote into it by hand.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs/results.md"
+PAGES = (ROOT / "docs/results.md", ROOT / "docs/others.md")
 _BLOCK = re.compile(
     r"<!-- measured: (?P<day>\S*), (?P<commit>\S*), (?P<cpu>\S*) s of processor time, (?P<digest>\S*) -->\n"
     r"```console\n\$ (?P<command>[^\n]*)\n(?P<output>.*?)```\n",
@@ -92,15 +92,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", nargs="+", metavar="TEXT", help="run the commands that hold one of these texts")
     arguments = parser.parse_args()
-    for block in list(blocks(PAGE.read_text(encoding="utf-8"))):
-        if not arguments.run:
+    for page in PAGES:
+        _go_through(page, arguments.run)
+
+
+def _go_through(page: Path, texts: list[str] | None) -> None:
+    for block in list(blocks(page.read_text(encoding="utf-8"))):
+        if not texts:
             changed = "" if block.digest == block.own_digest else "  WRITTEN INTO BY HAND: run it again"
             print(f"{block.day:10} {block.commit:7} {block.cpu:>6} s  {block.command}{changed}")
-        elif any(text in block.command for text in arguments.run):
+        elif any(text in block.command for text in texts):
             print(f"$ {block.command}", file=sys.stderr, flush=True)
             anew = measured(block.command)
-            page = PAGE.read_text(encoding="utf-8")  # read again: another run may have written meanwhile
-            PAGE.write_text(with_block(page, anew), encoding="utf-8")
+            now = page.read_text(encoding="utf-8")  # read again: another run may have written meanwhile
+            page.write_text(with_block(now, anew), encoding="utf-8")
 
 
 if __name__ == "__main__":
