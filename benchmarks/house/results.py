@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps docs/results.md and docs/others.md true: each block there is what a command printed, and this runs the command again.
+"""Keeps docs/results.md and docs/others.md true: each block is what a command printed; this runs it again.
 
     python benchmarks/house/results.py             # lists the blocks: when, at which commit, what they cost
     python benchmarks/house/results.py --run grid  # runs the commands that hold "grid", puts their output in place
 
 Commands see BAGS, a folder of bags by scenario (``slam simulate NAME -o $BAGS/NAME --profile ideal``),
-INDOOR_SLAM_DATA, the folder of the recordings, and what else the pages name. A digest beside each block tells whether somebody wrote into it by hand.
+INDOOR_SLAM_DATA, the folder of the recordings, and what else the pages name. A digest beside each block tells whether
+somebody wrote into it by hand.
 """
 
 from __future__ import annotations
