@@ -77,6 +77,34 @@ def test_what_was_moved_is_let_go_of_the_earlier_day_alone_and_that_is_said(days
         np.testing.assert_array_equal(record.submap.landmarks, was.submap.landmarks)
 
 
+def test_a_merged_map_is_merged_with_one_that_it_was_made_of_and_what_was_let_go_stays_so(days):
+    (before, _), (after, _) = days["before"], days["after"]
+    merged = NamedMap("merged", merge([before, after], GlobalMapConfig(), InProcess()).map.stored())
+    ids = {r.key: r.submap.landmark_ids for r in merged.records}
+    assert any(len(ids[r.key]) < len(r.submap.landmark_ids) for r in before.records)
+    for other in (before, after):
+        for maps in ([merged, other], [other, merged]):
+            union = united(maps)
+            assert [ids[s.agent, s.session, s.index].tolist() for s in union.submaps] == [
+                s.landmark_ids.tolist() for s in union.submaps
+            ]
+            assert len(union.submaps) == len(ids)
+    again = merge([before, merged], GlobalMapConfig(), InProcess())
+    assert again.notes == ("day 1: all its submaps are in the others; it adds nothing",)
+
+
+def test_the_order_of_two_maps_of_the_same_submaps_does_not_count(days):
+    """One let landmarks go, the other did not."""
+    (before, _), (after, _) = days["before"], days["after"]
+    thinned = NamedMap("thinned", merge([before, after], GlobalMapConfig(), InProcess()).map.stored())
+    whole = GlobalMap()
+    for record in (*before.records, *after.records):
+        assert whole.add(record.submap).accepted
+    maps = [thinned, NamedMap("whole", whole.stored())]
+    first, second = (united(given).submaps for given in (maps, maps[::-1]))
+    assert [len(s.landmarks) for s in first] == [len(s.landmarks) for s in second]
+
+
 def test_nothing_is_let_go_where_nothing_was_moved(days):
     union = united([days["before"][0], days["same"][0]])
     across = AcrossMaps(union, GlobalMapConfig().closure, InProcess())

@@ -6,8 +6,10 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -146,6 +148,42 @@ def test_a_failure_leaves_no_folder_but_the_old_results_and_logs(tmp_path: Path)
     with pytest.raises(RuntimeError):
         fail(tmp_path / "out")
     assert content(tmp_path / "out") == OLD
+
+
+@pytest.mark.parametrize("is_second_to_fail", [False, True])
+def test_two_workers_at_one_folder_do_not_touch_what_the_other_makes_ready(
+    tmp_path: Path, is_second_to_fail: bool
+) -> None:
+    """As a worker that a cluster lost, and the one that was given its recording again; ids are equal across hosts."""
+    out = tmp_path / "out"
+    first, second = OutputFolder(out, "run", "bag"), OutputFolder(out, "run", "bag")
+    with pytest.raises(RuntimeError) if is_second_to_fail else nullcontext(), second, second.staged() as folder:
+        (folder / "summary.json").write_text("same")
+        with first, first.staged() as other:
+            assert sorted(p.name for p in folder.iterdir()) == ["summary.json"]
+            for name in ("summary.json", "first.txt"):
+                (other / name).write_text("same")
+        assert {"summary.json": "same", "first.txt": "same"}.items() <= content(out).items()
+        if is_second_to_fail:
+            raise RuntimeError
+    kept = {"first.txt": "same"} if is_second_to_fail else {}
+    assert content(out) == {"summary.json": "same"} | kept
+    write(out, NEW)  # all that is there is known as ours
+    assert content(out) == NEW
+
+
+def test_what_a_worker_of_another_machine_makes_ready_is_not_removed(tmp_path: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    there, here, old = (
+        tmp_path / f".slam.{ended.pid}{end}.part" for end in (".1.another", f".1.{socket.gethostname()}", "")
+    )
+    for folder in (there, here, old):
+        folder.mkdir()
+    write(tmp_path, NEW)
+    assert there.is_dir()
+    assert not here.exists()
+    assert not old.exists()
 
 
 KILLED = """

@@ -90,15 +90,18 @@ def _canonical(one: NamedMap) -> tuple[int, int, bytes]:
     submaps, content = [r.submap for r in one.records], hashlib.sha256()
     for submap in submaps:
         content.update(repr(_key(submap)).encode() + _digest(submap))
+        content.update(np.ascontiguousarray(submap.landmarks).tobytes())
     return min(s.start_stamp_ns for s in submaps), -len(submaps), content.digest()
 
 
 def _digest(submap: Submap) -> bytes:
-    """Digest of a submap, whatever its agent is called, since a merge may have renamed it."""
+    """Digest of a submap, whatever its agent is called and however many landmarks it has.
+
+    A merge may have renamed the one, and let some of the others go.
+    """
     what = submap.session, submap.index, submap.start_stamp_ns, submap.end_stamp_ns
     digest = hashlib.sha256(repr(what).encode())
     digest.update(np.ascontiguousarray(submap.end_pose).tobytes())
-    digest.update(np.ascontiguousarray(submap.landmarks).tobytes())
     return digest.digest()
 
 

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import json
 import os
+import socket
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -27,7 +29,8 @@ from slam_core.storage.files import digest, naming, read_json, remove
 MANIFEST = ".slam.json"
 LOGS = "logs"
 _OWN_PREFIX = ".slam."
-_STAGING = ".slam.{pid}.part"
+_STAGING = ".slam.{pid}.{token}.{host}.part"
+"""Name of a folder in which results are made ready: workers on several machines may have the same process id."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class Manifest:
     def write(self, folder: Path) -> None:
         """Write the list, whole or not at all."""
         content = {"program": "slam", "command": self.command, "source": self.source, "files": self.files}
-        temporary = folder / f"{_OWN_PREFIX}{os.getpid()}.json.part"
+        temporary = folder / _part_name()
         temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         os.replace(temporary, folder / MANIFEST)
 
@@ -94,14 +97,15 @@ class OutputFolder:
         results = {name: digests for name, digests in self._old.files.items() if digests}
         self._manifest = Manifest(command, source, results)
         self._made_here = not path.exists()
+        self._staging = path / _part_name()
         self.rescued: Path | None = None
         """Results that were given up, as far as :meth:`staged` kept them."""
 
     def __enter__(self) -> Self:
         self.path.mkdir(parents=True, exist_ok=True)
         self._manifest.write(self.path)
-        for leftover in self.path.glob(_STAGING.format(pid="*")):
-            if not _is_running(leftover.name.split(".")[2]):
+        for leftover in self.path.glob(f"{_OWN_PREFIX}*.part"):
+            if _is_abandoned(leftover.name):
                 remove(leftover)
         for log in self._old.files.keys() - self._manifest.files.keys():
             _unlink(self.path, log)
@@ -114,7 +118,7 @@ class OutputFolder:
         logs = [p for p in self._logs.glob("*") if p.is_file()] if self._logs.is_dir() else []
         if kind is not None and self._made_here and not logs and _remove_if_empty(self.path):
             return
-        self._write(self._manifest.files | {f"{LOGS}/{log.name}": [] for log in logs if log.suffix == ".log"})
+        self._write(self._known() | {f"{LOGS}/{log.name}": [] for log in logs if log.suffix == ".log"})
 
     @property
     def logs(self) -> Path:
@@ -147,17 +151,13 @@ class OutputFolder:
         self._write(self._manifest.files | {str(f.relative_to(self.path)): [digest(f)] for f in found})
 
     @property
-    def _staging(self) -> Path:
-        return self.path / _STAGING.format(pid=os.getpid())
-
-    @property
     def _logs(self) -> Path:
         return self.path / LOGS
 
     def _commit(self) -> None:
         """The list first, so that everything is known as ours at any moment; the last file last."""
         new = {str(f.relative_to(self._staging)): digest(f) for f in sorted(self._staging.rglob("*")) if f.is_file()}
-        old = dict(self._manifest.files)
+        old = self._known()
         self._keep_apart_if_taken([name for name in new if _is_taken(self.path, name, is_ours=name in old)])
         both = {name: [*old.get(name, []), *([new[name]] if name in new else [])] for name in {**old, **new}}
         self._write(both)
@@ -177,6 +177,14 @@ class OutputFolder:
         kept = free_name(self.path / "results")
         os.replace(self._staging, kept)
         raise ValueError(f"{self.path / taken[0]} was not written by slam and stays: the results are in {kept}")
+
+    def _known(self) -> dict[str, list[str]]:
+        """Files of ours, with those that another worker has written for the same command meanwhile."""
+        own, there = self._manifest, Manifest.read(self.path)
+        if there is None or (there.command, there.source) != (own.command, own.source):
+            return dict(own.files)
+        return {name: list(dict.fromkeys([*there.files.get(name, []), *own.files.get(name, [])]))
+                for name in {**there.files, **own.files}}  # fmt: skip
 
     def _write(self, files: dict[str, list[str]]) -> None:
         self._manifest = Manifest(self._manifest.command, self._manifest.source, files)
@@ -253,6 +261,18 @@ def _remove_if_empty(folder: Path) -> bool:
     (folder / MANIFEST).unlink(missing_ok=True)
     folder.rmdir()
     return True
+
+
+def _part_name() -> str:
+    """Name of what is not complete yet, of this process alone."""
+    return _STAGING.format(pid=os.getpid(), token=uuid.uuid4().hex[:8], host=socket.gethostname())
+
+
+def _is_abandoned(name: str) -> bool:
+    """True if what has such a name was left by a process of this machine that has ended."""
+    pid, _, rest = name.removeprefix(_OWN_PREFIX).removesuffix(".part").partition(".")
+    host = rest.partition(".")[2]
+    return host in ("", socket.gethostname()) and not _is_running(pid)
 
 
 def _is_running(pid: str) -> bool:
