@@ -130,6 +130,63 @@ def test_a_scheduler_that_is_started_again_gets_all_work_once_more_and_its_worke
             monkeypatch.setattr("sjsam_node.regions.tasks._PATIENCE_S", 1)
             with pytest.raises(ClusterLost, match="start it again"):
                 tasks.gather([tasks.submit(int)])
+            with pytest.raises(ClusterLost, match="start it again"):
+                tasks.submit(int)
+
+
+class OfOneProcess:
+    """A client whose cluster is lost when told to; counts what it is given."""
+
+    def __init__(self):
+        self.given, self.is_lost = list[str](), False
+
+    def submit(self, function, *arguments, pure):
+        self._check()
+        self.given.append(arguments[0])
+        return arguments[0]
+
+    def gather(self, futures):
+        self._check()
+        return list(futures)
+
+    def close(self, timeout):
+        pass
+
+    def _check(self):
+        if self.is_lost:
+            from distributed.comm.core import CommClosedError
+
+            raise CommClosedError("closed")
+
+
+def test_a_cluster_that_is_there_again_is_given_at_once_all_that_is_still_asked_for():
+    pytest.importorskip("distributed")
+    first, second = OfOneProcess(), OfOneProcess()
+    tasks = OnCluster(first, lambda: second)
+    handles = [tasks.submit(str, name) for name in "abcd"]
+    assert tasks.gather(handles[:1]) == ["a"]
+    del handles[3]  # nobody asks for it any more
+    first.is_lost = True
+    assert tasks.gather(handles[1:2]) == ["b"]
+    assert second.given == ["b", "c"]
+    assert tasks.gather(handles) == ["a", "b", "c"]
+
+
+def test_a_cluster_that_does_not_come_back_is_waited_for_once():
+    pytest.importorskip("distributed")
+    client, asked = OfOneProcess(), []
+
+    def again():
+        asked.append(1)
+        raise ValueError("no scheduler answers")
+
+    tasks = OnCluster(client, again)
+    handles = [tasks.submit(str, name) for name in "abc"]
+    client.is_lost = True
+    for handle in handles:
+        with pytest.raises(ClusterLost):
+            tasks.gather([handle])
+    assert asked == [1]
 
 
 def until(is_true: Callable[[], bool]) -> None:

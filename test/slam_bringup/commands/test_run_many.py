@@ -15,6 +15,7 @@ from sjsam_node.regions.tasks import InProcess
 from slam_bringup.jobs import many_runs
 from slam_bringup.jobs.many_runs import RunOutcome, folder_names, outcomes_table, run_many
 from slam_bringup.jobs.recording_run import RunOptions
+from slam_bringup.processes.interrupt import INTERRUPTED
 from slam_bringup.terminal.run_end import FAILED
 
 
@@ -95,6 +96,27 @@ def test_a_fault_of_the_program_fails_its_recording_alone(tmp_path, monkeypatch)
     bags = [tmp_path / name for name in ("one", "two")]
     outcomes = run_many(bags, tmp_path / "out", RunOptions(), InProcess(), lambda *at: None)
     assert [one.reason for one in outcomes] == ["RuntimeError: no one", "RuntimeError: no two"]
+
+
+def test_ctrl_c_in_one_process_names_the_recordings_that_are_mapped(tmp_path, monkeypatch):
+    class Fake:
+        def __init__(self, bag, output, options):
+            self.name = bag.name
+
+        def write(self, display):
+            if self.name == "third":
+                raise KeyboardInterrupt
+            if self.name == "second":
+                raise ValueError("nothing was mapped")
+            return {"failure": "", "degraded": []}, False
+
+    monkeypatch.setattr(many_runs, "RecordingRun", Fake)
+    bags = [tmp_path / name for name in ("first", "second", "third")]
+    for bag in bags:
+        bag.mkdir()
+    done = call("run", *bags, "-o", tmp_path / "out", "--workers", 0)
+    assert done.exit_code == INTERRUPTED
+    assert "holds the results of: first\n" in done.stderr
 
 
 def test_paths_of_a_task_do_not_depend_on_the_workers_folder(tmp_path, monkeypatch):

@@ -10,11 +10,13 @@ Functions are pure and give the same bytes wherever they run, as long as the wor
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import time
 import uuid
 import warnings
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
@@ -73,13 +75,16 @@ class ClusterLost(ValueError):
 class _Task:
     """A function and its arguments, other tasks among them; kept so that it can be given to a cluster once more.
 
-    future: of the result, on the cluster of ``client``.
+    number: in the order in which they were submitted; future: of the result, on the cluster of ``client``;
+    is_asked_for: nobody has been given the result yet.
     """
 
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
+    number: int
     future: Any = None
     client: Any = None
+    is_asked_for: bool = True
 
 
 class OnCluster:
@@ -96,6 +101,8 @@ class OnCluster:
 
     def __init__(self, client: Any, again: Callable[[], Any] | None = None) -> None:
         self._client, self._again = client, again
+        self._tasks, self._number = weakref.WeakSet[_Task](), itertools.count()
+        self._lost: ClusterLost | None = None
         self._channels: list[tuple[str, Callable[[Any], None]]] = []
 
     def hold(self, value: Any) -> Any:
@@ -104,8 +111,9 @@ class OnCluster:
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """A handle of the result of a function."""
-        task = _Task(function, arguments)
+        task = _Task(function, arguments, next(self._number))
         self._surviving(lambda: self._future(task))
+        self._tasks.add(task)
         return task
 
     def gather(self, handles: Sequence[Any]) -> list[Any]:
@@ -118,7 +126,10 @@ class OnCluster:
         ValueError
             If the same task took several workers with it.
         """
-        return self._surviving(lambda: list(self._client.gather([self._future(task) for task in handles])))
+        results = self._surviving(lambda: list(self._client.gather([self._future(task) for task in handles])))
+        for task in handles:
+            task.is_asked_for = False
+        return results
 
     def channel(self, handler: Callable[[Any], None]) -> Callable[[Any], None]:
         """A function that logs an event of Dask's, which ``handler`` is told on a thread of the client."""
@@ -146,6 +157,8 @@ class OnCluster:
     def _surviving(self, ask: Callable[[], T]) -> T:
         """The result of asking the cluster, also if it is started again meanwhile."""
         while True:
+            if self._lost is not None:
+                raise ClusterLost(str(self._lost))
             try:
                 with _told():
                     return ask()
@@ -153,18 +166,23 @@ class OnCluster:
                 if self._again is None:
                     raise
                 _LOG.warning("the Dask cluster was lost; its work is done again once it is back")
-                self._client = self._go_on(self._again, lost)
-                for topic, handler in self._channels:
-                    self._listen(topic, handler)
+                self._go_on(self._again, lost)
 
-    def _go_on(self, again: Callable[[], Any], lost: ClusterLost) -> Any:
-        """A client of the cluster as it is now, in the place of the one that lost it."""
+    def _go_on(self, again: Callable[[], Any], lost: ClusterLost) -> None:
+        """Give the cluster as it is now all that the one before was asked for; where there is none, never ask again."""
         with suppress(Exception):  # what is lost cannot always be left in good order
             self._client.close(timeout=1)
         try:
-            return again()
+            self._client = again()
         except ValueError as error:
+            self._lost = lost
             raise lost from error
+        with suppress(ClusterLost), _told():  # lost once more: whoever asks next finds out
+            for topic, handler in self._channels:
+                self._listen(topic, handler)
+            for task in sorted(self._tasks, key=lambda one: one.number):
+                if task.is_asked_for:
+                    self._future(task)
 
 
 @dataclass

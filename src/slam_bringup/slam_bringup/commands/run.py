@@ -15,7 +15,7 @@ from rich.console import Console
 from sjsam_node.regions.tasks import cluster
 from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bags.reading.sensor_topics import BagNames, parse_topics
-from slam_bringup.jobs.many_runs import RunOutcome, folder_names, outcomes_table, run_many
+from slam_bringup.jobs.many_runs import folder_names, outcomes_table, run_many
 from slam_bringup.jobs.recording_run import RecordingRun, RunOptions, Watch
 from slam_bringup.processes.interrupt import INTERRUPTED, Interrupt
 from slam_bringup.processes.kernels import compile_kernels_once
@@ -84,16 +84,17 @@ def _run_many(
     """Map several recordings, show one table, and end with the exit code of the worst."""
     folder_names(bags)  # what is wrong with the names shows before anything is started
     compile_kernels_once()
-    done: list[RunOutcome] = []
+    written: list[str] = []
     try:
         with cluster(scheduler, workers) as tasks, progress_bar() as progress:
             task = progress.add_task(f"mapping {len(bags)} recordings", total=None)
             outcomes = run_many(
                 bags, output, options, tasks,
-                lambda at, total: progress.update(task, completed=at, total=total), done.append,
+                lambda at, total: progress.update(task, completed=at, total=total),
+                written.append,
             )  # fmt: skip
     except KeyboardInterrupt:
-        finished = ", ".join(one.output.name for one in done if one.summary) or "none"
+        finished = ", ".join(dict.fromkeys(written)) or "none"
         click.echo(f"slam: stopped; {output} holds the results of: {finished}", err=True)
         sys.exit(INTERRUPTED)
     show(outcomes_table(outcomes))

@@ -77,22 +77,26 @@ def run_many(
     options: RunOptions,
     tasks: Tasks,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-    on_done: Callable[[RunOutcome], None] = lambda outcome: None,
+    on_written: Callable[[str], None] = lambda name: None,
 ) -> list[RunOutcome]:
     """Map recordings, each into the folder of its name in ``output``; in the order in which they are given.
 
-    ``on_progress`` is told how many readings of how many known ones are mapped; it may be called by another thread.
+    ``on_progress`` is told how many readings of how many known ones are mapped, ``on_written`` the name of a folder as
+    soon as its results are there; both may be called by another thread.
     """
-    known: dict[int, tuple[int, int]] = {}
+    known, names = dict[int, tuple[int, int]](), folder_names(bags)
 
     def on_told(value: Any) -> None:
+        if len(value) == 1:
+            on_written(names[int(value[0])])
+            return
         known[int(value[0])] = int(value[1]), int(value[2])
         on_progress(sum(done for done, _ in known.values()), sum(total for _, total in known.values()))
 
     if options.old_map is not None:  # a worker of a cluster runs in a folder of its own
         options = replace(options, old_map=options.old_map.resolve())
     tell, handles = tasks.channel(on_told), list[tuple[RunTask, Any]]()
-    for number, (bag, name) in enumerate(zip(bags, folder_names(bags), strict=True)):
+    for number, (bag, name) in enumerate(zip(bags, names, strict=True)):
         task = RunTask(bag.resolve(), output.resolve() / name, options, tuple(sys.argv[1:]))
         handles.append((task, tasks.submit(run_task, task, number, tell)))
     outcomes = []
@@ -101,12 +105,15 @@ def run_many(
             outcomes += tasks.gather([handle])
         except ValueError as error:  # its worker, or the whole cluster, is lost
             outcomes.append(RunOutcome(task.bag, task.output, None, str(error)))
-        on_done(outcomes[-1])
     return outcomes
 
 
 def run_task(task: RunTask, number: int, tell: Callable[[Any], None]) -> RunOutcome:
-    """Map one recording; ``tell`` is given its number, the readings that are done, and all of them, now and then."""
+    """Map one recording.
+
+    ``tell`` is given its number, the readings that are done, and all of them, now and then; once its results are
+    written, its number alone.
+    """
     with working_for(task.arguments):
         try:
             run = RecordingRun(task.bag, task.output, task.options)
@@ -115,6 +122,7 @@ def run_task(task: RunTask, number: int, tell: Callable[[Any], None]) -> RunOutc
             return RunOutcome(task.bag, task.output, None, str(error) or type(error).__name__)
         except Exception as error:  # a fault of the program stops no other recording
             return RunOutcome(task.bag, task.output, None, f"{type(error).__name__}: {error}")
+    tell((number,))
     return RunOutcome(task.bag, task.output, summary)
 
 
