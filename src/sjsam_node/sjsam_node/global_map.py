@@ -24,11 +24,13 @@ from sjsam_node.closure_joining import ClosureJoiner, grouped
 from sjsam_node.graph.links import Link, Status
 from sjsam_node.graph.map_graph import BUILDING
 from sjsam_node.graph.offload import Offload
+from sjsam_node.loop_closure.comparing import RecordComparisons
 from sjsam_node.loop_closure.consistency import ConsistencyConfig, Verdict
 from sjsam_node.loop_closure.detector import LoopDetector
 from sjsam_node.loop_closure.verification import LINKED_SUBMAPS, ClosureConfig
 from sjsam_node.marks import Marks
 from sjsam_node.refining import lacking, refined
+from sjsam_node.regions.tasks import Tasks
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.smoothing.map_snapshot import InnerPaths, MapLandmarks, MapSnapshot
 from sjsam_node.smoothing.solver import SmootherConfig
@@ -103,7 +105,7 @@ class JoinReport:
 
 
 class GlobalMap:
-    """Joins submaps of one or several agents, each as it comes."""
+    """Joins submaps of one or several agents, each as it comes; ``tasks`` do parts of it, which change no byte."""
 
     estimate: MapEstimate
     agents: Agents
@@ -111,8 +113,8 @@ class GlobalMap:
     closures: ClosureJoiner
     marks: Marks
 
-    def __init__(self, config: GlobalMapConfig | None = None) -> None:
-        self.config = config or GlobalMapConfig()
+    def __init__(self, config: GlobalMapConfig | None = None, tasks: Tasks | None = None) -> None:
+        self.config, self._tasks = config or GlobalMapConfig(), tasks
         self.counters = Counters()
         self._known_tags = self.config.tags.known_tags()
         self.reset()
@@ -122,19 +124,18 @@ class GlobalMap:
         self._take(EstimateState())
         self.marks = Marks()
         self._offload = Offload()
-        self._has_moved = False
-        self._is_settled, self._was_settled_before = True, False
+        self._has_moved, self._is_settled, self._was_settled_before = False, True, False
 
     def _take(self, state: EstimateState) -> None:
         """Go on from a state."""
-        self.estimate = MapEstimate(self.config.smoothing, state)
+        self.estimate = MapEstimate(self.config.smoothing, state, self._tasks)
         self.agents = Agents(self.estimate, LINKED_SUBMAPS)
         self.detector = LoopDetector(self.estimate, self.config.closure)
+        if self._tasks is not None:
+            self.detector.compare = RecordComparisons(self.estimate, self.config.closure, self._tasks)
         self.closures = ClosureJoiner(self.estimate, self.config.consistency, self.config.closure)
         self.tags = TagLinks(self.estimate, self.detector.verifier)
-        self.detector.is_refuted = lambda first, second, found: is_against_tags(
-            self.estimate.graph, first, second, found
-        )
+        self.detector.is_refuted = lambda *pair_and_found: is_against_tags(self.estimate.graph, *pair_and_found)
         self._inner_paths = InnerPaths()
 
     @property
@@ -162,10 +163,10 @@ class GlobalMap:
         chain = self.agents.chain(new)
         self.estimate.add_links(with_tag_links(self.detector.sequential(chain, new), self.tags.sequential(chain, new)))
         matched = self.estimate.graph.shared_by(new)
-        self.estimate.condense(new, chain)
-        found = with_tag_links(self.detector.closures(chain, new), self.tags.closures(chain, new))
-        if self._has_moved:
-            found += self.detector.missed(self.agents.chained, _COMPARED_AT_ONCE)
+        with self.estimate.condensing(new, chain):
+            found = with_tag_links(self.detector.closures(chain, new), self.tags.closures(chain, new))
+            if self._has_moved:
+                found += self.detector.missed(self.agents.chained, _COMPARED_AT_ONCE)
         self._judge_redundancy(new, found)
         verdict = self.closures.join_closures(found, new)
         self._account(verdict, len(found))
@@ -323,7 +324,7 @@ class GlobalMap:
         submaps, rebuilt = [r.submap for r in self.estimate.graph.records], self
         ordered = in_order(submaps)
         if self._was_settled_before or ordered != submaps:
-            rebuilt = GlobalMap(self.config)
+            rebuilt = GlobalMap(self.config, self._tasks)
             for submap in ordered:
                 rebuilt.add_again(submap)
             rebuilt.counters = self.counters
@@ -378,9 +379,9 @@ class GlobalMap:
         )
 
     @classmethod
-    def load(cls, path: Path | str, config: GlobalMapConfig | None = None) -> GlobalMap:
+    def load(cls, path: Path | str, config: GlobalMapConfig | None = None, tasks: Tasks | None = None) -> GlobalMap:
         """The map that :meth:`save` wrote; ``ValueError`` if the folder is no such map."""
-        loaded = cls(config)
+        loaded = cls(config, tasks)
         loaded._restore(storage.read(Path(path)))
         return loaded
 
@@ -388,8 +389,7 @@ class GlobalMap:
         """Go on from a map that was put away."""
         self._take(stored.state)
         self._is_settled = not stored.state.graph.records
-        self.marks = stored.marks
-        self.closures.refused = stored.refused
+        self.marks, self.closures.refused = stored.marks, stored.refused
         self.detector.pending, self.detector.near.compared = stored.pending, stored.compared
         for i, record in enumerate(stored.state.graph.records):
             self.agents.add(i)

@@ -8,6 +8,7 @@
     session.finish().result()
     session.save(folder).result()
 
+With ``tasks`` parts of the work run on a cluster, with the same bytes; they end with the session.
 The thread alone changes the map; whoever hands something over goes on at once. Methods whose description begins with
 "Thread:" run there. Only marks are set by the caller, under a lock.
 """
@@ -33,6 +34,7 @@ from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
 from sjsam_node.localization import Localizer
 from sjsam_node.marks import Mark, Marks
 from sjsam_node.refining import undecided
+from sjsam_node.regions.live import LiveTasks
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate, Submap
@@ -91,15 +93,18 @@ class MapSession:
     snapshot: MapSnapshot
     counts: dict[str, int]
 
-    def __init__(self, config: GlobalMapConfig, mode: Mode = Mode.MAP, autosave: Autosave | None = None) -> None:
-        self.mode, self._config, self._autosave = mode, config, autosave
+    def __init__(
+        self, config: GlobalMapConfig, mode: Mode = Mode.MAP, autosave: Autosave | None = None,
+        tasks: LiveTasks | None = None,
+    ) -> None:  # fmt: skip
+        self.mode, self._config, self._autosave, self._elsewhere = mode, config, autosave, tasks
         self._executor = ThreadPoolExecutor(1, "map")  # its thread ends with the session
         self._tasks = PriorityQueue[tuple[int, int, Future[Any], Callable[[], Any]]]()
         self._number = itertools.count()
         self._submaps: list[Future[Any]] = []
         self.waiting_at_most = 0
         self._lock, self._asked_resets, self._done_resets = threading.Lock(), 0, 0
-        self._go_on_with(GlobalMap(config))
+        self._go_on_with(GlobalMap(config, tasks))
         self._copied: MapSnapshot | None = None
 
     def __enter__(self) -> Self:
@@ -108,6 +113,11 @@ class MapSession:
     def __exit__(self, *_: object) -> None:
         """End the thread after the submap it is at; what waits is left undone."""
         self._executor.shutdown(cancel_futures=True)
+        self._leave_cluster()
+
+    def _leave_cluster(self) -> None:
+        if self._elsewhere is not None:
+            self._elsewhere.close()
 
     # -- the thread ----------------------------------------------------------------------------------------------------
 
@@ -148,6 +158,13 @@ class MapSession:
         """Number of submaps that are not joined yet, the one at hand included."""
         self._submaps = [future for future in self._submaps if not future.done()]
         return len(self._submaps)
+
+    @property
+    def load_counts(self) -> dict[str, int]:
+        """Numbers of submaps that wait, and of tasks that the cluster did, or this process in its place, by name."""
+        tasks = self._elsewhere
+        elsewhere = {} if tasks is None else {"tasks elsewhere": tasks.elsewhere, "tasks here": tasks.here}
+        return {"submaps waiting": self.waiting, "submaps waiting at most": self.waiting_at_most} | elsewhere
 
     @property
     def next_session(self) -> int:
@@ -245,7 +262,7 @@ class MapSession:
             self._localizers = {}
             return
         self.mode = Mode.MAP
-        self._go_on_with(GlobalMap(self._config))
+        self._go_on_with(GlobalMap(self._config, self._elsewhere))
         if self._autosave is not None:
             self._autosave.retire()
 
@@ -276,7 +293,7 @@ class MapSession:
 
     def _load(self, path: Path, view: Callable[[MapSnapshot], T]) -> T:
         """Thread: load a map and view it: whatever is wrong with it shows before anything changes."""
-        loaded = GlobalMap.load(path, self._config)
+        loaded = GlobalMap.load(path, self._config, self._elsewhere)
         snapshot = loaded.snapshot()
         if not len(snapshot):
             raise ValueError(f"the map in {path} is empty: nothing can be found again in it")
@@ -317,6 +334,7 @@ class MapSession:
         if self._autosave is not None:
             self._autosave.retire()
             self._autosave.close()
+        self._leave_cluster()
 
     def _copy_now(self) -> None:
         """Thread, or after its end: bring the copy up to date."""

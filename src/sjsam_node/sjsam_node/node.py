@@ -25,6 +25,7 @@ from sjsam_node.global_map import ALREADY_JOINED, JoinReport
 from sjsam_node.map_session import MapSession, Mode, Outcome
 from sjsam_node.node_config import SjsamNodeConfig, copy_path
 from sjsam_node.pose_tracker import PoseTracker
+from sjsam_node.regions.live import LiveTasks
 from sjsam_node.smoothing.map_snapshot import ADVICE, MapSnapshot
 from sjsam_node.submap_order import SubmapOrder, gap_text
 from sjsam_node.tags.map_tags import map_tags, tags_text
@@ -67,9 +68,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     def __init__(self) -> None:
         super().__init__("sjsam", SjsamNodeConfig)
         mode = Mode.LOCALISE if self.config.localize_only else Mode.MAP
-        self.map = MapSession(self.config, mode, self._make_autosave())
-        self._stamp_ns = 0
-        self._drawn = self.map.snapshot
+        self.map = MapSession(self.config, mode, self._make_autosave(), LiveTasks.at(self.config.scheduler))
+        self._stamp_ns, self._drawn = 0, self.map.snapshot
         self._picture: Future[Any] = self.map.read(lambda _: None)
         self._advertise_outputs()
         self.placements = {agent: MapToOdom(self.config) for agent in self.config.agents}
@@ -218,7 +218,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self._follow(agent, located.end)
 
     def _show_waiting(self) -> None:
-        self.health.take({"submaps waiting": self.map.waiting, "submaps waiting at most": self.map.waiting_at_most})
+        self.health.take(self.map.load_counts)
 
     def on_odometry(self, agent: str, message: Message) -> None:
         """Publish the pose of an agent in the map at a pose of its odometry."""

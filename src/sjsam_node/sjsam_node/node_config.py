@@ -34,6 +34,11 @@ class SjsamNodeConfig(GlobalMapConfig):
     autosave_path: str = parameter(
         "", "folder of that copy; empty: map_path with the ending .autosave, a relative one below the user's state"
     )
+    scheduler: str = parameter(
+        "",
+        "address of the scheduler of a Dask cluster that compares submaps and joins old ones, tcp://HOST:8786; empty: "
+        "this process does",
+    )
     transform_tolerance_s: float = parameter(
         0.2, "how far ahead map_to_odom is stamped, so that a lookup at the present time works", unit="s", minimum=0.0
     )

@@ -5,12 +5,9 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
 
@@ -20,7 +17,7 @@ from random_joining import MODELS, random_problem
 from threadpoolctl import threadpool_info
 
 from sjsam_node.joint_problem.problem import flatten
-from sjsam_node.regions.tasks import ClusterLost, InProcess, OnCluster, _connected_again, cluster
+from sjsam_node.regions.tasks import ClusterLost, InProcess, OnCluster, cluster
 from sjsam_node.regions.tree import RegionTree
 
 
@@ -67,39 +64,6 @@ def test_workers_give_the_same_bytes_also_when_one_is_killed_half_way(client):
     assert killed
 
 
-@contextmanager
-def of_its_own(port: int) -> Iterator[Callable[[str], None]]:
-    """A scheduler at a port and its worker, as processes; kills them, or starts what does not run, when told to."""
-    address, here = f"tcp://127.0.0.1:{port}", [sys.executable, "-m"]
-    commands = {
-        "scheduler": [*here, "distributed.cli.dask_scheduler", "--port", str(port), "--no-dashboard"],
-        "worker": [*here, "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard"],
-    }
-    without = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
-    running = dict[str, subprocess.Popen[bytes]]()
-
-    def do(what: str) -> None:
-        if what == "kill":
-            for process in running.values():
-                process.kill()
-                process.wait()
-        else:
-            running.update((name, subprocess.Popen(c, env=without, stderr=subprocess.DEVNULL))
-                           for name, c in commands.items())  # fmt: skip
-
-    do("start")
-    try:
-        yield do
-    finally:
-        do("kill")
-
-
-def free_port() -> int:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        return int(taken.getsockname()[1])
-
-
 def blas_threads(tasks) -> set[int]:
     """Numbers of threads of BLAS on a worker, which has loaded it for its first task."""
     tasks.gather([tasks.submit(np.linalg.inv, np.eye(2))])
@@ -110,28 +74,28 @@ def blas_threads(tasks) -> set[int]:
 @pytest.mark.slow
 def test_a_scheduler_that_is_started_again_gets_all_work_once_more_and_its_workers_are_set_up(monkeypatch):
     pytest.importorskip("distributed")
-    expected, port, told = [part.tobytes() for part in solved(InProcess())], free_port(), []
-    with of_its_own(port) as do:
-        _connected_again(f"tcp://127.0.0.1:{port}").close()  # as soon as it and its worker are there
-        with cluster(f"tcp://127.0.0.1:{port}") as tasks:
-            assert blas_threads(tasks) == {1}
-            tell = tasks.channel(told.append)
+    from dask_cluster import running_cluster
 
-            def restart():
-                do("kill")
-                do("start")
+    expected, told = [part.tobytes() for part in solved(InProcess())], []
+    with running_cluster() as own, cluster(own.address) as tasks:
+        assert blas_threads(tasks) == {1}
+        tell = tasks.channel(told.append)
 
-            assert [part.tobytes() for part in solved(tasks, restart)] == expected
-            assert blas_threads(tasks) == {1}  # of a worker that came later
-            tasks.gather([tasks.submit(tell, "from the new worker")])
-            until(lambda: told == ["from the new worker"])
-            do("kill")
-            monkeypatch.setattr("sjsam_node.regions.tasks._RETURN_S", 0.0)
-            monkeypatch.setattr("sjsam_node.regions.tasks._PATIENCE_S", 1)
-            with pytest.raises(ClusterLost, match="start it again"):
-                tasks.gather([tasks.submit(int)])
-            with pytest.raises(ClusterLost, match="start it again"):
-                tasks.submit(int)
+        def restart():
+            own.kill()
+            own.start(is_awaited=False)
+
+        assert [part.tobytes() for part in solved(tasks, restart)] == expected
+        assert blas_threads(tasks) == {1}  # of a worker that came later
+        tasks.gather([tasks.submit(tell, "from the new worker")])
+        until(lambda: told == ["from the new worker"])
+        own.kill()
+        monkeypatch.setattr("sjsam_node.regions.tasks._RETURN_S", 0.0)
+        monkeypatch.setattr("sjsam_node.regions.tasks._PATIENCE_S", 1)
+        with pytest.raises(ClusterLost, match="start it again"):
+            tasks.gather([tasks.submit(int)])
+        with pytest.raises(ClusterLost, match="start it again"):
+            tasks.submit(int)
 
 
 class OfOneProcess:

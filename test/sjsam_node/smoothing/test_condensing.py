@@ -17,7 +17,7 @@ from sjsam_node.smoothing.condensing import RegionConfig, valid_submaps
 from sjsam_node.smoothing.frozen import FrozenSubmaps
 from sjsam_node.smoothing.solver import EstimatorConfig, SmootherConfig, optimized, updated
 from sjsam_node.smoothing.state import EstimateState, transformed, with_exactly, with_links
-from sjsam_node.smoothing.submap_joining import join_submaps
+from sjsam_node.smoothing.submap_joining import join_submaps, marginal
 from slam_core.geometry import boxminus, boxplus, make_transform, so3_exp
 from slam_core.types import Submap
 
@@ -57,7 +57,10 @@ def a_region(
     state: EstimateState, first: int = 3, end: int = 12, parts: Sequence[CondensedSubmap] = ()
 ) -> CondensedSubmap:
     records = NONE if parts else np.arange(first, end)
-    region = join_submaps(state, records, 0, "joint", Active.of(state.graph, NONE), parts)
+    work = join_submaps(state, records, 0, "joint", Active.of(state.graph, NONE), parts)
+    with pytest.raises(StopIteration) as end:
+        work.send(marginal(next(work)))
+    region = end.value.value
     assert region is not None
     return region
 

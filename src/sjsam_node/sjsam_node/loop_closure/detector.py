@@ -148,12 +148,11 @@ class LoopDetector:
     def _around(self, near: list[int], new: int, known: RedundancyCheck) -> list[Link]:
         """Links of record ``new`` to those near it, as long as they tell of landmarks that none has told of yet."""
         found: list[Link] = []
-        count, left = (
-            len(self.graph.records[new].observations),
-            np.ones(len(self.graph.records[new].observations), bool),
-        )
-        for old in near:
-            more = self._verified([(old, new)], known, by_looks=False)
+        count = len(self.graph.records[new].observations)
+        left, pairs = np.ones(count, dtype=bool), [(old, new) for old in near]
+        ahead = None if self.compare is None else self._compared_at_once(self.compare, pairs, known, by_looks=False)
+        for pair in pairs:
+            more = self._verified([pair], known, by_looks=False, ahead=ahead)
             found += more
             told = sum(int(left[k.pairs[:, 1]].sum()) for k in more)
             for k in more:
@@ -190,12 +189,18 @@ class LoopDetector:
         threshold = config.association.descriptor_threshold
         return RedundancyCheck(state, MIN_NEAR_INLIERS, threshold, RANSAC_DISTANCE)
 
-    def _verified(self, pairs: list[tuple[int, int]], known: RedundancyCheck, *, by_looks: bool = True) -> list[Link]:
-        """Links between pairs of records that geometry and the map support; none that tell nothing new."""
+    def _verified(
+        self, pairs: list[tuple[int, int]], known: RedundancyCheck, *, by_looks: bool = True,
+        ahead: dict[tuple[int, int], Found] | None = None,
+    ) -> list[Link]:  # fmt: skip
+        """Links between pairs of records that geometry and the map support; none that tell nothing new.
+
+        ``ahead``: what comparing them has found already.
+        """
         out: list[Link] = []
-        results: dict[tuple[int, int], Found] = {}
+        results = ahead or {}
         for k, (old, new) in enumerate(pairs):
-            if self.compare is not None and k % _AT_ONCE == 0:
+            if self.compare is not None and ahead is None and k % _AT_ONCE == 0:
                 results = self._compared_at_once(self.compare, pairs[k : k + _AT_ONCE], known, by_looks)
             if known.is_all_known(old, new):
                 self.near.note(self.estimate.state, old, new)

@@ -26,6 +26,10 @@ from typing import Any, Protocol, TypeVar
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
+_PATIENCE_S = 10.0
+"""Time that a scheduler has to answer, s."""
+_RETURN_S = 60.0
+"""Time within which a cluster that was lost has to be back, s."""
 
 
 class Tasks(Protocol):
@@ -71,6 +75,14 @@ class ClusterLost(ValueError):
     """The scheduler, or the link to it, is gone, and with it all results."""
 
 
+class WorkersKilled(ValueError):
+    """The same task took several workers with it."""
+
+
+class NotAvailable(ValueError):
+    """Nobody answers at a scheduler's address, or it has no workers."""
+
+
 @dataclass(eq=False)
 class _Task:
     """A function and its arguments, other tasks among them; kept so that it can be given to a cluster once more.
@@ -97,10 +109,12 @@ class OnCluster:
     again
         Gives a client of the cluster that was started again after it was lost: all tasks whose results may still be
         asked for run once more there. Without it a lost cluster ends the work.
+    wait_s
+        Time that results are waited for, s; any by default.
     """
 
-    def __init__(self, client: Any, again: Callable[[], Any] | None = None) -> None:
-        self._client, self._again = client, again
+    def __init__(self, client: Any, again: Callable[[], Any] | None = None, wait_s: float | None = None) -> None:
+        self._client, self._again, self._wait_s = client, again, wait_s
         self._tasks, self._number = weakref.WeakSet[_Task](), itertools.count()
         self._lost: ClusterLost | None = None
         self._channels: list[tuple[str, Callable[[Any], None]]] = []
@@ -123,10 +137,12 @@ class OnCluster:
         ------
         ClusterLost
             If the cluster was lost for good, which ``hold`` and ``submit`` raise too.
-        ValueError
+        WorkersKilled
             If the same task took several workers with it.
+        TimeoutError
+            If results were not there in time.
         """
-        results = self._surviving(lambda: list(self._client.gather([self._future(task) for task in handles])))
+        results = self._surviving(lambda: self._results([self._future(task) for task in handles]))
         for task in handles:
             task.is_asked_for = False
         return results
@@ -137,9 +153,17 @@ class OnCluster:
         self._surviving(lambda: self._listen(*self._channels[-1]))
         return _Channel(self._channels[-1][0])
 
-    def close(self) -> None:
-        """Leave the cluster."""
-        self._client.close()
+    def close(self, timeout_s: float | None = None) -> None:
+        """Leave the cluster, which has some time for it, s."""
+        self._client.close(**({} if timeout_s is None else {"timeout": timeout_s}))
+
+    def _results(self, futures: list[Any]) -> list[Any]:
+        if self._wait_s is not None:
+            from distributed import wait
+
+            with self._client.as_current():
+                wait(futures, timeout=self._wait_s)  # type: ignore[no-untyped-call]
+        return list(self._client.gather(futures))
 
     def _listen(self, topic: str, handler: Callable[[Any], None]) -> None:
         self._client.subscribe_topic(topic, lambda event: handler(event[1]))
@@ -210,7 +234,7 @@ def _told() -> Iterator[None]:
     try:
         yield
     except KilledWorker as error:
-        raise ValueError(
+        raise WorkersKilled(
             "several workers ended at the same task, most likely for want of memory: start workers with more "
             f"(--memory-limit), or fewer a host: {error}"
         ) from error
@@ -258,11 +282,11 @@ def _has_distributed() -> bool:
 def _of_this_machine(workers: int) -> Iterator[OnCluster]:
     from distributed import Client, LocalCluster  # a second to import, and needed here alone
 
-    from sjsam_node.regions.worker_setup import OneBlasThread
+    from sjsam_node.regions.worker_setup import Prepared
 
     here = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
     with LocalCluster(**here) as local, Client(local) as client:  # type: ignore[no-untyped-call]
-        client.register_plugin(OneBlasThread())
+        client.register_plugin(Prepared())
         yield OnCluster(client)
 
 
@@ -270,61 +294,58 @@ def _of_this_machine(workers: int) -> Iterator[OnCluster]:
 def _of_scheduler(address: str) -> Iterator[OnCluster]:
     import dask
 
-    with dask.config.set({"distributed.comm.timeouts.connect": f"{_PATIENCE_S} s"}):
-        tasks = OnCluster(_connected(address), partial(_connected_again, address))
+    with dask.config.set({"distributed.comm.timeouts.connect": f"{_PATIENCE_S:.0f} s"}):
+        tasks = OnCluster(connected(address), partial(connected_again, address))
         try:
             yield tasks
         finally:
             tasks.close()
 
 
-def _connected(address: str) -> Any:
+def connected(address: str) -> Any:
     """A client of the scheduler at an address, whose workers are set up.
 
     Raises
     ------
+    NotAvailable
+        If nobody answers there, or it has no workers.
     ValueError
-        If nobody answers there, it has no workers, or other versions.
+        If scheduler or workers have other versions of Dask, Python, NumPy, SciPy, Numba or this program.
     """
     from distributed import Client
 
-    from sjsam_node.regions.worker_setup import OneBlasThread
+    from sjsam_node.regions.worker_setup import Prepared, other_versions
 
     try:
-        client = Client(address, timeout=_PATIENCE_S)  # type: ignore[no-untyped-call]
+        client = Client(address, timeout=_PATIENCE_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, TimeoutError, ValueError) as error:
-        raise ValueError(f"no Dask scheduler answers at {address}: {error}") from error
+        raise NotAvailable(f"no Dask scheduler answers at {address}: {error}") from error
     try:
         client.get_versions(check=True)  # type: ignore[no-untyped-call]
         if not client.scheduler_info()["workers"]:  # type: ignore[no-untyped-call]
-            raise NoWorkers(f"the scheduler at {address} has no workers: start them with 'dask worker {address}'")
-        client.register_plugin(OneBlasThread())
-    except NoWorkers:
+            raise NotAvailable(f"the scheduler at {address} has no workers: start them with 'dask worker {address}'")
+        if others := other_versions(client):
+            raise ValueError("; ".join(others))
+        client.register_plugin(Prepared())
+    except NotAvailable:
         client.close()  # type: ignore[no-untyped-call]
         raise
     except ValueError as error:
         client.close()  # type: ignore[no-untyped-call]
         raise ValueError(f"the cluster at {address} has other versions than this program: {error}") from error
+    except (OSError, TimeoutError) as error:
+        client.close()  # type: ignore[no-untyped-call]
+        raise NotAvailable(f"the Dask scheduler at {address} answers no more: {error}") from error
     return client
 
 
-class NoWorkers(ValueError):
-    """A scheduler has no workers."""
-
-
-def _connected_again(address: str) -> Any:
+def connected_again(address: str) -> Any:
     """A client of the scheduler at an address as soon as it and a worker are there again."""
     deadline = time.monotonic() + _RETURN_S
     while True:
         try:
-            return _connected(address)
+            return connected(address)
         except (ValueError, OSError, TimeoutError):
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.2)
-
-
-_PATIENCE_S = 10
-"""Time that a scheduler has to answer, s."""
-_RETURN_S = 60.0
-"""Time within which a cluster that was lost has to be back, s."""

@@ -25,7 +25,7 @@ from sjsam_node.smoothing.condensed import Active, CondensedSubmap
 from sjsam_node.smoothing.frozen import is_tied
 from sjsam_node.smoothing.marginals import relative_pose
 from sjsam_node.smoothing.state import EstimateState
-from sjsam_node.smoothing.submap_joining import join_submaps
+from sjsam_node.smoothing.submap_joining import Eliminating, join_submaps
 from slam_core.config import Config, parameter
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 
@@ -82,7 +82,9 @@ def fully_expanded(state: EstimateState) -> EstimateState:
     return state
 
 
-def condense(state: EstimateState, config: RegionConfig, rows: str, new: int, busy: Sequence[int]) -> EstimateState:
+def condense(
+    state: EstimateState, config: RegionConfig, rows: str, new: int, busy: Sequence[int]
+) -> Eliminating[EstimateState]:
     """Freeze redundant submaps that are not needed, and join those that have been quiet for longest if many take part.
 
     ``busy`` ones stay. Of many condensed submaps those far from the newest one are joined to one, too.
@@ -98,12 +100,12 @@ def condense(state: EstimateState, config: RegionConfig, rows: str, new: int, bu
         is_open[c.records] = False
     if np.count_nonzero(is_open) > config.open:
         is_open[busy] = False
-        state = _condense_records(state, config, rows, component, np.nonzero(is_open)[0], active)
+        state = yield from _condense_records(state, config, rows, component, np.nonzero(is_open)[0], active)
     anchor = state.oldest(component).start
     own = [c for c in state.condensed if state.component_of[c.reference] == component]
     if len(own) > _MANY_CONDENSED:
         valid = [c for c in own if c.is_valid(state.graph, state.component_of, active, anchor)]
-        state = _condense_condensed(state, config, rows, component, valid, active)
+        state = yield from _condense_condensed(state, config, rows, component, valid, active)
     return state
 
 
@@ -120,13 +122,13 @@ def _needed(state: EstimateState, records: IntArray) -> EstimateState:
 
 def _condense_records(
     state: EstimateState, config: RegionConfig, rows: str, component: int, records: IntArray, active: Active
-) -> EstimateState:
+) -> Eliminating[EstimateState]:
     quiet = [i for i in records.tolist() if _is_quiet(state, config, i)]
     if not quiet:
         return state
     first = min(quiet, key=lambda i: (int(state.last_needed[i]), i))
     chosen = _gathered(state, config.size, np.array(quiet), first)
-    joined = join_submaps(state, chosen, component, rows, active)
+    joined = yield from join_submaps(state, chosen, component, rows, active)
     return _needed(state, chosen) if joined is None else replace(state, condensed=(*state.condensed, joined))
 
 
@@ -137,7 +139,7 @@ def _condense_condensed(
     component: int,
     valid: list[CondensedSubmap],
     active: Active,
-) -> EstimateState:
+) -> Eliminating[EstimateState]:
     graph, here = state.graph, state.poses[state.graph.starts[-1], :3, 3]
     left = [c for c in valid if _is_quiet(state, config, int(c.records[0]))]
     if not left:
@@ -151,7 +153,9 @@ def _condense_condensed(
             break
         parts.append(nearest)
         known |= nearest.boundary_keys(graph)
-    joined = join_submaps(state, no_indices(), component, rows, active, parts) if len(parts) > 1 else None
+    joined = None
+    if len(parts) > 1:
+        joined = yield from join_submaps(state, no_indices(), component, rows, active, parts)
     if joined is None:
         return _needed(state, parts[0].records[:1])
     return replace(state, condensed=(*(c for c in state.condensed if c not in parts), joined))

@@ -9,17 +9,20 @@ What is read comes from the last update's factor, and is as fresh as that.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 
 from sjsam_node.graph.links import Link, Prior
 from sjsam_node.graph.map_graph import ALL, MapGraph, Record
+from sjsam_node.regions.tasks import InProcess, Tasks
 from sjsam_node.smoothing.condensing import condense
 from sjsam_node.smoothing.marginals import prior_of_pair, relative_pose, seen_from
 from sjsam_node.smoothing.solver import Optimize, SmootherConfig, optimize_full, relinearized, simplified
 from sjsam_node.smoothing.state import EstimateState, with_links, with_submap
+from sjsam_node.smoothing.submap_joining import Eliminating, Elimination, Marginal, marginal
 from slam_core.geometry import FloatArray, compose_covariance
 from slam_core.types import Submap
 
@@ -27,11 +30,14 @@ from slam_core.types import Submap
 class MapEstimate:
     """The state that holds, and what replaces it.
 
-    ``optimize``: what solves the whole map in the end instead of its own factor (:mod:`sjsam_node.regions`).
+    ``optimize``: what solves the whole map in the end instead of its own factor (:mod:`sjsam_node.regions`); ``tasks``:
+    where old submaps are joined.
     """
 
-    def __init__(self, config: SmootherConfig | None = None, state: EstimateState | None = None) -> None:
-        self.config = config or SmootherConfig()
+    def __init__(
+        self, config: SmootherConfig | None = None, state: EstimateState | None = None, tasks: Tasks | None = None
+    ) -> None:
+        self.config, self._tasks = config or SmootherConfig(), tasks or InProcess()
         self.optimize: Optimize | None = None
         self._state = state or EstimateState()
 
@@ -78,10 +84,27 @@ class MapEstimate:
         """A record that says the same as the one there, its arrays elsewhere."""
         self._state = replace(self._state, graph=self.graph.with_record(number, record))
 
-    def condense(self, new: int, busy: Sequence[int]) -> None:
-        """Join old submaps that nothing touches, and freeze redundant ones; ``busy`` records stay as they are."""
-        if self.config.estimator.linearises:
-            self._state = condense(self._state, self.config.region, self.config.estimator.rows, new, busy)
+    @contextmanager
+    def condensing(self, new: int, busy: Sequence[int]) -> Iterator[None]:
+        """Join old submaps that nothing touches, and freeze redundant ones; ``busy`` records stay as they are.
+
+        Meanwhile links may be looked for, which needs nothing of that, but the state must stay.
+        """
+        if not self.config.estimator.linearises:
+            yield
+            return
+        before, region = self._state, self.config.region
+        work = condense(before, region, self.config.estimator.rows, new, busy)
+        found = _sent(work, None)
+        handle = None if isinstance(found, EstimateState) else self._tasks.submit(marginal, found)
+        yield
+        while not isinstance(found, EstimateState):
+            found = _sent(work, *self._tasks.gather([handle]))
+            if not isinstance(found, EstimateState):
+                handle = self._tasks.submit(marginal, found)
+        if self._state is not before:
+            raise RuntimeError("the map was changed while old submaps were joined")
+        self._state = found
 
     def optimize_full(self, *, coarse: bool = False) -> None:
         """All at its optimum, with every submap on its own and all shared landmarks, where that is affordable.
@@ -118,6 +141,15 @@ class MapEstimate:
         T_known, known = relative_pose(state.poses[first_node], state.poses[node], joint)
         T_node, T_covariance = T_known @ T, compose_covariance(T_known, known, T, covariance)
         return prior_of_pair(*seen_from(T_first, first_covariance, T_node, T_covariance))
+
+
+def _sent(work: Eliminating[EstimateState], result: Marginal | None) -> Elimination | EstimateState:
+    """The elimination that some work asks for next, or what comes of it."""
+    try:
+        return work.send(result)
+    except StopIteration as end:
+        state: EstimateState = end.value
+        return state
 
 
 def _anchored(state: EstimateState, component: int, record: int) -> tuple[int | None, FloatArray, FloatArray]:

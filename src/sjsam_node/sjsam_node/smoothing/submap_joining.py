@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,10 +24,65 @@ _WORTH = 0.4
 """Normal equations of a condensed submap must be smaller than this share of those of its parts together."""
 
 
+@dataclass(frozen=True, eq=False)
+class Elimination:
+    """Local maps of which all but a separator is to be marginalised out.
+
+    maps, state, fixed, last, constant: the problem (:class:`JoiningProblem`); poses (p,), landmarks (l,): separator;
+    root, seen_from_root: a pose, and the state in its frame, in which the covariances of all poses are wanted.
+    """
+
+    maps: FlatMaps
+    state: JoiningState
+    fixed: IntArray
+    last: IntArray
+    constant: float
+    poses: IntArray
+    landmarks: IntArray
+    root: IntArray
+    seen_from_root: JoiningState
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """The rest of an elimination: a Gaussian over its separator of n scalars.
+
+    step (n,), information (n, n), and chi2 at the optimum; covariances (poses, 6, 6) of all poses seen from the root;
+    redundancy of the problem.
+    """
+
+    step: FloatArray
+    information: FloatArray
+    chi2: float
+    covariances: FloatArray
+    redundancy: int
+
+
+T = TypeVar("T")
+Eliminating = Generator[Elimination, Marginal | None, T]
+"""Work that is given the marginal of each elimination that it asks for: these may be computed elsewhere."""
+
+
+def marginal(wanted: Elimination) -> Marginal | None:
+    """The marginal over a separator; None where it is not determined."""
+    maps, state = wanted.maps, wanted.state
+    problem = JoiningProblem(maps, state, wanted.fixed, kernels.TANGENT, last=wanted.last, constant=wanted.constant)
+    scalars = problem.scalars(wanted.poses, wanted.landmarks)
+    try:
+        newton, least = problem.newton_step(state)
+        step, information = newton[scalars], problem.marginal_information(state, scalars)
+        seen_from_root = JoiningProblem(maps, wanted.seen_from_root, wanted.root, kernels.TANGENT)
+        covariances = seen_from_root.marginals(wanted.seen_from_root).pose_blocks(np.arange(len(state.translations)))
+    except ValueError:
+        return None
+    redundancy = problem.rows - problem.layout.pattern.n
+    return Marginal(step, information, float(least + step @ information @ step), covariances, redundancy)
+
+
 def join_submaps(
     state: EstimateState, records: IntArray, component: int, rows_of: str, active: Active,
     parts: Sequence[CondensedSubmap] = (),
-) -> CondensedSubmap | None:  # fmt: skip
+) -> Eliminating[CondensedSubmap | None]:  # fmt: skip
     """Records and condensed submaps joined to one, where they are now.
 
     None where that does not pay, or is not determined.
@@ -55,24 +112,22 @@ def join_submaps(
     if rows**2 > _WORTH * sum(len(m.mean) ** 2 for m in maps):
         return None
     fixed, last = np.searchsorted(nodes, [reference]), np.concatenate([at_separator, len(nodes) + kept])
-    constant = sum(p.constant for p in parts)
-    flat = flatten(maps)
-    problem = JoiningProblem(flat, start, fixed, kernels.TANGENT, last=last, constant=constant)
-    scalars = problem.scalars(at_separator, kept)
-    try:
-        newton, least = problem.newton_step(start)
-        step, information = newton[scalars], problem.marginal_information(start, scalars)
-        covariances = _node_covariances(state, root, nodes, shared, flat, parts)
-    except ValueError:
+    wanted = Elimination(
+        flatten(maps), start, fixed, last, sum(p.constant for p in parts), at_separator, kept,
+        np.searchsorted(nodes, [root]), _seen_from(state, root, nodes, shared),
+    )  # fmt: skip
+    found = yield wanted
+    if found is None:
         return None
+    covariances = _node_covariances(state, root, nodes, found.covariances, parts)
     group = np.where(known, np.cumsum(known) - 1, -1)[np.searchsorted(landmarks, seen)]
     is_known, inside = group >= 0, observations[group < 0]
-    redundancy = problem.rows - problem.layout.pattern.n + sum(p.redundancy for p in parts)
+    redundancy = found.redundancy + sum(p.redundancy for p in parts)
     T_reference = invert_transform(state.poses[reference])
     poses, points = T_reference @ state.poses, transform_points(T_reference, state.points)
     return CondensedSubmap(
         every, reference, root, separator, inner, poses[separator], observations[first[known]],
-        points[landmarks[known]], information, -information @ step, float(least + step @ information @ step),
+        points[landmarks[known]], found.information, -found.information @ found.step, found.chi2,
         observations[is_known], group[is_known], poses[inner], inside, points[inside], graph.variable_of[inside],
         active.sightings[inside], active.uses[inner], covariances[inner], redundancy, tuple(parts),
     )  # fmt: skip
@@ -87,18 +142,11 @@ def _seen_from(state: EstimateState, base: int, nodes: IntArray, landmarks: IntA
 
 
 def _node_covariances(
-    state: EstimateState,
-    root: int,
-    nodes: IntArray,
-    landmarks: IntArray,
-    maps: FlatMaps,
-    parts: Sequence[CondensedSubmap],
+    state: EstimateState, root: int, nodes: IntArray, own: FloatArray, parts: Sequence[CondensedSubmap]
 ) -> FloatArray:
-    """Covariances (nodes of the graph, 6, 6) of what maps and parts are over, in the frame of the node ``root``."""
-    start = _seen_from(state, root, nodes, landmarks)
-    marginals = JoiningProblem(maps, start, np.searchsorted(nodes, [root]), kernels.TANGENT).marginals(start)
+    """Covariances (nodes of the graph, 6, 6) in the frame of the node ``root``: ``own`` of ``nodes``, and of parts."""
     covariances = np.zeros((len(state.poses), 6, 6))
-    covariances[nodes] = marginals.pose_blocks(np.arange(len(nodes)))
+    covariances[nodes] = own
     T_root = invert_transform(state.poses[root])
     for p in parts:
         T_part = state.poses[p.root]
