@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from submap_world import Agent, circle, ring_world
 
+from sjsam_node import storage
 from sjsam_node.global_map import ALREADY_JOINED, GlobalMap
 from sjsam_node.refining import has_more
 from slam_core.types import Submap
@@ -71,6 +74,26 @@ def test_settled_it_is_the_map_of_whole_submaps(agent: Agent) -> None:
     straight.settle()
     late = late.rebuilt_in_time_order()
     np.testing.assert_array_equal(late.state.poses, straight.state.poses)
+
+
+def test_put_away_and_taken_up_again_it_settles_to_the_same_map(agent: Agent, tmp_path: Path) -> None:
+    whole = agent.submaps()
+    unbroken = GlobalMap()
+    for submap in whole:
+        unbroken.add(part(submap, len(submap.landmarks) // 2))
+    unbroken.add(whole[1])
+    storage.write(tmp_path / "map", unbroken.stored())
+    again = GlobalMap.load(tmp_path / "map")
+    np.testing.assert_array_equal(again.rebuilt_in_time_order().state.poses,
+                                  unbroken.rebuilt_in_time_order().state.poses)  # fmt: skip
+
+
+def test_a_map_of_before_says_nothing_of_its_order_and_loads(agent: Agent, tmp_path: Path) -> None:
+    joined = GlobalMap()
+    joined.add(agent.submaps()[0])
+    storage.write(tmp_path / "map", joined.stored())
+    assert "is_out_of_order" not in json.loads((tmp_path / "map" / "manifest.json").read_text())
+    assert not storage.read(tmp_path / "map").is_out_of_order
 
 
 def test_another_submap_of_the_same_name_is_none_with_more(agent: Agent) -> None:

@@ -124,7 +124,7 @@ class GlobalMap:
         self._take(EstimateState())
         self.marks = Marks()
         self._offload = Offload()
-        self._has_moved, self._is_settled, self._was_settled_before = False, True, False
+        self._has_moved, self._is_settled, self._is_out_of_order = False, True, False
 
     def _take(self, state: EstimateState) -> None:
         """Go on from a state."""
@@ -156,7 +156,7 @@ class GlobalMap:
         if reason:
             self.counters.add(f"refused: {reason}")
             return JoinReport(False, reason)
-        self._was_settled_before |= self._is_settled and bool(self.estimate.graph.records)
+        self._is_out_of_order |= self._is_settled and bool(self.estimate.graph.records)
         self._is_settled = False
         self._place_building(submap.descriptors.shape[1])
         new = self._place(submap)
@@ -187,7 +187,6 @@ class GlobalMap:
         """Take further landmarks of a submap in, and compare it anew with what it may be the same place as."""
         before = len(self.estimate.graph.records[record].submap.landmarks)
         self._restore(refined(self.stored(), record, submap))
-        self._was_settled_before = True  # settled, all is joined anew, with what came now in its place
         found = self.detector.again(record, self.agents.chain(record))
         verdict = self.closures.join_closures(found, len(self.estimate.graph.records) - 1)
         self._account(verdict, len(found))
@@ -323,7 +322,7 @@ class GlobalMap:
         """
         submaps, rebuilt = [r.submap for r in self.estimate.graph.records], self
         ordered = in_order(submaps)
-        if self._was_settled_before or ordered != submaps:
+        if self._is_out_of_order or ordered != submaps:
             rebuilt = GlobalMap(self.config, self._tasks)
             for submap in ordered:
                 rebuilt.add_again(submap)
@@ -375,8 +374,9 @@ class GlobalMap:
     def stored(self) -> StoredMap:
         """The map as it is, to be written; nothing is settled."""
         return StoredMap(
-            self.state, self.detector.pending, self.closures.refused, self.detector.near.compared, self.marks
-        )
+            self.state, self.detector.pending, self.closures.refused, self.detector.near.compared, self.marks,
+            self._is_out_of_order,
+        )  # fmt: skip
 
     @classmethod
     def load(cls, path: Path | str, config: GlobalMapConfig | None = None, tasks: Tasks | None = None) -> GlobalMap:
@@ -388,7 +388,7 @@ class GlobalMap:
     def _restore(self, stored: StoredMap) -> None:
         """Go on from a map that was put away."""
         self._take(stored.state)
-        self._is_settled = not stored.state.graph.records
+        self._is_settled, self._is_out_of_order = not stored.state.graph.records, stored.is_out_of_order
         self.marks, self.closures.refused = stored.marks, stored.refused
         self.detector.pending, self.detector.near.compared = stored.pending, stored.compared
         for i, record in enumerate(stored.state.graph.records):

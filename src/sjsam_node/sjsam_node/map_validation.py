@@ -63,6 +63,8 @@ def check_manifest(manifest: dict[str, Any]) -> None:
         raise ValueError(f"arrays must name a file of the folder, got {name!r}")
     if not _is_int(manifest.get("bytes", 0)):
         raise ValueError(f"bytes must be the size of the arrays, got {manifest['bytes']!r}")
+    if not isinstance(manifest.get("is_out_of_order", False), bool):
+        raise ValueError(f"is_out_of_order must be true or false, got {manifest['is_out_of_order']!r}")
     for record in manifest["records"]:
         agent, index, session, start, follows = record
         if not (isinstance(agent, str) and isinstance(follows, bool) and all(map(_is_int, (index, session, start)))):

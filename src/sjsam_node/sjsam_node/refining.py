@@ -34,7 +34,10 @@ def lacking(graph: MapGraph, submap: Submap) -> int | None:
 
 
 def refined(stored: StoredMap, number: int, submap: Submap) -> StoredMap:
-    """A map in which a record has a submap with further landmarks, placed by the record's pose."""
+    """A map in which a record has a submap with further landmarks, placed by the record's pose.
+
+    Settled, all is joined anew, with what came now in its place.
+    """
     graph, before = stored.state.graph, stored.state.graph.records[number]
     arrays = estimate_arrays(stored.state)
     T = stored.state.start(number)
@@ -43,7 +46,7 @@ def refined(stored: StoredMap, number: int, submap: Submap) -> StoredMap:
     points = arrays["points"]
     arrays["points"] = np.concatenate([points[:behind], further, points[behind:]])
     submaps = [(r.start, submap if i == number else r.submap) for i, r in enumerate(graph.records)]
-    return replace(stored, state=stored_state(submaps, graph.links, arrays))
+    return replace(stored, state=stored_state(submaps, graph.links, arrays), is_out_of_order=True)
 
 
 def undecided(graph: MapGraph, pending: Iterable[Link]) -> frozenset[tuple[str, int, int]]:

@@ -43,7 +43,8 @@ class StoredMap:
     """All that a map needs to go on as if it had never been put away.
 
     pending, refused: closures that wait for another that says the same, and for more that speaks for them; compared:
-    pairs of submaps compared where they were near (see :mod:`sjsam_node.loop_closure.near_pairs`).
+    pairs of submaps compared where they were near (see :mod:`sjsam_node.loop_closure.near_pairs`); is_out_of_order:
+    submaps or landmarks came after it was settled, so that the settled map is joined anew.
     """
 
     state: EstimateState
@@ -51,6 +52,7 @@ class StoredMap:
     refused: list[Link]
     compared: Compared
     marks: Marks
+    is_out_of_order: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +86,8 @@ def pack(stored: StoredMap) -> PackedMap:
         ],
         "marks": [[m.name, m.node, *m.point.tolist()] for m in stored.marks.marks],
     }  # fmt: skip
+    if stored.is_out_of_order:
+        manifest["is_out_of_order"] = True
     return PackedMap(manifest, arrays)
 
 
@@ -160,7 +164,7 @@ def _stored(manifest: dict[str, Any], arrays: Arrays) -> StoredMap:
     marks = Marks([Mark(name, node, np.array(point, dtype=np.float64)) for name, node, *point in manifest["marks"]])
     pending, refused = _links("pending", arrays), _links("refused", arrays)
     compared = Compared.of(arrays["compared/pairs"], arrays["compared/middles"])
-    return StoredMap(state, pending, refused, compared, marks)
+    return StoredMap(state, pending, refused, compared, marks, manifest.get("is_out_of_order", False))
 
 
 def _digest(manifest: dict[str, Any]) -> str:
