@@ -69,7 +69,7 @@ def main() -> None:
     table = Table(*_COLUMNS)
     for run in arguments.runs:
         submaps = [r.submap for r in storage.read(run / "map").state.graph.records]
-        stamps = {p.stamp_ns for s in submaps for p in unpack(pack(s)).path}
+        stamps = {(s.agent, p.stamp_ns) for s in submaps for p in unpack(pack(s)).path}
         truth = truth_of(run, submaps)
         whole = joined(submaps)
         errors = accuracy(whole, truth, stamps)
@@ -169,11 +169,14 @@ def truth_of(run: Path, submaps: Sequence[Submap]) -> dict[str, Trajectory]:
     }
 
 
-def accuracy(found: Joined, truth: dict[str, Trajectory], stamps: set[int]) -> tuple[str, str]:
-    """Position error mm, all agents in one frame, and ANEES, mean of all poses, each from its agent's start."""
+def accuracy(found: Joined, truth: dict[str, Trajectory], stamps: set[tuple[str, int]]) -> tuple[str, str]:
+    """Position error mm, all agents in one frame, and ANEES, mean of all poses, each from its agent's start.
+
+    stamps: agent and stamp of the poses that count.
+    """
     estimates, truths, nees = [], [], []
     for agent, own in truth.items():
-        estimate = Trajectory.from_estimates(p for p in found.poses[agent] if p.stamp_ns in stamps)
+        estimate = Trajectory.from_estimates(p for p in found.poses[agent] if (agent, p.stamp_ns) in stamps)
         matched, true_poses = associate(estimate, own, _TRUTH_GAP_S, interpolate=True)
         estimates.append(matched.poses)
         truths.append(true_poses)

@@ -147,7 +147,7 @@ def test_forged_details_are_refused_or_of_a_submap(make_submap, rng):
         for at in rng.integers(len(forged), size=2):
             forged[at] = int(rng.integers(256))
         try:
-            found = with_details(message, struct.pack("<2sBI", b"SD", 1, zlib.crc32(forged)) + forged)
+            found = with_details(message, struct.pack("<2sBI", b"SD", 2, zlib.crc32(forged)) + forged)
         except ValueError:
             refused += 1
         else:

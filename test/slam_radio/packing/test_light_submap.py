@@ -13,7 +13,7 @@ import pytest
 from slam_core.geometry import boxminus
 from slam_radio.packing.descriptor_code import DIRECTIONS, basis, decode, encode
 from slam_radio.packing.landmark_choice import choose_landmarks, rank_values
-from slam_radio.packing.light_submap import LightConfig, pack, unpack
+from slam_radio.packing.light_submap import LightConfig, lightened, pack, unpack, write
 
 
 def test_what_is_sent_comes_out(make_submap):
@@ -58,10 +58,60 @@ def test_descriptors_of_the_basis_take_its_bytes_and_keep_their_likeness(rng):
     codes = encode(inside)
     assert codes.shape == (50, DIRECTIONS)
     np.testing.assert_allclose(decode(codes, 128) @ decode(codes, 128).T, inside @ inside.T, atol=0.1)
-    assert np.einsum("nd,nd->n", decode(codes, 128), inside).min() > 0.97
+    along = decode(codes, 128) @ basis()
+    assert np.einsum("nd,nd->n", along / np.linalg.norm(along, axis=1, keepdims=True), inside @ basis()).min() > 0.97
     other = rng.normal(size=(50, 128)).astype(np.float32)
     assert encode(other / np.linalg.norm(other, axis=1, keepdims=True)).shape == (50, 128)
     assert encode(np.eye(64, dtype=np.float32)).shape == (64, 64)
+
+
+def test_what_is_left_out_makes_no_two_landmarks_more_alike(rng):
+    """8 % of the squares of descriptors are left out: stretched to unit length, others would be 0.05 more alike."""
+    centre = 3.0 * np.eye(DIRECTIONS)[0]
+    whole = rng.normal(size=(100, DIRECTIONS)) @ basis().T + centre @ basis().T
+    whole /= np.linalg.norm(whole, axis=1, keepdims=True)
+    beyond = rng.normal(size=whole.shape)
+    beyond -= beyond @ basis() @ basis().T
+    whole = np.sqrt(0.92) * whole + np.sqrt(0.08) * beyond / np.linalg.norm(beyond, axis=1, keepdims=True)
+    again = whole + 0.01 * rng.normal(size=whole.shape)
+    again /= np.linalg.norm(again, axis=1, keepdims=True)
+    found, found_again = (decode(encode(d.astype(np.float32)), 128) for d in (whole, again))
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-5)
+    apart = ~np.eye(100, dtype=bool)
+    assert abs(np.mean((found @ found_again.T - whole @ again.T)[apart])) < 0.01
+    assert np.median(np.diag(found @ found_again.T)) > 0.96
+
+
+def test_descriptors_that_are_not_as_wide_as_they_say_are_refused(make_submap):
+    light = lightened(make_submap(12), LightConfig(landmarks=12))
+    assert light.landmarks.codes.shape == (12, 128)
+    for dimension in (DIRECTIONS, 64, 127):
+        with pytest.raises(ValueError, match=f"descriptors of {dimension} numbers, of which it sends 128"):
+            unpack(write(replace(light, dimension=dimension)))
+
+
+def test_ids_of_a_long_run_cost_no_more(make_submap):
+    submap = make_submap(60)
+    late = replace(submap, landmark_ids=submap.landmark_ids + 2**29)
+    assert len(pack(late)) <= len(pack(submap)) + 4
+    np.testing.assert_array_equal(unpack(pack(late)).landmark_ids, np.sort(late.landmark_ids))
+
+
+def test_a_path_that_begins_and_ends_elsewhere_is_sent_whole(make_submap):
+    submap = make_submap(12)
+    sent = unpack(pack(replace(submap, path=submap.path[1:2]))).path
+    assert [p.stamp_ns for p in sent] == [submap.path[1].stamp_ns]
+    np.testing.assert_allclose(boxminus(sent[0].T, submap.path[1].T), 0.0, atol=1e-6)
+
+
+def test_a_pose_between_has_its_own_covariance_not_one_shaped_as_the_ends(make_submap):
+    """How it errs in rotation and in position says how a closure moves it."""
+    submap = make_submap(12)
+    own = np.diag(np.square([0.003, 0.002, 0.001, 0.02, 0.01, 0.03]))
+    path = (submap.path[0], replace(submap.path[1], covariance=own), submap.path[2])
+    sent = unpack(pack(replace(submap, path=path))).path[1].covariance
+    np.testing.assert_allclose(np.diag(sent), np.diag(own), rtol=0.003)
+    assert (np.diag(sent) >= np.diag(own)).all()
 
 
 def test_the_basis_is_orthonormal():
@@ -117,7 +167,7 @@ def test_forged_messages_with_a_good_checksum_are_refused_or_a_submap(make_subma
         forged[rng.integers(len(forged))] = int(rng.integers(256))
         forged[rng.integers(90)] = int(rng.integers(256))  # among counts, stamps and end pose
         try:
-            light = unpack(struct.pack("<2sBI", b"SL", 3, zlib.crc32(forged)) + forged)
+            light = unpack(struct.pack("<2sBI", b"SL", 4, zlib.crc32(forged)) + forged)
         except ValueError:
             refused += 1
         else:
@@ -132,11 +182,11 @@ def test_a_message_of_more_landmarks_than_can_be_is_refused(make_submap):
     assert struct.unpack_from("<H", rest, at)[0] == 12
     struct.pack_into("<H", rest, at, 60000)
     with pytest.raises(ValueError, match="cannot have 60000 landmarks"):
-        unpack(struct.pack("<2sBI", b"SL", 3, zlib.crc32(rest)) + rest)
+        unpack(struct.pack("<2sBI", b"SL", 4, zlib.crc32(rest)) + rest)
 
 
 def test_an_older_version_is_refused_by_name(make_submap):
     data = bytearray(pack(make_submap(12)))
-    data[2] = 2
-    with pytest.raises(ValueError, match="not a submap for the air of version 3"):
+    data[2] = 3
+    with pytest.raises(ValueError, match="not a submap for the air of version 4"):
         unpack(bytes(data))

@@ -5,6 +5,11 @@ SURF-128 descriptors fill few of their 128 dimensions: 24 principal directions h
 directions were found on simulated rooms (``benchmarks/radio/descriptor_basis.py``) and are part of the format. A step
 of 0.05 adds an error that is as large in each direction as what is left out in the others. Descriptors of another kind,
 whose likeness this would spoil, go out whole, a number for each of theirs. Range coded, a descriptor has about 9 bytes.
+
+A decoded descriptor is not simply stretched to unit length: that would make all that are not alike more alike by what
+is left out, and landmarks beside each other are then taken for one. What it is short of stands in the other 104
+dimensions, as waves of its coordinates: nearly the same for two sightings of a landmark, unrelated for others (random
+features of a Gaussian kernel; Rahimi and Recht 2007).
 """
 
 from __future__ import annotations
@@ -25,7 +30,9 @@ _STEPS = 20.0
 _WHOLE_STEPS = 100.0
 """The same of a descriptor that goes out whole."""
 _LEAST_LIKENESS = 0.9
-"""Median scalar product of descriptors and their codes below which they go out whole."""
+"""Median scalar product of descriptors and their coordinates' directions below which they go out whole."""
+_KERNEL = 0.28
+"""Distance of two coordinate vectors of unit length beyond which what is left out is taken as unrelated."""
 
 
 @cache
@@ -40,10 +47,9 @@ def encode(descriptors: Float32Array, width: int = 0) -> IntArray:
 
     ``width``: number of columns, where it is decided already.
     """
-    dimension = descriptors.shape[1]
-    if dimension == len(basis()) and width in (0, DIRECTIONS):
+    if is_of_basis(width or DIRECTIONS, descriptors.shape[1]):
         codes = np.rint(_STEPS * (descriptors @ basis())).astype(np.int64)
-        likeness = np.einsum("nd,nd->n", descriptors, decode(codes, len(basis())))
+        likeness = np.einsum("nd,nd->n", descriptors, _unit(codes.astype(np.float32)) @ basis().T)
         if width or not len(codes) or np.median(likeness) >= _LEAST_LIKENESS:
             return np.asarray(codes)
     return np.asarray(np.rint(_WHOLE_STEPS * descriptors), dtype=np.int64)
@@ -52,7 +58,27 @@ def encode(descriptors: Float32Array, width: int = 0) -> IntArray:
 def decode(codes: IntArray, dimension: int) -> Float32Array:
     """Unit descriptors (n, dimension) of what :func:`encode` made."""
     values = codes.astype(np.float32)
-    if codes.shape[1] == DIRECTIONS and dimension == len(basis()):
-        values = values @ basis().T
+    if not is_of_basis(codes.shape[1], dimension):
+        return _unit(values)
+    along = _unit(values)
+    length = np.minimum(np.linalg.norm(values, axis=1, keepdims=True) / _STEPS, 1.0)
+    beyond = np.cos(along @ _waves() + np.arange(dimension, dtype=np.float32))
+    beyond = _unit(beyond - (beyond @ basis()) @ basis().T)
+    return np.asarray(length * (along @ basis().T) + np.sqrt(1.0 - length**2) * beyond, dtype=np.float32)
+
+
+def is_of_basis(width: int, dimension: int) -> bool:
+    """True if codes of ``width`` numbers are coordinates of descriptors (n, dimension), False if they are whole."""
+    return width == DIRECTIONS and dimension == len(basis())
+
+
+@cache
+def _waves() -> Float32Array:
+    """Wave numbers (DIRECTIONS, 128), of the same spread in all directions."""
+    count = np.arange(DIRECTIONS * len(basis()), dtype=np.float64).reshape(DIRECTIONS, -1)
+    return np.asarray(np.sqrt(2.0) / _KERNEL * np.cos(count**2), dtype=np.float32)
+
+
+def _unit(values: Float32Array) -> Float32Array:
     length = np.linalg.norm(values, axis=1, keepdims=True)
     return np.asarray(values / np.maximum(length, np.finfo(np.float32).tiny), dtype=np.float32)

@@ -58,7 +58,7 @@ class LandmarkBlock:
 
     def write(self, writer: SymbolWriter) -> None:
         """Write the columns, in the order in which :meth:`read` reads them."""
-        for column in (*self.cells.T, *self.factors.T, np.diff(self.ids, prepend=0), self.sightings):
+        for column in (*self.cells.T, *self.factors.T, self.ids[:1], np.diff(self.ids), self.sightings):
             writer.column(column)
         writer.columns(self.common)
         writer.columns(self.codes)
@@ -74,18 +74,18 @@ class LandmarkBlock:
         """
         if n > MOST_LANDMARKS or rank > MOST_RANK or width > MOST_WIDTH or not FINEST <= exponent <= COARSEST:
             raise ValueError(f"a submap for the air cannot have {n} landmarks, {rank} directions, {width} numbers")
-        columns = [reader.column(n) for _ in range(11)]
-        cells, factors = np.stack(columns[:3], axis=1), np.stack(columns[3:9], axis=1)
+        columns = [reader.column(n) for _ in range(9)]
+        cells, factors = np.stack(columns[:3], axis=1), np.stack(columns[3:], axis=1)
+        first, steps, sightings = (reader.column(count) for count in (min(n, 1), max(n - 1, 0), n))
         common, codes = reader.columns(3 * n, rank), reader.columns(n, width)
-        steps, sightings = columns[9:]
         if (
             np.abs(cells).max(initial=0) >= _MOST_CELLS
-            or (steps[1:] <= 0).any()
-            or (steps[:1] < 0).any()
+            or (steps <= 0).any()
+            or (first < 0).any()
             or not ((sightings >= 0) & (sightings <= _MOST_SIGHTINGS)).all()
         ):
             raise ValueError("a submap for the air holds landmarks that cannot be")
-        return cls(exponent, cells, factors, common, np.cumsum(steps), sightings, codes)
+        return cls(exponent, cells, factors, common, np.cumsum(np.concatenate([first, steps])), sightings, codes)
 
 
 def shown_sightings(sightings: npt.NDArray[np.int32]) -> IntArray:

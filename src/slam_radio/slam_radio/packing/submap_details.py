@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The landmarks of a submap that its message for the air left out, for who asks for them.
 
-Format, version 1, little endian: ``b"SD"``, u8 version, u32 CRC-32 of the rest; then
+Format, version 2, little endian: ``b"SD"``, u8 version, u32 CRC-32 of the rest; then
 
 ==================  ===================================================================================
 u8, bytes           length of the agent's name, the name (UTF-8)
@@ -36,7 +36,7 @@ from slam_radio.packing.landmark_choice import choose_landmarks
 from slam_radio.packing.light_submap import ENVELOPE, LightSubmap, opened, read, sealed, unknowns_of
 from slam_radio.packing.symbol_code import SymbolReader, SymbolWriter
 
-MAGIC, VERSION = b"SD", 1
+MAGIC, VERSION = b"SD", 2
 _NAME = "details of a submap"
 _NUMBERS, _COUNTS = struct.Struct("<III"), struct.Struct("<Hbf")
 
