@@ -23,12 +23,13 @@ import numpy as np
 
 from sjsam_node import storage
 from slam_core.types import PoseEstimate, Submap
+from slam_radio.byte_budget import OVERHEAD
 from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox
 from slam_radio.outbox import Outbox
 from slam_radio.packing.light_submap import pack
 from slam_radio.radio_messages import pack_pose, unpack_acknowledgement
-from slam_radio.uplink import OVERHEAD, Uplink
+from slam_radio.uplink import Uplink
 
 _STEP_S = 0.1
 _AFTER_S = 180.0

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from slam_core.types import PoseEstimate, Submap
+from slam_radio.byte_budget import OVERHEAD
 from slam_radio.detail_store import DetailStore
 from slam_radio.downlink import Downlink
 from slam_radio.inbox import Inbox
 from slam_radio.outbox import Outbox
-from slam_radio.packing.light_submap import LightConfig, lightened, write
+from slam_radio.packing.light_submap import LightConfig, pack
 from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_want
-from slam_radio.uplink import OVERHEAD, Uplink
+from slam_radio.uplink import Uplink
 
 SIZE = LightConfig(landmarks=5, rank=1)
 STEP_S = 0.1
@@ -34,6 +35,8 @@ class World:
     landmarks: int = 5
     detailed: list[Submap] = field(default_factory=list)
     detail_keys: list[int] = field(default_factory=list)
+    wants: int = 0
+    told_none: list[int] = field(default_factory=list)
     passed_on: list[int] = field(default_factory=list)
     sent: list[tuple[float, int]] = field(default_factory=list)
     keys: list[int] = field(default_factory=list)
@@ -47,7 +50,7 @@ class World:
         if hasattr(self, "uplink"):
             self.uplink.outbox.close()
             self.uplink.details.folder.close()
-        details = DetailStore(self.folder / "details")
+        details = DetailStore(self.folder / "details", self.bytes_per_second)
         self.uplink = Uplink(Outbox(self.folder / "out"), self.bytes_per_second, details=details)
 
     def start_post(self) -> list[int]:
@@ -60,10 +63,9 @@ class World:
 
     def submap(self, index: int) -> None:
         submap = self.whole(index)
-        light = lightened(submap, SIZE)
-        message = write(light)
+        message = pack(submap, SIZE)
         if self.uplink.details is not None:
-            self.uplink.details.keep((2, index), submap, light, message)
+            self.uplink.details.keep((2, index), submap, message)
         self.uplink.add_submap((2, index), message, self.now_s)
 
     def whole(self, index: int) -> Submap:
@@ -89,6 +91,8 @@ class World:
                 continue
             if message.kind == "backlog":
                 self.downlink.on_backlog("one", message.data, now)
+            elif message.kind == "none":
+                self.told_none.append(self.downlink.on_none("one", message.data, now))
             elif message.key is None:
                 self.poses.append((now, self.downlink.on_pose("one", message.data, now).stamp_ns))
             elif message.kind == "details":
@@ -101,4 +105,5 @@ class World:
             if told.kind == "ack":
                 self.uplink.on_acknowledgement(unpack_acknowledgement(told.data), now)
             elif told.kind == "want":
+                self.wants += 1
                 self.uplink.details.want(unpack_want(told.data))

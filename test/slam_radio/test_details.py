@@ -13,9 +13,10 @@ from radio_world import SIZE, World
 
 from slam_core.types import Submap
 from slam_radio.detail_store import DetailStore
-from slam_radio.packing.light_submap import lightened, write
+from slam_radio.packing.light_submap import lightened, pack, write
 from slam_radio.packing.submap_details import key_of_details, pack_details, with_details
 from slam_radio.radio_messages import MOST_RANGES
+from slam_radio.whole_submaps import WholeSubmaps
 
 
 @pytest.fixture
@@ -161,19 +162,131 @@ def test_a_submap_that_was_sent_whole_has_none(make_submap):
     assert pack_details(submap, light, write(light)) is None
 
 
-def test_a_landmark_that_cannot_be_sent_costs_the_details_and_not_the_submap(tmp_path, make_submap):
-    submap = make_submap(40)
-    light = lightened(submap, SIZE)
-    message = write(light)
-    left_out = int(np.flatnonzero(~np.isin(submap.landmark_ids, light.landmarks.ids))[0])
+def test_a_landmark_that_cannot_be_sent_costs_the_details_and_not_the_submap(world):
+    world.run(5.0)
+    submap = world.whole(0)
+    left_out = int(np.flatnonzero(~np.isin(submap.landmark_ids, lightened(submap, SIZE).landmarks.ids))[0])
     covariance = submap.covariance.copy()
     own = slice(6 + 3 * left_out, 9 + 3 * left_out)
     covariance[own, own] += 1e12 * np.eye(3)
-    store = DetailStore(tmp_path)
-    assert not store.keep((2, 0), replace(submap, covariance=covariance), light, message)
-    assert store.folder.sizes == {}
-    assert store.keep((2, 0), submap, light, message)
-    assert list(store.folder.sizes) == [(2, 0)]
+    world.uplink.details.keep((2, 0), replace(submap, covariance=covariance), pack(submap, SIZE))
+    world.uplink.add_submap((2, 0), pack(submap, SIZE), world.now_s)
+    world.submap(1)
+    world.run(10.0)
+    world.inbox.ask()
+    world.run(20.0)
+    assert world.passed_on == [0, 1]
+    assert world.detail_keys == [1]
+    assert world.told_none == [1]
+    assert world.uplink.details.damaged == 1
+
+
+def test_details_that_there_are_not_are_answered_once_and_not_asked_for_again(world):
+    """Gone, damaged, or nothing was left out; with all others they are asked for once more."""
+    world.run(5.0)
+    for index in range(4):
+        world.submap(index)
+    world.run(20.0)
+    world.uplink.details.whole.remove((2, 1))
+    (world.uplink.details.whole.path / "2-2.npz").write_bytes(b"PK damaged")
+    world.run(5.0)
+    world.inbox.ask([(2, 1), (2, 2), (2, 3)])
+    world.run(20.0)
+    assert world.detail_keys == [3]
+    assert sum(world.told_none) == 2
+    assert world.inbox.wanted == set()
+    answers, wants = len(world.told_none), world.wants
+    assert world.inbox.ask([(2, 1), (2, 2)]) == 0
+    world.run(20.0)
+    assert (len(world.told_none), world.wants) == (answers, wants)
+    assert world.start_post() == [0, 1, 2, 3]
+    assert world.inbox.ask([(2, 1), (2, 2)]) == 0
+    assert world.inbox.ask() == 3
+    world.run(20.0)
+    assert world.inbox.wanted == set()
+    assert sorted(world.detail_keys) == [0, 3]
+    assert (world.uplink.details.whole.path / "2-2.npz").read_bytes() == b"PK damaged"
+
+
+def test_an_answer_that_is_lost_is_given_again(world):
+    world.run(5.0)
+    world.submap(0)
+    world.run(10.0)
+    world.uplink.details.whole.remove((2, 0))
+    world.arrives = lambda to_post, now_s: not (to_post and now_s < 25.0)
+    world.inbox.ask()
+    world.run(30.0)
+    assert world.inbox.wanted == set()
+    assert world.told_none == [1]
+
+
+def test_details_are_packed_when_they_are_asked_for_and_the_whole_submap_goes(world):
+    world.run(5.0)
+    world.submap(0)
+    world.run(10.0)
+    store = world.uplink.details
+    assert (list(store.folder.sizes), list(store.whole.sizes)) == ([], [(2, 0)])
+    world.start_agent()
+    store = world.uplink.details
+    world.inbox.ask()
+    world.run(10.0)
+    assert (list(store.folder.sizes), list(store.whole.sizes)) == ([(2, 0)], [])
+    assert [len(s.landmarks) for s in world.detailed] == [12]
+    assert not list(store.whole.path.iterdir())
+
+
+def test_of_more_whole_submaps_than_may_lie_there_the_oldest_are_packed(tmp_path, make_submap):
+    submaps = [make_submap(12, index=k) for k in range(4)]
+    store = DetailStore(tmp_path / "one")
+    store.keep((2, 0), submaps[0], pack(submaps[0], SIZE))
+    store = DetailStore(tmp_path / "two", most_bytes=2.5 * store.whole.total)
+    for k, submap in enumerate(submaps):
+        store.keep((2, k), submap, pack(submap, SIZE))
+    assert sorted(store.whole.sizes) == [(2, 2), (2, 3)]
+    assert sorted(store.folder.sizes) == [(2, 0), (2, 1)]
+
+
+def test_a_whole_submap_on_disk_is_not_surer_and_says_the_same(tmp_path, make_submap):
+    submap = make_submap(60)
+    kept = WholeSubmaps(tmp_path)
+    message = pack(submap, SIZE)
+    kept.add((2, 3), submap, message)
+    found, light, again = WholeSubmaps(tmp_path).read((2, 3))
+    assert again == message
+    assert write(light) == message
+    L = np.linalg.inv(np.linalg.cholesky(submap.covariance))
+    assert np.linalg.eigvalsh(L @ found.covariance @ L.T)[0] >= 1.0
+    np.testing.assert_allclose(found.covariance, submap.covariance, rtol=1e-4, atol=1e-9)
+    np.testing.assert_array_equal(found.descriptors, submap.descriptors)
+    kept.add((2, 4), submap, message)
+    with pytest.raises(ValueError, match="holds submap 2/3"):
+        kept.read((2, 4))
+
+
+def test_details_keep_to_the_speed_of_the_link(tmp_path, make_submap):
+    """Of many that are wanted four seconds of the link are under way, and none goes out again while it may come."""
+    world = World(tmp_path, make_submap, landmarks=60, bytes_per_second=400.0)
+    world.run(5.0)
+    for index in range(8):
+        world.submap(index)
+    world.run(60.0)
+    world.arrives = lambda to_post, now_s: not to_post
+    world.inbox.ask()
+    began = world.now_s
+    world.uplink.details.want(world.inbox.lacking())
+    size = None
+    times = []
+    for _ in range(600):
+        world.now_s += 0.1
+        while (key := world.uplink.details.ready(world.now_s)) is not None:
+            size = world.uplink.details.size(key)
+            world.uplink.details.take(key, world.now_s)
+            times.append((round(world.now_s - began, 1), key[1]))
+    assert size is not None
+    first = [t for t, _ in times if t < 5.0]
+    assert len(first) == max(1, int(4.0 * 400.0 / size))
+    again = [t for t, index in times if index == times[0][1]]
+    assert again[1] - again[0] == pytest.approx(5.0 + size / 400.0, abs=0.2)
 
 
 def test_details_whose_file_is_gone_are_left_out(world):
@@ -181,11 +294,12 @@ def test_details_whose_file_is_gone_are_left_out(world):
     for index in range(3):
         world.submap(index)
     world.run(20.0)
-    for path in world.uplink.details.folder.path.iterdir():
+    for path in world.uplink.details.whole.path.iterdir():
         path.unlink()
     world.inbox.ask([(2, 1)])
     world.run(20.0)
     assert world.detail_keys == []
+    assert world.inbox.wanted == set()
 
 
 def test_many_that_an_agent_lacks_do_not_keep_others_waiting(world):
@@ -196,7 +310,8 @@ def test_many_that_an_agent_lacks_do_not_keep_others_waiting(world):
         world.submap(index)
     world.run(150.0)
     for index in scattered[:-1]:
-        world.uplink.details.folder.remove((2, index))
+        world.uplink.details.whole.remove((2, index))
     assert world.inbox.ask([(2, index) for index in scattered]) == len(scattered)
     world.run(30.0)
     assert world.detail_keys == [scattered[-1]]
+    assert world.inbox.wanted == set()

@@ -165,7 +165,7 @@ def test_files_of_others_stay(world, tmp_path):
         (folder / name).write_bytes(data)
     world.submap(0)
     world.start_agent()
-    assert world.uplink.outbox.strangers == 1
+    assert world.uplink.outbox.strangers == {tmp_path / "out": 1}
     assert world.uplink.outbox.waiting == [(2, 0)]
     with pytest.raises(ValueError, match="move it away"):
         world.submap(7)

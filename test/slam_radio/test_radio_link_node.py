@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -89,6 +90,10 @@ def test_submaps_poses_and_corrections_cross_the_link_and_survive_its_silence(
 
     agent = {"agents": ("anna",), "connect": (address,), "light.landmarks": 20, "resend_after_s": 1.0}
     post = {"role": "post", "agents": ("anna",), "listen": (address,)}
+    state = tmp_path / "state" / "indoor_slam"
+    old = state / "helmet" / "radio" / "details" / "anna" / "1-7.submap"
+    old.parent.mkdir(parents=True)
+    old.write_bytes(b"SD\x01 of an earlier version")
     with radio_link(environment, tmp_path / "agent.log", "helmet", **agent):
         with radio_link(environment, tmp_path / "post.log", **post):
             publish(0)
@@ -112,7 +117,7 @@ def test_submaps_poses_and_corrections_cross_the_link_and_survive_its_silence(
             wait_for(4)
         publish(2)  # the post is away
         publish(3)
-        waiting = tmp_path / "state" / "indoor_slam" / "helmet" / "radio" / "outbox" / "anna"
+        waiting = state / "helmet" / "radio" / "outbox" / "anna"
         probe.wait(lambda: len(list(waiting.glob("*.submap"))) == 2, "nothing waits on disk")
     for received_on in probe.received.values():
         received_on.clear()
@@ -123,7 +128,18 @@ def test_submaps_poses_and_corrections_cross_the_link_and_survive_its_silence(
     ):
         wait_for(5)  # two of before once more, for a sjsam that was started anew too
         probe.wait(lambda: not list(waiting.glob("*.submap")), "what was received still waits")
+        (old.parent / "whole" / "2-4.npz").unlink()
+        assert probe.call("/radio_link/request_details").message == "details of 3 submaps asked for"
+        wait_for(7)
+        untold = next(state.glob("**/inbox/anna")) / "untold.json"
+        wanted = untold.with_name("wanted.json")
+        probe.wait(lambda: json.loads(wanted.read_text()) == [], "details are still wanted that there are not")
+        assert json.loads(untold.read_text()) == [[2, 4, 5]]
+    assert f"1 files in {old.parent} are of another version of this program, or damaged: they are kept" in logs()
+    assert old.read_bytes() == b"SD\x01 of an earlier version"
     found = [submap_from_messages(SubmapMessages(*messages)) for messages in received()]
+    assert [(s.index, len(s.landmarks)) for s in found[5:]] == [(2, 40), (3, 40)]
+    found = found[:5]
     assert [s.index for s in found] == list(range(5))
     assert (detailed.index, len(detailed.landmarks)) == (1, 40)
     assert [len(s.landmarks) for s in found] == [40, 40, 20, 20, 20]

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+OVERHEAD = 150
+"""Bytes on the wire beside a message's own: key, headers of Zenoh, TCP and IP, and the other side's TCP answer."""
 _SAVED_S = 2.0
 """Unused budget is kept for so long."""
 

@@ -11,13 +11,19 @@ import numpy as np
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.health import State
 from slam_core.types import PoseEstimate, Submap
-from slam_radio.byte_budget import ByteBudget
+from slam_radio.byte_budget import OVERHEAD, ByteBudget
 from slam_radio.inbox import Inbox
 from slam_radio.index_ranges import Key, Range
 from slam_radio.link_report import Backlog, LinkReport, unpack_backlog
 from slam_radio.link_state import Hearing, LinkState
-from slam_radio.radio_messages import MOST_RANGES, pack_acknowledgement, pack_correction, pack_want, unpack_pose
-from slam_radio.uplink import OVERHEAD
+from slam_radio.radio_messages import (
+    MOST_RANGES,
+    pack_acknowledgement,
+    pack_correction,
+    pack_want,
+    unpack_none,
+    unpack_pose,
+)
 
 _BEACON_PERIOD_S = 3.0
 """An acknowledgement goes out so often even if there is no news: agents learn from it that the post is there."""
@@ -97,6 +103,13 @@ class Downlink:
         submaps = agent.inbox.take_details(key, data)
         agent.wants = None  # the agent is to know that they have come
         return submaps
+
+    def on_none(self, name: str, data: bytes, now_s: float) -> int:
+        """An agent cannot tell details that were wanted; returns of how many submaps. ValueError if it is damaged."""
+        agent = self._agents[name]
+        ranges = unpack_none(data)
+        agent.hearing.heard(now_s)
+        return agent.inbox.give_up(ranges)
 
     def on_pose(self, name: str, data: bytes, now_s: float) -> PoseEstimate:
         """Take a pose; ValueError if it is damaged."""

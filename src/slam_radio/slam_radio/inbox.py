@@ -33,6 +33,8 @@ class Inbox:
         self._wanted_file = path / "wanted.json"
         asked = IndexRanges(read_ranges(self._wanted_file))
         self.wanted = {key for key in self._folder.sizes if key in asked and key not in self._details.sizes}
+        self._untold_file = path / "untold.json"
+        self._untold = IndexRanges(read_ranges(self._untold_file))
         self._next: dict[int, int] = {}
         for session, index in sorted(self._held, reverse=True):
             self._next[session] = index
@@ -85,12 +87,33 @@ class Inbox:
         return light or unpack(self._folder.read(key))
 
     def ask(self, keys: Iterable[Key] | None = None) -> int:
-        """Want the details of some submaps that have come, or of all; returns of how many more than before."""
+        """Want the details of some submaps that have come, or of all; returns of how many more than before.
+
+        What the agent said it cannot tell is asked for again only with all others.
+        """
         asked = set(self._folder.sizes if keys is None else keys) & set(self._folder.sizes)
-        new = asked - set(self._details.sizes) - self.wanted
+        if keys is None:
+            self._set_untold(IndexRanges())
+        new = {key for key in asked - set(self._details.sizes) - self.wanted if key not in self._untold}
         if new:
             self._set_wanted(self.wanted | new)
         return len(new)
+
+    def give_up(self, ranges: Iterable[Range]) -> int:
+        """Want some details no more, which the agent cannot tell; returns of how many submaps."""
+        gone = IndexRanges(ranges)
+        keys = {key for key in self.wanted if key in gone}
+        if keys:
+            untold = IndexRanges(self._untold)
+            for key in keys:
+                untold.add(key)
+            self._set_untold(untold)
+            self._set_wanted(self.wanted - keys)
+        return len(keys)
+
+    def _set_untold(self, untold: IndexRanges) -> None:
+        write_ranges(self._untold_file, untold)
+        self._untold = untold
 
     def take_details(self, key: Key, data: bytes) -> list[Submap]:
         """Keep the details of a submap; returns the submap with them, unless it waits or has them already.
@@ -143,8 +166,14 @@ class Inbox:
         for key in list(self._details.sizes):
             self._details.remove(key)
         self._set_wanted(set())
+        self._set_untold(IndexRanges())
         self._held.clear()
         self._unpacked.clear()
+
+    @property
+    def strangers(self) -> dict[Path, int]:
+        """Files by folder that look like messages and are of another version, or damaged."""
+        return {folder.path: folder.strangers for folder in (self._folder, self._details) if folder.strangers}
 
     def close(self) -> None:
         """Let another process have the folder."""

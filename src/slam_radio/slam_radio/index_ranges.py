@@ -45,6 +45,21 @@ class IndexRanges:
             first, end = min(first, other), max(end, ends.pop(other))
         ends[first] = end
 
+    def without(self, keys: Iterable[Key]) -> IndexRanges:
+        """The set less some submaps."""
+        out = IndexRanges()
+        gone: dict[int, list[int]] = {}
+        for session, index in sorted(keys):
+            gone.setdefault(session, []).append(index)
+        for session, first, end in self:
+            for index in (i for i in gone.get(session, ()) if first <= i < end):
+                if first < index:
+                    out.add_range((session, first, index))
+                first = index + 1
+            if first < end:
+                out.add_range((session, first, end))
+        return out
+
     def around(self, key: Key) -> Range | None:
         """The range that holds a submap, or None."""
         for first, end in self._ends.get(key[0], {}).items():

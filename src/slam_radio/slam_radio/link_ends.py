@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,7 @@ from slam_radio.inbox import Inbox
 from slam_radio.index_ranges import Key
 from slam_radio.link_state import LinkState
 from slam_radio.outbox import Outbox
-from slam_radio.packing.light_submap import lightened, write
+from slam_radio.packing.light_submap import pack
 from slam_radio.radio_config import RadioConfig
 from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_correction, unpack_want
 from slam_radio.uplink import Uplink
@@ -80,6 +80,15 @@ class End:
     def close(self) -> None:
         """Keep what waits and what has come for the next start."""
 
+    def tell_strangers(self, strangers: Mapping[Path, int], use: str) -> None:
+        """Say which files of before this program cannot read; they stay where they are."""
+        for folder, count in strangers.items():
+            self.node.health.count("files of another version", count)
+            self.node.get_logger().warning(
+                f"{count} files in {folder} are of another version of this program, or damaged: "
+                f"they are kept, and not {use}"
+            )
+
     def hear(self, key: str, handle: Callable[[str, bytes], None]) -> None:
         """Have messages under a key handled in the node's own thread; damaged ones are counted."""
 
@@ -107,12 +116,17 @@ class AgentEnd(End):
         config = node.config
         self.name = config.agents[0]
         outbox = Outbox(node.state_folder / "outbox" / self.name)
-        self.details = DetailStore(node.state_folder / "details" / self.name, config.resend_after_s)
+        self.details = DetailStore(
+            node.state_folder / "details" / self.name, config.bytes_per_second, config.resend_after_s,
+            1e6 * config.whole_megabytes,
+        )  # fmt: skip
         self.uplink = Uplink(
             outbox, config.bytes_per_second, config.resend_after_s, config.silent_after_s, self.details
         )
         self._odometry: Message | None = None
         self._T_map_odom: FloatArray | None = None
+        self.tell_strangers(outbox.strangers, "sent")
+        self.tell_strangers(self.details.strangers, "sent")
         if waiting := outbox.waiting:
             node.get_logger().info(f"{len(waiting)} submaps of before wait for the post")
         node.listen_together(SUBMAP_TOPICS, self.on_submap, latched=True, required=False, stamps=StampPolicy.ANY)
@@ -131,11 +145,13 @@ class AgentEnd(End):
             self.node.health.count("submaps sent again")
             return
         submap = replace(submap, agent=self.name)
-        light = lightened(submap, self.node.config.light)
-        message = write(light)
+        message = pack(submap, self.node.config.light)
         try:
-            if not self.details.keep(key, submap, light, message):
-                self.node.health.count("submaps whose details cannot be sent")
+            self.details.keep(key, submap, message)
+        except OSError as error:
+            self.node.health.count("submaps whose details cannot be kept")
+            self.node.get_logger().warning(f"details of submap {submap.index} cannot be kept: {error}")
+        try:
             self.uplink.add_submap(key, message, time.monotonic())
         except OSError as error:
             raise ValueError(f"submap {submap.index} cannot be kept for the post: {error}") from error
@@ -180,8 +196,11 @@ class AgentEnd(End):
 
     def state(self, now_s: float) -> LinkState:
         """Health of the link."""
-        self.node.health.take({"submaps waiting": len(self.uplink.outbox.waiting), "resent": self.uplink.resent,
-                               "details sent": self.details.sent})  # fmt: skip
+        counts = {
+            "submaps waiting": len(self.uplink.outbox.waiting), "resent": self.uplink.resent,
+            "details sent": self.details.sent, "details that cannot be told": self.details.damaged,
+        }  # fmt: skip
+        self.node.health.take(counts)
         return self.uplink.state(now_s)
 
     def close(self) -> None:
@@ -199,6 +218,8 @@ class PostEnd(End):
         inboxes = [Inbox(agent, node.state_folder / "inbox" / agent) for agent in config.agents]
         self.downlink = Downlink(inboxes, config.bytes_per_second, config.silent_after_s)
         self.publisher = SubmapPublisher(node, config.agents)
+        for inbox in inboxes:
+            self.tell_strangers(inbox.strangers, "passed on")
         for agent in config.agents:
             correction = partial(self.on_map_to_odom, agent)
             node.listen(
@@ -212,6 +233,7 @@ class PostEnd(End):
             self.hear(f"slam/{agent}/pose", partial(self.on_pose, agent))
             self.hear(f"slam/{agent}/submap/*/*", partial(self.on_submap, agent))
             self.hear(f"slam/{agent}/details/*/*", partial(self.on_details, agent))
+            self.hear(f"slam/{agent}/none", partial(self.on_none, agent))
             self.hear(f"slam/{agent}/backlog", partial(self.on_backlog, agent))
 
     def on_pose(self, agent: str, _: str, data: bytes) -> None:
@@ -227,6 +249,11 @@ class PostEnd(End):
         submaps = self.downlink.on_details(agent, submap_key(name), data, time.monotonic())
         self.publisher.pass_on(agent, submaps)
         self.node.health.count("details received")
+
+    def on_none(self, agent: str, _: str, data: bytes) -> None:
+        """An agent cannot tell some details: they are not asked for again, but with all others."""
+        if count := self.downlink.on_none(agent, data, time.monotonic()):
+            self.node.health.count("details that agents cannot tell", count)
 
     def on_undecided(self, message: Message) -> None:
         """The map cannot tell if some submaps are of one place: ask for all that their agents know of them."""

@@ -29,9 +29,9 @@ class Outbox:
         return sorted(self._folder.sizes)
 
     @property
-    def strangers(self) -> int:
-        """Files that look like submaps and are none of this program's."""
-        return self._folder.strangers
+    def strangers(self) -> dict[Path, int]:
+        """Files by folder that look like submaps and are of another version, or damaged."""
+        return {self._folder.path: self._folder.strangers} if self._folder.strangers else {}
 
     def size(self, key: Key) -> int:
         """Bytes of a submap that waits."""

@@ -49,6 +49,10 @@ class PeerEnd(End):
         inboxes = [Inbox(other, node.state_folder / "inbox" / other) for other in others]
         self.downlink = Downlink(inboxes, budget, config.silent_after_s)
         self.publisher = SubmapPublisher(node, config.agents)
+        for inbox in (self.own, *inboxes):
+            self.tell_strangers(inbox.strangers, "passed on")
+        for uplink in self.uplinks.values():
+            self.tell_strangers(uplink.outbox.strangers, "sent")
         self._pose: bytes | None = None
         source = f"{config.source}/" if config.source else ""
         own_topics = {f"{source}{topic}": kind for topic, kind in SUBMAP_TOPICS.items()}

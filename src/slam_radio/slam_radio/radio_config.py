@@ -31,6 +31,10 @@ class RadioConfig(Config):
         unit="s", minimum=0.5,
     )  # fmt: skip
     silent_after_s: float = parameter(10.0, "the other end counts as silent after this time", unit="s", minimum=3.0)
+    whole_megabytes: float = parameter(
+        500.0, "whole submaps that an agent keeps on disk for a post that asks for details; of older ones it keeps the "
+        "details packed, a thousandth of that", unit="MB", minimum=0.0,
+    )  # fmt: skip
     state_path: str = parameter(
         "radio", "folder of what waits and of what has come; a relative one below the user's state and the namespace"
     )

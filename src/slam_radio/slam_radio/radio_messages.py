@@ -11,6 +11,7 @@ correction       32 bytes: i64 stamp ns; 3 x f32 position m, 3 x f32 rotation ve
 acknowledgement  b"SA", u8 version, u32 CRC-32 of the rest; then ranges of 3 x u32: session, first index, the
                  index behind the last
 want             as an acknowledgement, with b"SW": submaps whose details the post lacks, all of them; none: no ranges
+none             as an acknowledgement, with b"SN": submaps of these whose details the agent cannot tell
 submap           u32: the lowest index of this session that its agent still has to send; then a submap for the
                  air (:mod:`slam_radio.packing.light_submap`)
 ===============  =============================================================================================
@@ -35,7 +36,7 @@ MOST_RANGES = 64
 _ACKNOWLEDGEMENT = struct.Struct("<2sBI")
 _RANGE = struct.Struct("<III")
 _FLOOR = struct.Struct("<I")
-_MAGIC, _WANT_MAGIC, _VERSION = b"SA", b"SW", 1
+_MAGIC, _WANT_MAGIC, _NONE_MAGIC, _VERSION = b"SA", b"SW", b"SN", 1
 _TURN = np.pi / 32767
 _LEAST_SIGMA, _LARGEST_SIGMA = 1e-4, 6e4
 _FARTHEST_M = 1e6
@@ -89,6 +90,16 @@ def pack_want(ranges: Iterable[Range]) -> bytes:
 def unpack_want(data: bytes) -> list[Range]:
     """Inverse of :func:`pack_want`; ValueError if it is damaged."""
     return _unpack_ranges(_WANT_MAGIC, data, "a want")
+
+
+def pack_none(ranges: Iterable[Range]) -> bytes:
+    """The first :data:`MOST_RANGES` ranges of submaps whose details the agent does not have."""
+    return _pack_ranges(_NONE_MAGIC, ranges)
+
+
+def unpack_none(data: bytes) -> list[Range]:
+    """Inverse of :func:`pack_none`; ValueError if it is damaged."""
+    return _unpack_ranges(_NONE_MAGIC, data, "a none")
 
 
 def _pack_ranges(magic: bytes, ranges: Iterable[Range]) -> bytes:

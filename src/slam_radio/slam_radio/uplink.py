@@ -13,20 +13,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from slam_core.health import State
-from slam_radio.byte_budget import ByteBudget
+from slam_radio.byte_budget import OVERHEAD, ByteBudget
 from slam_radio.detail_store import DetailStore
+from slam_radio.in_flight import InFlight
 from slam_radio.index_ranges import Key, Range
 from slam_radio.link_report import Backlog, pack_backlog
 from slam_radio.link_state import Carriage, Hearing, LinkState
 from slam_radio.outbox import Outbox
 from slam_radio.radio_messages import pack_submap
 
-OVERHEAD = 150
-"""Bytes on the wire beside a message's own: key, headers of Zenoh, TCP and IP, and the other side's TCP answer."""
 _POSE_PERIOD_S = 1.0
-_WINDOW_S = 4.0
-"""So many seconds of the budget, or one submap, may be under way."""
-_LONGEST_WAIT_S = 60.0
 _BACKLOG_PERIOD_S = 5.0
 _BACKLOG_REMINDER_S = 30.0
 _LEAST_WAIT_S = 2.0
@@ -35,7 +31,7 @@ _LEAST_WAIT_S = 2.0
 
 @dataclass(frozen=True)
 class Outgoing:
-    """A message to send: ``kind`` pose, submap, details or backlog, ``key`` of a submap."""
+    """A message to send: ``kind`` pose, submap, details, none or backlog, ``key`` of a submap."""
 
     kind: str
     data: bytes
@@ -45,12 +41,6 @@ class Outgoing:
     def path(self) -> str:
         """The end of its key expression."""
         return self.kind if self.key is None else f"{self.kind}/{self.key[0]}/{self.key[1]}"
-
-
-@dataclass
-class _Sent:
-    tries: int
-    due_s: float
 
 
 class Uplink:
@@ -75,17 +65,20 @@ class Uplink:
         details: DetailStore | None = None,
     ) -> None:  # fmt: skip
         self.outbox, self.details = outbox, details
-        self.resent = 0
         self._budget = budget if isinstance(budget, ByteBudget) else ByteBudget(budget)
-        self._resend_after_s = resend_after_s
+        self._flight = InFlight(self._budget.bytes_per_second, resend_after_s)
         self._hearing = Hearing(silent_after_s)
         self._carriage = Carriage()
         self._pose: bytes | None = None
         self._pose_due_s = float("-inf")
-        self._sent: dict[Key, _Sent] = {}
         self._since_s: dict[Key, float] = {}
         self._told: Backlog | None = None
         self._told_at_s = float("-inf")
+
+    @property
+    def resent(self) -> int:
+        """Submaps that went out again."""
+        return self._flight.resent
 
     def set_pose(self, data: bytes) -> None:
         """Replace the pose that goes out next."""
@@ -103,15 +96,14 @@ class Uplink:
 
     def on_acknowledgement(self, ranges: Iterable[Range], now_s: float) -> None:
         """The post is there, and has these submaps."""
-        if not self._hearing.is_up(now_s):  # what is under way may have been lost: it need not wait for long any more
-            for sent in self._sent.values():
-                sent.due_s, sent.tries = min(sent.due_s, now_s + self._resend_after_s), 1
+        if not self._hearing.is_up(now_s):
+            self._flight.hurry(now_s)
             if self.details is not None:
                 self.details.hurry(now_s)
         self.on_heard(now_s)
         sizes = {key: self.outbox.size(key) for key in self.outbox.waiting}
         for key in self.outbox.acknowledge(ranges):
-            self._sent.pop(key, None)
+            self._flight.landed(key)
             self._since_s.pop(key, None)
             self._carriage.carried(sizes[key] + OVERHEAD, now_s)
 
@@ -127,12 +119,16 @@ class Uplink:
         return out + self.due_backlog(now_s) + self.due_details(now_s)
 
     def due_details(self, now_s: float) -> list[Outgoing]:
-        """Details that the post wants, while no submap waits."""
+        """Details that the post wants, and which there are not, while no submap waits."""
         out: list[Outgoing] = []
         if self.details is None or self.outbox.waiting or not self._hearing.is_up(now_s):
             return out
+        if (none := self.details.none()) is not None and self._budget.allows(len(none) + OVERHEAD, now_s):
+            self._budget.spend(len(none) + OVERHEAD)
+            self.details.none_is_sent()
+            out.append(Outgoing("none", none))
         while (key := self.details.ready(now_s)) is not None:
-            size = self.details.folder.sizes[key] + OVERHEAD
+            size = self.details.size(key)
             if not self._budget.allows(size, now_s):
                 break
             if (data := self.details.take(key, now_s)) is not None:
@@ -153,11 +149,8 @@ class Uplink:
         """The submap that goes out next, as soon as the budget allows; None while there is none or the post is away."""
         if not self._hearing.is_up(now_s):
             return None
-        under_way = self._under_way(now_s)
-        waits = (key for key in self.outbox.waiting if key not in self._sent or self._sent[key].due_s <= now_s)
-        key = next(waits, None)
-        window = _WINDOW_S * self._budget.bytes_per_second
-        return None if key is None or (under_way and under_way + self._wire_size(key) > window) else key
+        key = next((key for key in self.outbox.waiting if self._flight.is_due(key, now_s)), None)
+        return key if key is not None and self._flight.fits(self._wire_size(key), now_s) else None
 
     def affords(self, key: Key, now_s: float) -> bool:
         """True if the budget allows a submap."""
@@ -167,11 +160,7 @@ class Uplink:
         """The message of a submap, which goes out now."""
         message = Outgoing("submap", pack_submap(*self.outbox.read(key)), key)
         self._budget.spend(self._wire_size(key))
-        under_way = self._under_way(now_s) + self._wire_size(key)
-        tries = self._sent[key].tries + 1 if key in self._sent else 1
-        self.resent += tries > 1
-        wait = min(self._resend_after_s * 2.0 ** (tries - 1), _LONGEST_WAIT_S)
-        self._sent[key] = _Sent(tries, now_s + wait + under_way / self._budget.bytes_per_second)
+        self._flight.sent(key, self._wire_size(key), now_s)
         return message
 
     def due_backlog(self, now_s: float) -> list[Outgoing]:
@@ -212,10 +201,6 @@ class Uplink:
     def _oldest_s(self, now_s: float) -> float:
         """Time that the oldest submap has waited."""
         return max((now_s - self._since_s.setdefault(key, now_s) for key in self.outbox.waiting), default=0.0)
-
-    def _under_way(self, now_s: float) -> int:
-        """Bytes of submaps whose acknowledgement may still come."""
-        return sum(self._wire_size(key) for key, sent in self._sent.items() if sent.due_s > now_s)
 
     def _wire_size(self, key: Key) -> int:
         return self.outbox.size(key) + OVERHEAD

@@ -69,7 +69,7 @@ class KeyPoses:
         return cls(begins, ends, inner)
 
     def bytes(self) -> bytes:
-        """What :meth:`read` reads."""
+        """The bytes that :meth:`read` takes."""
         return b"".join(
             struct.pack("<q", stamp) + tangent_of(T).tobytes() + sigmas.astype("<f2").tobytes()
             for stamp, T, sigmas in self.inner
