@@ -302,6 +302,21 @@ def test_details_whose_file_is_gone_are_left_out(world):
     assert world.inbox.wanted == set()
 
 
+def test_packed_details_whose_file_is_gone_are_answered_too(world):
+    world.run(5.0)
+    world.submap(0)
+    world.run(10.0)
+    store = world.uplink.details
+    store.want([(2, 0, 1)])
+    assert store.ready(world.now_s) == (2, 0)
+    (store.folder.path / "2-0.submap").unlink()
+    store.want([])
+    world.inbox.ask()
+    world.run(1.0)
+    assert world.told_none == [1]
+    assert world.inbox.wanted == set()
+
+
 def test_many_that_an_agent_lacks_do_not_keep_others_waiting(world):
     """A message names 64 ranges; of more wanted ones others come each time."""
     world.run(5.0)

@@ -104,6 +104,7 @@ class DetailStore:
     def _give_up(self, key: Key) -> None:
         """The post is to know that these do not come."""
         self._wanted.remove(key)
+        self.folder.sizes.pop(key, None)
         self._none.add(key)
 
     def _pack(self, key: Key) -> bool:
