@@ -109,7 +109,8 @@ class ClosureJoiner:
                 if test.helps(before, after, record):
                     self.estimate.accept(after)
                     continue
-            neighbours = [k for k in links_of(before, record) if not k.is_closure]
+            positions = before.graph.is_position
+            neighbours = [k for k in links_of(before, record) if not (k.is_closure or positions[k.second])]
             self._keep_overconfidence(record)
             if neighbours:
                 self.estimate.accept(updated(self.estimate.state, record, [], neighbours, self.estimate.config))

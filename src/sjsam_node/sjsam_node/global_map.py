@@ -12,7 +12,8 @@ comes from a :class:`~sjsam_node.smoothing.map_snapshot.MapSnapshot`, which stay
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import overload
 
@@ -21,28 +22,30 @@ import numpy as np
 from sjsam_node import storage
 from sjsam_node.agents import Agents, in_order
 from sjsam_node.closure_joining import ClosureJoiner, grouped
+from sjsam_node.global_map_config import GlobalMapConfig as GlobalMapConfig
 from sjsam_node.graph.links import Link, Status
-from sjsam_node.graph.map_graph import BUILDING
+from sjsam_node.graph.map_graph import BUILDING, POSITIONS
 from sjsam_node.graph.offload import Offload
+from sjsam_node.join_report import JoinReport as JoinReport
 from sjsam_node.loop_closure.comparing import RecordComparisons
-from sjsam_node.loop_closure.consistency import ConsistencyConfig, Verdict
+from sjsam_node.loop_closure.consistency import Verdict
 from sjsam_node.loop_closure.detector import LoopDetector
-from sjsam_node.loop_closure.verification import LINKED_SUBMAPS, ClosureConfig
+from sjsam_node.loop_closure.verification import LINKED_SUBMAPS
 from sjsam_node.marks import Marks
+from sjsam_node.positions.antenna import seen_inside, with_antenna
+from sjsam_node.positions.position_links import PositionLinks, readings_of, without_antenna
 from sjsam_node.refining import lacking, refined
 from sjsam_node.regions.tasks import Tasks
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.smoothing.map_snapshot import InnerPaths, MapLandmarks, MapSnapshot
-from sjsam_node.smoothing.solver import SmootherConfig
+from sjsam_node.smoothing.solver import updated
 from sjsam_node.smoothing.state import EstimateState
 from sjsam_node.storage import StoredMap
 from sjsam_node.submap_check import fault_of
-from sjsam_node.tags.known_tags import KnownTagsConfig, building_submap
+from sjsam_node.tags.known_tags import building_submap
 from sjsam_node.tags.tag_links import TagLinks, is_against_tags, with_tag_links
-from slam_core.config import Config, group, parameter
-from slam_core.estimation.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, invert_transform
-from slam_core.types import Counters, PoseEstimate, Submap
+from slam_core.types import Counters, PoseEstimate, PositionReading, Submap
 
 ALREADY_JOINED = "already joined"
 
@@ -55,53 +58,6 @@ _COMPARED_AT_SETTLING = 2
 """Such pairs compared per submap when the map settles."""
 _UNLINKED_SIGMA = 100.0
 """Standard deviation given to poses of a stretch that nothing ties to the map yet (m)."""
-
-
-@dataclass(frozen=True)
-class GlobalMapConfig(Config):
-    """The joined map."""
-
-    joined_at_once: int = 12
-    """Closures found when the map settles that are joined, and refused, together."""
-    ties: int = parameter(8, "landmarks by which two submaps are tied together, at most", minimum=3)
-    redundant_share: float = parameter(
-        0.6, "share of a submap's landmarks that closures match from which on it shows nothing new", minimum=0.0
-    )
-    redundant_matches: int = 24
-    """Least number of these landmarks."""
-    smoothing: SmootherConfig = group(SmootherConfig)
-    closure: ClosureConfig = group(ClosureConfig)
-    consistency: ConsistencyConfig = group(ConsistencyConfig)
-    calibration: CalibrationErrorConfig = group(CalibrationErrorConfig)
-    tags: KnownTagsConfig = group(KnownTagsConfig)
-
-
-@dataclass(frozen=True, eq=False)
-class JoinReport:
-    """Report on one submap.
-
-    accepted with reason otherwise; matched: its landmarks already in the map; new_landmarks; closures: links accepted
-    now, as (agent, index) of the older submap; dropped: matches let go; components: parts of the map that hang
-    together; chi2, variance_factor, iterations, converged and solver of the update; redundant: it shows nothing new;
-    is_strained: the submaps contradict each other by more than ``consistency.max_variance_factor``; is_refined: further
-    landmarks of one that was joined.
-    """
-
-    accepted: bool
-    reason: str = ""
-    matched: int = 0
-    new_landmarks: int = 0
-    closures: tuple[tuple[str, int], ...] = ()
-    dropped: int = 0
-    components: int = 0
-    chi2: float = 0.0
-    variance_factor: float = 1.0
-    iterations: int = 0
-    converged: bool = True
-    solver: str = ""
-    redundant: bool = False
-    is_strained: bool = False
-    is_refined: bool = False
 
 
 class GlobalMap:
@@ -135,6 +91,7 @@ class GlobalMap:
             self.detector.compare = RecordComparisons(self.estimate, self.config.closure, self._tasks)
         self.closures = ClosureJoiner(self.estimate, self.config.consistency, self.config.closure)
         self.tags = TagLinks(self.estimate, self.detector.verifier)
+        self.positions = PositionLinks(self.estimate, self.detector.verifier, self.counters)
         self.detector.is_refuted = lambda *pair_and_found: is_against_tags(self.estimate.graph, *pair_and_found)
         self._inner_paths = InnerPaths()
 
@@ -148,8 +105,11 @@ class GlobalMap:
         marks = Marks(list(self.marks.marks))
         return MapSnapshot(self.state, _UNLINKED_SIGMA, self.config.calibration, marks, self._inner_paths)
 
-    def add(self, submap: Submap) -> JoinReport:
-        """Join one submap; a faulty one is refused with the reason, counted, and changes nothing."""
+    def add(self, submap: Submap, readings: Sequence[PositionReading] = ()) -> JoinReport:
+        """Join one submap; a faulty one is refused with the reason, counted, and changes nothing.
+
+        ``readings``: positions in a fixed frame that were measured inside it.
+        """
         reason = self._rejection(submap)
         if reason == ALREADY_JOINED and (known := lacking(self.estimate.graph, submap)) is not None:
             return self._refine(known, submap)
@@ -159,7 +119,10 @@ class GlobalMap:
         self._is_out_of_order |= self._is_settled and bool(self.estimate.graph.records)
         self._is_settled = False
         self._place_building(submap.descriptors.shape[1])
+        readings = seen_inside(submap, readings)
+        submap = with_antenna(submap, readings, np.array(self.config.position.lever_arm))
         new = self._place(submap)
+        self.positions.add(new, readings)
         chain = self.agents.chain(new)
         self.estimate.add_links(with_tag_links(self.detector.sequential(chain, new), self.tags.sequential(chain, new)))
         matched = self.estimate.graph.shared_by(new)
@@ -167,6 +130,7 @@ class GlobalMap:
             found = with_tag_links(self.detector.closures(chain, new), self.tags.closures(chain, new))
             if self._has_moved:
                 found += self.detector.missed(self.agents.chained, _COMPARED_AT_ONCE)
+        self._join_positions(new, before_others=bool(found))
         self._judge_redundancy(new, found)
         verdict = self.closures.join_closures(found, new)
         self._account(verdict, len(found))
@@ -193,6 +157,14 @@ class GlobalMap:
         self._has_moved |= bool(verdict.accepted)
         return JoinReport(True, "", 0, len(submap.landmarks) - before, self._named(verdict.accepted),
                           components=self.components, is_refined=True)  # fmt: skip
+
+    def _join_positions(self, new: int, *, before_others: bool) -> None:
+        """Take in what has been measured in a fixed frame; ``before_others``: closures are judged by what it says."""
+        made = self.positions.join(new)
+        for record in made:
+            self.agents.add(record)
+        if made and before_others:
+            self.estimate.accept(updated(self.estimate.state, new, [], [], self.estimate.config))
 
     def _judge_redundancy(self, new: int, found: list[Link]) -> None:
         """A submap of a place that the map knows well adds few unknowns, and nothing is compared with it later."""
@@ -320,23 +292,30 @@ class GlobalMap:
 
         The map itself where they came in that order, and nothing was settled on the way; otherwise all are joined anew.
         """
-        submaps, rebuilt = [r.submap for r in self.estimate.graph.records], self
+        submaps, rebuilt = [r.submap for r in self.estimate.graph.records if not r.is_position], self
         ordered = in_order(submaps)
         if self._is_out_of_order or ordered != submaps:
             rebuilt = GlobalMap(self.config, self._tasks)
             for submap in ordered:
-                rebuilt.add_again(submap)
-            rebuilt.counters = self.counters
+                rebuilt.add_again(without_antenna(submap), self._readings_in(submap))
+            rebuilt.counters.counts = self.counters.counts
             rebuilt.marks = self.marks_in(rebuilt)
         rebuilt.settle()
         return rebuilt
 
-    def add_again(self, submap: Submap) -> None:
+    def _readings_in(self, submap: Submap) -> tuple[PositionReading, ...]:
+        """The positions inside a submap that were not refused."""
+        record = self.agents.record(submap.agent, submap.session, submap.index)
+        made = self.agents.record(POSITIONS + submap.agent, submap.session, submap.index)
+        waiting = () if record is None else self.positions.waiting.get(record, ())
+        return waiting if made is None else readings_of(self.estimate.graph.records[made].submap)
+
+    def add_again(self, submap: Submap, readings: Sequence[PositionReading] = ()) -> None:
         """Join a submap that was in a map before; the tags of the building are placed as they were."""
         if submap.agent == BUILDING:
             self._place(submap)
         else:
-            self.add(submap)
+            self.add(submap, readings)
 
     def marks_in(self, other: GlobalMap) -> Marks:
         """The marks of this map, on the nodes of another one of the same submaps."""
@@ -387,7 +366,9 @@ class GlobalMap:
 
     def _restore(self, stored: StoredMap) -> None:
         """Go on from a map that was put away."""
+        waiting = self.positions.waiting
         self._take(stored.state)
+        self.positions.waiting = waiting
         self._is_settled, self._is_out_of_order = not stored.state.graph.records, stored.is_out_of_order
         self.marks, self.closures.refused = stored.marks, stored.refused
         self.detector.pending, self.detector.near.compared = stored.pending, stored.compared

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sjsam_node.graph.map_graph import BUILDING
+from sjsam_node.graph.map_graph import BUILDING, POSITIONS
 from slam_core.geometry import is_rigid_transform
 from slam_core.messages.poses import FARTHEST_M
 from slam_core.types import Submap
@@ -16,8 +16,8 @@ SMALLEST_VARIANCE = 1e-15
 
 def fault_of(submap: Submap) -> str:
     """Reason for which no map can take a submap; empty if there is none."""
-    if submap.agent == BUILDING:
-        return f"no agent may be called {BUILDING}"
+    if submap.agent == BUILDING or submap.agent.startswith(POSITIONS):
+        return f"no agent may be called {BUILDING}, or begin with {POSITIONS}"
     if not (np.all(np.isfinite(submap.covariance)) and np.all(np.isfinite(submap.landmarks))):
         return "not finite"
     if np.abs(submap.landmarks).max(initial=0.0) > FARTHEST_M:

@@ -31,12 +31,12 @@ def corner_ids(tags: Sequence[int] | IntArray) -> IntArray:
 
 def is_tag_corner(ids: npt.NDArray[np.integer]) -> BoolArray:
     """Mask (n,) of the ids that are of corners of tags."""
-    return np.asarray(ids < 0)
+    return np.asarray((ids < 0) & (ids >= -CORNERS * LARGEST_TAG))
 
 
 def whole_tags(ids: npt.NDArray[np.integer]) -> dict[int, IntArray]:
     """Rows of the four corners of each tag among ids (n,), by tag; a tag without one of them is left out."""
-    at = {int(value): k for k, value in enumerate(ids.tolist()) if value < 0}
+    at = {int(ids[k]): k for k in np.nonzero(is_tag_corner(ids))[0].tolist()}
     tags = sorted({(-1 - value) // CORNERS for value in at})
     wanted = {tag: corner_ids([tag]).tolist() for tag in tags}
     return {tag: np.array([at[i] for i in own]) for tag, own in wanted.items() if all(i in at for i in own)}

@@ -232,6 +232,18 @@ class OdometryReading:
 
 
 @dataclass(frozen=True, eq=False)
+class PositionReading:
+    """Position (3,) m of an antenna in a fixed frame of its own, as UWB or GNSS has it; covariance (3, 3) as reported.
+
+    The covariance may be zero, huge or not finite.
+    """
+
+    stamp_ns: int
+    position: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Submap:
     """A local map as one joint Gaussian, in the frame of its own first rig pose, ``<agent>/submap_<index>``.
 

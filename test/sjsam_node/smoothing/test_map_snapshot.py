@@ -9,7 +9,8 @@ from judging import errors, join
 from submap_world import Agent, circle, ring_world
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
-from sjsam_node.smoothing.map_snapshot import STILL, _moving, _smoothing
+from sjsam_node.smoothing.inner_poses import smoothing_gains
+from sjsam_node.smoothing.map_snapshot import STILL, _moving
 from slam_core.estimation.calibration_error import CalibrationErrorConfig
 from slam_core.geometry import FloatArray, make_transform
 from slam_core.types import PoseEstimate, Submap
@@ -54,7 +55,7 @@ def test_a_pose_is_corrected_by_the_end_only_as_far_as_the_two_share_errors(rng:
     frame_noise, step_noise = A @ A.T + np.eye(6), np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
     submap = walk(5, frame_noise, step_noise)
     for k in (1, 3):
-        (gain,), (remaining,) = _smoothing(submap, [submap.path[k]])
+        (gain,), (remaining,) = smoothing_gains(submap, [submap.path[k]])
         shared = frame_noise + (k - 0.5) * step_noise  # half of the first step counts as noise of its frame
         expected = shared @ np.linalg.inv(submap.covariance[:6, :6])
         assert np.allclose(gain, expected)
@@ -66,7 +67,7 @@ def test_a_pose_less_sure_than_the_end_is_moved_no_farther_than_the_end(rng: np.
     A = rng.normal(size=(6, 6))
     submap = replace(walk(6, 1e-6 * np.eye(6), A @ A.T + np.eye(6)), covariance=0.01 * (A @ A.T + np.eye(6)))
     for k in (2, 4):
-        (gain,), (remaining,) = _smoothing(submap, [submap.path[k]])
+        (gain,), (remaining,) = smoothing_gains(submap, [submap.path[k]])
         assert np.allclose(gain, np.eye(6))
         assert np.allclose(remaining, submap.path[k].covariance - submap.covariance)
 
@@ -74,7 +75,7 @@ def test_a_pose_less_sure_than_the_end_is_moved_no_farther_than_the_end(rng: np.
 def test_the_ends_of_a_submap_are_the_skeleton_itself() -> None:
     submap = walk(4, np.eye(6), 0.1 * np.eye(6))
     for pose, gain in ((submap.path[0], np.zeros((6, 6))), (submap.path[-1], np.eye(6))):
-        (found,), (remaining,) = _smoothing(submap, [pose])
+        (found,), (remaining,) = smoothing_gains(submap, [pose])
         assert np.array_equal(found, gain)
         assert not remaining.any()
 
@@ -83,7 +84,7 @@ def test_a_correction_turns_about_the_lever_arm_of_what_is_left_of_the_way() -> 
     submap = walk(4, 1e-9 * np.eye(6), np.eye(6))
     moved = make_transform(np.eye(3), np.array([1.0, 0.0, 0.0]))
     submap = replace(submap, end_pose=moved, path=(*submap.path[:-1], replace(submap.path[-1], T=moved)))
-    (gain,), _ = _smoothing(submap, [submap.path[2]])
+    (gain,), _ = smoothing_gains(submap, [submap.path[2]])
     lever = np.eye(6)
     lever[1, 5], lever[2, 4] = 1.0, -1.0  # turns about z and y move a point 1 m ahead
     assert gain @ submap.covariance[:6, :6] == pytest.approx(1.5 * lever.T)

@@ -29,6 +29,9 @@ from slam_core.types import Submap
 
 BUILDING = "building"
 """Agent whose only submap are the tags of which it is known where they are (:mod:`sjsam_node.tags.known_tags`)."""
+POSITIONS = "position/"
+"""What the agents are called, before the name of the agent whose they are, whose submaps are positions in a fixed frame
+(:mod:`sjsam_node.positions`)."""
 ALL = 1 << 30
 """Landmark budget of two submaps that all the landmarks which they share are to connect."""
 
@@ -48,9 +51,17 @@ class Record:
         return self.submap.agent, self.submap.session, self.submap.index
 
     @property
-    def frame_order(self) -> tuple[bool, tuple[str, int, int]]:
-        """Sort key: the first record of a component defines its frame, the building's before all others."""
-        return self.submap.agent != BUILDING, self.key
+    def frame_order(self) -> tuple[int, tuple[str, int, int]]:
+        """Sort key: the first record of a component defines its frame, the building's before all others.
+
+        Positions define none.
+        """
+        return 0 if self.submap.agent == BUILDING else 2 if self.is_position else 1, self.key
+
+    @property
+    def is_position(self) -> bool:
+        """True if it holds positions in a fixed frame, and nothing that a camera saw."""
+        return self.submap.agent.startswith(POSITIONS)
 
     @cached_property
     def observations(self) -> IntArray:
@@ -95,6 +106,8 @@ class MapGraph:
         Where the nodes are by odometry alone.
     point_covariances
         Of each observation in its submap, (observations, 3, 3).
+    is_position
+        Mask of those that hold positions in a fixed frame, (records,).
     budgets
         Most landmarks by which each record is connected to another one, (records,).
     least_budget
@@ -109,6 +122,7 @@ class MapGraph:
     ending_at: IntArray = field(default_factory=no_indices)
     odometry: Odometry = field(default_factory=Odometry)
     point_covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
+    is_position: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     budgets: IntArray = field(default_factory=no_indices)
     least_budget: int = 0
     _matches: LinkedPairs = field(default_factory=LinkedPairs)
@@ -130,9 +144,10 @@ class MapGraph:
         n, k = len(submap.landmarks), np.arange(len(submap.landmarks))
         own = submap.covariance[6:, 6:].reshape(n, 3, n, 3)[k, :, k, :]
         middle = np.median(submap.landmarks, axis=0) if n else np.zeros(3)
+        record = Record(submap, start, end, len(self.record_of))
         return replace(
             self,
-            records=(*self.records, Record(submap, start, end, len(self.record_of))),
+            records=(*self.records, record),
             sets=self.sets.with_submap(n, number),
             starts=np.append(self.starts, start),
             ends=np.append(self.ends, end),
@@ -142,6 +157,7 @@ class MapGraph:
                 float(odometry.path_length[start]) + step,
             ),
             point_covariances=np.concatenate([self.point_covariances, own]),
+            is_position=np.append(self.is_position, record.is_position),
             budgets=np.append(self.budgets, budget),
             least_budget=0,
             _rank=np.append(self._rank, spread_order(submap.landmarks)),

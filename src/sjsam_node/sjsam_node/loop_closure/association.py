@@ -192,6 +192,23 @@ def _compatible(
         pairs = np.delete(pairs, np.argsort(solved.nis)[-count:], axis=0)
 
 
+def agreeing(
+    first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig
+) -> Alignment:
+    """Alignment by the pairs that are left when the worst is dropped until none stands out; none if all together do.
+
+    Covariances and prior are believed as they are, unlike those of submaps.
+    """
+    while True:
+        solved = _solve(first, second, pairs, prior, config)
+        if len(pairs) and solved.nis.max() > chi_square_bound(GATE_PROBABILITY, 3):
+            pairs = np.delete(pairs, int(np.argmax(solved.nis)), axis=0)
+        elif solved.chi2 > chi_square_bound(GATE_PROBABILITY, max(solved.dof, 1)):
+            pairs = pairs[:0]
+        else:
+            return solved.alignment(pairs)
+
+
 def nis_one_by_one(
     first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig
 ) -> FloatArray:

@@ -18,6 +18,7 @@ from sjsam_node.graph.links import Prior
 from sjsam_node.loop_closure.association import Alignment, PointSet
 from sjsam_node.loop_closure.verification import Verifier
 from sjsam_node.merging.union import Union
+from sjsam_node.thinning import thinned
 from slam_core.geometry import transform_points
 from slam_core.linear_algebra.block_pattern import IntArray
 from slam_core.types import Submap
@@ -64,7 +65,7 @@ def without(union: Union, moved: Sequence[Moved]) -> Union:
         np.nonzero(~np.isin(names, sorted(gone.get(source, ()))) | (submap.landmark_ids < 0))[0]
         for submap, names, source in zip(union.submaps, union.landmarks, union.source, strict=True)
     ]
-    submaps = tuple(_thinned(submap, k) for submap, k in zip(union.submaps, kept, strict=True))
+    submaps = tuple(thinned(submap, k) for submap, k in zip(union.submaps, kept, strict=True))
     landmarks = tuple(names[k] for names, k in zip(union.landmarks, kept, strict=True))
     return replace(union, submaps=submaps, landmarks=landmarks, notes=(*union.notes, *_notes(union, moved)))
 
@@ -72,21 +73,6 @@ def without(union: Union, moved: Sequence[Moved]) -> Union:
 def _names(union: Union, one: Moved) -> list[int]:
     """The landmarks of the earlier map that its submaps know the moved ones as."""
     return [int(name) for name in union.landmarks[one.earlier][one.landmarks]]
-
-
-def _thinned(submap: Submap, kept: IntArray) -> Submap:
-    """The submap with some of its landmarks; the others are marginalised out."""
-    if len(kept) == len(submap.landmarks):
-        return submap
-    rows = np.concatenate([np.arange(6), (6 + 3 * kept[:, None] + np.arange(3)).ravel()])
-    return replace(
-        submap,
-        landmarks=submap.landmarks[kept],
-        covariance=submap.covariance[np.ix_(rows, rows)],
-        landmark_ids=submap.landmark_ids[kept],
-        sightings=submap.sightings[kept],
-        descriptors=submap.descriptors[kept],
-    )
 
 
 def _notes(union: Union, moved: Sequence[Moved]) -> list[str]:

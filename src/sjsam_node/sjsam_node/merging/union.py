@@ -125,13 +125,17 @@ class _Taken:
 
     def add(self, number: int, one: NamedMap) -> None:
         """Take a map over."""
-        digests = {r.key: _digest(r.submap) for r in one.records}
+        digests = {r.key: _digest(r.submap) for r in one.records if not r.is_position}
         shared = {key: self.keys[digest] for key, digest in digests.items() if digest in self.keys}
-        if len(shared) == len(one.records):
+        if len(shared) == len(digests):
             self.notes.append(f"{one.name}: all its submaps are in the others; it adds nothing")
+        if len(digests) < len(one.records):
+            self.notes.append(f"{one.name}: its positions in a fixed frame are not used")
         names = self._renamed(one, shared)
         at: dict[int, tuple[Key, bool]] = {}
         for k, record in enumerate(one.records):
+            if record.is_position:
+                continue
             submap = replace(record.submap, agent=names.get(record.key[:2], record.submap.agent))
             key = shared.get(record.key, _key(submap))
             at[record.start], at[record.end] = at.get(record.start, (key, False)), (key, True)
@@ -166,7 +170,7 @@ class _Taken:
         """
         taken = {key[:2] for key in self.submaps}
         known = {key[:2]: there[0] for key, there in shared.items()}
-        new = {r.key[:2] for r in one.records} - known.keys()
+        new = {r.key[:2] for r in one.records if not r.is_position} - known.keys()
         clashes = {agent for agent, _ in new & taken}
         if BUILDING in clashes:
             raise ValueError(f"{one.name} knows other tags of the building than another map")

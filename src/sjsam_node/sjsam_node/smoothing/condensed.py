@@ -34,6 +34,7 @@ class Active:
         ends = np.concatenate([graph.starts[takes_part], graph.ends[takes_part]])
         open_end = np.ones(len(graph.ending_at), dtype=bool)
         open_end[graph.starts] = False
+        open_end[graph.ends[graph.is_position]] = False
         uses = np.bincount(ends, minlength=len(graph.ending_at)) + 2 * open_end
         return cls(np.asarray(seen[graph.variable_of]), np.asarray(uses))
 

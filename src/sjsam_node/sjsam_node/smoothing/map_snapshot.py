@@ -17,8 +17,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sjsam_node.graph.map_graph import BoolArray, MapGraph, Record
+from sjsam_node.graph.map_graph import POSITIONS, BoolArray, MapGraph, Record
 from sjsam_node.marks import Marks
+from sjsam_node.smoothing.inner_poses import positive, smoothing_gains, transposed
 from sjsam_node.smoothing.marginals import ComponentMarginals
 from sjsam_node.smoothing.state import EstimateState
 from slam_core.estimation.calibration_error import (
@@ -26,16 +27,9 @@ from slam_core.estimation.calibration_error import (
     covariance_of_calibration,
     point_covariances_of_calibration,
 )
-from slam_core.geometry import (
-    FloatArray,
-    boxminus,
-    boxplus,
-    compose_jacobians,
-    inverse_jacobian,
-    invert_transform,
-    skew,
-)  # fmt: skip
+from slam_core.geometry import FloatArray, boxminus, boxplus, compose_covariance, compose_jacobians, inverse_jacobian, invert_transform
 from slam_core.linear_algebra.sparse_cholesky import IntArray
+from sjsam_node.positions.position_ids import is_position_id
 from slam_core.types import ORIGIN_SIGMA, Float32Array, PoseEstimate, Submap
 
 ADVICE = (
@@ -77,7 +71,7 @@ class _Stacked:
     def with_one(self, submap: Submap) -> _Stacked:
         kept = _moving(submap.path)
         poses = np.concatenate([self.poses, [p.T for p in kept]])
-        gains = np.concatenate([self.gains, _smoothing(submap, kept)[0]])
+        gains = np.concatenate([self.gains, smoothing_gains(submap, kept)[0]])
         return _Stacked([*self.count, len(kept)], [*self.inside, *kept], poses, gains)
 
 
@@ -217,6 +211,20 @@ class MapSnapshot:
         r = self._state.graph.records[record]
         return PoseEstimate(r.submap.end_stamp_ns, self.poses[r.end], self._covariance(r.end))
 
+    @property
+    def submap_count(self) -> int:
+        """Number of submaps that cameras made, without positions in a fixed frame."""
+        return len(self) - int(np.count_nonzero(self._state.graph.is_position))
+
+    def fixed_frame(self) -> PoseEstimate | None:
+        """T_map_frame of the fixed frame that positions are in, with covariance, as of the last one; None without."""
+        numbers = np.nonzero(self._state.graph.is_position & self.is_tied)[0]
+        if not len(numbers):
+            return None
+        start, submap = self.start(int(numbers[-1])), self.submaps[numbers[-1]]
+        covariance = compose_covariance(start.T, start.covariance, submap.end_pose, np.zeros((6, 6)))
+        return PoseEstimate(submap.end_stamp_ns, start.T @ submap.end_pose, covariance)
+
     # -- poses and landmarks -------------------------------------------------------------------------------------------
 
     def path(self) -> dict[str, list[PoseEstimate]]:
@@ -234,7 +242,7 @@ class MapSnapshot:
         agents = [r.submap.agent for r, n in zip(records, stacked.count, strict=True) for _ in range(n)]
         for agent, p, T in zip(agents, stacked.inside, poses, strict=True):
             parts.setdefault(agent, []).append(PoseEstimate(p.stamp_ns, T, p.covariance))
-        return {agent: _unique_stamps(part) for agent, part in sorted(parts.items())}
+        return {agent: _unique_stamps(part) for agent, part in sorted(parts.items()) if not agent.startswith(POSITIONS)}
 
     def trajectory(self, since: int = 0) -> dict[str, list[PoseEstimate]]:
         """Poses of every agent in records from number ``since`` on, in the order of their stamps, with covariances.
@@ -246,10 +254,10 @@ class MapSnapshot:
         out: dict[str, list[PoseEstimate]] = {}
         for component in self._state.components():
             marginals, widening = self._state.marginals(component), self._widening(component)
-            for i in (i for i in marginals.records if i >= since):
+            for i in (i for i in marginals.records if i >= since and not self._state.graph.is_position[i]):
                 record = self._state.graph.records[i]
                 poses, covariances = _with_covariances(
-                    self.poses, record, marginals, i, *_smoothing(record.submap, record.submap.path)
+                    self.poses, record, marginals, i, *smoothing_gains(record.submap, record.submap.path)
                 )
                 covariances += np.array([covariance_of_calibration(T, self.calibration) for T in poses])
                 own = record.submap.path
@@ -269,6 +277,7 @@ class MapSnapshot:
         state, graph = self._state, self._state.graph
         ids, counts = np.unique(graph.landmark_of, return_counts=True)
         kept = (counts > 1) | ~state.redundant[graph.record_of[ids]]
+        kept &= ~is_antenna(graph)[ids]
         ids, counts = ids[kept], counts[kept]
         rows = _estimated(graph)[ids]
         component = state.component_of[graph.starts[graph.record_of[rows]]]
@@ -286,6 +295,12 @@ class MapSnapshot:
         if component == self._state.component(0):
             return np.asarray(ORIGIN_SIGMA**2 * np.eye(6))
         return np.diag(np.square([*[self.unlinked_sigma] * 3, np.pi, np.pi, np.pi]))
+
+
+def is_antenna(graph: MapGraph) -> BoolArray:
+    """Mask (observations,) of those of an antenna's places, which are no landmarks of the building."""
+    every = [r.submap.landmark_ids for r in graph.records]
+    return is_position_id(np.concatenate([np.empty(0, np.int64), *every]))
 
 
 def _estimated(graph: MapGraph) -> IntArray:
@@ -336,9 +351,9 @@ def _with_covariances(
     J_start, J_pose = compose_jacobians(np.broadcast_to(T_start, poses.shape), T_inverse @ poses)
     J = J_pose @ gains @ D
     J[:, :, :6] += J_start
-    left = marginals.factor * J_pose @ remaining @ _transposed(J_pose)
+    left = marginals.factor * J_pose @ remaining @ transposed(J_pose)
     # The map's first pose has no covariance of its own.
-    return poses, _positive(J @ joint @ _transposed(J) + left)
+    return poses, positive(J @ joint @ transposed(J) + left)
 
 
 def _moving(path: Sequence[PoseEstimate]) -> list[PoseEstimate]:
@@ -350,48 +365,3 @@ def _moving(path: Sequence[PoseEstimate]) -> list[PoseEstimate]:
             kept.append(pose)
             last = here
     return [*kept, path[-1]]
-
-
-def _smoothing(submap: Submap, path: Sequence[PoseEstimate]) -> tuple[FloatArray, FloatArray]:
-    """Gain by which a better end corrects each pose of a path, and the covariance of what it leaves, (n, 6, 6).
-
-    A pose errs by what it hands on to the end, and by the noise of its own frame's measurement, which the end does not
-    share. The first pose after the start shows the size of the latter: its covariance is that of two frames.
-
-    Where the filter was less sure on the way than it is at the end (it has come back to landmarks of the start), most
-    of what a pose erred by was made good before the end, which shares no more than the whole of its own error.
-    """
-    end_covariance = submap.covariance[:6, :6]
-    stamps = np.array([pose.stamp_ns for pose in path])
-    gain, remaining = np.zeros((len(path), 6, 6)), np.zeros((len(path), 6, 6))
-    gain[stamps == submap.end_stamp_ns] = np.eye(6)
-    between = np.nonzero((stamps != submap.end_stamp_ns) & (stamps != submap.start_stamp_ns))[0]
-    if len(between):
-        own = np.array([path[k].covariance for k in between.tolist()])
-        handed_on = _positive(own - 0.5 * submap.path[1].covariance)
-        A: FloatArray = np.tile(np.eye(6), (len(between), 1, 1))  # the lever arm of what is left of the way
-        A[:, :3, 3:] = -skew(submap.end_pose[:3, 3] - np.array([path[k].T[:3, 3] for k in between.tolist()]))
-        shared = _capped(A @ handed_on @ _transposed(A), end_covariance)
-        gain[between] = np.linalg.solve(A, _transposed(np.asarray(np.linalg.solve(end_covariance, shared))))
-        left = gain[between] @ end_covariance @ _transposed(gain[between])
-        remaining[between] = _positive(own - left)
-    return gain, remaining
-
-
-def _transposed(A: FloatArray) -> FloatArray:
-    return np.swapaxes(A, -1, -2)
-
-
-def _capped(covariance: FloatArray, largest: FloatArray) -> FloatArray:
-    """The covariance, in no direction larger than another one, which is positive definite."""
-    root = np.linalg.cholesky(largest)
-    relative = np.linalg.solve(root, _transposed(np.linalg.solve(root, covariance)))
-    values, vectors = np.linalg.eigh(0.5 * (relative + _transposed(relative)))
-    half = root @ vectors
-    return np.asarray((half * np.minimum(values, 1.0)[..., None, :]) @ _transposed(half))
-
-
-def _positive(covariance: FloatArray) -> FloatArray:
-    """Nearest positive definite matrix: eigenvalues no smaller than nothing much."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + _transposed(covariance)))
-    return np.asarray((vectors * np.maximum(values, 1e-12)[..., None, :]) @ _transposed(vectors))

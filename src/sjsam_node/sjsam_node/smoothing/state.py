@@ -120,8 +120,8 @@ class EstimateState:
         return list(np.nonzero(self.component_of[self.graph.starts] == component)[0].tolist())
 
     def is_redundant(self, records: IntArray | int) -> BoolArray:
-        """Mask (n,) of those of some records that show nothing new."""
-        return np.asarray(self.redundant[records])
+        """Mask (n,) of those of some records that show nothing new; positions in a fixed frame show nothing at all."""
+        return np.asarray(self.redundant[records] | self.graph.is_position[records])
 
     def middles(self, records: IntArray) -> FloatArray:
         """Middle of the landmarks of some records in the map frame, (n, 3); the start pose where there are none."""

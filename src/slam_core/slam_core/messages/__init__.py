@@ -51,6 +51,8 @@ from slam_core.messages.poses import (
     pose_message,
     pose_stamped_message,
     pose_with_covariance_message,
+    position_from_message,
+    position_message,
     transform_from_message,
     transform_message,
 )
@@ -108,6 +110,8 @@ __all__ = [
     "pose_message",
     "pose_stamped_message",
     "pose_with_covariance_message",
+    "position_from_message",
+    "position_message",
     "rectified_info",
     "rounded",
     "stamp_ns",

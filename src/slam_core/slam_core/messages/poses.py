@@ -10,7 +10,7 @@ import numpy as np
 
 from slam_core.geometry import FloatArray, pose7_from_transform, transform_from_pose7
 from slam_core.messages.base import Message, MessageTypes, header_message, stamp_ns
-from slam_core.types import ImuSample, OdometryReading, PoseEstimate, RelativeMotion
+from slam_core.types import ImuSample, OdometryReading, PoseEstimate, PositionReading, RelativeMotion
 
 FARTHEST_M = 1e6
 """Positions beyond are no positions in a building; their squares would spoil covariances."""
@@ -46,6 +46,28 @@ def pose_with_covariance_message(types: MessageTypes, frame_id: str, estimate: P
     return types.PoseWithCovarianceStamped(
         header=header_message(types, estimate.stamp_ns, frame_id), pose=_with_covariance(types, estimate)
     )
+
+
+def position_message(types: MessageTypes, frame_id: str, reading: PositionReading) -> Message:
+    """geometry_msgs/PoseWithCovarianceStamped of a position alone: its rotation is unknown."""
+    T, covariance = np.eye(4), _UNKNOWN_VARIANCE * np.eye(6)
+    T[:3, 3], covariance[:3, :3] = reading.position, reading.covariance
+    return pose_with_covariance_message(types, frame_id, PoseEstimate(reading.stamp_ns, T, covariance))
+
+
+def position_from_message(message: Message) -> PositionReading:
+    """Position of a geometry_msgs/PoseWithCovarianceStamped, whatever its orientation.
+
+    Raises
+    ------
+    ValueError
+        If the position is not finite, or beyond ``FARTHEST_M``.
+    """
+    position = _xyz(message.pose.pose.position)
+    if not np.abs(position).max() <= FARTHEST_M:
+        raise ValueError(f"position is not finite, or beyond {FARTHEST_M:g} m: {position.tolist()}")
+    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+    return PositionReading(stamp_ns(message), position, covariance[:3, :3])
 
 
 def odometry_message(

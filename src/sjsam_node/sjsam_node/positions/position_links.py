@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Positions in a fixed frame, joined with the map: each submap's are one more submap, which starts in that frame.
+
+Its landmarks are the positions, and those of the submap are where its antenna was (:mod:`sjsam_node.positions.antenna`):
+a link says which are the same, and the joint problem does the rest, as with tags of which it is known where they are.
+The map's frame stays as it is. Where the fixed frame lies in it is one more unknown, and so every position is worth
+what it says beyond that. Until that frame is determined (:mod:`sjsam_node.positions.fixed_frame`) positions wait.
+
+A position is believed if the others of its submap, the map and the odometry's drift agree with it; those that do not are
+counted, and tie nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from sjsam_node.graph.links import Link, Prior
+from sjsam_node.graph.map_graph import ALL, POSITIONS, MapGraph
+from sjsam_node.loop_closure.association import PointSet, agreeing
+from sjsam_node.loop_closure.point_sets import at_start
+from sjsam_node.loop_closure.verification import Verifier
+from sjsam_node.positions.fixed_frame import find_frame
+from sjsam_node.positions.position_ids import is_position_id, position_stamps
+from sjsam_node.smoothing.estimate import MapEstimate
+from sjsam_node.thinning import thinned
+from slam_core.geometry import FloatArray, invert_transform, make_transform, transform_points
+from slam_core.linear_algebra.sparse_cholesky import IntArray
+from slam_core.types import ORIGIN_SIGMA, Counters, PoseEstimate, PositionReading, Submap
+
+USED, REFUSED = "positions_used", "positions_refused"
+_EXACT = ORIGIN_SIGMA**2 * np.eye(6)
+_LEAF = 1e-4 * np.eye(6)
+"""Covariance of the end of a submap of positions. Nothing hangs on it, so that its size says nothing; were it exact, far
+from the start, the joint problem would lose digits."""
+
+
+@dataclass
+class PositionLinks:
+    """Joins positions with the records of a map; ``waiting``: readings of records that are not joined yet."""
+
+    estimate: MapEstimate
+    verifier: Verifier
+    counters: Counters
+    waiting: dict[int, tuple[PositionReading, ...]] = field(default_factory=dict)
+
+    @property
+    def graph(self) -> MapGraph:
+        """Graph that positions are joined with."""
+        return self.estimate.graph
+
+    def add(self, record: int, readings: Sequence[PositionReading]) -> None:
+        """Take the readings for which a new record has places of the antenna."""
+        if readings:
+            self.waiting[record] = tuple(readings)
+
+    def join(self, new: int) -> list[int]:
+        """Link what waits in the component of a new record; numbers of the records of positions that this made."""
+        component = self.estimate.state.component(new)
+        own = [i for i in self.waiting if self.estimate.state.component(i) == component]
+        if not own:
+            return []
+        base = self._base()
+        if base is None or self.estimate.state.component_of[self.graph.records[base].start] != component:
+            return self._aligned(own, base)
+        return [made for i in own if (made := self._near(i, base)) is not None]
+
+    def _base(self) -> int | None:
+        """The first record of positions: where it starts all others do."""
+        found = np.nonzero(self.graph.is_position)[0]
+        return int(found[0]) if len(found) else None
+
+    def _aligned(self, records: Sequence[int], base: int | None) -> list[int]:
+        """Link all records of a component whose place in the fixed frame is not known, once it can be found."""
+        state = self.estimate.state
+        antenna, drift = [], []
+        for i in records:
+            own = self.graph.records[i].submap.landmarks[_antenna_rows(self.graph, i)]
+            antenna.append(transform_points(state.start(i), own))
+            drift.append(np.full(len(own), self.graph.odometry.path_length[self.graph.records[i].start]))
+        places, gone = np.concatenate(antenna), np.concatenate(drift)
+        readings = [r for i in records for r in self.waiting[i]]
+        positions = np.array([r.position for r in readings])
+        away = self.verifier.config.drift * (gone - np.median(gone))
+        covariances = np.array([r.covariance for r in readings])
+        # Errors of positions are those of their own axes, which lie no other way than the frame's does: by the largest.
+        largest = np.linalg.eigvalsh(covariances)[:, -1] + away**2
+        found = find_frame(places, positions, largest[:, None, None] * np.eye(3))
+        if found is None:
+            return []
+        shift = np.median(positions[found.agrees], axis=0) if base is None else self._shift(base)
+        T_map_base = found.T @ make_transform(np.eye(3), shift)
+        made, first = [], 0
+        for i in records:
+            kept = np.nonzero(found.agrees[first : first + len(self.waiting[i])])[0]
+            first += len(self.waiting[i])
+            made += self._linked(i, kept, invert_transform(state.start(i)) @ T_map_base, _EXACT, shift)
+        return made
+
+    def _near(self, record: int, base: int) -> int | None:
+        """Link a record whose place in the fixed frame the map knows; None if it does not yet, or none agrees."""
+        prior = self.estimate.relative_pose(record, base)
+        if prior is None or prior.covariance is None:
+            return None
+        readings, shift = self.waiting[record], self._shift(base)
+        prior = Prior(prior.T, prior.covariance + self.verifier.drift(self._way_since_positions(record)))
+        points = at_start(self.graph.records[record]).select(_antenna_rows(self.graph, record))
+        measured = PointSet(
+            np.array([r.position for r in readings]) - shift, block_diag(*(r.covariance for r in readings)),
+            points.descriptors,
+        )  # fmt: skip
+        pairs = np.repeat(np.arange(len(readings))[:, None], 2, axis=1)
+        found = agreeing(points, measured, pairs, prior, self.verifier.config.association)
+        made = self._linked(record, found.pairs[:, 0], found.T, found.covariance, shift)
+        return made[0] if made else None
+
+    def _way_since_positions(self, record: int) -> float:
+        """Way of an agent from the nearest of its records that has positions in the map, else its whole way (m)."""
+        graph, run = self.graph, self.graph.records[record].key[:2]
+        lengths = graph.odometry.path_length[graph.starts]
+        tied = graph.linked[graph.is_position[graph.linked[:, 1]], 0].tolist()
+        gone = [abs(lengths[i] - lengths[record]) for i in tied if graph.records[i].key[:2] == run]
+        return float(min(gone, default=lengths[record]))
+
+    def _shift(self, base: int) -> FloatArray:
+        """Where in the fixed frame the records of positions start, (3,) m: near the map, as numbers ought to be."""
+        return np.asarray(-self.graph.records[base].submap.end_pose[:3, 3])
+
+    def _linked(
+        self, record: int, kept: IntArray, T: FloatArray, covariance: FloatArray, shift: FloatArray
+    ) -> list[int]:
+        """The record of positions that is made of those of ``record`` that are ``kept``, linked; none without any."""
+        readings, submap = self.waiting.pop(record), self.graph.records[record].submap
+        self._count(REFUSED, len(readings) - len(kept))
+        if not len(kept):
+            return []
+        self._count(USED, len(kept))
+        rows = _antenna_rows(self.graph, record)[kept]
+        base = self._base()
+        start = None if base is None else self.graph.records[base].start
+        chosen = [readings[k] for k in kept.tolist()]
+        made = self.estimate.add_submap(
+            _positions_submap(submap, chosen, rows, shift), start, self.estimate.state.start(record) @ T, ALL
+        )
+        pairs = np.stack([rows, np.arange(len(kept))], axis=1)
+        self.estimate.add_links([Link(record, made, pairs, T, covariance)])
+        return [made]
+
+    def _count(self, name: str, amount: int) -> None:
+        if amount:
+            self.counters.add(name, amount)
+
+
+def readings_of(positions: Submap) -> tuple[PositionReading, ...]:
+    """The readings that a submap of positions was made of."""
+    n, k = len(positions.landmarks), np.arange(len(positions.landmarks))
+    own = positions.covariance[6:, 6:].reshape(n, 3, n, 3)[k, :, k, :]
+    stamps = position_stamps(positions.landmark_ids).tolist()
+    places = positions.landmarks - positions.end_pose[:3, 3]
+    return tuple(PositionReading(s, p, P) for s, p, P in zip(stamps, places, own, strict=True))
+
+
+def without_antenna(submap: Submap) -> Submap:
+    """The submap as it came, without places of the antenna."""
+    return thinned(submap, np.nonzero(~is_position_id(submap.landmark_ids))[0])
+
+
+def _antenna_rows(graph: MapGraph, record: int) -> IntArray:
+    return np.nonzero(is_position_id(graph.records[record].submap.landmark_ids))[0]
+
+
+def _positions_submap(
+    submap: Submap, readings: Sequence[PositionReading], rows: IntArray, shift: FloatArray
+) -> Submap:
+    """Readings as a submap that starts ``shift`` (3,) m from the fixed frame's origin, and ends there."""
+    n, end = len(readings), make_transform(np.eye(3), -shift)
+    stamps = submap.start_stamp_ns, submap.end_stamp_ns
+    path = (PoseEstimate(stamps[0], np.eye(4), _EXACT), PoseEstimate(stamps[1], end, _LEAF))
+    covariance = block_diag(_LEAF, *(r.covariance for r in readings))
+    return Submap(
+        f"{POSITIONS}{submap.agent}", submap.index, *stamps, end, np.array([r.position for r in readings]) - shift,
+        covariance, submap.landmark_ids[rows], np.ones(n, np.int32),
+        np.zeros((n, submap.descriptors.shape[1]), np.float32), path, follows_previous=False, session=submap.session,
+    )  # fmt: skip
