@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from sjsam_node.smoothing.map_snapshot import MapLandmarks, MapSnapshot
-from slam_core.geometry import FloatArray
+from slam_core.geometry import FloatArray, invert_transform
 from slam_core.messages import ellipsoid_markers, landmark_cloud, path_marker, points_message, transform_message
 from slam_core.messages.base import Message, MessageTypes
-from slam_core.storage.anchor_file import read_anchor
+from slam_core.storage.anchor_file import BUILDING_FRAME, read_anchor
+from slam_core.types import PoseEstimate
 
 _SKELETON = (0.1, 0.4, 1.0, 1.0)
 _CLOSURE = (0.9, 0.1, 0.1, 1.0)
@@ -23,6 +24,30 @@ def anchor_message(types: MessageTypes, path: str, map_frame: str) -> Message:
     """The static transform from the map to its building, from the ``anchor.yaml`` of ``slam anchor``."""
     anchor = read_anchor(Path(path).expanduser())
     return transform_message(types, 0, anchor.frame, map_frame, anchor.T)
+
+
+def fixed_frame_message(types: MessageTypes, T_map_frame: PoseEstimate, map_frame: str) -> Message:
+    """The static transform from the map to the fixed frame that positions are in."""
+    return transform_message(types, 0, BUILDING_FRAME, map_frame, invert_transform(T_map_frame.T))
+
+
+def map_pictures(
+    types: MessageTypes, header: Message, snapshot: MapSnapshot, landmarks: MapLandmarks
+) -> dict[str, Message]:
+    """What shows a map to all, by topic."""
+    return {
+        "map/landmarks": landmarks_message(types, header, landmarks),
+        "map/cloud": cloud_message(types, header, landmarks),
+        "map/graph": graph_message(types, header, snapshot),
+        "map/marks": marks_message(types, header, snapshot.mark_positions()),
+    }
+
+
+def clicked_point(message: Message, map_frame: str) -> FloatArray:
+    """Point (3,) of a geometry_msgs/PointStamped of the map frame; ValueError if it is of another one."""
+    if message.header.frame_id not in ("", map_frame):
+        raise ValueError(f"clicked_point must be in frame {map_frame}, got {message.header.frame_id}")
+    return np.array([message.point.x, message.point.y, message.point.z])
 
 
 def landmarks_message(types: MessageTypes, header: Message, landmarks: MapLandmarks) -> Message:

@@ -19,7 +19,7 @@ import itertools
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -33,11 +33,12 @@ from sjsam_node.autosave import Autosave
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
 from sjsam_node.localization import Localizer
 from sjsam_node.marks import Mark, Marks
+from sjsam_node.positions.position_queue import PositionQueue
 from sjsam_node.refining import undecided
 from sjsam_node.regions.live import LiveTasks
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_core.geometry import FloatArray
-from slam_core.types import PoseEstimate, Submap
+from slam_core.types import PoseEstimate, PositionReading, Submap
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -103,6 +104,7 @@ class MapSession:
         self._number = itertools.count()
         self._submaps: list[Future[Any]] = []
         self.waiting_at_most = 0
+        self._positions = PositionQueue(round(config.position.interval * 1e9))
         self._lock, self._asked_resets, self._done_resets = threading.Lock(), 0, 0
         self._go_on_with(GlobalMap(config, tasks))
         self._copied: MapSnapshot | None = None
@@ -149,7 +151,7 @@ class MapSession:
         with self._lock:
             if not self._is_to_reset:
                 self.snapshot = self._map.snapshot().structure()
-                self.counts = dict(self._map.counters.counts)
+                self.counts = self._map.counters.counts | self._positions.counters.counts
 
     # -- submaps -------------------------------------------------------------------------------------------------------
 
@@ -171,24 +173,28 @@ class MapSession:
         """Number of a session that no agent in the map has had; -1 in a new one: the second of the first stamp."""
         return 1 + max((session for _, session, _ in self.snapshot.keys), default=-2)
 
+    def add_position(self, agent: str, reading: PositionReading) -> None:
+        """Take a position of an agent in a fixed frame; it counts if it comes before the submap that it is inside."""
+        self._positions.add(agent, reading)
+
     def add(self, submap: Submap) -> Future[Outcome | None]:
         """Join a submap, or locate its agent by it, after those before it; None if all was reset meanwhile."""
-        future = self._put(_SUBMAP, partial(self._add, submap, self._asked_resets))
+        future = self._put(_SUBMAP, partial(self._add, submap, self._positions.take(submap), self._asked_resets))
         self._submaps.append(future)
         self.waiting_at_most = max(self.waiting_at_most, self.waiting)
         return future
 
-    def _add(self, submap: Submap, resets: int) -> Outcome | None:
+    def _add(self, submap: Submap, readings: Sequence[PositionReading], resets: int) -> Outcome | None:
         """Thread: do with a submap what the mode says."""
         if resets != self._done_resets:
             return None
         began = time.perf_counter()
-        outcome = self._locate(submap) if self.mode is Mode.LOCALISE else self._join(submap)
+        outcome = self._locate(submap) if self.mode is Mode.LOCALISE else self._join(submap, readings)
         return None if self._is_to_reset else replace(outcome, duration_s=time.perf_counter() - began)
 
-    def _join(self, submap: Submap) -> Outcome:
-        """Thread: the map with one more submap."""
-        report = self._map.add(submap)
+    def _join(self, submap: Submap, readings: Sequence[PositionReading]) -> Outcome:
+        """Thread: the map with one more submap, and the positions inside it."""
+        report = self._map.add(submap, readings)
         _LOG.info(
             "submap %d of %s: %s, %d landmarks known, %d new, closures %s", submap.index, submap.agent or "the rig",
             report.reason or "joined", report.matched, report.new_landmarks, list(report.closures),
@@ -239,7 +245,7 @@ class MapSession:
     def mark(self, point: FloatArray) -> Mark:
         """Mark a point (3,) of the map frame, m, at once; ValueError in an empty map."""
         with self._lock:
-            mark = self._map.marks.add(self.snapshot.poses, point)
+            mark = self._map.marks.add(self.snapshot.poses, point, where=self.snapshot.is_on_a_way)
             self.snapshot = replace(self.snapshot, marks=Marks(list(self._map.marks.marks)))
         return mark
 
@@ -247,6 +253,7 @@ class MapSession:
         """Forget where the agents are and what waits, and the map too unless it is to stay as it is."""
         with self._lock:
             self._asked_resets += 1
+            self._positions.clear()
             if self.mode is not Mode.LOCALISE:
                 self.snapshot = GlobalMap(self._config).snapshot()
         self._put(_REQUEST, self._begin_anew)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
 
@@ -28,8 +29,12 @@ class Marks:
 
     marks: list[Mark] = field(default_factory=list)
 
-    def add(self, poses: FloatArray, point: FloatArray, name: str = "") -> Mark:
+    def add(
+        self, poses: FloatArray, point: FloatArray, name: str = "", where: npt.NDArray[np.bool_] | None = None
+    ) -> Mark:
         """Mark a point (3,) of the map frame, m, where the map's nodes are at ``poses`` (n, 4, 4).
+
+        ``where``: mask (n,) of the nodes that it may hang on, by default all.
 
         Raises
         ------
@@ -40,7 +45,8 @@ class Marks:
             raise ValueError("nothing can be marked in an empty map")
         if point.shape != (3,) or not np.all(np.isfinite(point)):
             raise ValueError(f"a mark needs three finite coordinates in m, got {point}")
-        node = int(np.argmin(np.linalg.norm(poses[:, :3, 3] - point, axis=1)))
+        distance = np.linalg.norm(poses[:, :3, 3] - point, axis=1)
+        node = int(np.argmin(distance if where is None else np.where(where, distance, np.inf)))
         T = poses[node]
         mark = Mark(name or f"mark {len(self.marks) + 1}", node, T[:3, :3].T @ (point - T[:3, 3]))
         self.marks.append(mark)

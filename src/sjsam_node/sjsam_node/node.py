@@ -37,6 +37,7 @@ from slam_core.messages import (
     header_message,
     path_message,
     pose_with_covariance_message,
+    position_from_message,
     submap_from_messages,
     transform_message,
 )
@@ -147,9 +148,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     def _listen_to(self, agent: str) -> None:
         topics = {below(agent, topic): kind for topic, kind in SUBMAP_TOPICS.items()}
-        on_odometry = partial(self.on_odometry, agent)
         self.listen_together(topics, partial(self.on_submap, agent), latched=True, stamps=StampPolicy.ANY)
-        self.listen(below(agent, "odom"), "Odometry", on_odometry, required=False, stamps=StampPolicy.ANY)
+        optional = ("odom", "Odometry", self.on_odometry), ("position", "PoseWithCovarianceStamped", self.on_position)
+        for topic, kind, take in optional:
+            self.listen(below(agent, topic), kind, partial(take, agent), required=False, stamps=StampPolicy.ANY)
 
     def _serve(self, name: str, action: Callable[[], Awaitable[str]]) -> None:
         async def answer(_: Any, response: Any) -> Any:
@@ -226,11 +228,13 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         for pose in self.placements[agent].tracker.add_odometry(estimate_from_message(message)):
             self.publish(below(agent, "pose"), pose_with_covariance_message(self.types, self.config.map_frame, pose))
 
+    def on_position(self, agent: str, message: Message) -> None:
+        """A position of an agent's antenna in a fixed frame."""
+        self.map.add_position(agent, position_from_message(message))
+
     def on_clicked_point(self, message: Message) -> None:
         """Mark a find at a point of the map frame."""
-        if message.header.frame_id not in ("", self.config.map_frame):
-            raise ValueError(f"clicked_point must be in frame {self.config.map_frame}, got {message.header.frame_id}")
-        self._mark(np.array([message.point.x, message.point.y, message.point.z]))
+        self._mark(map_messages.clicked_point(message, self.config.map_frame))
 
     def on_initial_pose(self, message: Message) -> None:
         """Take the pose at which the agents are believed to be in the loaded map."""
@@ -248,7 +252,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         """Join all submaps that have come and settle the map: saved now, it is that of ``slam run``."""
         await self._done(self.map.finish())
         self.finish_work()
-        return f"{len(self.map.snapshot)} submaps joined"
+        return f"{self.map.snapshot.submap_count} submaps joined"
 
     def on_close(self) -> None:
         """Join what waits: no submap that has come is lost."""
@@ -314,7 +318,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
 
     async def mark_here(self) -> str:
         """Mark where the agent that was heard last is."""
-        return self._mark(self.map.snapshot.poses[-1:, :3, 3].sum(axis=0))
+        return self._mark(self.map.snapshot.newest_place)
 
     def _mark(self, point: FloatArray) -> str:
         mark = self.map.mark(point)
@@ -323,7 +327,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         return mark.name
 
     def _size(self, done: str) -> str:
-        return f"{len(self.map.snapshot)} submaps {done} {self.map_path}"
+        return f"{self.map.snapshot.submap_count} submaps {done} {self.map_path}"
 
     async def _done(self, future: Future[T]) -> T:
         """Result of another thread; until it is there the node does all else."""
@@ -364,12 +368,10 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         landmarks, paths = snapshot.landmarks(), snapshot.path()
         if said := tags_text(map_tags(snapshot, landmarks)):
             self.do_later("tags", lambda: self.health.show("tags", said))
-        messages = {
-            "map/landmarks": map_messages.landmarks_message(self.types, header, landmarks),
-            "map/cloud": map_messages.cloud_message(self.types, header, landmarks),
-            "map/graph": map_messages.graph_message(self.types, header, snapshot),
-            "map/marks": map_messages.marks_message(self.types, header, snapshot.mark_positions()),
-        }
+        if (frame := snapshot.fixed_frame()) is not None and not self.config.anchor_path:
+            fixed = map_messages.fixed_frame_message(self.types, frame, self.config.map_frame)
+            self.do_later("building", partial(self.broadcast_static, fixed))
+        messages = map_messages.map_pictures(self.types, header, snapshot, landmarks)
         if self.has_listeners("map/ellipsoids"):
             messages["map/ellipsoids"] = map_messages.ellipsoids_message(self.types, header, landmarks)
         for agent in self.config.agents:

@@ -6,6 +6,7 @@ seed: 16
 rate: 10.0                       # frames per second
 frames: 414
 sensors: [stereo, tof, imu]      # and wheels, of a rig that drives: wheels: {slip: 0.01, radius_error: 0.02}
+                                 # and position, in the building's frame: position: {sigma: 0.1, outlier_share: 0.1}
 profile: ideal                   # or real: what real rooms and sensors add; single effects: realism: {...}
 rooms:
   - {name: office, x: [0, 5], y: [0, 4], style: office}
@@ -32,6 +33,7 @@ import numpy as np
 from slam_core.config import Config, from_mapping, group, parameter
 from slam_core.storage.files import read_yaml
 from slam_simulation.sensors.imu import ImuSensorConfig
+from slam_simulation.sensors.position import PositionSensorConfig
 from slam_simulation.sensors.profiles import PROFILES, REAL, REAL_STEREO, RealismConfig
 from slam_simulation.sensors.stereo_sensor import StereoSensorConfig
 from slam_simulation.sensors.tof_sensor import TofSensorConfig
@@ -45,7 +47,7 @@ from slam_simulation.world.world import World
 
 SENSORS = ("stereo", "tof", "imu")
 """Sensors of a rig unless a scenario says otherwise."""
-_KNOWN = (*SENSORS, "wheels")
+_KNOWN = (*SENSORS, "wheels", "position")
 _SUITE = (*_KNOWN, "realism")
 SCENARIOS = FilePath(__file__).with_name("scenarios")
 """``bags/scenarios`` of the sources, installed with the package."""
@@ -91,6 +93,7 @@ class SensorSuite(Config):
     tof: TofSensorConfig = group(TofSensorConfig)
     imu: ImuSensorConfig = group(ImuSensorConfig)
     wheels: WheelSensorConfig = group(WheelSensorConfig)
+    position: PositionSensorConfig = group(PositionSensorConfig)
     realism: RealismConfig = group(RealismConfig)
     start_stamp_s: float = parameter(1000.0, "header stamp of the first frame", unit="s", minimum=0.0)
 

@@ -16,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
-from slam_core.types import ByteArray, Float32Array, ImuSample, OdometryReading
+from slam_core.types import ByteArray, Float32Array, ImuSample, OdometryReading, PositionReading
 from slam_simulation.rendering.raycaster import Rays, camera_rays, make_view, trace
 from slam_simulation.scenario import Scenario
 from slam_simulation.sensors.imu import ImuSensor
+from slam_simulation.sensors.position import PositionSensor
 from slam_simulation.sensors.stereo_sensor import StereoSensor
 from slam_simulation.sensors.tof_sensor import TofImages, TofSensor
 from slam_simulation.sensors.wheels import WheelSensor
@@ -45,8 +46,8 @@ class SimulatedFrame:
     """All that one agent's sensors report at one moment.
 
     left, right: raw uint8 images, None for a sensor that is not carried or a frame that was lost; right_stamp_ns
-    differs from stamp_ns by the jitter between the cameras. tof: raw images or None. imu, wheels: readings since the
-    previous frame.
+    differs from stamp_ns by the jitter between the cameras. tof: raw images or None. imu, wheels, positions: readings since
+    the previous frame.
     """
 
     index: int
@@ -59,6 +60,7 @@ class SimulatedFrame:
     tof: TofImages | None
     imu: tuple[ImuSample, ...]
     wheels: tuple[OdometryReading, ...]
+    positions: tuple[PositionReading, ...]
     truth: DepthTruth | None
 
 
@@ -108,6 +110,9 @@ class Simulator:
         if "wheels" in scenario.sensors:
             height = scenario.agents[agent].height
             self.wheels = WheelSensor(scenario.suite.wheels, self.path, height, (scenario.seed, 10, agent))
+        self.position: PositionSensor | None = None
+        if "position" in scenario.sensors:
+            self.position = PositionSensor(scenario.suite.position, self.path, (scenario.seed, 11, agent))
         self.threads = threads or os.cpu_count() or 1
         self._right_late_s = 1e-3 * scenario.suite.stereo.right_late_ms
         self._truth_rays = camera_rays(self.stereo.stereo.camera) if truth else None
@@ -167,6 +172,7 @@ class Simulator:
             tof=tof,
             imu=self._imu_samples(t - every / scenario.rate, t),
             wheels=self._wheel_readings(t - every / scenario.rate, t),
+            positions=self._position_readings(t - every / scenario.rate, t),
             truth=None if self._truth_rays is None else self._truth(T, world, self._truth_rays, pool),
         )
 
@@ -191,6 +197,9 @@ class Simulator:
 
     def _wheel_readings(self, previous: float, t: float) -> tuple[OdometryReading, ...]:
         return () if self.wheels is None else self.wheels.read(max(previous, -1e-6), t, self.stamp_ns(0))
+
+    def _position_readings(self, previous: float, t: float) -> tuple[PositionReading, ...]:
+        return () if self.position is None else self.position.read(max(previous, -1e-6), t, self.stamp_ns(0))
 
     def _truth(self, T: FloatArray, world: SurfaceTable, rays: Rays, pool: ThreadPoolExecutor | None) -> DepthTruth:
         view = make_view(world, T @ self.T_rig_left, rays.bounds)

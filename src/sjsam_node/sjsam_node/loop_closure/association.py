@@ -192,9 +192,7 @@ def _compatible(
         pairs = np.delete(pairs, np.argsort(solved.nis)[-count:], axis=0)
 
 
-def agreeing(
-    first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig
-) -> Alignment:
+def agreeing(first: PointSet, second: PointSet, pairs: IntArray, prior: Prior, config: AssociationConfig) -> Alignment:
     """Alignment by the pairs that are left when the worst is dropped until none stands out; none if all together do.
 
     Covariances and prior are believed as they are, unlike those of submaps.

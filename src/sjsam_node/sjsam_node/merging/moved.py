@@ -21,7 +21,6 @@ from sjsam_node.merging.union import Union
 from sjsam_node.thinning import thinned
 from slam_core.geometry import transform_points
 from slam_core.linear_algebra.block_pattern import IntArray
-from slam_core.types import Submap
 
 _LEAST_SHIFT_M = 0.2
 """Distance that a thing has moved at least, m: less may be drift inside the submaps."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fixed frame that positions are in, as the map sees it: found once they are spread enough, whatever some err by."""
+"""The fixed frame that positions are in, as the map sees it: found once they are spread enough, outliers or not."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def find_frame(antenna: FloatArray, positions: FloatArray, covariances: FloatArr
     coarse = ransac_rigid_transform(positions, antenna, reach, np.random.default_rng(1), min_inliers=least)
     if not coarse.success:
         return None
-    T, weight = coarse.T, np.linalg.inv(covariances)
+    T = coarse.T
+    weight = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
     agrees = coarse.inliers
     for _ in range(_STEPS):
         T, information = _step(T, antenna, positions, weight, agrees)

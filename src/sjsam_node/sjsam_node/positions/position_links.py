@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Positions in a fixed frame, joined with the map: each submap's are one more submap, which starts in that frame.
 
-Its landmarks are the positions, and those of the submap are where its antenna was (:mod:`sjsam_node.positions.antenna`):
-a link says which are the same, and the joint problem does the rest, as with tags of which it is known where they are.
+Its landmarks are the positions, and the submap has where its antenna was (:mod:`sjsam_node.positions.antenna`). A link
+says which are the same, and the joint problem does the rest, as with tags of which it is known where they are.
 The map's frame stays as it is. Where the fixed frame lies in it is one more unknown, and so every position is worth
 what it says beyond that. Until that frame is determined (:mod:`sjsam_node.positions.fixed_frame`) positions wait.
 
-A position is believed if the others of its submap, the map and the odometry's drift agree with it; those that do not are
-counted, and tie nothing.
+A position is believed if the others of its submap, the map and the odometry's drift agree with it. Those that do not
+are counted, and tie nothing.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from slam_core.types import ORIGIN_SIGMA, Counters, PoseEstimate, PositionReadin
 USED, REFUSED = "positions_used", "positions_refused"
 _EXACT = ORIGIN_SIGMA**2 * np.eye(6)
 _LEAF = 1e-4 * np.eye(6)
-"""Covariance of the end of a submap of positions. Nothing hangs on it, so that its size says nothing; were it exact, far
-from the start, the joint problem would lose digits."""
+"""Covariance of the end of a submap of positions. Nothing hangs on it, so that its size says nothing; were it exact,
+far from the start, the joint problem would lose digits."""
 
 
 @dataclass
@@ -172,9 +172,7 @@ def _antenna_rows(graph: MapGraph, record: int) -> IntArray:
     return np.nonzero(is_position_id(graph.records[record].submap.landmark_ids))[0]
 
 
-def _positions_submap(
-    submap: Submap, readings: Sequence[PositionReading], rows: IntArray, shift: FloatArray
-) -> Submap:
+def _positions_submap(submap: Submap, readings: Sequence[PositionReading], rows: IntArray, shift: FloatArray) -> Submap:
     """Readings as a submap that starts ``shift`` (3,) m from the fixed frame's origin, and ends there."""
     n, end = len(readings), make_transform(np.eye(3), -shift)
     stamps = submap.start_stamp_ns, submap.end_stamp_ns

@@ -38,6 +38,7 @@ def smoothing_gains(submap: Submap, path: Sequence[PoseEstimate]) -> tuple[Float
 
 
 def transposed(A: FloatArray) -> FloatArray:
+    """Matrices (..., m, n) transposed, (..., n, m)."""
     return np.swapaxes(A, -1, -2)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from sjsam_node.graph.map_graph import POSITIONS, BoolArray, MapGraph, Record
 from sjsam_node.marks import Marks
+from sjsam_node.positions.position_ids import is_position_id
 from sjsam_node.smoothing.inner_poses import positive, smoothing_gains, transposed
 from sjsam_node.smoothing.marginals import ComponentMarginals
 from sjsam_node.smoothing.state import EstimateState
@@ -27,9 +28,16 @@ from slam_core.estimation.calibration_error import (
     covariance_of_calibration,
     point_covariances_of_calibration,
 )
-from slam_core.geometry import FloatArray, boxminus, boxplus, compose_covariance, compose_jacobians, inverse_jacobian, invert_transform
+from slam_core.geometry import (
+    FloatArray,
+    boxminus,
+    boxplus,
+    compose_covariance,
+    compose_jacobians,
+    inverse_jacobian,
+    invert_transform,
+)
 from slam_core.linear_algebra.sparse_cholesky import IntArray
-from sjsam_node.positions.position_ids import is_position_id
 from slam_core.types import ORIGIN_SIGMA, Float32Array, PoseEstimate, Submap
 
 ADVICE = (
@@ -215,6 +223,18 @@ class MapSnapshot:
     def submap_count(self) -> int:
         """Number of submaps that cameras made, without positions in a fixed frame."""
         return len(self) - int(np.count_nonzero(self._state.graph.is_position))
+
+    @property
+    def is_on_a_way(self) -> BoolArray:
+        """Mask (nodes,) of those at which an agent was: a submap of positions starts and ends elsewhere."""
+        out = np.ones(len(self.poses), dtype=np.bool_)
+        out[self.nodes[self._state.graph.is_position].ravel()] = False
+        return out
+
+    @property
+    def newest_place(self) -> FloatArray:
+        """Where the submap ends that came last, (3,) m; the origin of an empty map."""
+        return np.asarray(self.poses[self.is_on_a_way][-1:, :3, 3].sum(axis=0))
 
     def fixed_frame(self) -> PoseEstimate | None:
         """T_map_frame of the fixed frame that positions are in, with covariance, as of the last one; None without."""

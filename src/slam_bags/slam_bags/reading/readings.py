@@ -21,11 +21,12 @@ from slam_core.messages import (
     odometry_from_message,
     picture_from_message,
     points_from_scan,
+    position_from_message,
     stamp_ns,
 )
 from slam_core.messages.base import Message
 from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
-from slam_core.types import ByteArray, ImuSample, Mask, OdometryReading
+from slam_core.types import ByteArray, ImuSample, Mask, OdometryReading, PositionReading
 from stereo_frontend.sources import RawPair
 from tof_driver.stage import RawDepth
 
@@ -83,6 +84,19 @@ class PoseReading:
 
 
 @dataclass(frozen=True, eq=False)
+class FixReading:
+    """A position of an agent's antenna in a fixed frame."""
+
+    agent: str
+    position: PositionReading
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the position."""
+        return self.position.stamp_ns
+
+
+@dataclass(frozen=True, eq=False)
 class LaserReading:
     """A scan of a laser scanner, points (n, 2) in its own frame."""
 
@@ -137,7 +151,15 @@ class InfoReading:
 
 
 Reading = (
-    StereoReading | DepthReading | LaserReading | ImuReading | PoseReading | ColourReading | MaskReading | SessionStart
+    StereoReading
+    | DepthReading
+    | LaserReading
+    | ImuReading
+    | PoseReading
+    | FixReading
+    | ColourReading
+    | MaskReading
+    | SessionStart
 )
 
 
@@ -191,6 +213,10 @@ def _pose_reading(sensors: AgentSensors, message: Message) -> Reading:
     return PoseReading(sensors.agent, pose)
 
 
+def _fix_reading(sensors: AgentSensors, message: Message) -> Reading:
+    return FixReading(sensors.agent, position_from_message(message))
+
+
 def _laser_reading(sensors: AgentSensors, message: Message) -> Reading:
     return LaserReading(sensors.agent, Scan(stamp_ns(message), points_from_scan(message), message.header.frame_id))
 
@@ -209,6 +235,7 @@ MASK_ROLES = {"stereo": "mask", "tof": "tof_mask"}
 UNPAIRED_ROLES: dict[str, Callable[[AgentSensors, Message], Reading]] = {
     "imu": _imu_reading,
     "odometry": _pose_reading,
+    "position": _fix_reading,
     "scan": _laser_reading,
     "color": _colour_reading,
     "mask": partial(_mask_reading, "stereo"),

@@ -25,6 +25,7 @@ _CANDIDATES = {
     "tof_mask": ("tof/mask",),
     "imu": ("imu",),
     "odometry": ("odometry",),
+    "position": ("position",),
     "scan": ("scan",),
     "ground_truth": ("ground_truth/pose",),
 }

@@ -18,9 +18,10 @@ from slam_core.messages import (
     imu_message,
     odometry_message,
     pose_stamped_message,
+    position_message,
     transform_message,
 )
-from slam_core.types import AnyArray, ByteArray, ImuSample, OdometryReading, PoseEstimate
+from slam_core.types import AnyArray, ByteArray, ImuSample, OdometryReading, PoseEstimate, PositionReading
 
 BASE_FRAME = "base_link"
 LEFT_FRAME = "stereo_left_optical_frame"
@@ -91,6 +92,10 @@ class SensorWriter:
         twist = reading.twist, reading.twist_covariance
         frames = self._frame("wheel_odom"), self._frame(reading.frame_id)
         self._bag.write(f"{self._prefix}/odometry", odometry_message(self._types, *frames, pose, twist), pose.stamp_ns)
+
+    def position(self, reading: PositionReading, frame: str) -> None:
+        """A position of the rig's antenna in a fixed frame, which all agents share."""
+        self._bag.write(f"{self._prefix}/position", position_message(self._types, frame, reading), reading.stamp_ns)
 
     def ground_truth(self, stamp_ns: int, T_world_base: FloatArray) -> None:
         """True pose of base_link."""

@@ -24,7 +24,7 @@ from slam_bringup.pipeline.sensor_pipeline import AgentItem, Value
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.messages import motion_as_received, rounded
 from slam_core.runtime.memory import leave_libraries
-from slam_core.types import Features, ImuSample, OdometryReading, PoseEstimate, Submap
+from slam_core.types import Features, ImuSample, OdometryReading, PoseEstimate, PositionReading, Submap
 
 _LOADED = 1, 4
 """Frames of an agent after which what images, and what the filter needs, is loaded."""
@@ -60,6 +60,8 @@ class Mapper:
         if isinstance(value, SessionStart):
             self._process_waiting(item.agent)
             self._hand_over(stage.start_session())
+        elif isinstance(value, PositionReading):
+            self.session.add_position(item.agent, value)
         elif isinstance(value, ScanEstimate):
             self._diaries[item.agent].scans.append(value.pose)
         add_to_filter(stage, value)

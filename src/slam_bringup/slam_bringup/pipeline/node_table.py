@@ -82,7 +82,7 @@ NODES = (
     ),
     NodeDeclaration(
         "sjsam_node", "sjsam", "sjsam_node.node", "SjsamNode", "sjsam_node.node_config:SjsamNodeConfig",
-        inputs=(*_SUBMAP, "odom", "clicked_point", "initialpose"),
+        inputs=(*_SUBMAP, "odom", "position", "clicked_point", "initialpose"),
         outputs=("map/landmarks", "map/path", "map/graph", "map/ellipsoids", "map/cloud", "map/marks", "map_to_odom",
                  "map_to_odom_pose", "pose"),
         recorded=("pose", "map_to_odom", "map/landmarks", "map/path", "map/graph", "map/ellipsoids", "map/cloud",

@@ -20,6 +20,7 @@ from slam_bags.reading.readings import (
     MASK_ROLES,
     AgentSensors,
     DepthReading,
+    FixReading,
     ImuReading,
     LaserReading,
     MaskReading,
@@ -30,13 +31,15 @@ from slam_bags.reading.readings import (
 )
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_core.types import Features, ImuSample, OdometryReading
+from slam_core.types import Features, ImuSample, OdometryReading, PositionReading
 from stereo_frontend.frame_log import FrameLog
 from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
 from tof_driver.stage import DepthStage
 
-Value: TypeAlias = ExtractedFrame | Features | ScanEstimate | ImuSample | OdometryReading | SessionStart
+Value: TypeAlias = (
+    ExtractedFrame | Features | ScanEstimate | ImuSample | OdometryReading | PositionReading | SessionStart
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +82,8 @@ class SensorPipeline:
             yield from self._on_imu(reading.sample)
         elif isinstance(reading, PoseReading):
             yield self._item(reading.pose)
+        elif isinstance(reading, FixReading):
+            yield self._item(reading.position)
         elif isinstance(reading, StereoReading) and self._uses_stereo:
             yield from self._on_pair(reading)
         elif isinstance(reading, DepthReading) and self._uses_depth:

@@ -46,6 +46,7 @@ ARGUMENTS = (
     LaunchArgument("set", "", "parameters in one line: ekf_slam.submap.max_distance=1.5, tof_driver.pictures=both"),
     LaunchArgument("topics", "", "topics that are named otherwise: left=/cam/left/image_raw, right_info=/..."),
     LaunchArgument("odometry_topic", "", "odometry of wheels, legs or another estimator [odometry]"),
+    LaunchArgument("position_topic", "", "positions of UWB or GNSS in a fixed frame [position]"),
     LaunchArgument("base_frame", "", "frame of the rig [base_link, below the agent's name]"),
     LaunchArgument("calibration", "", "folders of slam calibrate, comma-separated, instead of the drivers' infos"),
     LaunchArgument("rectified", "false", "the stereo images are rectified: image_rect", _BOOLEANS),
@@ -80,7 +81,8 @@ def plan_launch(values: Mapping[str, str]) -> LaunchPlan:
     values = {argument.name: argument.default for argument in ARGUMENTS} | dict(values)
     overrides = _overrides(values)
     given = [part.strip() for part in values["topics"].split(",") if part.strip()]
-    given += [f"odometry={values['odometry_topic']}"] if values["odometry_topic"] else []
+    for role in ("odometry", "position"):
+        given += [f"{role}={values[f'{role}_topic']}"] if values[f"{role}_topic"] else []
     topics = parse_topics(given)
     folders = [Path(part.strip()).expanduser() for part in values["calibration"].split(",") if part.strip()]
     names = BagNames(topics, values["base_frame"], read_rig_calibration(folders))

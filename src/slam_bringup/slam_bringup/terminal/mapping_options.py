@@ -19,17 +19,18 @@ from slam_viewer.results import RunResult
 from stereo_frontend.fiducials.detector import DICTIONARIES
 from stereo_frontend.frontend_config import MODES
 
-_ODOMETRY = "slam_bringup.odometry_topic"
+_TOPICS = "slam_bringup.topics"
 
 
-def _keep_odometry(context: click.Context, _: click.Parameter, topic: str | None) -> None:
-    context.meta[_ODOMETRY] = topic
+def _keep_topic(context: click.Context, option: click.Parameter, topic: str | None) -> None:
+    if topic:
+        role = str(option.name).removesuffix("_topic")
+        context.meta.setdefault(_TOPICS, []).append(f"{role}={topic}")
 
 
-def _with_odometry(context: click.Context, _: click.Parameter, topics: tuple[str, ...]) -> tuple[str, ...]:
-    """The topics given by role, with that of ``--odometry-topic``, which is read before them."""
-    topic = context.meta.get(_ODOMETRY)
-    return (*topics, f"odometry={topic}") if topic else topics
+def _with_kept(context: click.Context, _: click.Parameter, topics: tuple[str, ...]) -> tuple[str, ...]:
+    """The topics given by role, with those of options such as ``--odometry-topic``, which are read before them."""
+    return (*topics, *context.meta.get(_TOPICS, ()))
 
 
 _TAGS = "slam_bringup.tags"
@@ -80,11 +81,16 @@ _RIG_OPTIONS = (
         help="YAML, one group per node, as in docs/parameters.md",
     ),
     click.option(
-        "--odometry-topic", metavar="TOPIC", is_eager=True, expose_value=False, callback=_keep_odometry,
+        "--odometry-topic", metavar="TOPIC", is_eager=True, expose_value=False, callback=_keep_topic,
         help="odometry of wheels, legs or another estimator (nav_msgs/Odometry) [odometry, if there is one]",
     ),
     click.option(
-        "--topic", "topics", multiple=True, metavar="ROLE=TOPIC", callback=_with_odometry,
+        "--position-topic", metavar="TOPIC", is_eager=True, expose_value=False, callback=_keep_topic,
+        help="positions of UWB or GNSS in a fixed frame (geometry_msgs/PoseWithCovarianceStamped, docs/positions.md) "
+        "[position, if there is one]",
+    ),
+    click.option(
+        "--topic", "topics", multiple=True, metavar="ROLE=TOPIC", callback=_with_kept,
         help=f"a topic that is not named like the nodes' (may be repeated); roles: {', '.join(ROLES)}",
     ),
     calibration_option(),

@@ -25,6 +25,7 @@ class TransformNode(ListeningNode):
         super().__init__(name)
         self._ros_types = RosTypes()
         self.frames = FrameTree()
+        self._static_output: Any = None
         self._listen_to_static_transforms()
         self._tf = self._advertise_tf()
 
@@ -44,15 +45,13 @@ class TransformNode(ListeningNode):
             self._tf.publish(self._ros_types.TFMessage(transforms=as_ros(list(transforms))))
 
     def broadcast_static(self, transform: Message) -> None:
-        """Send a TransformStamped message once, for all who come later too: on /tf_static."""
+        """Send a TransformStamped message for all who come later too: on /tf_static."""
         profile, kind = sensor_qos(LATCHED_DEPTH, latched=True), self._tf_class()
-        if kind is not None:
-            self._static_output = self.create_publisher(kind, "/tf_static", profile)
-            self._static_output.publish(self._ros_types.TFMessage(transforms=as_ros([transform])))
-        else:
-            kind = self._ros_types.TransformStamped
-            self._static_output = self.create_publisher(kind, STATIC_TRANSFORMS_TOPIC, profile)
-            self._static_output.publish(as_ros(transform))
+        if self._static_output is None:
+            topic = STATIC_TRANSFORMS_TOPIC if kind is None else "/tf_static"
+            self._static_output = self.create_publisher(kind or self._ros_types.TransformStamped, topic, profile)
+        sent = as_ros(transform)
+        self._static_output.publish(sent if kind is None else self._ros_types.TFMessage(transforms=[sent]))
 
     def _reject(self, why: str, number: int = 1) -> None:
         self.health.count("rejected", number)

@@ -35,13 +35,14 @@ from slam_simulation.sensors.profiles import PROFILES
 @click.option("--rectified", is_flag=True, help="rectified stereo images (image_rect) instead of raw ones")
 @click.option("--truth", is_flag=True, help="also store the true depth of the left image")
 @click.option("--wheels", is_flag=True, help="wheel odometry too, with 1 % of slip unless the scenario says otherwise")
+@click.option("--position", is_flag=True, help="positions in the building's frame too, 10 % of them 5 m off")
 @click.option(
     "--threads", type=click.IntRange(1), help="threads that draw (all processors); the bag does not depend on it"
 )
 @overwrite_option("a bag that slam wrote")
 def command(
     scenario: str, output: Path, every: int, frames: int | None, seed: int | None, profile: str | None, storage: str,
-    images: str, compact: bool, rectified: bool, truth: bool, wheels: bool, threads: int | None,
+    images: str, compact: bool, rectified: bool, truth: bool, wheels: bool, position: bool, threads: int | None,
     overwrite: bool,
 ) -> None:  # fmt: skip
     """Render SCENARIO (a YAML file, or the name of one in bags/scenarios) to a bag with ground truth."""
@@ -52,8 +53,8 @@ def command(
         plan = replace(plan, seed=seed)
     if frames is not None:
         plan = plan.shortened(frames)
-    if wheels:
-        plan = replace(plan, sensors=(*plan.sensors, *{"wheels"}.difference(plan.sensors)))
+    for name in ["wheels"] * wheels + ["position"] * position:
+        plan = replace(plan, sensors=(*plan.sensors, *{name}.difference(plan.sensors)))
     options = BagOptions(images, compact, truth, rectified, storage, every, overwrite)
     with progress_bar() as progress:
         task = progress.add_task(f"rendering {plan.name}", total=-(-plan.frames // every) * len(plan.agents))

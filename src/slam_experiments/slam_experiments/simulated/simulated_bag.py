@@ -31,6 +31,7 @@ from slam_core.geometry import FloatArray
 from slam_core.messages import compressed_image_message, header_message, transform_message
 from slam_core.types import ByteArray
 from slam_simulation import Scenario, SimulatedFrame, Simulator
+from slam_simulation.sensors.position import BUILDING_FRAME
 from slam_simulation.sensors.stereo_sensor import SIDES
 from slam_simulation.sensors.tof_sensor import TofImages
 from slam_simulation.sensors.wheels import FRAME
@@ -112,6 +113,8 @@ class SimulationWriter(SensorWriter):
             self.imu(sample)
         for reading in frame.wheels:
             self.odometry(reading)
+        for position in frame.positions:
+            self.position(position, BUILDING_FRAME)
         self.ground_truth(frame.stamp_ns, frame.T_world_rig)
         self._moving_truth(frame.stamp_ns, frame.T_world_rig)
         if frame.left is not None and frame.right is not None:
