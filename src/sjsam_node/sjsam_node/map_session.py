@@ -175,7 +175,8 @@ class MapSession:
 
     def add_position(self, agent: str, reading: PositionReading) -> None:
         """Take a position of an agent in a fixed frame; it counts if it comes before the submap that it is inside."""
-        self._positions.add(agent, reading)
+        if self._config.position.use != "off":
+            self._positions.add(agent, reading)
 
     def add(self, submap: Submap) -> Future[Outcome | None]:
         """Join a submap, or locate its agent by it, after those before it; None if all was reset meanwhile."""

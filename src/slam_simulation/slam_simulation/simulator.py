@@ -46,8 +46,8 @@ class SimulatedFrame:
     """All that one agent's sensors report at one moment.
 
     left, right: raw uint8 images, None for a sensor that is not carried or a frame that was lost; right_stamp_ns
-    differs from stamp_ns by the jitter between the cameras. tof: raw images or None. imu, wheels, positions: readings since
-    the previous frame.
+    differs from stamp_ns by the jitter between the cameras. tof: raw images or None. imu, wheels, positions: readings
+    since the previous frame.
     """
 
     index: int

@@ -19,6 +19,7 @@ from sjsam_node.tags.map_tags import MapTag, tags_summary
 from slam_core.evaluation import Evaluation, evaluate
 from slam_core.geometry import FloatArray
 from slam_core.trajectory import Trajectory
+from slam_core.types import PoseEstimate
 from slam_viewer.verdict import RunConfig, faults_of_run
 from stereo_frontend.frame_log import LoggedFrame
 from stereo_frontend.frontend_config import FrontendReport
@@ -115,6 +116,8 @@ class RunResult:
     """True if the agents were located in a map of an earlier run, and nothing was mapped."""
     tags: tuple[MapTag, ...] = ()
     """Fiducial tags of the map, each once for every place."""
+    fixed_frame: PoseEstimate | None = None
+    """T_map_frame of the frame that positions are in, where it has been determined."""
 
 
 def summarise(result: RunResult) -> dict[str, Any]:

@@ -31,8 +31,10 @@ class FixedFrame:
     agrees: BoolArray
 
 
-def find_frame(antenna: FloatArray, positions: FloatArray, covariances: FloatArray) -> FixedFrame | None:
+def find_frame(antenna: FloatArray, positions: FloatArray, noise: FloatArray, drift: FloatArray) -> FixedFrame | None:
     """The frame of some positions; None unless most agree and are spread along two directions.
+
+    A map that is bent along its way feigns a spread that is not there, however many positions there are.
 
     Parameters
     ----------
@@ -40,40 +42,51 @@ def find_frame(antenna: FloatArray, positions: FloatArray, covariances: FloatArr
         Where the map has the antenna, (n, 3) m.
     positions
         Where it was in the fixed frame, (n, 3) m.
-    covariances
-        Of the difference, (n, 3, 3) m2: a position's own, and what the map may have drifted by.
+    noise
+        Variance of each position along any axis, (n,) m2.
+    drift
+        Variance that the map's own places have against each other, which does not average out, (n,) m2.
     """
     n = len(antenna)
     if n < _FEWEST:
         return None
-    reach = np.sqrt(_INSIDE * np.linalg.eigvalsh(covariances)[:, -1])
-    least = max(_FEWEST, int(np.ceil(_SHARE * n)))
+    reach, least = np.sqrt(_INSIDE * (noise + drift)), max(_FEWEST, int(np.ceil(_SHARE * n)))
     coarse = ransac_rigid_transform(positions, antenna, reach, np.random.default_rng(1), min_inliers=least)
     if not coarse.success:
         return None
-    T = coarse.T
-    weight = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
-    agrees = coarse.inliers
+    T, agrees = coarse.T, coarse.inliers
     for _ in range(_STEPS):
-        T, information = _step(T, antenna, positions, weight, agrees)
-        error = antenna - transform_points(T, positions)
-        agrees = np.einsum("ni,nij,nj->n", error, weight, error) <= _INSIDE
+        T = _step(T, antenna, positions, 1.0 / (noise + drift), agrees)
+        agrees = np.linalg.norm(antenna - transform_points(T, positions), axis=1) <= reach
         if agrees.sum() < least:
             return None
-    sigma = np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information)[3:, 3:])[-1])
+    sure = _information(antenna[agrees], 1.0 / (noise + agrees.sum() * drift)[agrees])
+    sigma = np.sqrt(np.linalg.eigvalsh(np.linalg.inv(sure)[3:, 3:])[-1])
     return FixedFrame(T, agrees) if sigma <= LARGEST_ANGLE else None
 
 
 def _step(
     T: FloatArray, antenna: FloatArray, positions: FloatArray, weight: FloatArray, agrees: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """A Gauss-Newton step, and the information (6, 6) of the transform about the middle of the positions."""
-    # Of the two the map's places are the sure ones: noise of positions would feign a spread that is not there.
-    places, W = antenna[agrees], weight[agrees]
-    middle = places.mean(axis=0)
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(places - middle)], axis=2)
+) -> FloatArray:
+    """A Gauss-Newton step."""
+    places, w = antenna[agrees], weight[agrees]
     error = places - transform_points(T, positions[agrees])
-    information = np.einsum("nij,nik,nkl->jl", J, W, J) + 1e-9 * np.eye(6)
-    d = np.linalg.solve(information, np.einsum("nij,nik,nk->j", J, W, error))
+    J, middle = _jacobian(places)
+    d = np.linalg.solve(_information(places, w), np.einsum("nij,n,ni->j", J, w, error))
     d[:3] -= np.cross(d[3:], middle)
-    return boxplus(T, d), information
+    return boxplus(T, d)
+
+
+def _information(places: FloatArray, weight: FloatArray) -> FloatArray:
+    """Information (6, 6) of a transform to some places (n, 3), about their middle."""
+    J, _ = _jacobian(places)
+    return np.asarray(np.einsum("nij,n,nil->jl", J, weight, J) + 1e-9 * np.eye(6))
+
+
+def _jacobian(places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivative (n, 3, 6) of what a transform leads to, turned about the middle (3,) of that.
+
+    At the map's places, which are the sure ones: noise of positions would feign a spread that is not there.
+    """
+    middle = places.mean(axis=0)
+    return np.concatenate([np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(places - middle)], axis=2), middle

@@ -76,19 +76,18 @@ class PositionLinks:
     def _aligned(self, records: Sequence[int], base: int | None) -> list[int]:
         """Link all records of a component whose place in the fixed frame is not known, once it can be found."""
         state = self.estimate.state
-        antenna, drift = [], []
-        for i in records:
-            own = self.graph.records[i].submap.landmarks[_antenna_rows(self.graph, i)]
-            antenna.append(transform_points(state.start(i), own))
-            drift.append(np.full(len(own), self.graph.odometry.path_length[self.graph.records[i].start]))
-        places, gone = np.concatenate(antenna), np.concatenate(drift)
+        counts = [len(self.waiting[i]) for i in records]
+        rows = [_antenna_rows(self.graph, i) for i in records]
+        places = [
+            transform_points(state.start(i), self.graph.records[i].submap.landmarks[r])
+            for i, r in zip(records, rows, strict=True)
+        ]
         readings = [r for i in records for r in self.waiting[i]]
         positions = np.array([r.position for r in readings])
-        away = self.verifier.config.drift * (gone - np.median(gone))
-        covariances = np.array([r.covariance for r in readings])
-        # Errors of positions are those of their own axes, which lie no other way than the frame's does: by the largest.
-        largest = np.linalg.eigvalsh(covariances)[:, -1] + away**2
-        found = find_frame(places, positions, largest[:, None, None] * np.eye(3))
+        # The frame's axes are not known yet: an error along any of them may be as large as that along the worst.
+        noise = np.array([np.linalg.eigvalsh(r.covariance)[-1] for r in readings])
+        drift = np.repeat(self._drift(records), counts)
+        found = find_frame(np.concatenate(places), positions, noise, drift)
         if found is None:
             return []
         shift = np.median(positions[found.agrees], axis=0) if base is None else self._shift(base)
@@ -99,6 +98,18 @@ class PositionLinks:
             first += len(self.waiting[i])
             made += self._linked(i, kept, invert_transform(state.start(i)) @ T_map_base, _EXACT, shift)
         return made
+
+    def _drift(self, records: Sequence[int]) -> FloatArray:
+        """Variance (n,) m2 of where the map has each of some records, seen from the middle one of them."""
+        middle, out = records[len(records) // 2], []
+        for i in records:
+            prior = self.estimate.relative_pose(middle, i) if i != middle else None
+            known = (
+                0.0 if prior is None or prior.covariance is None else np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]
+            )
+            length = self.graph.path_length_between(middle, i)
+            out.append(known + (self.verifier.config.drift * length) ** 2)
+        return np.array(out)
 
     def _near(self, record: int, base: int) -> int | None:
         """Link a record whose place in the fixed frame the map knows; None if it does not yet, or none agrees."""

@@ -27,6 +27,7 @@ LATE = "positions_in_no_submap"
 class PositionConfig(Config):
     """Positions of an antenna on the rig in a fixed frame of its own, of UWB or GNSS."""
 
+    use: str = parameter("auto", "positions on the topic position", choices=("auto", "off"))
     lever_arm: tuple[float, ...] = parameter((0.0, 0.0, 0.0), "place of the antenna in the base frame", unit="m")
     interval: float = parameter(
         1.0, "positions closer in time share what they err by: of these one counts", unit="s", minimum=0.0

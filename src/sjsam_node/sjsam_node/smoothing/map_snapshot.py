@@ -198,8 +198,8 @@ class MapSnapshot:
         return replace(self, _state=replace(self._state, solved={}, reduced={}, recovered={}))
 
     def skeleton_lines(self) -> FloatArray:
-        """Start and end (submaps, 2, 3) m of every submap."""
-        return np.asarray(self.poses[self.nodes][:, :, :3, 3])
+        """Start and end (n, 2, 3) m of every submap that cameras made."""
+        return np.asarray(self.poses[self.nodes[~self.is_position]][:, :, :3, 3])
 
     def closure_lines(self) -> FloatArray:
         """Starts (closures, 2, 3) m of the two submaps of every closure."""
@@ -220,15 +220,20 @@ class MapSnapshot:
         return PoseEstimate(r.submap.end_stamp_ns, self.poses[r.end], self._covariance(r.end))
 
     @property
+    def is_position(self) -> BoolArray:
+        """Mask (submaps,) of those that cameras did not make: positions in a fixed frame."""
+        return self._state.graph.is_position
+
+    @property
     def submap_count(self) -> int:
-        """Number of submaps that cameras made, without positions in a fixed frame."""
-        return len(self) - int(np.count_nonzero(self._state.graph.is_position))
+        """Number of submaps that cameras made."""
+        return int(np.count_nonzero(~self.is_position))
 
     @property
     def is_on_a_way(self) -> BoolArray:
         """Mask (nodes,) of those at which an agent was: a submap of positions starts and ends elsewhere."""
         out = np.ones(len(self.poses), dtype=np.bool_)
-        out[self.nodes[self._state.graph.is_position].ravel()] = False
+        out[self.nodes[self.is_position].ravel()] = False
         return out
 
     @property
@@ -238,7 +243,7 @@ class MapSnapshot:
 
     def fixed_frame(self) -> PoseEstimate | None:
         """T_map_frame of the fixed frame that positions are in, with covariance, as of the last one; None without."""
-        numbers = np.nonzero(self._state.graph.is_position & self.is_tied)[0]
+        numbers = np.nonzero(self.is_position & self.is_tied)[0]
         if not len(numbers):
             return None
         start, submap = self.start(int(numbers[-1])), self.submaps[numbers[-1]]

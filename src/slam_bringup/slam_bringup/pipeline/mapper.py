@@ -111,8 +111,8 @@ class Mapper:
     def record(self, wall_s: float, dropped: Mapping[str, int], failure: str) -> RunRecord:
         """Record of the run, after :meth:`finish`."""
         known, is_located = self.session.known, self.session.mode is Mode.LOCALISE
-        shown, landmarks, mapped = self.session.read(
-            lambda now: (now.structure(), now.landmarks(), now.trajectory(known))
+        shown, landmarks, mapped, fixed_frame = self.session.read(
+            lambda now: (now.structure(), now.landmarks(), now.trajectory(known), now.fixed_frame())
         ).result()
         tags = map_tags(shown, landmarks)
         return RunRecord(
@@ -131,6 +131,7 @@ class Mapper:
             solver=next((o.report.solver for o in reversed(self._outcomes) if o.report and o.report.solver), ""),
             backlog=self._backlog(),
             tags=tags,
+            fixed_frame=fixed_frame,
         )
 
     def _located(self) -> dict[str, list[PoseEstimate]]:

@@ -104,6 +104,7 @@ class RunRecord:
     failure: str = ""
     backlog: Mapping[str, int] = field(default_factory=dict)
     tags: tuple[MapTag, ...] = ()
+    fixed_frame: PoseEstimate | None = None
 
     def with_front_ends(
         self, reports: Mapping[str, FrontendReport], frames: Mapping[str, Sequence[LoggedFrame]] | None = None
@@ -170,6 +171,7 @@ def run_result(
         changed=_changed(config),
         limits=config.run,
         tags=record.tags,
+        fixed_frame=record.fixed_frame,
     )
     on_mapped(mapped)
     surface, plans, failure = _dense(bag, config, record, agents, on_reading, stopped)
@@ -241,7 +243,7 @@ def _sensors(bag: SensorBag, config: SystemConfig, agent: str, odometry: str) ->
     used = ["stereo camera"] * (mode != "tof") + [depth] * (mode != "stereo" or odometry != "none")
     used += ["IMU"] * (config.ekf_slam.imu.use != "off" and bag.count(agent, "imu") > 0)
     used += ["odometry"] * (config.ekf_slam.odometry.use != "off" and bag.count(agent, "odometry") > 0)
-    used += ["positions"] * (bag.count(agent, "position") > 0)
+    used += ["positions"] * (config.sjsam.position.use != "off" and bag.count(agent, "position") > 0)
     for name, wanted, role in (("stereo camera", dense.use_stereo, "right"), (depth, dense.use_tof, "depth")):
         if wanted and role in topics and name not in used:
             used.append(f"{name} for the dense model alone")

@@ -98,6 +98,7 @@ def collect(
             map=snapshot,
             landmarks=landmarks,
             tags=map_tags(snapshot, landmarks),
+            fixed_frame=snapshot.fixed_frame(),
             trajectories={agent: recording.located(agent) for agent in opened.agents}
             if is_localized
             else snapshot.trajectory(start_map.submaps if start_map else 0),

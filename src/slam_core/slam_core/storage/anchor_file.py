@@ -15,7 +15,7 @@ from slam_core.geometry import FloatArray, is_rigid_transform, pose7_from_transf
 from slam_core.storage.files import atomic_text, read_yaml
 
 BUILDING_FRAME = "building"
-_WRITER = "slam anchor"
+_WRITERS = ("slam anchor", "slam run")
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,8 @@ class Anchor:
     """``T`` = T_building_map (4, 4) with its covariance (6, 6), translation first, about the building's axes.
 
     ``frame`` and ``map_frame`` are the names of the two; ``plan`` the building's floor plan and how it lies in that
-    frame; ``points`` what the transform comes from; ``files`` digests of what was written with it.
+    frame; ``points`` what the transform comes from; ``files`` digests of what was written with it;
+    ``written_by`` the command that wrote it.
     """
 
     T: FloatArray
@@ -33,6 +34,7 @@ class Anchor:
     plan: dict[str, Any] = field(default_factory=dict)
     points: list[dict[str, Any]] = field(default_factory=list)
     files: dict[str, str] = field(default_factory=dict)
+    written_by: str = _WRITERS[0]
 
     def write(self, path: Path) -> None:
         """Write the file, whole or not at all."""
@@ -41,7 +43,7 @@ class Anchor:
             "frame": self.frame, "child_frame": self.map_frame,
             "position": pose[:3], "quaternion": pose[3:],
             "covariance": [[float(v) for v in row] for row in self.covariance],
-            "plan": self.plan, "points": self.points, "written_by": _WRITER, "files": self.files,
+            "plan": self.plan, "points": self.points, "written_by": self.written_by, "files": self.files,
         }  # fmt: skip
         atomic_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
 
@@ -82,12 +84,12 @@ def read_anchor(path: Path) -> Anchor:
 
 
 def is_anchor(path: Path) -> bool:
-    """True if ``slam anchor`` wrote the file."""
+    """True if ``slam anchor`` wrote the file, or a run with positions in a fixed frame."""
     try:
         content = read_yaml(path)
     except (OSError, ValueError):
         return False
-    return isinstance(content, Mapping) and content.get("written_by") == _WRITER
+    return isinstance(content, Mapping) and content.get("written_by") in _WRITERS
 
 
 def _require_covariance(P: FloatArray) -> None:

@@ -10,7 +10,9 @@ import numpy as np
 import yaml
 
 from sjsam_node.tags.map_tags import tags_file
+from slam_core.geometry import inverse_jacobian, invert_transform
 from slam_core.point_cloud import write_ply
+from slam_core.storage.anchor_file import Anchor
 from slam_core.storage.files import atomic_text
 from slam_core.trajectory import write_covariance_csv, write_tum
 from slam_viewer.results import AgentResult, LandmarkMap, RunResult
@@ -26,6 +28,10 @@ def write_mapped(out: Path, result: RunResult, save_map: SaveMap | None = None) 
         save_map(out / "map")
     _write_trajectories(out, result.agents)
     _write_landmarks(out / "landmarks.ply", result.landmarks)
+    if (frame := result.fixed_frame) is not None:
+        T = invert_transform(frame.T)
+        J = inverse_jacobian(frame.T)
+        Anchor(T, J @ frame.covariance @ J.T, written_by="slam run").write(out / "anchor.yaml")
     if any(tag.is_tied and tag.submaps for tag in result.tags):
         atomic_text(out / "tags.yaml", yaml.safe_dump(tags_file(result.tags), sort_keys=False, default_flow_style=None))
 

@@ -44,13 +44,15 @@ def _chained(snapshot: MapSnapshot) -> FloatArray:
 
 
 def _draw_submaps(axes: Axes, snapshot: MapSnapshot, starts: FloatArray) -> None:
-    for k, (submap, T) in enumerate(zip(snapshot.submaps, starts, strict=True)):
+    every = list(zip(snapshot.submaps, starts, strict=True))
+    own = ~snapshot.is_position
+    for k, (submap, T) in enumerate(every[i] for i in np.nonzero(own)[0].tolist()):
         colour = COLOURS[k % len(COLOURS)]
         points = transform_points(T, submap.landmarks)
         axes.plot(points[:, 0], points[:, 1], ".", color=colour, markersize=1.5, alpha=0.5)
         path = np.array([(T @ pose.T)[:2, 3] for pose in submap.path])
         axes.plot(*path.T, color=colour, linewidth=1.6)
-    middle = starts[:, :2, 3]
+    middle = starts[own, :2, 3]
     margin = 0.3 * float(np.ptp(middle, axis=0).max()) + 2.0
     axes.set_xlim(middle[:, 0].min() - margin, middle[:, 0].max() + margin)
     axes.set_ylim(middle[:, 1].min() - margin, middle[:, 1].max() + margin)
