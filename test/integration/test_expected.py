@@ -32,6 +32,7 @@ def test_every_scenario_of_the_thesis_has_bounds():
         "tagged_corridor",
         "tagged_corridor_2",
         "untriggered_pair",
+        "corridor_with_positions",
     }
 
 

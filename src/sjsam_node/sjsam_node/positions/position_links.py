@@ -12,7 +12,7 @@ are counted, and tie nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -163,6 +163,16 @@ class PositionLinks:
     def _count(self, name: str, amount: int) -> None:
         if amount:
             self.counters.add(name, amount)
+
+
+def positions_text(counts: Mapping[str, int], *, is_determined: bool) -> str:
+    """Line for a user whose rig heard positions, by the map's counts."""
+    if not is_determined:
+        return (
+            "positions were heard, but where their frame lies in the map is not determined: they change nothing. They "
+            "must agree with the way, and be spread along two directions by more than they and the map err"
+        )
+    return f"{counts.get(USED, 0)} positions joined with the map, {counts.get(REFUSED, 0)} refused"
 
 
 def readings_of(positions: Submap) -> tuple[PositionReading, ...]:

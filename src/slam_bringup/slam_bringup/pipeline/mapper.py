@@ -15,6 +15,7 @@ from ekf_slam_node.stage import FilterStage, FrameResult
 from ndt_registration.stage import ScanEstimate
 from sjsam_node.agents import in_order
 from sjsam_node.map_session import MapSession, Mode, Outcome
+from sjsam_node.positions.position_links import positions_text
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from sjsam_node.tags.map_tags import map_tags
 from slam_bags.reading.readings import AgentSensors, SessionStart
@@ -53,6 +54,7 @@ class Mapper:
         self._futures: list[Future[Outcome | None]] = []
         self._outcomes: list[Outcome] = []
         self._events: list[str] = []
+        self._uses_positions, self._has_positions = config.sjsam.position.use != "off", False
 
     def process(self, item: AgentItem) -> None:
         """One step of one agent's filter, and of the map where that finished a submap."""
@@ -61,6 +63,7 @@ class Mapper:
             self._process_waiting(item.agent)
             self._hand_over(stage.start_session())
         elif isinstance(value, PositionReading):
+            self._has_positions = self._uses_positions
             self.session.add_position(item.agent, value)
         elif isinstance(value, ScanEstimate):
             self._diaries[item.agent].scans.append(value.pose)
@@ -101,7 +104,8 @@ class Mapper:
             text = f"{lost} of {len(self._outcomes)} submaps were not found in the map: their poses are left out"
             return [text] * bool(lost)
         shown = self.session.snapshot
-        return [*_loose(shown, self.session.known), *filter(None, [shown.overconfidence])]
+        said = positions_text(self.session.counts, is_determined=bool(shown.is_position.any()))
+        return [*_loose(shown, self.session.known), *filter(None, [shown.overconfidence]), *[said] * self._has_positions]
 
     @property
     def has_frames(self) -> bool:
