@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,10 +47,10 @@ class HeldJoiner:
         self.may_go_on, self.is_held = threading.Event(), threading.Event()
         add = GlobalMap.add
 
-        def held(joined: GlobalMap, submap: Submap) -> JoinReport:
+        def held(joined: GlobalMap, *given: Any) -> JoinReport:
             self.is_held.set()
             assert self.may_go_on.wait(60.0)
-            return add(joined, submap)
+            return add(joined, *given)
 
         monkeypatch.setattr(GlobalMap, "add", held)
 
@@ -99,7 +100,7 @@ def test_what_one_submap_raises_reaches_its_future_and_the_next_is_joined(
     submaps: list[Submap], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     add = GlobalMap.add
-    monkeypatch.setattr(GlobalMap, "add", lambda joined, s: add(joined, s) if s.index else 1 / 0)
+    monkeypatch.setattr(GlobalMap, "add", lambda joined, s, *more: add(joined, s, *more) if s.index else 1 / 0)
     session = MapSession(GlobalMapConfig(), autosave=Autosave(tmp_path / "copy", 10.0))
     futures = [session.add(submap) for submap in submaps]
     session.close()

@@ -160,11 +160,11 @@ class SlowJoiner:
         self.may_go_on, self.is_held = threading.Event(), threading.Event()
         add, left = GlobalMap.add, iter(range(before))
 
-        def slow_add(joined: GlobalMap, submap: Submap) -> JoinReport:
+        def slow_add(joined: GlobalMap, *given: Any) -> JoinReport:
             if next(left, None) is None:
                 self.is_held.set()
                 assert self.may_go_on.wait(60.0)
-            return add(joined, submap)
+            return add(joined, *given)
 
         monkeypatch.setattr(GlobalMap, "add", slow_add)
 

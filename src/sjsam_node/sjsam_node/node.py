@@ -6,11 +6,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
+from time import ctime, monotonic
 from typing import Any, TypeVar
 
 import numpy as np
@@ -109,9 +109,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         initial = self.config.initial_map or (self.config.map_path if self.config.localize_only else "")
         copy = self.map.crash_recovery_path()
         if copy is None and initial:
-            path = Path(initial).expanduser()
-            self._show_loaded(self.map.load(path, self._seen).result())
-            self.get_logger().info(f"{len(self.map.snapshot)} submaps read from {path}")
+            self._show_loaded(self.map.load(Path(initial).expanduser(), self._seen).result())
+            self.get_logger().info(f"{len(self.map.snapshot)} submaps read from {initial}")
         elif copy is not None:
             try:
                 self._show_loaded(self.map.load(copy, self._seen).result())
@@ -119,8 +118,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
                 self.get_logger().error(f"the autosaved map cannot be used, a new one begins: {error}")
                 self.map.reset()
                 return
-            written = time.ctime((copy / "manifest.json").stat().st_mtime)
-            known = f"{len(self.map.snapshot)} submaps of {written} in {copy}"
+            known = f"{len(self.map.snapshot)} submaps of {ctime((copy / 'manifest.json').stat().st_mtime)} in {copy}"
             self.get_logger().warning(f"a node was killed: going on from {known} (~/reset forgets them)")
 
     def _start_trackers(self) -> None:
@@ -173,7 +171,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         self.health.count("submaps received")
         key, item = (submap.agent, submap.session, submap.index), (agent, submap)
         self._hand_over([item] if self.config.localize_only else self._order.add(key, item))
-        if self._order.should_ask(time.monotonic()):
+        if self._order.should_ask(monotonic()):
             self.ask_again(below(agent, topic) for topic in SUBMAP_TOPICS)
 
     def _hand_over(self, submaps: list[tuple[str, Submap]]) -> None:
@@ -338,7 +336,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     # -- outputs -------------------------------------------------------------------------------------------------------
 
     def _publish_news(self) -> None:
-        if missing := self._order.overdue(time.monotonic()):
+        if missing := self._order.overdue(monotonic()):
             for (agent, _), indices in missing.items():
                 self.health.count("submaps missed", len(indices))
                 self.get_logger().warning(gap_text(agent, indices))

@@ -132,7 +132,7 @@ def test_a_map_joined_anew_in_time_order_keeps_its_positions(agent: Agent, subma
     known = joined(submaps, positions(agent, 1)[0])
     settled = joined(submaps, positions(agent, 1)[0])
     settled.settle()
-    settled._was_settled_before = True
+    settled._is_out_of_order = True
     again = settled.rebuilt_in_time_order()
     assert again is not settled
     assert [r.key for r in again.state.graph.records] == [r.key for r in known.state.graph.records]
