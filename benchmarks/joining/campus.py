@@ -28,9 +28,9 @@ def campus(agents: int, submaps: int, seed: int = 0) -> tuple[FlatMaps, JoiningS
     rng = np.random.default_rng(seed)
     # Corridors along x and y, BLOCK_M apart: 2 (n + 1) n BLOCK_M metres in all.
     n = max(2, round(np.sqrt(agents * submaps / VISITS / (2 * BLOCK_M))))
-    places, headings = zip(*(_walk(n, submaps, rng) for _ in range(agents)), strict=True)
+    places, headings = zip(*(walk(n, submaps, rng) for _ in range(agents)), strict=True)
     xy, yaw = np.array(places, dtype=np.float64), np.array(headings)
-    landmarks = _landmarks(n, rng)
+    landmarks = landmarks_on_walls(n, rng)
     poses = agents * (submaps + 1)
     t = np.concatenate([xy.reshape(poses, 2) + rng.uniform(-0.3, 0.3, (poses, 2)), np.zeros((poses, 1))], axis=1)
     R = so3_exp(np.stack([*rng.normal(0, 0.02, (2, poses)), yaw.ravel()], axis=1))
@@ -46,7 +46,7 @@ def campus(agents: int, submaps: int, seed: int = 0) -> tuple[FlatMaps, JoiningS
     return maps, state, np.array([0])
 
 
-def _walk(n: int, steps: int, rng: np.random.Generator) -> tuple[list[tuple[int, int]], list[float]]:
+def walk(n: int, steps: int, rng: np.random.Generator) -> tuple[list[tuple[int, int]], list[float]]:
     """Places (steps + 1) in metres, on the grid of corridors, and headings there."""
     at = np.array([rng.integers(0, n + 1) * BLOCK_M, rng.integers(0, n * BLOCK_M + 1)])
     direction, places, headings = np.array([0, 1]), [], []
@@ -67,7 +67,7 @@ def _is_inside(at: IntArray, n: int) -> bool:
     return bool(((at >= 0) & (at <= n * BLOCK_M)).all())
 
 
-def _landmarks(n: int, rng: np.random.Generator) -> FloatArray:
+def landmarks_on_walls(n: int, rng: np.random.Generator) -> FloatArray:
     """Landmarks on the walls of all corridors, (l, 3) m."""
     along = rng.uniform(0, n * BLOCK_M, (2 * (n + 1), n * BLOCK_M * DENSITY))
     across = np.repeat(np.arange(n + 1) * BLOCK_M, 2)[:, None] + rng.choice([-1.2, 1.2], along.shape)
