@@ -10,6 +10,7 @@ import numpy as np
 
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray
+from slam_radio.packing import packing_kernels
 
 
 class BlockDiagonal(NamedTuple):
@@ -46,8 +47,9 @@ class BlockDiagonal(NamedTuple):
 
     def times(self, M: AnyArray) -> AnyArray:
         """The product with a matrix (6 + 3n, k)."""
-        n, k = len(self.landmarks), M.shape[1]
-        return np.concatenate([self.pose @ M[:6], (self.landmarks @ M[6:].reshape(n, 3, k)).reshape(3 * n, k)])
+        out = np.empty(M.shape, dtype=np.result_type(self.pose, M))
+        packing_kernels.times(*self, M, out)
+        return out
 
     def around(self, other: BlockDiagonal) -> BlockDiagonal:
         """A S A' for this matrix A and a symmetric one of the same blocks."""

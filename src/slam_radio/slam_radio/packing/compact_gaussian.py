@@ -18,17 +18,21 @@ factor by the Lanczos method (Golub and Van Loan, Matrix Computations, 8.2 and 1
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
 from slam_core.types import AnyArray, Float32Array
-from slam_radio.packing import gaussian_kernels
+from slam_radio.packing import packing_kernels
 from slam_radio.packing.block_diagonal import BlockDiagonal
 
 IntArray = npt.NDArray[np.int64]
+Product = Callable[[AnyArray], AnyArray]
+"""The products of a matrix (m, m) with vectors (m, k)."""
 
 UNIT = 1e-3
 """Factors are sent in mm and mrad."""
@@ -97,9 +101,7 @@ class CompactGaussian:
 
     def blocks(self) -> BlockDiagonal:
         """The blocks of B."""
-        pose = np.zeros((6, 6))
-        pose[np.tril_indices(6)] = UNIT * self.pose.astype(np.float64)
-        return BlockDiagonal(pose, _ray_frames(self.rays) @ _factors(self.factors))
+        return BlockDiagonal(_pose_factor(self.pose), _ray_frames(self.rays) @ _factors(self.factors))
 
     def require_positive(self) -> None:
         """Raise ``ValueError`` if rounding may leave the covariance not positive definite.
@@ -110,16 +112,16 @@ class CompactGaussian:
             raise ValueError("a submap for the air holds numbers that are not finite")
         if (np.abs(self.factors[:, :3]) // _OCTAVE).max(initial=0) >= _MOST_OCTAVES:
             raise ValueError("a submap for the air has a covariance that cannot be")
-        pose = np.zeros((6, 6))
-        pose[np.tril_indices(6)] = self.pose
-        for L in (pose, _factors(self.factors)):
+        for L in (_pose_factor(self.pose), _factors(self.factors)):
             length = np.linalg.norm(L, axis=-1, keepdims=True)
             if not (length > 0.0).all() or np.linalg.svd(L / length, compute_uv=False).min(initial=1.0) < _LEAST_SHARE:
                 raise ValueError("a submap for the air has a covariance that is not positive definite")
 
     def end_covariance(self) -> FloatArray:
         """The pose's own covariance (6, 6)."""
-        return replace(self, factors=self.factors[:0], rays=self.rays[:0], common=self.common[:6]).covariance()
+        U = self.common[:6] / _STEPS
+        L = _pose_factor(self.pose)
+        return np.asarray(L @ (_COMMON * U @ U.T + self.inflation * _floored(np.eye(6) - U @ U.T)) @ L.T)
 
     def followed_by(self, factors: IntArray, rays: FloatArray, common: IntArray, inflation: float) -> CompactGaussian:
         """The Gaussian with more landmarks, and another factor t."""
@@ -152,9 +154,10 @@ def compact_gaussian(covariance: FloatArray, rays: FloatArray, rank: int, roundi
     S = _with_rounding(covariance, rounding)
     rounded = CompactGaussian(*_rounded_factors(S, rays), rays, np.zeros((len(S), 0), dtype=np.int64), 1.0)
     rounded.require_positive()
-    whitened = _whitened(S, rounded)
+    B = rounded.blocks()
+    whitened = _whitened(S, B)
     U = _common_directions(whitened, min(rank, len(S) - 1))
-    return _with_least_factor(S, replace(rounded, common=_rounded(U)), whitened)
+    return _with_least_factor(S, replace(rounded, common=_rounded(U)), B, whitened)
 
 
 def extended(
@@ -182,11 +185,14 @@ def extended(
     none = np.zeros((len(S) - known, gaussian.common.shape[1]), dtype=np.int64)
     rounded = gaussian.followed_by(factors[len(gaussian.factors) :], rays, none, 1.0)
     rounded.require_positive()
-    whitened = _whitened(S, rounded)
+    B = rounded.blocks()
+    whitened = _whitened(S, B)
     U = gaussian.common / _STEPS
     weighted = _own(U).mapped(np.linalg.inv).times(U)
     more = np.linalg.lstsq(U.T @ weighted, weighted.T @ whitened[:known, known:], rcond=None)[0].T
-    return _with_least_factor(S, replace(rounded, common=np.concatenate([gaussian.common, _rounded(more)])), whitened)
+    return _with_least_factor(
+        S, replace(rounded, common=np.concatenate([gaussian.common, _rounded(more)])), B, whitened
+    )
 
 
 def _sum(S: FloatArray, blocks: BlockDiagonal) -> FloatArray:
@@ -224,6 +230,13 @@ def _rounded_factors(S: FloatArray, rays: FloatArray) -> tuple[npt.NDArray[np.fl
     return values.astype(np.float16), np.concatenate([logarithms, np.rint(_RATIO * ratios)], axis=1).astype(np.int64)
 
 
+def _pose_factor(values: npt.NDArray[np.float16]) -> FloatArray:
+    """The pose's factor (6, 6), m and rad."""
+    L = np.zeros((6, 6))
+    L[np.tril_indices(6)] = UNIT * values.astype(np.float64)
+    return L
+
+
 _BESIDE = np.tril_indices(3, -1)
 
 
@@ -246,18 +259,18 @@ def _ray_frames(rays: FloatArray) -> FloatArray:
     return np.stack([x, np.cross(z, x), z], axis=2)
 
 
-def _whitened(S: FloatArray, rounded: CompactGaussian) -> Float32Array:
+def _whitened(S: FloatArray, B: BlockDiagonal) -> Float32Array:
     """B^-1 S B'^-1 in single precision."""
     out = np.empty(S.shape, dtype=np.float32)
-    gaussian_kernels.between(*rounded.blocks().inverse(), S, out)
+    packing_kernels.between(*B.inverse(), S, out)
     return out
 
 
-def _scaled(left: BlockDiagonal, C: Float32Array) -> Float32Array:
-    """A C A' in single precision."""
-    out = np.empty_like(C)
-    gaussian_kernels.between(*left.coarse(), C, out)
-    return out
+def _scaled(L: BlockDiagonal, C: Product) -> Product:
+    """Products of vectors (m, k) with L^-1 C L'^-1, in single precision."""
+    inverse = L.inverse().coarse()
+    transposed = inverse.mapped(lambda blocks: np.ascontiguousarray(np.swapaxes(blocks, -1, -2)))
+    return lambda V: inverse.times(C(transposed.times(V)))
 
 
 def _rounded(U: AnyArray) -> IntArray:
@@ -291,30 +304,33 @@ def _common_directions(C: Float32Array, rank: int) -> FloatArray:
     U, D = np.zeros((m, rank)), BlockDiagonal(0.5 * np.eye(6), np.tile(0.5 * np.eye(3), ((m - 6) // 3, 1, 1)))
     for _ in range(_ITERATIONS):
         L = D.cholesky()
-        scaled = _scaled(L.inverse(), C)
+        scaled = _scaled(L, lambda X: C @ X)
         for _ in range(_POWERS):
-            V = scaled @ V
+            V = scaled(V)
         V = np.linalg.qr(V)[0]
-        values, turns = np.linalg.eigh(V.T @ (scaled @ V))
+        values, turns = np.linalg.eigh(V.T @ scaled(V))
         vectors = (V @ turns[:, -rank:]).astype(np.float64)
         U = L.times(vectors * np.sqrt(np.maximum(values[-rank:] - 1.0, 0.0)))
         D = _own(U)
     return np.asarray(U)
 
 
-def _with_least_factor(S: FloatArray, rounded: CompactGaussian, whitened: Float32Array) -> CompactGaussian:
+def _with_least_factor(
+    S: FloatArray, rounded: CompactGaussian, B: BlockDiagonal, whitened: Float32Array
+) -> CompactGaussian:
     """The Gaussian with the least t >= 1, to 0.5 % and never less, for which it less S is positive definite.
 
-    ``whitened``: S between inverses of B, which gives a first t; it is tested on S itself.
+    ``B``: the blocks of the Gaussian; ``whitened``: S between their inverses, which gives a first t. It is tested on S.
     """
     U = rounded.common / _STEPS
     own, coarse = _own(U), (np.sqrt(_COMMON) * U).astype(np.float32)
-    t = max(1.0, _largest_eigenvalue(_scaled(own.cholesky().inverse(), whitened - coarse @ coarse.T)))
-    B, step = rounded.blocks(), _FACTOR_STEP * t
+    left = _scaled(own.cholesky(), lambda X: whitened @ X - coarse @ (coarse.T @ X))
+    t = max(1.0, _largest_eigenvalue(left, len(S)))
+    step = _FACTOR_STEP * t
     V, own = np.sqrt(_COMMON) * B.times(U), B.around(own)
     while t + step < MOST_INFLATION / _MARGIN**2:
         gap = V @ V.T
-        gaussian_kernels.with_blocks(*own.scaled(t + step), S, gap)
+        packing_kernels.with_blocks(*own.scaled(t + step), S, gap)
         if _is_positive(gap):
             up = float(np.nextafter(np.float32((t + step) * _MARGIN), np.float32(np.inf)))
             return replace(rounded, inflation=up)
@@ -322,15 +338,14 @@ def _with_least_factor(S: FloatArray, rounded: CompactGaussian, whitened: Float3
     raise ValueError(f"a submap's covariance would have to be sent {MOST_INFLATION:.0e} times too large")
 
 
-def _largest_eigenvalue(C: Float32Array) -> float:
+def _largest_eigenvalue(C: Product, m: int) -> float:
     """Largest eigenvalue of a symmetric matrix by the Lanczos method, from below; all vectors are kept orthogonal."""
-    m = len(C)
     count = min(_KRYLOV, m)
     Q, T = np.zeros((count, m), dtype=np.float32), np.zeros((count, count))
     v = _start(m, 1)[:, 0]
     for k in range(count):
         Q[k] = v
-        known, w = Q[: k + 1], C @ v
+        known, w = Q[: k + 1], C(v[:, None])[:, 0]
         T[: k + 1, k] = along = known @ w
         w -= along @ known
         w -= (known @ w) @ known
@@ -342,6 +357,7 @@ def _largest_eigenvalue(C: Float32Array) -> float:
     return float(np.linalg.eigvalsh(T[:count, :count], UPLO="U")[-1])
 
 
+@lru_cache(maxsize=8)
 def _start(m: int, count: int) -> Float32Array:
     """Vectors (m, count), orthonormal and the same for ever, that are like no direction of a submap."""
     values = np.cos(np.arange(m * count, dtype=np.float64).reshape(m, count) ** 2)

@@ -16,6 +16,7 @@ from slam_core.geometry import FloatArray
 from slam_core.tags import is_tag_corner
 from slam_core.types import Float32Array, Submap
 from slam_radio.packing.descriptor_code import basis
+from slam_radio.packing.packing_kernels import crowded
 
 _COLUMN = 1
 """Of the basis: the direction in which SURF-128 descriptors differ most from each other; all share the first one."""
@@ -47,10 +48,4 @@ def rank_values(descriptors: Float32Array) -> FloatArray:
 
 def _is_crowded(points: FloatArray) -> npt.NDArray[np.bool_]:
     """Mask (n,) of points beside an earlier one that is not crowded itself."""
-    from scipy.spatial import cKDTree  # receivers need none
-
-    reach = _APART * np.maximum(np.linalg.norm(points, axis=1), 1.0)
-    crowded = np.zeros(len(points), dtype=bool)
-    for k, near in enumerate(cKDTree(points).query_ball_point(points, reach)):
-        crowded[k] = any(other < k and not crowded[other] for other in near)
-    return crowded
+    return np.asarray(crowded(points, _APART * np.maximum(np.linalg.norm(points, axis=1), 1.0)))

@@ -159,7 +159,8 @@ def unpack(data: bytes) -> Submap:
 def lightened(submap: Submap, config: LightConfig) -> LightSubmap:
     """The content of a submap's message; ``ValueError`` as :func:`pack`."""
     rows = choose_landmarks(submap, config.landmarks)
-    covariance = submap.covariance[np.ix_(*2 * [unknowns_of(rows)])]
+    unknowns = unknowns_of(rows)
+    covariance = submap.covariance.take(unknowns, 0).take(unknowns, 1)
     blocks = covariance[6:, 6:].reshape(len(rows), 3, len(rows), 3)[np.arange(len(rows)), :, np.arange(len(rows)), :]
     exponent = grid_exponent(blocks)
     cells = on_grid(submap.landmarks[rows], exponent)

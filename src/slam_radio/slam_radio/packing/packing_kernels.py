@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled products of symmetric matrices and of block-diagonal ones: a pose's block of 6, then landmarks' of 3.
+"""Compiled: products of symmetric matrices and of block-diagonal ones, and the search for points beside others.
+
+A block-diagonal matrix has a pose's block of 6, then landmarks' of 3.
 
 ``pose`` (6, 6) and ``blocks`` (n, 3, 3) are the blocks of A; matrices are (6 + 3n, 6 + 3n).
 """
@@ -47,6 +49,20 @@ def between(pose, blocks, S, out):
 
 
 @njit(cache=True, nogil=True)
+def times(pose, blocks, M, out):
+    """``out`` = A M, (6 + 3n, k)."""
+    out[:] = 0
+    for i in range(len(blocks) + 1):
+        a, count = (0, 6) if i == 0 else (3 + 3 * i, 3)
+        for p in range(count):
+            row = out[a + p]
+            for q in range(count):
+                factor, of = pose[p, q] if i == 0 else blocks[i - 1, p, q], M[a + q]
+                for c in range(len(row)):
+                    row[c] += factor * of[c]
+
+
+@njit(cache=True, nogil=True)
 def with_blocks(pose, blocks, S, out):
     """``out`` += A - S, the lower triangle alone; A is symmetric."""
     for x in range(len(S)):
@@ -60,3 +76,17 @@ def with_blocks(pose, blocks, S, out):
         for p in range(3):
             for q in range(p + 1):
                 out[a + p, a + q] += blocks[i, p, q]
+
+
+@njit(cache=True, nogil=True)
+def crowded(points, reach):
+    """Mask (n,) of points (n, 3) within ``reach`` (n,) of an earlier one that is not crowded itself."""
+    out = np.zeros(len(points), dtype=np.bool_)
+    for i in range(len(points)):
+        for j in range(i):
+            if not out[j]:
+                x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+                if x * x + y * y + z * z <= reach[i] * reach[i]:
+                    out[i] = True
+                    break
+    return out
