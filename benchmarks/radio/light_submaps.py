@@ -10,7 +10,8 @@ between whole submaps too, parts of the map, position error (mm, all agents alig
 that are sent, and the claimed sigma of the submaps' ends over that of whole submaps (median and least).
 
 ``--only``: what is done to submaps, to find what a loss is due to: ``landmarks`` are chosen, ``descriptors`` coded,
-the ``gaussian`` compacted, and nothing else. ``--details``: with the details of all submaps, which count too.
+the ``gaussian`` compacted, the ``path`` thinned, and nothing else. ``--details``: with the details of all submaps,
+which count too.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     parser.add_argument("--landmarks", type=int, nargs="+", default=(64, 96, 128, 160))
     parser.add_argument("--rank", type=int, default=LightConfig().rank)
-    parser.add_argument("--only", choices=("landmarks", "descriptors", "gaussian"))
+    parser.add_argument("--only", choices=("landmarks", "descriptors", "gaussian", "path"))
     parser.add_argument("--details", action="store_true")
     arguments = parser.parse_args()
     share_one_heap()  # as nodes do
@@ -133,6 +134,8 @@ def partly(submap: Submap, only: str, config: LightConfig) -> Submap:
                 submap.covariance, submap.landmarks - 0.5 * submap.end_pose[:3, 3], config.rank
             ).covariance(),
         )
+    if only == "path":
+        return replace(submap, path=unpack(pack(submap, config)).path)
     rows = choose_landmarks(submap, config.landmarks)
     unknowns = np.concatenate([np.arange(6), (6 + 3 * rows[:, None] + np.arange(3)).ravel()])
     return replace(
