@@ -43,11 +43,14 @@ PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "bags/READM
 FRAMES = 6
 
 NOT_RUN = {
-    r"\./slam (demo|test|setup)": "makes the environment that runs this test; the demo runs in test/integration",
+    r"(\./)?slam (demo|test|setup)": "makes the environment that runs this test; test_extras.py asks what demo starts",
     r"\./slam nodes": "starts processes; test/integration/test_executables.py runs it",
     r"\./slam view": "serves a page until Ctrl-C; test/slam_viewer/page looks at it",
     r"\./slam live ": "needs a camera",
     r"\./slam run .*--scheduler ": "needs a cluster; test_run_many.py maps bags on workers",
+    r"\./slam run monday.bag ": "test_run_many.py maps several bags on as many workers as there are processors",
+    r"\./slam (simulate tagged_corridor|run out/corridor) ": "test/integration/test_fiducials.py runs both as typed",
+    r"slam (simulate|run|calibrate refine) untriggered": "test_untriggered_pair.py runs each, with smaller pictures",
     r"\./slam merge ": "takes finished maps; test/slam_bringup/commands/test_merge.py makes some and merges them",
     r"(\S*/)?dask ": "serves a cluster until Ctrl-C; test/sjsam_node/regions/test_tasks.py starts one",
     r"\./slam post ": "runs until Ctrl-C; test/slam_bringup/commands/test_live.py looks at what it starts",

@@ -6,13 +6,13 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import subprocess
-import sys
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from demo_parts import call
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,10 +21,9 @@ SHIFT = np.array([10.0, -20.0, 3.0])
 
 
 def slam(folder: Path, *words: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "slam_bringup.cli", *words], cwd=folder, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
+    with chdir(folder):
+        done = call(*words)
+    assert done.exit_code == 0, f"{words}: {done.output}{done.exception}"
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from slam_bringup.cli import slam
-from slam_bringup.commands import demo, run
+from slam_bringup.commands import demo, nodes, run
 from slam_bringup.extras import EXTRA_OF, advice_for
 from slam_bringup.processes.kernels import DEMO
 
@@ -60,3 +60,15 @@ def test_the_demo_is_mapped_offline_without_ros(monkeypatch, tmp_path):
     (options,) = given
     assert options.keys() == {parameter.name for parameter in run.command.params if parameter.expose_value}
     assert (options["bags"], options["mode"], options["odometry"], options["imu"]) == ((DEMO,), "fuse", "ndt", "off")
+
+
+def test_the_demo_is_mapped_by_the_nodes_in_one_process(monkeypatch, tmp_path):
+    given: list[dict[str, Any]] = []
+    monkeypatch.setattr(demo, "has_ros", lambda: True)
+    monkeypatch.setattr(nodes.command, "callback", lambda **options: given.append(options))
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(slam, ["demo"]).exit_code == 0
+    (options,) = given
+    assert options.keys() == {parameter.name for parameter in nodes.command.params if parameter.expose_value}
+    assert (options["bag"], options["mode"], options["odometry"], options["composed"]) == (DEMO, "fuse", "ndt", True)
+    assert options["output"] == Path("out/demo")

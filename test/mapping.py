@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps a bag for what the trajectory and the map say: without the dense model, which takes as long again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from slam_bringup.pipeline.configuration import SystemConfig, choose, load_system_config
+from slam_bringup.pipeline.offline import run_bag
+from slam_viewer.results import RunResult
+
+
+def without_dense_model(config: SystemConfig) -> SystemConfig:
+    return replace(config, dense_mapper=replace(config.dense_mapper, use_stereo=False, use_tof=False))
+
+
+def mapped(bag: Path, mode: str = "stereo", **options: Any) -> RunResult:
+    """The result of a bag by default parameters, without a dense model."""
+    config = choose(load_system_config(None), mode, "sjsam", options.get("odometry", "none"))
+    return run_bag(bag, without_dense_model(config), **options)[0]
