@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tutorial_run import made_once, run_tutorial
+
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")  # no test judges time
 
@@ -30,6 +32,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    # What takes long begins first, or one process would be at it alone in the end.
+    long_ones = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in long_ones)
     if not config.getoption("--fast"):
         return
     long = set(LONG.read_text(encoding="utf-8").split("\n"))
@@ -59,6 +64,12 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"no public data sets at {path} (set INDOOR_SLAM_DATA)")
     return path
+
+
+@pytest.fixture(scope="session")
+def tutorial(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the commands of the tutorial were run as typed, once for all processes of the tests."""
+    return made_once(tmp_path_factory.getbasetemp(), "tutorial", run_tutorial)
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from slam_bringup.pipeline.configuration import SystemConfig, choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
@@ -16,7 +15,7 @@ def without_dense_model(config: SystemConfig) -> SystemConfig:
     return replace(config, dense_mapper=replace(config.dense_mapper, use_stereo=False, use_tof=False))
 
 
-def mapped(bag: Path, mode: str = "stereo", **options: Any) -> RunResult:
+def mapped(bag: Path, mode: str = "stereo", odometry: str = "none", imu: str | None = None) -> RunResult:
     """The result of a bag by default parameters, without a dense model."""
-    config = choose(load_system_config(None), mode, "sjsam", options.get("odometry", "none"))
-    return run_bag(bag, without_dense_model(config), **options)[0]
+    config = choose(load_system_config(None), mode, "sjsam", odometry, imu)
+    return run_bag(bag, without_dense_model(config), odometry=odometry)[0]

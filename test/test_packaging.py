@@ -30,6 +30,8 @@ ROSDEP_KEY = {
 NO_ROSDEP_KEY = {"threadpoolctl", "viser", "eclipse-zenoh", "constriction", "distributed"}
 """Projects that rosdep does not know; README says how to get them, and each manifest that it lacks them."""
 
+WITH_DATA = ("slam_simulation", "slam_bags", "slam_viewer", "slam_bringup", "slam_experiments")
+
 FROM_ROS = re.compile(r"rclpy|launch(_ros)?|ament_index_python|std_srvs|rcl_interfaces|\w+_msgs|builtin_interfaces")
 PEERS = {"gtsam", "orbslam3"}
 """What results are compared with, where it is installed."""
@@ -117,7 +119,7 @@ def test_setup_installs_files_by_their_ending(package: str) -> None:
 def installed(tmp_path_factory) -> Path:
     """What a wheel and a colcon install hold of the packages that bring data."""
     folder = tmp_path_factory.mktemp("installed")
-    for package in ("slam_simulation", "slam_bags", "slam_viewer", "slam_bringup", "slam_experiments"):
+    for package in WITH_DATA:
         build = [sys.executable, "setup.py", "-q", "egg_info", "-e", str(folder), "build_py", "-d", str(folder)]
         subprocess.run(build, cwd=SRC / package, check=True, capture_output=True, timeout=120)
     return folder
@@ -128,6 +130,16 @@ def test_kernels_in_opencl_are_installed(tmp_path):
     subprocess.run(build, cwd=SRC / "stereo_frontend", check=True, capture_output=True, timeout=120)
     kernels = {path.name for path in (SRC / "stereo_frontend").rglob("*.cl")}
     assert {path.name for path in tmp_path.rglob("*.cl")} == kernels == {"surf_detector.cl", "surf_descriptor.cl"}
+
+
+@pytest.mark.parametrize("package", WITH_DATA)
+def test_every_module_is_installed(installed, package):
+    """What is there need not be compiled and run to show that nothing is missing."""
+    there, here = (
+        {path.relative_to(root).as_posix() for path in root.rglob("*.py")}
+        for root in (installed / package, SRC / package / package)
+    )
+    assert there == here
 
 
 def test_scenarios_bounds_and_demo_bag_are_installed(installed):
@@ -147,7 +159,7 @@ def test_scenarios_bounds_and_demo_bag_are_installed(installed):
     ("arguments", "code", "said"),
     [
         (("simulate", "nonsense", "-o", "bag"), 2, "known: conference, demo"),
-        (("simulate", "demo", "-o", "bag", "--frames", "1"), 0, ""),
+        (("simulate", "demo", "-o", "no/bag/\0", "--frames", "1"), 2, "null"),
         (("experiment", "planar", "--quick", "-o", "page"), 0, "written to"),
         (("demo", "--help"), 0, "--view"),
         (("--help",), 0, "experiment the experiments of the thesis"),

@@ -11,21 +11,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from demo_parts import cut
 from indoor_slam import Camera, CameraInfo, DepthSlam, GlobalMap, StereoSlam, register
+from mapping import mapped
 from slam_bags.reading.readings import DepthReading, StereoReading
 from slam_bags.reading.sensor_bag import SensorBag
-from slam_bringup.pipeline.configuration import choose, load_system_config
-from slam_bringup.pipeline.offline import run_bag
 
 ROOT = Path(__file__).resolve().parents[2]
-DEMO = ROOT / "bags" / "demo"
 FRAMES = 20
 
 
 @pytest.fixture(scope="module")
-def demo():
-    """Sensors and the first readings of the demo bag."""
-    with SensorBag(DEMO) as bag:
+def bag_of_demo(tmp_path_factory):
+    """The first part of the demo, of several submaps."""
+    return cut(tmp_path_factory.mktemp("demo") / "part.mcap", 0.0, 0.5)
+
+
+@pytest.fixture(scope="module")
+def demo(bag_of_demo):
+    """Sensors and the readings of that part."""
+    with SensorBag(bag_of_demo) as bag:
         sensors = bag.sensors[""]
         readings = list(bag.readings())
     return sensors, readings
@@ -35,9 +40,10 @@ def pairs_of(readings):
     return [(r.stamp_ns, r.pair.left, r.pair.right) for r in readings if isinstance(r, StereoReading)]
 
 
-def test_the_library_maps_as_slam_run_does(demo):
+def test_the_library_maps_as_slam_run_does(demo, bag_of_demo):
     sensors, readings = demo
-    result, _ = run_bag(DEMO, choose(load_system_config(None), "stereo", "sjsam", "none", "off"))
+    result = mapped(bag_of_demo, imu="off")
+    assert result.submaps > 1
     with StereoSlam(sensors.left, sensors.right, T_base_left=sensors.transform("base", "left")) as slam:
         frames = [frame for pair in pairs_of(readings) for frame in slam.add_pair(*pair)]
         joined = slam.finish()
@@ -63,9 +69,10 @@ def test_the_lines_of_the_readme_run(demo, tmp_path, monkeypatch, capsys):
     assert len(GlobalMap.load(tmp_path / "map").trajectory("")) == FRAMES
 
 
-def test_a_depth_camera_with_scan_odometry_maps_as_slam_run_does(demo):
+def test_a_depth_camera_with_scan_odometry_maps_as_slam_run_does(demo, bag_of_demo):
     sensors, readings = demo
-    result, _ = run_bag(DEMO, choose(load_system_config(None), "tof", "sjsam", "ndt", "off"), odometry="ndt")
+    result = mapped(bag_of_demo, "tof", "ndt", "off")
+    assert result.submaps > 1
     raw = [r.raw for r in readings if isinstance(r, DepthReading)]
     mounting = sensors.transform("base", "tof")
     with DepthSlam(sensors.tof, measurement=sensors.measurement, odometry="ndt", T_base_camera=mounting) as slam:

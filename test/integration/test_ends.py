@@ -67,8 +67,13 @@ def wait_for(condition: Callable[[], bool], timeout_s: float = 120.0) -> bool:
 
 
 @pytest.fixture
-def run(workspace: dict[str, str], tmp_path: Path) -> Iterator[Run]:
-    run = Run(workspace, tmp_path / "out", "--rate", "0.5")
+def options() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def run(workspace: dict[str, str], tmp_path: Path, options: list[str]) -> Iterator[Run]:
+    run = Run(workspace, tmp_path / "out", "--rate", "0.5", *options)
     yield run
     if run.process.poll() is None:
         run.process.kill()
@@ -76,9 +81,9 @@ def run(workspace: dict[str, str], tmp_path: Path) -> Iterator[Run]:
 
 
 def is_playing(run: Run) -> bool:
-    log = run.out / "logs" / "ekf_slam.log"
-    player = run.out / "logs" / "bag_player.log"
-    return player.exists() and "ready" in player.read_text() and "ready" in log.read_text()
+    player, *others = (run.out / "logs" / f"{name}.log" for name in ("bag_player", "ekf_slam", "slam_composed"))
+    is_ready = player.exists() and "ready" in player.read_text()
+    return is_ready and any(log.exists() and "ready" in log.read_text() for log in others)
 
 
 def test_a_killed_run_leaves_no_nodes(run: Run) -> None:
@@ -88,7 +93,11 @@ def test_a_killed_run_leaves_no_nodes(run: Run) -> None:
     assert wait_for(lambda: not run.nodes(), 30.0), [log.read_text()[-3000:] for log in run.out.glob("logs/*.log")]
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("number", "options"),
+    [(signal.SIGHUP, ["--composed"]), (signal.SIGINT, []), (signal.SIGTERM, ["--composed"])],
+    ids=["hangup", "ctrl-c", "terminate"],
+)
 def test_a_run_that_is_asked_to_end_writes_what_is_mapped(run: Run, number: signal.Signals) -> None:
     assert wait_for(lambda: is_playing(run))
     time.sleep(_MAPPED_S)
@@ -105,6 +114,7 @@ def test_a_run_that_is_asked_to_end_writes_what_is_mapped(run: Run, number: sign
     assert (run.out / "map" / "manifest.json").exists()
 
 
+@pytest.mark.parametrize("options", [["--composed"]], ids=["composed"])
 def test_a_second_ctrl_c_leaves_at_once_with_the_map(run: Run) -> None:
     assert wait_for(lambda: is_playing(run))
     time.sleep(_MAPPED_S)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+
 from demo_parts import call
 
 pytestmark = pytest.mark.slow
@@ -65,7 +66,7 @@ def test_known_tags_move_the_map(folder: Path) -> None:
 
 
 def test_nodes_find_the_same_tags(folder: Path) -> None:
-    slam(folder, "nodes", "out/corridor", "-o", "out/nodes", *TAGS)
+    slam(folder, "nodes", "out/corridor", "-o", "out/nodes", "--composed", *TAGS)
     offline, online = tags(folder / "out/tagged"), tags(folder / "out/nodes")
     assert offline.keys() == online.keys()
     for number, position in offline.items():

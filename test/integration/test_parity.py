@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from calibration_folder import write_calibrations
+from mapping import without_dense_model
 from sjsam_node.map_session import MapSession, Mode
 from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bags.reading.sensor_bag import SensorBag
@@ -105,7 +106,7 @@ def test_nodes_and_the_offline_pipeline_agree(
     domain_environment: dict[str, str], short_bag: Path, tmp_path: Path, mode: str, odometry: str, composed: bool,
     calibrated: bool,
 ) -> None:  # fmt: skip
-    config = choose(load_system_config(None), mode, "sjsam", odometry)
+    config = without_dense_model(choose(load_system_config(None), mode, "sjsam", odometry))
     folders = write_calibrations(DEMO, tmp_path / "calibration") if calibrated else ()
     names = BagNames(calibration=read_rig_calibration(folders))
     out = tmp_path / "out"
@@ -130,7 +131,7 @@ def test_nodes_and_the_offline_pipeline_agree(
 def test_a_rig_is_located_in_a_map_through_the_nodes_as_offline(
     domain_environment: dict[str, str], short_bag: Path, tmp_path: Path
 ) -> None:
-    config = choose(load_system_config(None), "fuse", "sjsam", "none")
+    config = without_dense_model(choose(load_system_config(None), "fuse", "sjsam", "none"))
     _, grown = run_bag(short_bag, config)
     grown.save(tmp_path / "map").result()
     start = StartMap.read(config, tmp_path / "map", localize_only=True)

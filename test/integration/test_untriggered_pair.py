@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from mapping import mapped, without_dense_model
 from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.cli import slam
@@ -37,20 +38,14 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bag_of(tmp_path_factory.mktemp("pairs"), 8.0)
 
 
-def summary(bag: Path, out: Path, *options: object) -> dict[str, object]:
-    slam(["run", str(bag), "-o", str(out), "-q", *map(str, options)], standalone_mode=False)
-    found: dict[str, object] = json.loads((out / "summary.json").read_text())
-    return found
-
-
 @pytest.mark.slow
 def test_the_offset_is_learnt_told_and_corrected(late: Path, tmp_path: Path) -> None:
-    learning = summary(late, tmp_path / "learning")
+    learning = summarise(mapped(late))
     assert learning["rectification"]["right_image_late_ms"] == pytest.approx(8.0, abs=1.0)
     assert any("the right image is taken 8" in event for event in learning["events"])
     off = tmp_path / "off.yaml"
     off.write_text("feature_extractor: {pair: {sigma_time_offset: 0.0}}\n")
-    without = summary(late, tmp_path / "without", "--config", off)
+    without = summarise(run_bag(late, without_dense_model(load_system_config(off)))[0])
     assert learning["ate_rmse_m"] < 0.5 * without["ate_rmse_m"]
 
 
@@ -60,17 +55,18 @@ def test_refine_writes_it_and_the_next_run_knows_it(late: Path, tmp_path: Path) 
     pair = load_system_config(None, None, read_rig_calibration([tmp_path / "rig"]).parameters).feature_extractor.pair
     assert pair.time_offset == pytest.approx(0.008, abs=1e-3)
     assert 1e-4 < pair.sigma_time_offset < 1e-3
-    known = summary(late, tmp_path / "known", "--calibration", tmp_path / "rig")
-    together = summary(bag_of(tmp_path, 0.0), tmp_path / "together")
-    print(known["ate_rmse_m"], together["ate_rmse_m"])
+    out = tmp_path / "known"
+    slam(["run", str(late), "-o", str(out), "-q", "--calibration", str(tmp_path / "rig")], standalone_mode=False)
+    known = json.loads((out / "summary.json").read_text())
+    together = summarise(mapped(bag_of(tmp_path, 0.0)))
     assert not any("the right image is taken" in event for event in together["events"])
     assert known["ate_rmse_m"] < 2.0 * together["ate_rmse_m"]
 
 
 @pytest.mark.slow
 def test_the_nodes_tell_the_same(domain_environment: dict[str, str], late: Path, tmp_path: Path) -> None:
-    config = choose(load_system_config(None), "stereo", "sjsam", "none")
-    run = run_nodes(late, config, tmp_path / "nodes", odometry=False, composed=False, names=BagNames())
+    config = without_dense_model(choose(load_system_config(None), "stereo", "sjsam", "none"))
+    run = run_nodes(late, config, tmp_path / "nodes", odometry=False, composed=True, names=BagNames())
     online, _ = collect(late, config, run, mapper="sjsam", odometry="none", names=BagNames())
     offline, _ = run_bag(late, config)
     told, expected = (summarise(result)["rectification"]["right_image_late_ms"] for result in (online, offline))

@@ -3,26 +3,45 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
+import io
 import os
-import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from slam_bringup.cli import main
 from slam_core.point_cloud import write_ply
 
 ROOT = Path(__file__).resolve().parents[3]
 DEMO = ROOT / "bags" / "demo"
 
 
-def slam(*arguments: object, home: Path | None = None) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(p) for p in sorted((ROOT / "src").iterdir()))}
-    environment |= {"HOME": str(home)} if home else {}
-    command = [sys.executable, "-m", "slam_bringup.cli", *map(str, arguments)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+@dataclass(frozen=True)
+class Ended:
+    returncode: int
+    stderr: str
+
+
+def slam(*arguments: object, home: Path | None = None) -> Ended:
+    """How the program ends, in this process: to load it takes longer than most of these commands do."""
+    place = {"HOME": str(home)} if home else {}
+    with (
+        patch.object(sys, "argv", ["slam", *map(str, arguments)]),
+        patch.dict(os.environ, place),
+        redirect_stderr(io.StringIO()) as said,
+        redirect_stdout(io.StringIO()),
+        pytest.raises(SystemExit) as end,
+    ):
+        main()
+    gc.enable()
+    return Ended(int(end.value.code or 0), said.getvalue())
 
 
 def snapshot(folder: Path) -> dict[str, str]:
