@@ -15,6 +15,13 @@ def without_dense_model(config: SystemConfig) -> SystemConfig:
     return replace(config, dense_mapper=replace(config.dense_mapper, use_stereo=False, use_tof=False))
 
 
+def quick_options(folder: Path) -> tuple[str, str]:
+    """Options of ``slam run`` for a run without a dense model; ``folder`` takes the file that they name."""
+    path = folder / "without_dense_model.yaml"
+    path.write_text("dense_mapper: {use_stereo: false, use_tof: false}\n")
+    return "--config", str(path)
+
+
 def mapped(bag: Path, mode: str = "stereo", odometry: str = "none", imu: str | None = None) -> RunResult:
     """The result of a bag by default parameters, without a dense model."""
     config = choose(load_system_config(None), mode, "sjsam", odometry, imu)

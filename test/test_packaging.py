@@ -159,7 +159,7 @@ def test_scenarios_bounds_and_demo_bag_are_installed(installed):
     ("arguments", "code", "said"),
     [
         (("simulate", "nonsense", "-o", "bag"), 2, "known: conference, demo"),
-        (("simulate", "demo", "-o", "no/bag/\0", "--frames", "1"), 2, "null"),
+        (("simulate", "demo", "-o", "/proc/bag", "--frames", "1"), 2, "No such file or directory"),
         (("experiment", "planar", "--quick", "-o", "page"), 0, "written to"),
         (("demo", "--help"), 0, "--view"),
         (("--help",), 0, "experiment the experiments of the thesis"),

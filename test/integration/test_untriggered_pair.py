@@ -22,6 +22,7 @@ from slam_simulation import Scenario
 from slam_viewer.results import summarise
 
 FRAMES = 60
+CHOSEN = ("stereo", "sjsam", "none")
 SMALL = {"width": 320, "height": 240, "focal_length": 141.5, "raw_focal_length": 166.0}
 
 
@@ -45,7 +46,7 @@ def test_the_offset_is_learnt_told_and_corrected(late: Path, tmp_path: Path) -> 
     assert any("the right image is taken 8" in event for event in learning["events"])
     off = tmp_path / "off.yaml"
     off.write_text("feature_extractor: {pair: {sigma_time_offset: 0.0}}\n")
-    without = summarise(run_bag(late, without_dense_model(load_system_config(off)))[0])
+    without = summarise(run_bag(late, without_dense_model(choose(load_system_config(off), *CHOSEN)))[0])
     assert learning["ate_rmse_m"] < 0.5 * without["ate_rmse_m"]
 
 
@@ -65,7 +66,7 @@ def test_refine_writes_it_and_the_next_run_knows_it(late: Path, tmp_path: Path) 
 
 @pytest.mark.slow
 def test_the_nodes_tell_the_same(domain_environment: dict[str, str], late: Path, tmp_path: Path) -> None:
-    config = without_dense_model(choose(load_system_config(None), "stereo", "sjsam", "none"))
+    config = without_dense_model(choose(load_system_config(None), *CHOSEN))
     run = run_nodes(late, config, tmp_path / "nodes", odometry=False, composed=True, names=BagNames())
     online, _ = collect(late, config, run, mapper="sjsam", odometry="none", names=BagNames())
     offline, _ = run_bag(late, config)

@@ -43,6 +43,12 @@ def days():
     return [day(1), day(2, turns=(0.3, 1.0)), day(3, "bert", (0.1, 0.6))]
 
 
+@pytest.fixture(scope="module")
+def merged_days(days):
+    """The three in one map, which no test changes."""
+    return merge(days, GlobalMapConfig(), InProcess())
+
+
 def packed(merged) -> tuple[dict, dict]:
     one = storage.pack(merged.map.stored())
     return one.manifest, {name: np.array(value) for name, value in one.arrays.items()}
@@ -55,8 +61,8 @@ def assert_same_bytes(first, second):
         assert value.tobytes() == second[1][name].tobytes(), name
 
 
-def test_maps_of_days_and_agents_become_one_map_at_its_optimum(days):
-    merged = merge(days, GlobalMapConfig(), InProcess())
+def test_maps_of_days_and_agents_become_one_map_at_its_optimum(days, merged_days):
+    merged = merged_days
     assert merged.parts == (("day 1", "day 2", "day 3"),)
     assert merged.closures >= 3
     assert not merged.notes
@@ -69,15 +75,15 @@ def test_maps_of_days_and_agents_become_one_map_at_its_optimum(days):
         assert radius == pytest.approx(RADIUS, abs=0.25), key
 
 
-def test_the_order_of_the_maps_and_workers_change_no_byte(days):
-    first = packed(merge(days, GlobalMapConfig(), InProcess()))
+def test_the_order_of_the_maps_changes_no_byte(days, merged_days):
+    first = packed(merged_days)
     assert_same_bytes(first, packed(merge(days[::-1], GlobalMapConfig(), InProcess())))
 
 
 @pytest.mark.slow
-def test_workers_change_no_byte(days):
+def test_workers_change_no_byte(days, merged_days):
     pytest.importorskip("distributed")
-    first = packed(merge(days, GlobalMapConfig(), InProcess()))
+    first = packed(merged_days)
     with cluster(workers=2) as tasks:
         assert_same_bytes(first, packed(merge([days[1], days[0], days[2]], GlobalMapConfig(), tasks)))
 
@@ -98,7 +104,7 @@ def test_marks_stay_on_the_submaps_that_they_hang_on(days):
     assert mark.node == merged.state.graph.records[merged.agents.record(*key)].end
 
 
-def test_what_was_found_ahead_changes_nothing(days):
+def test_what_was_found_ahead_changes_nothing(days, merged_days):
     """A map whose submaps are all compared where they are asked for has the same bytes."""
     union = united(days)
     plain = GlobalMap()
@@ -107,7 +113,7 @@ def test_what_was_found_ahead_changes_nothing(days):
     looks = AcrossMaps(union, GlobalMapConfig().closure, InProcess()).looks
     assert any(found is not None for found in looks.values())
     plain.settle()
-    merged = merge(days, GlobalMapConfig(), InProcess()).map
+    merged = merged_days.map
     for name, value in storage.pack(plain.stored()).arrays.items():
         other = storage.pack(merged.stored()).arrays[name]
         if value.dtype.kind == "f":  # the last optimum comes from another factor
@@ -131,8 +137,8 @@ def with_known_tags(folder) -> GlobalMapConfig:
     return replace(GlobalMapConfig(), tags=KnownTagsConfig(known=str(file)))
 
 
-def test_known_tags_of_the_building_change_no_part_closure_or_way(days, tmp_path):
-    plain = merge(days, GlobalMapConfig(), InProcess())
+def test_known_tags_of_the_building_change_no_part_closure_or_way(days, merged_days, tmp_path):
+    plain = merged_days
     merged = merge(days, with_known_tags(tmp_path), InProcess())
     assert merged.map.state.graph.records[0].submap.agent == BUILDING
     assert (merged.parts, merged.closures, merged.notes) == (plain.parts, plain.closures, ())

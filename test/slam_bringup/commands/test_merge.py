@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from demo_parts import DEMO, call, cut
+from mapping import quick_options
 from sjsam_node import storage
 from slam_bringup.jobs.merged_run import map_of_bag
 from slam_bringup.pipeline.overrides import Overrides
@@ -18,9 +19,9 @@ from slam_viewer.page.run_folder import RunFolder
 def days(tmp_path_factory) -> tuple[Path, Path]:
     """The finished run of the first part of the demo, and the bag of the second."""
     folder = tmp_path_factory.mktemp("days")
-    done = call("run", cut(folder / "first.mcap", 0.0, 0.6), "-o", folder / "first")
+    done = call("run", cut(folder / "first.mcap", 0.0, 0.5), "-o", folder / "first", *quick_options(folder))
     assert done.exit_code == 0, done.output
-    return folder / "first", cut(folder / "second.mcap", 0.4, 1.0)
+    return folder / "first", cut(folder / "second.mcap", 0.3, 0.8)
 
 
 def map_bytes(out: Path) -> dict[str, bytes]:
@@ -43,7 +44,7 @@ def test_a_map_and_a_bag_become_one_map_of_the_same_bytes_with_any_number_of_wor
     assert second > first
     assert len(run.map) == second == run.summary["submaps"]
     assert run.map.components == 1
-    again = call("run", days[1], "-o", tmp_path / "again", "--map", tmp_path / "one")
+    again = call("run", days[1], "-o", tmp_path / "again", "--map", tmp_path / "one", *quick_options(tmp_path))
     assert again.exit_code == 0, again.output
 
 

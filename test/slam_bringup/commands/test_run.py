@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from ekf_slam_node.slam import EkfSlam
+from mapping import quick_options
 from sjsam_node.global_map import GlobalMap
 from slam_bags.storage.bag import BagReader, BagWriter
 from slam_bringup.cli import slam
@@ -91,7 +92,8 @@ def again(request, outputs, tmp_path_factory) -> tuple[Path, Path, bool]:
             if stamp >= middle or "static" in topic:
                 bag.write_raw(topic, reader.topics[topic].type_name, data, max(stamp, middle))
     folder = tmp_path_factory.mktemp("again") / "out"
-    result = run(str(later), "-o", str(folder), "--map", str(outputs[0]), *request.param)
+    options = *quick_options(later.parent), *request.param
+    result = run(str(later), "-o", str(folder), "--map", str(outputs[0]), *options)
     assert result.exit_code == 0, result.output
     return folder, outputs[0], not request.param
 

@@ -29,7 +29,7 @@ def result_bytes(out: Path) -> dict[str, bytes]:
 @pytest.mark.slow
 def test_several_recordings_are_mapped_to_the_bytes_of_single_runs_and_a_bad_one_fails_alone(tmp_path):
     pytest.importorskip("distributed")
-    first, second = cut(tmp_path / "first.mcap", 0.0, 0.4), cut(tmp_path / "second.mcap", 0.5, 0.9)
+    first, second = cut(tmp_path / "first.mcap", 0.0, 0.25), cut(tmp_path / "second.mcap", 0.5, 0.75)
     bad = tmp_path / "bad.mcap"
     bad.write_bytes(first.read_bytes()[:2000])
     done = call("run", first, bad, second, "-o", tmp_path / "many")
