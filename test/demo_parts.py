@@ -17,9 +17,9 @@ def call(*arguments: object):
     return CliRunner().invoke(slam, [str(a) for a in arguments], catch_exceptions=True)
 
 
-def cut(path: Path, start: float, end: float) -> Path:
-    """A part of the demo, by share of its time."""
-    with BagReader(DEMO) as bag, BagWriter(path) as part:
+def cut(path: Path, start: float, end: float, source: Path = DEMO) -> Path:
+    """A part of the demo, or of another bag, by share of its time."""
+    with BagReader(source) as bag, BagWriter(path) as part:
         for message in bag.raw():
             info, since = bag.topics[message.topic], (message.stamp_ns - bag.start_ns) * 1e-9 / bag.duration_s
             if start <= since <= end or info.count == 1 or "tf" in message.topic:

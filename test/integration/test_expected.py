@@ -16,7 +16,6 @@ from slam_simulation import Scenario
 from slam_viewer.results import summarise
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
-SMALL = {"width": 448, "height": 336, "focal_length": 198.0, "raw_focal_length": 232.0}
 
 
 def summary_of(bag: Path, mode: str):
@@ -45,13 +44,15 @@ def test_the_demo_keeps_its_bounds(tutorial):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "every", "pictures"), [("sweep", 2, {}), ("fireman_5hz", 1, SMALL)])
-def test_a_rendered_scenario_keeps_its_bounds(tmp_path, name, every, pictures):
-    """With half the frames or pixels, and without a depth camera: rendering takes as long as there are pixels."""
-    scenario = Scenario.load(name)
+@pytest.mark.parametrize(("name", "every", "frames"), [("sweep", 2, 72), ("fireman_5hz", 1, 37)])
+def test_a_rendered_scenario_keeps_its_bounds(tmp_path, name, every, frames):
+    """With half the frames and without a depth camera, as rendering takes most of the time.
+
+    Smaller pictures would not do: a baseline 4 % too long is then within the bounds.
+    """
+    scenario = Scenario.load(name).shortened(frames)
     assert expected()[name]["mode"] == "stereo"
-    suite = replace(scenario.suite, stereo=replace(scenario.suite.stereo, **pictures))
-    scenario = replace(scenario, suite=suite, sensors=tuple(s for s in scenario.sensors if s != "tof"))
+    scenario = replace(scenario, sensors=tuple(s for s in scenario.sensors if s != "tof"))
     write_bag(scenario, tmp_path / "bag", BagOptions(images="jpeg", compact=True, every=every))
     assert violations(name, summary_of(tmp_path / "bag", expected()[name]["mode"])) == []
 
