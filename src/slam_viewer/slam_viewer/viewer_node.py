@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
+from std_srvs.srv import Trigger
 
 from dense_mapping.plans.floor_plan import FloorPlan
 from slam_core.config import Config, parameter
@@ -103,6 +104,9 @@ class ViewerNode(SlamNode[ViewerConfig]):
             for agent in self.config.agents:
                 here = self.page.server.gui.add_button(f"Mark where {agent or 'the rig'} is")
                 here.on_click(partial(self._mark_agent, agent))
+            self._ask = self.page.server.gui.add_button("Ask agents for details of all submaps", visible=False)
+            self._ask.on_click(lambda _: self._ask_for_details())
+        self._request_details = self.create_client(Trigger, "radio_link/request_details")
         self.create_timer(_POST_PERIOD_S, self._show_post, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f"the page is at {self.page.url}")
 
@@ -217,6 +221,15 @@ class ViewerNode(SlamNode[ViewerConfig]):
             return
         for agent, link in links.items():
             self._agents[agent].link = link
+        self._ask.visible = any(links.values())
+
+    def _ask_for_details(self) -> None:
+        """Have the post's radio_link ask for the landmarks that light submaps left out."""
+        if self._request_details.service_is_ready():
+            asked = self._request_details.call_async(Trigger.Request())
+            asked.add_done_callback(lambda done: self.get_logger().info(done.result().message))
+        else:
+            self.get_logger().warning("no radio_link beside the viewer answers: no details are asked for")
 
     # -- map -----------------------------------------------------------------------------------------------------------
 

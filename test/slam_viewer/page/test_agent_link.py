@@ -132,6 +132,9 @@ def test_the_leader_sees_the_link_and_where_a_silent_agent_may_be(tmp_path: Path
             assert "link: up" in text, log.read_text()
             assert "position ±" in text
             before = reddish(browser)
+            named = "b => b.textContent.includes('Ask agents for details')"
+            browser.evaluate(f"[...document.querySelectorAll('button')].find({named}).click()")
+            probe.wait(lambda: "details of 0 submaps asked for" in log.read_text(), "the click asked for no details")
         browser.wait("document.body.textContent.includes('link: silent for')")
         browser.wait("document.body.textContent.includes('of it if walking')")
         wait_for_red(browser, before + 1000, 10**7)
