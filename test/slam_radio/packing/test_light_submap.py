@@ -9,11 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from slam_core.geometry import boxminus
 from slam_radio.packing.descriptor_code import DIRECTIONS, basis, decode, encode
 from slam_radio.packing.landmark_choice import choose_landmarks, rank_values
 from slam_radio.packing.light_submap import LightConfig, lightened, pack, unpack, write
+from slam_radio.packing.packing_kernels import crowded
 
 
 def test_what_is_sent_comes_out(make_submap):
@@ -145,6 +147,16 @@ def test_a_landmark_beside_another_one_comes_last(make_submap):
     assert beside not in rows
     assert beside in choose_landmarks(submap, 40)
     assert len(choose_landmarks(replace(submap, landmarks=np.tile(points[:1], (60, 1))), 40)) == 40
+
+
+def test_points_beside_others_are_those_that_a_tree_finds(rng):
+    points = rng.uniform(-1.0, 1.0, size=(200, 3))
+    reach = rng.uniform(0.1, 0.5, size=200)
+    expected = np.zeros(200, dtype=bool)
+    for k, near in enumerate(cKDTree(points).query_ball_point(points, reach)):
+        expected[k] = any(other < k and not expected[other] for other in near)
+    assert 50 < expected.sum() < 190
+    np.testing.assert_array_equal(crowded(points, reach), expected)
 
 
 def test_damaged_messages_are_refused(make_submap, rng):
