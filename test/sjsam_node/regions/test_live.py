@@ -127,6 +127,16 @@ def test_without_workers_a_result_is_waited_for_once_and_computed_here(monkeypat
         elsewhere.close()
 
 
+@pytest.mark.slow
+def test_many_tasks_may_take_longer_than_one(monkeypatch):
+    monkeypatch.setattr(live, "WAIT_S", 1.5)
+    with running_cluster(1) as own:
+        elsewhere = LiveTasks(own.address)
+        elsewhere.gather([elsewhere.submit(time.sleep, 0.5) for _ in range(5)])
+        assert (elsewhere.elsewhere, elsewhere.here) == (5, 0)
+        elsewhere.close()
+
+
 def test_a_cluster_that_is_not_there_yet_is_looked_for(monkeypatch):
     found = SimpleNamespace(close=lambda: None)
     tries = [tasks.NotAvailable("no Dask scheduler answers"), tasks.NotAvailable("no workers"), found]

@@ -23,7 +23,7 @@ from sjsam_node.regions.tasks import ClusterLost, NotAvailable, OnCluster, Worke
 
 _LOG = logging.getLogger(__name__)
 WAIT_S = 5.0
-"""Time that the cluster has for tasks, s."""
+"""Time within which the cluster has to give the next result, s."""
 _RETRY_S = 2.0
 """Time between two looks for a cluster that does not answer, s."""
 

@@ -76,7 +76,7 @@ class ClusterLost(ValueError):
 
 
 class WorkersKilled(ValueError):
-    """The same task took several workers with it."""
+    """Several workers ended at the same task."""
 
 
 class NotAvailable(ValueError):
@@ -110,7 +110,7 @@ class OnCluster:
         Gives a client of the cluster that was started again after it was lost: all tasks whose results may still be
         asked for run once more there. Without it a lost cluster ends the work.
     wait_s
-        Time that results are waited for, s; any by default.
+        Time within which the next result has to come, s; any by default.
     """
 
     def __init__(self, client: Any, again: Callable[[], Any] | None = None, wait_s: float | None = None) -> None:
@@ -161,8 +161,10 @@ class OnCluster:
         if self._wait_s is not None:
             from distributed import wait
 
+            left = futures
             with self._client.as_current():
-                wait(futures, timeout=self._wait_s)  # type: ignore[no-untyped-call]
+                while left:  # as long as one after the other comes
+                    left = list(wait(left, self._wait_s, "FIRST_COMPLETED").not_done)  # type: ignore[no-untyped-call]
         return list(self._client.gather(futures))
 
     def _listen(self, topic: str, handler: Callable[[Any], None]) -> None:
