@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from sjsam_node.autosave import Autosave
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
 from sjsam_node.map_session import MapSession, Mode, Outcome
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
-from slam_core.types import PoseEstimate, Submap
+from slam_core.types import PoseEstimate, PositionReading, Submap
 
 
 @pytest.fixture
@@ -47,10 +46,10 @@ class HeldJoiner:
         self.may_go_on, self.is_held = threading.Event(), threading.Event()
         add = GlobalMap.add
 
-        def held(joined: GlobalMap, *given: Any) -> JoinReport:
+        def held(joined: GlobalMap, submap: Submap, readings: Sequence[PositionReading] = ()) -> JoinReport:
             self.is_held.set()
             assert self.may_go_on.wait(60.0)
-            return add(joined, *given)
+            return add(joined, submap, readings)
 
         monkeypatch.setattr(GlobalMap, "add", held)
 
@@ -100,7 +99,7 @@ def test_what_one_submap_raises_reaches_its_future_and_the_next_is_joined(
     submaps: list[Submap], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     add = GlobalMap.add
-    monkeypatch.setattr(GlobalMap, "add", lambda joined, s, *more: add(joined, s, *more) if s.index else 1 / 0)
+    monkeypatch.setattr(GlobalMap, "add", lambda joined, s, _: add(joined, s) if s.index else 1 / 0)
     session = MapSession(GlobalMapConfig(), autosave=Autosave(tmp_path / "copy", 10.0))
     futures = [session.add(submap) for submap in submaps]
     session.close()

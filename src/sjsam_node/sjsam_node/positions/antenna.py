@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sjsam_node.positions.position_ids import position_ids
+from sjsam_node.graph.position_ids import position_ids
 from sjsam_node.smoothing.inner_poses import smoothing_gains
 from slam_core.geometry import FloatArray, interpolate_transform, skew
 from slam_core.types import PoseEstimate, PositionReading, Submap
@@ -24,7 +24,7 @@ _ARM_SIGMA = 1e-3
 
 
 def seen_inside(submap: Submap, readings: Sequence[PositionReading]) -> tuple[PositionReading, ...]:
-    """Those of some readings near whose stamps the submap has poses."""
+    """The readings near whose stamps the submap has poses."""
     stamps = np.array([pose.stamp_ns for pose in submap.path])
     found = []
     for reading in readings:

@@ -20,11 +20,11 @@ from scipy.linalg import block_diag
 
 from sjsam_node.graph.links import Link, Prior
 from sjsam_node.graph.map_graph import ALL, POSITIONS, MapGraph
+from sjsam_node.graph.position_ids import is_position_id, position_stamps
 from sjsam_node.loop_closure.association import PointSet, agreeing
 from sjsam_node.loop_closure.point_sets import at_start
 from sjsam_node.loop_closure.verification import Verifier
 from sjsam_node.positions.fixed_frame import find_frame
-from sjsam_node.positions.position_ids import is_position_id, position_stamps
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.thinning import thinned
 from slam_core.geometry import FloatArray, invert_transform, make_transform, transform_points
@@ -64,7 +64,7 @@ class PositionLinks:
         if not own:
             return []
         base = self._base()
-        if base is None or self.estimate.state.component_of[self.graph.records[base].start] != component:
+        if base is None or self.estimate.state.component(base) != component:
             return self._aligned(own, base)
         return [made for i in own if (made := self._near(i, base)) is not None]
 
@@ -131,10 +131,10 @@ class PositionLinks:
     def _way_since_positions(self, record: int) -> float:
         """Way of an agent from the nearest of its records that has positions in the map, else its whole way (m)."""
         graph, run = self.graph, self.graph.records[record].key[:2]
-        lengths = graph.odometry.path_length[graph.starts]
         tied = graph.linked[graph.is_position[graph.linked[:, 1]], 0].tolist()
-        gone = [abs(lengths[i] - lengths[record]) for i in tied if graph.records[i].key[:2] == run]
-        return float(min(gone, default=lengths[record]))
+        own = [i for i in tied if graph.records[i].key[:2] == run]
+        first = next(i for i, r in enumerate(graph.records) if r.key[:2] == run)
+        return min(graph.path_length_between(i, record) for i in own or [first])
 
     def _shift(self, base: int) -> FloatArray:
         """Where in the fixed frame the records of positions start, (3,) m: near the map, as numbers ought to be."""

@@ -104,10 +104,12 @@ class Mapper:
             text = f"{lost} of {len(self._outcomes)} submaps were not found in the map: their poses are left out"
             return [text] * bool(lost)
         shown = self.session.snapshot
-        said = [*_loose(shown, self.session.known), *filter(None, [shown.overconfidence])]
-        if self._has_positions:
-            said.append(positions_text(self.session.counts, is_determined=bool(shown.is_position.any())))
-        return said
+        said = positions_text(self.session.counts, is_determined=bool(shown.is_position.any()))
+        return [
+            *_loose(shown, self.session.known),
+            *filter(None, [shown.overconfidence]),
+            *[said] * self._has_positions,
+        ]
 
     @property
     def has_frames(self) -> bool:
