@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from sjsam_node.global_map import GlobalMap, JoinReport  # noqa: E402
 from sjsam_node.map_session import MapSession  # noqa: E402
 from slam_core.geometry import boxminus, make_transform, rotation_from_euler, transform_from_pose7  # noqa: E402
 from slam_core.messages import SUBMAP_TOPICS, odometry_message, path_from_message, submap_messages  # noqa: E402
-from slam_core.types import PoseEstimate, Submap  # noqa: E402
+from slam_core.types import PoseEstimate, PositionReading, Submap  # noqa: E402
 
 
 @pytest.fixture(params=["agents:=['']"])
@@ -160,11 +161,11 @@ class SlowJoiner:
         self.may_go_on, self.is_held = threading.Event(), threading.Event()
         add, left = GlobalMap.add, iter(range(before))
 
-        def slow_add(joined: GlobalMap, *given: Any) -> JoinReport:
+        def slow_add(joined: GlobalMap, submap: Submap, readings: Sequence[PositionReading]) -> JoinReport:
             if next(left, None) is None:
                 self.is_held.set()
                 assert self.may_go_on.wait(60.0)
-            return add(joined, *given)
+            return add(joined, submap, readings)
 
         monkeypatch.setattr(GlobalMap, "add", slow_add)
 
