@@ -104,12 +104,10 @@ class Mapper:
             text = f"{lost} of {len(self._outcomes)} submaps were not found in the map: their poses are left out"
             return [text] * bool(lost)
         shown = self.session.snapshot
-        said = positions_text(self.session.counts, is_determined=bool(shown.is_position.any()))
-        return [
-            *_loose(shown, self.session.known),
-            *filter(None, [shown.overconfidence]),
-            *[said] * self._has_positions,
-        ]
+        said = [*_loose(shown, self.session.known), *filter(None, [shown.overconfidence])]
+        if self._has_positions:
+            said.append(positions_text(self.session.counts, is_determined=bool(shown.is_position.any())))
+        return said
 
     @property
     def has_frames(self) -> bool:
