@@ -18,6 +18,7 @@ from slam_core.camera import Camera
 from slam_core.config import Config, group, parameter
 from slam_core.runtime.in_place import in_place
 from slam_core.types import AnyArray, ByteArray, Counters, DepthImage, Float32Array
+from tof_driver.distortion import DepthDistortion, DepthDistortionConfig
 from tof_driver.mask import (
     MAXIMUM_INCIDENCE_DEG,
     NOISE_MULTIPLE,
@@ -44,6 +45,7 @@ class DepthConfig(Config):
     )
     noise: NoiseConfig = group(NoiseConfig)
     mask: MaskConfig = group(MaskConfig)
+    depth_distortion: DepthDistortionConfig = group(DepthDistortionConfig)
 
 
 class DepthProcessor:
@@ -79,6 +81,8 @@ class DepthProcessor:
         same = camera.is_rectified and np.allclose(self.output_camera.K, camera.K, atol=1e-6)
         self._rectification = None if same else RectificationMap.between(camera, self.output_camera)
         self._ray_length = _ray_length(camera)
+        distortion = config.depth_distortion
+        self._distortion = None if distortion.is_exact else DepthDistortion(distortion, camera)
         self._pixel_angle = 1.0 / min(camera.fx, camera.fy)
 
     def process(
@@ -106,6 +110,9 @@ class DepthProcessor:
         intensity = self._picture("intensity", intensity)
         distance = measured * self._ray_length if self.config.measurement == "depth" else measured
         reason, sigma = self._believable(distance, amplitude)
+        if self._distortion is not None:
+            sigma = np.hypot(sigma, self._distortion.sigma * distance)
+            distance = distance * self._distortion.factor
         depth = np.empty_like(distance)
         counts = np.zeros(len(Reason), np.int64)
         flat = (a.reshape(-1) for a in (distance, reason, self._ray_length, depth, sigma))

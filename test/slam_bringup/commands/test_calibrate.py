@@ -16,11 +16,15 @@ from click.testing import CliRunner
 
 from demo_parts import cut
 from slam_bags.reading.rig_calibration import read_rig_calibration
+from slam_bags.storage.bag import BagWriter
+from slam_bags.storage.sensor_writer import T_BASE_OPTICAL, TOF_FRAME, SensorWriter
 from slam_bringup.cli import slam
 from slam_bringup.commands.calibrate import command
 from slam_bringup.pipeline.configuration import load_system_config
+from slam_core.camera import Camera
 from slam_core.camera_info import read_camera_info
 from slam_core.geometry import make_transform, rotation_from_quaternion
+from slam_core.messages import rectified_info
 
 
 def run(*arguments: str) -> str:
@@ -126,3 +130,33 @@ def test_refine_writes_a_readout_that_the_next_run_knows(data_dir: Path, tmp_pat
     assert 0.0005 < filter_config.measurement.sigma_readout < 0.002
     assert filter_config.calibration.sigma_scale == 0.004
     assert read_camera_info(out / "tof.yaml").info.camera.width == 540
+
+
+def test_refine_writes_the_bend_of_a_depth_camera_that_the_next_run_takes_out(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    bag, out, bend, camera = (
+        tmp_path / "corner.mcap",
+        tmp_path / "out",
+        0.06,
+        Camera(160, 120, 146.0, 146.0, 80.0, 60.0),
+    )
+    x = (np.arange(camera.width) - camera.cx) / camera.fx
+    y = (np.arange(camera.height)[:, None] - camera.cy) / camera.fy
+    with BagWriter(bag) as writer:
+        sensors = SensorWriter(writer)
+        sensors.extrinsics(0, {TOF_FRAME: T_BASE_OPTICAL})
+        for number in range(30):
+            left, right = rng.uniform(0.3, 0.7, 2)
+            true = 2.5 / np.maximum(1.0 + left * x + 0.05 * y, 1.0 - right * x - 0.05 * y)
+            measured = true / (1.0 + bend * (x**2 - np.mean(x**2))) + rng.normal(0.0, 0.005, true.shape)
+            info, stamp = rectified_info(camera), 200_000_000 * number
+            sensors.depth(stamp, measured.astype(np.float32), info, measurement="depth")
+    assert "depth is bent along columns by" in run("refine", str(bag), "-o", str(out))
+    found = load_system_config(None, None, read_rig_calibration([out]).parameters).tof_driver.depth_distortion
+    assert found.sigma_columns < 0.005
+    assert found.columns == pytest.approx(bend, abs=3.0 * found.sigma_columns)
+    written = (out / "calibration.yaml").read_text()
+    assert "depth_distortion.sigma_columns" in written
+    assert "depth_distortion.sigma_rows" not in written, "rows are straight"
+    assert found.rows == 0.0

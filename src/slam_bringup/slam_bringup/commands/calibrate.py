@@ -77,8 +77,8 @@ def command(
 
     IMAGES are files, folders or quoted patterns; for two cameras one folder or pattern each, or all files of the first
     followed by those of the second. With refine IMAGES is a bag: its stereo calibration is corrected by what its own
-    pairs show, and the readout of a rolling shutter and offsets of the clocks of the IMU and of the right camera are
-    learnt, for --calibration or beside the bag.
+    pairs show, and the bend of a depth camera's depth, the readout of a rolling shutter and offsets of the clocks of
+    the IMU and of the right camera are learnt, for --calibration or beside the bag.
     """
     if kind == "refine":
         _refine(images, output, overwrite)

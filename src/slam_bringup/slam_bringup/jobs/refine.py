@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """``slam calibrate refine``: what a recording shows of its cameras without a board.
 
-A stereo pair that is not quite rectified is corrected; the readout of a rolling shutter, the time between the images of
-a pair and the difference of the IMU's clock and the images' are written down, so that the next run knows them from its
-first frame on.
+A stereo pair that is not quite rectified is corrected; the distortion of a depth camera's depth, the readout of a
+rolling shutter, the time between the images of a pair and the difference of the IMU's clock and the images' are written
+down, so that the next run knows them from its first frame on.
 """
 
 from __future__ import annotations
@@ -14,20 +14,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from ekf_slam_node.stage import FilterStage
+from slam_bags.reading.readings import DepthReading
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.storage.bag_calibration import FILE_NAME, calibration_file
 from slam_bringup.pipeline.configuration import choose, filter_config, load_system_config
 from slam_bringup.pipeline.overrides import read_overrides
-from slam_bringup.pipeline.sensor_pipeline import SensorPipeline
+from slam_bringup.pipeline.sensor_pipeline import SensorPipeline, depth_stage
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_bringup.terminal.mapping_options import mode_for
 from slam_core.camera import CameraInfo
 from slam_core.camera_info import CameraInfoFile
 from slam_core.storage.files import atomic_text
 from slam_core.types import Features, ImuSample
+from stereo_frontend.depth.plane_evidence import DistortionEstimate, PlaneEvidence
 from stereo_frontend.frontend_config import FrontendReport
 from stereo_frontend.stereo.corrected_info import corrected_right
 
@@ -37,6 +40,9 @@ _TIMES = (
     ("the right image is taken later by", "pair.time_offset", "pair.sigma_time_offset"),
 )
 """Words for a finding, and its parameters of the nodes."""
+_DISTORTION = ("columns", "rows")
+_IMAGE_EVERY_NS, _MOST_IMAGES = 150_000_000, 200
+"""Depth images whose walls are looked at, ns apart: those between show the same walls."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,9 @@ class Refined:
             if name in self.parameters:
                 value, sigma = (1e3 * self.parameters[key] for key in (name, sigma_name))
                 found.append(f"{text} {value:.1f} +- {sigma:.1f} ms: {FILE_NAME}")
+        for name in (n for n in _DISTORTION if f"depth_distortion.{n}" in self.parameters):
+            value, sigma = (100.0 * self.parameters[f"depth_distortion.{key}"] for key in (name, f"sigma_{name}"))
+            found.append(f"depth is bent along {name} by {value:.1f} +- {sigma:.1f} % per (x/z)^2: {FILE_NAME}")
         return "\n".join(found)
 
 
@@ -79,7 +88,9 @@ def refine(bag: Path) -> Refined:
         if len(known) < len(infos):
             raise ValueError(f"{bag} has images without camera infos: calibrate with a board first")
         report, parameters = _learnt(source, agent, mode)
-    figures = {**report.rectification, **parameters}
+        distortion = _distortion(source, agent) if sensors.tof is not None else {}
+    figures = {**report.rectification, **parameters, **distortion}
+    parameters |= {name: value for name, value in distortion.items() if name.startswith("depth_distortion.")}
     if report.correction is None and not parameters:
         raise ValueError(f"the images show no significant error to correct: {figures}")
     if report.correction is not None:
@@ -113,6 +124,36 @@ def _learnt(source: SensorBag, agent: str, mode: str) -> tuple[FrontendReport, d
     found = (stages[0].readout_s, stages[-1].imu_time_offset_s, front_end.right_late_s)
     learnt = [zip(names, times, strict=True) for (_, *names), times in zip(_TIMES, found, strict=True) if times[0]]
     return front_end, {name: value for times in learnt for name, value in times}
+
+
+def _distortion(source: SensorBag, agent: str) -> dict[str, float]:
+    """Parameters of the depth's distortion that is sure, and figures of what the walls tell."""
+    stage = depth_stage(load_system_config(None), source.sensors[agent])
+    evidence, newest, images = PlaneEvidence(np.random.default_rng(0)), -_IMAGE_EVERY_NS, 0
+    for reading in source.readings():
+        if not isinstance(reading, DepthReading) or reading.agent != agent or images >= _MOST_IMAGES:
+            continue
+        if abs(reading.stamp_ns - newest) < _IMAGE_EVERY_NS:
+            continue
+        newest, images = reading.stamp_ns, images + 1
+        stage.add(reading.raw)
+        for image in stage.ready():
+            evidence.add(image)
+    return _distortion_figures(evidence.estimate())
+
+
+def _distortion_figures(found: DistortionEstimate) -> dict[str, float]:
+    figures: dict[str, float] = {"planes": found.planes}
+    for j, name in enumerate(_DISTORTION):
+        figures |= {
+            f"depth_bend_{name}": float(found.measured[j]),
+            f"depth_bend_sigma_{name}": float(found.sigma[j]),
+            f"depth_bend_{name}_is_observable": bool(found.is_observable[j]),
+        }
+        if found.is_corrected[j]:
+            figures[f"depth_distortion.{name}"] = float(found.values[j])
+            figures[f"depth_distortion.sigma_{name}"] = float(found.sigma[j])
+    return figures
 
 
 def write_refined(folder: Path, bag: Path, found: Refined) -> None:
