@@ -28,7 +28,7 @@ PRIOR_SIGMA = 0.05
 _OBSERVABLE = 0.2
 """A number is observable if its standard deviation falls below this share of the prior's."""
 _FLOOR = 0.002
-"""Standard deviation that more images do not lower: walls that are not flat, and pixels of the next wall that look like this one's.
+"""Standard deviation that more images do not lower: bent walls, and pixels of the next wall among this one's.
 
 In exact simulated corners the estimate is off by 0.001 to 0.002.
 """
@@ -165,7 +165,7 @@ def _equations(rays: FloatArray, inverse: FloatArray, sigma: FloatArray) -> Norm
     Q, _ = np.linalg.qr(rays / sigma[:, None])
     value = inverse / sigma
     rows = np.square(rays[:, :2]) * (Q @ (Q.T @ value))[:, None]
-    rows, value = rows - Q @ (Q.T @ rows), value - Q @ (Q.T @ value)
+    rows -= Q @ (Q.T @ rows)
     return NormalEquations(rows.T @ rows, rows.T @ value)
 
 
