@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What became of a submap that was to be joined."""
+"""Report on a submap that was to be joined."""
 
 from __future__ import annotations
 

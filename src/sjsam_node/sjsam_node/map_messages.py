@@ -34,7 +34,7 @@ def fixed_frame_message(types: MessageTypes, T_map_frame: PoseEstimate, map_fram
 def map_pictures(
     types: MessageTypes, header: Message, snapshot: MapSnapshot, landmarks: MapLandmarks
 ) -> dict[str, Message]:
-    """What shows a map to all, by topic."""
+    """Messages that show a map, by topic."""
     return {
         "map/landmarks": landmarks_message(types, header, landmarks),
         "map/cloud": cloud_message(types, header, landmarks),

@@ -30,7 +30,7 @@ from slam_core.types import Submap
 BUILDING = "building"
 """Agent whose only submap are the tags of which it is known where they are (:mod:`sjsam_node.tags.known_tags`)."""
 POSITIONS = "position/"
-"""What the agents are called, before the name of the agent whose they are, whose submaps are positions in a fixed frame
+"""Prefix of the names of agents whose submaps are positions in a fixed frame; the rig's name follows
 (:mod:`sjsam_node.positions`)."""
 ALL = 1 << 30
 """Landmark budget of two submaps that all the landmarks which they share are to connect."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where an antenna was inside a submap: landmarks of it, correlated with its end and its other landmarks.
+"""Places of an antenna inside a submap: landmarks of it, correlated with its end and its other landmarks.
 
 A pose on the way errs by what it hands on to the end, and by a rest (:mod:`sjsam_node.smoothing.inner_poses`); given
 the end, that rest has nothing to do with the landmarks.

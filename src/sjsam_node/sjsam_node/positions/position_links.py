@@ -137,7 +137,7 @@ class PositionLinks:
         return min(graph.path_length_between(i, record) for i in own or [first])
 
     def _shift(self, base: int) -> FloatArray:
-        """Where in the fixed frame the records of positions start, (3,) m: near the map, as numbers ought to be."""
+        """Start (3,) m of the records of positions in the fixed frame: near the map, as numbers ought to be."""
         return np.asarray(-self.graph.records[base].submap.end_pose[:3, 3])
 
     def _linked(

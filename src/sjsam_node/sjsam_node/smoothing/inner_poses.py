@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the poses inside a submap follow its end: gains, and the covariance that these leave."""
+"""Gains by which the poses inside a submap follow its end, and the covariance that these leave."""
 
 from __future__ import annotations
 

@@ -238,7 +238,7 @@ class MapSnapshot:
 
     @property
     def newest_place(self) -> FloatArray:
-        """Where the submap ends that came last, (3,) m; the origin of an empty map."""
+        """End (3,) m of the submap that came last; the origin of an empty map."""
         return np.asarray(self.poses[self.is_on_a_way][-1:, :3, 3].sum(axis=0))
 
     def fixed_frame(self) -> PoseEstimate | None:

@@ -14,7 +14,7 @@ from slam_simulation.trajectory import Path
 
 BUILDING_FRAME = "building"
 T_BUILDING_WORLD = make_transform(rotation_from_euler(np.radians(35.0)), np.array([40.0, -25.0, 6.0]))
-"""Where the simulated world lies in the frame of the positions."""
+"""Pose of the simulated world in the frame of the positions."""
 
 
 @dataclass(frozen=True)
