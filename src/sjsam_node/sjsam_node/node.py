@@ -110,7 +110,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         copy = self.map.crash_recovery_path()
         if copy is None and initial:
             self._show_loaded(self.map.load(Path(initial).expanduser(), self._seen).result())
-            self.get_logger().info(f"{len(self.map.snapshot)} submaps read from {initial}")
+            self.get_logger().info(f"{self.map.snapshot.submap_count} submaps read from {initial}")
         elif copy is not None:
             try:
                 self._show_loaded(self.map.load(copy, self._seen).result())
@@ -118,7 +118,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
                 self.get_logger().error(f"the autosaved map cannot be used, a new one begins: {error}")
                 self.map.reset()
                 return
-            known = f"{len(self.map.snapshot)} submaps of {ctime((copy / 'manifest.json').stat().st_mtime)} in {copy}"
+            known = f"{self.map.snapshot.submap_count} submaps of {ctime((copy / 'manifest.json').stat().st_mtime)} in {copy}"
             self.get_logger().warning(f"a node was killed: going on from {known} (~/reset forgets them)")
 
     def _start_trackers(self) -> None:
