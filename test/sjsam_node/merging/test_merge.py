@@ -130,9 +130,9 @@ def assert_same_ways(merged: GlobalMap, other: GlobalMap):
         np.testing.assert_allclose(first, second, atol=1e-3)
 
 
-def with_known_tags(folder) -> GlobalMapConfig:
+def with_known_tags(folder, number: int = 1, x: float = 0.0) -> GlobalMapConfig:
     file = folder / "known.yaml"
-    tag = "{id: 1, position: [0, 0, 0], quaternion: [0, 0, 0, 1]}"
+    tag = f"{{id: {number}, position: [{x}, 0, 0], quaternion: [0, 0, 0, 1]}}"
     file.write_text(f"size: 0.2\nsigma: 0.01\nsigma_angle: 0.01\ntags: [{tag}]\n")
     return replace(GlobalMapConfig(), tags=KnownTagsConfig(known=str(file)))
 
@@ -143,6 +143,23 @@ def test_known_tags_of_the_building_change_no_part_closure_or_way(days, merged_d
     assert merged.map.state.graph.records[0].submap.agent == BUILDING
     assert (merged.parts, merged.closures, merged.notes) == (plain.parts, plain.closures, ())
     assert_same_ways(merged.map, plain.map)
+
+
+def knowing_tags(one: NamedMap, config: GlobalMapConfig) -> NamedMap:
+    """A map of the first submap alone, made with known tags of the building."""
+    built = GlobalMap(config)
+    assert built.add(one.records[0].submap).accepted
+    return NamedMap(one.name, built.stored())
+
+
+@pytest.mark.parametrize(("number", "x"), [(2, 0.0), (1, 0.5)])
+def test_maps_that_know_other_tags_of_the_building_are_refused_and_those_of_the_same_are_one(days, tmp_path, number, x):
+    first = knowing_tags(days[0], with_known_tags(tmp_path))
+    second = knowing_tags(days[1], with_known_tags(tmp_path))
+    assert [s.agent for s in united([first, second]).submaps].count(BUILDING) == 1
+    other = knowing_tags(days[1], with_known_tags(tmp_path, number, x))
+    with pytest.raises(ValueError, match="knows other tags of the building than another map"):
+        united([first, other])
 
 
 @pytest.mark.parametrize(("has_known_tags", "is_one_bent"), [(True, False), (False, True), (True, True)])

@@ -97,11 +97,15 @@ def _canonical(one: NamedMap) -> tuple[int, int, bytes]:
 def _digest(submap: Submap) -> bytes:
     """Digest of a submap, whatever its agent is called and however many landmarks it has.
 
-    A merge may have renamed the one, and let some of the others go.
+    A merge may have renamed the one, and let some of the others go. Tags of the building, which all maps have by the
+    same name and stamps, are known by their corners; of those none is let go.
     """
     what = submap.session, submap.index, submap.start_stamp_ns, submap.end_stamp_ns
     digest = hashlib.sha256(repr(what).encode())
     digest.update(np.ascontiguousarray(submap.end_pose).tobytes())
+    if submap.agent == BUILDING:
+        digest.update(np.ascontiguousarray(submap.landmark_ids).tobytes())
+        digest.update(np.ascontiguousarray(submap.landmarks).tobytes())
     return digest.digest()
 
 
