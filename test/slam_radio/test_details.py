@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 import zlib
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -109,6 +111,37 @@ def test_a_silence_and_restarts_of_both_sides_lose_no_details_and_send_none_twic
     assert world.inbox.wanted == set()
     again = {s.index: len(s.landmarks) for s in [world.inbox._submap((2, k)) for k in range(3)]}
     assert again == {0: 12, 1: 12, 2: 12}
+
+
+def test_after_a_silence_any_message_of_the_post_has_details_go_out_again_soon(world):
+    world.run(5.0)
+    world.submap(0)
+    world.run(10.0)
+    world.arrives = lambda to_post, now_s: not to_post
+    world.inbox.ask()
+    world.run(39.0)
+    assert world.detail_keys == [0] * 4
+    world.uplink.on_heard(world.now_s + 20.0)
+    assert world.uplink.details.ready(world.now_s + 24.0) is None
+    assert world.uplink.details.ready(world.now_s + 25.0) == (2, 0)
+
+
+def test_details_that_came_when_the_disk_was_full_are_passed_on_when_they_come_again(world, monkeypatch):
+    world.run(5.0)
+    world.submap(0)
+    world.run(10.0)
+    world.inbox.ask()
+    details = packed(world.whole(0))[1]
+    with monkeypatch.context() as full:
+        full.setattr("slam_radio.inbox.write_ranges", Mock(side_effect=OSError(errno.ENOSPC, "disk full")))
+        with pytest.raises(OSError, match="disk full"):
+            world.inbox.take_details((2, 0), details)
+    assert world.inbox.lacking() == [(2, 0, 1)]
+    world.run(20.0)
+    assert [len(s.landmarks) for s in world.detailed] == [12]
+    assert world.inbox.wanted == set()
+    assert world.inbox.take_details((2, 0), details) == []
+    assert world.inbox.repeated == 1
 
 
 def test_a_fifth_of_all_messages_may_be_lost(world, rng):

@@ -136,6 +136,18 @@ def test_too_much_for_the_link_is_said(world):
     assert state.backlog_s > 30.0
 
 
+def test_after_a_silence_any_message_of_the_post_has_submaps_go_out_again_soon(world):
+    """A correction may be the first; a submap that was tried four times would wait for 40 s."""
+    world.run(5.0)
+    world.arrives = lambda to_post, now_s: not to_post
+    world.submap(0)
+    world.run(39.0)
+    assert world.keys == [0] * 4
+    world.uplink.on_heard(world.now_s + 20.0)
+    assert world.uplink.ready(world.now_s + 24.0) is None
+    assert world.uplink.ready(world.now_s + 25.0) == (2, 0)
+
+
 def test_what_a_silent_agent_said_of_its_link_is_not_repeated(world):
     world.downlink.on_backlog("one", pack_backlog(Backlog(9, 900, 9.0, 90.0, 50.0, True)), 0.0)
     assert "more comes in at one" in world.downlink.state(1.0).reason

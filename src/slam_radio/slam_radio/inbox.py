@@ -116,7 +116,7 @@ class Inbox:
         self._untold = untold
 
     def take_details(self, key: Key, data: bytes) -> list[Submap]:
-        """Keep the details of a submap; returns the submap with them, unless it waits or has them already.
+        """Keep the details of a submap; returns the submap with them, unless it waits or was returned with them before.
 
         Raises
         ------
@@ -128,20 +128,21 @@ class Inbox:
         if key not in self._folder.sizes:
             raise ValueError(f"details of submap {self.agent} {key}, which is not here")
         submap = with_details(self._folder.read(key), data)
-        if key in self._details.sizes:
+        if key not in self._details.sizes:
+            self._details.add(key, data)
+        elif key not in self.wanted:  # else the disk was full when this was to be noted
             self.repeated += 1
             return []
-        self._details.add(key, data)
         self._set_wanted(self.wanted - {key})
         return [] if key in self._held else [submap]
 
     def _set_wanted(self, wanted: set[Key]) -> None:
+        write_ranges(self._wanted_file, _ranges(wanted))
         self.wanted = wanted
-        write_ranges(self._wanted_file, self.lacking())
 
     def lacking(self) -> list[Range]:
         """Ranges of the submaps whose details are wanted."""
-        return list(IndexRanges((session, index, index + 1) for session, index in self.wanted))
+        return _ranges(self.wanted)
 
     def kept(self) -> Iterator[tuple[Key, bytes]]:
         """Keys and bytes of the submaps that lie on disk, oldest first."""
@@ -179,3 +180,7 @@ class Inbox:
         """Let another process have the folder."""
         self._folder.close()
         self._details.close()
+
+
+def _ranges(keys: Iterable[Key]) -> list[Range]:
+    return list(IndexRanges((session, index, index + 1) for session, index in keys))

@@ -96,10 +96,6 @@ class Uplink:
 
     def on_acknowledgement(self, ranges: Iterable[Range], now_s: float) -> None:
         """The post is there, and has these submaps."""
-        if not self._hearing.is_up(now_s):
-            self._flight.hurry(now_s)
-            if self.details is not None:
-                self.details.hurry(now_s)
         self.on_heard(now_s)
         sizes = {key: self.outbox.size(key) for key in self.outbox.waiting}
         for key in self.outbox.acknowledge(ranges):
@@ -108,7 +104,11 @@ class Uplink:
             self._carriage.carried(sizes[key] + OVERHEAD, now_s)
 
     def on_heard(self, now_s: float) -> None:
-        """The post is there."""
+        """The post is there; after a silence what was under way goes out again soon."""
+        if not self._hearing.is_up(now_s):
+            self._flight.hurry(now_s)
+            if self.details is not None:
+                self.details.hurry(now_s)
         self._hearing.heard(now_s)
 
     def due(self, now_s: float) -> list[Outgoing]:
