@@ -40,13 +40,14 @@ class DetailStore:
     @property
     def strangers(self) -> dict[Path, int]:
         """Files by folder that look like details and are of another version, or damaged."""
-        return {self.folder.path: self.folder.strangers} if self.folder.strangers else {}
+        counts = {self.folder.path: self.folder.strangers, self.whole.path: len(self.whole.strangers)}
+        return {path: count for path, count in counts.items() if count}
 
     def keep(self, key: Key, submap: Submap, message: bytes) -> None:
         """Keep what the message of a submap leaves out; OSError if it cannot be written."""
         self.whole.add(key, submap, message)
         with suppress(OSError):  # a full disk: at the next one
-            while self.whole.total > self._most_bytes:
+            while self.whole.sizes and self.whole.total > self._most_bytes:
                 self._pack(min(self.whole.sizes))
 
     def want(self, ranges: Iterable[Range]) -> None:
@@ -115,7 +116,7 @@ class DetailStore:
         try:
             submap, light, message = self.whole.read(key)
         except ValueError:
-            del self.whole.sizes[key]
+            self.whole.set_aside(key)
             self.damaged += 1
             return False
         try:

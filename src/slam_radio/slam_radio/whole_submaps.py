@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,18 +20,26 @@ _NAME = re.compile(r"(\d{1,10})-(\d{1,10})\.npz")
 
 
 class WholeSubmaps:
-    """A folder of whole submaps without their paths: ``sizes`` has their keys and bytes."""
+    """A folder of whole submaps without their paths: ``sizes`` has their keys and bytes.
+
+    ``strangers`` has those of files that are of another version, or damaged: they stay where they are until the same
+    submap comes anew.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         path.mkdir(parents=True, exist_ok=True)
-        found = {_NAME.fullmatch(file.name): file for file in path.iterdir()}
-        self.sizes: dict[Key, int] = {(int(m[1]), int(m[2])): file.stat().st_size for m, file in found.items() if m}
+        self.sizes: dict[Key, int] = {}
+        self.strangers: dict[Key, int] = {}
+        for file in sorted(path.iterdir()):
+            if match := _NAME.fullmatch(file.name):
+                key = int(match[1]), int(match[2])
+                (self.sizes if self._is_ours(file, key) else self.strangers)[key] = file.stat().st_size
 
     @property
     def total(self) -> int:
-        """Bytes of all."""
-        return sum(self.sizes.values())
+        """Bytes of all, strangers included."""
+        return sum(self.sizes.values()) + sum(self.strangers.values())
 
     def add(self, key: Key, submap: Submap, message: bytes) -> None:
         """Write a submap and its message, whole or not at all; OSError if that fails."""
@@ -42,6 +51,7 @@ class WholeSubmaps:
                 descriptors=submap.descriptors,
             )  # fmt: skip
         self.sizes[key] = file.stat().st_size
+        self.strangers.pop(key, None)
 
     def read(self, key: Key) -> tuple[Submap, LightSubmap, bytes]:
         """A submap, what was sent of it, and its message.
@@ -70,6 +80,21 @@ class WholeSubmaps:
         """Remove a submap that is there."""
         del self.sizes[key]
         self._file(key).unlink(missing_ok=True)
+
+    def set_aside(self, key: Key) -> None:
+        """Look at a submap that cannot be read no more; its file stays, if there is one."""
+        del self.sizes[key]
+        with suppress(FileNotFoundError):
+            self.strangers[key] = self._file(key).stat().st_size
+
+    def _is_ours(self, file: Path, key: Key) -> bool:
+        """True if the message in a file is of this version: that is read in a moment, all of a file is not."""
+        try:
+            with np.load(file, allow_pickle=False) as arrays:
+                light = read(arrays["message"].tobytes())
+        except (OSError, KeyError, EOFError, TypeError, ValueError, zipfile.BadZipFile):
+            return False
+        return (light.session, light.index) == key
 
     def _file(self, key: Key) -> Path:
         return self.path / f"{key[0]}-{key[1]}.npz"
