@@ -8,7 +8,8 @@
 ``.slam.json`` lists what was written, with digests. A folder that has files but no list is refused. Results of the same
 command on the same source are replaced; other results, or files changed since they were written, only with
 ``overwrite``. Files that a user added stay, and a program killed at any moment leaves the old results or the new ones;
-the file ``last`` (``summary.json``) is absent in between.
+the file ``last`` (``summary.json``) is absent in between. What a killed program was making ready (``.slam.*.part``) is
+removed by the next one on the same machine; of another machine nobody can tell here if it has ended, so that stays.
 """
 
 from __future__ import annotations
