@@ -118,7 +118,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
                 self.get_logger().error(f"the autosaved map cannot be used, a new one begins: {error}")
                 self.map.reset()
                 return
-            known = f"{self.map.snapshot.submap_count} submaps of {ctime((copy / 'manifest.json').stat().st_mtime)} in {copy}"
+            written = ctime((copy / "manifest.json").stat().st_mtime)
+            known = f"{self.map.snapshot.submap_count} submaps of {written} in {copy}"
             self.get_logger().warning(f"a node was killed: going on from {known} (~/reset forgets them)")
 
     def _start_trackers(self) -> None:
@@ -382,8 +383,7 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
         if self._paused:
             return
         for agent, placement in self.placements.items():
-            found = placement.at_present(self._stamp_ns, self.config.transform_tolerance_s)
-            if found is None:
+            if (found := placement.at_present(self._stamp_ns, self.config.transform_tolerance_s)) is None:
                 continue
             pose, held_back_m = found
             frame, odom = self.config.map_frame, below(agent, self.config.odom_frame)
