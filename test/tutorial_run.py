@@ -16,16 +16,22 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def made_once(base: Path, name: str, make: Callable[[Path], None]) -> Path:
-    """A folder below the session's ``base`` that the first process fills; the others wait for it."""
+    """A folder below the session's ``base`` that the first process fills; the others wait, and fail as it did."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         base = base.parent
     folder, done = base / name, base / f"{name}.done"
     with (base / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not done.exists():
-            folder.mkdir(exist_ok=True)
-            make(folder)
+            folder.mkdir()
+            try:
+                make(folder)
+            except BaseException as error:
+                done.write_text(f"{type(error).__name__}: {error}")
+                raise
             done.touch()
+    failed = done.read_text()
+    assert not failed, failed
     return folder
 
 
@@ -34,8 +40,7 @@ def run_tutorial(folder: Path) -> None:
     script = folder / "slam"
     script.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m slam_bringup.cli "$@"\n')
     script.chmod(0o755)
-    if not (folder / "bags").exists():
-        (folder / "bags").symlink_to(ROOT / "bags")
+    (folder / "bags").symlink_to(ROOT / "bags")
     blocks = re.findall(r"```bash\n(.*?)```", (ROOT / "docs/tutorial.md").read_text(encoding="utf-8"), flags=re.S)
     lines = re.findall(r"^\./slam .*$", "\n".join(blocks), flags=re.M)
     assert len(lines) == 4

@@ -32,7 +32,7 @@ def test_several_recordings_are_mapped_to_the_bytes_of_single_runs_and_a_bad_one
     first, second = cut(tmp_path / "first.mcap", 0.0, 0.25), cut(tmp_path / "second.mcap", 0.5, 0.75)
     bad = tmp_path / "bad.mcap"
     bad.write_bytes(first.read_bytes()[:2000])
-    done = call("run", first, bad, second, "-o", tmp_path / "many")
+    done = call("run", first, bad, second, "-o", tmp_path / "many", "--workers", 2)
     assert done.exit_code == FAILED, done.output
     assert str(bad) in done.stderr
     for name in ("first", "bad", "second"):

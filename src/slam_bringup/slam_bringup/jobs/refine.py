@@ -40,7 +40,8 @@ _TIMES = (
     ("the right image is taken later by", "pair.time_offset", "pair.sigma_time_offset"),
 )
 """Words for a finding, and its parameters of the nodes."""
-_DISTORTION = ("columns", "rows")
+_DISTORTION = {"columns": "x", "rows": "y"}
+"""Coordinate in whose square each number of the depth's distortion grows."""
 _IMAGE_EVERY_NS, _MOST_IMAGES = 150_000_000, 200
 """Depth images whose walls are looked at, ns apart: those between show the same walls."""
 
@@ -68,7 +69,9 @@ class Refined:
                 found.append(f"{text} {value:.1f} +- {sigma:.1f} ms: {FILE_NAME}")
         for name in (n for n in _DISTORTION if f"depth_distortion.{n}" in self.parameters):
             value, sigma = (100.0 * self.parameters[f"depth_distortion.{key}"] for key in (name, f"sigma_{name}"))
-            found.append(f"depth is bent along {name} by {value:.1f} +- {sigma:.1f} % per (x/z)^2: {FILE_NAME}")
+            found.append(
+                f"depth is bent along {name} by {value:.1f} +- {sigma:.1f} % per ({_DISTORTION[name]}/z)^2: {FILE_NAME}"
+            )
         return "\n".join(found)
 
 
@@ -129,13 +132,15 @@ def _learnt(source: SensorBag, agent: str, mode: str) -> tuple[FrontendReport, d
 def _distortion(source: SensorBag, agent: str) -> dict[str, float]:
     """Parameters of the depth's distortion that is sure, and figures of what the walls tell."""
     stage = depth_stage(load_system_config(None), source.sensors[agent])
+    every = -(-source.count(agent, "depth") // _MOST_IMAGES)  # of the whole recording
     evidence, newest, images = PlaneEvidence(np.random.default_rng(0)), -_IMAGE_EVERY_NS, 0
     for reading in source.readings():
-        if not isinstance(reading, DepthReading) or reading.agent != agent or images >= _MOST_IMAGES:
+        if not isinstance(reading, DepthReading) or reading.agent != agent:
             continue
-        if abs(reading.stamp_ns - newest) < _IMAGE_EVERY_NS:
+        images += 1
+        if (images - 1) % every or abs(reading.stamp_ns - newest) < _IMAGE_EVERY_NS:
             continue
-        newest, images = reading.stamp_ns, images + 1
+        newest = reading.stamp_ns
         stage.add(reading.raw)
         for image in stage.ready():
             evidence.add(image)
