@@ -43,13 +43,15 @@ class RecordComparisons:
 
     def __call__(self, wanted: Sequence[RecordPair]) -> list[Found]:
         """The findings of all comparisons, in their order."""
-        handles = [
-            self._tasks.submit(_compared, self._points(one.first), self._points(one.second), one, self._config)
-            for one in wanted
-        ]
-        found: list[Found] = self._tasks.gather(handles)
-        while len(self._held) > _HELD:
-            self._held.popitem(last=False)
+        found = list[Found]()
+        for start in range(0, len(wanted), _HELD // 2):  # a few at once: what workers are sent takes time and memory
+            handles = [
+                self._tasks.submit(_compared, self._points(one.first), self._points(one.second), one, self._config)
+                for one in wanted[start : start + _HELD // 2]
+            ]
+            found += self._tasks.gather(handles)
+            while len(self._held) > _HELD:
+                self._held.popitem(last=False)
         return found
 
     def _points(self, record: int) -> Any:

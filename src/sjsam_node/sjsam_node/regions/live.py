@@ -26,6 +26,8 @@ WAIT_S = 5.0
 """Time within which the cluster has to give the next result, s."""
 _RETRY_S = 2.0
 """Time between two looks for a cluster that does not answer, s."""
+_MOST_DOUBLINGS = 8
+"""Of that time, before the first look for a cluster that was too slow again and again."""
 
 
 @dataclass(eq=False)
@@ -70,7 +72,7 @@ class LiveTasks:
     def __init__(self, address: str) -> None:
         self._address = address
         self._cluster: OnCluster | None = None
-        self.elsewhere = self.here = 0
+        self.elsewhere = self.here = self._timeouts = 0
         self._ended = threading.Event()
         try:
             self._cluster = OnCluster(connected(address), wait_s=WAIT_S)
@@ -110,6 +112,8 @@ class LiveTasks:
                 _LOG.warning("%s; it is done in this process", error)
             except (ClusterLost, TimeoutError) as error:
                 self._lose(cluster, error)
+            except Exception as error:  # what the task itself raises is raised here, too
+                _LOG.warning("a task failed on the Dask cluster at %s: %r; it is done here", self._address, error)
             else:
                 self.elsewhere += len(handles)
                 return results
@@ -146,17 +150,22 @@ class LiveTasks:
         reason = str(error.__cause__ or "") if isinstance(error, ClusterLost) else f"no result within {WAIT_S:.0f} s"
         _LOG.warning("the Dask cluster at %s: %s; submaps are joined in this process", self._address, reason)
         self._cluster = None
-        self._look_for_it(cluster)
+        pause_s = _RETRY_S
+        if not isinstance(error, ClusterLost):  # it is there, but slow: it would be given all anew, and be slow again
+            pause_s *= 2.0 ** min(self._timeouts, _MOST_DOUBLINGS)
+            self._timeouts += 1
+        self._look_for_it(cluster, pause_s)
 
-    def _look_for_it(self, lost: OnCluster | None = None) -> None:
-        threading.Thread(target=self._until_there, args=(lost,), name="cluster", daemon=True).start()
+    def _look_for_it(self, lost: OnCluster | None = None, pause_s: float = 0.0) -> None:
+        threading.Thread(target=self._until_there, args=(lost, pause_s), name="cluster", daemon=True).start()
 
-    def _until_there(self, lost: OnCluster | None) -> None:
-        """Thread: leave a lost cluster, and take the one that answers."""
+    def _until_there(self, lost: OnCluster | None, pause_s: float) -> None:
+        """Thread: leave a lost cluster, and take the one that answers, after a pause of some s at least."""
         if lost is not None:
             with suppress(Exception):  # what is lost cannot always be left in good order
                 lost.close(timeout_s=1.0)
-        while not self._ended.wait(_RETRY_S):
+        while not self._ended.wait(max(pause_s, _RETRY_S)):
+            pause_s = _RETRY_S
             try:
                 found = OnCluster(connected(self._address), wait_s=WAIT_S)
             except NotAvailable:
