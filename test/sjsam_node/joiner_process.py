@@ -32,11 +32,14 @@ def neighbour() -> Iterator[Probe]:
     rclpy.shutdown(context=context)
 
 
-def start(*parameters: str, **options: Any) -> subprocess.Popen[str]:
-    """A node of its own with parameters ``name:=value``; what it says comes through ``stdout``."""
+def start(*parameters: str, before: str = "", **options: Any) -> subprocess.Popen[str]:
+    """A node of its own with parameters ``name:=value``; what it says comes through ``stdout``.
+
+    ``before``: Python code that its process runs first.
+    """
     given = [word for parameter in parameters for word in ("-p", parameter)]
     return subprocess.Popen(
-        [sys.executable, "-c", "from sjsam_node.node import main; main()", "--ros-args", *given],
+        [sys.executable, "-c", f"{before}\nfrom sjsam_node.node import main; main()", "--ros-args", *given],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         **options,
     )

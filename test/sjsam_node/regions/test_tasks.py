@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
+import threading
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from types import SimpleNamespace
 
@@ -17,7 +20,7 @@ from random_joining import MODELS, random_problem
 from threadpoolctl import threadpool_info
 
 from sjsam_node.joint_problem.problem import flatten
-from sjsam_node.regions.tasks import ClusterLost, InProcess, OnCluster, cluster
+from sjsam_node.regions.tasks import ClusterLost, InProcess, NotAvailable, OnCluster, cluster, connected
 from sjsam_node.regions.tree import RegionTree
 
 
@@ -194,6 +197,110 @@ def test_a_lost_cluster_and_a_task_that_kills_workers_are_told():
                 call()
     with pytest.raises(ValueError, match="want of memory"):
         OnCluster(Lost(killed)).gather([])
+
+
+def test_results_are_waited_for_one_after_the_other_and_fetched_within_the_same_time(monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    waits, fetches = list[tuple[int, float]](), list[float]()
+
+    def wait(left, timeout, return_when):
+        waits.append((len(left), timeout))
+        assert return_when == "FIRST_COMPLETED"
+        return SimpleNamespace(not_done=left[1:])
+
+    class Client(OfOneProcess):
+        def as_current(self):
+            return nullcontext()
+
+        def gather(self, futures, asynchronous):
+            assert asynchronous
+            return list(futures)
+
+        def sync(self, function, futures, callback_timeout):
+            fetches.append(callback_timeout)
+            if self.is_lost:  # its worker died before the fetch
+                raise TimeoutError
+            return function(futures)
+
+    monkeypatch.setattr(distributed, "wait", wait)
+    client = Client()
+    tasks = OnCluster(client, wait_s=7.0)
+    handles = [tasks.submit(str, name) for name in "abc"]
+    assert tasks.gather(handles) == ["a", "b", "c"]
+    assert waits == [(3, 7.0), (2, 7.0), (1, 7.0)]
+    client.is_lost = True
+    with pytest.raises(TimeoutError):
+        tasks.gather(handles)
+    assert fetches == [7.0, 7.0]
+
+
+@pytest.mark.slow
+def test_a_result_that_is_lost_before_it_is_fetched_is_not_waited_for_for_ever(monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=":0") as local:
+        client = distributed.Client(local, set_as_default=False)
+        tasks = OnCluster(client, wait_s=0.1)
+        monkeypatch.setattr(distributed, "wait", lambda *_: SimpleNamespace(not_done=()))  # it was there a moment ago
+        handle = tasks.submit(time.sleep, 3.0)
+        with pytest.raises(TimeoutError):
+            tasks.gather([handle])
+        client.close()
+
+
+def test_tries_to_reach_a_scheduler_that_is_not_there_leave_no_thread_behind(monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("sjsam_node.regions.tasks._PATIENCE_S", 0.2)
+
+    def left() -> list[str]:
+        return [one.name for one in threading.enumerate() if one.name == "IO loop"]
+
+    before = left()
+    with socket.socket() as mute:  # its queue takes connections, and nobody speaks
+        mute.bind(("127.0.0.1", 0))
+        for _ in range(2):
+            for listens in (False, True):
+                if listens:
+                    mute.listen()
+                with pytest.raises(NotAvailable, match="no Dask scheduler answers"):
+                    connected(f"tcp://127.0.0.1:{mute.getsockname()[1]}")
+    assert left() == before
+
+
+class Reached:
+    """A client of a cluster whose workers cannot be set up."""
+
+    def __init__(self, error):
+        self.error, self.is_closed = error, False
+
+    def get_versions(self, check):
+        pass
+
+    def scheduler_info(self):
+        return {"workers": {"a": {}}}
+
+    def run(self, function, on_error):
+        return {"a": function()}
+
+    def register_plugin(self, plugin):
+        raise self.error
+
+    def close(self):
+        self.is_closed = True
+
+
+def test_workers_that_cannot_be_set_up_now_are_tried_again_later(monkeypatch):
+    distributed = pytest.importorskip("distributed")
+
+    async def greet(address):
+        pass
+
+    monkeypatch.setattr("sjsam_node.regions.tasks._greet", greet)
+    for error in (RuntimeError("no space for compiled code"), OSError("closed")):
+        client = Reached(error)
+        monkeypatch.setattr(distributed, "Client", lambda *_, client=client, **__: client)
+        with pytest.raises(NotAvailable, match=str(error)):
+            connected("tcp://somewhere:1")
+        assert client.is_closed
 
 
 def test_without_distributed_everything_runs_in_process_unless_workers_are_asked_for(monkeypatch):

@@ -10,6 +10,7 @@ Functions are pure and give the same bytes wherever they run, as long as the wor
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import logging
 import os
@@ -110,7 +111,7 @@ class OnCluster:
         Gives a client of the cluster that was started again after it was lost: all tasks whose results may still be
         asked for run once more there. Without it a lost cluster ends the work.
     wait_s
-        Time within which the next result has to come, s; any by default.
+        Time within which the next result has to be computed, and all of them fetched, s; any by default.
     """
 
     def __init__(self, client: Any, again: Callable[[], Any] | None = None, wait_s: float | None = None) -> None:
@@ -158,14 +159,16 @@ class OnCluster:
         self._client.close(**({} if timeout_s is None else {"timeout": timeout_s}))
 
     def _results(self, futures: list[Any]) -> list[Any]:
-        if self._wait_s is not None:
-            from distributed import wait
+        if self._wait_s is None:
+            return list(self._client.gather(futures))
+        from distributed import wait
 
-            left = futures
-            with self._client.as_current():
-                while left:  # as long as one after the other comes
-                    left = list(wait(left, self._wait_s, "FIRST_COMPLETED").not_done)  # type: ignore[no-untyped-call]
-        return list(self._client.gather(futures))
+        left = futures
+        with self._client.as_current():
+            while left:  # as long as one after the other comes
+                left = list(wait(left, self._wait_s, "FIRST_COMPLETED").not_done)  # type: ignore[no-untyped-call]
+        fetch = partial(self._client.gather, asynchronous=True)  # a result whose worker dies now may never come
+        return list(self._client.sync(fetch, futures, callback_timeout=self._wait_s))
 
     def _listen(self, topic: str, handler: Callable[[Any], None]) -> None:
         self._client.subscribe_topic(topic, lambda event: handler(event[1]))
@@ -310,7 +313,7 @@ def connected(address: str) -> Any:
     Raises
     ------
     NotAvailable
-        If nobody answers there, or it has no workers.
+        If nobody answers there, or it has no workers, or they cannot be set up now.
     ValueError
         If scheduler or workers have other versions of Dask, Python, NumPy, SciPy, Numba or this program.
     """
@@ -319,6 +322,7 @@ def connected(address: str) -> Any:
     from sjsam_node.regions.worker_setup import Prepared, other_versions
 
     try:
+        asyncio.run(_greet(address))
         client = Client(address, timeout=_PATIENCE_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, TimeoutError, ValueError) as error:
         raise NotAvailable(f"no Dask scheduler answers at {address}: {error}") from error
@@ -338,7 +342,21 @@ def connected(address: str) -> Any:
     except (OSError, TimeoutError) as error:
         client.close()  # type: ignore[no-untyped-call]
         raise NotAvailable(f"the Dask scheduler at {address} answers no more: {error}") from error
+    except Exception as error:  # of a worker, whatever it is
+        client.close()  # type: ignore[no-untyped-call]
+        raise NotAvailable(f"the workers of the Dask scheduler at {address} cannot be set up: {error}") from error
     return client
+
+
+async def _greet(address: str) -> None:
+    """Connect to a scheduler and leave; a client that cannot connect would leave a thread behind each time."""
+    from distributed.comm.core import connect
+    from distributed.security import Security
+
+    arguments = Security().get_connection_args("client")  # type: ignore[no-untyped-call]
+    async with asyncio.timeout(1.1 * _PATIENCE_S):  # Dask's own does not end where somebody listens and says nothing
+        comm = await connect(address, timeout=_PATIENCE_S, **arguments)  # type: ignore[no-untyped-call]
+    comm.abort()
 
 
 def connected_again(address: str) -> Any:
