@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Twenty agents and a post on one shaped channel, in made-up time: how long submaps take, and the bytes they need.
 
-    python benchmarks/radio/shared_channel.py RUN [--agents 20] [--rate 500] [--loss 0.2] [--late] [--restart]
+    python benchmarks/radio/shared_channel.py RUN [--agents 20] [--rate 500] [--loss 0.2] [--silence 60] [--late]
+        [--restart]
 
 RUN: the folder of a run with its ``map``. Every agent replays its submaps, agent k beginning k seconds later, by the
 uplink, downlink, outbox and inbox of the node; there is no Zenoh in it. All share ``--rate`` kbit/s, first come first
 served, both directions together; a message has the 150 bytes of headers that the budget counts. ``--loss``: share of
-messages lost. ``--late``: the last agent begins at minute 10. ``--restart``: the post is started anew in the middle.
+messages lost. ``--silence``: nothing comes through between the post and one agent for so long, then it is the next
+one's turn; agents repeat the run until all have had theirs. ``--late``: the last agent begins at minute 10.
+``--restart``: the post is started anew in the middle.
 Prints submaps received of those packed, seconds from a submap's end to its arrival,
-kB a metre on the channel, the share of the channel that is used, and seconds until the last had arrived.
+kB a metre on the channel, the share of the channel that is used, seconds until the last had arrived, and seconds from
+the end of an agent's silence until the post had all that had ended by then.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from sjsam_node import storage
+from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate, Submap
 from slam_radio.byte_budget import OVERHEAD
 from slam_radio.downlink import Downlink
@@ -45,12 +50,12 @@ class Channel:
         self._line: deque[tuple[float, str, str, object, bytes]] = deque()
         self._rng = np.random.default_rng(1)
 
-    def send(self, now_s: float, agent: str, kind: str, key: object, data: bytes) -> None:
-        """Put a message at the end of the line."""
+    def send(self, now_s: float, agent: str, kind: str, key: object, data: bytes, *, silent: bool = False) -> None:
+        """Put a message at the end of the line; while its agent is silent it needs its bytes and is lost."""
         size = len(data) + OVERHEAD
         self.sent += size
         self._free_at_s = max(self._free_at_s, now_s) + size / self._rate
-        if self._rng.random() >= self._loss:
+        if self._rng.random() >= self._loss and not silent:
             self._line.append((self._free_at_s, agent, kind, key, data))
 
     def arrived(self, now_s: float) -> list[tuple[float, str, str, object, bytes]]:
@@ -67,6 +72,7 @@ def main() -> None:
     parser.add_argument("--agents", type=int, default=20)
     parser.add_argument("--rate", type=float, default=500.0, help="of the channel, kbit/s")
     parser.add_argument("--loss", type=float, default=0.0, help="share of messages lost")
+    parser.add_argument("--silence", type=float, default=0.0, help="of each agent in turn, s")
     parser.add_argument("--late", action="store_true")
     parser.add_argument("--restart", action="store_true")
     arguments = parser.parse_args()
@@ -87,8 +93,9 @@ def replay(submaps: list[Submap], arguments: argparse.Namespace, folder: Path) -
     uplinks = {n: Uplink(Outbox(folder / "out" / n), rate / len(names)) for n in names}
     inboxes = [Inbox(n, folder / "in" / n) for n in names]
     downlink = Downlink(inboxes, rate / 5.0)
+    silences = {n: arguments.silence * np.array([k + 1, k + 2]) for k, n in enumerate(names)}
+    submaps, ends = repeated(submaps, arguments.silence * (len(names) + 2))
     keys = {(s.session, s.index) for s in submaps}
-    ends = [(s.end_stamp_ns - submaps[0].start_stamp_ns) * 1e-9 for s in submaps]
     due = sorted((begins[n] + end, n, k) for n in names for k, end in enumerate(ends))
     count, last_s, middle_s = len(due), due[-1][0], 0.5 * due[-1][0]
     ended = {(n, (submaps[k].session, submaps[k].index)): at for at, n, k in due}
@@ -96,6 +103,7 @@ def replay(submaps: list[Submap], arguments: argparse.Namespace, folder: Path) -
     now, joined_s = 0.0, 0.0
     while now < last_s + _AFTER_S and (due or len(took) < count):
         now += _STEP_S
+        silent = {n for n, (begin, end) in silences.items() if begin <= now < end}
         if arguments.restart and now - _STEP_S < middle_s <= now:
             for inbox in inboxes:
                 inbox.close()
@@ -112,9 +120,9 @@ def replay(submaps: list[Submap], arguments: argparse.Namespace, folder: Path) -
             if uplink.pose_is_due(now):
                 uplink.set_pose(pack_pose(PoseEstimate(round(now * 1e9), np.eye(4), 1e-4 * np.eye(6))))
             for message in uplink.due(now):
-                channel.send(now, name, message.kind, message.key, message.data)
+                channel.send(now, name, message.kind, message.key, message.data, silent=name in silent)
         for told in downlink.due(now):
-            channel.send(now, told.agent, "ack", None, told.data)
+            channel.send(now, told.agent, "ack", None, told.data, silent=told.agent in silent)
         for at, name, kind, key, data in channel.arrived(now):
             if kind == "ack":
                 uplinks[name].on_acknowledgement(unpack_acknowledgement(data), now)
@@ -133,6 +141,34 @@ def replay(submaps: list[Submap], arguments: argparse.Namespace, folder: Path) -
     print(f"{held} of {count} submaps, 50 % {np.median(waits):.1f} s, 95 % {np.percentile(waits, 95):.1f} s, "
           f"most {waits.max():.1f} s, {channel.sent / way / 1e3:.1f} kB/m, channel used "
           f"{100 * channel.sent / rate / now:.0f} %, the last {joined_s - last_s:.1f} s after its end")  # fmt: skip
+    if arguments.silence:
+        gone = backlogs_gone(ended, took, silences)
+        print(f"backlog gone after a silence: 50 % {np.median(gone):.1f} s, 95 % {np.percentile(gone, 95):.1f} s, "
+              f"most {gone.max():.1f} s")  # fmt: skip
+
+
+def repeated(submaps: list[Submap], seconds: float) -> tuple[list[Submap], list[float]]:
+    """Submaps of the run, repeated in further sessions for at least so long, and seconds at which they end."""
+    first, last = submaps[0], submaps[-1]
+    length_s = (last.end_stamp_ns - first.start_stamp_ns) * 1e-9
+    times = max(1, int(np.ceil(seconds / length_s)))
+    again = [replace(s, session=s.session + k) for k in range(times) for s in submaps]
+    ends = [k * length_s + (s.end_stamp_ns - first.start_stamp_ns) * 1e-9 for k in range(times) for s in submaps]
+    return again, ends
+
+
+def backlogs_gone(
+    ended: dict[tuple[str, tuple[int, int]], float],
+    took: dict[tuple[str, object], float],
+    silences: dict[str, FloatArray],
+) -> FloatArray:
+    """Seconds from the end of each agent's silence until its submaps of before had arrived; inf if one never has."""
+    gone = dict.fromkeys(silences, 0.0)
+    for (name, key), at in ended.items():
+        end = silences[name][1]
+        if at < end:
+            gone[name] = max(gone[name], at + took.get((name, key), np.inf) - end)
+    return np.array(list(gone.values()))
 
 
 if __name__ == "__main__":
