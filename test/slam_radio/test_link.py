@@ -190,3 +190,31 @@ def test_files_of_others_stay(world, tmp_path):
 def test_one_process_keeps_the_outbox(world):
     with pytest.raises(ValueError, match="in use by another process"):
         type(world.uplink.outbox)(world.folder / "out")
+
+
+def test_a_lost_submap_goes_out_again_as_soon_as_a_later_one_has_come(world):
+    world.run(4.0)
+    world.arrives = lambda to_post, now_s: not to_post
+    world.submap(0)
+    world.run(0.2)
+    world.arrives = lambda to_post, now_s: True
+    world.submap(1)
+    world.run(1.0)
+    assert world.keys == [0, 1, 0]
+    assert world.passed_on == [0, 1]
+    assert world.uplink.resent == 1
+
+
+def test_a_submap_that_went_out_twice_says_nothing_about_those_before_it(world):
+    """The acknowledgement of its first copy may have been late: what went out between is not lost."""
+    world.run(4.0)
+    world.arrives = lambda to_post, now_s: to_post
+    world.submap(0)
+    world.run(5.0)
+    world.submap(1)
+    world.run(1.5)
+    assert world.keys == [0, 1, 0]
+    world.uplink.on_acknowledgement([(2, 0, 1)], world.now_s)
+    assert world.uplink.ready(world.now_s) is None
+    world.uplink.on_acknowledgement([(2, 0, 2)], world.now_s)
+    assert not world.uplink.outbox.waiting

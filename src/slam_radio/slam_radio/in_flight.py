@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from slam_radio.index_ranges import Key
@@ -17,6 +18,7 @@ class _Sent:
     tries: int
     due_s: float
     size: int
+    is_repeated: bool
 
 
 class InFlight:
@@ -43,15 +45,26 @@ class InFlight:
     def sent(self, key: Key, size: int, now_s: float) -> None:
         """A message goes out."""
         tries = self._sent[key].tries + 1 if key in self._sent else 1
-        self.resent += tries > 1
-        self._sent.pop(key, None)
+        is_repeated = self._sent.pop(key, None) is not None
+        self.resent += is_repeated
         wait = min(self._resend_after_s * 2.0 ** (tries - 1), _LONGEST_WAIT_S)
         arrives_s = (self._under_way(now_s) + size) / self.bytes_per_second
-        self._sent[key] = _Sent(tries, now_s + wait + arrives_s, size)
+        self._sent[key] = _Sent(tries, now_s + wait + arrives_s, size, is_repeated)
 
     def landed(self, key: Key) -> None:
         """The other side has a message, or does not want it any more."""
         self._sent.pop(key, None)
+
+    def overtaken(self, by: Iterable[Key], now_s: float) -> None:
+        """Send again what went out before one of these, which have landed: it is lost.
+
+        Messages arrive in the order in which they went out. One that went out several times says nothing: its first
+        copy may be the one that has landed.
+        """
+        order = list(self._sent)
+        last = max((order.index(key) for key in by if key in self._sent and not self._sent[key].is_repeated), default=0)
+        for key in order[:last]:
+            self._sent[key].due_s, self._sent[key].tries = now_s, 0
 
     def hurry(self, now_s: float) -> None:
         """The other side is back: what was under way may have been lost, and need not wait for long any more."""

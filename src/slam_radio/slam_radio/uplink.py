@@ -3,8 +3,9 @@
 
 The newest pose goes first and always, once a second. Submaps follow oldest first, as far as the budget allows and while
 the post is heard; few are under way at a time, so that a slow link does not fill with what poses would wait behind. One
-that is not acknowledged goes out again after a time that doubles from try to try. How much waits is told while it
-waits, and when nothing does any more. Details that the post wants come last, when no submap waits.
+that is not acknowledged goes out again as soon as one that went out later is, else after a time that doubles from try
+to try. How much waits is told while it waits, and when nothing does any more. Details that the post wants come last,
+when no submap waits.
 """
 
 from __future__ import annotations
@@ -98,7 +99,9 @@ class Uplink:
         """The post is there, and has these submaps."""
         self.on_heard(now_s)
         sizes = {key: self.outbox.size(key) for key in self.outbox.waiting}
-        for key in self.outbox.acknowledge(ranges):
+        landed = self.outbox.acknowledge(ranges)
+        self._flight.overtaken(landed, now_s)
+        for key in landed:
             self._flight.landed(key)
             self._since_s.pop(key, None)
             self._carriage.carried(sizes[key] + OVERHEAD, now_s)
