@@ -81,6 +81,19 @@ def test_outliers_are_refused_and_change_little(agent: Agent, submaps: list[Subm
     assert max(np.abs(r.position - true_place(agent, r)).max() for r in used(known)) < 6 * SIGMA
 
 
+@pytest.mark.parametrize(("error_m", "counted"), [(0.0, USED), (3.0, REFUSED)])
+def test_far_from_the_first_position_the_drift_turns_the_rig_and_not_that_place(
+    agent: Agent, submaps: list[Submap], error_m: float, counted: str
+) -> None:
+    readings = positions(agent, 1)[0]
+    until = submaps[21].end_stamp_ns
+    known = joined(submaps[:29], [r for r in readings if r.stamp_ns <= until])
+    before = known.counters.counts.get(counted, 0)
+    inside = next(r for r in readings if r.stamp_ns > submaps[29].start_stamp_ns)
+    known.add(submaps[29], [replace(inside, position=inside.position + [0.0, 0.0, error_m])])
+    assert known.counters.counts[counted] == before + 1
+
+
 def used(known: GlobalMap) -> list[PositionReading]:
     return [r for record in known.state.graph.records if record.is_position for r in readings_of(record.submap)]
 

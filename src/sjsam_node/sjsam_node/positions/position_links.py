@@ -27,7 +27,7 @@ from sjsam_node.loop_closure.verification import Verifier
 from sjsam_node.positions.fixed_frame import find_frame
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.thinning import thinned
-from slam_core.geometry import FloatArray, invert_transform, make_transform, transform_points
+from slam_core.geometry import FloatArray, compose_covariance, invert_transform, make_transform, transform_points
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 from slam_core.types import ORIGIN_SIGMA, Counters, PoseEstimate, PositionReading, Submap
 
@@ -117,7 +117,7 @@ class PositionLinks:
         if prior is None or prior.covariance is None:
             return None
         readings, shift = self.waiting[record], self._shift(base)
-        prior = Prior(prior.T, prior.covariance + self.verifier.drift(self._way_since_positions(record)))
+        prior = self._drifted(prior.T, prior.covariance, self._way_since_positions(record))
         points = at_start(self.graph.records[record]).select(_antenna_rows(self.graph, record))
         measured = PointSet(
             np.array([r.position for r in readings]) - shift, block_diag(*(r.covariance for r in readings)),
@@ -127,6 +127,11 @@ class PositionLinks:
         found = agreeing(points, measured, pairs, prior, self.verifier.config.association)
         made = self._linked(record, found.pairs[:, 0], found.T, found.covariance, shift)
         return made[0] if made else None
+
+    def _drifted(self, T: FloatArray, covariance: FloatArray, way: float) -> Prior:
+        """What is known of a place seen from a record that has drifted along a ``way`` (m): the record has turned."""
+        drift = compose_covariance(np.eye(4), self.verifier.drift(way), T, np.zeros((6, 6)))
+        return Prior(T, covariance + drift)
 
     def _way_since_positions(self, record: int) -> float:
         """Way of an agent from the nearest of its records that has positions in the map, else its whole way (m)."""
