@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from judging import errors
-from positioned_world import ARM, SIGMA, T_BUILDING_WORLD, drive, positions
+from positioned_world import ARM, SIGMA, T_BUILDING_WORLD, drive, positions, unit
 from submap_world import Agent
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
@@ -81,6 +81,22 @@ def test_outliers_are_refused_and_change_little(agent: Agent, submaps: list[Subm
     assert max(np.abs(r.position - true_place(agent, r)).max() for r in used(known)) < 6 * SIGMA
 
 
+@pytest.mark.parametrize(("sigma_z", "error_m"), [(2.0, 5.0), (SIGMA, 1.5)])
+def test_outliers_beside_the_way_are_refused_whatever_the_height_says(sigma_z: float, error_m: float) -> None:
+    agent, rng, bad, readings = drive(2), np.random.default_rng(2), set(), []
+    for r in positions(agent, 2)[0]:
+        place = r.position + np.array([0.0, 0.0, rng.normal() * (sigma_z if sigma_z > SIGMA else 0.0)])
+        if rng.random() < 0.1:
+            place[:2] += error_m * unit(rng.normal(size=2))
+            bad.add(r.stamp_ns)
+        readings.append(replace(r, position=place, covariance=np.diag([SIGMA, SIGMA, sigma_z]) ** 2))
+    known = joined(agent.submaps(), readings)
+    assert len(bad) > 8
+    assert {r.stamp_ns for r in readings} - {r.stamp_ns for r in used(known)} == bad
+    known.settle()
+    assert ate(known, agent) < 0.25
+
+
 @pytest.mark.parametrize(("error_m", "counted"), [(0.0, USED), (3.0, REFUSED)])
 def test_far_from_the_first_position_the_drift_turns_the_rig_and_not_that_place(
     agent: Agent, submaps: list[Submap], error_m: float, counted: str
@@ -90,7 +106,7 @@ def test_far_from_the_first_position_the_drift_turns_the_rig_and_not_that_place(
     known = joined(submaps[:29], [r for r in readings if r.stamp_ns <= until])
     before = known.counters.counts.get(counted, 0)
     inside = next(r for r in readings if r.stamp_ns > submaps[29].start_stamp_ns)
-    known.add(submaps[29], [replace(inside, position=inside.position + [0.0, 0.0, error_m])])
+    known.add(submaps[29], [replace(inside, position=inside.position + np.array([0.0, 0.0, error_m]))])
     assert known.counters.counts[counted] == before + 1
 
 

@@ -20,18 +20,22 @@ _SHARE = 0.6
 """Least share of the positions that agree."""
 _INSIDE = chi_square_bound(0.9999, 3)
 """Squared error of a true position, normalised."""
-_STEPS = 10
+_SHARES_OF_WORST = (*0.5 ** np.arange(9), 0.0)
+"""Of the largest variance in that along every axis, step by step: where outliers have gone, each axis has its own."""
 
 
 @dataclass(frozen=True, eq=False)
 class FixedFrame:
-    """``T`` = T_map_frame (4, 4), and a mask (n,) of the positions that agree."""
+    """``T`` = T_map_frame (4, 4) with its covariance (6, 6), and a mask (n,) of the positions that agree."""
 
     T: FloatArray
+    covariance: FloatArray
     agrees: BoolArray
 
 
-def find_frame(antenna: FloatArray, positions: FloatArray, noise: FloatArray, drift: FloatArray) -> FixedFrame | None:
+def find_frame(
+    antenna: FloatArray, positions: FloatArray, covariances: FloatArray, drift: FloatArray
+) -> FixedFrame | None:
     """The frame of some positions; None unless most agree and are spread along two directions.
 
     A map that is bent along its way feigns a spread that is not there, however many positions there are.
@@ -42,51 +46,63 @@ def find_frame(antenna: FloatArray, positions: FloatArray, noise: FloatArray, dr
         Where the map has the antenna, (n, 3) m.
     positions
         Where it was in the fixed frame, (n, 3) m.
-    noise
-        Variance of each position along any axis, (n,) m2.
+    covariances
+        Of each position, (n, 3, 3) m2.
     drift
         Variance that the map's own places have against each other, which does not average out, (n,) m2.
     """
     n = len(antenna)
     if n < _FEWEST:
         return None
-    reach, least = np.sqrt(_INSIDE * (noise + drift)), max(_FEWEST, int(np.ceil(_SHARE * n)))
+    # The frame's axes are not known at first: an error along any of them may be as large as that along the worst.
+    worst, own = np.linalg.eigvalsh(covariances)[:, -1, None, None] * np.eye(3), drift[:, None, None] * np.eye(3)
+    reach, least = np.sqrt(_INSIDE * (worst[:, 0, 0] + drift)), max(_FEWEST, int(np.ceil(_SHARE * n)))
     coarse = ransac_rigid_transform(positions, antenna, reach, np.random.default_rng(1), min_inliers=least)
     if not coarse.success:
         return None
     T, agrees = coarse.T, coarse.inliers
-    for _ in range(_STEPS):
-        T = _step(T, antenna, positions, 1.0 / (noise + drift), agrees)
-        agrees = np.linalg.norm(antenna - transform_points(T, positions), axis=1) <= reach
+    for share in _SHARES_OF_WORST:
+        P = share * worst + (1.0 - share) * T[:3, :3] @ covariances @ T[:3, :3].T
+        T = _step(T, antenna, positions, np.linalg.inv(P + own), agrees)
+        error = antenna - transform_points(T, positions)
+        agrees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P + own), error) <= _INSIDE
         if agrees.sum() < least:
             return None
-    sure = _information(antenna[agrees], 1.0 / (noise + agrees.sum() * drift)[agrees])
-    sigma = np.sqrt(np.linalg.eigvalsh(np.linalg.inv(sure)[3:, 3:])[-1])
-    return FixedFrame(T, agrees) if sigma <= LARGEST_ANGLE else None
+    sure = _information(antenna[agrees], np.linalg.inv(P + agrees.sum() * own)[agrees])
+    covariance = np.linalg.inv(sure)
+    if np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > LARGEST_ANGLE:
+        return None
+    A = _about_its_origin(T, antenna[agrees])
+    return FixedFrame(T, A @ covariance @ A.T, agrees)
 
 
 def _step(
     T: FloatArray, antenna: FloatArray, positions: FloatArray, weight: FloatArray, agrees: BoolArray
 ) -> FloatArray:
-    """A Gauss-Newton step."""
+    """A Gauss-Newton step; ``weight``: information (n, 3, 3) of each position."""
     places, w = antenna[agrees], weight[agrees]
     error = places - transform_points(T, positions[agrees])
-    J, middle = _jacobian(places)
-    d = np.linalg.solve(_information(places, w), np.einsum("nij,n,ni->j", J, w, error))
-    d[:3] -= np.cross(d[3:], middle)
-    return boxplus(T, d)
+    d = np.linalg.solve(_information(places, w), np.einsum("nij,nil,nl->j", _jacobian(places), w, error))
+    return boxplus(T, _about_its_origin(T, places) @ d)
 
 
 def _information(places: FloatArray, weight: FloatArray) -> FloatArray:
     """Information (6, 6) of a transform to some places (n, 3), about their middle."""
-    J, _ = _jacobian(places)
-    return np.asarray(np.einsum("nij,n,nil->jl", J, weight, J) + 1e-9 * np.eye(6))
+    J = _jacobian(places)
+    return np.asarray(np.einsum("nij,nil,nlk->jk", J, weight, J, optimize=True) + 1e-9 * np.eye(6))
 
 
-def _jacobian(places: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivative (n, 3, 6) of what a transform leads to, turned about the middle (3,) of that.
+def _jacobian(places: FloatArray) -> FloatArray:
+    """Derivative (n, 3, 6) of what a transform leads to, turned about the middle of that.
 
     At the map's places, which are the sure ones: noise of positions would feign a spread that is not there.
     """
-    middle = places.mean(axis=0)
-    return np.concatenate([np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(places - middle)], axis=2), middle
+    turned = -skew(places - places.mean(axis=0))
+    return np.concatenate([np.broadcast_to(np.eye(3), (len(places), 3, 3)), turned], axis=2)
+
+
+def _about_its_origin(T: FloatArray, places: FloatArray) -> FloatArray:
+    """Matrix (6, 6) from a change of ``T`` about the middle of some places to one about its origin."""
+    A = np.eye(6)
+    A[:3, 3:] = skew(places.mean(axis=0) - T[:3, 3])
+    return A

@@ -21,18 +21,25 @@ from scipy.linalg import block_diag
 from sjsam_node.graph.links import Link, Prior
 from sjsam_node.graph.map_graph import ALL, POSITIONS, MapGraph
 from sjsam_node.graph.position_ids import is_position_id, position_stamps
-from sjsam_node.loop_closure.association import PointSet, agreeing
+from sjsam_node.loop_closure.association import Alignment, PointSet, agreeing
 from sjsam_node.loop_closure.point_sets import at_start
 from sjsam_node.loop_closure.verification import Verifier
 from sjsam_node.positions.fixed_frame import find_frame
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.thinning import thinned
-from slam_core.geometry import FloatArray, compose_covariance, invert_transform, make_transform, transform_points
+from slam_core.geometry import (
+    FloatArray,
+    compose_covariance,
+    inverse_jacobian,
+    invert_transform,
+    make_transform,
+    transform_points,
+)
 from slam_core.linear_algebra.sparse_cholesky import IntArray
 from slam_core.types import ORIGIN_SIGMA, Counters, PoseEstimate, PositionReading, Submap
 
 USED, REFUSED = "positions_used", "positions_refused"
-_EXACT = ORIGIN_SIGMA**2 * np.eye(6)
+_EXACT, _NOTHING = ORIGIN_SIGMA**2 * np.eye(6), np.zeros((6, 6))
 _LEAF = 1e-4 * np.eye(6)
 """Covariance of the end of a submap of positions. Nothing hangs on it, so that its size says nothing; were it exact,
 far from the start, the joint problem would lose digits."""
@@ -75,62 +82,63 @@ class PositionLinks:
 
     def _aligned(self, records: Sequence[int], base: int | None) -> list[int]:
         """Link all records of a component whose place in the fixed frame is not known, once it can be found."""
-        state = self.estimate.state
-        counts = [len(self.waiting[i]) for i in records]
-        rows = [_antenna_rows(self.graph, i) for i in records]
+        state, middle = self.estimate.state, records[len(records) // 2]
+        starts = [state.start(i) for i in records]
         places = [
-            transform_points(state.start(i), self.graph.records[i].submap.landmarks[r])
-            for i, r in zip(records, rows, strict=True)
+            transform_points(T, self.graph.records[i].submap.landmarks[_antenna_rows(self.graph, i)])
+            for T, i in zip(starts, records, strict=True)
         ]
-        readings = [r for i in records for r in self.waiting[i]]
-        positions = np.array([r.position for r in readings])
-        # The frame's axes are not known yet: an error along any of them may be as large as that along the worst.
-        noise = np.array([np.linalg.eigvalsh(r.covariance)[-1] for r in readings])
-        drift = np.repeat(self._drift(records), counts)
-        found = find_frame(np.concatenate(places), positions, noise, drift)
+        readings, counts = [r for i in records for r in self.waiting[i]], [len(self.waiting[i]) for i in records]
+        positions, noise = np.array([r.position for r in readings]), np.array([r.covariance for r in readings])
+        seen = [self._seen_from(i, middle) for i in records]
+        ways = np.array([self.graph.path_length_between(middle, i) for i in records])
+        drift = np.array([_variance_of(*prior) for prior in seen]) + (self.verifier.config.drift * ways) ** 2
+        found = find_frame(np.concatenate(places), positions, noise, np.repeat(drift, counts))
         if found is None:
             return []
         shift = np.median(positions[found.agrees], axis=0) if base is None else self._shift(base)
-        T_map_base = found.T @ make_transform(np.eye(3), shift)
-        made, first = [], 0
-        for i in records:
-            kept = np.nonzero(found.agrees[first : first + len(self.waiting[i])])[0]
-            first += len(self.waiting[i])
-            made += self._linked(i, kept, invert_transform(state.start(i)) @ T_map_base, _EXACT, shift)
+        to_base = make_transform(np.eye(3), shift)
+        T_map_base, of_frame = found.T @ to_base, compose_covariance(found.T, found.covariance, to_base, _NOTHING)
+        made, agrees = [], np.split(found.agrees, np.cumsum(counts)[:-1])
+        for i, T_map, (T_middle, of_map), way, kept in zip(records, starts, seen, ways.tolist(), agrees, strict=True):
+            T_base = invert_transform(T_map) @ T_map_base
+            covariance = compose_covariance(invert_transform(T_map), _NOTHING, T_map_base, of_frame)
+            covariance += compose_covariance(T_middle, of_map, invert_transform(T_middle) @ T_base, _NOTHING)
+            believed = self._believed(i, self._drifted(T_base, covariance, way), shift, np.nonzero(kept)[0])
+            made += self._linked(i, believed.pairs[:, 0], T_base, _EXACT, shift)
         return made
 
-    def _drift(self, records: Sequence[int]) -> FloatArray:
-        """Variance (n,) m2 of where the map has each of some records, seen from the middle one of them."""
-        middle, out = records[len(records) // 2], []
-        for i in records:
-            prior = self.estimate.relative_pose(middle, i) if i != middle else None
-            known = (
-                0.0 if prior is None or prior.covariance is None else np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]
-            )
-            length = self.graph.path_length_between(middle, i)
-            out.append(known + (self.verifier.config.drift * length) ** 2)
-        return np.array(out)
+    def _seen_from(self, record: int, other: int) -> tuple[FloatArray, FloatArray]:
+        """T_record_other in one component with its covariance; certain where the map does not say that."""
+        state = self.estimate.state
+        prior = self.estimate.relative_pose(record, other) if record != other else None
+        if prior is None or prior.covariance is None:
+            return invert_transform(state.start(record)) @ state.start(other), _EXACT
+        return prior.T, prior.covariance
 
     def _near(self, record: int, base: int) -> int | None:
         """Link a record whose place in the fixed frame the map knows; None if it does not yet, or none agrees."""
         prior = self.estimate.relative_pose(record, base)
         if prior is None or prior.covariance is None:
             return None
-        readings, shift = self.waiting[record], self._shift(base)
-        prior = self._drifted(prior.T, prior.covariance, self._way_since_positions(record))
+        prior, shift = self._drifted(prior.T, prior.covariance, self._way_since_positions(record)), self._shift(base)
+        found = self._believed(record, prior, shift, np.arange(len(self.waiting[record])))
+        made = self._linked(record, found.pairs[:, 0], found.T, found.covariance, shift)
+        return made[0] if made else None
+
+    def _believed(self, record: int, prior: Prior, shift: FloatArray, among: IntArray) -> Alignment:
+        """Those ``among`` a record's readings that agree with the map and with each other."""
+        readings = self.waiting[record]
         points = at_start(self.graph.records[record]).select(_antenna_rows(self.graph, record))
         measured = PointSet(
             np.array([r.position for r in readings]) - shift, block_diag(*(r.covariance for r in readings)),
             points.descriptors,
         )  # fmt: skip
-        pairs = np.repeat(np.arange(len(readings))[:, None], 2, axis=1)
-        found = agreeing(points, measured, pairs, prior, self.verifier.config.association)
-        made = self._linked(record, found.pairs[:, 0], found.T, found.covariance, shift)
-        return made[0] if made else None
+        return agreeing(points, measured, np.stack([among, among], axis=1), prior, self.verifier.config.association)
 
     def _drifted(self, T: FloatArray, covariance: FloatArray, way: float) -> Prior:
         """What is known of a place seen from a record that has drifted along a ``way`` (m): the record has turned."""
-        drift = compose_covariance(np.eye(4), self.verifier.drift(way), T, np.zeros((6, 6)))
+        drift = compose_covariance(np.eye(4), self.verifier.drift(way), T, _NOTHING)
         return Prior(T, covariance + drift)
 
     def _way_since_positions(self, record: int) -> float:
@@ -187,6 +195,12 @@ def readings_of(positions: Submap) -> tuple[PositionReading, ...]:
     stamps = position_stamps(positions.landmark_ids).tolist()
     places = positions.landmarks - positions.end_pose[:3, 3]
     return tuple(PositionReading(s, p, P) for s, p, P in zip(stamps, places, own, strict=True))
+
+
+def _variance_of(T: FloatArray, covariance: FloatArray) -> float:
+    """Variance (m2) of where a record is, seen from another one that it sees at ``T``."""
+    J = inverse_jacobian(T)
+    return float(np.linalg.eigvalsh((J @ covariance @ J.T)[:3, :3])[-1])
 
 
 def without_antenna(submap: Submap) -> Submap:
