@@ -93,7 +93,7 @@ class GlobalMap:
         self.tags = TagLinks(self.estimate, self.detector.verifier)
         self.positions = PositionLinks(self.estimate, self.detector.verifier, self.counters)
         self.detector.is_refuted = lambda *pair_and_found: is_against_tags(self.estimate.graph, *pair_and_found)
-        self._inner_paths = InnerPaths()
+        self._inner_paths, self._paged_out = InnerPaths(), 0
 
     @property
     def state(self) -> EstimateState:
@@ -139,7 +139,7 @@ class GlobalMap:
         is_redundant = bool(self.state.is_redundant(new))
         if not is_redundant:
             self.detector.index.add(new, submap.descriptors)
-        self._page_out(new - LINKED_SUBMAPS)
+        self._page_out(new + 1 - LINKED_SUBMAPS)
         result, shared = self.state.result(self.state.component(new)), self.estimate.graph.shared_by(new)
         return JoinReport(
             True, "", matched, len(submap.landmarks) - shared, self._named(verdict.accepted), verdict.dropped,
@@ -189,9 +189,9 @@ class GlobalMap:
         older = [self.estimate.graph.records[link.first].submap for link in links]
         return tuple((submap.agent, submap.index) for submap in older)
 
-    def _page_out(self, old: int) -> None:
-        """Keep the large arrays of a submap on disk from here on."""
-        if old >= 0:
+    def _page_out(self, before: int) -> None:
+        """Keep the large arrays of all submaps before a record on disk from here on."""
+        for old in range(self._paged_out, before):
             record, put = self.estimate.graph.records[old], self._offload.put
             submap = record.submap
             on_the_way = put(np.array([p.covariance for p in submap.path]))
@@ -200,6 +200,7 @@ class GlobalMap:
             self.estimate.replace_record(old, replace(record, submap=small))
             self.detector.index.move(old, small.descriptors)
             self._offload.forget()
+        self._paged_out = max(self._paged_out, before)
 
     @property
     def components(self) -> int:
@@ -377,5 +378,5 @@ class GlobalMap:
             self.tags.add(i)
             if not stored.state.is_redundant(i):
                 self.detector.index.add(i, record.submap.descriptors)
-            self._page_out(i)
+            self._page_out(i + 1)
         self.estimate.relinearize()

@@ -157,6 +157,12 @@ def test_a_map_with_positions_is_loaded_as_it_was_and_goes_on(
     assert ate(loaded, agent) < 0.12
 
 
+def test_all_but_the_newest_submaps_are_on_disk(agent: Agent, submaps: list[Submap]) -> None:
+    known = joined(submaps, positions(agent, 1)[0])
+    in_memory = [r.key for r in known.state.graph.records if not known._offload._holds(r.submap.covariance)]
+    assert in_memory == [(name, 0, index) for index in (29, 30) for name in ("a", "position/a")]
+
+
 def test_a_map_joined_anew_in_time_order_keeps_its_positions(agent: Agent, submaps: list[Submap]) -> None:
     known = joined(submaps, positions(agent, 1)[0])
     settled = joined(submaps, positions(agent, 1)[0])
