@@ -8,7 +8,7 @@ import pytest
 from positioned_world import drive
 
 from sjsam_node.positions.antenna import seen_inside, with_antenna
-from sjsam_node.positions.position_queue import FAR, LATE, UNUSABLE, PositionConfig, PositionQueue
+from sjsam_node.positions.position_queue import FAR, LATE, ODD, UNUSABLE, PositionConfig, PositionQueue
 from slam_core.geometry import skew
 from slam_core.types import PositionReading, Submap
 
@@ -60,12 +60,33 @@ def test_of_positions_close_in_time_one_counts(submaps: list[Submap]) -> None:
     assert [r.stamp_ns - start for r in queue.take(submaps[0])] == [k * 100_000_000 for k in (1, 3, 5, 7)]
 
 
+def test_an_interval_goes_on_where_a_submap_ends(submaps: list[Submap]) -> None:
+    queue, end = PositionQueue(200_000_000), submaps[0].end_stamp_ns
+    queue.add("a", at(end))
+    assert [r.stamp_ns for r in queue.take(submaps[0])] == [end]
+    for k in (1, 2):
+        queue.add("a", at(end + k * 100_000_000))
+    assert [r.stamp_ns for r in queue.take(submaps[1])] == [end + 200_000_000]
+    queue.clear()
+    queue.add("a", at(end))
+    assert [r.stamp_ns for r in queue.take(submaps[0])] == [end]
+
+
 def test_after_a_jump_back_in_time_all_begins_anew(submaps: list[Submap]) -> None:
-    queue = PositionQueue(0)
-    queue.add("a", at(submaps[2].end_stamp_ns))
-    queue.add("a", at(submaps[0].end_stamp_ns))
-    assert [r.stamp_ns for r in queue.take(submaps[0])] == [submaps[0].end_stamp_ns]
-    assert queue.take(submaps[2]) == ()
+    queue, first, later = PositionQueue(0), submaps[0].start_stamp_ns, submaps[0].start_stamp_ns + 10**11
+    for start in (later, first):
+        for k in range(1, 4):
+            queue.add("a", at(start + k * 100_000_000))
+    assert [r.stamp_ns - first for r in queue.take(submaps[0])] == [k * 100_000_000 for k in range(1, 4)]
+    assert queue.counters.counts == {LATE: 3}
+
+
+def test_a_single_odd_stamp_is_rejected_and_all_else_stays(submaps: list[Submap]) -> None:
+    queue, start = PositionQueue(0), submaps[0].start_stamp_ns
+    for k in (10, 20, 19, 20, 10**6, 30, 40):  # out of order, twice, far ahead
+        queue.add("a", at(start + k * 10_000_000))
+    assert [(r.stamp_ns - start) // 10_000_000 for r in queue.take(submaps[0])] == [10, 20, 30, 40]
+    assert queue.counters.counts == {ODD: 3}
 
 
 def test_a_lever_arm_has_three_numbers() -> None:

@@ -37,7 +37,7 @@ def test_positions_tell_where_the_building_is(tmp_path: Path) -> None:
         nothing = PositionReading(readings[0].stamp_ns - 1, readings[0].position, np.zeros((3, 3)))
         for reading in (nothing, *readings):
             publisher.publish(position_message(bench.types, "uwb", reading))
-        assert bench.spin_until(lambda: len(bench.node.map._positions._waiting["anna"]) == len(readings))
+        assert bench.spin_until(lambda: len(bench.node.map._positions._streams["anna"].waiting) == len(readings))
         bench.send(submaps)
         assert bench.spin_until(lambda: bench.counters["submaps joined"] == len(submaps), 60.0)
         counts = bench.node.map.counts

@@ -10,6 +10,7 @@ import numpy as np
 
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
+from slam_core.nodes.stamp_guard import StampGuard
 from slam_core.types import Counters, PositionReading, Submap
 
 LARGEST_SIGMA = 100.0
@@ -21,6 +22,7 @@ FARTHEST = 1e5
 UNUSABLE = "positions_without_a_usable_covariance"
 FAR = "positions_too_far_from_their_origin"
 LATE = "positions_in_no_submap"
+ODD = "positions_with_an_odd_stamp"
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,15 @@ class PositionConfig(Config):
 
 
 @dataclass
+class _Stream:
+    """Readings of an agent that wait, and the stamp of the newest one that was taken (ns)."""
+
+    guard: StampGuard[PositionReading] = field(default_factory=StampGuard)
+    waiting: list[PositionReading] = field(default_factory=list)
+    newest_ns: int | None = None
+
+
+@dataclass
 class PositionQueue:
     """Keeps what comes, and gives each submap its own.
 
@@ -48,36 +59,47 @@ class PositionQueue:
 
     interval_ns: int
     counters: Counters = field(default_factory=Counters)
-    _waiting: dict[str, list[PositionReading]] = field(default_factory=lambda: defaultdict(list))
+    _streams: dict[str, _Stream] = field(default_factory=lambda: defaultdict(_Stream))
 
     def add(self, agent: str, reading: PositionReading) -> None:
-        """Take a reading of an agent; an unusable one is counted. After a jump back in time all begins anew."""
+        """Take a reading of an agent; an unusable one, and one with an odd stamp, are counted.
+
+        After a jump back in time all begins anew.
+        """
         if not is_usable(reading.covariance):
             self.counters.add(UNUSABLE)
             return
         if not np.abs(reading.position).max() <= FARTHEST:
             self.counters.add(FAR)
             return
-        waiting = self._waiting[agent]
-        if waiting and reading.stamp_ns < waiting[-1].stamp_ns:
-            self.counters.add(LATE, len(waiting))
-            waiting.clear()
-        if not waiting or reading.stamp_ns >= waiting[-1].stamp_ns + self.interval_ns:
-            waiting.append(reading)
+        stream = self._streams[agent]
+        decision = stream.guard.add("position", reading.stamp_ns, reading)
+        if decision.rejected:
+            self.counters.add(ODD, len(decision.rejected))
+        if decision.new_session:
+            self._count_late(len(stream.waiting))
+            stream.waiting, stream.newest_ns = [], None
+        for stamp_ns, released in decision.released:
+            if stream.newest_ns is None or stamp_ns >= stream.newest_ns + self.interval_ns:
+                stream.waiting.append(released)
+                stream.newest_ns = stamp_ns
 
     def take(self, submap: Submap) -> tuple[PositionReading, ...]:
         """The readings inside a submap, its end included; older ones are let go."""
-        waiting = self._waiting[submap.agent]
+        waiting = self._streams[submap.agent].waiting
         before = [r for r in waiting if r.stamp_ns <= submap.end_stamp_ns]
         inside = tuple(r for r in before if r.stamp_ns > submap.start_stamp_ns)
-        if len(before) > len(inside):
-            self.counters.add(LATE, len(before) - len(inside))
+        self._count_late(len(before) - len(inside))
         del waiting[: len(before)]
         return inside
 
     def clear(self) -> None:
         """Forget what waits."""
-        self._waiting.clear()
+        self._streams.clear()
+
+    def _count_late(self, amount: int) -> None:
+        if amount:
+            self.counters.add(LATE, amount)
 
 
 def is_usable(covariance: FloatArray) -> bool:
