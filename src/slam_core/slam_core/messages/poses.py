@@ -61,11 +61,11 @@ def position_from_message(message: Message) -> PositionReading:
     Raises
     ------
     ValueError
-        If the position is not finite, or beyond ``FARTHEST_M``.
+        If the position is not finite.
     """
     position = _xyz(message.pose.pose.position)
-    if not np.abs(position).max() <= FARTHEST_M:
-        raise ValueError(f"position is not finite, or beyond {FARTHEST_M:g} m: {position.tolist()}")
+    if not np.isfinite(position).all():
+        raise ValueError(f"position is not finite: {position.tolist()}")
     covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     return PositionReading(stamp_ns(message), position, covariance[:3, :3])
 
