@@ -173,6 +173,11 @@ class MapSession:
         """Number of a session that no agent in the map has had; -1 in a new one: the second of the first stamp."""
         return 1 + max((session for _, session, _ in self.snapshot.keys), default=-2)
 
+    @property
+    def positions_waiting(self) -> int:
+        """Number of positions whose submaps are joined, but not tied to the fixed frame; after :meth:`finish`."""
+        return self._map.positions.waiting_count
+
     def add_position(self, agent: str, reading: PositionReading) -> None:
         """Take a position of an agent in a fixed frame; it counts if it comes before the submap that it is inside."""
         if self._config.position.use != "off":

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
+from positioned_world import drive, positions
 from submap_world import Agent, circle, ring_world
 
 from sjsam_node.map_session import MapSession, Mode
@@ -62,3 +64,25 @@ def test_poses_of_an_agent_that_is_located_begin_where_it_is_recognised(
     stamps = [pose.stamp_ns for pose in made.trajectories["visitor"]]
     assert stamps == sorted({pose.stamp_ns for submap in visitor.submaps() for pose in submap.path})
     assert made.loop_closures >= len(visitor.submaps()) // 2
+
+
+def test_positions_of_a_run_that_nothing_ties_to_the_map_are_said_to_wait(tmp_path: Path) -> None:
+    first, second = drive(1), drive(2)
+    second.name, second.stamp_ns = "b", 10**12
+    with MapSession(SYSTEM.sjsam) as session:
+        assert "joined with the map, 0 refused" in heard(session, first, len(first.path))
+        session.save(tmp_path / "map").result()
+    with MapSession(SYSTEM.sjsam) as session:
+        session.load(tmp_path / "map", lambda _: None).result()
+        assert re.match(r"\d\d? positions wait", heard(session, second, 40))
+
+
+def heard(session: MapSession, agent: Agent, steps: int) -> str:
+    """What a run says of the positions on the first steps of a way."""
+    mapper = Mapper(SYSTEM, {}, StageTimes(), session)
+    mapper._has_positions = True
+    for reading in positions(agent, 1)[0]:
+        session.add_position(agent.name, reading)
+    mapper._hand_over(agent.submaps()[: steps // agent.steps])
+    mapper.finish()
+    return next(said for said in mapper.record(0.0, {}, "").events if "positions" in said)

@@ -59,6 +59,11 @@ class PositionLinks:
         """Graph that positions are joined with."""
         return self.estimate.graph
 
+    @property
+    def waiting_count(self) -> int:
+        """Number of the readings that wait."""
+        return sum(map(len, self.waiting.values()))
+
     def add(self, record: int, readings: Sequence[PositionReading]) -> None:
         """Take the readings for which a new record has places of the antenna."""
         if readings:
@@ -178,14 +183,17 @@ class PositionLinks:
             self.counters.add(name, amount)
 
 
-def positions_text(counts: Mapping[str, int], *, is_determined: bool) -> str:
-    """Line for a user whose rig heard positions, by the map's counts."""
-    if not is_determined:
+def positions_text(counts: Mapping[str, int], waiting: int) -> str:
+    """Line for a user whose rig heard positions, by the map's counts of this run and the number of those that wait."""
+    used, refused = counts.get(USED, 0), counts.get(REFUSED, 0)
+    if not used and not refused:
         return (
-            "positions were heard, but where their frame lies in the map is not determined: they change nothing. They "
-            "must agree with the way, and be spread along two directions by more than they and the map err"
+            f"{waiting} positions wait, since where their frame lies in the map is not determined: they "
+            "change nothing. They must agree with the way, and be spread along two directions by more than they and "
+            "the map err"
         )
-    return f"{counts.get(USED, 0)} positions joined with the map, {counts.get(REFUSED, 0)} refused"
+    more = f", {waiting} wait for a tie between their submaps and those with positions" if waiting else ""
+    return f"{used} positions joined with the map, {refused} refused{more}"
 
 
 def readings_of(positions: Submap) -> tuple[PositionReading, ...]:

@@ -106,7 +106,7 @@ class Mapper:
         shown = self.session.snapshot
         said = [*_loose(shown, self.session.known), *filter(None, [shown.overconfidence])]
         if self._has_positions:
-            said.append(positions_text(self.session.counts, is_determined=bool(shown.is_position.any())))
+            said.append(positions_text(self.session.counts, self.session.positions_waiting))
         return said
 
     @property
