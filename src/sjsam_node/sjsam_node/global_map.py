@@ -355,7 +355,7 @@ class GlobalMap:
         """The map as it is, to be written; nothing is settled."""
         return StoredMap(
             self.state, self.detector.pending, self.closures.refused, self.detector.near.compared, self.marks,
-            self._is_out_of_order,
+            self._is_out_of_order, dict(self.positions.waiting),
         )  # fmt: skip
 
     @classmethod
@@ -367,9 +367,8 @@ class GlobalMap:
 
     def _restore(self, stored: StoredMap) -> None:
         """Go on from a map that was put away."""
-        waiting = self.positions.waiting
         self._take(stored.state)
-        self.positions.waiting = waiting
+        self.positions.waiting = dict(stored.waiting)
         self._is_settled, self._is_out_of_order = not stored.state.graph.records, stored.is_out_of_order
         self.marks, self.closures.refused = stored.marks, stored.refused
         self.detector.pending, self.detector.near.compared = stored.pending, stored.compared

@@ -13,8 +13,8 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,11 @@ from sjsam_node.graph.links import Link
 from sjsam_node.loop_closure.near_pairs import Compared
 from sjsam_node.map_validation import arrays_of, check_arrays, check_manifest
 from sjsam_node.marks import Mark, Marks
+from sjsam_node.positions.stored_readings import stored_waiting, waiting_arrays
 from sjsam_node.smoothing.state import EstimateState
 from sjsam_node.smoothing.stored import estimate_arrays, stored_state
 from slam_core.storage.files import MOST_BYTES, atomic_path, digest, naming, read_bytes, read_json, remove
-from slam_core.types import AnyArray, PoseEstimate, Submap
+from slam_core.types import AnyArray, PoseEstimate, PositionReading, Submap
 
 FORMAT, VERSION = "indoor-slam-map", 6
 _MANIFEST = "manifest.json"
@@ -44,7 +45,8 @@ class StoredMap:
 
     pending, refused: closures that wait for another that says the same, and for more that speaks for them; compared:
     pairs of submaps compared where they were near (see :mod:`sjsam_node.loop_closure.near_pairs`); is_out_of_order:
-    submaps or landmarks came after it was settled, so that the settled map is joined anew.
+    submaps or landmarks came after it was settled, so that the settled map is joined anew; waiting: positions by
+    record, which are not tied to the fixed frame.
     """
 
     state: EstimateState
@@ -53,6 +55,7 @@ class StoredMap:
     compared: Compared
     marks: Marks
     is_out_of_order: bool = False
+    waiting: Mapping[int, tuple[PositionReading, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +79,7 @@ def pack(stored: StoredMap) -> PackedMap:
     arrays.update(_link_arrays("pending", stored.pending))
     arrays.update(_link_arrays("refused", stored.refused))
     arrays["compared/pairs"], arrays["compared/middles"] = stored.compared.pairs, stored.compared.seen.copy()
+    arrays.update(waiting_arrays(stored.waiting))
     for i, record in enumerate(graph.records):
         arrays.update({f"submap_{i}/{name}": value for name, value in _submap_arrays(record.submap).items()})
     manifest = {
@@ -164,7 +168,8 @@ def _stored(manifest: dict[str, Any], arrays: Arrays) -> StoredMap:
     marks = Marks([Mark(name, node, np.array(point, dtype=np.float64)) for name, node, *point in manifest["marks"]])
     pending, refused = _links("pending", arrays), _links("refused", arrays)
     compared = Compared.of(arrays["compared/pairs"], arrays["compared/middles"])
-    return StoredMap(state, pending, refused, compared, marks, manifest.get("is_out_of_order", False))
+    is_out_of_order = manifest.get("is_out_of_order", False)
+    return StoredMap(state, pending, refused, compared, marks, is_out_of_order, stored_waiting(arrays))
 
 
 def _digest(manifest: dict[str, Any]) -> str:

@@ -16,6 +16,7 @@ from submap_world import Agent
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.positions.position_links import REFUSED, USED, readings_of
 from sjsam_node.positions.position_queue import PositionConfig
+from sjsam_node.positions.stored_readings import stored_waiting
 from slam_core.estimation.rigid_alignment import umeyama
 from slam_core.geometry import FloatArray, boxminus, invert_transform, transform_points
 from slam_core.types import PositionReading, Submap
@@ -155,6 +156,25 @@ def test_a_map_with_positions_is_loaded_as_it_was_and_goes_on(
         loaded.add(s, [r for r in readings if s.start_stamp_ns < r.stamp_ns <= s.end_stamp_ns])
     assert loaded.counters.counts[USED] > 30
     assert ate(loaded, agent) < 0.12
+
+
+def test_positions_that_wait_are_stored(agent: Agent, submaps: list[Submap], tmp_path: Path) -> None:
+    readings = positions(agent, 1)[0]
+    straight = [r for r in readings if r.stamp_ns <= submaps[7].end_stamp_ns]
+    known = joined(submaps[:8], straight)
+    assert known.positions.waiting_count == len(straight) > 20
+    known.save(tmp_path / "map")
+    loaded = GlobalMap.load(tmp_path / "map", CONFIG)
+    for s in submaps[8:]:
+        loaded.add(s, [r for r in readings if s.start_stamp_ns < r.stamp_ns <= s.end_stamp_ns])
+    assert loaded.positions.waiting_count == 0
+    assert {r.stamp_ns for r in straight} - {r.stamp_ns for r in used(loaded)} == set()
+    (stored,) = (tmp_path / "map").glob("*.npz")
+    with np.load(stored) as arrays:
+        changed = dict(arrays)
+    for name, value in (("records", changed["waiting/records"] * 0), ("positions", np.zeros((2, 3)))):
+        with pytest.raises(ValueError, match="position"):
+            stored_waiting(changed | {f"waiting/{name}": value})
 
 
 def test_all_but_the_newest_submaps_are_on_disk(agent: Agent, submaps: list[Submap]) -> None:
