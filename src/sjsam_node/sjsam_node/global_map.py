@@ -269,6 +269,8 @@ class GlobalMap:
         """
         if self._is_settled:
             return
+        for record in self.positions.look_again():
+            self._join_positions(record, before_others=True)
         newest = len(self.estimate.graph.records) - 1
         for _ in range(_PASSES):
             missed = self.detector.missed(self.agents.chained, _COMPARED_AT_SETTLING * len(self.estimate.graph.records))

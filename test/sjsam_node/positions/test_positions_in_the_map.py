@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from positioned_world import ARM, SIGMA, T_BUILDING_WORLD, drive, positions, uni
 from submap_world import Agent
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
+from sjsam_node.positions import position_links
 from sjsam_node.positions.position_links import REFUSED, USED, readings_of
 from sjsam_node.positions.position_queue import PositionConfig
 from sjsam_node.positions.stored_readings import stored_waiting
@@ -156,6 +158,39 @@ def test_a_map_with_positions_is_loaded_as_it_was_and_goes_on(
         loaded.add(s, [r for r in readings if s.start_stamp_ns < r.stamp_ns <= s.end_stamp_ns])
     assert loaded.counters.counts[USED] > 30
     assert ate(loaded, agent) < 0.12
+
+
+def test_a_frame_that_is_not_found_is_looked_for_ever_more_seldom(
+    submaps: list[Submap], agent: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[int] = []
+    monkeypatch.setattr(position_links, "find_frame", lambda antenna, *_: looks.append(len(antenna)))
+    monkeypatch.setattr(position_links, "_MOST_RECORDS", 20)
+    joined(submaps, positions(agent, 1, every=1)[0])
+    assert looks[0] == 8
+    assert all(b >= 1.1 * a or b >= 20 * 7 for a, b in pairwise(looks))
+    assert len(looks) < 0.8 * len(submaps)
+    assert looks[-1] == 20 * 8
+
+
+def test_settling_looks_for_the_frame_whatever_has_come_since(
+    submaps: list[Submap], agent: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(position_links, "_GROWTH", 1000.0)
+    known = joined(submaps, positions(agent, 1)[0])
+    assert USED not in known.counters.counts
+    known.settle()
+    assert known.counters.counts[USED] > 115
+    assert ate(known, agent) < 0.12
+
+
+def test_records_that_a_frame_was_not_looked_for_with_follow(
+    submaps: list[Submap], agent: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(position_links, "_MOST_RECORDS", 6)
+    known = joined(submaps, positions(agent, 1)[0])
+    assert known.positions.waiting_count == 0
+    assert known.counters.counts[USED] > 115
 
 
 def test_positions_that_wait_are_stored(agent: Agent, submaps: list[Submap], tmp_path: Path) -> None:

@@ -44,6 +44,11 @@ _LEAF = 1e-4 * np.eye(6)
 """Covariance of the end of a submap of positions. Nothing hangs on it, so that its size says nothing; were it exact,
 far from the start, the joint problem would lose digits."""
 
+_GROWTH = 1.1
+"""Factor by which the positions that wait grow before their frame is looked for again: all looks cost little more."""
+_MOST_RECORDS = 200
+"""Records that a frame is looked for with, at most."""
+
 
 @dataclass
 class PositionLinks:
@@ -53,6 +58,7 @@ class PositionLinks:
     verifier: Verifier
     counters: Counters
     waiting: dict[int, tuple[PositionReading, ...]] = field(default_factory=dict)
+    _looked_at: dict[int, int] = field(default_factory=dict)
 
     @property
     def graph(self) -> MapGraph:
@@ -69,6 +75,11 @@ class PositionLinks:
         if readings:
             self.waiting[record] = tuple(readings)
 
+    def look_again(self) -> list[int]:
+        """Have the frame looked for whatever has come since; a record of each component in which positions wait."""
+        self._looked_at.clear()
+        return list({self.estimate.state.component(i): i for i in self.waiting}.values())
+
     def join(self, new: int) -> list[int]:
         """Link what waits in the component of a new record; numbers of the records of positions that this made."""
         component = self.estimate.state.component(new)
@@ -77,8 +88,16 @@ class PositionLinks:
             return []
         base = self._base()
         if base is None or self.estimate.state.component(base) != component:
-            return self._aligned(own, base)
+            return self._aligned(own, base) if self._is_due(component, own) else []
         return [made for i in own if (made := self._near(i, base)) is not None]
+
+    def _is_due(self, component: int, records: Sequence[int]) -> bool:
+        """True if so much more waits since the frame of a component was looked for that it is worth the time."""
+        count = sum(len(self.waiting[i]) for i in records)
+        if count < _GROWTH * self._looked_at.get(component, 0):
+            return False
+        self._looked_at[component] = count
+        return True
 
     def _base(self) -> int | None:
         """The first record of positions: where it starts all others do."""
@@ -86,7 +105,11 @@ class PositionLinks:
         return int(found[0]) if len(found) else None
 
     def _aligned(self, records: Sequence[int], base: int | None) -> list[int]:
-        """Link all records of a component whose place in the fixed frame is not known, once it can be found."""
+        """Link records of a component whose place in the fixed frame is not known, once it can be found.
+
+        Of very many some along the whole way; the others, which wait for the next submap, are near these.
+        """
+        records = [records[k] for k in np.unique(np.linspace(0, len(records) - 1, _MOST_RECORDS).astype(np.int64))]
         state, middle = self.estimate.state, records[len(records) // 2]
         starts = [state.start(i) for i in records]
         places = [
