@@ -173,6 +173,20 @@ def test_a_frame_that_is_not_found_is_looked_for_ever_more_seldom(
     assert looks[-1] == 20 * 8
 
 
+def test_a_map_too_sure_of_itself_does_not_refuse_all_positions_of_a_submap(
+    agent: Agent, submaps: list[Submap]
+) -> None:
+    sure = [
+        replace(
+            s, covariance=0.04 * s.covariance, path=tuple(replace(p, covariance=0.04 * p.covariance) for p in s.path)
+        )
+        for s in submaps
+    ]
+    known = joined(sure, positions(agent, 1, every=1)[0])
+    assert known.counters.counts.get(REFUSED, 0) <= 2
+    assert ate(known, agent) < 0.12
+
+
 def test_settling_looks_for_the_frame_whatever_has_come_since(
     submaps: list[Submap], agent: Agent, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,7 +21,7 @@ from scipy.linalg import block_diag
 from sjsam_node.graph.links import Link, Prior
 from sjsam_node.graph.map_graph import ALL, POSITIONS, MapGraph
 from sjsam_node.graph.position_ids import is_position_id, position_stamps
-from sjsam_node.loop_closure.association import Alignment, PointSet, agreeing
+from sjsam_node.loop_closure.association import MAX_VARIANCE_FACTOR, Alignment, PointSet, agreeing
 from sjsam_node.loop_closure.point_sets import at_start
 from sjsam_node.loop_closure.verification import Verifier
 from sjsam_node.positions.fixed_frame import find_frame
@@ -48,6 +48,9 @@ _GROWTH = 1.1
 """Factor by which the positions that wait grow before their frame is looked for again: all looks cost little more."""
 _MOST_RECORDS = 200
 """Records that a frame is looked for with, at most."""
+
+_TOGETHER = 4
+"""Positions of a submap that agree with each other, from which on the map may be wrong."""
 
 
 @dataclass
@@ -155,14 +158,23 @@ class PositionLinks:
         return made[0] if made else None
 
     def _believed(self, record: int, prior: Prior, shift: FloatArray, among: IntArray) -> Alignment:
-        """Those ``among`` a record's readings that agree with the map and with each other."""
+        """Those ``among`` a record's readings that agree with the map and with each other.
+
+        A map too sure of itself may agree with none: several that agree with each other are believed all the same.
+        """
         readings = self.waiting[record]
         points = at_start(self.graph.records[record]).select(_antenna_rows(self.graph, record))
         measured = PointSet(
             np.array([r.position for r in readings]) - shift, block_diag(*(r.covariance for r in readings)),
             points.descriptors,
         )  # fmt: skip
-        return agreeing(points, measured, np.stack([among, among], axis=1), prior, self.verifier.config.association)
+        pairs, association = np.stack([among, among], axis=1), self.verifier.config.association
+        found = agreeing(points, measured, pairs, prior, association)
+        if len(found.pairs) or len(pairs) < _TOGETHER or prior.covariance is None:
+            return found
+        loose = Prior(prior.T, MAX_VARIANCE_FACTOR * prior.covariance)
+        more = agreeing(points, measured, pairs, loose, association)
+        return more if len(more.pairs) >= _TOGETHER else found
 
     def _drifted(self, T: FloatArray, covariance: FloatArray, way: float) -> Prior:
         """What is known of a place seen from a record that has drifted along a ``way`` (m): the record has turned."""
