@@ -177,7 +177,7 @@ class PositionLinks:
         return more if len(more.pairs) >= _TOGETHER else found
 
     def _drifted(self, T: FloatArray, covariance: FloatArray, way: float) -> Prior:
-        """What is known of a place seen from a record that has drifted along a ``way`` (m): the record has turned."""
+        """A place ``T`` as a record sees it that has drifted, and so turned, along a ``way`` (m)."""
         drift = compose_covariance(np.eye(4), self.verifier.drift(way), T, _NOTHING)
         return Prior(T, covariance + drift)
 
