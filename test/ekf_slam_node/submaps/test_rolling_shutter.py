@@ -119,6 +119,13 @@ def test_a_few_pairs_that_agree_by_chance_prove_nothing(rng: np.random.Generator
     assert standard_error == pytest.approx(0.005 / 4.0)
 
 
+def test_pairs_that_are_equal_have_a_mean_all_the_same() -> None:
+    values = np.array([0.0] * 12 + [0.02] * 4)
+    mean, standard_error = _robust_mean(values, np.full(16, 0.005))
+    assert mean == pytest.approx(0.0, abs=1e-9)
+    assert standard_error >= 0.005 / 4.0 - 1e-12
+
+
 def test_a_frame_that_does_not_follow_the_last_takes_no_velocity_from_it(rng: np.random.Generator) -> None:
     shutter, world = learnt(READOUT_S, rng)
     frame, _ = measured(world, 70 / RATE, READOUT_S, rng)

@@ -28,6 +28,8 @@ _APART = 3
 """Frames from one of a pair to the other, where the two share enough."""
 _MIN_SHARED = 20
 """Landmarks that both frames of a pair must see."""
+_LEAST_SCALE = 1e-9
+"""Scatter of values in their sigma where more than half of them are equal."""
 _GROUP = 4
 """Neighbouring pairs that are not independent."""
 _CERTAIN = 6.0
@@ -241,7 +243,7 @@ def _robust_mean(values: FloatArray, sigma: FloatArray) -> tuple[float, float]:
     what the sigma say: the few groups of a run's beginning may agree by chance.
     """
     mean, weight = float(np.median(values)), sigma**-2.0
-    scale = MAD_TO_SIGMA * np.median(np.abs(values - mean) / sigma)
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(values - mean) / sigma)), _LEAST_SCALE)
     for _ in range(5):
         pull = sigma * scale * np.clip((values - mean) / (sigma * scale), -_BOUND, _BOUND)
         inside = np.abs(values - mean) < _BOUND * sigma * scale
