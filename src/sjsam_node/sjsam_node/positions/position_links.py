@@ -158,7 +158,7 @@ class PositionLinks:
         return made[0] if made else None
 
     def _believed(self, record: int, prior: Prior, shift: FloatArray, among: IntArray) -> Alignment:
-        """Those ``among`` a record's readings that agree with the map and with each other.
+        """Readings of a record, ``among`` some, that agree with the map and with each other.
 
         A map too sure of itself may agree with none: several that agree with each other are believed all the same.
         """
