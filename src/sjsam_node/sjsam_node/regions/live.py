@@ -19,7 +19,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from sjsam_node.regions.tasks import ClusterLost, NotAvailable, OnCluster, WorkersKilled, connected
+from sjsam_node.regions.tasks import ClusterLost, NotAvailable, OnCluster, WorkersKilled, connected, unchanged
 
 _LOG = logging.getLogger(__name__)
 WAIT_S = 5.0
@@ -94,7 +94,7 @@ class LiveTasks:
 
     def hold(self, value: Any) -> Any:
         """A handle of a value that several tasks take."""
-        return self.submit(_same, value)
+        return self.submit(unchanged, value)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """A handle of the result of a function."""
@@ -120,10 +120,6 @@ class LiveTasks:
         self.here += len(handles)
         return [work.value() for work in handles]
 
-    def channel(self, handler: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Not for live maps: their tasks are short."""
-        raise NotImplementedError
-
     def close(self) -> None:
         """Leave the cluster."""
         self._ended.set()
@@ -133,8 +129,10 @@ class LiveTasks:
     def _there(self, work: _Work) -> Any:
         """The handle of some work on the cluster, which is given it where it does not have it; None without one."""
         cluster = self._cluster
-        if cluster is None or work.cluster is cluster:
-            return work.there if cluster is not None else None
+        if cluster is None:
+            return None
+        if work.cluster is cluster:
+            return work.there
         arguments = [self._there(a) if isinstance(a, _Work) else a for a in work.arguments]
         if self._cluster is not cluster:  # lost on the way
             return None
@@ -179,7 +177,3 @@ class LiveTasks:
             self._cluster = found
             _LOG.warning("the Dask cluster at %s answers: it joins submaps, too", self._address)
             return
-
-
-def _same(value: Any) -> Any:
-    return value

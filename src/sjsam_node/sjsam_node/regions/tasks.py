@@ -45,6 +45,10 @@ class Tasks(Protocol):
     def gather(self, handles: Sequence[Any]) -> list[Any]:
         """The results; what a task raised is raised here."""
 
+
+class TellingTasks(Tasks, Protocol):
+    """Tasks that may say something while they run."""
+
     def channel(self, handler: Callable[[Any], None]) -> Callable[[Any], None]:
         """A function that tasks may be given to tell ``handler`` something while they run, numbers and texts alone.
 
@@ -122,7 +126,7 @@ class OnCluster:
 
     def hold(self, value: Any) -> Any:
         """A handle of a value that is sent to the cluster once; it is sent again if its worker is lost."""
-        return self.submit(_same, value)
+        return self.submit(unchanged, value)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """A handle of the result of a function."""
@@ -247,12 +251,13 @@ def _told() -> Iterator[None]:
         raise ClusterLost(f"the Dask cluster was lost: start it again, then the same command: {error}") from error
 
 
-def _same(value: Any) -> Any:
+def unchanged(value: Any) -> Any:
+    """The value itself: a task that only brings it to the cluster."""
     return value
 
 
 @contextmanager
-def cluster(scheduler: str | None = None, workers: int | None = None) -> Iterator[Tasks]:
+def cluster(scheduler: str | None = None, workers: int | None = None) -> Iterator[TellingTasks]:
     """Tasks run on the cluster of a ``scheduler``, on ``workers`` processes of this machine, or here.
 
     Without either there is one process for each processor, or none where ``distributed`` is not installed.

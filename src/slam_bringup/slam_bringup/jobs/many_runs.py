@@ -13,7 +13,7 @@ from typing import Any
 
 from rich.table import Table
 
-from sjsam_node.regions.tasks import Tasks
+from sjsam_node.regions.tasks import TellingTasks
 from slam_bringup.jobs.recording_run import RecordingRun, RunOptions, Watch
 from slam_core.runtime.process_life import working_for
 
@@ -75,7 +75,7 @@ def run_many(
     bags: Sequence[Path],
     output: Path,
     options: RunOptions,
-    tasks: Tasks,
+    tasks: TellingTasks,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     on_written: Callable[[str], None] = lambda name: None,
 ) -> list[RunOutcome]:
