@@ -26,7 +26,7 @@ try:
 except ImportError:  # of version 0.1
     from slam_bringup.stage_times import StageTimes
 try:
-    from sjsam_node.map_session import MapSession
+    from sjsam_node.session.map_session import MapSession
 except ImportError:  # joining was measured as the other stages are
     MapSession = None  # type: ignore[assignment,misc]
 

@@ -24,8 +24,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sjsam_node import storage
 from sjsam_node.global_map import GlobalMapConfig
+from sjsam_node.map_file import storage
 from sjsam_node.merging.merge import Merged, merge
 from sjsam_node.merging.union import NamedMap
 from sjsam_node.regions.tasks import InProcess, cluster

@@ -26,10 +26,10 @@ import problems  # noqa: F401 - sets the import path
 from campus import BLOCK_M, VISITS, landmarks_on_walls, walk
 from submap_world import Agent, World, path_through
 
-from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
-from sjsam_node.map_session import MapSession
+from sjsam_node.map_file import storage
 from sjsam_node.regions.live import LiveTasks
+from sjsam_node.session.map_session import MapSession
 from slam_core.geometry import FloatArray
 from slam_core.types import Submap
 

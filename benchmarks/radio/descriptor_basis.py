@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sjsam_node import storage
+from sjsam_node.map_file import storage
 from slam_radio.packing.descriptor_code import DIRECTIONS
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sjsam_node import storage
+from sjsam_node.map_file import storage
 from slam_radio.packing.light_submap import ENVELOPE, MAGIC, VERSION, LightConfig, pack, sealed, unpack
 
 

@@ -27,8 +27,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap
+from sjsam_node.map_file import storage
 from slam_core.evaluation import align, associate, evaluate
 from slam_core.geometry import FloatArray
 from slam_core.runtime.memory import share_one_heap

@@ -33,7 +33,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from sjsam_node import storage
+from sjsam_node.map_file import storage
 from slam_bags.storage.bag import BagReader
 from slam_core.geometry import boxminus
 from slam_core.messages import stamp_ns

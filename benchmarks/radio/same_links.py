@@ -21,9 +21,9 @@ from light_submaps import messages, unpacked
 from rich.console import Console
 from rich.table import Table
 
-from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.graph.links import Link
+from sjsam_node.map_file import storage
 from slam_core.geometry import FloatArray
 from slam_core.types import Submap
 from slam_radio.packing.light_submap import LightConfig, pack, unpack

@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sjsam_node import storage
+from sjsam_node.map_file import storage
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import find_executable, node_environment
 from slam_core.types import Submap

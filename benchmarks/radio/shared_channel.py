@@ -25,16 +25,16 @@ from pathlib import Path
 
 import numpy as np
 
-from sjsam_node import storage
+from sjsam_node.map_file import storage
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate, Submap
-from slam_radio.byte_budget import OVERHEAD
 from slam_radio.downlink import Downlink
-from slam_radio.inbox import Inbox
-from slam_radio.outbox import Outbox
 from slam_radio.packing.light_submap import pack
-from slam_radio.radio_messages import pack_pose, unpack_acknowledgement
+from slam_radio.queues.byte_budget import OVERHEAD
+from slam_radio.queues.inbox import Inbox
+from slam_radio.queues.outbox import Outbox
 from slam_radio.uplink import Uplink
+from slam_radio.wire.radio_messages import pack_pose, unpack_acknowledgement
 
 _STEP_S = 0.1
 _AFTER_S = 180.0

@@ -13,7 +13,7 @@ import pytest
 
 from calibration_folder import write_calibrations
 from mapping import without_dense_model
-from sjsam_node.map_session import MapSession, Mode
+from sjsam_node.session.map_session import MapSession, Mode
 from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames

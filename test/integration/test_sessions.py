@@ -18,7 +18,7 @@ from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped  # noqa: E
 from feature_chain import HOUR, START, STEP_NS, Chain, stamp_of  # noqa: E402
 from feature_world import loop  # noqa: E402
 from sjsam_node.global_map import GlobalMap  # noqa: E402
-from sjsam_node.storage import is_map  # noqa: E402
+from sjsam_node.map_file.storage import is_map  # noqa: E402
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.usefixtures("domain")]
 from joiner_process import call, neighbour, running, send  # noqa: E402
 
 from sjsam_node.global_map import GlobalMap  # noqa: E402
-from sjsam_node.storage import is_map  # noqa: E402
+from sjsam_node.map_file.storage import is_map  # noqa: E402
 
 
 def test_a_killed_node_goes_on_from_its_saved_map(rng: np.random.Generator, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from node_bench import Bench, running  # noqa: E402
 
 from sjsam_node.agents import in_order  # noqa: E402
 from sjsam_node.global_map import GlobalMap, JoinReport  # noqa: E402
-from sjsam_node.map_session import MapSession  # noqa: E402
+from sjsam_node.session.map_session import MapSession  # noqa: E402
 from slam_core.geometry import boxminus, make_transform, rotation_from_euler, transform_from_pose7  # noqa: E402
 from slam_core.messages import SUBMAP_TOPICS, odometry_message, path_from_message, submap_messages  # noqa: E402
 from slam_core.types import PoseEstimate, PositionReading, Submap  # noqa: E402

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from slam_core.types import PoseEstimate, Submap
-from slam_radio.byte_budget import OVERHEAD
-from slam_radio.detail_store import DetailStore
 from slam_radio.downlink import Downlink
-from slam_radio.inbox import Inbox
-from slam_radio.outbox import Outbox
 from slam_radio.packing.light_submap import LightConfig, pack
-from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_want
+from slam_radio.queues.byte_budget import OVERHEAD
+from slam_radio.queues.detail_store import DetailStore
+from slam_radio.queues.inbox import Inbox
+from slam_radio.queues.outbox import Outbox
 from slam_radio.uplink import Uplink
+from slam_radio.wire.radio_messages import pack_pose, unpack_acknowledgement, unpack_want
 
 SIZE = LightConfig(landmarks=5, rank=1)
 STEP_S = 0.1

@@ -16,7 +16,7 @@ from radio_world import SIZE, World
 from slam_core.types import Submap
 from slam_radio.packing.light_submap import lightened, pack, write
 from slam_radio.packing.submap_details import key_of_details, pack_details, with_details
-from slam_radio.radio_messages import MOST_RANGES
+from slam_radio.wire.radio_messages import MOST_RANGES
 
 
 @pytest.fixture
@@ -131,7 +131,7 @@ def test_details_that_came_when_the_disk_was_full_are_passed_on_when_they_come_a
     world.inbox.ask()
     details = packed(world.whole(0))[1]
     with monkeypatch.context() as full:
-        full.setattr("slam_radio.inbox.write_ranges", Mock(side_effect=OSError(errno.ENOSPC, "disk full")))
+        full.setattr("slam_radio.queues.inbox.write_ranges", Mock(side_effect=OSError(errno.ENOSPC, "disk full")))
         with pytest.raises(OSError, match="disk full"):
             world.inbox.take_details((2, 0), details)
     assert world.inbox.lacking() == [(2, 0, 1)]

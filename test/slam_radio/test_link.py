@@ -8,9 +8,9 @@ import pytest
 from radio_world import World
 
 from slam_core.health import State
-from slam_radio.link_report import Backlog, pack_backlog
 from slam_radio.packing.light_submap import pack
-from slam_radio.radio_messages import pack_submap
+from slam_radio.wire.link_report import Backlog, pack_backlog
+from slam_radio.wire.radio_messages import pack_submap
 
 
 @pytest.fixture

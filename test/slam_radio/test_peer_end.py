@@ -11,11 +11,11 @@ from radio_world import STEP_S
 from slam_bags.storage.bag_types import BagTypes
 from slam_core.health import Health, State
 from slam_core.messages import submap_messages
-from slam_radio.link_report import Backlog, pack_backlog
 from slam_radio.packing.light_submap import LightConfig
 from slam_radio.peer_end import PeerEnd
 from slam_radio.radio_config import RadioConfig
-from slam_radio.radio_messages import pack_acknowledgement
+from slam_radio.wire.link_report import Backlog, pack_backlog
+from slam_radio.wire.radio_messages import pack_acknowledgement
 
 
 class Node:

@@ -25,8 +25,8 @@ from node_process import begin_node, end_node, free_port, private_probe  # noqa:
 from ros_probe import Probe  # noqa: E402
 from sjsam_node import storage  # noqa: E402
 from sjsam_node.agents import in_order  # noqa: E402
-from sjsam_node.map_session import MapSession  # noqa: E402
 from sjsam_node.node_config import SjsamNodeConfig  # noqa: E402
+from sjsam_node.session.map_session import MapSession  # noqa: E402
 from slam_bringup.pipeline.configuration import SystemConfig  # noqa: E402
 from slam_bringup.processes.node_graph import NodeSpec, peer_nodes  # noqa: E402
 from slam_core.messages import SUBMAP_TOPICS, odometry_message, submap_messages  # noqa: E402

@@ -16,7 +16,7 @@ import numpy as np
 
 from ekf_slam_node.results import EkfResult
 from ekf_slam_node.stage import FilterStage
-from sjsam_node.map_session import MapSession, Outcome
+from sjsam_node.session.map_session import MapSession, Outcome
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_bags.reading.readings import AgentSensors, DepthReading, ImuReading, Reading, StereoReading
 from slam_bringup.pipeline.configuration import SystemConfig, choose, filter_config, system_config

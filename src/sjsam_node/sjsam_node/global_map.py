@@ -19,28 +19,28 @@ from typing import overload
 
 import numpy as np
 
-from sjsam_node import storage
 from sjsam_node.agents import Agents, in_order
-from sjsam_node.closure_joining import ClosureJoiner, grouped
+from sjsam_node.consistency.closure_joining import ClosureJoiner, grouped
+from sjsam_node.consistency.conditions import Verdict
 from sjsam_node.global_map_config import GlobalMapConfig as GlobalMapConfig
 from sjsam_node.graph.links import Link, Status
 from sjsam_node.graph.map_graph import BUILDING, POSITIONS
+from sjsam_node.graph.marks import Marks
 from sjsam_node.graph.offload import Offload
 from sjsam_node.join_report import JoinReport as JoinReport
 from sjsam_node.loop_closure.comparing import RecordComparisons
-from sjsam_node.loop_closure.consistency import Verdict
 from sjsam_node.loop_closure.detector import LoopDetector
 from sjsam_node.loop_closure.verification import LINKED_SUBMAPS
-from sjsam_node.marks import Marks
+from sjsam_node.map_file import storage
+from sjsam_node.map_file.refining import lacking, refined
+from sjsam_node.map_file.storage import StoredMap
 from sjsam_node.positions.antenna import seen_inside, with_antenna
 from sjsam_node.positions.position_links import PositionLinks, readings_of, without_antenna
-from sjsam_node.refining import lacking, refined
 from sjsam_node.regions.tasks import Tasks
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.smoothing.map_snapshot import InnerPaths, MapLandmarks, MapSnapshot
 from sjsam_node.smoothing.solver import updated
 from sjsam_node.smoothing.state import EstimateState
-from sjsam_node.storage import StoredMap
 from sjsam_node.submap_check import fault_of
 from sjsam_node.tags.known_tags import building_submap
 from sjsam_node.tags.tag_links import TagLinks, is_against_tags, with_tag_links
@@ -342,7 +342,7 @@ class GlobalMap:
         return None if newest is None else self.snapshot().end(newest)
 
     def save(self, path: Path | str, *, is_last: bool = False) -> None:
-        """Write the map to a folder (see :mod:`sjsam_node.storage`), and go on from it as a map that is loaded does.
+        """Write the map to a folder (see :mod:`sjsam_node.map_file.storage`), and go on from it as a loaded map does.
 
         ``is_last``: nobody adds to the map or asks for covariances any more, so that only its graph is kept.
         """

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sjsam_node.loop_closure.consistency import ConsistencyConfig
+from sjsam_node.consistency.conditions import ConsistencyConfig
 from sjsam_node.loop_closure.verification import ClosureConfig
 from sjsam_node.positions.position_queue import PositionConfig
 from sjsam_node.smoothing.solver import SmootherConfig

@@ -19,15 +19,15 @@ from std_srvs.srv import Trigger
 
 from sjsam_node import map_messages
 from sjsam_node.agents import separate_parts
-from sjsam_node.autosave import Autosave
 from sjsam_node.correction import MapToOdom
 from sjsam_node.global_map import ALREADY_JOINED, JoinReport
-from sjsam_node.map_session import MapSession, Mode, Outcome
 from sjsam_node.node_config import SjsamNodeConfig, copy_path
 from sjsam_node.pose_tracker import PoseTracker
 from sjsam_node.regions.live import LiveTasks
+from sjsam_node.session.autosave import Autosave
+from sjsam_node.session.map_session import MapSession, Mode, Outcome
+from sjsam_node.session.submap_order import SubmapOrder, gap_text
 from sjsam_node.smoothing.map_snapshot import ADVICE, MapSnapshot
-from sjsam_node.submap_order import SubmapOrder, gap_text
 from sjsam_node.tags.map_tags import map_tags, tags_text
 from slam_core.geometry import FloatArray
 from slam_core.health import State
@@ -60,8 +60,8 @@ class SjsamNode(SlamNode[SjsamNodeConfig]):
     """Publishes each agent's pose, ``map_to_odom`` and the map.
 
     ``pose`` comes with every odometry message, ``map_to_odom`` twenty times a second, and the map, which costs the more
-    the larger it is, once a second at most. Submaps are joined on a thread of :mod:`sjsam_node.map_session`, so that
-    all else goes on meanwhile, from the last estimate.
+    the larger it is, once a second at most. Submaps are joined on a thread of
+    :mod:`sjsam_node.session.map_session`, so that all else goes on meanwhile, from the last estimate.
     """
 
     CHANGEABLE = ("map_path", "ply_path", "transform_tolerance_s")

@@ -11,12 +11,12 @@ import numpy as np
 from slam_core.geometry import FloatArray, boxminus
 from slam_core.health import State
 from slam_core.types import PoseEstimate, Submap
-from slam_radio.byte_budget import OVERHEAD, ByteBudget
-from slam_radio.inbox import Inbox
-from slam_radio.index_ranges import Key, Range
-from slam_radio.link_report import Backlog, LinkReport, unpack_backlog
 from slam_radio.link_state import Hearing, LinkState
-from slam_radio.radio_messages import (
+from slam_radio.queues.byte_budget import OVERHEAD, ByteBudget
+from slam_radio.queues.inbox import Inbox
+from slam_radio.wire.index_ranges import Key, Range
+from slam_radio.wire.link_report import Backlog, LinkReport, unpack_backlog
+from slam_radio.wire.radio_messages import (
     MOST_RANGES,
     pack_acknowledgement,
     pack_correction,

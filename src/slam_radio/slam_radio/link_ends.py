@@ -28,16 +28,16 @@ from slam_core.messages.submap_keys import submap_keys_from_message
 from slam_core.messages.submaps import SubmapMessages
 from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.types import PoseEstimate, Submap
-from slam_radio.detail_store import DetailStore
 from slam_radio.downlink import Downlink
-from slam_radio.inbox import Inbox
-from slam_radio.index_ranges import Key
 from slam_radio.link_state import LinkState
-from slam_radio.outbox import Outbox
 from slam_radio.packing.light_submap import pack
+from slam_radio.queues.detail_store import DetailStore
+from slam_radio.queues.inbox import Inbox
+from slam_radio.queues.outbox import Outbox
 from slam_radio.radio_config import RadioConfig
-from slam_radio.radio_messages import pack_pose, unpack_acknowledgement, unpack_correction, unpack_want
 from slam_radio.uplink import Uplink
+from slam_radio.wire.index_ranges import Key
+from slam_radio.wire.radio_messages import pack_pose, unpack_acknowledgement, unpack_correction, unpack_want
 from slam_radio.zenoh_link import ZenohLink
 
 

@@ -12,16 +12,16 @@ from slam_core.messages import SUBMAP_TOPICS, estimate_from_message, submap_from
 from slam_core.messages.base import Message
 from slam_core.messages.submaps import SubmapMessages
 from slam_core.nodes.stamp_guard import StampPolicy
-from slam_radio.byte_budget import ByteBudget
 from slam_radio.downlink import Downlink
-from slam_radio.inbox import Inbox
-from slam_radio.index_ranges import Key
 from slam_radio.link_ends import End, LinkNode, SubmapPublisher, submap_key
 from slam_radio.link_state import LinkState
-from slam_radio.outbox import Outbox
 from slam_radio.packing.light_submap import pack
-from slam_radio.radio_messages import pack_pose, pack_submap, unpack_acknowledgement, unpack_pose
+from slam_radio.queues.byte_budget import ByteBudget
+from slam_radio.queues.inbox import Inbox
+from slam_radio.queues.outbox import Outbox
 from slam_radio.uplink import Uplink, UplinkTurns
+from slam_radio.wire.index_ranges import Key
+from slam_radio.wire.radio_messages import pack_pose, pack_submap, unpack_acknowledgement, unpack_pose
 
 
 class PeerEnd(End):

@@ -14,14 +14,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from slam_core.health import State
-from slam_radio.byte_budget import OVERHEAD, ByteBudget
-from slam_radio.detail_store import DetailStore
-from slam_radio.in_flight import InFlight
-from slam_radio.index_ranges import Key, Range
-from slam_radio.link_report import Backlog, pack_backlog
 from slam_radio.link_state import Carriage, Hearing, LinkState
-from slam_radio.outbox import Outbox
-from slam_radio.radio_messages import pack_submap
+from slam_radio.queues.byte_budget import OVERHEAD, ByteBudget
+from slam_radio.queues.detail_store import DetailStore
+from slam_radio.queues.in_flight import InFlight
+from slam_radio.queues.outbox import Outbox
+from slam_radio.wire.index_ranges import Key, Range
+from slam_radio.wire.link_report import Backlog, pack_backlog
+from slam_radio.wire.radio_messages import pack_submap
 
 _POSE_PERIOD_S = 1.0
 _BACKLOG_PERIOD_S = 5.0

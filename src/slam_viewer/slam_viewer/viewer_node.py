@@ -32,7 +32,7 @@ from slam_core.nodes.base_node import SlamNode
 from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.ros import below, run_node, sensor_qos
 from slam_core.types import ByteArray, PoseEstimate
-from slam_radio.link_report import LinkReport
+from slam_radio.wire.link_report import LinkReport
 from slam_viewer.page.agent_link import link_text, link_warning, reach, reach_text
 from slam_viewer.page.command_post import has_place, position_radius, storey_at, unseen, ways_out
 from slam_viewer.page.page import ViewerPage

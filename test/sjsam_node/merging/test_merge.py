@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from submap_world import Agent, circle, ring_world
 
-from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.graph.map_graph import BUILDING
+from sjsam_node.graph.marks import Marks
 from sjsam_node.loop_closure.detector import RecordPair
 from sjsam_node.loop_closure.point_sets import at_start
 from sjsam_node.loop_closure.verification import Verifier
-from sjsam_node.marks import Marks
+from sjsam_node.map_file import storage
 from sjsam_node.merging.across import AcrossMaps
 from sjsam_node.merging.by_records import ByRecords
 from sjsam_node.merging.merge import merge

@@ -17,9 +17,9 @@ pytest.importorskip("distributed")
 from dask_cluster import running_cluster
 from distributed.comm.core import CommClosedError
 
-from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.loop_closure.detector import RecordPair
+from sjsam_node.map_file import storage
 from sjsam_node.regions import live, tasks
 from sjsam_node.regions.live import LiveTasks
 from sjsam_node.regions.tasks import InProcess, WorkersKilled

@@ -9,7 +9,7 @@ import pytest
 
 from demo_parts import DEMO, call, cut
 from mapping import quick_options
-from sjsam_node import storage
+from sjsam_node.map_file import storage
 from slam_bringup.jobs.merged_run import map_of_bag
 from slam_bringup.pipeline.overrides import Overrides
 from slam_viewer.page.run_folder import RunFolder

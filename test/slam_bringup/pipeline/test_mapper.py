@@ -10,7 +10,7 @@ import numpy as np
 from positioned_world import drive, positions
 from submap_world import Agent, circle, ring_world
 
-from sjsam_node.map_session import MapSession, Mode
+from sjsam_node.session.map_session import MapSession, Mode
 from slam_bringup.pipeline.configuration import load_system_config
 from slam_bringup.pipeline.mapper import Mapper
 from slam_bringup.pipeline.run_record import RunRecord

@@ -13,7 +13,7 @@ import pytest
 
 from browser import Browser, find_chromium
 from slam_core.types import PoseEstimate
-from slam_radio.link_report import Backlog, LinkReport
+from slam_radio.wire.link_report import Backlog, LinkReport
 from slam_viewer.page.agent_link import link_text, link_warning, reach, reach_text
 from slam_viewer.page.page import ViewerPage
 from slam_viewer.page.panel import AgentRow, agent_table

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
-from sjsam_node.marks import Marks
+from sjsam_node.graph.marks import Marks
 from sjsam_node.merging.across import AcrossMaps
 from sjsam_node.merging.by_records import ByRecords
 from sjsam_node.merging.moved import without

@@ -15,8 +15,8 @@ import numpy as np
 
 from sjsam_node.agents import Key, in_order
 from sjsam_node.graph.map_graph import BUILDING, Record
-from sjsam_node.marks import Mark
-from sjsam_node.storage import StoredMap
+from sjsam_node.graph.marks import Mark
+from sjsam_node.map_file.storage import StoredMap
 from slam_core.linear_algebra.block_pattern import IntArray
 from slam_core.types import Submap
 

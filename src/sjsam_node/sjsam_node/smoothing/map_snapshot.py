@@ -18,8 +18,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sjsam_node.graph.map_graph import POSITIONS, BoolArray, MapGraph, Record
+from sjsam_node.graph.marks import Marks
 from sjsam_node.graph.position_ids import is_position_id
-from sjsam_node.marks import Marks
 from sjsam_node.smoothing.inner_poses import positive, smoothing_gains, transposed
 from sjsam_node.smoothing.marginals import ComponentMarginals
 from sjsam_node.smoothing.state import EstimateState

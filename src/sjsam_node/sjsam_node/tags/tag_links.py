@@ -3,8 +3,8 @@
 
 A tag's name is evidence that looks never are, so that a link by one needs no other. It can still be wrong, of a tag
 that was moved or printed twice: the map's pose and the odometry are asked, as for every closure, and one that they
-contradict waits (:mod:`sjsam_node.closure_joining`). The *places* of a tag are the landmarks that its sightings were
-joined to: more than one in a part of the map means that it was moved, or that there are two.
+contradict waits (:mod:`sjsam_node.consistency.closure_joining`). The *places* of a tag are the landmarks that its
+sightings were joined to: more than one in a part of the map means that it was moved, or that there are two.
 """
 
 from __future__ import annotations

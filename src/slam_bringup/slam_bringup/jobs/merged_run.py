@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from dense_mapping.reconstruction.surface import Surface
-from sjsam_node import storage
-from sjsam_node.map_session import MapSession
+from sjsam_node.map_file import storage
+from sjsam_node.map_file.storage import StoredMap, is_map
 from sjsam_node.merging.merge import Merged
 from sjsam_node.merging.union import NamedMap
 from sjsam_node.regions.tasks import Tasks
-from sjsam_node.storage import StoredMap, is_map
+from sjsam_node.session.map_session import MapSession
 from sjsam_node.tags.map_tags import map_tags, tags_text
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.doctor.examination import require_stereo

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from sjsam_node.map_session import MapSession, Mode
+from sjsam_node.session.map_session import MapSession, Mode
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.doctor.examination import require_stereo

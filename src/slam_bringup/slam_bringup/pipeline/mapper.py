@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filters of all agents and the session of the one map that their submaps go to.
 
-The session has a thread of its own (:mod:`sjsam_node.map_session`). Where the nodes would send compact submaps, their
-rounding is in the map here too.
+The session has a thread of its own (:mod:`sjsam_node.session.map_session`). Where the nodes would send compact
+submaps, their rounding is in the map here too.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from concurrent.futures import Future
 from ekf_slam_node.stage import FilterStage, FrameResult
 from ndt_registration.stage import ScanEstimate
 from sjsam_node.agents import in_order
-from sjsam_node.map_session import MapSession, Mode, Outcome
 from sjsam_node.positions.position_links import positions_text
+from sjsam_node.session.map_session import MapSession, Mode, Outcome
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from sjsam_node.tags.map_tags import map_tags
 from slam_bags.reading.readings import AgentSensors, SessionStart

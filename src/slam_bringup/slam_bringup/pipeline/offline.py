@@ -18,7 +18,7 @@ from pathlib import Path
 
 import cv2
 
-from sjsam_node.map_session import MapSession
+from sjsam_node.session.map_session import MapSession
 from slam_bags.reading.readings import FixReading, ImuReading, PoseReading, Reading
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sjsam_node.map_session import MapSession
+from sjsam_node.session.map_session import MapSession
 from slam_bringup.pipeline.configuration import SystemConfig
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from dense_mapping.plans.floor_plan import FREE, OCCUPIED, FloorPlan
 from dense_mapping.plans.plan_io import read_plan
 from sjsam_node.global_map import GlobalMap
-from sjsam_node.storage import is_map
+from sjsam_node.map_file.storage import is_map
 from slam_core.geometry import FloatArray, invert_transform, transform_points
 from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray

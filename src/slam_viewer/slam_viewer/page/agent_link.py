@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from slam_radio.link_report import LinkReport
+from slam_radio.wire.link_report import LinkReport
 from slam_viewer.page.command_post import has_place, radius_text
 
 

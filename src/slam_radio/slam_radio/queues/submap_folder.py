@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from slam_core.storage.files import PathLock, atomic_path, read_bytes
-from slam_radio.index_ranges import Key
 from slam_radio.packing.light_submap import MOST_BYTES, unpack
+from slam_radio.wire.index_ranges import Key
 
 _NAME = re.compile(r"(\d{1,10})-(\d{1,10})\.submap")
 

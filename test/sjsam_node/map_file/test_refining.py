@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from submap_world import Agent, circle, ring_world
 
-from sjsam_node import storage
 from sjsam_node.global_map import ALREADY_JOINED, GlobalMap
-from sjsam_node.refining import has_more
+from sjsam_node.map_file import storage
+from sjsam_node.map_file.refining import has_more
 from slam_core.types import Submap
 
 

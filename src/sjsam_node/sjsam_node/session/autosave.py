@@ -13,8 +13,8 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from sjsam_node import storage
-from sjsam_node.storage import PackedMap, StoredMap
+from sjsam_node.map_file import storage
+from sjsam_node.map_file.storage import PackedMap, StoredMap
 from slam_core.storage.files import PathLock, remove
 
 _SHARE = 20.0

@@ -2,8 +2,8 @@
 """Conditions on a joined map for a closure to be held, and what was decided about closures.
 
 Three tests decide, and none of them changes the map: closures against each other and the odometry
-(:mod:`sjsam_node.loop_closure.pairwise`), closures against the joined map (:mod:`sjsam_node.loop_closure.map_test`),
-and submaps that contradict each other whatever is held (:mod:`sjsam_node.loop_closure.overconfidence`).
+(:mod:`sjsam_node.consistency.pairwise`), closures against the joined map (:mod:`sjsam_node.consistency.map_test`),
+and submaps that contradict each other whatever is held (:mod:`sjsam_node.consistency.overconfidence`).
 """
 
 from __future__ import annotations

@@ -10,9 +10,9 @@ import pytest
 
 from slam_core.geometry import boxminus, boxplus
 from slam_core.types import PoseEstimate
-from slam_radio.byte_budget import ByteBudget
-from slam_radio.index_ranges import IndexRanges, read_ranges, write_ranges
-from slam_radio.radio_messages import (
+from slam_radio.queues.byte_budget import ByteBudget
+from slam_radio.wire.index_ranges import IndexRanges, read_ranges, write_ranges
+from slam_radio.wire.radio_messages import (
     MOST_RANGES,
     pack_acknowledgement,
     pack_correction,

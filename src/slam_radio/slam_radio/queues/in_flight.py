@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from slam_radio.index_ranges import Key
+from slam_radio.wire.index_ranges import Key
 
 _WINDOW_S = 4.0
 """So many seconds of the budget, or one message, may be under way."""

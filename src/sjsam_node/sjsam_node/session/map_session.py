@@ -28,14 +28,14 @@ from pathlib import Path
 from queue import PriorityQueue
 from typing import Any, Self, TypeVar
 
-from sjsam_node import storage
-from sjsam_node.autosave import Autosave
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
-from sjsam_node.localization import Localizer
-from sjsam_node.marks import Mark, Marks
+from sjsam_node.graph.marks import Mark, Marks
+from sjsam_node.map_file import storage
+from sjsam_node.map_file.refining import undecided
 from sjsam_node.positions.position_queue import PositionQueue
-from sjsam_node.refining import undecided
 from sjsam_node.regions.live import LiveTasks
+from sjsam_node.session.autosave import Autosave
+from sjsam_node.session.localization import Localizer
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate, PositionReading, Submap
@@ -60,7 +60,7 @@ class Outcome:
 
     end: the pose at its end in the map, None where it was refused or is not known; closures: places recognised;
     duration_s: what it took. Of one that was joined or refused: report, in_odom, its end in its agent's odometry, and
-    undecided, agent, session and index of submaps whose closures wait (:mod:`sjsam_node.refining`).
+    undecided, agent, session and index of submaps whose closures wait (:mod:`sjsam_node.map_file.refining`).
     Of one that was to be located: path, the poses inside it in the map, empty where its place is not known.
     """
 

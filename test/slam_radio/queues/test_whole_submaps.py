@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from radio_world import SIZE
 
-from slam_radio.detail_store import DetailStore
 from slam_radio.packing.light_submap import pack, write
-from slam_radio.whole_submaps import WholeSubmaps
+from slam_radio.queues.detail_store import DetailStore
+from slam_radio.queues.whole_submaps import WholeSubmaps
 
 
 def test_of_more_whole_submaps_than_may_lie_there_the_oldest_are_packed(tmp_path, make_submap):

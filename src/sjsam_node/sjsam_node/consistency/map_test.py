@@ -12,9 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sjsam_node.graph.links import Link
-from sjsam_node.loop_closure.association import variance_factor
-from sjsam_node.loop_closure.consistency import (
+from sjsam_node.consistency.conditions import (
     CLOSURE_PROBABILITY,
     OUTLIER_PROBABILITY,
     OUTLIER_SHARE,
@@ -22,7 +20,9 @@ from sjsam_node.loop_closure.consistency import (
     ConsistencyConfig,
     Verdict,
 )
-from sjsam_node.loop_closure.pairwise import support_of
+from sjsam_node.consistency.pairwise import support_of
+from sjsam_node.graph.links import Link
+from sjsam_node.loop_closure.association import variance_factor
 from sjsam_node.smoothing.state import EstimateState
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray

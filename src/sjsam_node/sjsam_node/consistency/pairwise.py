@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sjsam_node.consistency.conditions import CLOSURE_PROBABILITY, ConsistencyConfig, is_among
 from sjsam_node.graph.links import Link, Status
 from sjsam_node.graph.map_graph import BoolArray, MapGraph
-from sjsam_node.loop_closure.consistency import CLOSURE_PROBABILITY, ConsistencyConfig, is_among
 from sjsam_node.loop_closure.verification import ClosureConfig
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, boxminus

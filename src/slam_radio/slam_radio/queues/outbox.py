@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from slam_radio.index_ranges import IndexRanges, Key, Range, read_ranges, write_ranges
-from slam_radio.submap_folder import SubmapFolder
+from slam_radio.queues.submap_folder import SubmapFolder
+from slam_radio.wire.index_ranges import IndexRanges, Key, Range, read_ranges, write_ranges
 
 
 class Outbox:

@@ -27,7 +27,7 @@ import numpy as np
 
 from slam_core.geometry import FloatArray, is_rigid_transform, make_transform, so3_exp, so3_log
 from slam_core.types import PoseEstimate
-from slam_radio.index_ranges import Range
+from slam_radio.wire.index_ranges import Range
 
 POSE = struct.Struct("<q3f3h2e")
 CORRECTION = struct.Struct("<q6f")

@@ -14,10 +14,10 @@ import pytest
 from judging import join
 from submap_world import Agent, circle, ring_world
 
-from sjsam_node import storage
 from sjsam_node.global_map import GlobalMap
-from sjsam_node.localization import Localizer
-from sjsam_node.map_validation import arrays_of
+from sjsam_node.map_file import storage
+from sjsam_node.map_file.map_validation import arrays_of
+from sjsam_node.session.localization import Localizer
 from slam_core.geometry import boxminus, boxplus, invert_transform
 from slam_core.types import PoseEstimate, Submap
 

@@ -8,13 +8,13 @@ from contextlib import suppress
 from pathlib import Path
 
 from slam_core.types import Submap
-from slam_radio.byte_budget import OVERHEAD
-from slam_radio.in_flight import InFlight
-from slam_radio.index_ranges import IndexRanges, Key, Range
 from slam_radio.packing.submap_details import key_of_details, pack_details
-from slam_radio.radio_messages import MOST_RANGES, pack_none
-from slam_radio.submap_folder import SubmapFolder
-from slam_radio.whole_submaps import WholeSubmaps
+from slam_radio.queues.byte_budget import OVERHEAD
+from slam_radio.queues.in_flight import InFlight
+from slam_radio.queues.submap_folder import SubmapFolder
+from slam_radio.queues.whole_submaps import WholeSubmaps
+from slam_radio.wire.index_ranges import IndexRanges, Key, Range
+from slam_radio.wire.radio_messages import MOST_RANGES, pack_none
 
 
 class DetailStore:

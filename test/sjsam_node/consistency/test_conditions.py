@@ -11,12 +11,12 @@ import pytest
 from judging import ate, errors, join
 from submap_world import Agent, Sensor, World, circle, path_through, ring_world, room
 
+from sjsam_node.consistency.conditions import Verdict
+from sjsam_node.consistency.pairwise import PairwiseConsistency
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig
 from sjsam_node.graph.links import Link, Prior, Status
 from sjsam_node.graph.map_graph import MapGraph
 from sjsam_node.loop_closure.association import match
-from sjsam_node.loop_closure.consistency import Verdict
-from sjsam_node.loop_closure.pairwise import PairwiseConsistency
 from sjsam_node.loop_closure.point_sets import at_start
 from sjsam_node.loop_closure.verification import ClosureConfig
 from sjsam_node.smoothing.solver import updated

@@ -13,8 +13,8 @@ import numpy as np
 from slam_core.geometry import FloatArray
 from slam_core.storage.files import atomic_path
 from slam_core.types import Float32Array, Submap
-from slam_radio.index_ranges import Key
 from slam_radio.packing.light_submap import LightSubmap, read
+from slam_radio.wire.index_ranges import Key
 
 _NAME = re.compile(r"(\d{1,10})-(\d{1,10})\.npz")
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from sjsam_node.submap_order import SubmapOrder, gap_text
+from sjsam_node.session.submap_order import SubmapOrder, gap_text
 
 A, B = ("a", 0), ("b", 7)
 

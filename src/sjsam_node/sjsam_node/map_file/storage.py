@@ -4,7 +4,7 @@
 The manifest names the format, its version, the file of arrays, its size and digest, and carries a digest of itself. A
 map that is there is replaced by one rename of the manifest, so that at any moment, also after a power cut, the folder
 holds the old map or the new one. Foreign, newer or damaged folders are refused with a clear line: everything is read
-and checked before anything is made of it (:mod:`sjsam_node.map_validation`).
+and checked before anything is made of it (:mod:`sjsam_node.map_file.map_validation`).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from sjsam_node.graph.links import Link
+from sjsam_node.graph.marks import Mark, Marks
 from sjsam_node.loop_closure.near_pairs import Compared
-from sjsam_node.map_validation import arrays_of, check_arrays, check_manifest
-from sjsam_node.marks import Mark, Marks
+from sjsam_node.map_file.map_validation import arrays_of, check_arrays, check_manifest
 from sjsam_node.positions.stored_readings import stored_waiting, waiting_arrays
 from sjsam_node.smoothing.state import EstimateState
 from sjsam_node.smoothing.stored import estimate_arrays, stored_state

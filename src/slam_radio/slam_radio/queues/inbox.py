@@ -7,11 +7,11 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from slam_core.types import Submap
-from slam_radio.index_ranges import IndexRanges, Key, Range, read_ranges, write_ranges
 from slam_radio.packing.light_submap import unpack
 from slam_radio.packing.submap_details import key_of_details, with_details
-from slam_radio.radio_messages import MOST_RANGES, unpack_submap
-from slam_radio.submap_folder import SubmapFolder
+from slam_radio.queues.submap_folder import SubmapFolder
+from slam_radio.wire.index_ranges import IndexRanges, Key, Range, read_ranges, write_ranges
+from slam_radio.wire.radio_messages import MOST_RANGES, unpack_submap
 
 
 class Inbox:

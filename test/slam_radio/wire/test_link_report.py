@@ -9,7 +9,7 @@ import pytest
 from radio_world import World
 
 from slam_core.health import State
-from slam_radio.link_report import Backlog, LinkReport, pack_backlog, unpack_backlog
+from slam_radio.wire.link_report import Backlog, LinkReport, pack_backlog, unpack_backlog
 
 FULL = Backlog(12, 84_000, 42.0, 1500.0, 700.0, is_too_much=True)
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from sjsam_node.graph.links import Link
 from sjsam_node.graph.map_graph import MapGraph
+from sjsam_node.map_file.storage import StoredMap
 from sjsam_node.smoothing.stored import estimate_arrays, stored_state
-from sjsam_node.storage import StoredMap
 from slam_core.types import Submap
 
 

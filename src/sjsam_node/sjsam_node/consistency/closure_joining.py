@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from sjsam_node.graph.links import Link, Status
-from sjsam_node.loop_closure.consistency import (
+from sjsam_node.consistency.conditions import (
     JOINING_ROUNDS,
     MAX_REFUSED_CLOSURES,
     RETRY_GROWTH,
@@ -22,9 +21,10 @@ from sjsam_node.loop_closure.consistency import (
     is_among,
     verdict_on,
 )
-from sjsam_node.loop_closure.map_test import MapTest
-from sjsam_node.loop_closure.overconfidence import OverconfidenceTest, links_of, reduced_chi2
-from sjsam_node.loop_closure.pairwise import PairwiseConsistency, support_of
+from sjsam_node.consistency.map_test import MapTest
+from sjsam_node.consistency.overconfidence import OverconfidenceTest, links_of, reduced_chi2
+from sjsam_node.consistency.pairwise import PairwiseConsistency, support_of
+from sjsam_node.graph.links import Link, Status
 from sjsam_node.loop_closure.verification import LINKED_SUBMAPS, ClosureConfig
 from sjsam_node.smoothing.estimate import MapEstimate
 from sjsam_node.smoothing.solver import relinked, updated
@@ -87,7 +87,7 @@ class ClosureJoiner:
         return verdict_on([], before.graph.links, after.graph.links)
 
     def resolve_overconfidence(self) -> Verdict:
-        """Treat parts whose submaps contradict each other (see :mod:`sjsam_node.loop_closure.overconfidence`)."""
+        """Treat parts whose submaps contradict each other (see :mod:`sjsam_node.consistency.overconfidence`)."""
         offered, test = self.estimate.graph.links, self.overconfidence
         records = test.overconfident_records(self.estimate.state)
         for record in records:

@@ -11,8 +11,8 @@ import pytest
 from judging import join
 from submap_world import Agent, circle, ring_world
 
-from sjsam_node.autosave import Autosave
 from sjsam_node.global_map import GlobalMap
+from sjsam_node.session.autosave import Autosave
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_a_map_that_is_saved_again_is_never_absent(
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sjsam_node.storage.os.replace", killed)
+    monkeypatch.setattr("sjsam_node.map_file.storage.os.replace", killed)
     with pytest.raises(KeyboardInterrupt):
         joined.save(tmp_path / "map")
     monkeypatch.undo()

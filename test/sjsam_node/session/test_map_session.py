@@ -13,9 +13,9 @@ import pytest
 from submap_world import Agent, circle, ring_world
 
 from sjsam_node.agents import in_order
-from sjsam_node.autosave import Autosave
 from sjsam_node.global_map import GlobalMap, GlobalMapConfig, JoinReport
-from sjsam_node.map_session import MapSession, Mode, Outcome
+from sjsam_node.session.autosave import Autosave
+from sjsam_node.session.map_session import MapSession, Mode, Outcome
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
 from slam_core.types import PoseEstimate, PositionReading, Submap
 

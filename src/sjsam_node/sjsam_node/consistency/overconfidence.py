@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from sjsam_node.consistency.conditions import ConsistencyConfig
+from sjsam_node.consistency.map_test import worst_closures
 from sjsam_node.graph.links import Link
-from sjsam_node.loop_closure.consistency import ConsistencyConfig
-from sjsam_node.loop_closure.map_test import worst_closures
 from sjsam_node.smoothing.state import EstimateState
 
 _RELIEF = 0.5
