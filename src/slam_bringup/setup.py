@@ -11,7 +11,7 @@ setup(
     name=PACKAGE,
     version="0.2.0",
     packages=find_packages(),
-    package_data={"": ["py.typed", "demo/*.mcap", "demo/*.yaml"]},
+    package_data={"": ["py.typed", "demo/*.mcap", "demo/*.yaml", "processes/*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -33,6 +33,7 @@ setup(
         "tof_driver",
         "click",
         "matplotlib",
+        "numba",
         "numpy",
         "opencv-python-headless",
         "PyYAML",

@@ -23,8 +23,15 @@ def test_scans_and_tracks_are_among_what_is_compiled(monkeypatch: pytest.MonkeyP
         runs.append((config.feature_extractor.tracks, odometry))
 
     monkeypatch.setattr(warmup, "run_bag", mapped)
+    monkeypatch.setattr(warmup, "compile_listed", lambda on_module, calls: False)
     assert CliRunner().invoke(slam, ["warmup", str(DEMO)]).exit_code == 0
     assert sorted(runs) == [(False, "ndt"), (True, "none")]
+
+
+def test_nothing_is_mapped_where_the_list_of_calls_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warmup, "run_bag", lambda *_, **__: pytest.fail("mapped"))
+    monkeypatch.setattr(warmup, "compile_listed", lambda on_module, calls: len(calls) > 20)
+    assert CliRunner().invoke(slam, ["warmup", str(DEMO)]).exit_code == 0
 
 
 def test_a_bag_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import click
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bringup.pipeline.configuration import choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
+from slam_bringup.processes.kernel_signatures import called_kernels, compile_listed, read_signatures, write_signatures
 from slam_bringup.terminal.console import progress_bar
 
 _RUNS = (("fuse", "ndt"), ("stereo", "none"))
@@ -18,13 +19,23 @@ _RUNS = (("fuse", "ndt"), ("stereo", "none"))
 
 @click.command()
 @click.argument("bag", type=click.Path(exists=True, path_type=Path))
-def command(bag: Path) -> None:
-    """Map BAG, which should have stereo, ToF and a loop (bags/demo), for the sake of the compiler's cache alone."""
+@click.option("--write", is_flag=True, help="write the list of calls by which kernels are compiled, after mapping BAG.")
+def command(bag: Path, write: bool) -> None:
+    """Compile all kernels, on all processors; map BAG for that where the list of calls does not fit.
+
+    BAG should have stereo, ToF and a loop (bags/demo).
+    """
     with SensorBag(bag) as opened:
         readings = sum(opened.count(agent, role) for agent in opened.agents for role in ("left", "depth", "imu"))
+    calls = {} if write else read_signatures()
     with progress_bar() as progress:
-        task = progress.add_task("compiling kernels", total=2 * len(_RUNS) * readings)
+        task = progress.add_task("compiling kernels", total=len(calls) or None)
+        if calls and compile_listed(lambda: progress.advance(task), calls):
+            return
+        progress.update(task, total=2 * len(_RUNS) * readings, completed=0)
         for number, (mode, odometry) in enumerate(_RUNS, 1):
             config = choose(load_system_config(None), mode, "sjsam", odometry)
             run_bag(bag, config, odometry=odometry, on_reading=lambda: progress.advance(task))
             progress.update(task, completed=2 * number * readings)
+    if write:
+        write_signatures(called_kernels())

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calls of kernels as text, compiled by other processes; the list of them is that of the kernels as they are."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numba import typeof
+
+from demo_parts import cut
+from slam_bringup.processes import kernel_signatures as listed
+
+MAPPED = """
+import json, sys
+import slam_bringup.commands.warmup as warmup
+from slam_bringup.processes.kernel_signatures import called_kernels
+warmup.read_signatures = dict
+warmup.command.main([sys.argv[1]], standalone_mode=False)
+print(json.dumps(called_kernels()))
+"""
+KERNELS = """
+from numba import njit
+
+@njit(cache=True)
+def doubled(values):
+    return 2 * values
+
+@njit(cache=True)
+def longest(values):
+    return doubled(values).max()
+"""
+
+
+class Pair(NamedTuple):
+    first: np.ndarray
+    second: object
+
+
+FLOATS = np.zeros((2, 3))
+
+
+@pytest.mark.parametrize(
+    "value",
+    [1, 1.5, True, FLOATS, FLOATS.T, FLOATS[::2, ::2], np.zeros(3, np.uint8), (1, 2.0), (1.0, 2.0), ((), (1,)),
+     np.broadcast_to(FLOATS, (4, 2, 3)), Pair(FLOATS, FLOATS), Pair(FLOATS, 1),
+     Pair(FLOATS, Pair(FLOATS, (FLOATS, 3)))],
+    ids=lambda value: type(value).__name__,
+)  # fmt: skip
+def test_a_type_comes_back_from_its_text(value: object) -> None:
+    kind = typeof(value)
+    assert listed._type_of(json.loads(json.dumps(listed._text_of(kind)))) == kind
+
+
+def test_listed_calls_are_compiled_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "some_kernels.py").write_text(KERNELS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    seen: list[None] = []
+    call = [["float64", 1, "C", True]]
+    assert listed.compile_listed(lambda: seen.append(None), {"some_kernels": {"longest": [call]}})
+    assert len(seen) == 1
+    kept = {path.name.split("-")[0] for path in (tmp_path / "cache").rglob("*.nbc")}
+    assert kept == {"some_kernels.longest", "some_kernels.doubled"}
+
+
+@pytest.mark.parametrize("calls", [{"none": [["int64"]]}, {"doubled": [["int64", "int64"]]}, {"doubled": [["int65"]]}])
+def test_a_list_that_fits_no_longer_is_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls) -> None:
+    (tmp_path / "some_kernels.py").write_text(KERNELS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    sys.modules.pop("some_kernels", None)
+    assert listed._compile_module(("some_kernels", {"doubled": [["int64"]]}))
+    assert not listed._compile_module(("some_kernels", calls))
+
+
+def test_every_listed_kernel_takes_as_many_arguments() -> None:
+    calls = listed.read_signatures()
+    assert len(calls) > 20
+    for module, kernels in calls.items():
+        for name, signatures in kernels.items():
+            count = len(inspect.signature(getattr(importlib.import_module(module), name).py_func).parameters)
+            assert {len(one) for one in signatures} == {count}, f"{module}.{name}: run `slam warmup bags/demo --write`"
+
+
+def test_what_mapping_calls_is_in_the_list(tmp_path: Path) -> None:
+    part = cut(tmp_path / "part", 0.0, 0.3)
+    done = subprocess.run([sys.executable, "-c", MAPPED, str(part)], check=True, capture_output=True, text=True)
+    calls = listed.read_signatures()
+    called = json.loads(done.stdout.splitlines()[-1])
+    assert {"ekf_slam_node", "ndt_registration", "stereo_frontend"} <= {name.split(".")[0] for name in called}
+    missing = [
+        (module, name)
+        for module, kernels in called.items()
+        for name, signatures in kernels.items()
+        if any(one not in calls.get(module, {}).get(name, []) for one in signatures)
+    ]
+    assert missing == [], "run `slam warmup bags/demo --write`"
