@@ -17,6 +17,8 @@ SEEN = 20
 """Landmarks of a submap, the nearest ones to its middle."""
 VISITS = 4.0
 """Times that each metre of the campus is walked, on average."""
+_AT_ONCE = 2000
+"""Submaps whose covariances are in memory at a time, 35 kB each."""
 
 
 def campus(agents: int, submaps: int, seed: int = 0) -> tuple[FlatMaps, JoiningState, IntArray]:
@@ -94,12 +96,14 @@ def _measured(
     end = np.concatenate([(base @ (t[reference + 1] - T)[..., None])[..., 0], so3_log(base @ R[reference + 1])], axis=1)
     local = np.einsum("nij,nkj->nki", base, landmarks[ids] - T[:, None])
     sigma = np.concatenate([np.repeat([0.01, 0.002], 3), np.full(3 * SEEN, 0.02)])
-    common = rng.normal(0, 0.2, (count, rows, 6)) * sigma[:, None]
-    covariance = common @ np.swapaxes(common, 1, 2) + np.diag(sigma**2)
-    error = (common @ rng.normal(size=(count, 6, 1)))[..., 0] + sigma * rng.normal(size=(count, rows))
-    information = np.linalg.inv(covariance)
+    mean, information = np.concatenate([end, local.reshape(count, -1)], axis=1), np.empty((count, rows, rows))
+    for first in range(0, count, _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        common = rng.normal(0, 0.2, (len(mean[part]), rows, 6)) * sigma[:, None]
+        mean[part] += (common @ rng.normal(size=(len(common), 6, 1)))[..., 0]
+        mean[part] += sigma * rng.normal(size=(len(common), rows))
+        information[part] = np.linalg.inv(common @ np.swapaxes(common, 1, 2) + np.diag(sigma**2))
     ones, seen = np.ones(count, dtype=np.int64), np.full(count, SEEN)
-    mean = np.concatenate([end, local.reshape(count, -1)], axis=1) + error
     return FlatMaps(
         reference, pointers(ones), reference + 1, pointers(seen), ids.ravel(), pointers(np.full(count, rows)),
         mean.ravel(), pointers(np.full(count, rows * rows)), information.ravel(), np.zeros(count * rows),

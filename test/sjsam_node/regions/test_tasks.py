@@ -59,7 +59,7 @@ def test_workers_give_the_same_bytes_also_when_one_is_killed_half_way(client):
         while not holders:
             assert time.monotonic() < deadline, f"no worker holds a factor: {client.has_what()}"
             time.sleep(0.05)
-            holders = [w for w, keys in client.has_what().items() if any("_eliminate" in str(k) for k in keys)]
+            holders = [w for w, keys in client.has_what().items() if any("eliminate_piece" in str(k) for k in keys)]
         killed.append(client.run(os.getpid, workers=holders[:1])[holders[0]])
         os.kill(killed[0], signal.SIGKILL)
 

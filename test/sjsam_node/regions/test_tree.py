@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from random_joining import MODELS, perturbed, random_problem
@@ -10,6 +12,7 @@ from random_joining import MODELS, perturbed, random_problem
 from sjsam_node.joint_problem.joining import JoiningProblem
 from sjsam_node.joint_problem.problem import flatten
 from sjsam_node.regions.fronts import NotDetermined
+from sjsam_node.regions.pieces import Eliminated
 from sjsam_node.regions.tasks import InProcess
 from sjsam_node.regions.tree import RegionTree
 from sjsam_node.regions.tree_problem import TreeProblem
@@ -45,6 +48,34 @@ def test_means_and_covariances_are_those_of_one_factor(model, sizes):
     maps, state = random_problem(model, rng, maps=40, landmarks=60)
     tree = compare(maps, state, model, **sizes)
     assert sum(len(r.maps) for r in tree.root.regions() if not r.children) == 40
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+def test_factors_that_are_not_kept_change_no_byte(model):
+    maps, state = random_problem(model, np.random.default_rng(4), maps=40, landmarks=60)
+    results, factors = [], []
+    for kept in (40, 39):
+        tasks = Counting()
+        tree = RegionTree(flatten(maps), state, FIXED, model, tasks, leaf_maps=2, task_maps=9, kept_maps=kept)
+        tree.eliminate(state, 0.1)
+        factors.append(tasks.kept)
+        results.append((tree.step(), *tree.covariances()))
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert factors[1] < 0.5 * factors[0], "only those above the pieces are left"
+
+
+class Counting(InProcess):
+    """Tasks here, and the bytes of the factors among their results."""
+
+    def __init__(self):
+        self.kept = 0
+
+    def submit(self, function, *arguments):
+        result = super().submit(function, *arguments)
+        if isinstance(result, Eliminated):
+            self.kept += len(pickle.dumps(result))
+        return result
 
 
 def test_every_variable_is_eliminated_once_and_the_root_leaves_none():
