@@ -26,6 +26,8 @@ from campus import campus
 from sjsam_node.joint_problem import kernels
 from sjsam_node.joint_problem.joining import JoiningProblem
 from sjsam_node.joint_problem.problem import FlatMaps, JoiningState
+from sjsam_node.regions.fronts import Front
+from sjsam_node.regions.pieces import Eliminated
 from sjsam_node.regions.tasks import InProcess, OnCluster, Tasks
 from sjsam_node.regions.tree import RegionTree
 from slam_core.geometry import FloatArray
@@ -55,7 +57,7 @@ class Recorded:
         self.seconds.append(time.process_time() - began)
         self.after.append([a.number for a in arguments if isinstance(a, _Handle)])
         self.names.append(getattr(function, "__name__", "part"))
-        if not hasattr(result, "front") and not isinstance(result, tuple):
+        if not isinstance(result, (Eliminated, Front, tuple)):
             self.passed += len(pickle.dumps(result, protocol=5))
         return _Handle(len(self.seconds) - 1, result)
 

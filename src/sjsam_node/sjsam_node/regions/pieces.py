@@ -135,9 +135,9 @@ def step_inside(piece: Piece, eliminated: Eliminated, separator: FloatArray) -> 
     return out
 
 
-def step_above(eliminated: Eliminated, separator: FloatArray) -> FloatArray:
+def step_above(front: Front, separator: FloatArray) -> FloatArray:
     """Step (n,) of a front above the pieces, own variables and separator."""
-    return np.concatenate([substitute(eliminated.front, separator), separator])
+    return np.concatenate([substitute(front, separator), separator])
 
 
 def blocks_inside(piece: Piece, eliminated: Eliminated, separator: FloatArray) -> FloatArray:
@@ -156,9 +156,9 @@ def blocks_inside(piece: Piece, eliminated: Eliminated, separator: FloatArray) -
     return out
 
 
-def covariance_above(eliminated: Eliminated, separator: FloatArray) -> FloatArray:
+def covariance_above(front: Front, separator: FloatArray) -> FloatArray:
     """Covariance (n, n) of a front above the pieces, own variables and separator."""
-    return joint_covariance(eliminated.front, separator)
+    return joint_covariance(front, separator)
 
 
 def own_blocks(width: IntArray, joint: FloatArray) -> FloatArray:

@@ -98,7 +98,7 @@ class RegionTree:
         self._add(self.root, maps, model, task_maps)
         self._held = [self._tasks.hold(piece) for piece in self._pieces]
         self._keeps = len(maps.reference) <= kept_maps
-        self._eliminated: list[Any] = []
+        self._factors: list[Any] = []
         self._linearised_at: tuple[JoiningState, float] = state, 0.0
 
     def _add(self, region: MapRegion, maps: FlatMaps, model: int, task_maps: int) -> int:
@@ -120,19 +120,19 @@ class RegionTree:
     def eliminate(self, state: JoiningState, damping: float = 0.0) -> None:
         """Go up the tree, linearised at ``state``, the diagonal ``1 + damping`` times what it is."""
         submit, width, reduced = self._tasks.submit, self.variables.width, list[Any]()
-        self._eliminated, self._linearised_at = [], (state, damping)
+        self._factors, self._linearised_at = [], (state, damping)
         for node in self._nodes:
             if node.piece >= 0:
                 task = eliminate_piece if self._keeps else reduce_piece
                 done = submit(task, self._held[node.piece], self._pieces[node.piece].state(state), damping)
-                if not self._keeps:
-                    self._eliminated.append(None)
-                    reduced.append(done)
-                    continue
-            else:
-                own, size = (int(width[v].sum()) for v in (node.region.own, node.region.variables))
-                done = submit(eliminate_above, own, size, self._places(node), *(reduced[k] for k in node.below))
-            self._eliminated.append(done)
+                self._factors.append(done if self._keeps else None)
+                reduced.append(submit(attrgetter("reduced"), done) if self._keeps else done)
+                continue
+            own, size = (int(width[v].sum()) for v in (node.region.own, node.region.variables))
+            done = submit(eliminate_above, own, size, self._places(node), *(reduced[k] for k in node.below))
+            for k in node.below:
+                reduced[k] = None  # nobody else asks for it
+            self._factors.append(submit(attrgetter("front"), done))
             reduced.append(submit(attrgetter("reduced"), done))
 
     def step(self) -> FloatArray:
@@ -158,10 +158,10 @@ class RegionTree:
             If the problem does not determine all its variables.
         """
         width, out = self.variables.width, np.zeros((len(self.variables.width), 6, 6))
-        handles = self._down(blocks_inside, covariance_above, np.zeros((0, 0)))
-        for k, node in enumerate(self._nodes):
-            if node.piece < 0:
-                handles[k] = self._tasks.submit(own_blocks, width[node.region.own], handles[k])
+        handles = self._down(
+            blocks_inside, covariance_above, np.zeros((0, 0)),
+            lambda node, joint: self._tasks.submit(own_blocks, width[node.region.own], joint),
+        )  # fmt: skip
         for node, blocks in zip(self._nodes, self._tasks.gather(handles), strict=True):
             variables = node.region.own if node.piece < 0 else self._variables_of(node)
             inside = ~np.isin(variables, node.region.separator)
@@ -169,24 +169,34 @@ class RegionTree:
         poses, (pose, landmark) = self.variables.poses, self._sizes
         return out[:poses, :pose, :pose], out[poses:, :landmark, :landmark]
 
-    def _down(self, inside: Callable[..., Any], above: Callable[..., Any], nothing: FloatArray) -> list[Any]:
-        """Handles of what each node's task gives, from the root down: each is told what its parent knows of it."""
+    def _down(
+        self,
+        inside: Callable[..., Any],
+        above: Callable[..., Any],
+        nothing: FloatArray,
+        shortened: Callable[[_Node, Any], Any] = lambda _, handle: handle,
+    ) -> list[Any]:
+        """Handles of what each node's task gives, from the root down: each is told what its parent knows of it.
+
+        ``shortened`` gives what is kept of a result above the pieces once the node's children have their part.
+        """
         submit, known, out = self._tasks.submit, {len(self._nodes) - 1: nothing}, [None] * len(self._nodes)
         for k in reversed(range(len(self._nodes))):
             node = self._nodes[k]
             if node.piece >= 0:
-                out[k] = self._down_inside(inside, node.piece, self._eliminated[k], known.pop(k))
+                out[k] = self._down_inside(inside, node.piece, self._factors[k], known.pop(k))
                 continue
-            out[k] = submit(above, self._eliminated[k], known.pop(k))
+            result = submit(above, self._factors[k], known.pop(k))
             for child, at in zip(node.below, self._places(node), strict=True):
-                known[child] = submit(selected, out[k], at)
+                known[child] = submit(selected, result, at)
+            out[k] = shortened(node, result)
         return out
 
-    def _down_inside(self, inside: Callable[..., Any], number: int, eliminated: Any, separator: Any) -> Any:
+    def _down_inside(self, inside: Callable[..., Any], number: int, factor: Any, separator: Any) -> Any:
         """Handle of what a piece's task gives, by its factor or, where that was not kept, by a new one."""
         piece = self._held[number]
         if self._keeps:
-            return self._tasks.submit(inside, piece, eliminated, separator)
+            return self._tasks.submit(inside, piece, factor, separator)
         state, damping = self._linearised_at
         return self._tasks.submit(
             eliminated_again, inside, piece, self._pieces[number].state(state), damping, separator
