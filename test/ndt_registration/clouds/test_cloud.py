@@ -4,14 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ndt_registration.clouds.cloud import _quantile, evened, finite_points, largest_extent
-
-
-@pytest.mark.parametrize("count", [1, 2, 5, 1000])
-@pytest.mark.parametrize("share", [0.5, 0.9])
-def test_quantiles_are_those_of_numpy_to_the_bit(rng: np.random.Generator, count: int, share: float) -> None:
-    values = rng.uniform(0.3, 7.0, count)
-    assert _quantile(np.sort(values), share) == np.quantile(values, share)
+from ndt_registration.clouds.cloud import evened, finite_points, largest_extent
 
 
 def test_strays_are_left_out_and_an_even_cloud_is_kept(rng: np.random.Generator) -> None:

@@ -114,7 +114,8 @@ def test_cells_at_a_step_keep_their_own_normal(rng: np.random.Generator) -> None
 
 
 def test_counts_are_those_of_the_moments(rng: np.random.Generator) -> None:
-    for points in (rng.normal(0.0, 1.0, (500, 3)), 0.8 * np.arange(300.0).reshape(100, 3)):
+    far_apart = np.repeat(rng.uniform(-50.0, 50.0, (2000, 3)), 2, axis=0)
+    for points in (rng.normal(0.0, 1.0, (500, 3)), 0.8 * np.arange(300.0).reshape(100, 3), far_apart):
         counts = np.sort(block_moments(points, 0.4).counts)
         np.testing.assert_array_equal(np.sort(block_counts(points, 0.4)), counts)
 

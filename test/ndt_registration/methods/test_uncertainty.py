@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ndt_registration.methods.uncertainty import gradient_scatter
+from ndt_registration.methods.uncertainty import _sums_of_cubes, gradient_scatter
 from slam_core.geometry import FloatArray
 
 
@@ -27,3 +27,12 @@ def test_independent_blocks_are_counted_once() -> None:
     wide, single = scatters(0.0)
     assert np.all(wide >= 0.99 * single)
     assert np.median(wide) < 1.6 * np.median(single)
+
+
+def test_gradients_are_summed_by_cube_in_the_order_of_the_places() -> None:
+    rng = np.random.default_rng(3)
+    cubes, gradients = rng.integers(-3, 3, (500, 3)).astype(np.int32), rng.normal(size=(500, 6))
+    places, number = np.unique(cubes, axis=0, return_inverse=True)
+    expected = [gradients[number.ravel() == k].sum(axis=0) for k in range(len(places))]
+    np.testing.assert_allclose(_sums_of_cubes(gradients, cubes), expected, rtol=1e-12, atol=1e-12)
+    assert _sums_of_cubes(np.empty((0, 6)), np.empty((0, 3), np.int32)).shape == (0, 6)

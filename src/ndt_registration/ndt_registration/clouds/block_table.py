@@ -52,6 +52,12 @@ def place_in_brick(ix: int, iy: int, iz: int) -> int:
     return ((ix & _MASK) << (2 * _SHIFT)) | ((iy & _MASK) << _SHIFT) | (iz & _MASK)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def in_one_brick(ax: int, ay: int, az: int, bx: int, by: int, bz: int) -> bool:
+    """True if two blocks lie in the same brick."""
+    return (((ax ^ bx) | (ay ^ by) | (az ^ bz)) >> _SHIFT) == 0
+
+
 @in_place()
 def _slot_of(keys: IntArray, key: int) -> int:
     """Place of ``key`` in the table, or of the empty slot where it belongs (linear probing, Fibonacci hashing)."""

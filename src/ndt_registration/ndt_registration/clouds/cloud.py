@@ -11,8 +11,8 @@ from numba import njit
 
 from ndt_registration.clouds.edges import rim_points
 from ndt_registration.clouds.moments import block_counts, block_moments
+from ndt_registration.clouds.quantiles import quantiles, root_quantiles
 from ndt_registration.clouds.visibility import mean_spacing, range_image
-from slam_core.estimation.least_squares import median
 from slam_core.geometry import FloatArray
 from slam_core.runtime.in_place import in_place
 from slam_core.types import AnyArray
@@ -122,26 +122,18 @@ def evened(points: FloatArray) -> FloatArray:
     """
     if len(points) == 0:
         return points
-    distance = _distances(points)
-    distance.sort()
-    farthest = _FARTHEST * _quantile(distance, 0.5)
-    if 0.0 < farthest < distance[-1]:
-        points, distance = points[_distances(points) <= farthest], distance[distance <= farthest]
-    size = _EVEN_SIZE * max(_quantile(distance, 0.9), 1e-6)
+    squares = _squares(points)
+    middle, far = root_quantiles(squares, (0.5, 0.9))
+    farthest = _FARTHEST * middle
+    if 0.0 < farthest < np.sqrt(squares.max()):
+        points = points[np.sqrt(squares) <= farthest]
+        far = root_quantiles(_squares(points), (0.9,))[0]
+    size = _EVEN_SIZE * max(far, 1e-6)
     counts = block_counts(points, size)
-    if not (counts**2).sum() / counts.sum() / median(counts) > _CROWDED:
+    if not (counts**2).sum() / counts.sum() / quantiles(counts, (0.5,))[0] > _CROWDED:
         return points
     blocks = block_moments(points, size)
     return blocks.sums / blocks.counts[:, None]
-
-
-def _quantile(ordered: FloatArray, share: float) -> float:
-    """``np.quantile`` of numbers (n,), n > 0, in rising order: sorting them once takes half of its time."""
-    place = share * (len(ordered) - 1)
-    below = int(place)
-    low, high = float(ordered[below]), float(ordered[min(below + 1, len(ordered) - 1)])
-    part = place - below
-    return low + (high - low) * part if part < 0.5 else high - (high - low) * (1.0 - part)
 
 
 def thinned(points: FloatArray, limit: int, *, planar: bool) -> Cloud:
@@ -151,19 +143,19 @@ def thinned(points: FloatArray, limit: int, *, planar: bool) -> Cloud:
     if n > limit:
         points = points[((np.arange(limit) + rng.random(limit)) * (n / limit)).astype(np.int64)]
     points = np.ascontiguousarray(points[rng.permutation(len(points))])
-    scale = float(np.median(_distances(points))) if len(points) else 0.0
+    scale = root_quantiles(_squares(points), (0.5,))[0] if len(points) else 0.0
     spacing = mean_spacing(points, range_image(points, _COVERAGE_SIZE), planar)
     rims = rim_points(points, spacing, _RIM_STEP * scale)
     return Cloud(points, rims[rng.permutation(len(rims))], scale, planar)
 
 
 @njit(cache=True, nogil=True)
-def _distances(points: FloatArray) -> FloatArray:
-    """Distances (n,) m of points (n, 3) from the origin."""
+def _squares(points: FloatArray) -> FloatArray:
+    """Squared distances (n,) m2 of points (n, 3) from the origin."""
     out = np.empty(points.shape[0])
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        out[i] = np.sqrt(x * x + y * y + z * z)
+        out[i] = x * x + y * y + z * z
     return out
 
 

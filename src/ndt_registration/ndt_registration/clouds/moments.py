@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -17,6 +17,7 @@ from ndt_registration.clouds.block_table import (
     brick_key,
     brick_of,
     has_room,
+    in_one_brick,
     place_in_brick,
     with_room,
 )
@@ -25,6 +26,10 @@ from slam_core.runtime.in_place import in_place
 
 ENTRIES_PER_BRICK = 8
 """So many entries for each brick: a table has room for that many bricks at first."""
+_CHUNK = 1024
+"""Points whose blocks are computed at once."""
+_NOWHERE: Any = np.int32(1 << 30)
+"""Coordinate of no block."""
 
 
 class Moments(NamedTuple):
@@ -170,27 +175,33 @@ def _number_points(points, block_size, table, number, corner, done, used):  # ty
 def _point_counts(points: FloatArray, block_size: float) -> FloatArray:
     """Points of each block, brick by brick."""
     table = block_table(points.shape[0] // ENTRIES_PER_BRICK + 8)
-    done = 0
-    while done < points.shape[0]:
-        table = with_room(table, 1)
-        done = _count_points(points, block_size, table, done)
+    numbers, corners = points.reshape(-1), np.empty(3 * _CHUNK, np.int32)
+    for first in range(0, points.shape[0], _CHUNK):
+        count = min(points.shape[0] - first, _CHUNK)
+        table = with_room(table, count)
+        _write_corners(numbers[3 * first : 3 * (first + count)], 1.0 / block_size, corners)
+        _count_points(corners, count, table)
     counts = np.empty(points.shape[0] + 1)  # one beyond the last, where what is empty is written
     return counts[: _write_counts(table, counts)]
 
 
 @in_place()
-def _count_points(points, block_size, table, done):  # type: ignore[no-untyped-def]
-    """Add points from ``done`` on, while there is room, to the table's rows, which hold -1 at first; the next point."""
-    last, brick, inverse = -1, 0, 1.0 / block_size
-    while done < points.shape[0] and has_room(table, 1):
-        x, y, z = points[done, 0], points[done, 1], points[done, 2]
-        ix, iy, iz = int(np.floor(x * inverse)), int(np.floor(y * inverse)), int(np.floor(z * inverse))
-        key = brick_key(ix, iy, iz)
-        if key != last:  # neighbours in a picture often share a brick
-            brick, last = brick_of(table, key), key
-        table.rows[brick, place_in_brick(ix, iy, iz)] += 1
-        done += 1
-    return done
+def _write_corners(numbers, inverse, corners):  # type: ignore[no-untyped-def]
+    """Integer coordinates of the blocks of points, number by number: a loop of its own is vectorised."""
+    for i in range(numbers.shape[0]):
+        corners[i] = np.int32(np.floor(numbers[i] * inverse))
+
+
+@in_place()
+def _count_points(corners, count, table):  # type: ignore[no-untyped-def]
+    """Add so many points to the rows of their blocks, which hold -1 at first."""
+    rows, brick = table.rows, 0
+    last_x = last_y = last_z = _NOWHERE
+    for i in range(count):
+        x, y, z = corners[3 * i], corners[3 * i + 1], corners[3 * i + 2]
+        if not in_one_brick(x, y, z, last_x, last_y, last_z):  # neighbours in a picture often share a brick
+            brick, last_x, last_y, last_z = brick_of(table, brick_key(int(x), int(y), int(z))), x, y, z
+        rows[brick, place_in_brick(x, y, z)] += 1
 
 
 @in_place()

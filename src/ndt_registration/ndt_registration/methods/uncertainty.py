@@ -147,13 +147,21 @@ def gradient_scatter(gradients: FloatArray, places: Int32Array, width: int, dens
     """
     each = _scatter_of(gradients)
     while width > 1:
-        cubes = np.unique(places // width, axis=0, return_inverse=True)[1].ravel()
-        sums = np.zeros((int(cubes.max(initial=-1)) + 1, 6))
-        np.add.at(sums, cubes, gradients)
+        sums = _sums_of_cubes(gradients, places // width)
         if len(sums) >= _FEWEST_CUBES:
             return (1.0 + density_ratio) * _at_least(each, _scatter_of(sums))
         width //= 2
     return (1.0 + density_ratio) * each
+
+
+def _sums_of_cubes(gradients: FloatArray, cubes: Int32Array) -> FloatArray:
+    """Sums (c, 6) of the gradients (b, 6) of each cube at integer places (b, 3), in the order of the places.
+
+    These span less than 2^21 along each axis.
+    """
+    x, y, z = (cubes - cubes.min(axis=0, initial=0)).astype(np.int64).T
+    _, number = np.unique((x << 42) | (y << 21) | z, return_inverse=True)
+    return np.stack([np.bincount(number, column) for column in gradients.T], axis=1)
 
 
 def _scatter_of(gradients: FloatArray) -> FloatArray:
