@@ -8,7 +8,7 @@ import pytest
 
 from slam_core.camera import Camera
 from slam_core.types import DepthImage
-from stereo_frontend.depth.depth_lookup import sample_depth
+from stereo_frontend.depth.depth_lookup import has_depth, sample_depth
 
 CAMERA = Camera(204, 204, 280.0, 280.0, 101.5, 101.5)
 NORMAL = (0.5, -0.2, 1.0)
@@ -56,6 +56,7 @@ def test_the_kernel_against_its_twin(rng):
     expected = [plane_twin(image, *position) for position in uv]
     known = np.array([plane is not None for plane in expected])
     np.testing.assert_array_equal(np.isfinite(samples.depth), known)
+    np.testing.assert_array_equal(has_depth(image, uv), known)
     assert 200 < known.sum() < 590
     found = np.column_stack([samples.depth, samples.gradient])[known]
     np.testing.assert_allclose(found, [plane for plane in expected if plane], rtol=1e-9, atol=1e-12)

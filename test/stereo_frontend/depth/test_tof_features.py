@@ -6,7 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereo_frontend.depth.tof_features import normalised_picture
+from slam_core.types import DepthImage
+from stereo_frontend.depth.depth_lookup import sample_depth
+from stereo_frontend.depth.tof_features import TofFeatureConfig, TofFeatures, normalised_picture
+from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
+from stereo_frontend.stereo.pixel_noise import PixelNoiseConfig
 
 
 def twin(values, clip, gamma):
@@ -29,3 +33,19 @@ def test_pictures_are_those_of_the_twin(rng, gamma, missing):
 def test_images_without_contrast_or_values_are_black():
     assert not normalised_picture(np.full((4, 5), np.nan, np.float32), 0.005, 0.5).any()
     assert not normalised_picture(np.ones((4, 5), np.float32), 0.005, 0.5).any()
+
+
+def test_features_are_those_of_all_keypoints_less_those_without_depth(stereo_pair):
+    pair = stereo_pair()
+    depth = np.full(pair.left.shape, 2.0, np.float32)
+    depth[:, :150] = np.nan
+    sigma = np.full(pair.left.shape, 0.01, np.float32)
+    image = DepthImage(1, depth, sigma, pair.stereo.camera, amplitude=pair.left.astype(np.float32))
+    tof = TofFeatures(TofFeatureConfig(), FeatureConfig(target=200), PixelNoiseConfig(), None)
+    features = tof(image)
+    every = FeatureExtractor(FeatureConfig(target=200))(tof.picture(image, "amplitude"))
+    known = np.isfinite(sample_depth(image, every.uv).depth)
+    assert 50 < known.sum() < 150
+    np.testing.assert_array_equal(features.uv, every.uv[known])
+    np.testing.assert_array_equal(features.descriptors, every.descriptors[known])
+    np.testing.assert_allclose(features.depth, 2.0)

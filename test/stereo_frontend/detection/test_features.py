@@ -64,6 +64,18 @@ def test_the_threshold_settles_so_that_one_pass_suffices(stereo_pair):
     assert abs(np.log(thresholds[-1] / thresholds[-2])) < 0.02
 
 
+@pytest.mark.parametrize("name", DETECTORS)
+def test_only_wanted_keypoints_are_described_and_the_others_change_nothing(stereo_pair, name):
+    image = stereo_pair().left
+    extractors = [FeatureExtractor(FeatureConfig(detector=name, target=150)) for _ in range(2)]
+    every, wanted = extractors[0](image), extractors[1](image, None, lambda uv: uv[:, 0] < 100.0)
+    left = every.select(every.uv[:, 0] < 100.0)
+    assert 20 < len(left) < 100
+    for field in ("uv", "size", "response", "descriptors"):
+        np.testing.assert_array_equal(getattr(wanted, field), getattr(left, field))
+    assert extractors[0].threshold == extractors[1].threshold
+
+
 def test_a_dim_image_still_gives_its_features(stereo_pair):
     dim = (stereo_pair(noise=0.0).left // 6).astype(np.uint8)
     assert len(FeatureExtractor(FeatureConfig(target=150))(dim)) > 100

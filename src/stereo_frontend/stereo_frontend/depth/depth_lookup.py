@@ -41,12 +41,23 @@ class DepthSamples:
 
 def sample_depth(image: DepthImage, uv: npt.ArrayLike) -> DepthSamples:
     """Depth of positions (n, 2) px; positions outside the image or beside missing pixels are NaN."""
-    uv = np.ascontiguousarray(uv, dtype=np.float64).reshape(-1, 2)
-    planes = np.full((len(uv), 6), np.nan)
-    _fit_planes(image.depth, image.sigma, uv, planes)
+    planes = _planes(image, uv)
     depth, gradient, (pixel_variance, misfit, offset_squared) = planes[:, 0], planes[:, 1:3], planes[:, 3:].T
     variance = _variance_of_fit(pixel_variance, misfit, offset_squared, np.isfinite(depth))
     return DepthSamples(depth, np.sqrt(variance), gradient)
+
+
+def has_depth(image: DepthImage, uv: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """True (n,) where :func:`sample_depth` finds the depth of a position (n, 2) px."""
+    return np.asarray(np.isfinite(_planes(image, uv)[:, 0]))
+
+
+def _planes(image: DepthImage, uv: npt.ArrayLike) -> FloatArray:
+    """The numbers (n, 6) of :func:`_fit_planes` at positions (n, 2) px, NaN where there is no single surface."""
+    uv = np.ascontiguousarray(uv, dtype=np.float64).reshape(-1, 2)
+    planes = np.full((len(uv), 6), np.nan)
+    _fit_planes(image.depth, image.sigma, uv, planes)
+    return planes
 
 
 @in_place(error_model="numpy")

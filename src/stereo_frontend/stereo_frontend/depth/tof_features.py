@@ -17,7 +17,7 @@ from slam_core.config import Config, parameter
 from slam_core.runtime.in_place import in_place
 from slam_core.types import ByteArray, DepthImage, Features, FeatureSource, Float32Array
 from stereo_frontend.assembly import DepthEstimate, MeasuredKeypoints, joined_features
-from stereo_frontend.depth.depth_lookup import sample_depth
+from stereo_frontend.depth.depth_lookup import has_depth, sample_depth
 from stereo_frontend.detection.features import FeatureConfig, FeatureExtractor
 from stereo_frontend.keypoints import Keypoints
 from stereo_frontend.stereo.pixel_noise import PixelNoise, PixelNoiseConfig
@@ -77,7 +77,7 @@ class TofFeatures:
         """Features of ``image`` in the ToF optical frame; those without a single surface below them are left out."""
         before, pictures = self.used, self._pictures(image)
         if self._tracker is None or len(pictures) > 1:
-            keypoints = _joined([self._extractors[name](picture, image.mask) for name, picture in pictures.items()])
+            keypoints = _joined([self._with_depth(image, name, picture) for name, picture in pictures.items()])
             parts = [
                 MeasuredKeypoints.untracked(keypoints, _depth_at(image, keypoints), self._noise.sigma(keypoints.size))
             ]
@@ -86,6 +86,10 @@ class TofFeatures:
                 self._tracker.forget()
             parts = self._tracked(self._tracker, image, *pictures.popitem())
         return joined_features(parts, image.stamp_ns, image.camera, "tof_optical_frame", max_relative_sigma)
+
+    def _with_depth(self, image: DepthImage, name: str, picture: ByteArray) -> Keypoints:
+        """Keypoints in the picture of that name; those without a depth, which no one uses, are not described."""
+        return self._extractors[name](picture, image.mask, lambda uv: has_depth(image, uv))
 
     def _tracked(self, tracker: Tracker, image: DepthImage, name: str, picture: ByteArray) -> list[MeasuredKeypoints]:
         """Tracks in the picture of that name, and new keypoints where they are few.

@@ -11,6 +11,7 @@ so that features cover the image (thesis section 3.2); the threshold follows the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,9 @@ _SURPLUS = 1.5
 """Candidates wanted per feature kept: the grid chooses among them."""
 _ADAPTATION = 0.7
 """Rate at which the threshold follows the number of candidates; 0 keeps it fixed."""
+
+Places = Callable[[Float32Array], npt.NDArray[np.bool_]]
+"""Tells of places (n, 2) px whether they are wanted (n,)."""
 
 TRACKING = ("auto", "always", "never")
 """Words that YAML does not take for true and false."""
@@ -96,10 +100,11 @@ class FeatureExtractor:
         """Keypoints left out so far because they lie in masks."""
         self._detect = make_detector(self.config, for_pairs=for_pairs, device=device)
 
-    def __call__(self, image: ByteArray, mask: ByteArray | None = None) -> Keypoints:
+    def __call__(self, image: ByteArray, mask: ByteArray | None = None, is_wanted: Places | None = None) -> Keypoints:
         """At most ``target`` keypoints of an image, uint8 (height, width), best of each grid cell first.
 
-        None lies where ``mask``, of the same shape, is not zero.
+        None lies where ``mask``, of the same shape, is not zero. Of those chosen only the ones whose places (n, 2) px
+        ``is_wanted`` says True (n,) of are described and returned.
 
         Raises
         ------
@@ -109,7 +114,7 @@ class FeatureExtractor:
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ValueError(f"features need a uint8 grey image (height, width), got {image.dtype} {image.shape}")
         for _ in range(_MOST_PASSES):
-            keypoints, candidates = self._one_pass(image, mask)
+            keypoints, candidates = self._one_pass(image, mask, is_wanted)
             enough = candidates >= self.config.target or self.threshold <= _THRESHOLD_RANGE[0]
             self._adapt(candidates)
             if enough or _ADAPTATION == 0.0:
@@ -124,7 +129,7 @@ class FeatureExtractor:
         """Forget the threshold."""
         self.threshold = _FIRST_THRESHOLD
 
-    def _one_pass(self, image: ByteArray, mask: ByteArray | None) -> tuple[Keypoints, int]:
+    def _one_pass(self, image: ByteArray, mask: ByteArray | None, is_wanted: Places | None) -> tuple[Keypoints, int]:
         candidates = masked = 0
 
         def select(uv: Float32Array, size: Float32Array, response: Float32Array) -> npt.NDArray[np.intp]:
@@ -132,7 +137,8 @@ class FeatureExtractor:
             free = np.flatnonzero(~is_masked(mask, uv))
             candidates, masked = len(free), len(uv) - len(free)
             shape, grid = (image.shape[0], image.shape[1]), (_GRID_ROWS, _GRID_COLUMNS)
-            return free[spread_over_grid(uv[free], response[free], shape, grid, self.config.target)]
+            chosen = free[spread_over_grid(uv[free], response[free], shape, grid, self.config.target)]
+            return chosen if is_wanted is None else chosen[is_wanted(uv[chosen])]
 
         keypoints = self._detect(image, self.threshold, select)
         self.masked += masked
