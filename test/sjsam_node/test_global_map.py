@@ -263,11 +263,14 @@ def test_what_cannot_be_joined_is_refused_and_changes_nothing(rng: np.random.Gen
     before = joined.state.poses.copy()
     bad = submaps[0].covariance.copy()
     bad[0, 0] = -1.0
+    indefinite = submaps[0].covariance.copy()
+    indefinite[0, 1] = indefinite[1, 0] = 2.0 * np.sqrt(indefinite[0, 0] * indefinite[1, 1])
     nan = submaps[0].landmarks.copy()
     nan[0] = np.nan
     later = 10**12
     for fault in (
         replace(submaps[0], covariance=bad, start_stamp_ns=later),
+        replace(submaps[0], covariance=indefinite, start_stamp_ns=later),
         replace(submaps[0], landmarks=nan, start_stamp_ns=later),
         replace(submaps[0], descriptors=submaps[0].descriptors[:, :64], start_stamp_ns=later),
         submaps[1],
@@ -276,7 +279,8 @@ def test_what_cannot_be_joined_is_refused_and_changes_nothing(rng: np.random.Gen
         assert not report.accepted
         assert report.reason
     assert np.array_equal(joined.state.poses, before)
-    assert sum(joined.counters.counts.values()) == 4
+    assert sum(joined.counters.counts.values()) == 5
+    assert joined.counters.counts["refused: covariance is not positive definite"] == 1
 
 
 def test_false_matches_are_taken_back(rng: np.random.Generator) -> None:

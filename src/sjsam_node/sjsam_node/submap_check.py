@@ -7,6 +7,7 @@ import numpy as np
 
 from sjsam_node.graph.map_graph import BUILDING, POSITIONS
 from slam_core.geometry import is_rigid_transform
+from slam_core.linear_algebra import blas
 from slam_core.messages.poses import FARTHEST_M
 from slam_core.types import Submap
 
@@ -26,8 +27,6 @@ def fault_of(submap: Submap) -> str:
         return f"variances below {SMALLEST_VARIANCE:g}, less than any sensor's"
     if not is_rigid_transform(submap.end_pose):
         return "end pose is not a rigid transform"
-    try:
-        np.linalg.cholesky(submap.covariance)
-    except np.linalg.LinAlgError:
+    if not blas.cholesky(np.array(submap.covariance.T, np.float64, order="F")):
         return "covariance is not positive definite"
     return ""
