@@ -113,7 +113,7 @@ def test_no_rim_is_lost_where_nothing_farther_is_near(room: Any, start: FloatArr
     points = room.scan(start, np.random.default_rng(3))[::7].copy()
     size, reach, step = 40, 0.03, 0.1
     sorted_points = edges._sorted_by_bin(points, size)
-    found = [np.zeros_like(points) for _ in range(2)]
+    found, around = [np.zeros_like(points) for _ in range(2)], np.empty((5, len(points)))
     for out, farthest in zip(found, (sorted_points[4], np.full(size * size, np.inf)), strict=True):
-        assert edges._find_rims(size, reach, step, *sorted_points[:4], farthest, out) > 20
+        assert edges._find_rims(size, reach, step, *sorted_points[:4], farthest, around, out) > 20
     np.testing.assert_array_equal(*found)

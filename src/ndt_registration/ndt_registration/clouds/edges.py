@@ -52,42 +52,53 @@ def _sorted_by_bin(points: FloatArray, size: int) -> tuple[FloatArray, FloatArra
 
 
 @in_place()
-def _nearest_behind(
-    i: int, size: int, reach: float, step: float, d: FloatArray, r: FloatArray, bins: Int32Array, first: Int32Array
-) -> int:
-    """The nearest point beside ``i`` that is more than ``step`` farther away, -1 if none is within reach."""
-    row, column = bins[i] // size, bins[i] % size
-    best, nearest = -1, reach * reach
+def _gather_around(k: int, size: int, d: FloatArray, r: FloatArray, first: Int32Array, around: FloatArray) -> int:
+    """Write directions and ranges of the points in a bin and those beside it to ``around`` (5, n); how many they are.
+
+    One coordinate beside the other's: so the compiler takes eight points at once.
+    """
+    row, column, count = k // size, k % size, 0
     for a in range(max(row - 1, 0), min(row + 2, size)):
         low = a * size + max(column - 1, 0)
         high = a * size + min(column + 1, size - 1)
         for j in range(first[low], first[high + 1]):
-            if r[j] > r[i] + step:
-                distance = (d[j, 0] - d[i, 0]) ** 2 + (d[j, 1] - d[i, 1]) ** 2 + (d[j, 2] - d[i, 2]) ** 2
-                if 0.0 < distance < nearest:
-                    best, nearest = j, distance
-    return best
+            around[0, count], around[1, count], around[2, count] = d[j, 0], d[j, 1], d[j, 2]
+            around[3, count] = r[j]
+            count += 1
+    return count
 
 
-@in_place()
-def _surface_goes_on(
-    i: int, behind: int, size: int, step: float, d: FloatArray, r: FloatArray, bins: Int32Array, first: Int32Array
-) -> bool:
-    """True if a point of the surface of ``i`` lies farther towards ``behind`` than ``i`` does, or before it."""
-    row, column = bins[i] // size, bins[i] % size
-    bx, by, bz = d[behind, 0] - d[i, 0], d[behind, 1] - d[i, 1], d[behind, 2] - d[i, 2]
+@in_place(fastmath={"nnan", "nsz"})
+def _nearest_behind(x, y, z, least, reach, xs, ys, zs, ranges, gaps):  # type: ignore[no-untyped-def]
+    """Index of the nearest direction that is more than ``least`` m away, -1 if none is within reach.
+
+    ``gaps`` (n,) is room for the squared distances between directions.
+    """
+    nearest = reach * reach
+    for j in range(xs.shape[0]):
+        gap = (xs[j] - x) ** 2 + (ys[j] - y) ** 2 + (zs[j] - z) ** 2
+        gaps[j] = gap if (ranges[j] > least) & (gap > 0.0) else np.inf
+    for j in range(xs.shape[0]):
+        nearest = min(nearest, gaps[j])
+    if nearest < reach * reach:
+        for j in range(xs.shape[0]):
+            if gaps[j] == nearest:
+                return j
+    return -1
+
+
+@in_place(error_model="numpy")
+def _surface_goes_on(x, y, z, behind, least, xs, ys, zs, ranges):  # type: ignore[no-untyped-def]
+    """True if a point of the surface lies farther towards ``behind`` than (x, y, z) does, or before it."""
+    bx, by, bz = xs[behind] - x, ys[behind] - y, zs[behind] - z
     gap = bx * bx + by * by + bz * bz
-    for a in range(max(row - 1, 0), min(row + 2, size)):
-        low = a * size + max(column - 1, 0)
-        high = a * size + min(column + 1, size - 1)
-        for j in range(first[low], first[high + 1]):
-            if r[j] <= r[i] + step and j != i:
-                x, y, z = d[j, 0] - d[i, 0], d[j, 1] - d[i, 1], d[j, 2] - d[i, 2]
-                along = (x * bx + y * by + z * bz) / gap
-                across = x * x + y * y + z * z - along * along * gap
-                if 0.3 < along < 2.0 and across < gap:
-                    return True
-    return False
+    hits = 0
+    for j in range(xs.shape[0]):
+        dx, dy, dz = xs[j] - x, ys[j] - y, zs[j] - z
+        along = (dx * bx + dy * by + dz * bz) / gap
+        across = dx * dx + dy * dy + dz * dz - along * along * gap
+        hits += (ranges[j] <= least) & (along > 0.3) & (along < 2.0) & (across < gap)
+    return hits > 0
 
 
 @in_place()
@@ -103,8 +114,8 @@ def _farthest_around(k: int, size: int, farthest: FloatArray) -> float:
 @njit(cache=True, nogil=True)
 def _rims(points: FloatArray, size: int, reach: float, step: float) -> FloatArray:
     d, r, bins, first, farthest = _sorted_by_bin(points, size)
-    out = np.empty((points.shape[0], 3))
-    used = _find_rims(size, reach, step, d, r, bins, first, farthest, out)
+    out, around = np.empty((points.shape[0], 3)), np.empty((5, points.shape[0]))
+    used = _find_rims(size, reach, step, d, r, bins, first, farthest, around, out)
     return out[:used].copy()
 
 
@@ -118,21 +129,28 @@ def _find_rims(
     bins: Int32Array,
     first: Int32Array,
     farthest: FloatArray,
+    around: FloatArray,
     out: FloatArray,
 ) -> int:
-    """Write the rims to ``out``; returns their number."""
-    used, last, limit = 0, -1, 0.0
+    """Write the rims to ``out``; returns their number. ``around`` (5, n) is room."""
+    used, last, limit, count = 0, -1, 0.0, 0
     for i in range(len(r)):
         if bins[i] != last:
-            last, limit = bins[i], _farthest_around(bins[i], size, farthest)
-        if not limit > r[i] + step:  # on most surfaces nothing is farther by so much
+            last, limit, count = bins[i], _farthest_around(bins[i], size, farthest), 0
+        least = r[i] + step
+        if not limit > least:  # on most surfaces nothing is farther by so much
             continue
-        behind = _nearest_behind(i, size, reach, step, d, r, bins, first)
-        if behind < 0 or _surface_goes_on(i, behind, size, step, d, r, bins, first):
+        if count == 0:
+            count = _gather_around(last, size, d, r, first, around)
+        x, y, z = d[i, 0], d[i, 1], d[i, 2]
+        xs, ys, zs, ranges = around[0, :count], around[1, :count], around[2, :count], around[3, :count]
+        behind = _nearest_behind(x, y, z, least, reach, xs, ys, zs, ranges, around[4])
+        if behind < 0 or _surface_goes_on(x, y, z, behind, least, xs, ys, zs, ranges):
             continue
         # The rim lies between the last direction that sees the surface and the first that misses it.
-        for c in range(3):
-            out[used, c] = 0.5 * r[i] * (d[i, c] + d[behind, c])
+        out[used, 0] = 0.5 * r[i] * (x + xs[behind])
+        out[used, 1] = 0.5 * r[i] * (y + ys[behind])
+        out[used, 2] = 0.5 * r[i] * (z + zs[behind])
         used += 1
     return used
 
