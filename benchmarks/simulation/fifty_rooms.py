@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes bags/scenarios/fifty_rooms.yaml: 50 rooms along two corridors that two passages join to a ring.
 
-    python benchmarks/simulation/fifty_rooms.py
+    python benchmarks/simulation/fifty_rooms.py [--agents N --seconds S -o FILE]
 
 The path goes into every room, round once, and out again; along the first corridor, through the passage, back along
 the second and home. It closes one large loop and fifty small ones.
+
+With ``--agents`` the path is cut into stretches, one for each agent, that overlap by half: every place but the ends is
+walked by two. All set out at the same time.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
 from itertools import pairwise
 from pathlib import Path
@@ -101,29 +105,67 @@ def walk() -> list[Point]:
     ]
 
 
+def stretch(points: list[Point], begin: float, length: float) -> list[Point]:
+    """The part of a path from ``begin`` (m along it) on, so long; ends between way points are interpolated."""
+    out: list[Point] = []
+    at = 0.0
+    for a, b in pairwise(points):
+        step = math.dist(a[:2], b[:2])
+        for where in (begin, begin + length):
+            if at <= where < at + step:
+                share = (where - at) / step
+                out.append([a[k] + share * (b[k] - a[k]) for k in range(2)])
+        at += step
+        if begin < at < begin + length:
+            out.append(b[:2])
+    return out
+
+
+def agent_lines(paths: dict[str, list[Point]]) -> list[str]:
+    """Lines of the agents and their way points."""
+    lines = []
+    for name, points in paths.items():
+        lines += [f"  - name: {name}", "    motion: rig"] if name else ["  - motion: rig"]
+        lines += ["    height: 1.2", "    path:", *(f"      - [{', '.join(f'{c:.2f}' for c in p)}]" for p in points)]
+    return lines
+
+
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--agents", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=24.0, help="that each of several agents walks")
+    parser.add_argument("-o", "--output", type=Path, default=SCENARIO, metavar="FILE")
+    arguments = parser.parse_args()
+    if arguments.agents > 1 and arguments.output == SCENARIO:
+        parser.error("several agents are a scenario of their own: name its file with -o")
     rooms, doors = plan()
     points = walk()
-    points[0].append(0.0)
     length = sum(math.dist(a[:2], b[:2]) for a, b in pairwise(points))
+    if arguments.agents == 1:
+        points[0].append(0.0)
+        paths, seconds = {"": points}, length / SPEED
+        description = f"A building of 50 rooms, every one visited, about {length:.0f} m; for scale"
+    else:
+        seconds, each = arguments.seconds, SPEED * arguments.seconds
+        if (arguments.agents + 1) * each / 2 > length:
+            parser.error(f"the path of {length:.0f} m is too short for {arguments.agents} agents of {each:.0f} m")
+        paths = {f"agent_{k}": stretch(points, k * each / 2, each) for k in range(arguments.agents)}
+        description = f"{arguments.agents} agents in a building of 50 rooms, {each:.0f} m each; for scale"
     lines = [
-        f"description: A building of 50 rooms, every one visited, about {length:.0f} m; for scale",
+        f"description: {description}",
         "# Written by benchmarks/simulation/fifty_rooms.py.",
         "seed: 950",
         "rate: 10.0",
-        f"frames: {int(length / SPEED * 10)}",
+        f"frames: {int(seconds * 10)}",
         "rooms:",
         *rooms,
         "doorways:",
         *doors,
         "agents:",
-        "  - motion: rig",
-        "    height: 1.2",
-        "    path:",
-        *(f"      - [{', '.join(f'{c:.2f}' for c in p)}]" for p in points),
+        *agent_lines(paths),
     ]
-    SCENARIO.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(f"{SCENARIO}: {len(rooms)} rooms with corridors, {length:.0f} m")
+    arguments.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(f"{arguments.output}: {len(rooms)} rooms with corridors, {length:.0f} m")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,11 @@ from slam_radio.queues.detail_store import DetailStore
 from slam_radio.queues.inbox import Inbox
 from slam_radio.queues.outbox import Outbox
 from slam_radio.uplink import Uplink
+from slam_radio.views.view_files import ViewFiles
+from slam_radio.views.view_inbox import ViewInbox
+from slam_radio.views.view_sender import ViewSender
 from slam_radio.wire.radio_messages import pack_pose, unpack_acknowledgement, unpack_want
+from slam_radio.wire.view_messages import unpack_look, unpack_piece, unpack_unseen
 
 SIZE = LightConfig(landmarks=5, rank=1)
 STEP_S = 0.1
@@ -36,6 +40,10 @@ class World:
     detailed: list[Submap] = field(default_factory=list)
     detail_keys: list[int] = field(default_factory=list)
     wants: int = 0
+    looks: int = 0
+    pieces: list[tuple[int, int]] = field(default_factory=list)
+    seen: list[int] = field(default_factory=list)
+    kinds: list[str] = field(default_factory=list)
     told_none: list[int] = field(default_factory=list)
     passed_on: list[int] = field(default_factory=list)
     sent: list[tuple[float, int]] = field(default_factory=list)
@@ -50,15 +58,19 @@ class World:
         if hasattr(self, "uplink"):
             self.uplink.outbox.close()
             self.uplink.details.folder.close()
+            self.uplink.views.files.close()
         details = DetailStore(self.folder / "details", self.bytes_per_second)
-        self.uplink = Uplink(Outbox(self.folder / "out"), self.bytes_per_second, details=details)
+        views = ViewSender(ViewFiles(self.folder / "shots", 1e6), self.bytes_per_second)
+        self.uplink = Uplink(Outbox(self.folder / "out"), self.bytes_per_second, details=details, views=views)
 
     def start_post(self) -> list[int]:
         """Start the post anew; the indices that it passes on again."""
         if hasattr(self, "downlink"):
             self.inbox.close()
+            self.views.close()
         self.inbox = Inbox("one", self.folder / "in")
-        self.downlink = Downlink([self.inbox], 2000.0)
+        self.views = ViewInbox("one", self.folder / "views", 1e6)
+        self.downlink = Downlink([self.inbox], 2000.0, views={"one": self.views})
         return [s.index for s in self.inbox.release()]
 
     def submap(self, index: int) -> None:
@@ -83,7 +95,11 @@ class World:
             self.uplink.set_pose(pack_pose(PoseEstimate(round(now * 1e9), np.eye(4), 1e-4 * np.eye(6))))
         for message in self.uplink.due(now):
             self.sent.append((now, len(message.data) + OVERHEAD))
-            if message.kind == "details":
+            self.kinds.append(message.kind)
+            if message.kind == "piece":
+                piece = unpack_piece(message.data)
+                self.pieces.append((piece.key.stamp_ns, piece.number))
+            elif message.kind == "details":
                 self.detail_keys.append(message.key[1])
             elif message.key is not None:
                 self.keys.append(message.key[1])
@@ -91,6 +107,11 @@ class World:
                 continue
             if message.kind == "backlog":
                 self.downlink.on_backlog("one", message.data, now)
+            elif message.kind == "piece":
+                view = self.downlink.on_piece("one", message.data, now)
+                self.seen += [] if view is None else [view.stamp_ns]
+            elif message.kind == "unseen":
+                self.views.give_up(unpack_unseen(message.data))
             elif message.kind == "none":
                 self.told_none.append(self.downlink.on_none("one", message.data, now))
             elif message.key is None:
@@ -107,3 +128,6 @@ class World:
             elif told.kind == "want":
                 self.wants += 1
                 self.uplink.details.want(unpack_want(told.data))
+            elif told.kind == "look":
+                self.looks += 1
+                self.uplink.views.lack(unpack_look(told.data), now)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,8 @@ from slam_core.types import PoseEstimate, Submap
 from slam_radio.link_state import Hearing, LinkState
 from slam_radio.queues.byte_budget import OVERHEAD, ByteBudget
 from slam_radio.queues.inbox import Inbox
+from slam_radio.views.view_format import View
+from slam_radio.views.view_inbox import ViewInbox
 from slam_radio.wire.index_ranges import Key, Range
 from slam_radio.wire.link_report import Backlog, LinkReport, unpack_backlog
 from slam_radio.wire.radio_messages import (
@@ -24,10 +26,13 @@ from slam_radio.wire.radio_messages import (
     unpack_none,
     unpack_pose,
 )
+from slam_radio.wire.view_messages import Lack, pack_look
 
 _BEACON_PERIOD_S = 3.0
 """An acknowledgement goes out so often even if there is no news: agents learn from it that the post is there."""
 _LEAST_PERIOD_S = 0.25
+_LOOK_PERIOD_S = 1.0
+"""News of pieces that have come go out so often at most: four seconds of the link are under way."""
 _CORRECTION_PERIOD_S = 1.0
 _REMINDER_PERIOD_S = 10.0
 _LEAST_CHANGE = np.repeat([1e-3, 2e-4], 3)
@@ -35,7 +40,7 @@ _LEAST_CHANGE = np.repeat([1e-3, 2e-4], 3)
 
 
 class Message(NamedTuple):
-    """A message for an agent, ``kind`` being ``ack``, ``want`` or ``correction``."""
+    """A message for an agent, ``kind`` being ``ack``, ``want``, ``look`` or ``correction``."""
 
     agent: str
     kind: str
@@ -45,8 +50,8 @@ class Message(NamedTuple):
 class _Agent:
     """The post's record of one agent."""
 
-    def __init__(self, inbox: Inbox, silent_after_s: float) -> None:
-        self.inbox = inbox
+    def __init__(self, inbox: Inbox, silent_after_s: float, views: ViewInbox | None) -> None:
+        self.inbox, self.views = inbox, views
         self.hearing = Hearing(silent_after_s)
         self.backlog: Backlog | None = None
         self.has_news = False
@@ -54,6 +59,8 @@ class _Agent:
         self.wants: list[Range] | None = []
         self.wanted_at_s = float("-inf")
         self.first_want = 0
+        self.looks: list[Lack] | None = []
+        self.looked_at_s = float("-inf")
         self.correction: tuple[int, FloatArray] | None = None
         self.corrected_by: FloatArray | None = None
         self.corrected_at_s = float("-inf")
@@ -62,6 +69,11 @@ class _Agent:
         """True if the agent does not know what is wanted, or may have to be told again."""
         pause_s = now_s - self.wanted_at_s
         return pause_s >= _LEAST_PERIOD_S if self.wants != lacking else bool(lacking) and pause_s >= _BEACON_PERIOD_S
+
+    def look_is_due(self, lacks: list[Lack], now_s: float) -> bool:
+        """True if the agent does not know which pieces of views are lacking, or may have to be told again."""
+        pause_s = now_s - self.looked_at_s
+        return pause_s >= _LOOK_PERIOD_S if self.looks != lacks else bool(lacks) and pause_s >= _BEACON_PERIOD_S
 
     def correction_is_due(self, now_s: float) -> bool:
         """True if there is a correction that the agent does not have, or has not had for long."""
@@ -76,11 +88,16 @@ class _Agent:
 class Downlink:
     """Takes messages of agents, and decides what they are told. Times are those of any steady clock, s.
 
-    ``budget``: bytes a second on the wire, or one that several share.
+    ``budget``: bytes a second on the wire, or one that several share. ``views``: those of each agent, where some may be
+    asked for.
     """
 
-    def __init__(self, inboxes: Iterable[Inbox], budget: float | ByteBudget, silent_after_s: float = 10.0) -> None:
-        self._agents = {inbox.agent: _Agent(inbox, silent_after_s) for inbox in inboxes}
+    def __init__(
+        self, inboxes: Iterable[Inbox], budget: float | ByteBudget, silent_after_s: float = 10.0,
+        views: Mapping[str, ViewInbox] | None = None,
+    ) -> None:  # fmt: skip
+        found = views or {}
+        self._agents = {i.agent: _Agent(i, silent_after_s, found.get(i.agent)) for i in inboxes}
         self._budget = budget if isinstance(budget, ByteBudget) else ByteBudget(budget)
 
     @property
@@ -110,6 +127,14 @@ class Downlink:
         ranges = unpack_none(data)
         agent.hearing.heard(now_s)
         return agent.inbox.give_up(ranges)
+
+    def on_piece(self, name: str, data: bytes, now_s: float) -> View | None:
+        """Take a piece of a view; returns the view if it is whole. Raises as :meth:`ViewInbox.take`."""
+        agent = self._agents[name]
+        assert agent.views is not None
+        agent.hearing.heard(now_s)
+        agent.looks = None  # the agent is to know that it has come
+        return agent.views.take(data)
 
     def on_pose(self, name: str, data: bytes, now_s: float) -> PoseEstimate:
         """Take a pose; ValueError if it is damaged."""
@@ -146,6 +171,12 @@ class Downlink:
                 if self._take_budget(data, now_s):
                     agent.wanted_at_s, agent.wants, agent.first_want = now_s, lacking, first + MOST_RANGES
                     out.append(Message(name, "want", data))
+            lacks = [] if agent.views is None else agent.views.lacks()
+            if agent.look_is_due(lacks, now_s) and agent.hearing.is_up(now_s):
+                data = pack_look(lacks)
+                if self._take_budget(data, now_s):
+                    agent.looked_at_s, agent.looks = now_s, lacks
+                    out.append(Message(name, "look", data))
             if agent.correction_is_due(now_s) and agent.hearing.is_up(now_s):
                 data = pack_correction(*agent.correction)  # type: ignore[misc]
                 if self._take_budget(data, now_s):

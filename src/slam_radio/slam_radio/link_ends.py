@@ -1,22 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ends of a link: an agent's and a post's."""
+"""An agent's end of a link, and a post's."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import Any, Protocol
 
 from slam_core.geometry import FloatArray
-from slam_core.health import Health
 from slam_core.messages import (
     SUBMAP_TOPICS,
-    MessageTypes,
     estimate_from_message,
     odometry_message,
+    pose_from_message,
     stamp_ns,
     submap_from_messages,
     submap_messages,
@@ -29,83 +26,16 @@ from slam_core.messages.submaps import SubmapMessages
 from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.types import PoseEstimate, Submap
 from slam_radio.downlink import Downlink
+from slam_radio.link_end import End, LinkNode
 from slam_radio.link_state import LinkState
 from slam_radio.packing.light_submap import pack
 from slam_radio.queues.detail_store import DetailStore
 from slam_radio.queues.inbox import Inbox
 from slam_radio.queues.outbox import Outbox
-from slam_radio.radio_config import RadioConfig
 from slam_radio.uplink import Uplink
+from slam_radio.view_ends import AgentViews, PostViews
 from slam_radio.wire.index_ranges import Key
 from slam_radio.wire.radio_messages import pack_pose, unpack_acknowledgement, unpack_correction, unpack_want
-from slam_radio.zenoh_link import ZenohLink
-
-
-class LinkNode(Protocol):
-    """The node of an end, as far as the end needs it: its topics, its health, and the link of bytes."""
-
-    config: RadioConfig
-    state_folder: Path
-    link: ZenohLink
-    health: Health
-    types: MessageTypes
-
-    def listen(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
-    def listen_together(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
-    def advertise(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
-    def publish(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
-    def broadcast(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
-    def do_later(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
-    def serve(self, name: str, action: Callable[[], str]) -> None: ...  # noqa: D102
-    def get_logger(self, *args: Any, **more: Any) -> Any: ...  # noqa: D102
-
-
-class End:
-    """One end of the link, around its node: ``pump`` sends what is due, ``state`` is its health."""
-
-    def __init__(self, node: LinkNode) -> None:
-        self.node = node
-
-    def pump(self, now_s: float) -> None:
-        """Send what is due."""
-        raise NotImplementedError
-
-    def state(self, now_s: float) -> LinkState:
-        """Health of the link."""
-        raise NotImplementedError
-
-    def reset(self) -> None:
-        """Forget what has come (``~/reset``); what waits still has to go out."""
-
-    def close(self) -> None:
-        """Keep what waits and what has come for the next start."""
-
-    def tell_strangers(self, strangers: Mapping[Path, int], use: str) -> None:
-        """Say which files of before this program cannot read; they stay where they are."""
-        for folder, count in strangers.items():
-            self.node.health.count("files of another version", count)
-            self.node.get_logger().warning(
-                f"{count} files in {folder} are of another version of this program, or damaged: "
-                f"they are kept, and not {use}"
-            )
-
-    def hear(self, key: str, handle: Callable[[str, bytes], None]) -> None:
-        """Have messages under a key handled in the node's own thread; damaged ones are counted."""
-
-        def run(name: str, data: bytes) -> None:
-            self.node.health.count("bytes_received", len(data))
-            try:
-                handle(name, data)
-            except (ValueError, OSError) as error:
-                self.node.health.count("damaged" if isinstance(error, ValueError) else "not_written")
-                self.node.get_logger().warning(f"{name}: message refused: {error}", throttle_duration_sec=1.0)
-
-        self.node.link.listen(key, lambda name, data: self.node.do_later("radio", partial(run, name, data)))
-
-    def send(self, key: str, data: bytes, *, urgent: bool = False) -> None:
-        """Send and count."""
-        self.node.health.count("bytes_sent", len(data))
-        self.node.link.send(key, data, urgent=urgent)
 
 
 class AgentEnd(End):
@@ -120,9 +50,11 @@ class AgentEnd(End):
             node.state_folder / "details" / self.name, config.bytes_per_second, config.resend_after_s,
             1e6 * config.whole_megabytes,
         )  # fmt: skip
+        self.views = AgentViews(self, self.name)
         self.uplink = Uplink(
-            outbox, config.bytes_per_second, config.resend_after_s, config.silent_after_s, self.details
-        )
+            outbox, config.bytes_per_second, config.resend_after_s, config.silent_after_s, self.details,
+            self.views.sender,
+        )  # fmt: skip
         self._odometry: Message | None = None
         self._T_map_odom: FloatArray | None = None
         self.tell_strangers(outbox.strangers, "sent")
@@ -145,6 +77,7 @@ class AgentEnd(End):
             self.node.health.count("submaps sent again")
             return
         submap = replace(submap, agent=self.name)
+        self.views.on_submap(submap)
         message = pack(submap, self.node.config.light)
         try:
             self.details.keep(key, submap, message)
@@ -160,6 +93,7 @@ class AgentEnd(End):
     def on_odometry(self, message: Message) -> None:
         """Keep the newest pose; publish where the post's map has it."""
         self._odometry = message
+        self.views.on_pose(pose_from_message(message.pose.pose))
         topic = self.node.config.correction_topic
         if self._T_map_odom is not None and topic:
             config = self.node.config
@@ -201,12 +135,14 @@ class AgentEnd(End):
             "details sent": self.details.sent, "details that cannot be told": self.details.damaged,
         }  # fmt: skip
         self.node.health.take(counts)
+        self.views.show()
         return self.uplink.state(now_s)
 
     def close(self) -> None:
         """Keep what waits for the next start."""
         self.uplink.outbox.close()
         self.details.folder.close()
+        self.views.close()
 
 
 class PostEnd(End):
@@ -216,8 +152,9 @@ class PostEnd(End):
         super().__init__(node)
         config = node.config
         inboxes = [Inbox(agent, node.state_folder / "inbox" / agent) for agent in config.agents]
-        self.downlink = Downlink(inboxes, config.bytes_per_second, config.silent_after_s)
-        self.publisher = SubmapPublisher(node, config.agents)
+        self.views = PostViews(self, config.agents)
+        self.downlink = Downlink(inboxes, config.bytes_per_second, config.silent_after_s, self.views.inboxes)
+        self.publisher = SubmapPublisher(node, config.agents, self.views.on_submap)
         for inbox in inboxes:
             self.tell_strangers(inbox.strangers, "passed on")
         for agent in config.agents:
@@ -234,6 +171,7 @@ class PostEnd(End):
             self.hear(f"slam/{agent}/submap/*/*", partial(self.on_submap, agent))
             self.hear(f"slam/{agent}/details/*/*", partial(self.on_details, agent))
             self.hear(f"slam/{agent}/none", partial(self.on_none, agent))
+            self.hear(f"slam/{agent}/piece", partial(self.on_piece, agent))
             self.hear(f"slam/{agent}/backlog", partial(self.on_backlog, agent))
 
     def on_pose(self, agent: str, _: str, data: bytes) -> None:
@@ -254,6 +192,10 @@ class PostEnd(End):
         """An agent cannot tell some details: they are not asked for again, but with all others."""
         if count := self.downlink.on_none(agent, data, time.monotonic()):
             self.node.health.count("details that agents cannot tell", count)
+
+    def on_piece(self, agent: str, _: str, data: bytes) -> None:
+        """Keep a piece of a view, and publish the view if that is whole."""
+        self.views.on_piece(agent, self.downlink.on_piece(agent, data, time.monotonic()))
 
     def on_undecided(self, message: Message) -> None:
         """The map cannot tell if some submaps are of one place: ask for all that their agents know of them."""
@@ -283,24 +225,29 @@ class PostEnd(End):
         """Health of the link."""
         self.publisher.show(self.downlink, now_s)
         self.node.health.take({"details wanted": sum(len(inbox.wanted) for inbox in self.downlink.inboxes)})
+        self.views.show()
         return self.downlink.state(now_s)
 
     def reset(self) -> None:
         """Forget what has come; it is not sent again."""
         for inbox in self.downlink.inboxes:
             inbox.forget()
+        self.views.reset()
 
     def close(self) -> None:
         """Keep what has come for the next start."""
         for inbox in self.downlink.inboxes:
             inbox.close()
+        self.views.close()
 
 
 class SubmapPublisher:
     """Submaps and poses of agents as ``sjsam`` reads them, below their names."""
 
-    def __init__(self, node: LinkNode, agents: Iterable[str]) -> None:
-        self.node = node
+    def __init__(
+        self, node: LinkNode, agents: Iterable[str], notice: Callable[[str, Submap], None] | None = None
+    ) -> None:
+        self.node, self._notice = node, notice
         self._begun = False
         for agent in agents:
             for topic, kind in SUBMAP_TOPICS.items():
@@ -313,6 +260,8 @@ class SubmapPublisher:
             for topic, message in zip(SUBMAP_TOPICS, submap_messages(self.node.types, submap), strict=True):
                 self.node.publish(f"{agent}/{topic}", message)
             self.node.health.count("submaps passed on")
+            if self._notice is not None:
+                self._notice(agent, submap)
 
     def pass_on_pose(self, agent: str, pose: PoseEstimate) -> None:
         """Publish a pose of an agent as its odometry."""

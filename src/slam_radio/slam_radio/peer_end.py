@@ -13,7 +13,8 @@ from slam_core.messages.base import Message
 from slam_core.messages.submaps import SubmapMessages
 from slam_core.nodes.stamp_guard import StampPolicy
 from slam_radio.downlink import Downlink
-from slam_radio.link_ends import End, LinkNode, SubmapPublisher, submap_key
+from slam_radio.link_end import End, LinkNode
+from slam_radio.link_ends import SubmapPublisher, submap_key
 from slam_radio.link_state import LinkState
 from slam_radio.packing.light_submap import pack
 from slam_radio.queues.byte_budget import ByteBudget

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from slam_core.config import Config, group, parameter
 from slam_radio.packing.light_submap import LightConfig
+from slam_radio.views.view_config import ViewConfig
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
@@ -35,6 +36,7 @@ class RadioConfig(Config):
         500.0, "whole submaps that an agent keeps on disk for a post that asks for details; of older ones it keeps the "
         "details packed, a thousandth of that", unit="MB", minimum=0.0,
     )  # fmt: skip
+    views: ViewConfig = group(ViewConfig)
     state_path: str = parameter(
         "radio", "folder of what waits and of what has come; a relative one below the user's state and the namespace"
     )

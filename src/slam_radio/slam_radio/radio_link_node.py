@@ -4,7 +4,8 @@
 At the agent it reads ``submap/*`` and ``odom``; at the post it publishes them below each agent's name, as ``sjsam``
 reads them, and sends ``sjsam``'s ``map_to_odom`` back. Key expressions: ``slam/<agent>/pose``,
 ``slam/<agent>/submap/<session>/<index>`` and ``slam/<agent>/backlog`` to the post, ``slam/<agent>/ack`` and
-``slam/<agent>/correction`` from it; ``slam/<agent>/want`` from it asks for ``slam/<agent>/details/<session>/<index>``.
+``slam/<agent>/correction`` from it; ``slam/<agent>/want`` from it asks for ``slam/<agent>/details/<session>/<index>``,
+``slam/<agent>/look`` for pictures and dense key frames in pieces, ``slam/<agent>/piece``.
 With role peer an agent has such a link to every other one, under ``slam/<agent>/to/<other>/...``, and publishes all
 submaps, its own too, as a post would have them.
 """
@@ -24,7 +25,8 @@ from std_srvs.srv import Trigger
 from slam_core.nodes.base_node import SlamNode
 from slam_core.ros import run_node
 from slam_core.storage.files import state_folder
-from slam_radio.link_ends import AgentEnd, End, PostEnd
+from slam_radio.link_end import End
+from slam_radio.link_ends import AgentEnd, PostEnd
 from slam_radio.packing.symbol_code import coder_library
 from slam_radio.peer_end import PeerEnd
 from slam_radio.radio_config import RadioConfig

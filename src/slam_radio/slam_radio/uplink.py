@@ -4,8 +4,8 @@
 The newest pose goes first and always, once a second. Submaps follow oldest first, as far as the budget allows and while
 the post is heard; few are under way at a time, so that a slow link does not fill with what poses would wait behind. One
 that is not acknowledged goes out again as soon as one that went out later is, else after a time that doubles from try
-to try. How much waits is told while it waits, and when nothing does any more. Details that the post wants come last,
-when no submap waits.
+to try. How much waits is told while it waits, and when nothing does any more. Details that the post wants come when no
+submap waits, and pictures and dense key frames when no details go out either.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from slam_radio.queues.byte_budget import OVERHEAD, ByteBudget
 from slam_radio.queues.detail_store import DetailStore
 from slam_radio.queues.in_flight import InFlight
 from slam_radio.queues.outbox import Outbox
+from slam_radio.views.view_sender import ViewSender
 from slam_radio.wire.index_ranges import Key, Range
 from slam_radio.wire.link_report import Backlog, pack_backlog
 from slam_radio.wire.radio_messages import pack_submap
@@ -32,7 +33,7 @@ _LEAST_WAIT_S = 2.0
 
 @dataclass(frozen=True)
 class Outgoing:
-    """A message to send: ``kind`` pose, submap, details, none or backlog, ``key`` of a submap."""
+    """A message to send, ``key`` of a submap; ``kind``: pose, submap, details, none, backlog, piece or unseen."""
 
     kind: str
     data: bytes
@@ -57,15 +58,15 @@ class Uplink:
         A submap that is not acknowledged goes out again after so long, then after twice that, up to a minute.
     silent_after_s
         The post counts as silent when nothing came from it for so long.
-    details
+    details, views
         What the post may ask for.
     """
 
     def __init__(
         self, outbox: Outbox, budget: float | ByteBudget, resend_after_s: float = 5.0, silent_after_s: float = 10.0,
-        details: DetailStore | None = None,
+        details: DetailStore | None = None, views: ViewSender | None = None,
     ) -> None:  # fmt: skip
-        self.outbox, self.details = outbox, details
+        self.outbox, self.details, self.views = outbox, details, views
         self._budget = budget if isinstance(budget, ByteBudget) else ByteBudget(budget)
         self._flight = InFlight(self._budget.bytes_per_second, resend_after_s)
         self._hearing = Hearing(silent_after_s)
@@ -110,8 +111,9 @@ class Uplink:
         """The post is there; after a silence what was under way goes out again soon."""
         if not self._hearing.is_up(now_s):
             self._flight.hurry(now_s)
-            if self.details is not None:
-                self.details.hurry(now_s)
+            for asked in (self.details, self.views):
+                if asked is not None:
+                    asked.hurry(now_s)
         self._hearing.heard(now_s)
 
     def due(self, now_s: float) -> list[Outgoing]:
@@ -119,7 +121,8 @@ class Uplink:
         out = self.due_pose(now_s)
         while (key := self.ready(now_s)) is not None and self.affords(key, now_s):
             out.append(self.take(key, now_s))
-        return out + self.due_backlog(now_s) + self.due_details(now_s)
+        out += self.due_backlog(now_s) + self.due_details(now_s)
+        return out + self.due_views(now_s)
 
     def due_details(self, now_s: float) -> list[Outgoing]:
         """Details that the post wants, and which there are not, while no submap waits."""
@@ -137,6 +140,25 @@ class Uplink:
             if (data := self.details.take(key, now_s)) is not None:
                 self._budget.spend(size)
                 out.append(Outgoing("details", data, key))
+        return out
+
+    def due_views(self, now_s: float) -> list[Outgoing]:
+        """Pieces of views that the post lacks, and names of those which there are not, while nothing else waits."""
+        out: list[Outgoing] = []
+        if self.views is None or self.outbox.waiting or not self._hearing.is_up(now_s):
+            return out
+        if self.details is not None and self.details.ready(now_s) is not None:
+            return out
+        if (unseen := self.views.unseen()) is not None and self._budget.allows(len(unseen) + OVERHEAD, now_s):
+            self._budget.spend(len(unseen) + OVERHEAD)
+            self.views.unseen_is_sent()
+            out.append(Outgoing("unseen", unseen))
+        while (piece := self.views.ready(now_s)) is not None:
+            size = self.views.size(piece)
+            if not self._budget.allows(size, now_s):
+                break
+            self._budget.spend(size)
+            out.append(Outgoing("piece", self.views.take(piece, now_s)))
         return out
 
     def due_pose(self, now_s: float) -> list[Outgoing]:

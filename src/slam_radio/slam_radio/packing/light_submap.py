@@ -239,10 +239,10 @@ def sealed(magic: bytes, version: int, rest: bytes) -> bytes:
     return ENVELOPE.pack(magic, version, zlib.crc32(rest)) + rest
 
 
-def opened(data: bytes, magic: bytes, version: int, name: str) -> bytes:
+def opened(data: bytes, magic: bytes, version: int, name: str, most_bytes: int = MOST_BYTES) -> bytes:
     """The rest of a message without its envelope; ``ValueError`` if it is damaged or another one."""
-    if not ENVELOPE.size <= len(data) <= MOST_BYTES:
-        raise ValueError(f"a {name} has {ENVELOPE.size} to {MOST_BYTES} bytes, got {len(data)}")
+    if not ENVELOPE.size <= len(data) <= most_bytes:
+        raise ValueError(f"a {name} has {ENVELOPE.size} to {most_bytes} bytes, got {len(data)}")
     found, found_version, checksum = ENVELOPE.unpack_from(data)
     if found != magic or found_version != version:
         raise ValueError(f"not a {name} of version {version}: begins with {bytes(data[:3])!r}")

@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
-
-from slam_radio.wire.index_ranges import Key
 
 _WINDOW_S = 4.0
 """So many seconds of the budget, or one message, may be under way."""
@@ -31,9 +29,9 @@ class InFlight:
     def __init__(self, bytes_per_second: float, resend_after_s: float) -> None:
         self.bytes_per_second, self.resent = bytes_per_second, 0
         self._resend_after_s = resend_after_s
-        self._sent: dict[Key, _Sent] = {}
+        self._sent: dict[Hashable, _Sent] = {}
 
-    def is_due(self, key: Key, now_s: float) -> bool:
+    def is_due(self, key: Hashable, now_s: float) -> bool:
         """True if a message was not sent yet, or has to go out again."""
         return key not in self._sent or self._sent[key].due_s <= now_s
 
@@ -42,7 +40,7 @@ class InFlight:
         under_way = self._under_way(now_s)
         return not under_way or under_way + size <= _WINDOW_S * self.bytes_per_second
 
-    def sent(self, key: Key, size: int, now_s: float) -> None:
+    def sent(self, key: Hashable, size: int, now_s: float) -> None:
         """A message goes out."""
         tries = self._sent[key].tries + 1 if key in self._sent else 1
         is_repeated = self._sent.pop(key, None) is not None
@@ -51,11 +49,11 @@ class InFlight:
         arrives_s = (self._under_way(now_s) + size) / self.bytes_per_second
         self._sent[key] = _Sent(tries, now_s + wait + arrives_s, size, is_repeated)
 
-    def landed(self, key: Key) -> None:
+    def landed(self, key: Hashable) -> None:
         """The other side has a message, or does not want it any more."""
         self._sent.pop(key, None)
 
-    def overtaken(self, by: Iterable[Key], now_s: float) -> None:
+    def overtaken(self, by: Iterable[Hashable], now_s: float) -> None:
         """Send again what went out before one of these, which have landed: it is lost.
 
         Messages arrive in the order in which they went out. One that went out several times says nothing: its first
