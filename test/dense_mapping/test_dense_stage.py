@@ -10,6 +10,7 @@ from dense_mapping.dense_model import DenseConfig
 from dense_mapping.dense_stage import DenseStage
 from dense_room import Room
 from slam_core.geometry import OPTICAL_FROM_RIG, boxplus, invert_transform, make_transform, so3_exp
+from slam_core.messages.key_frames import AnchoredKeyFrame
 from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray, Mask
 
@@ -135,3 +136,23 @@ def test_a_mask_of_another_size_is_refused(room: Room) -> None:
     stage.add_mask("one", "tof", Mask(image.stamp_ns, np.ones((7, 9), np.uint8)))
     stage.add("one", "tof", T_BASE_CAMERA, image)
     assert (stage.refused_masks, stage.waiting) == (1, 1)
+
+
+def test_a_key_frame_of_the_radio_is_where_its_submap_is_and_moves_with_it(room: Room) -> None:
+    image = room.depth(3, np.random.default_rng(5))
+    object.__setattr__(image, "stamp_ns", 12_345)  # the path has no pose of this time
+    T_start_camera = boxplus(T_BASE_CAMERA, np.array([0.3, 0.1, 0.0, 0.0, 0.1, 0.0]))
+    stage, path = DenseStage(DenseConfig()), path_of(room, "one")
+    frame = AnchoredKeyFrame(image, red(1), 2 * STEP_NS, T_start_camera)
+    assert not stage.add_anchored("one", frame)  # no path yet
+    assert stage.set_path("one", path) == 1
+    placed = stage.model.keyframes[0]
+    np.testing.assert_allclose(placed.T_map_camera, path.poses[1] @ T_start_camera, atol=1e-12)
+    assert (placed.keyframe.picture == red(1)[0, 0]).all()
+    assert not stage.add_anchored("one", frame)  # it is there
+    second = AnchoredKeyFrame(room.depth(4, np.random.default_rng(6)), red(1), 2 * STEP_NS, T_start_camera)
+    assert stage.add_anchored("one", second)  # of the same submap
+    moved = boxplus(path.poses, np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert stage.set_path("one", Trajectory(path.stamps_ns, moved)) == 2
+    for placed in stage.model.keyframes:
+        np.testing.assert_allclose(placed.T_map_camera, moved[1] @ T_start_camera, atol=1e-12)

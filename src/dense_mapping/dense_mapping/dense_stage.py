@@ -33,6 +33,7 @@ from dense_mapping.plans.floor_plan import FloorPlan
 from dense_mapping.reconstruction.surface import Surface
 from dense_mapping.stereo_depth import stereo_depth
 from slam_core.geometry import FloatArray
+from slam_core.messages.key_frames import AnchoredKeyFrame
 from slam_core.trajectory import Trajectory
 from slam_core.types import ByteArray, DepthImage, Mask
 from stereo_frontend.sources import RawPair
@@ -188,6 +189,19 @@ class DenseStage:
         self._waiting = deque(self._with_mask(item) if item.camera == camera else item for item in self._waiting)
         if self._final is not None:
             self._place()
+
+    def add_anchored(self, agent: str, frame: AnchoredKeyFrame) -> bool:
+        """Take a key frame that came over the radio, whatever the odometry says; True if it is in the model now.
+
+        Its camera is one of its own, mounted on the rig as it was when a submap began: there the map has a pose, and
+        moves the key frame with it.
+        """
+        camera = f"{agent}/view_{frame.image.stamp_ns}"
+        if camera in self._mounts:
+            return False
+        image = replace(frame.image, stamp_ns=frame.start_stamp_ns)
+        self.add(agent, camera.removeprefix(f"{agent}/"), frame.T_start_camera, image, frame.colours)
+        return self._final is None and self._place() > 0
 
     def add_force(self, agent: str, stamp_ns: int, force: FloatArray) -> None:
         """Take an accelerometer's reading (3,) m/s2 in the rig's frame: on the whole it points up."""

@@ -38,6 +38,7 @@ from slam_core.messages import (
     stamp_ns,
 )
 from slam_core.messages.base import Message
+from slam_core.messages.key_frames import KEY_FRAME_TOPICS, key_frame_from_messages
 from slam_core.nodes.base_node import SlamNode
 from slam_core.nodes.stamp_guard import StampPolicy
 from slam_core.ros import below, run_node, sensor_qos
@@ -102,6 +103,8 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         listen(own("odom"), "Odometry", partial(self._on_odometry, agent))
         listen(own("map/path"), "Path", partial(self._on_path, agent), latched=True, stamps=StampPolicy.ANY)
         listen(own("imu"), "Imu", partial(self._on_imu, agent), required=False)
+        radio = {own(topic): kind for topic, kind in KEY_FRAME_TOPICS.items()}
+        listen_together(radio, partial(self._on_key_frame, agent), latched=True, required=False, stamps=StampPolicy.ANY)
         if self.config.use_tof:
             topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
             topics = {own(topic): kind for topic, kind in topics.items()}
@@ -129,6 +132,11 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         T_base_camera = self.lookup(below(agent, self.config.base_frame), depth.header.frame_id)
         if self.mapper.wants(agent, "tof", stamp_ns(depth), T_base_camera):
             self.mapper.add(agent, "tof", T_base_camera, depth_from_messages(depth, noise, info), NO_PICTURE)
+
+    def _on_key_frame(self, agent: str, *messages: Message) -> None:
+        """Take a key frame that a post has asked for over the radio."""
+        if self.mapper.add_anchored(agent, key_frame_from_messages(*messages)):
+            self._is_news = True
 
     def _on_colour(self, agent: str, sensor: str, message: Message) -> None:
         self.mapper.add_colour(agent, sensor, stamp_ns(message), colour_from_message(message))

@@ -45,6 +45,9 @@ WANTED = {PICTURE: "wanted_picture", DENSE: "wanted_key_frame"}
 """Topics at the post that ask for a view."""
 _ANY: dict[str, Any] = {"required": False, "stamps": StampPolicy.ANY}
 _GREY = 128
+"""Colour of a key frame without a picture."""
+_KEPT = 50
+"""Views that whoever comes later gets too."""
 
 
 class AgentViews:
@@ -113,7 +116,7 @@ class AgentViews:
         self.sender.lack(unpack_look(data), time.monotonic())
 
     def _mount(self, message: Message) -> FloatArray:
-        return self.node.lookup(self.node.config.base_frame, message.header.frame_id)
+        return np.asarray(self.node.lookup(self.node.config.base_frame, message.header.frame_id))
 
     def show(self) -> None:
         """Counts in the diagnostics."""
@@ -141,12 +144,12 @@ class PostViews:
                 end.tell_strangers({inbox.files.path: inbox.files.strangers}, "shown")
             self.node.listen(f"{agent}/map/path", "Path", partial(self.on_path, agent), latched=True, **_ANY)
             end.hear(f"slam/{agent}/unseen", partial(self.on_unseen, agent))
-            self.node.advertise(f"{agent}/view/pose", "PoseStamped", latched=True)
-            self.node.advertise(f"{agent}/view/picture/compressed", "CompressedImage", latched=True)
+            self.node.advertise(f"{agent}/view/pose", "PoseStamped", latched=True, depth=_KEPT)
+            self.node.advertise(f"{agent}/view/picture/compressed", "CompressedImage", latched=True, depth=_KEPT)
             for topic, kind in KEY_FRAME_TOPICS.items():
-                self.node.advertise(f"{agent}/{topic}", kind, latched=True)
-        for kind, topic in WANTED.items():
-            self.node.listen(topic, "PointStamped", partial(self.on_wanted, kind), **_ANY)
+                self.node.advertise(f"{agent}/{topic}", kind, latched=True, depth=_KEPT)
+        for wanted, topic in WANTED.items():
+            self.node.listen(topic, "PointStamped", partial(self.on_wanted, wanted), **_ANY)
 
     def on_submap(self, agent: str, submap: Submap) -> None:
         """Note the time of a submap."""

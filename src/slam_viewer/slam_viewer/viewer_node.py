@@ -34,6 +34,7 @@ from slam_core.ros import below, run_node, sensor_qos
 from slam_core.types import ByteArray, PoseEstimate
 from slam_radio.wire.link_report import LinkReport
 from slam_viewer.page.agent_link import link_text, link_warning, reach, reach_text
+from slam_viewer.page.asked_views import AskedViews
 from slam_viewer.page.command_post import has_place, position_radius, storey_at, unseen, ways_out
 from slam_viewer.page.page import ViewerPage
 from slam_viewer.page.panel import AgentRow
@@ -42,6 +43,8 @@ _SILENT_S = 3.0
 _STOREYS = 4
 _STATES = ("OK", "DEGRADED", "LOST")
 _ABOVE_FLOOR_M = 0.04
+_EYE_LEVEL_M = 1.2
+"""A place that is clicked on the floor is asked for at this height above it."""
 _POST_PERIOD_S = 2.0
 """Time from one look for ways out to the next, s."""
 
@@ -106,6 +109,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
                 here.on_click(partial(self._mark_agent, agent))
             self._ask = self.page.server.gui.add_button("Ask agents for details of all submaps", visible=False)
             self._ask.on_click(lambda _: self._ask_for_details())
+        self._asked = AskedViews(self, self.page, self._place_of)
         self._request_details = self.create_client(Trigger, "radio_link/request_details")
         self.create_timer(_POST_PERIOD_S, self._show_post, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f"the page is at {self.page.url}")
@@ -222,6 +226,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
         for agent, link in links.items():
             self._agents[agent].link = link
         self._ask.visible = any(links.values())
+        self._asked.offer(is_post=any(links.values()))
 
     def _ask_for_details(self) -> None:
         """Have the post's radio_link ask for the landmarks that light submaps left out."""
@@ -324,12 +329,22 @@ class ViewerNode(SlamNode[ViewerConfig]):
         self.page.show_reach(index, point, shown)
 
     def _on_click(self, origin: FloatArray, direction: FloatArray) -> None:
-        """Publish where the ray of a click meets the lowest floor plan, or the map's plane z = 0."""
+        """Publish where the ray of a click meets the floor."""
+        if (point := self._on_floor(origin, direction)) is not None:
+            self._publish_mark(point)
+
+    def _on_floor(self, origin: FloatArray, direction: FloatArray) -> FloatArray | None:
+        """Point (3,) m where a ray meets the lowest floor plan, or the map's plane z = 0; None if it is parallel."""
         T = self._plans[0].T_map_plan if self._plans else np.eye(4)
         along = float(direction @ T[:3, 2])
-        if abs(along) < 1e-6:
-            return
-        self._publish_mark(origin + direction * ((T[:3, 3] - origin) @ T[:3, 2]) / along)
+        return None if abs(along) < 1e-6 else origin + direction * ((T[:3, 3] - origin) @ T[:3, 2]) / along
+
+    def _place_of(self, origin: FloatArray, direction: FloatArray) -> FloatArray | None:
+        """Point (3,) m at eye level above that of a click; without a plan, the map's z = 0 is at that level."""
+        point = self._on_floor(origin, direction)
+        if point is None or not self._plans:
+            return point
+        return np.asarray(point + _EYE_LEVEL_M * self._plans[0].T_map_plan[:3, 2])
 
     def _mark_agent(self, agent: str, _: object) -> None:
         """Publish where an agent is, as a find of its own; nothing while that is not known."""

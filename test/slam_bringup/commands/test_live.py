@@ -72,6 +72,7 @@ def test_a_rig_with_a_name_speaks_to_a_command_post(started: dict[str, Any]) -> 
     assert CliRunner().invoke(slam, [*words, "--agents", "anna"]).exit_code == 0
     assert 'connect:=["tcp/10.0.0.1:7447"]' in started["radio_link"]
     assert 'agents:=["anna"]' in started["radio_link"]
+    assert 'base_frame:="anna/base_link"' in started["radio_link"]
     assert "__ns:=/anna" in started["radio_link"]
 
 
@@ -96,8 +97,9 @@ def test_agents_without_a_post_have_a_map_of_their_own_together(started: dict[st
 def test_a_command_post_has_link_map_and_page(started: dict[str, Any]) -> None:
     result = CliRunner().invoke(slam, ["post", "--agents", "anna, bert", "--port", "0"])
     assert result.exit_code == 0, result.output
-    assert started.keys() == {"radio_link", "sjsam", "viewer", "rest"}
-    assert all('agents:=["anna", "bert"]' in started[name] for name in ("radio_link", "sjsam", "viewer"))
+    assert started.keys() == {"radio_link", "sjsam", "dense_mapper", "viewer", "rest"}
+    nodes = ("radio_link", "sjsam", "dense_mapper", "viewer")
+    assert all('agents:=["anna", "bert"]' in started[name] for name in nodes)
     assert 'role:="post"' in started["radio_link"]
     assert 'listen:=["tcp/0.0.0.0:7447"]' in started["radio_link"]
     assert "port:=0" in started["viewer"]

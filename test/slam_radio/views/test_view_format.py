@@ -13,7 +13,7 @@ from slam_core.geometry import boxplus
 from slam_radio.packing.light_submap import ENVELOPE, sealed
 from slam_radio.views.depth_code import FARTHEST_M, depth_levels, depth_of_levels
 from slam_radio.views.view_format import DENSE, MAGIC, PICTURE, VERSION, View, pack_view, rgb_of, unpack_view
-from slam_radio.views.view_taker import _jpeg
+from slam_radio.views.view_taker import encoded
 from slam_radio.wire.view_messages import (
     Lack,
     ViewKey,
@@ -40,7 +40,7 @@ def depth_image(rng, height=30, width=40):
 
 
 def made(rng, kind=DENSE):
-    jpeg = _jpeg(rng.integers(0, 256, (30, 40, 3), dtype=np.uint8), 50)
+    jpeg = encoded(rng.integers(0, 256, (30, 40, 3), dtype=np.uint8), 50)
     view = View(3, 7, 5 * 10**9, 4 * 10**9, T, (40, 30), (33.0, 34.0, 19.5, 14.5), jpeg)
     if kind == PICTURE:
         return view

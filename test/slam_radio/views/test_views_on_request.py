@@ -9,7 +9,7 @@ from radio_world import World
 
 from slam_radio.queues.byte_budget import OVERHEAD
 from slam_radio.views.view_format import DENSE, PICTURE, View, pack_view
-from slam_radio.views.view_taker import _jpeg
+from slam_radio.views.view_taker import encoded
 from slam_radio.wire.view_messages import (
     PIECE_BYTES,
     WINDOW,
@@ -31,7 +31,7 @@ def world(tmp_path, make_submap):
 def picture(stamp_ns: int, side: int = 64, seed: int = 1) -> View:
     """A picture of noise: about one byte a pixel."""
     pixels = np.random.default_rng(seed).integers(0, 256, (side, side, 3), dtype=np.uint8)
-    return View(SESSION, 0, stamp_ns, 0, np.eye(4), (side, side), (0.0, 0.0, 0.0, 0.0), _jpeg(pixels, 80))
+    return View(SESSION, 0, stamp_ns, 0, np.eye(4), (side, side), (0.0, 0.0, 0.0, 0.0), encoded(pixels, 80))
 
 
 def keep(world: World, stamp_ns: int, **more) -> int:

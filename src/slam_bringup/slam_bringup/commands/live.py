@@ -62,7 +62,7 @@ def command(
     if camera is not None:
         nodes = tuple(_with_camera(spec, camera, left_info, right_info) for spec in nodes)
     if post:
-        nodes = (*nodes, radio_node(_only(agents), post))
+        nodes = (*nodes, radio_node(_only(agents), post, base_frame))
     if peers:
         given_config = load_system_config(config)
         nodes = (*nodes, *peer_nodes(_only(agents), _addresses(peers), peer_listen, given_config))

@@ -16,6 +16,7 @@ _RECTIFIED = ("stereo/{left,right}/image_rect", "stereo/{left,right}/camera_info
 _TOF_IN = ("tof/range/image_raw", "tof/amplitude/image_raw", "tof/intensity/image_raw", "tof/camera_info")
 _DEPTH = ("tof/depth/image", "tof/noise/image", "tof/camera_info")
 _FEATURES = ("features", "features/descriptors", "features/camera_info")
+_KEY_FRAME = ("view/depth/image", "view/noise/image", "view/camera_info", "view/color/image", "view/anchor")
 _SUBMAP = ("submap/landmarks", "submap/info", "submap/path", "submap/gaussian", "submap/descriptors")
 
 
@@ -78,7 +79,9 @@ NODES = (
     NodeDeclaration(
         "slam_radio", "radio_link", "slam_radio.radio_link_node", "RadioLinkNode",
         "slam_radio.radio_config:RadioConfig",
-        inputs=(*_SUBMAP, "odom"), outputs=("map_to_odom",),
+        inputs=(*_SUBMAP, "odom", *_RECTIFIED, *_DEPTH, "tof/color/image", "map/path", "wanted_picture",
+                "wanted_key_frame"),
+        outputs=("map_to_odom", *_KEY_FRAME, "view/picture/compressed", "view/pose"),
     ),
     NodeDeclaration(
         "sjsam_node", "sjsam", "sjsam_node.node", "SjsamNode", "sjsam_node.node_config:SjsamNodeConfig",
@@ -90,13 +93,15 @@ NODES = (
     ),
     NodeDeclaration(
         "dense_mapping", "dense_mapper", "dense_mapping.node", "DenseMapperNode", "dense_mapping.node:DenseNodeConfig",
-        inputs=(*_DEPTH, "tof/color/image", *_RECTIFIED, "mask", "tof/mask", "odom", "map/path", "imu"),
+        inputs=(*_DEPTH, "tof/color/image", *_RECTIFIED, "mask", "tof/mask", "odom", "map/path", "imu",
+                *_KEY_FRAME),
         outputs=("map/dense_cloud", "map/occupancy"),
     ),
     NodeDeclaration(
         "slam_viewer", "viewer", "slam_viewer.viewer_node", "ViewerNode", "slam_viewer.viewer_node:ViewerConfig",
-        inputs=("odom", "map/landmarks", "map/path", "map/graph", "map/dense_cloud", "map/occupancy"),
-        outputs=("clicked_point",), is_tool=True,
+        inputs=("odom", "map/landmarks", "map/path", "map/graph", "map/dense_cloud", "map/occupancy",
+                "view/picture/compressed", "view/pose"),
+        outputs=("clicked_point", "wanted_picture", "wanted_key_frame"), is_tool=True,
     ),
     NodeDeclaration(
         "slam_bags", "bag_player", "slam_bags.nodes.bag_player_node", "BagPlayerNode",

@@ -154,10 +154,14 @@ def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port
     return [model, page]
 
 
-def radio_node(agent: str, addresses: Sequence[str]) -> NodeSpec:
-    """The link of an agent, which has a map of its own, to the command post at ``addresses``."""
+def radio_node(agent: str, addresses: Sequence[str], base_frame: str = "") -> NodeSpec:
+    """The link of an agent, which has a map of its own, to the command post at ``addresses``.
+
+    ``base_frame``: of the rig, by default ``base_link`` below the agent's name.
+    """
     parameters = {
-        "agents": (agent,), "connect": tuple(addresses), "correction_topic": "post/map_to_odom", "broadcast_tf": False
+        "agents": (agent,), "connect": tuple(addresses), "correction_topic": "post/map_to_odom", "broadcast_tf": False,
+        "base_frame": base_frame or f"{agent}/base_link",
     }  # fmt: skip
     return NodeSpec("slam_radio", "radio_link", agent, parameters)
 
@@ -191,6 +195,7 @@ def post_nodes(agents: Sequence[str], addresses: Sequence[str], port: int, confi
     return [
         NodeSpec("slam_radio", "radio_link", "", link),
         _spec("sjsam", config.sjsam, "", {}, agents=tuple(agents)),
+        _spec("dense_mapper", config.dense_mapper, "", {}, agents=tuple(agents)),
         _spec("viewer", None, "", {}, agents=tuple(agents), port=port),
     ]
 

@@ -64,7 +64,7 @@ class ViewTaker:
         height, width = small.shape[:2]
         known = camera is not None and (camera.width, camera.height) == picture.shape[1::-1]
         intrinsics = _scaled(camera, share) if camera is not None and known else (0.0, 0.0, 0.0, 0.0)
-        jpeg = _jpeg(small, self.config.quality)
+        jpeg = encoded(small, self.config.quality)
         self._wait(View(0, 0, stamp_ns, 0, T_base_camera, (width, height), intrinsics, jpeg))
 
     def add_depth(self, image: DepthImage, T_base_camera: FloatArray, picture: ByteArray | None) -> None:
@@ -78,7 +78,8 @@ class ViewTaker:
         intrinsics = camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step
         jpeg = b""
         if picture is not None and picture.shape[:2] == image.depth.shape:
-            jpeg = _jpeg(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), self.config.quality)
+            small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+            jpeg = encoded(np.asarray(small, dtype=np.uint8), self.config.quality)
         size = width, height
         self._wait(View(0, 0, image.stamp_ns, 0, T_base_camera, size, intrinsics, jpeg, depth, steps))
 
@@ -139,7 +140,7 @@ def _spacing(shape: tuple[int, ...], most_pixels: int) -> int:
     return step
 
 
-def _jpeg(picture: ByteArray, quality: int) -> bytes:
+def encoded(picture: ByteArray, quality: int) -> bytes:
     """A JPEG of a picture (h, w, 3), red first; grey if its channels are equal."""
     is_grey = bool((picture[..., :1] == picture[..., 1:]).all())
     image = picture[..., 0] if is_grey else picture[..., ::-1]

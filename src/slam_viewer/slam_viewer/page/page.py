@@ -266,13 +266,17 @@ class ViewerPage:
             self.server.scene.add_icosphere(f"/marks/{k}", radius=0.12, color=_MARKS, position=position)
             self.server.scene.add_label(f"/marks/{k}/name", name, position=(0, 0, 0.15), anchor="bottom-center")
 
-    def show_camera(self, T_map_base: FloatArray, picture: ByteArray, fov: float = 1.2) -> None:
-        """A picture (h, w, 3) uint8 where the camera is that took it, looking along the rig's X axis."""
+    def show_camera(self, T_map_base: FloatArray, picture: ByteArray, fov: float = 1.2, number: int = 0) -> None:
+        """A picture (h, w, 3) uint8 where the camera is that took it, looking along the rig's X axis.
+
+        One with the same ``number`` is replaced; 0 is the live picture.
+        """
         small = np.ascontiguousarray(picture[:: max(1, picture.shape[1] // 320), :: max(1, picture.shape[1] // 320)])
         R = T_map_base[:3, :3] @ OPTICAL_FROM_RIG.T
         self.server.scene.add_camera_frustum(
-            "/camera image/rig", fov, picture.shape[1] / picture.shape[0], scale=0.35, color=(20, 20, 20), image=small,
-            format="jpeg", wxyz=_wxyz(R), position=T_map_base[:3, 3], cast_shadow=False, receive_shadow=False,
+            f"/camera image/{number}", fov, picture.shape[1] / picture.shape[0], scale=0.35, color=(20, 20, 20),
+            image=small, format="jpeg", wxyz=_wxyz(R), position=T_map_base[:3, 3], cast_shadow=False,
+            receive_shadow=False,
         )  # fmt: skip
 
     def show_layer(self, name: str) -> None:
