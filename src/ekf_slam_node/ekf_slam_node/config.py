@@ -87,6 +87,24 @@ class ExternalOdometryConfig(Config):
 
 
 @dataclass(frozen=True)
+class RideConfig(Config):
+    """Lift rides, and the barometer that measures their height beside the accelerometer."""
+
+    use: str = parameter(
+        "auto", "whether rides are looked for: where there is an IMU, or never", choices=("auto", "off")
+    )
+    sigma_pressure_height: float = parameter(
+        0.3, "noise of a barometer whose readings claim no variance, as a height", unit="m", minimum=1e-3
+    )
+    sigma_pressure_scale: float = parameter(
+        0.03, "error of heights by air pressure for want of the temperature (0.035 for 10 degrees)", minimum=1e-6
+    )
+    pressure_drift: float = parameter(
+        0.02, "random walk of a barometer's height: weather, doors, ventilation", unit="m/sqrt(s)", minimum=0.0
+    )
+
+
+@dataclass(frozen=True)
 class MeasurementConfig(Config):
     """The time that a picture takes to be read out, while the features come about."""
 
@@ -193,6 +211,7 @@ class EkfSlamConfig(Config):
     motion: MotionConfig = group(MotionConfig)
     imu: InertialConfig = group(InertialConfig)
     odometry: ExternalOdometryConfig = group(ExternalOdometryConfig)
+    ride: RideConfig = group(RideConfig)
     measurement: MeasurementConfig = group(MeasurementConfig)
     association: FeatureAssociationConfig = group(FeatureAssociationConfig)
     landmark: LandmarkConfig = group(LandmarkConfig)

@@ -25,6 +25,7 @@ from slam_core.messages import (
     odometry_from_message,
     odometry_message,
     path_message,
+    pressure_from_message,
     stamp_ns,
     submap_messages,
     transform_message,
@@ -70,6 +71,7 @@ class EkfNode(StageNode[EkfNodeConfig]):
         self.listen("ndt/motion", "PoseWithCovarianceStamped", self.on_motion, required=False)
         self.listen("imu", "Imu", self.on_imu, required=False)
         self.listen("odometry", "Odometry", self.on_odometry, required=False)
+        self.listen("pressure", "FluidPressure", self.on_pressure, required=False)
 
     def _advertise_outputs(self) -> None:
         self.advertise("odom", "Odometry")
@@ -97,6 +99,11 @@ class EkfNode(StageNode[EkfNodeConfig]):
     def on_odometry(self, message: Message) -> None:
         """A pose of wheels, legs or another estimator."""
         self.stage.add_odometry(odometry_from_message(message))
+        self.publish_ready()
+
+    def on_pressure(self, message: Message) -> None:
+        """A pressure of the air."""
+        self.stage.add_pressure(pressure_from_message(message))
         self.publish_ready()
 
     def on_config(self, config: EkfNodeConfig) -> None:
@@ -136,6 +143,7 @@ class EkfNode(StageNode[EkfNodeConfig]):
             self.health.show("rolling_shutter", self.stage.shutter_finding or "none seen")
             self.health.show("imu_clock", self.stage.clock_finding or "as the images'")
             self.health.show("odometry", self.stage.odometry_finding or "none heard")
+            self.health.show("lift_rides", self.stage.rides_finding or "none")
             self.health.show("moving_objects", self.stage.moving_objects or "none seen")
 
     def _publish_result(self, result: EkfResult) -> None:

@@ -26,6 +26,7 @@ from ekf_slam_node.odometry.relative_poses import (
     contradicts,
 )
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
+from ekf_slam_node.ride_submaps import RideSubmaps
 from ekf_slam_node.submaps.frame_input import frame_of_strongest, usable_features, without_tags
 from ekf_slam_node.submaps.missed_frames import MissedFrames
 from ekf_slam_node.submaps.motion_checks import (
@@ -40,7 +41,7 @@ from ekf_slam_node.submaps.rolling_shutter import RollingShutter
 from ekf_slam_node.submaps.steps import LinkedFrame, UpdatedFrame
 from ekf_slam_node.submaps.submap_chain import SubmapChain
 from slam_core.geometry import OPTICAL_FROM_RIG, FloatArray, is_rigid_transform, make_transform
-from slam_core.types import Counters, Features, ImuSample, OdometryReading, RelativeMotion, Submap
+from slam_core.types import Counters, Features, ImuSample, OdometryReading, PressureReading, RelativeMotion, Submap
 
 MOVING = "moving_objects"
 """Name of things that move in the counters: ``frames_with_moving_objects``, ``features_on_moving_objects``."""
@@ -83,7 +84,8 @@ class EkfSlam:
         return submaps
 
     def _forget(self) -> None:
-        self._aids = RelativePoseBuffer(self.config.motion, self.config.imu, self.config.odometry)
+        config = self.config
+        self._aids = RelativePoseBuffer(config.motion, config.imu, config.odometry, config.ride)
         self._noise = NoiseMonitor()
         self._innovations = InnovationWatch()
         self._common = CorrelatedNoise(CORRELATED_NOISE_FACTOR)
@@ -93,6 +95,7 @@ class EkfSlam:
         self._tags: Frame | None = None
         self._standing = StandingDetector(STANDING_FRAMES, self.config.association.gate)
         missed = MissedFrames(self._linker, self._T_rig_optical, self.config.motion)
+        self._rides = RideSubmaps(self._chain, self._aids, self.counters)
         self._recovery = LossRecovery(self.config, self._chain, self._aids, missed, self.counters, self._advance)
 
     # --------------------------------------------------------------------------------------------------------- input
@@ -114,8 +117,9 @@ class EkfSlam:
         if not self._chain.is_open:
             return self._recovery.begin(frame)
         slips = self._aids.external.slips
+        self._aids.rides.forget_events()
         try:
-            result = self._advance(frame)
+            result = self._rides.after_frame(frame, self._advance(frame))
         except np.linalg.LinAlgError:
             return self._recovery.abandon(frame, "a matrix could not be factored")
         if self._aids.external.slips > slips:
@@ -153,6 +157,16 @@ class EkfSlam:
         """A pose of an external odometry, in the order of the stamps, before the frames that come after it."""
         if reason := self._aids.add_odometry(reading):
             self.counters.add(f"odometry_{reason.replace(' ', '_')}")
+
+    def process_pressure(self, reading: PressureReading) -> None:
+        """A reading of a barometer, in the order of the stamps, before the frames that come after it."""
+        if reason := self._aids.rides.pressure.add(reading):
+            self.counters.add(f"pressure_{reason.replace(' ', '_')}")
+
+    @property
+    def rides_finding(self) -> str:
+        """The heights of the lift rides so far, or ""."""
+        return self._rides.finding
 
     @property
     def diagnostic(self) -> str:
@@ -193,6 +207,7 @@ class EkfSlam:
         It ends where an odometry has carried the rig to, if the last frames had no link.
         """
         self._recovery.end_where_odometry_is()
+        self._rides.end_early()
         return self._chain.finish()
 
     # ----------------------------------------------------------------------------------------------------- Algorithm 3
@@ -258,7 +273,7 @@ class EkfSlam:
         None if there are not, and few features have made the link: the IMU bridges the frame.
         """
         told = self._aids.witness(self._chain.stamp_ns, stamp_ns)
-        if told is None:
+        if told is None or self._is_carried(told, link.T, stamp_ns):
             return link
         if not contradicts(told, link.T, link.covariance, RELATIVE_POSE_GATE):
             return replace(link, is_sure=True)
@@ -272,6 +287,11 @@ class EkfSlam:
         moving = np.setdiff1d(link.columns, other.columns)
         self._linker.mark_moving(frame, moving)
         return replace(other, moving=link.moving + len(moving))  # which the IMU is sure of
+
+    def _is_carried(self, told: RelativePoseMeasurement, T: FloatArray, stamp_ns: int) -> bool:
+        """True if a lift may explain why the IMU contradicts a rig that is seen to stand."""
+        dt = seconds_between(self._chain.stamp_ns, stamp_ns)
+        return told.rows == ALL and self._aids.rides.suspects(self._aids.inertial, told.T, T, dt)
 
     def _is_inconsistent(self, stamp_ns: int, link: FrameLink) -> bool:
         """True if looks alone have led to a place where the IMU says that the rig cannot be."""

@@ -2,7 +2,7 @@
 """EKF-SLAM of one rig without ROS: features, motions and IMU readings in any order in, results in order of stamps out.
 
     features ----------------> wait until all others have reached their stamp -> EkfSlam -> result, finished submaps
-    motions, IMU, odometry --^
+    motions, IMU, odometry, pressure --^
 
 A stream that falls silent holds nothing up: the filter goes on without it, says so in its state, and uses it again when
 it comes back.
@@ -20,9 +20,9 @@ from ekf_slam_node.slam import MOVING, EkfSlam
 from slam_core.config import parameter
 from slam_core.frame_tree import FrameTree
 from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams
-from slam_core.types import Counters, Features, ImuSample, OdometryReading, RelativeMotion, Submap
+from slam_core.types import Counters, Features, ImuSample, OdometryReading, PressureReading, RelativeMotion, Submap
 
-MOTION, IMU, ODOMETRY = STREAMS = "motion", "imu", "odometry"
+MOTION, IMU, ODOMETRY, PRESSURE = STREAMS = "motion", "imu", "odometry", "pressure"
 _SIGNIFICANT_OFFSET_S, _SIGNIFICANT_SIGMAS = 3e-3, 4.0
 """A difference of the clocks so large is told."""
 
@@ -77,6 +77,8 @@ class FilterStage:
         self._last_sample_ns = -1
         self._poses: deque[OdometryReading] = deque()
         self._last_pose_ns = -1
+        self._pressures: deque[PressureReading] = deque()
+        self._last_pressure_ns = -1
         self._awaited = AwaitedStreams(config.wait_for, config.patience)
         self._slam: EkfSlam | None = None
         self._next_session = session
@@ -117,6 +119,13 @@ class FilterStage:
         self._poses.append(replace(reading, T_rig_frame=mounting))
         self._awaited.heard(ODOMETRY, reading.stamp_ns)
 
+    def add_pressure(self, reading: PressureReading) -> None:
+        """Take a pressure of the air; it measures the heights of lift rides."""
+        if self._config.ride.use == "off":
+            return
+        self._pressures.append(reading)
+        self._awaited.heard(PRESSURE, reading.stamp_ns)
+
     def ready(self) -> Iterator[FrameResult]:
         """Results of the frames that need not wait, oldest first.
 
@@ -141,7 +150,8 @@ class FilterStage:
     @property
     def diagnostic(self) -> str:
         """Findings about camera and odometry that a user should know of, or ""."""
-        return "; ".join(filter(None, [self.shutter_finding, self.clock_finding, self.odometry_finding]))
+        found = [self.shutter_finding, self.clock_finding, self.odometry_finding, self.rides_finding]
+        return "; ".join(filter(None, found))
 
     @property
     def shutter_finding(self) -> str:
@@ -168,6 +178,11 @@ class FilterStage:
     def odometry_finding(self) -> str:
         """The calibration of an external odometry as it was learnt, or ""."""
         return "" if self._slam is None else self._slam.odometry_finding
+
+    @property
+    def rides_finding(self) -> str:
+        """The heights of lift rides, or ""."""
+        return "" if self._slam is None else self._slam.rides_finding
 
     @property
     def moving_objects(self) -> str:
@@ -207,7 +222,8 @@ class FilterStage:
         self._motions.clear()
         self._samples.clear()
         self._poses.clear()
-        self._last_sample_ns = self._last_pose_ns = -1
+        self._pressures.clear()
+        self._last_sample_ns = self._last_pose_ns = self._last_pressure_ns = -1
         self._awaited.clear()
 
     def _process(self, features: Features) -> FrameResult:
@@ -250,3 +266,7 @@ class FilterStage:
             pose = self._poses.popleft()
             self._last_pose_ns = pose.stamp_ns
             slam.process_odometry(pose)
+        while self._pressures and self._last_pressure_ns < stamp_ns:
+            reading = self._pressures.popleft()
+            self._last_pressure_ns = reading.stamp_ns
+            slam.process_pressure(reading)

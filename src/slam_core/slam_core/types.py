@@ -244,6 +244,15 @@ class PositionReading:
 
 
 @dataclass(frozen=True, eq=False)
+class PressureReading:
+    """Pressure of the air (Pa) around the rig with its variance (Pa2) as reported, which may be zero or not finite."""
+
+    stamp_ns: int
+    pressure: float
+    variance: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class Submap:
     """A local map as one joint Gaussian, in the frame of its own first rig pose, ``<agent>/submap_<index>``.
 

@@ -6,7 +6,8 @@ seed: 16
 rate: 10.0                       # frames per second
 frames: 414
 sensors: [stereo, tof, imu]      # and wheels, of a rig that drives: wheels: {slip: 0.01, radius_error: 0.02}
-                                 # and position, in the building's frame: position: {sigma: 0.1, outlier_share: 0.1}
+                                 # position, in the building's frame: position: {sigma: 0.1, outlier_share: 0.1}
+                                 # and pressure of a barometer: pressure: {sigma: 1.5, temperature: 294}
 profile: ideal                   # or real: what real rooms and sensors add; single effects: realism: {...}
 rooms:
   - {name: office, x: [0, 5], y: [0, 4], style: office}
@@ -18,6 +19,7 @@ tags:
   - {id: 7, at: [2.0, 4.0, 1.5], yaw: -90}       # fiducial, on the wall; yaw: the way it faces
 agents:
   - {name: "", motion: handheld, height: 1.3, path: [[1, 1], [4, 1, 90], [1, 1]]}   # x, y[, yaw[, pitch[, z]]]
+                                                 # rides: [{at: 1, height: 9}], in a lift at way point 1
 """
 
 from __future__ import annotations
@@ -32,8 +34,10 @@ import numpy as np
 
 from slam_core.config import Config, from_mapping, group, parameter
 from slam_core.storage.files import read_yaml
+from slam_simulation.lift import LiftPath, Ride
 from slam_simulation.sensors.imu import ImuSensorConfig
 from slam_simulation.sensors.position import PositionSensorConfig
+from slam_simulation.sensors.pressure import PressureSensorConfig
 from slam_simulation.sensors.profiles import PROFILES, REAL, REAL_STEREO, RealismConfig
 from slam_simulation.sensors.stereo_sensor import StereoSensorConfig
 from slam_simulation.sensors.tof_sensor import TofSensorConfig
@@ -47,7 +51,7 @@ from slam_simulation.world.world import World
 
 SENSORS = ("stereo", "tof", "imu")
 """Sensors of a rig unless a scenario says otherwise."""
-_KNOWN = (*SENSORS, "wheels", "position")
+_KNOWN = (*SENSORS, "wheels", "position", "pressure")
 _SUITE = (*_KNOWN, "realism")
 SCENARIOS = FilePath(__file__).with_name("scenarios")
 """``bags/scenarios`` of the sources, installed with the package."""
@@ -64,8 +68,13 @@ class Agent:
     stations: tuple[tuple[float, ...], ...] = ()
     scans: int = 15
     start_s: float = 0.0
+    rides: tuple[Ride, ...] = ()
 
     def __post_init__(self) -> None:
+        rides = tuple(ride if isinstance(ride, Ride) else _make(Ride, ride, self.name) for ride in self.rides)
+        object.__setattr__(self, "rides", rides)
+        if self.rides and self.stations:
+            raise ValueError(f"agent '{self.name}' rides along a path, not from station to station")
         if self.motion not in MOTION_STYLES:
             raise ValueError(f"agent '{self.name}': unknown motion '{self.motion}', known: {', '.join(MOTION_STYLES)}")
         if bool(self.path) == bool(self.stations) or len(self.path) == 1:
@@ -94,6 +103,7 @@ class SensorSuite(Config):
     imu: ImuSensorConfig = group(ImuSensorConfig)
     wheels: WheelSensorConfig = group(WheelSensorConfig)
     position: PositionSensorConfig = group(PositionSensorConfig)
+    pressure: PressureSensorConfig = group(PressureSensorConfig)
     realism: RealismConfig = group(RealismConfig)
     start_stamp_s: float = parameter(1000.0, "header stamp of the first frame", unit="s", minimum=0.0)
 
@@ -237,6 +247,8 @@ class Scenario:
         duration = max((self.full_frames or self.frames) - 1, 1) / self.rate
         rng = np.random.default_rng([self.seed, 1, agent])
         waypoints = resolve_waypoints([list(r) for r in who.path], who.height)
+        if who.rides:
+            return LiftPath(waypoints, who.rides, duration, MOTION_STYLES[who.motion], rng)
         return SplinePath(waypoints, duration, MOTION_STYLES[who.motion], rng)
 
 

@@ -16,11 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_core.geometry import FloatArray
-from slam_core.types import ByteArray, Float32Array, ImuSample, OdometryReading, PositionReading
+from slam_core.types import ByteArray, Float32Array, ImuSample, OdometryReading, PositionReading, PressureReading
+from slam_simulation.lift import seen_path
 from slam_simulation.rendering.raycaster import Rays, camera_rays, make_view, trace
 from slam_simulation.scenario import Scenario
 from slam_simulation.sensors.imu import ImuSensor
 from slam_simulation.sensors.position import PositionSensor
+from slam_simulation.sensors.pressure import PressureSensor
 from slam_simulation.sensors.stereo_sensor import StereoSensor
 from slam_simulation.sensors.tof_sensor import TofImages, TofSensor
 from slam_simulation.sensors.wheels import WheelSensor
@@ -46,8 +48,8 @@ class SimulatedFrame:
     """All that one agent's sensors report at one moment.
 
     left, right: raw uint8 images, None for a sensor that is not carried or a frame that was lost; right_stamp_ns
-    differs from stamp_ns by the jitter between the cameras. tof: raw images or None. imu, wheels, positions: readings
-    since the previous frame.
+    differs from stamp_ns by the jitter between the cameras. tof: raw images or None. imu, wheels, positions, pressures:
+    readings since the previous frame.
     """
 
     index: int
@@ -61,6 +63,7 @@ class SimulatedFrame:
     imu: tuple[ImuSample, ...]
     wheels: tuple[OdometryReading, ...]
     positions: tuple[PositionReading, ...]
+    pressures: tuple[PressureReading, ...]
     truth: DepthTruth | None
 
 
@@ -103,6 +106,7 @@ class Simulator:
         self.world = finished(world, realism.finishes, scenario.seed)
         self._moving = MovingThings(realism.moving, scenario.path())
         self.path = scenario.path(agent)
+        self._seen = seen_path(self.path)
         self.stereo = StereoSensor(scenario.suite.stereo, scenario.seed, rectified=rectified, realism=realism)
         self.tof = TofSensor(scenario.suite.tof, scenario.seed, realism)
         self.imu = ImuSensor(scenario.suite.imu, (scenario.seed, 9, agent))
@@ -113,6 +117,9 @@ class Simulator:
         self.position: PositionSensor | None = None
         if "position" in scenario.sensors:
             self.position = PositionSensor(scenario.suite.position, self.path, (scenario.seed, 11, agent))
+        self.pressure: PressureSensor | None = None
+        if "pressure" in scenario.sensors:
+            self.pressure = PressureSensor(scenario.suite.pressure, self.path, (scenario.seed, 12, agent))
         self.threads = threads or os.cpu_count() or 1
         self._right_late_s = 1e-3 * scenario.suite.stereo.right_late_ms
         self._truth_rays = camera_rays(self.stereo.stereo.camera) if truth else None
@@ -159,7 +166,7 @@ class Simulator:
         left, right = self._stereo(k, t, world, pool)
         tof = None
         if "tof" in scenario.sensors:
-            tof = self.tof.capture(world, T, self._rng(k, 3), pool)
+            tof = self.tof.capture(world, self._seen.pose(t), self._rng(k, 3), pool)
         jitter = scenario.suite.stereo.stamp_jitter_us * 1e3 * self._rng(k, 4).standard_normal()
         return SimulatedFrame(
             index=k,
@@ -173,7 +180,8 @@ class Simulator:
             imu=self._imu_samples(t - every / scenario.rate, t),
             wheels=self._wheel_readings(t - every / scenario.rate, t),
             positions=self._position_readings(t - every / scenario.rate, t),
-            truth=None if self._truth_rays is None else self._truth(T, world, self._truth_rays, pool),
+            pressures=self._pressure_readings(t - every / scenario.rate, t),
+            truth=None if self._truth_rays is None else self._truth(self._seen.pose(t), world, self._truth_rays, pool),
         )
 
     def _rng(self, k: int, sensor: int) -> np.random.Generator:
@@ -185,7 +193,7 @@ class Simulator:
         if "stereo" not in self.scenario.sensors:
             return None, None
         rng = self._rng(k, 2)
-        left, right = ((self.path.pose(at), rig_twist(self.path, at)) for at in (t, t + self._right_late_s))
+        left, right = ((self._seen.pose(at), rig_twist(self._seen, at)) for at in (t, t + self._right_late_s))
         pair = self.stereo.capture(world, (left, right), rng, pool)
         return (None, None) if rng.random() < self.scenario.suite.stereo.drop_probability else pair
 
@@ -200,6 +208,9 @@ class Simulator:
 
     def _position_readings(self, previous: float, t: float) -> tuple[PositionReading, ...]:
         return () if self.position is None else self.position.read(max(previous, -1e-6), t, self.stamp_ns(0))
+
+    def _pressure_readings(self, previous: float, t: float) -> tuple[PressureReading, ...]:
+        return () if self.pressure is None else self.pressure.read(max(previous, -1e-6), t, self.stamp_ns(0))
 
     def _truth(self, T: FloatArray, world: SurfaceTable, rays: Rays, pool: ThreadPoolExecutor | None) -> DepthTruth:
         view = make_view(world, T @ self.T_rig_left, rays.bounds)

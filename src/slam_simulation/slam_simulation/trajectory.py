@@ -62,9 +62,7 @@ class SplinePath:
 
     def __init__(self, waypoints: FloatArray, duration: float, style: MotionStyle, rng: np.random.Generator) -> None:
         self._duration, self.style = duration, style
-        steps = np.linalg.norm(np.diff(waypoints[:, :3], axis=0), axis=1)
-        cost = steps + TURN_COST * np.abs(np.diff(waypoints[:, 3])) + TURN_COST * np.abs(np.diff(waypoints[:, 4]))
-        knots = np.concatenate([[0.0], np.cumsum(np.maximum(cost, 1e-3))])
+        knots = np.concatenate([[0.0], np.cumsum(path_cost(waypoints))])
         self._spline = CubicSpline(knots * (duration / knots[-1]), waypoints, bc_type="clamped")
         self._frequencies = rng.uniform(0.15, 1.1, (UNREST_WAVES, 6))
         self._phases = rng.uniform(0.0, 2.0 * np.pi, (UNREST_WAVES, 6))
@@ -98,6 +96,13 @@ class SplinePath:
         up, lean = np.sin(step), np.sin(step / 2.0)
         gait = [0.0, s.sway * lean, s.bob * up, 0.0, np.radians(s.nod_deg) * up, np.radians(s.roll_deg) * lean]
         return np.asarray(unrest + gait)
+
+
+def path_cost(waypoints: FloatArray) -> FloatArray:
+    """Length (n - 1,) of each way between way points (n, 5), m, with their turns; time is shared out by it."""
+    steps = np.linalg.norm(np.diff(waypoints[:, :3], axis=0), axis=1)
+    cost = steps + TURN_COST * np.abs(np.diff(waypoints[:, 3])) + TURN_COST * np.abs(np.diff(waypoints[:, 4]))
+    return np.asarray(np.maximum(cost, 1e-3))
 
 
 class StationPath:

@@ -30,7 +30,7 @@ from ekf_slam_node.filtering.models import (
 )
 from ekf_slam_node.filtering.update_kernels import applied, sighted
 from slam_core.camera import Camera
-from slam_core.geometry import FloatArray
+from slam_core.geometry import FloatArray, skew
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +164,20 @@ class Ekf:
         head = self.covariance.head(6)
         head[:6] += np.diag(sigma**2)
         self.covariance.set_head(head)
+
+    def displace(self, way: FloatArray, covariance: FloatArray) -> None:
+        """Move the rig by a way (3,) that is known along its own axes, with an independent covariance (3, 3).
+
+        The way turns with the error of the rig's orientation.
+        """
+        turned = -skew(way)
+        head = self.covariance.head(6)
+        head[:, :3] += head[:, 3:] @ turned.T
+        head[:3] += turned @ head[3:6]
+        head[:3, :3] += covariance
+        self.covariance.set_head(head)
+        self.T = self.T.copy()
+        self.T[:3, 3] += way
 
     def move_to_mean(self) -> None:
         """Move the state from where it was linearised to its mean."""

@@ -31,6 +31,22 @@ class UpDirection:
     direction: FloatArray
     covariance: FloatArray
 
+    def seen_from(self, T: FloatArray) -> UpDirection:
+        """The direction along the axes of another frame, ``T`` = T_frame_own (4, 4)."""
+        R = T[:3, :3]
+        return UpDirection(R @ self.direction, R @ self.covariance @ R.T)
+
+    def raised(self, pose: PoseEstimate, height: float, variance: float) -> PoseEstimate:
+        """A pose in the direction's frame, raised by a height (m) with its variance."""
+        T, covariance = pose.T.copy(), pose.covariance.copy()
+        T[:3, 3] += height * self.direction
+        covariance[:3, :3] += self.spread(height, variance)
+        return PoseEstimate(pose.stamp_ns, T, covariance)
+
+    def spread(self, height: float, variance: float) -> FloatArray:
+        """Covariance (3, 3) of a way upwards by a height (m) with its variance."""
+        return np.asarray(variance * np.outer(self.direction, self.direction) + height**2 * self.covariance)
+
 
 class OdometryChain:
     """``T_odom_submap`` of the open submap with its covariance.

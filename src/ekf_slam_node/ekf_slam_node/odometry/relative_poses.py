@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ekf_slam_node.config import ExternalOdometryConfig, InertialConfig, MotionConfig
+from ekf_slam_node.config import ExternalOdometryConfig, InertialConfig, MotionConfig, RideConfig
 from ekf_slam_node.odometry.clock_watch import FARTHEST_S
 from ekf_slam_node.odometry.external_odometry import ExternalOdometry, Reckoning
-from ekf_slam_node.odometry.inertial import InertialFilter, at_place
+from ekf_slam_node.odometry.inertial import InertialFilter, Prediction, at_place
 from ekf_slam_node.odometry.odometry import UpDirection
 from ekf_slam_node.odometry.preintegration import ImuReadings, Preintegral
+from ekf_slam_node.odometry.rides import RideWatch
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import (
     FloatArray,
@@ -68,12 +69,14 @@ class RelativePoseBuffer:
         config: MotionConfig,
         inertial: InertialConfig | None = None,
         external: ExternalOdometryConfig | None = None,
+        ride: RideConfig | None = None,
     ) -> None:
         self._config = config
         self._motions: list[RelativeMotion] = []
         self._readings = ImuReadings()
         self.inertial = InertialFilter(config, inertial or InertialConfig())
         self.external = ExternalOdometry(external or ExternalOdometryConfig())
+        self.rides = RideWatch(ride or RideConfig())
         self._newest: tuple[int, int, Preintegral | None] = (0, 0, None)
         self._reached_ns = self._doubted_ns = 0
 
@@ -118,7 +121,8 @@ class RelativePoseBuffer:
             return None
         step = self.inertial.predict(pre)
         covariance = self.inertial.motion_covariance(step)
-        return RelativePoseMeasurement(*at_place(step.T, covariance, -self._place()), ALL, "the IMU")
+        T = self.rides.without_ride(self.inertial, step.T)
+        return RelativePoseMeasurement(*at_place(T, covariance, -self._place()), ALL, "the IMU")
 
     def moved(
         self,
@@ -140,21 +144,35 @@ class RelativePoseBuffer:
         pre = self._preintegral(start_stamp_ns, end_stamp_ns)
         if pre is None or start_stamp_ns != self._reached_ns:
             self.inertial.forget_motion()
+            self.rides.forget()
         self._newest, self._reached_ns = (0, 0, None), end_stamp_ns
         if pre is None:
             return True
         self.inertial.check_specific_force(pre)
         step = self.inertial.predict(pre)
         if T_previous_now is None or covariance is None:
+            self.rides.unseen(self.inertial, step, end_stamp_ns)
             self.inertial.advance(step)
             return True
-        return self.inertial.measure(step, *at_place(T_previous_now, covariance, self._place()))
+        return self._measure_imu(step, (start_stamp_ns, end_stamp_ns), T_previous_now, covariance)
+
+    def _measure_imu(
+        self, step: Prediction, stamps: tuple[int, int], T_previous_now: FloatArray, covariance: FloatArray
+    ) -> bool:
+        """Let the IMU's filter measure a motion by images, in a lift as one within the cabin; False if they differ."""
+        T, at_imu = at_place(T_previous_now, covariance, self._place())
+        self.inertial = self.rides.take(self.inertial, step, stamps, T, at_imu)
+        if not self.rides.is_riding:
+            return self.inertial.measure(step, T, at_imu)
+        self.rides.within_cabin(self.inertial, self.inertial.predict(step.pre), stamps[1], T, at_imu)
+        self.rides.end_if_at_rest(stamps[1])
+        return True
 
     def witness(self, start_stamp_ns: int, end_stamp_ns: int) -> RelativePoseMeasurement | None:
         """The motion, or its rotation, as an IMU tells it that has agreed with the images so far; None without one."""
         if not self.inertial.is_proven:
             return None
-        bridge = self._inertial_bridge(start_stamp_ns, end_stamp_ns)
+        bridge = None if self.rides.is_riding else self._inertial_bridge(start_stamp_ns, end_stamp_ns)
         return bridge or self._rotation_between(start_stamp_ns, end_stamp_ns)
 
     def is_inconsistent(

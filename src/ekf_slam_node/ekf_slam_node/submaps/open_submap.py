@@ -19,6 +19,7 @@ from ekf_slam_node.filtering.drift import Drift
 from ekf_slam_node.filtering.ekf import Ekf, TimeUpdate, UpdateReport
 from ekf_slam_node.filtering.landmarks import CandidateLandmarks, LandmarkTable, spread_choice
 from ekf_slam_node.filtering.models import CORE_DIM, Frame, observe, relative_motion, rig_points
+from ekf_slam_node.odometry.odometry import UpDirection
 from ekf_slam_node.odometry.relative_poses import RELATIVE_POSE_GATE, RelativePoseMeasurement, relative_pose_error
 from slam_core.camera import MIN_DEPTH
 from slam_core.geometry import FloatArray, skew
@@ -206,6 +207,10 @@ class OpenSubmap:
     def set_velocity(self, velocity: FloatArray, sigma: FloatArray) -> None:
         """Replace what is known of the velocity by (6,) with standard deviations (6,)."""
         self._ekf.restart(velocity, sigma)
+
+    def displace(self, height: float, variance: float, up: UpDirection) -> None:
+        """Move the rig, not the landmarks, by a height (m) with its variance; ``up`` along the submap's axes."""
+        self._ekf.displace(height * up.direction, up.spread(height, variance))
 
     def initialise_landmarks(self, frame: Frame, link: FrameLink, wanted: int, new_ids: IndexArray) -> LandmarkMatches:
         """Make landmarks of the pending features that the frame confirms, until ``wanted`` are in sight.

@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from ekf_slam_node.config import SubmapConfig
+from ekf_slam_node.odometry.odometry import UpDirection
+from ekf_slam_node.odometry.ride_filter import HeightAt
 from ekf_slam_node.submaps.bridging import BridgedPose, positive_definite, smoothed
 from ekf_slam_node.submaps.open_submap import OpenSubmap
 from slam_core.types import ORIGIN_SIGMA, PoseEstimate, Submap
@@ -57,6 +59,17 @@ class SubmapBuilder:
         They are in the submap only if a pose of the filter ends them.
         """
         self._bridged.append(pose)
+
+    def raise_path(self, way: tuple[HeightAt, ...], up: UpDirection) -> None:
+        """Raise the poses at the stamps of a lift's way by its heights; ``up`` along the submap's axes."""
+        heights = {at.stamp_ns: at for at in way}
+        for number, pose in enumerate(self._path):
+            if (at := heights.get(pose.stamp_ns)) is not None and number > 0:
+                self._path[number] = up.raised(pose, at.height, at.variance)
+
+    def replace_end(self, pose: PoseEstimate) -> None:
+        """Replace the newest pose of the path."""
+        self._path[-1] = pose
 
     def is_complete(self, local: OpenSubmap, config: SubmapConfig, shared: int) -> bool:
         """True if the rig is far enough from the start, or the submap large or old enough.

@@ -11,6 +11,7 @@ from ekf_slam_node.config import EkfSlamConfig
 from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.odometry.odometry import OdometryChain, UpDirection
 from ekf_slam_node.odometry.relative_poses import RelativePoseMeasurement
+from ekf_slam_node.odometry.ride_filter import HeightAt
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.submaps.bridging import BridgedPose
 from ekf_slam_node.submaps.open_submap import LandmarkMatches, OpenSubmap, candidate_landmarks, with_inherited_ids
@@ -48,6 +49,8 @@ class SubmapChain:
         self._builder = SubmapBuilder(config.agent, 0, 0, False, session)
         self._next_index = 0
         self._is_finished = False
+        self.is_held_open = False
+        """True while the submap must not end, in a lift."""
         self.stamp_ns = 0
         """Stamp of the frame that the filter has reached."""
 
@@ -126,7 +129,21 @@ class SubmapChain:
 
     def is_complete(self, shared: int) -> bool:
         """True if the submap ends with this frame, in which the next one would share so many landmarks with it."""
-        return self._builder.is_complete(self.local, self._config.submap, shared)
+        return not self.is_held_open and self._builder.is_complete(self.local, self._config.submap, shared)
+
+    @property
+    def is_empty(self) -> bool:
+        """True if the open submap has no pose beside its first."""
+        return self._builder.is_empty
+
+    def raise_path(self, way: tuple[HeightAt, ...], up: UpDirection) -> None:
+        """Raise the poses of the path, which a lift has carried to these heights; ``up`` along the rig's axes."""
+        self._builder.raise_path(way, up.seen_from(self.local.T))
+
+    def displace(self, height: float, variance: float, up: UpDirection) -> None:
+        """Move the rig upwards by a height (m) with its variance: the submap ends there, its landmarks stay."""
+        self.local.displace(height, variance, up.seen_from(self.local.T))
+        self._builder.replace_end(self.local.filter_pose(self.stamp_ns))
 
     # -------------------------------------------------------------------------------------------------------- closing
     def close(self) -> tuple[Submap, ...]:

@@ -16,7 +16,7 @@ from slam_core.nodes.stamp_guard import StampDecision, StampGuard
 from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S
 
 _UNPAIRED = f"images without a partner within {1000 * PAIRING_TOLERANCE_S:g} ms of their stamp"
-FOLLOWING = ("imu", "odometry", "position", "mask", "tof_mask")
+FOLLOWING = ("imu", "odometry", "position", "pressure", "mask", "tof_mask")
 """Roles that begin no session."""
 
 

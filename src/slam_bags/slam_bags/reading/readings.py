@@ -22,11 +22,12 @@ from slam_core.messages import (
     picture_from_message,
     points_from_scan,
     position_from_message,
+    pressure_from_message,
     stamp_ns,
 )
 from slam_core.messages.base import Message
 from slam_core.nodes.synchronizer import PAIRING_TOLERANCE_S, StampSynchronizer
-from slam_core.types import ByteArray, ImuSample, Mask, OdometryReading, PositionReading
+from slam_core.types import ByteArray, ImuSample, Mask, OdometryReading, PositionReading, PressureReading
 from stereo_frontend.sources import RawPair
 from tof_driver.stage import RawDepth
 
@@ -97,6 +98,19 @@ class FixReading:
 
 
 @dataclass(frozen=True, eq=False)
+class AirReading:
+    """A pressure of the air around an agent."""
+
+    agent: str
+    pressure: PressureReading
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the pressure."""
+        return self.pressure.stamp_ns
+
+
+@dataclass(frozen=True, eq=False)
 class LaserReading:
     """A scan of a laser scanner, points (n, 2) in its own frame."""
 
@@ -157,6 +171,7 @@ Reading = (
     | ImuReading
     | PoseReading
     | FixReading
+    | AirReading
     | ColourReading
     | MaskReading
     | SessionStart
@@ -217,6 +232,10 @@ def _fix_reading(sensors: AgentSensors, message: Message) -> Reading:
     return FixReading(sensors.agent, position_from_message(message))
 
 
+def _air_reading(sensors: AgentSensors, message: Message) -> Reading:
+    return AirReading(sensors.agent, pressure_from_message(message))
+
+
 def _laser_reading(sensors: AgentSensors, message: Message) -> Reading:
     return LaserReading(sensors.agent, Scan(stamp_ns(message), points_from_scan(message), message.header.frame_id))
 
@@ -236,6 +255,7 @@ UNPAIRED_ROLES: dict[str, Callable[[AgentSensors, Message], Reading]] = {
     "imu": _imu_reading,
     "odometry": _pose_reading,
     "position": _fix_reading,
+    "pressure": _air_reading,
     "scan": _laser_reading,
     "color": _colour_reading,
     "mask": partial(_mask_reading, "stereo"),

@@ -12,7 +12,7 @@ Topics are those of the nodes, or given by role, see :mod:`slam_bags.reading.sen
   ``tof/camera_info`` and, where there are any, ``tof/{amplitude,intensity}/image_raw``, and ``tof/color/image_raw``
   in the pixels of the depth image: colours of the dense model, and the picture that features come from where there is
   no other;
-- ``scan`` of a laser scanner, ``imu``, ``odometry``, ``position`` and ``ground_truth/pose``;
+- ``scan`` of a laser scanner, ``imu``, ``odometry``, ``position``, ``pressure`` and ``ground_truth/pose``;
 - ``mask`` of the rectified left image and ``tof/mask`` of the depth image: pixels that are not zero are not used.
 
 Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts, and
@@ -40,6 +40,7 @@ from slam_bags.reading.readings import (
     ROLES_READ,
     AgentPairing,
     AgentSensors,
+    AirReading,
     ColourReading,
     DepthReading,
     FixReading,
@@ -70,7 +71,7 @@ from slam_core.trajectory import Trajectory
 R = TypeVar("R", bound=Reading | InfoReading)
 
 _RANKS = (
-    SessionStart, InfoReading, ImuReading, PoseReading, FixReading, ColourReading, MaskReading, DepthReading,
+    SessionStart, InfoReading, ImuReading, PoseReading, FixReading, AirReading, ColourReading, MaskReading, DepthReading,
     LaserReading, StereoReading,
 )  # fmt: skip
 _LEADER: dict[type[Reading], str] = {StereoReading: "left", DepthReading: "depth"}

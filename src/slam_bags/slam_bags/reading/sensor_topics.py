@@ -26,6 +26,7 @@ _CANDIDATES = {
     "imu": ("imu",),
     "odometry": ("odometry",),
     "position": ("position",),
+    "pressure": ("pressure",),
     "scan": ("scan",),
     "ground_truth": ("ground_truth/pose",),
 }

@@ -19,9 +19,18 @@ from slam_core.messages import (
     odometry_message,
     pose_stamped_message,
     position_message,
+    pressure_message,
     transform_message,
 )
-from slam_core.types import AnyArray, ByteArray, ImuSample, OdometryReading, PoseEstimate, PositionReading
+from slam_core.types import (
+    AnyArray,
+    ByteArray,
+    ImuSample,
+    OdometryReading,
+    PoseEstimate,
+    PositionReading,
+    PressureReading,
+)
 
 BASE_FRAME = "base_link"
 LEFT_FRAME = "stereo_left_optical_frame"
@@ -96,6 +105,11 @@ class SensorWriter:
     def position(self, reading: PositionReading, frame: str) -> None:
         """A position of the rig's antenna in a fixed frame, which all agents share."""
         self._bag.write(f"{self._prefix}/position", position_message(self._types, frame, reading), reading.stamp_ns)
+
+    def pressure(self, reading: PressureReading) -> None:
+        """A pressure of the air at the rig."""
+        message = pressure_message(self._types, self._frame(BASE_FRAME), reading)
+        self._bag.write(f"{self._prefix}/pressure", message, reading.stamp_ns)
 
     def ground_truth(self, stamp_ns: int, T_world_base: FloatArray) -> None:
         """True pose of base_link."""

@@ -47,7 +47,7 @@ def command(
     submaps and poses go to a command post too, with --peer to other agents, and theirs come: what all have together is
     one map, that of /NAME/peers/sjsam, whether there is a post or not.
     """
-    by_topics = by_topics or any(not topic.startswith(("odometry=", "position=")) for topic in topics)
+    by_topics = by_topics or any(not topic.startswith(("odometry=", "position=", "pressure=")) for topic in topics)
     if by_topics == (camera is not None):
         raise ValueError("say what to map: a CAMERA, or --topics of the sensors' drivers")
     given = {

@@ -29,16 +29,18 @@ from slam_core.messages import (
     odometry_from_message,
     picture_from_message,
     position_from_message,
+    pressure_from_message,
     transform_from_message,
 )
 from slam_core.messages.base import Message
-from slam_core.types import AnyArray, OdometryReading, PositionReading
+from slam_core.types import AnyArray, OdometryReading, PositionReading, PressureReading
 
 Stamps = npt.NDArray[np.int64]
 BURSTS, BURST = 3, 12
 """Bursts of consecutive images that are looked at, and images in each."""
 
-_STREAMED = ("left", "right", "depth", "range", "amplitude", "intensity", "imu", "odometry", "position")
+_ACCOMPANYING = ("imu", "odometry", "position", "pressure")
+_STREAMED = ("left", "right", "depth", "range", "amplitude", "intensity", *_ACCOMPANYING)
 """Roles of which all stamps are looked at."""
 _PICTURES = ("left", "right", "depth", "range", "amplitude")
 _INFOS = {"left": "left_info", "right": "right_info", "depth": "tof_info", "range": "tof_info"}
@@ -71,7 +73,7 @@ class Evidence:
 
     images: decoded sample by role and stamp; depth and range in m. faults: messages that could not be decoded, by topic
     with the first reason. imu: rows of stamp s, angular velocity rad/s, specific force m/s2, in the IMU's axes.
-    odometry, positions: every pose, and position in a fixed frame, that could be read.
+    odometry, positions, pressures: every pose, position in a fixed frame, and pressure that could be read.
     """
 
     agent: str
@@ -86,6 +88,7 @@ class Evidence:
     imu: FloatArray = field(default_factory=lambda: np.empty((0, 7)))
     odometry: list[OdometryReading] = field(default_factory=list)
     positions: list[PositionReading] = field(default_factory=list)
+    pressures: list[PressureReading] = field(default_factory=list)
 
     @property
     def depth_role(self) -> str:
@@ -204,7 +207,7 @@ def _decode_sample(bag: BagReader, evidence: Evidence, messages: int | None) -> 
     }
     role_of = {topic: role for role, topic in evidence.topics.items() if role in _STREAMED}
     samples: list[FloatArray] = []
-    accompanying = {evidence.topics[role]: role for role in ("imu", "odometry", "position") if role in evidence.streams}
+    accompanying = {evidence.topics[role]: role for role in _ACCOMPANYING if role in evidence.streams}
     last = max(max(stamps, default=0) for stamps in chosen.values())
     for count, (topic, _, data) in enumerate(bag.raw([*chosen, *accompanying])):
         if messages is not None and count >= messages:
@@ -220,6 +223,8 @@ def _decode_sample(bag: BagReader, evidence: Evidence, messages: int | None) -> 
                 evidence.odometry.append(odometry_from_message(message))
             elif accompanying.get(topic) == "position":
                 evidence.positions.append(position_from_message(message))
+            elif accompanying.get(topic) == "pressure":
+                evidence.pressures.append(pressure_from_message(message))
             elif topic in accompanying:
                 sample = imu_from_message(message)
                 samples.append(np.array([stamp / 1e9, *sample.angular_velocity, *sample.linear_acceleration]))

@@ -16,13 +16,14 @@ from slam_bringup.doctor.frames import check_frames
 from slam_bringup.doctor.imu import check_imu
 from slam_bringup.doctor.odometry import check_odometry
 from slam_bringup.doctor.positions import check_positions
+from slam_bringup.doctor.pressure import check_pressure
 from slam_bringup.doctor.stamps import check_stamps
 from slam_bringup.doctor.stereo_images import check_stereo_images
 from slam_bringup.doctor.topics import check_topics
 
 CHECKS: tuple[Callable[[Evidence], Iterator[Finding]], ...] = (
     check_topics, check_stamps, check_frames, check_calibration, check_stereo_images, check_depth_images, check_imu,
-    check_odometry, check_positions,
+    check_odometry, check_positions, check_pressure,
 )  # fmt: skip
 GROUPS = tuple(check.__name__.removeprefix("check_").replace("_", " ") for check in CHECKS)
 """Names of the checks, in their order."""

@@ -25,7 +25,15 @@ from slam_bringup.pipeline.sensor_pipeline import AgentItem, Value
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.messages import motion_as_received, rounded
 from slam_core.runtime.memory import leave_libraries
-from slam_core.types import Features, ImuSample, OdometryReading, PoseEstimate, PositionReading, Submap
+from slam_core.types import (
+    Features,
+    ImuSample,
+    OdometryReading,
+    PoseEstimate,
+    PositionReading,
+    PressureReading,
+    Submap,
+)
 
 _LOADED = 1, 4
 """Frames of an agent after which what images, and what the filter needs, is loaded."""
@@ -177,6 +185,8 @@ def add_to_filter(stage: FilterStage, value: Value) -> None:
         stage.add_imu(value)
     elif isinstance(value, OdometryReading):
         stage.add_odometry(value)
+    elif isinstance(value, PressureReading):
+        stage.add_pressure(value)
     elif isinstance(value, ScanEstimate):
         stage.add_motion(value.pose.stamp_ns, motion_as_received(value.motion))
     elif isinstance(value, Features):

@@ -72,7 +72,7 @@ NODES = (
     ),
     NodeDeclaration(
         "ekf_slam_node", "ekf_slam", "ekf_slam_node.node", "EkfNode", "ekf_slam_node.node:EkfNodeConfig",
-        inputs=(*_FEATURES, "ndt/motion", "odometry", "imu"), outputs=("odom", "landmarks", *_SUBMAP),
+        inputs=(*_FEATURES, "ndt/motion", "odometry", "imu", "pressure"), outputs=("odom", "landmarks", *_SUBMAP),
         holds_frames=True,
         recorded=("odom", "landmarks", "submap/landmarks", "submap/info", "submap/path"),
     ),

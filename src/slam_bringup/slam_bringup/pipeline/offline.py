@@ -19,7 +19,7 @@ from pathlib import Path
 import cv2
 
 from sjsam_node.session.map_session import MapSession
-from slam_bags.reading.readings import FixReading, ImuReading, PoseReading, Reading
+from slam_bags.reading.readings import AirReading, FixReading, ImuReading, PoseReading, Reading
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig
@@ -28,10 +28,13 @@ from slam_bringup.pipeline.prefetch import prefetch
 from slam_bringup.pipeline.run_record import describe_error, run_result
 from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_core.types import ImuSample, OdometryReading, PositionReading
+from slam_core.types import ImuSample, OdometryReading, PositionReading, PressureReading
 from slam_viewer.results import RunResult
 
 _LOG = logging.getLogger(__name__)
+_BESIDE_IMAGES = (
+    ImuReading | ImuSample | PoseReading | OdometryReading | FixReading | PositionReading | AirReading | PressureReading
+)
 
 
 def run_bag(
@@ -142,4 +145,4 @@ def _extracted(
 
 def _is_of_an_image(item: Reading | AgentItem) -> bool:
     value = item.value if isinstance(item, AgentItem) else item
-    return not isinstance(value, ImuReading | ImuSample | PoseReading | OdometryReading | FixReading | PositionReading)
+    return not isinstance(value, _BESIDE_IMAGES)

@@ -243,6 +243,7 @@ def _sensors(bag: SensorBag, config: SystemConfig, agent: str, odometry: str) ->
     used = ["stereo camera"] * (mode != "tof") + [depth] * (mode != "stereo" or odometry != "none")
     used += ["IMU"] * (config.ekf_slam.imu.use != "off" and bag.count(agent, "imu") > 0)
     used += ["odometry"] * (config.ekf_slam.odometry.use != "off" and bag.count(agent, "odometry") > 0)
+    used += ["barometer"] * (config.ekf_slam.ride.use != "off" and bag.count(agent, "pressure") > 0)
     used += ["positions"] * (config.sjsam.position.use != "off" and bag.count(agent, "position") > 0)
     for name, wanted, role in (("stereo camera", dense.use_stereo, "right"), (depth, dense.use_tof, "depth")):
         if wanted and role in topics and name not in used:

@@ -19,6 +19,7 @@ from ndt_registration.stage import Scan, ScanEstimate, ScanOdometryStage
 from slam_bags.reading.readings import (
     MASK_ROLES,
     AgentSensors,
+    AirReading,
     DepthReading,
     FixReading,
     ImuReading,
@@ -31,14 +32,21 @@ from slam_bags.reading.readings import (
 )
 from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.stage_times import StageTimes
-from slam_core.types import Features, ImuSample, OdometryReading, PositionReading
+from slam_core.types import Features, ImuSample, OdometryReading, PositionReading, PressureReading
 from stereo_frontend.frame_log import FrameLog
 from stereo_frontend.frontend_config import FrontendConfig, FrontendReport
 from stereo_frontend.stage import ExtractedFrame, FeatureStage, StereoStage
 from tof_driver.stage import DepthStage
 
 Value: TypeAlias = (
-    ExtractedFrame | Features | ScanEstimate | ImuSample | OdometryReading | PositionReading | SessionStart
+    ExtractedFrame
+    | Features
+    | ScanEstimate
+    | ImuSample
+    | OdometryReading
+    | PositionReading
+    | PressureReading
+    | SessionStart
 )
 
 
@@ -84,6 +92,8 @@ class SensorPipeline:
             yield self._item(reading.pose)
         elif isinstance(reading, FixReading):
             yield self._item(reading.position)
+        elif isinstance(reading, AirReading):
+            yield self._item(reading.pressure)
         elif isinstance(reading, StereoReading) and self._uses_stereo:
             yield from self._on_pair(reading)
         elif isinstance(reading, DepthReading) and self._uses_depth:

@@ -47,6 +47,7 @@ ARGUMENTS = (
     LaunchArgument("topics", "", "topics that are named otherwise: left=/cam/left/image_raw, right_info=/..."),
     LaunchArgument("odometry_topic", "", "odometry of wheels, legs or another estimator [odometry]"),
     LaunchArgument("position_topic", "", "positions of UWB or GNSS in a fixed frame [position]"),
+    LaunchArgument("pressure_topic", "", "air pressure of a barometer [pressure]"),
     LaunchArgument("base_frame", "", "frame of the rig [base_link, below the agent's name]"),
     LaunchArgument("calibration", "", "folders of slam calibrate, comma-separated, instead of the drivers' infos"),
     LaunchArgument("rectified", "false", "the stereo images are rectified: image_rect", _BOOLEANS),
@@ -81,7 +82,7 @@ def plan_launch(values: Mapping[str, str]) -> LaunchPlan:
     values = {argument.name: argument.default for argument in ARGUMENTS} | dict(values)
     overrides = _overrides(values)
     given = [part.strip() for part in values["topics"].split(",") if part.strip()]
-    for role in ("odometry", "position"):
+    for role in ("odometry", "position", "pressure"):
         given += [f"{role}={values[f'{role}_topic']}"] if values[f"{role}_topic"] else []
     topics = parse_topics(given)
     folders = [Path(part.strip()).expanduser() for part in values["calibration"].split(",") if part.strip()]

@@ -222,7 +222,7 @@ def _bag_parameters(
 
 def _topics(sensor: AgentSensors, mode: str, odometry: bool, calibrated: Collection[str]) -> dict[str, str]:
     """Topics to play by the nodes' names; the camera infos of cameras that are ``calibrated`` come from files."""
-    roles = ["imu", "odometry", "position"]
+    roles = ["imu", "odometry", "position", "pressure"]
     if mode != "tof":
         roles += ["mask", "left", "right", "left_info", "right_info"]
     if odometry and sensor.scanner == "scan":

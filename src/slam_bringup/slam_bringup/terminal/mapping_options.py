@@ -90,6 +90,10 @@ _RIG_OPTIONS = (
         "[position, if there is one]",
     ),
     click.option(
+        "--pressure-topic", metavar="TOPIC", is_eager=True, expose_value=False, callback=_keep_topic,
+        help="air pressure of a barometer (sensor_msgs/FluidPressure, docs/storeys.md) [pressure, if there is one]",
+    ),
+    click.option(
         "--topic", "topics", multiple=True, metavar="ROLE=TOPIC", callback=_with_kept,
         help=f"a topic that is not named like the nodes' (may be repeated); roles: {', '.join(ROLES)}",
     ),

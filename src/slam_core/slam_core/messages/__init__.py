@@ -53,6 +53,8 @@ from slam_core.messages.poses import (
     pose_with_covariance_message,
     position_from_message,
     position_message,
+    pressure_from_message,
+    pressure_message,
     transform_from_message,
     transform_message,
 )
@@ -112,6 +114,8 @@ __all__ = [
     "pose_with_covariance_message",
     "position_from_message",
     "position_message",
+    "pressure_from_message",
+    "pressure_message",
     "rectified_info",
     "rounded",
     "stamp_ns",

@@ -15,7 +15,9 @@ MESSAGE_PACKAGES = {
         "Point", "Vector3", "Quaternion", "Pose", "Transform", "Twist", "PoseStamped", "PointStamped",
         "TransformStamped", "PoseWithCovariance", "PoseWithCovarianceStamped", "TwistWithCovariance",
     ),
-    "sensor_msgs": ("Image", "CompressedImage", "CameraInfo", "PointCloud2", "PointField", "LaserScan", "Imu"),
+    "sensor_msgs": (
+        "Image", "CompressedImage", "CameraInfo", "PointCloud2", "PointField", "LaserScan", "Imu", "FluidPressure",
+    ),
     "nav_msgs": ("Odometry", "Path", "OccupancyGrid", "MapMetaData"),
     "visualization_msgs": ("Marker", "MarkerArray"),
     "diagnostic_msgs": ("DiagnosticArray", "DiagnosticStatus", "KeyValue"),

@@ -10,7 +10,7 @@ import numpy as np
 
 from slam_core.geometry import FloatArray, pose7_from_transform, transform_from_pose7
 from slam_core.messages.base import Message, MessageTypes, header_message, stamp_ns
-from slam_core.types import ImuSample, OdometryReading, PoseEstimate, PositionReading, RelativeMotion
+from slam_core.types import ImuSample, OdometryReading, PoseEstimate, PositionReading, PressureReading, RelativeMotion
 
 FARTHEST_M = 1e6
 """Positions beyond are no positions in a building; their squares would spoil covariances."""
@@ -213,6 +213,26 @@ def imu_from_message(message: Message) -> ImuSample:
     if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
         raise ValueError("IMU message has no angular velocity or no acceleration (covariance -1)")
     return ImuSample(stamp_ns(message), rate, acceleration, message.header.frame_id)
+
+
+def pressure_message(types: MessageTypes, frame_id: str, reading: PressureReading) -> Message:
+    """sensor_msgs/FluidPressure of the air."""
+    header = header_message(types, reading.stamp_ns, frame_id)
+    return types.FluidPressure(header=header, fluid_pressure=reading.pressure, variance=reading.variance)
+
+
+def pressure_from_message(message: Message) -> PressureReading:
+    """Pressure (Pa) of a sensor_msgs/FluidPressure, with its variance as it is.
+
+    Raises
+    ------
+    ValueError
+        If the pressure is not finite.
+    """
+    pressure = float(message.fluid_pressure)
+    if not np.isfinite(pressure):
+        raise ValueError(f"pressure is not finite: {pressure} Pa")
+    return PressureReading(stamp_ns(message), pressure, float(message.variance))
 
 
 def _with_covariance(types: MessageTypes, estimate: PoseEstimate) -> Message:

@@ -52,7 +52,7 @@ from slam_core.ros import changed_config, declare_config, sensor_qos
 C = TypeVar("C", bound=Config)
 
 _POLICIES = dict.fromkeys(("CameraInfo", "PointStamped"), StampPolicy.ANY)
-_POLICIES |= dict.fromkeys(("Imu", "PoseWithCovarianceStamped", "Odometry"), StampPolicy.FOLLOWS)
+_POLICIES |= dict.fromkeys(("Imu", "PoseWithCovarianceStamped", "Odometry", "FluidPressure"), StampPolicy.FOLLOWS)
 """Types whose messages accompany frames: having processed one says nothing of the frame of its stamp."""
 
 PROGRESS_TOPIC = "/progress"

@@ -36,14 +36,15 @@ from slam_simulation.sensors.profiles import PROFILES
 @click.option("--truth", is_flag=True, help="also store the true depth of the left image")
 @click.option("--wheels", is_flag=True, help="wheel odometry too, with 1 % of slip unless the scenario says otherwise")
 @click.option("--position", is_flag=True, help="positions in the building's frame too, 10 % of them 5 m off")
+@click.option("--pressure", is_flag=True, help="air pressure of a barometer too")
 @click.option(
     "--threads", type=click.IntRange(1), help="threads that draw (all processors); the bag does not depend on it"
 )
 @overwrite_option("a bag that slam wrote")
 def command(
     scenario: str, output: Path, every: int, frames: int | None, seed: int | None, profile: str | None, storage: str,
-    images: str, compact: bool, rectified: bool, truth: bool, wheels: bool, position: bool, threads: int | None,
-    overwrite: bool,
+    images: str, compact: bool, rectified: bool, truth: bool, wheels: bool, position: bool, pressure: bool,
+    threads: int | None, overwrite: bool,
 ) -> None:  # fmt: skip
     """Render SCENARIO (a YAML file, or the name of one in bags/scenarios) to a bag with ground truth."""
     require_free(output, overwrite=overwrite)
@@ -53,7 +54,7 @@ def command(
         plan = replace(plan, seed=seed)
     if frames is not None:
         plan = plan.shortened(frames)
-    for name in ["wheels"] * wheels + ["position"] * position:
+    for name in ["wheels"] * wheels + ["position"] * position + ["pressure"] * pressure:
         plan = replace(plan, sensors=(*plan.sensors, *{name}.difference(plan.sensors)))
     options = BagOptions(images, compact, truth, rectified, storage, every, overwrite)
     with progress_bar() as progress:

@@ -115,6 +115,8 @@ class SimulationWriter(SensorWriter):
             self.odometry(reading)
         for position in frame.positions:
             self.position(position, BUILDING_FRAME)
+        for pressure in frame.pressures:
+            self.pressure(pressure)
         self.ground_truth(frame.stamp_ns, frame.T_world_rig)
         self._moving_truth(frame.stamp_ns, frame.T_world_rig)
         if frame.left is not None and frame.right is not None:
