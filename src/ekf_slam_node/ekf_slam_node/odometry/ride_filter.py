@@ -134,9 +134,9 @@ class RideFilter:
         return self._measure(height - predicted, J, variance)
 
     def come_to_rest(self) -> float:
-        """Measure that the cabin stands; returns the squared normalised error, by which the state is widened.
+        """Measure that the cabin stands; returns the squared normalised error.
 
-        A larger error than claimed means that the specific force was worse than claimed on the whole way.
+        An error larger than claimed means that the specific force was worse than claimed on the whole way.
         """
         J = np.array([0.0, 1.0, 0.0, 0.0, 0.0])
         error, expected = self._seen_speed - float(self._x[V]), float(self._P[V, V]) + _SIGMA_REST**2

@@ -21,6 +21,7 @@ from ekf_slam_node.odometry.inertial import InertialFilter, Prediction
 from ekf_slam_node.odometry.preintegration import Preintegral
 from ekf_slam_node.odometry.pressure import PressureHeights
 from ekf_slam_node.odometry.ride_filter import HeightAt, RideFilter, VerticalMotion
+from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, make_transform
 
 _WINDOW_NS, _SHORTEST_NS = 1_200_000_000, 350_000_000
@@ -39,6 +40,8 @@ _CONSTANT = 0.1
 """Changes of the speed (m/s) over that time which are none."""
 _LEFT_CABIN = 2.5
 """A rig that is seen this far (m) from where the ride began has left the cabin."""
+_CONTRADICTED = chi_square_bound(0.99, 1)
+"""Squared normalised error of the speed at the end beyond which heights are as much less certain."""
 _LONGEST_NS = 300_000_000_000
 _OPEN = 10.0
 """Standard deviation (m) of the vertical motion for the inertial filter during a ride."""
@@ -180,7 +183,8 @@ class RideWatch:
         """End the ride if the cabin has arrived, or the rig has left it."""
         if self._filter is None or not (self._is_at_rest() or self._has_left(stamp_ns)):
             return
-        widened = max(self._filter.come_to_rest(), 1.0)
+        squared = self._filter.come_to_rest()
+        widened = squared if squared > _CONTRADICTED else 1.0
         now = self._filter.height
         way = tuple(HeightAt(at.stamp_ns, at.height, at.variance * widened) for at in self._filter.smoothed())
         self.ended = Ride(self._filter.start_ns, stamp_ns, now.height, now.variance * widened, way)

@@ -71,8 +71,8 @@ from slam_core.trajectory import Trajectory
 R = TypeVar("R", bound=Reading | InfoReading)
 
 _RANKS = (
-    SessionStart, InfoReading, ImuReading, PoseReading, FixReading, AirReading, ColourReading, MaskReading, DepthReading,
-    LaserReading, StereoReading,
+    SessionStart, InfoReading, ImuReading, PoseReading, FixReading, AirReading, ColourReading, MaskReading,
+    DepthReading, LaserReading, StereoReading,
 )  # fmt: skip
 _LEADER: dict[type[Reading], str] = {StereoReading: "left", DepthReading: "depth"}
 """Role of the first image of each kind of reading of a camera."""

@@ -48,7 +48,7 @@ def check_pressure(evidence: Evidence) -> Iterator[Finding]:
         per_pascal = SCALE_HEIGHT / typical
         yield Finding(
             "pressure variance",
-            f"{topic} claims a standard deviation of {told:.2g} Pa ({told * per_pascal:.2f} m), and its readings scatter "
-            f"by {noise:.2g} Pa ({noise * per_pascal:.2f} m)",
+            f"{topic} claims a standard deviation of {told:.2g} Pa ({told * per_pascal:.2f} m), and its readings "
+            f"scatter by {noise:.2g} Pa ({noise * per_pascal:.2f} m)",
             "let the driver fill variance, or leave it 0: ride.sigma_pressure_height counts then",
         )

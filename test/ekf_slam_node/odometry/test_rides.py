@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lift rides by accelerometer and barometer: found, honest heights, and none where a rig only climbs or stands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ekf_slam_node.config import InertialConfig, MotionConfig, RideConfig
+from ekf_slam_node.odometry.relative_poses import RelativePoseBuffer
+from ekf_slam_node.odometry.rides import Ride
+from slam_core.geometry import (
+    FloatArray,
+    boxplus,
+    invert_transform,
+    make_transform,
+    rotation_from_euler,
+    so3_exp,
+    so3_log,
+)
+from slam_core.types import ImuSample, PressureReading
+from slam_simulation.lift import Ride as Journey
+
+STEP_NS, RATE, DT = 200_000_000, 100.0, 1e-3
+STANDS, SECONDS = 10.0, 26.0
+SEEN = np.repeat([1.5e-3, 5e-4], 3)
+"""Standard deviations (m, rad) of a motion that the images show."""
+JOURNEY = Journey(at=1, height=9.0, seconds=9.0, wait=2.0)
+NOISE = InertialConfig()
+
+
+def within_storey(t: float) -> FloatArray:
+    """Pose of a rig that walks half a circle until it stands, with a hand's unrest, and turns round slowly later."""
+    s = min(t / (STANDS - 1.0), 1.0)
+    angle = 3.0 * s**3 * (s * (6.0 * s - 15.0) + 10.0)
+    sway = 0.004 * np.array([np.sin(2.1 * t), np.cos(1.3 * t), np.sin(1.7 * t)])
+    tilt = 0.03 * np.array([np.sin(1.3 * t), np.sin(1.1 * t + 1.0), np.sin(0.7 * t + 2.0)])
+    place = 1.5 * np.array([np.cos(angle), np.sin(angle), 0.0])
+    return make_transform(rotation_from_euler(angle + 0.02 * t) @ so3_exp(tilt), place + sway)
+
+
+def by_lift(t: float) -> float:
+    return JOURNEY.risen(t - STANDS)
+
+
+def by_stairs(t: float) -> float:
+    """Up and down again, a step a second, while one walks."""
+    return 1.5 * (1.0 - np.cos(0.7 * t)) / 2.0 + 0.03 * np.sin(2.0 * np.pi * 1.8 * t)
+
+
+def stays(_: float) -> float:
+    return 0.0
+
+
+@cache
+def ideal(height: Callable[[float], float]) -> tuple[list[float], FloatArray]:
+    """Times, and rows of angular velocity and specific force without errors."""
+    rows, times = [], [k / RATE for k in range(-1, int(SECONDS * RATE) + 2)]
+    for t in times:
+        poses = [within_storey(t + s) for s in (-DT, 0.0, DT)]
+        places = [T[:3, 3] + [0.0, 0.0, height(t + s)] for T, s in zip(poses, (-DT, 0.0, DT), strict=True)]
+        force = (places[2] - 2.0 * places[1] + places[0]) / DT**2 + [0.0, 0.0, 9.81]
+        turn = so3_log(poses[0][:3, :3].T @ poses[2][:3, :3]) / (2.0 * DT)
+        rows.append(np.concatenate([turn, poses[1][:3, :3].T @ force]))
+    return times, np.array(rows)
+
+
+def ridden(
+    height: Callable[[float], float], seed: int, seen_height: Callable[[float], float] = stays, pressure: bool = False
+) -> list[Ride]:
+    """The rides that are found while the images show the motion within a storey, or ``seen_height`` of it."""
+    rng = np.random.default_rng(seed)
+    times, rows = ideal(height)
+    bias = np.concatenate([0.01 * rng.standard_normal(3), 0.05 * rng.standard_normal(3)])
+    density = np.repeat([NOISE.gyroscope_noise_density, NOISE.accelerometer_noise_density], 3)
+    rows = rows + bias + density * np.sqrt(RATE) * rng.standard_normal(rows.shape)
+    aids = RelativePoseBuffer(MotionConfig(), NOISE, None, RideConfig())
+    for t, row in zip(times, rows, strict=True):
+        aids.add_imu(ImuSample(round(t * 1e9), row[:3], row[3:]))
+    if pressure:
+        scale = 1.0 + 0.03 * rng.standard_normal()
+        walk = np.cumsum(0.02 * np.sqrt(0.1) * rng.standard_normal(int(SECONDS * 10) + 1))
+        for k, drift in enumerate(walk):
+            pascal = 1e5 * np.exp(-(scale * height(0.1 * k) + drift) / 8434.0) + 1.5 * rng.standard_normal()
+            assert not aids.rides.pressure.add(PressureReading(k * 10**8, pascal, 1.5**2))
+    rides = []
+    for k in range(int(SECONDS * 1e9) // STEP_NS - 1):
+        start, end = k * STEP_NS, (k + 1) * STEP_NS
+        poses = [within_storey(1e-9 * at) for at in (start, end)]
+        for T, at in zip(poses, (start, end), strict=True):
+            T[2, 3] += seen_height(1e-9 * at)
+        seen = boxplus(invert_transform(poses[0]) @ poses[1], SEEN * rng.standard_normal(6))
+        aids.rides.forget_events()
+        aids.moved(start, end, seen, np.diag(SEEN**2))
+        if aids.rides.ended is not None:
+            rides.append(aids.rides.ended)
+    assert aids.inertial.uses_force
+    assert not aids.rides.is_riding
+    return rides
+
+
+def test_heights_of_rides_are_honest() -> None:
+    """Their normalised errors have a mean of about one, as their smoothed heights on the way have."""
+    errors, on_the_way = [], []
+    for seed in range(24):
+        (ride,) = ridden(by_lift, seed)
+        assert abs(ride.height - 9.0) < 0.6
+        errors.append((ride.height - 9.0) ** 2 / ride.variance)
+        middle = ride.way[len(ride.way) // 2]
+        true = by_lift(1e-9 * middle.stamp_ns) - by_lift(1e-9 * ride.start_ns)
+        on_the_way.append((middle.height - true) ** 2 / middle.variance)
+        assert ride.variance < 0.35**2
+        assert ride.start_ns < (STANDS + JOURNEY.wait + 1.0) * 1e9 < ride.end_ns < (STANDS + JOURNEY.stay + 1.5) * 1e9
+    assert 0.3 < np.mean(errors) < 1.7
+    assert 0.3 < np.mean(on_the_way) < 1.9
+
+
+def test_a_barometer_makes_heights_surer() -> None:
+    errors = []
+    for seed in range(12):
+        (ride,), (alone,) = ridden(by_lift, seed, pressure=True), ridden(by_lift, seed)
+        errors.append((ride.height - 9.0) ** 2 / ride.variance)
+        assert ride.variance < alone.variance
+    assert 0.2 < np.mean(errors) < 2.2
+
+
+@pytest.mark.parametrize(("height", "seen"), [(by_stairs, by_stairs), (stays, stays)])
+def test_who_climbs_or_stands_does_not_ride(height: Callable[[float], float], seen: Callable[[float], float]) -> None:
+    assert ridden(height, 3, seen) == []
+
+
+def test_a_ride_down_is_one_too() -> None:
+    (ride,) = ridden(lambda t: -by_lift(t), 5)
+    assert ride.height == pytest.approx(-9.0, abs=0.5)
