@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,7 @@ from slam_core.messages import (  # noqa: E402
     odometry_message,
     path_message,
     points_from_message,
+    pose_with_covariance_message,
     rectified_info,
 )
 from slam_core.ros import RosTypes  # noqa: E402
@@ -174,3 +177,25 @@ def test_pairs_are_rectified_as_the_front_end_has_found_out(node):
     plain, corrected = rights(""), rights(error.text)
     assert np.abs(plain - corrected).mean() > 1.0
     np.testing.assert_array_equal(rights(""), plain)
+
+
+def test_the_storey_of_a_rig_is_told_with_its_plan(node):
+    poses = drive(node)
+    node._on_path("", path_message(TYPES, poses[-1].stamp_ns, "map", poses))
+    node._publish_news()
+    (lowest,) = node._plans
+    T = lowest.T_map_plan.copy()
+    T[2, 3] += 3.0
+    node._plans = (lowest, replace(lowest, T_map_plan=T))
+    place = np.linalg.inv(node._plans[0].T_map_plan)
+    for up in (1.2, 1.3, 4.0, 4.2, 1.2):
+        pose = PoseEstimate(10**9, make_transform(np.eye(3), np.array([0.0, 0.0, up]) - place[:3, 3]), np.eye(6))
+        node._on_pose("", pose_with_covariance_message(TYPES, "map", pose))
+    assert [message.data for message in node.sent["storey"]] == [0, 1, 0]
+    heights = [occupancy_from_message(message)[2][2, 3] for message in node.sent["storey/occupancy"]]
+    assert heights == pytest.approx([lowest.T_map_plan[2, 3], T[2, 3], lowest.T_map_plan[2, 3]])
+    node._publish_model()
+    assert node.sent["storey"][-1].data == 0, "a new model tells it again"
+    node.on_reset()
+    node._on_pose("", pose_with_covariance_message(TYPES, "map", pose))
+    assert len(node.sent["storey"]) == 4

@@ -17,7 +17,9 @@ from std_srvs.srv import Trigger
 from dense_mapping.colours import NO_PICTURE
 from dense_mapping.dense_model import DenseConfig
 from dense_mapping.dense_stage import DenseStage
+from dense_mapping.plans.floor_plan import FloorPlan
 from dense_mapping.plans.plan_io import plan_names, write_plan
+from dense_mapping.plans.storeys import CurrentStorey
 from dense_mapping.reconstruction.surface_cloud import cloud_of
 from dense_mapping.reconstruction.surface_io import write_mesh
 from slam_core.config import parameter
@@ -64,7 +66,10 @@ class DenseNodeConfig(DenseConfig):
 
 
 class DenseMapperNode(SlamNode[DenseNodeConfig]):
-    """Publishes ``map/dense_cloud`` and ``map/occupancy`` (lowest storey; then ``map/occupancy_1`` ...), latched."""
+    """Publishes ``map/dense_cloud`` and ``map/occupancy`` (lowest storey; then ``map/occupancy_1`` ...), latched.
+
+    Of each agent, as it changes: ``storey``, the number of the storey that it is on, and ``storey/occupancy``, its plan.
+    """
 
     def __init__(self) -> None:
         super().__init__("dense_mapper", DenseNodeConfig)
@@ -76,6 +81,11 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         self.advertise("map/dense_cloud", "PointCloud2", latched=True, depth=1)
         self._storeys = 0
         self._advertise_storeys(1)
+        self._plans: tuple[FloorPlan, ...] = ()
+        self._current = {agent: CurrentStorey() for agent in self.config.agents}
+        for agent in self.config.agents:
+            self.advertise(below(agent, "storey"), "Int32", latched=True, depth=1)
+            self.advertise(below(agent, "storey/occupancy"), "OccupancyGrid", latched=True, depth=1)
         for agent in self.config.agents:
             self._listen_to(agent)
         self.create_service(Trigger, "~/save", self._on_save)
@@ -84,6 +94,8 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
     def on_reset(self) -> None:
         """Forget the model."""
         self.mapper.reset()
+        self._plans = ()
+        self._current = {agent: CurrentStorey() for agent in self.config.agents}
         self._is_news = False
 
     def on_new_session(self) -> None:
@@ -102,6 +114,7 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         listen, listen_together = partial(self.listen, clock=agent), partial(self.listen_together, clock=agent)
         listen(own("odom"), "Odometry", partial(self._on_odometry, agent))
         listen(own("map/path"), "Path", partial(self._on_path, agent), latched=True, stamps=StampPolicy.ANY)
+        listen(own("pose"), "PoseWithCovarianceStamped", partial(self._on_pose, agent), required=False)
         listen(own("imu"), "Imu", partial(self._on_imu, agent), required=False)
         radio = {own(topic): kind for topic, kind in KEY_FRAME_TOPICS.items()}
         listen_together(radio, partial(self._on_key_frame, agent), latched=True, required=False, stamps=StampPolicy.ANY)
@@ -127,6 +140,10 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
 
     def _on_odometry(self, agent: str, message: Message) -> None:
         self.mapper.add_odometry(agent, pose_from_message(message.pose.pose))
+
+    def _on_pose(self, agent: str, message: Message) -> None:
+        if self._current[agent].update(self._plans, pose_from_message(message.pose.pose)[:3, 3]):
+            self._publish_storey(agent)
 
     def _on_depth(self, agent: str, depth: Message, noise: Message, info: Message) -> None:
         T_base_camera = self.lookup(below(agent, self.config.base_frame), depth.header.frame_id)
@@ -201,8 +218,22 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         plans = self.mapper.floor_plans(surface)
         self._advertise_storeys(len(plans))
         for number, plan in enumerate(plans):
-            grid = occupancy_message(self.types, header, plan.cells, plan.resolution, plan.T_map_plan)
-            self.publish(_storey_topic(number), grid)
+            self._publish_plan(_storey_topic(number), plan)
+        self._plans = plans
+        for agent, current in self._current.items():
+            if current.number is not None:
+                self._publish_storey(agent)
+
+    def _publish_plan(self, topic: str, plan: FloorPlan) -> None:
+        header = header_message(self.types, self._stamp_ns, self.config.map_frame)
+        self.publish(topic, occupancy_message(self.types, header, plan.cells, plan.resolution, plan.T_map_plan))
+
+    def _publish_storey(self, agent: str) -> None:
+        """Publish the storey that an agent is on, and its plan; nothing where there are fewer plans by now."""
+        number = self._current[agent].number
+        if number is not None and number < len(self._plans):
+            self.publish(below(agent, "storey"), self.types.Int32(data=number))
+            self._publish_plan(below(agent, "storey/occupancy"), self._plans[number])
 
     def _advertise_storeys(self, count: int) -> None:
         for number in range(self._storeys, count):

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.plans.storeys import storey_number
 from dense_mapping.reconstruction.surface import Surface
 from sjsam_node.global_map import GlobalMap
 from sjsam_node.smoothing.map_snapshot import MapSnapshot
@@ -120,6 +121,21 @@ class RunResult:
     """T_map_frame of the frame that positions are in, where it has been determined."""
 
 
+def storeys(result: RunResult) -> list[dict[str, Any]]:
+    """Of each storey, from the lowest: height (m) of its floor above the lowest one, and its submaps by agent."""
+    plans = result.floor_plans
+    if not plans:
+        return []
+    found: list[dict[str, Any]] = [
+        {"height_m": float(plans[0].height_of(plan.T_map_plan[None, :3, 3])[0]), "submaps": {}} for plan in plans
+    ]
+    for (agent, _, index), (start, _) in zip(result.map.keys, result.map.nodes if len(result.map) else (), strict=True):
+        number = storey_number(plans, result.map.poses[start][:3, 3])
+        if number is not None:
+            found[number]["submaps"].setdefault(agent, []).append(index)
+    return found
+
+
 def summarise(result: RunResult) -> dict[str, Any]:
     """The content of ``summary.json``; figures against ground truth only where there is one."""
     first = result.agents[0] if result.agents else AgentResult("", EMPTY_TRAJECTORY)
@@ -138,6 +154,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "dense_points": len(result.dense),
         "dense_triangles": len(result.dense.faces),
         "free_floor_m2": [plan.free_m2 for plan in result.floor_plans],
+        "storeys": storeys(result),
         "submaps": result.submaps,
         "submap_backlog": dict(result.backlog),
         "loop_closures": result.loop_closures,

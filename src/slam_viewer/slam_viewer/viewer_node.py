@@ -15,6 +15,7 @@ from rclpy.clock import Clock, ClockType  # type: ignore[attr-defined]
 from std_srvs.srv import Trigger
 
 from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.plans.storeys import CurrentStorey
 from slam_core.config import Config, parameter
 from slam_core.geometry import FloatArray
 from slam_core.messages import (
@@ -96,6 +97,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
         self.page = ViewerPage(self.config.port, self.config.host)
         self._agents = {agent: _Agent() for agent in self.config.agents}
         self._plans: dict[int, FloorPlan] = {}
+        self._storeys: dict[str, CurrentStorey] = {}
         self._looked = False
         self.advertise("clicked_point", "PointStamped")
         for index, agent in enumerate(self.config.agents):
@@ -298,6 +300,7 @@ class ViewerNode(SlamNode[ViewerConfig]):
                 poses[agent] = PoseEstimate(0, own.T_map_odom @ own.T_odom_base, covariance)
                 paths[agent] = own.path
         self.page.show_agent_table(rows)
+        self._show_storeys(poses)
         texts = []
         for out in ways_out(tuple(self._plans.values()), poses, paths) if self._plans else ():
             points = np.empty((0, 3)) if out.route is None else out.route.points
@@ -305,10 +308,21 @@ class ViewerNode(SlamNode[ViewerConfig]):
             texts.append((out.agent, out.text))
         self.page.show_ways_text(texts)
 
+    def _show_storeys(self, poses: Mapping[str, PoseEstimate]) -> None:
+        """Show the plans up to the storey of the highest agent; all while nobody has a place."""
+        plans = tuple(self._plans[number] for number in sorted(self._plans))
+        for agent, pose in poses.items():
+            self._storeys.setdefault(agent, CurrentStorey()).update(plans, pose.T[:3, 3])
+        numbers = [own.number for own in self._storeys.values() if own.number is not None]
+        self.page.show_storeys_up_to(max(numbers, default=_STOREYS))
+
     def _row(self, agent: str, own: _Agent) -> AgentRow:
         silent_s = own.silent_s(self._now_ns())
         state = f"silent for {silent_s:.0f} s" if silent_s else own.state
         note = own.reason if own.reason not in ("", "OK") else ""
+        storey = self._storeys[agent].number if agent in self._storeys else None
+        if storey is not None and len(self._plans) > 1:
+            note = " ".join(filter(None, (note, f"storey {storey}")))
         if own.pose is not None:
             where = reach_text(position_radius(own.pose), silent_s, self.config.walking_speed)
             note = " ".join(filter(None, (note, where)))

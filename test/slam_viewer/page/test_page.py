@@ -123,3 +123,12 @@ def test_a_large_mesh_is_made_coarser_not_torn():
 def test_a_port_that_is_taken_is_named(page):
     with pytest.raises(ValueError, match=f"port {page.port} is taken"):
         ViewerPage(page.port)
+
+
+def test_plans_above_a_storey_are_hidden(page):
+    for number in range(3):
+        page.show_plan(FloorPlan(np.zeros((4, 4), dtype=np.int8), 0.1, np.eye(4)), number)
+    page.show_storeys_up_to(1)
+    assert [page._plans[number].visible for number in range(3)] == [True, True, False]
+    page.show_storeys_up_to(2)
+    assert page._plans[2].visible

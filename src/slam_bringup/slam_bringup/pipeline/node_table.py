@@ -93,9 +93,9 @@ NODES = (
     ),
     NodeDeclaration(
         "dense_mapping", "dense_mapper", "dense_mapping.node", "DenseMapperNode", "dense_mapping.node:DenseNodeConfig",
-        inputs=(*_DEPTH, "tof/color/image", *_RECTIFIED, "mask", "tof/mask", "odom", "map/path", "imu",
+        inputs=(*_DEPTH, "tof/color/image", *_RECTIFIED, "mask", "tof/mask", "odom", "map/path", "pose", "imu",
                 *_KEY_FRAME),
-        outputs=("map/dense_cloud", "map/occupancy"),
+        outputs=("map/dense_cloud", "map/occupancy", "storey", "storey/occupancy"),
     ),
     NodeDeclaration(
         "slam_viewer", "viewer", "slam_viewer.viewer_node", "ViewerNode", "slam_viewer.viewer_node:ViewerConfig",

@@ -10,7 +10,7 @@ from slam_core.types import AnyArray
 
 MESSAGE_PACKAGES = {
     "builtin_interfaces": ("Time", "Duration"),
-    "std_msgs": ("Header", "ColorRGBA"),
+    "std_msgs": ("Header", "ColorRGBA", "Int32"),
     "geometry_msgs": (
         "Point", "Vector3", "Quaternion", "Pose", "Transform", "Twist", "PoseStamped", "PointStamped",
         "TransformStamped", "PoseWithCovariance", "PoseWithCovarianceStamped", "TwistWithCovariance",

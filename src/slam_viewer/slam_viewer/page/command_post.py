@@ -10,6 +10,7 @@ import numpy as np
 
 from dense_mapping.plans.floor_plan import FloorPlan
 from dense_mapping.plans.navigation import Frontier, Route, frontiers, plan_route, walked
+from dense_mapping.plans.storeys import storey_number
 from slam_core.estimation.chi_square import ELLIPSE_PROBABILITY, chi_square_bound
 from slam_core.geometry import FloatArray
 from slam_core.types import PoseEstimate
@@ -45,9 +46,8 @@ class WayOut:
 
 def storey_at(plans: Sequence[FloorPlan], point: FloatArray) -> FloorPlan | None:
     """The plan of the storey that a point (3,) of the map is on: the highest floor below it."""
-    heights = [(float(plan.height_of(point[None])[0]), i) for i, plan in enumerate(plans)]
-    above = [(height, i) for height, i in heights if height > -0.3]
-    return plans[min(above)[1]] if above else (plans[0] if plans else None)
+    number = storey_number(plans, point)
+    return None if number is None else plans[number]
 
 
 def ways_out(

@@ -89,6 +89,7 @@ class ViewerPage:
         self.server.scene.set_up_direction("+z")
         self.server.scene.set_background_image(np.full((2, 2, 3), _BACKGROUND, dtype=np.uint8), format="png")
         self.server.gui.set_panel_label(title)
+        self._plans: dict[int, viser.ImageHandle] = {}
         tabs = self.server.gui.add_tab_group()
         self.overview, self.layers, self.camera = (tabs.add_tab(name) for name in ("Overview", "Layers", "Image"))
         with self.overview:
@@ -167,7 +168,7 @@ class ViewerPage:
         T = plan.T_map_plan
         centre = T[:3, :3] @ [width / 2, height / 2, -0.08] + T[:3, 3]
         turned = T[:3, :3] @ np.diag([1.0, -1.0, -1.0])  # viser's image lies with its rows downwards
-        self.server.scene.add_image(
+        self._plans[number] = self.server.scene.add_image(
             f"/floor plan/{number}",
             plan_picture(plan),
             width,
@@ -178,6 +179,11 @@ class ViewerPage:
             wxyz=_wxyz(turned),
             position=centre,
         )
+
+    def show_storeys_up_to(self, highest: int) -> None:
+        """Hide the floor plans of storeys above one, from 0: they would cover what goes on there."""
+        for number, plan in self._plans.items():
+            plan.visible = number <= highest
 
     def show_trajectory(self, index: int, poses: FloatArray, layer: str = "trajectories") -> None:
         """The way of an agent, poses (n, 4, 4)."""
