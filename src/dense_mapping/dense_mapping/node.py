@@ -68,7 +68,7 @@ class DenseNodeConfig(DenseConfig):
 class DenseMapperNode(SlamNode[DenseNodeConfig]):
     """Publishes ``map/dense_cloud`` and ``map/occupancy`` (lowest storey; then ``map/occupancy_1`` ...), latched.
 
-    Of each agent, as it changes: ``storey``, the number of the storey that it is on, and ``storey/occupancy``, its plan.
+    Of each agent, as it changes: ``storey``, the number of its storey, and ``storey/occupancy``, the plan of that.
     """
 
     def __init__(self) -> None:

@@ -44,7 +44,7 @@ from slam_simulation.sensors.tof_sensor import TofSensorConfig
 from slam_simulation.sensors.wheels import WheelSensorConfig
 from slam_simulation.trajectory import MOTION_STYLES, Path, SplinePath, StationPath, resolve_waypoints
 from slam_simulation.world.building import WALL_GAP, Doorway, Room, build_doorways, build_shell, room_walls
-from slam_simulation.world.furniture import Spot, chair, furnish_wall, pillar, table
+from slam_simulation.world.furniture import Spot, chair, furnish_wall, gallery, pillar, stairs, table
 from slam_simulation.world.moving import add_moving
 from slam_simulation.world.tags import TagOnWall
 from slam_simulation.world.world import World
@@ -53,6 +53,7 @@ SENSORS = ("stereo", "tof", "imu")
 """Sensors of a rig unless a scenario says otherwise."""
 _KNOWN = (*SENSORS, "wheels", "position", "pressure")
 _SUITE = (*_KNOWN, "realism")
+_KINDS = "table, chair, pillar, stairs, gallery"
 SCENARIOS = FilePath(__file__).with_name("scenarios")
 """``bags/scenarios`` of the sources, installed with the package."""
 
@@ -86,12 +87,17 @@ class Agent:
 
 @dataclass(frozen=True)
 class FurnitureObject:
-    """A free-standing object: ``kind`` table, chair or pillar, ``at`` (x, y) m, ``size`` (x, y) m, ``yaw`` deg."""
+    """A free-standing object.
+
+    ``kind`` table, chair, pillar, stairs or gallery, ``at`` (x, y) m its middle, ``size`` (x, y) m, ``yaw`` deg; stairs
+    rise along their x to ``height`` m, at which a gallery has its floor.
+    """
 
     kind: str
     at: tuple[float, float]
     size: tuple[float, float] = (1.6, 0.8)
     yaw: float = 0.0
+    height: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -230,8 +236,12 @@ class Scenario:
             chair(world, spot)
         elif item.kind == "pillar":
             pillar(world, spot, self.rooms[room].height)
+        elif item.kind == "stairs":
+            stairs(world, spot, item.size, item.height)
+        elif item.kind == "gallery":
+            gallery(world, spot, item.size, item.height)
         else:
-            raise ValueError(f"scenario '{self.name}': unknown object '{item.kind}', known: table, chair, pillar")
+            raise ValueError(f"scenario '{self.name}': unknown object '{item.kind}', known: {_KINDS}")
 
     def _room_at(self, at: tuple[float, ...], margin: float = 0.0) -> int:
         for k, room in enumerate(self.rooms):

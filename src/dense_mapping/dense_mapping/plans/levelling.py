@@ -80,13 +80,14 @@ def floor_heights(
     floors: list[float] = []
     bins = np.arange(below.min() - _BIN_M, below.max() + 2 * _BIN_M, _BIN_M)
     counts = np.convolve(np.histogram(below, bins)[0], np.ones(3), mode="same")
-    for k in np.argsort(-counts, kind="stable"):
-        height = float(bins[k] + 0.5 * _BIN_M)
-        above = cameras[:, 2] - height
-        walked = ((above > 0.3) & (above < storey_height)).any()
-        if counts[k] < 0.15 * counts.max():
-            break
-        if walked and all(abs(height - other) >= storey_height for other in floors):
+    middles = bins[:-1] + 0.5 * _BIN_M
+    above = cameras[None, :, 2] - middles[:, None]
+    # Treads of stairs are as large as what is seen of a floor, but few cameras were above them.
+    walked = ((above > 0.3) & (above < storey_height)).sum(axis=1)
+    for k in np.argsort(-counts * walked, kind="stable"):
+        height = float(middles[k])
+        is_floor = counts[k] >= 0.15 * counts.max() and walked[k] > 0
+        if is_floor and all(abs(height - other) >= storey_height for other in floors):
             floors.append(float(np.median(below[np.abs(below - height) < 0.1])))
     return np.array(sorted(floors)) if floors else np.array([float(np.percentile(below, 5))])
 

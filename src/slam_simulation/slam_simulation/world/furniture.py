@@ -17,6 +17,8 @@ from slam_simulation.world.building import Room, Wall
 from slam_simulation.world.world import Material, Rectangle, World, box
 
 Generator = np.random.Generator
+_RISE, _SLAB = 0.18, 0.2
+"""Height of a step of stairs, and thickness of a gallery's floor, m."""
 SIDE = "side"
 
 
@@ -169,6 +171,22 @@ def pillar(world: World, spot: Spot, height: float, side: float = 0.4) -> None:
     """A square pillar with a notice on two of its sides."""
     faces = {"front": Material("poster"), "left": Material("notices"), SIDE: Material("concrete", 1.3)}
     world.add(*spot.box((0, 0, 0), (side, side, height), faces))
+
+
+def stairs(world: World, spot: Spot, size: tuple[float, float], height: float) -> None:
+    """Solid stairs of ``size`` (x, y) m up to a height, which rise along x of their own frame."""
+    steps = round(height / _RISE)
+    tread = size[0] / steps
+    faces = {"top": Material("planks", 0.9), SIDE: Material("concrete", 1.1)}
+    for k in range(steps):
+        x = (k + 0.5) * tread - size[0] / 2.0
+        world.add(*spot.box((x, 0, 0), (tread, size[1], (k + 1) * height / steps), faces))
+
+
+def gallery(world: World, spot: Spot, size: tuple[float, float], height: float) -> None:
+    """A floor of ``size`` (x, y) m whose upper side is at a height."""
+    faces = {"top": Material("tiles"), SIDE: Material("concrete", 1.2)}
+    world.add(*spot.box((0, 0, height - _SLAB), (*size, _SLAB), faces))
 
 
 def _pictures(world: World, wall: Wall, s: float, width: float, rng: Generator) -> None:
