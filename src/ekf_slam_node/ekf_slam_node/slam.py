@@ -15,6 +15,7 @@ from ekf_slam_node.association.linking import CONVINCING, FrameLink, Linker
 from ekf_slam_node.config import MAX_FRAME_FEATURES, MAX_UPDATE_LANDMARKS, STANDING_FRAMES, EkfSlamConfig
 from ekf_slam_node.filtering.candidates import Candidates, MotionPrior, motion_prior
 from ekf_slam_node.filtering.correlated_noise import CORRELATED_NOISE_FACTOR, CorrelatedNoise
+from ekf_slam_node.filtering.landmarks import KEPT_FOR_NS
 from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.filtering.noise_monitor import InnovationWatch, NoiseMonitor
 from ekf_slam_node.loss_recovery import LossRecovery
@@ -27,7 +28,7 @@ from ekf_slam_node.odometry.relative_poses import (
 )
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.ride_submaps import RideSubmaps
-from ekf_slam_node.submaps.frame_input import frame_of_strongest, usable_features, without_tags
+from ekf_slam_node.submaps.frame_input import frame_of_strongest, mounted, usable_features, without_tags
 from ekf_slam_node.submaps.missed_frames import MissedFrames
 from ekf_slam_node.submaps.motion_checks import (
     StandingDetector,
@@ -58,7 +59,8 @@ class EkfSlam:
     Parameters
     ----------
     T_rig_optical
-        Mounting of the camera, (4, 4); by default at the rig's origin, looking along its X axis.
+        Mounting of the camera, (4, 4); by default at the rig's origin, looking along its X axis. Of a rig with several
+        cameras: of one of them; :meth:`mount` tells where all are.
     session
         Number of the first session, see :class:`slam_core.types.Submap`.
     """
@@ -70,11 +72,18 @@ class EkfSlam:
             raise ValueError(f"T_rig_optical must be a rigid transform (4, 4), got {T_rig_optical}")
         self.config = config
         self._T_rig_optical = T_rig_optical
+        self._mountings: dict[str, FloatArray] = {}
         self._linker = Linker(config.association, T_rig_optical)
         self._shutter = RollingShutter(T_rig_optical, (config.measurement.readout, config.measurement.sigma_readout))
         self.counters = Counters()
         self.session = session
         self._forget()
+
+    def mount(self, frame_id: str, T_rig_optical: FloatArray) -> None:
+        """Say where on the rig the optical frame of one of several cameras sits, (4, 4), before its first features."""
+        if not is_rigid_transform(T_rig_optical):
+            raise ValueError(f"T_rig_optical of {frame_id} must be a rigid transform (4, 4), got {T_rig_optical}")
+        self._mountings[frame_id] = T_rig_optical
 
     def start_session(self) -> tuple[Submap, ...]:
         """Begin anew with the next frame, whatever its stamp; the open submap is closed and returned."""
@@ -93,6 +102,7 @@ class EkfSlam:
         self._next_id = 0
         self._newest_stamp_ns = 0
         self._tags: Frame | None = None
+        self._linked_cameras: set[int] = set()
         self._standing = StandingDetector(STANDING_FRAMES, self.config.association.gate)
         missed = MissedFrames(self._linker, self._T_rig_optical, self.config.motion)
         self._rides = RideSubmaps(self._chain, self._aids, self.counters)
@@ -110,11 +120,15 @@ class EkfSlam:
         if problem:
             return self._chain.result(self._newest_stamp_ns, TrackingState.DEGRADED, problem)
         self._newest_stamp_ns = features.stamp_ns
-        features, self._tags = without_tags(features)
+        features, tags = without_tags(features)
+        place = features.cameras, self._T_rig_optical, self._mountings
+        self._tags = None if tags is None else mounted(tags, *place)
         usable = usable_features(features)
         self.counters.add("features_unusable", int(len(features) - usable.sum()))
-        frame = self._noise.corrected(frame_of_strongest(features, usable, MAX_FRAME_FEATURES))
+        strongest = frame_of_strongest(features, usable, MAX_FRAME_FEATURES)
+        frame = self._noise.corrected(mounted(strongest, *place))
         if not self._chain.is_open:
+            self._linked_cameras = set(frame.camera_numbers)
             return self._recovery.begin(frame)
         slips = self._aids.external.slips
         self._aids.rides.forget_events()
@@ -223,8 +237,12 @@ class EkfSlam:
             bridge = self._aids.bridge(self._chain.stamp_ns, frame.stamp_ns)
         if linked is None and bridge is not None:
             linked = self._link(frame, dt, bridge)
+        if linked is None and self._others_see(frame):
+            self.counters.add("frames_of_one_camera_unlinked")
+            return self._chain.result(frame.stamp_ns, TrackingState.OK, "")
         if linked is None:
             return self._recovery.track_lost(frame, bridge)
+        self._linked_cameras = set(frame.camera_numbers)
         if bridge is not None:
             self._chain.add_bridged_pose(frame.stamp_ns, bridge)
         if self._standing.add(linked):
@@ -236,10 +254,20 @@ class EkfSlam:
         submaps = self._close(linked, seen, updated) if updated.closes else self._maintain(linked, updated)
         return self._chain.result(frame.stamp_ns, *updated.state(linked.link), submaps, updated)
 
+    def _others_see(self, frame: Frame) -> bool:
+        """True if a camera that is not among the frame's own has been linked just now: its next frame will be, too."""
+        recent = frame.stamp_ns - self._chain.stamp_ns < KEPT_FOR_NS
+        return recent and bool(frame.cameras) and bool(self._linked_cameras - set(frame.camera_numbers))
+
+    def _expected(self, dt: float) -> MotionPrior:
+        """The motion over dt (s) at the velocity that is known."""
+        local = self._chain.local
+        return motion_prior(local.velocity, local.velocity_covariance(), self.config.motion.sigma, dt)
+
     def _link(self, frame: Frame, dt: float, aid: RelativePoseMeasurement | None) -> LinkedFrame | None:
         """Associate a frame with what is known, and learn its noise from the pairs; None if nothing fits."""
         local = self._chain.local
-        expected = motion_prior(local.velocity, local.velocity_covariance(), self.config.motion.sigma, dt)
+        expected = self._expected(dt)
         prior = fused_prior(expected, aid)
         known = None if aid is None else prior.T
         predicted = self._shutter.corrected(frame, dt, known)
@@ -259,7 +287,7 @@ class EkfSlam:
             wider = frame.variance + link.wrong
             self._innovations.add(float(np.max(link.variance_scale[:2] * (frame.variance / wider).mean(axis=0)[:2])))
             frame = replace(frame, variance=wider)
-        self._common.learn(frame.z[link.columns, :2], link.error[:, :2], frame.camera.width)
+        self._common.learn(frame.side_by_side(gap=1.0)[link.columns], link.error[:, :2], frame.camera.width)
         surprising = is_surprising(link, expected, self.config.association.gate)
         common = self._common.sigma(frame)
         aid = None if aid is None else widened(aid, common)

@@ -4,6 +4,8 @@
     features ----------------> wait until all others have reached their stamp -> EkfSlam -> result, finished submaps
     motions, IMU, odometry, pressure --^
 
+Of a rig with several cameras the features of one moment are joined first (:mod:`slam_core.nodes.rig_groups`).
+
 A stream that falls silent holds nothing up: the filter goes on without it, says so in its state, and uses it again when
 it comes back.
 """
@@ -20,6 +22,8 @@ from ekf_slam_node.slam import MOVING, EkfSlam
 from slam_core.config import parameter
 from slam_core.frame_tree import FrameTree
 from slam_core.nodes.awaited_streams import PATIENCE, AwaitedStreams
+from slam_core.nodes.rig_groups import RigGroups
+from slam_core.rig_features import features_of_rig
 from slam_core.types import Counters, Features, ImuSample, OdometryReading, PressureReading, RelativeMotion, Submap
 
 MOTION, IMU, ODOMETRY, PRESSURE = STREAMS = "motion", "imu", "odometry", "pressure"
@@ -38,9 +42,20 @@ class FilterConfig(EkfSlamConfig):
     patience: int = parameter(
         PATIENCE, "frames that may wait for a stream before they go on without it", unit="frames", minimum=1
     )
+    cameras: tuple[str, ...] = parameter(
+        (),
+        "names of the cameras of a rig that has several, each with its own topics below its name (``front/features``); "
+        "empty: one camera",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        RigGroups(self.cameras)  # ValueError for names that cannot be
+        if self.cameras and self.association.method in ("jcbb", "ccda"):
+            raise ValueError(
+                f"association.method '{self.association.method}' is for one camera, and the rig has "
+                f"{len(self.cameras)}: take mahalanobis"
+            )
         if unknown := set(self.wait_for) - set(STREAMS):
             known = ", ".join(STREAMS)
             raise ValueError(f"parameter 'wait_for' may hold {known}, got {', '.join(sorted(unknown))}")
@@ -80,7 +95,9 @@ class FilterStage:
         self._pressures: deque[PressureReading] = deque()
         self._last_pressure_ns = -1
         self._awaited = AwaitedStreams(config.wait_for, config.patience)
+        self._rig = RigGroups[Features](config.cameras, config.patience) if config.cameras else None
         self._slam: EkfSlam | None = None
+        self._late = 0
         self._next_session = session
 
     @property
@@ -90,13 +107,34 @@ class FilterStage:
 
     @property
     def oldest_waiting_ns(self) -> int | None:
-        """Stamp of the oldest frame that waits for another stream."""
-        return self._waiting[0].stamp_ns if self._waiting else None
+        """Stamp of the oldest frame that waits for another stream or camera."""
+        if self._waiting:
+            return self._waiting[0].stamp_ns
+        return None if self._rig is None else self._rig.oldest_waiting_ns
 
-    def add_features(self, features: Features) -> None:
-        """Take one frame."""
+    def add_features(self, features: Features, camera: str = "") -> None:
+        """Take one frame; of a rig with several cameras that of ``camera``, which may have to wait for the others'.
+
+        What comes too late is counted.
+
+        Raises
+        ------
+        ValueError
+            If the rig has no such camera.
+        """
+        if self._rig is None:
+            self._take(features)
+            return
+        self._late += not self._rig.add(camera, features)
+        self._take_frames_of_rig()
+
+    def _take(self, features: Features) -> None:
         self._waiting.append(features)
         self._awaited.frame(features.stamp_ns)
+
+    def _take_frames_of_rig(self) -> None:
+        for parts in () if self._rig is None else self._rig.ready():
+            self._take(features_of_rig(parts))
 
     def add_motion(self, stamp_ns: int, motion: RelativeMotion | None) -> None:
         """Take a motion of the rig that ended at a stamp, or word that it is not known."""
@@ -198,6 +236,9 @@ class FilterStage:
 
     def give_up(self) -> None:
         """Stop waiting for what a live node has not heard for long, until it is heard again."""
+        if self._rig is not None:
+            self._rig.give_up()
+            self._take_frames_of_rig()
         if self._waiting:
             self._awaited.give_up(self._waiting[-1].stamp_ns)
 
@@ -225,23 +266,31 @@ class FilterStage:
         self._pressures.clear()
         self._last_sample_ns = self._last_pose_ns = self._last_pressure_ns = -1
         self._awaited.clear()
+        if self._rig is not None:
+            self._rig.clear()
 
     def _process(self, features: Features) -> FrameResult:
         """One frame, after all that was measured up to its stamp."""
         slam = self._filter(features)
         self._give_aids(slam, features.stamp_ns)
         result = slam.process(features)
+        if self._late:
+            slam.counters.add("features_of_a_camera_too_late", self._late)
+            self._late = 0
         self._awaited.set_time_offset(IMU, self._offset_ns(slam))
-        if result.state is TrackingState.OK and (diagnostic := self._awaited.diagnostic() or slam.diagnostic):
+        silent = "" if self._rig is None else self._rig.diagnostic
+        if result.state is TrackingState.OK and (diagnostic := silent or self._awaited.diagnostic() or slam.diagnostic):
             result = replace(result, state=TrackingState.DEGRADED, reason=diagnostic)
         return FrameResult(result, len(features))
 
     def _filter(self, features: Features) -> EkfSlam:
-        """The filter; the camera's mounting is looked up at the first frame."""
+        """The filter; a camera's mounting is looked up at its first frame."""
         if self._slam is None:
             session = self._next_session if self._next_session >= 0 else features.stamp_ns // 1_000_000_000
             T_base_optical = self._frames.lookup(self._base_frame, features.frame_id)
             self._slam = EkfSlam(self._config, T_base_optical, session)
+        for camera in features.cameras:
+            self._slam.mount(camera.frame_id, self._frames.lookup(self._base_frame, camera.frame_id))
         return self._slam
 
     @staticmethod

@@ -4,14 +4,17 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from ndt_registration.odometry import OdometryConfig, OdometryResult, OdometryStatus, ScanOdometry
 from slam_core.frame_tree import FrameTree
-from slam_core.geometry import FloatArray
+from slam_core.geometry import FloatArray, transform_points
 from slam_core.motion import motion_of_rig, pose_of_rig
 from slam_core.nodes.awaited_streams import AwaitedStreams
+from slam_core.nodes.rig_groups import RigGroups
 from slam_core.types import AnyArray, Counters, ImuSample, PoseEstimate, RelativeMotion
 
 IMU = "imu"
@@ -49,9 +52,14 @@ class ScanOdometryStage:
     ----------
     frames
         Knows where the sensors sit on the rig.
+    cameras
+        Names of the depth cameras of a rig that has several: what they measure at one moment is one scan, in the rig's
+        own frame.
     """
 
-    def __init__(self, config: OdometryConfig, frames: FrameTree, base_frame: str = "base_link") -> None:
+    def __init__(
+        self, config: OdometryConfig, frames: FrameTree, base_frame: str = "base_link", cameras: Sequence[str] = ()
+    ) -> None:
         self.counters = Counters()
         self._config = config
         self._frames = frames
@@ -60,21 +68,48 @@ class ScanOdometryStage:
         self._scans: deque[Scan] = deque()
         self._samples: deque[ImuSample] = deque(maxlen=_SAMPLES_KEPT)
         self._awaited = AwaitedStreams()
+        self._rig = RigGroups[Scan](cameras) if cameras else None
 
     @property
     def diagnostic(self) -> str:
-        """Since when the IMU is silent, or ""."""
-        return self._awaited.diagnostic()
+        """Since when the IMU or a camera is silent, or ""."""
+        return self._awaited.diagnostic() or ("" if self._rig is None else self._rig.diagnostic)
 
     @property
     def oldest_waiting_ns(self) -> int | None:
-        """Stamp of the oldest frame that waits for another stream."""
-        return self._scans[0].stamp_ns if self._scans else None
+        """Stamp of the oldest frame that waits for another stream or camera."""
+        if self._scans:
+            return self._scans[0].stamp_ns
+        return None if self._rig is None else self._rig.oldest_waiting_ns
 
-    def add_scan(self, scan: Scan) -> None:
-        """Take a scan."""
+    def add_scan(self, scan: Scan, camera: str = "") -> None:
+        """Take a scan; of a rig with several cameras that of ``camera``, which may have to wait for the others'.
+
+        What comes too late is counted.
+
+        Raises
+        ------
+        ValueError
+            If the rig has no such camera, or it is not known where it sits.
+        """
+        if self._rig is None:
+            self._take(scan)
+            return
+        T_base_sensor = self._frames.lookup(self._base_frame, scan.frame_id)
+        points = scan.points.reshape(-1, 3)
+        points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        if not self._rig.add(camera, Scan(scan.stamp_ns, transform_points(T_base_sensor, points), self._base_frame)):
+            self.counters.add("scans_of_a_camera_too_late")
+        self._take_scans_of_rig()
+
+    def _take(self, scan: Scan) -> None:
         self._scans.append(scan)
         self._awaited.frame(scan.stamp_ns)
+
+    def _take_scans_of_rig(self) -> None:
+        for parts in () if self._rig is None else self._rig.ready():
+            points = np.concatenate([own.points for _, own in parts])
+            self._take(Scan(parts[0][1].stamp_ns, points, self._base_frame))
 
     def add_imu(self, sample: ImuSample) -> None:
         """Take an IMU's reading; without the parameter ``imu.enabled`` nothing comes of it."""
@@ -95,7 +130,10 @@ class ScanOdometryStage:
             yield self._register(self._scans.popleft())
 
     def give_up(self) -> None:
-        """Stop waiting for an IMU that a live node has not heard for long."""
+        """Stop waiting for an IMU or a camera that a live node has not heard for long."""
+        if self._rig is not None:
+            self._rig.give_up()
+            self._take_scans_of_rig()
         if self._scans:
             self._awaited.give_up(self._scans[-1].stamp_ns)
 
@@ -109,6 +147,8 @@ class ScanOdometryStage:
         self._scans.clear()
         self._samples.clear()
         self._awaited.clear()
+        if self._rig is not None:
+            self._rig.clear()
 
     def _register(self, scan: Scan) -> ScanEstimate:
         T_base_sensor = self._frames.lookup(self._base_frame, scan.frame_id)

@@ -109,6 +109,18 @@ class DepthImage:
         return points
 
 
+@dataclass(frozen=True)
+class RigCamera:
+    """One of several cameras of a rig.
+
+    Its rectified lens, the optical frame ``frame_id`` of its features, its number on the rig.
+    """
+
+    camera: Camera
+    frame_id: str
+    number: int
+
+
 @dataclass(frozen=True, eq=False)
 class Features:
     """Features of one instant in one optical frame, as on the ``features`` topic; float32, so a topic loses nothing.
@@ -117,7 +129,9 @@ class Features:
     along z; sigma_uv (n, 2) px; sigma_depth (n,) m; response (n,); source (n,) uint8, see :class:`FeatureSource`;
     descriptors (n, d), unit norm, d = 128 for SURF-128 and SIFT. track_ids (n,): equal in the frames through which
     the front end has followed a feature, 0 where it has not. Corners of fiducial tags have descriptors of zeros and
-    negative track ids, which say the tag and the corner (:mod:`slam_core.tags`).
+    negative track ids, which say the tag and the corner (:mod:`slam_core.tags`). Features of several cameras of a rig
+    (:func:`slam_core.rig_features.features_of_rig`): ``cameras`` and ``seen_by`` (n,), which of them; each feature is
+    then in the optical frame and the image of its own camera. Both are empty for one camera alone.
     """
 
     stamp_ns: int
@@ -132,10 +146,14 @@ class Features:
     camera: Camera
     frame_id: str = "stereo_left_optical_frame"
     track_ids: npt.NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    cameras: tuple[RigCamera, ...] = ()
+    seen_by: ByteArray = field(default_factory=lambda: np.zeros(0, np.uint8))
 
     def __post_init__(self) -> None:
         if len(self.track_ids) != len(self.uv):
             object.__setattr__(self, "track_ids", np.zeros(len(self.uv), np.int32))
+        if len(self.seen_by) != len(self.uv):
+            object.__setattr__(self, "seen_by", np.zeros(len(self.uv), np.uint8))
 
     def __len__(self) -> int:
         return len(self.uv)
@@ -154,6 +172,7 @@ class Features:
             source=np.concatenate([f.source, g.source]),
             descriptors=np.concatenate([f.descriptors, g.descriptors]),
             track_ids=np.concatenate([f.track_ids, g.track_ids]),
+            seen_by=np.concatenate([f.seen_by, g.seen_by]),
         )
 
     def select(self, index: AnyArray) -> Features:
@@ -171,6 +190,8 @@ class Features:
             self.camera,
             self.frame_id,
             self.track_ids[index],
+            self.cameras,
+            self.seen_by[index],
         )
 
 

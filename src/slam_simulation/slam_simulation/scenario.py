@@ -17,6 +17,9 @@ objects:
   - {kind: table, at: [2.5, 2.0], size: [1.4, 0.8]}
 tags:
   - {id: 7, at: [2.0, 4.0, 1.5], yaw: -90}       # fiducial, on the wall; yaw: the way it faces
+cameras:                         # of a rig with several, which has the sensors stereo and tof once for each
+  - {name: front}
+  - {name: back, at: [-0.1, 0.0, 0.0], yaw: 180}   # place (m) and heading (degrees) on the rig
 agents:
   - {name: "", motion: handheld, height: 1.3, path: [[1, 1], [4, 1, 90], [1, 1]]}   # x, y[, yaw[, pitch[, z]]]
                                                  # rides: [{at: 1, height: 9}], in a lift at way point 1
@@ -33,6 +36,7 @@ from typing import Any
 import numpy as np
 
 from slam_core.config import Config, from_mapping, group, parameter
+from slam_core.geometry import FloatArray, make_transform, rotation_from_euler
 from slam_core.storage.files import read_yaml
 from slam_simulation.lift import LiftPath, Ride
 from slam_simulation.sensors.imu import ImuSensorConfig
@@ -44,7 +48,7 @@ from slam_simulation.sensors.tof_sensor import TofSensorConfig
 from slam_simulation.sensors.wheels import WheelSensorConfig
 from slam_simulation.trajectory import MOTION_STYLES, Path, SplinePath, StationPath, resolve_waypoints
 from slam_simulation.world.building import WALL_GAP, Doorway, Room, build_doorways, build_shell, room_walls
-from slam_simulation.world.furniture import Spot, chair, furnish_wall, gallery, pillar, stairs, table
+from slam_simulation.world.furniture import Spot, blank, chair, furnish_wall, gallery, pillar, stairs, table
 from slam_simulation.world.moving import add_moving
 from slam_simulation.world.tags import TagOnWall
 from slam_simulation.world.world import World
@@ -53,7 +57,7 @@ SENSORS = ("stereo", "tof", "imu")
 """Sensors of a rig unless a scenario says otherwise."""
 _KNOWN = (*SENSORS, "wheels", "position", "pressure")
 _SUITE = (*_KNOWN, "realism")
-_KINDS = "table, chair, pillar, stairs, gallery"
+_KINDS = "table, chair, pillar, stairs, gallery, blank"
 SCENARIOS = FilePath(__file__).with_name("scenarios")
 """``bags/scenarios`` of the sources, installed with the package."""
 
@@ -86,11 +90,34 @@ class Agent:
 
 
 @dataclass(frozen=True)
+class CameraMount:
+    """One of several cameras of a rig: ``name``, its topics' namespace; ``at`` (x, y, z) m, ``yaw`` and ``pitch`` deg.
+
+    A camera is what a rig with one has: a stereo pair, a ToF camera or both, as ``sensors`` says.
+    """
+
+    name: str
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    yaw: float = 0.0
+    pitch: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier() or len(self.at) != 3:
+            raise ValueError(f"camera '{self.name}': needs a name of letters, digits and _, and at: [x, y, z]")
+
+    @property
+    def T_rig_mount(self) -> FloatArray:
+        """Pose (4, 4) on the rig of what would be the rig's own frame if the camera were the only one."""
+        return make_transform(rotation_from_euler(np.radians(self.yaw), np.radians(self.pitch)), np.array(self.at))
+
+
+@dataclass(frozen=True)
 class FurnitureObject:
     """A free-standing object.
 
-    ``kind`` table, chair, pillar, stairs or gallery, ``at`` (x, y) m its middle, ``size`` (x, y) m, ``yaw`` deg; stairs
-    rise along their x to ``height`` m, at which a gallery has its floor.
+    ``kind`` table, chair, pillar, stairs, gallery or blank, ``at`` (x, y) m its middle, ``size`` (x, y) m, ``yaw`` deg;
+    stairs rise along their x to ``height`` m, at which a gallery has its floor. ``blank``: a white wall without any
+    texture, wide and high as ``size`` says, seen from where ``yaw`` points.
     """
 
     kind: str
@@ -128,6 +155,7 @@ class Scenario:
     doorways: tuple[Doorway, ...] = ()
     objects: tuple[FurnitureObject, ...] = ()
     tags: tuple[TagOnWall, ...] = ()
+    cameras: tuple[CameraMount, ...] = ()
     description: str = ""
     suite: SensorSuite = field(default_factory=SensorSuite)
     full_frames: int = 0
@@ -145,6 +173,9 @@ class Scenario:
         unknown = set(self.sensors) - set(_KNOWN)
         if unknown:
             raise ValueError(f"scenario '{self.name}': unknown sensors {sorted(unknown)}, known: {', '.join(_KNOWN)}")
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) < len(names):
+            raise ValueError(f"scenario '{self.name}': two cameras of the rig have one name: {', '.join(names)}")
         for k, room in enumerate(self.rooms):
             if room.like and room.like not in {r.name for r in self.rooms[:k]}:
                 raise ValueError(f"room '{room.name}' is like '{room.like}', which is no earlier room")
@@ -171,10 +202,11 @@ class Scenario:
     @classmethod
     def from_mapping(cls, name: str, values: Mapping[str, Any]) -> Scenario:
         """A scenario from the YAML file's contents."""
-        own = ("rooms", "agents", "doorways", "objects", "tags", "profile", *_SUITE)
+        own = ("rooms", "agents", "doorways", "objects", "tags", "cameras", "profile", *_SUITE)
         plain = {k: v for k, v in values.items() if k not in own}
         suite = {key: values[key] for key in _SUITE if key in values}
         kinds = {"rooms": Room, "agents": Agent, "doorways": Doorway, "objects": FurnitureObject, "tags": TagOnWall}
+        kinds["cameras"] = CameraMount
         for key, kind in kinds.items():
             plain[key] = tuple(_make(kind, row, name) for row in values.get(key, ()))
         plain["sensors"] = tuple(plain.get("sensors", SENSORS))
@@ -240,6 +272,8 @@ class Scenario:
             stairs(world, spot, item.size, item.height)
         elif item.kind == "gallery":
             gallery(world, spot, item.size, item.height)
+        elif item.kind == "blank":
+            blank(world, spot, item.size)
         else:
             raise ValueError(f"scenario '{self.name}': unknown object '{item.kind}', known: {_KINDS}")
 

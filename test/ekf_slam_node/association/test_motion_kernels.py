@@ -14,19 +14,19 @@ from slam_core.geometry import boxplus, invert_transform, make_transform, so3_ex
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3, 2.0])
-def test_the_motion_of_three_points_is_that_of_least_squares(rng: np.random.Generator, noise: float) -> None:
+def test_themotion_of_three_points_is_that_of_least_squares(rng: np.random.Generator, noise: float) -> None:
     for _ in range(50):
         source, T = rng.standard_normal((3, 3)), np.eye(4)
         target = source @ so3_exp(2.0 * rng.standard_normal(3)).T + rng.standard_normal(3)
         target += noise * rng.standard_normal((3, 3))
-        kernels._motion_of_three(source, target, np.array([2, 0, 1]), T)
+        kernels.motion_of_three(source, target, np.array([2, 0, 1]), T)
         np.testing.assert_allclose(T, umeyama(source, target), atol=1e-6)
 
 
 def test_three_different_pairs_are_drawn_evenly(rng: np.random.Generator) -> None:
     counts, sample = np.zeros((5, 5)), np.empty(3, dtype=np.int64)
     for draw in rng.random((6000, 3)):
-        kernels._draw(draw, 5, sample)
+        kernels.draw_three(draw, 5, sample)
         assert len(set(sample)) == 3
         counts[sample[0], sample[1]] += 1
         counts[sample[2], sample[2]] += 1

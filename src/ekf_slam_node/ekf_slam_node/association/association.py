@@ -19,7 +19,7 @@ from ekf_slam_node.association.jcbb import JointPrediction, jcbb
 from ekf_slam_node.association.pair_kernels import first_of_both
 from ekf_slam_node.config import FeatureAssociationConfig
 from ekf_slam_node.filtering.candidates import Candidates, innovation_covariance, predict
-from ekf_slam_node.filtering.models import Frame, Observation, rig_points
+from ekf_slam_node.filtering.models import Frame, Observation, observe, rig_points
 from slam_core.estimation.chi_square import chi_square_bound
 from slam_core.geometry import FloatArray, transform_points
 from slam_core.runtime.in_place import in_place
@@ -130,14 +130,21 @@ def associate_mahalanobis(
     candidates: Candidates, frame: Frame, T_previous_now: FloatArray, motion_covariance: FloatArray,
     T_rig_optical: FloatArray, config: FeatureAssociationConfig,
 ) -> tuple[IndexArray, IndexArray]:  # fmt: skip
-    """Algorithm 2: indices of candidates and of features, paired by normalised distance and descriptors."""
-    seen = predict(candidates, T_previous_now, T_rig_optical, frame)
-    S = innovation_covariance(seen, candidates, motion_covariance)
-    visible = seen.in_image(frame.camera, margin_px=-50.0)
-    rows, columns, costs = _gated_pairs(
-        frame.z, frame.variance, frame.descriptors, seen.z, S, visible, candidates.descriptors,
-        config.descriptor_threshold, config.gate, config.descriptor_weight,
-    )  # fmt: skip
+    """Algorithm 2: indices of candidates and of features, paired by normalised distance and descriptors.
+
+    Of several cameras each looks for the candidates in its own image; the cheapest of all pairs come first.
+    """
+    found = []
+    for index, camera, T in frame.parts(T_rig_optical):
+        seen = observe(T_previous_now, T, candidates.points, camera)
+        S = innovation_covariance(seen, candidates, motion_covariance)
+        visible = seen.in_image(camera, margin_px=-50.0)
+        rows, own, costs = _gated_pairs(
+            frame.z[index], frame.variance[index], frame.descriptors[index], seen.z, S, visible, candidates.descriptors,
+            config.descriptor_threshold, config.gate, config.descriptor_weight,
+        )  # fmt: skip
+        found.append((rows, own if isinstance(index, slice) else index[own], costs))
+    rows, columns, costs = found[0] if len(found) == 1 else (np.concatenate(part) for part in zip(*found, strict=True))
     return pair_up(rows, columns, costs, (len(candidates), len(frame)))
 
 

@@ -35,8 +35,8 @@ def best_sample(points, covariances, z, variance, T_rig_optical, lens, draws, fi
         if h < len(first):
             motion[:] = first[h]
         else:
-            _draw(draws[h - len(first)], n, sample)
-            _motion_of_three(before, now, sample, motion)
+            draw_three(draws[h - len(first)], n, sample)
+            motion_of_three(before, now, sample, motion)
         cost = _cost(motion, before, spread, z, variance, lens, gate, least)
         if cost < least:
             least = cost
@@ -66,7 +66,7 @@ def _in_optical_frames(points, covariances, z, T, lens, before, now, spread):  #
 
 
 @in_place()
-def _draw(draw, n, sample):  # type: ignore[no-untyped-def]
+def draw_three(draw, n, sample):  # type: ignore[no-untyped-def]
     """Three different numbers below n from three numbers in [0, 1)."""
     i, j, k = np.int64(draw[0] * n), np.int64(draw[1] * (n - 1)), np.int64(draw[2] * (n - 2))
     j += j >= i
@@ -76,7 +76,7 @@ def _draw(draw, n, sample):  # type: ignore[no-untyped-def]
 
 
 @in_place(error_model="numpy")
-def _motion_of_three(source, target, sample, T):  # type: ignore[no-untyped-def]
+def motion_of_three(source, target, sample, T):  # type: ignore[no-untyped-def]
     """Fill T (4, 4) with the rigid motion that brings three points nearest to three others, in closed form.
 
     Least squares turn the plane of one triangle into that of the other, and there by the mean angle between the two
@@ -152,17 +152,25 @@ def _cost(M, points, spread, z, variance, lens, gate, enough):  # type: ignore[n
 
 # ---- least squares
 @njit(cache=True, nogil=True, error_model="numpy")
-def refined(points, covariances, z, variance, T_rig_optical, lens, start, gate, iterations, error, S, J, depth):  # type: ignore[no-untyped-def]
+def refined(points, covariances, z, variance, mountings, lenses, ends, start, gate, iterations, error, S, J, depth):  # type: ignore[no-untyped-def]
     """Gauss-Newton from the motion ``start`` (4, 4), see :func:`ekf_slam_node.association.motion_guess.refine_motion`.
 
-    Fills error, S, J and depth of the pairs. Returns whether a motion was found, T, its covariance (6, 6), mask of the
-    inliers (n,), and by how much their errors exceed the claimed variances (3,).
+    The pairs of each camera, with its mounting (c, 4, 4) and lens (c, 4), end where ``ends`` (c,) says. Fills error, S,
+    J and depth of the pairs. Returns whether a motion was found, T, its covariance (6, 6), mask of the inliers (n,),
+    and by how much their errors exceed the claimed variances (3,).
     """
     T, covariance, camera = start.copy(), np.eye(6), np.eye(4)
     variance_scale, root, inliers = np.ones(3), np.ones(3), np.zeros(len(points), np.bool_)
     for step in range(iterations):
-        _product(T, T_rig_optical, camera)
-        pair_errors(points, covariances, z, variance, camera, T[:3, 3], lens, error, S, J, depth)
+        first = 0
+        for c in range(len(ends)):
+            a, b = first, ends[c]
+            first = b
+            _product(T, mountings[c], camera)
+            pair_errors(
+                points[a:b], covariances[a:b], z[a:b], variance[a:b], camera, T[:3, 3], lenses[c], error[a:b], S[a:b],
+                J[a:b], depth[a:b],
+            )  # fmt: skip
         updated = gated(error, S, depth, root, gate * max(1.0, 4.0 - step))
         if updated.sum() < 4:
             return False, T, covariance, inliers, variance_scale

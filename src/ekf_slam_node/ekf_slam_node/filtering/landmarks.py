@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,13 +12,15 @@ from ekf_slam_node.config import LandmarkConfig
 from ekf_slam_node.filtering.candidates import Candidates
 from ekf_slam_node.filtering.covariance import IndexArray
 from ekf_slam_node.filtering.landmark_noise import LandmarkNoise
-from slam_core.geometry import FloatArray
+from slam_core.geometry import FloatArray, skew
 from slam_core.runtime.in_place import in_place
 from slam_core.tags import is_tag_corner
 from slam_core.types import Float32Array
 
 _COLUMNS, _ROWS = 8, 6
 """Cells of the image that landmarks are spread over."""
+KEPT_FOR_NS = 300_000_000
+"""Time for which features of one camera wait for its next frame while other cameras have theirs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,19 +29,52 @@ class CandidateLandmarks:
 
     candidates: points in the rig frame of that frame. ids: (n,) of the landmarks they belong to where a new submap has
     just begun, else -1. sightings: (n,) so far. free: (n,) whether the measurement may be used; where the submap before
-    has used it, it only helps to link the frames.
+    has used it, it only helps to link the frames. cameras: (n,) numbers of the cameras that saw them; stamps: (n,) ns,
+    when. Of a rig with several cameras those of a camera that a frame is not of stay for its next one.
     """
 
     candidates: Candidates
     ids: IndexArray
     sightings: np.ndarray
     free: np.ndarray
+    cameras: np.ndarray
+    stamps: IndexArray
 
     def select(self, index: np.ndarray) -> CandidateLandmarks:
         """The features at ``index``."""
         return CandidateLandmarks(
-            self.candidates.select(index), self.ids[index], self.sightings[index], self.free[index]
-        )
+            self.candidates.select(index), self.ids[index], self.sightings[index], self.free[index],
+            self.cameras[index], self.stamps[index],
+        )  # fmt: skip
+
+    def joined(self, other: CandidateLandmarks) -> CandidateLandmarks:
+        """Features with others after them."""
+        a, b = self.candidates, other.candidates
+        return CandidateLandmarks(
+            Candidates(
+                np.concatenate([a.points, b.points]), np.concatenate([a.covariances, b.covariances]),
+                np.concatenate([a.descriptors, b.descriptors]), np.concatenate([a.tracks, b.tracks]),
+            ),
+            np.concatenate([self.ids, other.ids]), np.concatenate([self.sightings, other.sightings]),
+            np.concatenate([self.free, other.free]), np.concatenate([self.cameras, other.cameras]),
+            np.concatenate([self.stamps, other.stamps]),
+        )  # fmt: skip
+
+    def of_others(self, cameras: Collection[int], stamp_ns: int) -> CandidateLandmarks:
+        """Those that other cameras than ``cameras`` saw, not long before a stamp."""
+        is_recent = stamp_ns - self.stamps < KEPT_FOR_NS
+        return self.select(np.flatnonzero(is_recent & ~np.isin(self.cameras, list(cameras))))
+
+    def moved(self, T: FloatArray, covariance: FloatArray) -> CandidateLandmarks:
+        """Those whose points are seen from another rig frame: by T_other_own (4, 4) of covariance (6, 6).
+
+        The error of the motion, which they share, is part of each one's own from then on.
+        """
+        candidates, R = self.candidates, T[:3, :3]
+        arms = candidates.points @ R.T
+        J = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], axis=2)
+        covariances = R @ candidates.covariances @ R.T + J @ covariance @ np.swapaxes(J, 1, 2)
+        return replace(self, candidates=replace(candidates, points=arms + T[:3, 3], covariances=covariances))
 
     def without(self, index: IndexArray) -> CandidateLandmarks:
         """All but the features at ``index``."""

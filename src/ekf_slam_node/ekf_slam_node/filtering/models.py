@@ -11,7 +11,8 @@ for a ToF depth, whose sigma is small against d, both are the same.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,11 +69,33 @@ def noise_gain(rotation: FloatArray, velocity: FloatArray, dt: float) -> FloatAr
 
 # ---- measurement
 @dataclass(frozen=True, eq=False)
+class FrameCamera:
+    """One of several cameras of a frame: its number on the rig, and its mounting.
+
+    T_first_own: (4, 4) its optical frame in that of the camera whose mounting the filter calls T_rig_optical.
+    """
+
+    camera: Camera
+    T_first_own: FloatArray
+    number: int
+
+
+class CameraPart(NamedTuple):
+    """What one camera has of a frame: the measurements ``index``, their camera and its mounting (4, 4) on the rig."""
+
+    index: slice | np.ndarray
+    camera: Camera
+    T_rig_optical: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """The usable features of one instant as measurements.
 
     z: (n, 3) u px, v px, inverse depth 1/m. variance: (n, 3) of z. descriptors: (n, d) float32, unit norm. index: (n,)
-    into the features they came from. tracks: (n,) of the front end, 0 without one.
+    into the features they came from. tracks: (n,) of the front end, 0 without one. Of a rig with several cameras:
+    ``cameras`` that took part, with or without features, and ``seen_by`` (n,), which of them each measurement is of;
+    ``camera`` is the first of them. Both are empty or zero for one camera alone.
     """
 
     stamp_ns: int
@@ -82,9 +105,47 @@ class Frame:
     camera: Camera
     index: np.ndarray
     tracks: np.ndarray
+    cameras: tuple[FrameCamera, ...] = ()
+    seen_by: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint8))
+
+    def __post_init__(self) -> None:
+        if len(self.seen_by) != len(self.z):
+            object.__setattr__(self, "seen_by", np.zeros(len(self.z), np.uint8))
 
     def __len__(self) -> int:
         return len(self.z)
+
+    def parts(self, T_rig_optical: FloatArray) -> list[CameraPart]:
+        """The frame camera by camera; ``T_rig_optical`` (4, 4) is the mounting of the rig's first camera."""
+        if not self.cameras:
+            return [CameraPart(slice(None), self.camera, T_rig_optical)]
+        return [
+            CameraPart(np.flatnonzero(self.seen_by == k), own.camera, T_rig_optical @ own.T_first_own)
+            for k, own in enumerate(self.cameras)
+        ]
+
+    @property
+    def camera_numbers(self) -> tuple[int, ...]:
+        """Numbers on the rig of the cameras that took part; 0 is one alone."""
+        return tuple(camera.number for camera in self.cameras) or (0,)
+
+    def side_by_side(self, gap: float = 0.0) -> FloatArray:
+        """Pixels (n, 2) in one wide image with the cameras' own beside each other, ``gap`` image widths between.
+
+        Each image is as large in it as that of ``camera``.
+        """
+        if not self.cameras:
+            return self.z[:, :2]
+        first = self.camera
+        scale = np.array([[first.width / c.camera.width, first.height / c.camera.height] for c in self.cameras])
+        pixels = self.z[:, :2] * scale[self.seen_by]
+        pixels[:, 0] += self.seen_by * (1.0 + gap) * first.width
+        return np.asarray(pixels)
+
+    @property
+    def wide_size(self) -> tuple[int, int]:
+        """Width and height (px) of the image of :meth:`side_by_side`."""
+        return self.camera.width * max(1, len(self.cameras)), self.camera.height
 
     def with_larger_noise(self, factor: FloatArray) -> Frame:
         """Copy of the measurements with their variances multiplied by (3,)."""
@@ -94,13 +155,14 @@ class Frame:
         """The measurements at ``index``."""
         return Frame(
             self.stamp_ns, self.z[index], self.variance[index], self.descriptors[index], self.camera, self.index[index],
-            self.tracks[index],
+            self.tracks[index], self.cameras, self.seen_by[index],
         )  # fmt: skip
 
     def places(self, index: np.ndarray) -> Frame:
         """The measurements at ``index`` without their descriptors, which are the larger part."""
         z, variance, own, tracks = self.z[index], self.variance[index], self.index[index], self.tracks[index]
-        return Frame(self.stamp_ns, z, variance, self.descriptors[:0], self.camera, own, tracks)
+        none = self.descriptors[:0]
+        return Frame(self.stamp_ns, z, variance, none, self.camera, own, tracks, self.cameras, self.seen_by[index])
 
 
 def frame_from_features(features: Features, usable: np.ndarray, min_sigma_px: float, min_sigma_depth: float) -> Frame:
@@ -111,7 +173,8 @@ def frame_from_features(features: Features, usable: np.ndarray, min_sigma_px: fl
         z, variance,
     )  # fmt: skip
     descriptors, tracks = features.descriptors[usable], features.track_ids[usable]
-    return Frame(features.stamp_ns, z, variance, descriptors, features.camera, usable, tracks)
+    seen_by = features.seen_by[usable]
+    return Frame(features.stamp_ns, z, variance, descriptors, features.camera, usable, tracks, (), seen_by)
 
 
 def project(points: FloatArray, camera: Camera) -> FloatArray:
@@ -147,7 +210,10 @@ def back_project(z: FloatArray, camera: Camera) -> FloatArray:
 def rig_points(frame: Frame, T_rig_optical: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Positions (n, 3) of a frame's features in the rig frame and their covariances (n, 3, 3) (Eqs. 6.22, 6.24)."""
     points, covariances = np.empty((len(frame), 3)), np.empty((len(frame), 3, 3))
-    placed(frame.z, frame.variance, T_rig_optical, frame.camera.lens, points, covariances)
+    for index, camera, T in frame.parts(T_rig_optical):
+        own, spread = points[index], covariances[index]
+        placed(frame.z[index], frame.variance[index], T, camera.lens, own, spread)
+        points[index], covariances[index] = own, spread
     return points, covariances
 
 

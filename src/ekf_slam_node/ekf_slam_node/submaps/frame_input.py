@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
 import numpy as np
 
-from ekf_slam_node.filtering.models import Frame, frame_from_features
+from ekf_slam_node.filtering.models import Frame, FrameCamera, frame_from_features
 from slam_core.camera import MIN_DEPTH
+from slam_core.geometry import FloatArray, invert_transform
 from slam_core.runtime.in_place import in_place
 from slam_core.tags import is_tag_corner, whole_tags
-from slam_core.types import Features
+from slam_core.types import Features, RigCamera
 
 _MAX_RELATIVE_DEPTH_SIGMA = 0.3
 """Features of a larger sigma of depth / depth are not used; a limit that cuts through many favours those whose noise
@@ -42,11 +46,21 @@ def _keep_possible(uv, depth, sigma_uv, sigma_depth, usable):  # type: ignore[no
 
 
 def frame_of_strongest(features: Features, usable: np.ndarray, most: int) -> Frame:
-    """At ``most`` so many of the usable features as a frame: the strongest, in their own order."""
+    """At ``most`` so many of the usable features of each camera as a frame: the strongest, in their own order."""
+    most *= max(1, len(features.cameras))
     index = np.flatnonzero(usable)
     if len(index) > most:
         index = np.sort(index[np.argsort(-features.response[index], kind="stable")[:most]])
     return frame_from_features(features, index, _MIN_SIGMA_PX, _MIN_SIGMA_DEPTH)
+
+
+def mounted(
+    frame: Frame, cameras: Sequence[RigCamera], T_rig_optical: FloatArray, mountings: Mapping[str, FloatArray]
+) -> Frame:
+    """The frame of features of several ``cameras``, each where ``mountings`` (T_rig_optical by frame) has it."""
+    T_first_rig = invert_transform(T_rig_optical)
+    seen = tuple(FrameCamera(c.camera, T_first_rig @ mountings[c.frame_id], c.number) for c in cameras)
+    return replace(frame, cameras=seen) if seen else frame
 
 
 def without_tags(features: Features) -> tuple[Features, Frame | None]:

@@ -18,11 +18,12 @@ from ekf_slam_node.filtering.covariance import IndexArray
 from ekf_slam_node.filtering.drift import Drift
 from ekf_slam_node.filtering.ekf import Ekf, TimeUpdate, UpdateReport
 from ekf_slam_node.filtering.landmarks import CandidateLandmarks, LandmarkTable, spread_choice
-from ekf_slam_node.filtering.models import CORE_DIM, Frame, observe, relative_motion, rig_points
+from ekf_slam_node.filtering.models import CORE_DIM, Frame, relative_motion, rig_points
+from ekf_slam_node.filtering.sightings import in_view, observed_by, sighted_by
 from ekf_slam_node.odometry.odometry import UpDirection
 from ekf_slam_node.odometry.relative_poses import RELATIVE_POSE_GATE, RelativePoseMeasurement, relative_pose_error
 from slam_core.camera import MIN_DEPTH
-from slam_core.geometry import FloatArray, skew
+from slam_core.geometry import FloatArray, inverse_jacobian, invert_transform, skew
 from slam_core.tags import CORNERS
 from slam_core.types import PoseEstimate
 
@@ -221,8 +222,7 @@ class OpenSubmap:
         known = np.flatnonzero(link.rows < len(self.table))
         fresh = np.flatnonzero(link.rows >= len(self.table))
         fresh = fresh[self.pending.free[link.rows[fresh] - len(self.table)]]
-        pixels = frame.z[link.columns, :2]
-        size = (frame.camera.width, frame.camera.height)
+        pixels, size = frame.side_by_side()[link.columns], frame.wide_size
         known = known[spread_choice(pixels[known], pixels[:0], MAX_UPDATE_LANDMARKS, size)]
         which = link.rows[fresh] - len(self.table)
         inherited = self.pending.ids[which] >= 0
@@ -255,15 +255,15 @@ class OpenSubmap:
         if closes:
             self._ekf.add_pose_noise(common)
             common = np.zeros(6)
-        z, claimed = frame.z[sight.columns], frame.variance[sight.columns]
-        variance = claimed * self._noise_factors(sight)
-        found = self._ekf.sighted(z, variance, sight.slots, self._T_rig_optical, frame.camera, common)
+        seen = frame.places(sight.columns)
+        z, variance = seen.z, seen.variance * self._noise_factors(sight)
+        found = sighted_by(self._ekf.sighted, seen, variance, sight.slots, self._T_rig_optical, common)
         good = np.flatnonzero((found.nis < self._config.association.gate) & (found.seen.depth > MIN_DEPTH))
         is_followed = 2 * np.sum(frame.tracks[sight.columns] > 0) > len(sight)
         used = most_telling(found.information, good, self._config.landmark.most_measured) if is_followed else good
         report = self._ekf.update(z[used], variance[used], found.seen.select(used), sight.slots[used], common)
-        after = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks[sight.slots], frame.camera)
-        self.table.noise.record(sight.slots, (z - after.z)[:, :2], claimed[:, :2])
+        after = observed_by(seen, self._ekf.T, self._T_rig_optical, self._ekf.landmarks[sight.slots])
+        self.table.noise.record(sight.slots, (z - after.z)[:, :2], seen.variance[:, :2])
         return report, sight.select(good)
 
     def measure_tags(self, frame: Frame, common: FloatArray) -> TagReport:
@@ -291,8 +291,8 @@ class OpenSubmap:
 
     def _distances(self, frame: Frame, slots: IndexArray, columns: IndexArray, common: FloatArray) -> FloatArray:
         """NIS (k,) of sightings; infinite behind the camera."""
-        z, variance = frame.z[columns], frame.variance[columns]
-        found = self._ekf.sighted(z, variance, slots, self._T_rig_optical, frame.camera, common)
+        seen = frame.places(columns)
+        found = sighted_by(self._ekf.sighted, seen, seen.variance, slots, self._T_rig_optical, common)
         return np.where(found.seen.depth > MIN_DEPTH, found.nis, np.inf)
 
     def _tags_missed(self, first_corners: IndexArray, is_far: np.ndarray) -> int:
@@ -337,13 +337,18 @@ class OpenSubmap:
         pending = candidate_landmarks(frame, self._T_rig_optical)
         pending.ids[link.columns[named]] = self.pending.ids[which]
         pending.sightings[link.columns[named]] = self.pending.sightings[which] + 1
-        self.pending = pending.without(sight.columns)
+        pending = pending.without(sight.columns)
+        if frame.cameras:
+            others = self.pending.without(which).of_others(frame.camera_numbers, frame.stamp_ns)
+            J = inverse_jacobian(link.T)
+            pending = pending.joined(others.moved(invert_transform(link.T), J @ link.covariance @ J.T))
+        self.pending = pending
 
     def prune_landmarks(self, frame: Frame, sight: LandmarkMatches) -> None:
         """Count who was seen and who should have been, and remove landmarks that cannot be relied on."""
-        view = observe(self._ekf.T, self._T_rig_optical, self._ekf.landmarks, frame.camera)
+        expected = in_view(frame, self._ekf.T, self._T_rig_optical, self._ekf.landmarks, margin_px=10.0)
         self.table.tracks[sight.slots] = frame.tracks[sight.columns]
-        self.table.count(sight.slots, frame.descriptors[sight.columns], view.in_image(frame.camera, margin_px=10.0))
+        self.table.count(sight.slots, frame.descriptors[sight.columns], expected)
         self._frames += 1
         for slot in self.table.unreliable(self._frames, self._config.landmark):
             self._remove(slot)
@@ -368,6 +373,8 @@ def candidate_landmarks(frame: Frame, T_rig_optical: FloatArray) -> CandidateLan
         np.full(n, -1, dtype=np.int64),
         np.ones(n, dtype=np.int32),
         np.ones(n, dtype=bool),
+        np.array(frame.camera_numbers)[frame.seen_by],
+        np.full(n, frame.stamp_ns, dtype=np.int64),
     )
 
 

@@ -6,6 +6,7 @@ after the middle one lies, for the camera of the middle row, where the rig's mot
 2012). The readout, time from the first row to the last, is learnt from pairs of frames with a motion between them that
 has changed: at a constant velocity both are bent alike, which no pair can tell. A frame's velocity is the mean of the
 motions before and after it. A camera whose rows are exposed at once shows no readout beyond chance and stays as it is.
+The frames of several cameras are left as they are: each would have a readout of its own.
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ class RollingShutter:
         ``T_previous_now`` (4, 4) is the motion that led to it, None while that is not known.
         """
         readout = self.readout_s
-        if readout == 0.0:
+        if readout == 0.0 or frame.cameras:
             return frame
         velocities = [] if T_previous_now is None else [velocity_of_motion(T_previous_now, dt)]
         if self._frame_pairs and self._follows(frame, dt):
@@ -133,6 +134,8 @@ class RollingShutter:
 
     def learn(self, frame: Frame, ids: np.ndarray, columns: np.ndarray, T_previous_now: FloatArray, dt: float) -> None:
         """Take in a frame as it was measured, its landmarks ``ids`` at ``columns``, and its motion over dt (s)."""
+        if frame.cameras:
+            return
         if dt > _LONGEST_STEP_S or not (self._frame_pairs and self._follows(frame, dt)):
             self._frame_pairs.clear()
         self._frame_pairs.append(

@@ -182,7 +182,9 @@ Reading = (
 class AgentSensors:
     """Sensors of one agent. Frames and infos are None where there is no such sensor.
 
-    ``measurement``: "range" along the ray or "depth" along z. ``frames``: the static transforms between its frames.
+    Of a rig with several cameras these are the sensors of one of them, ``agent`` is its namespace, ``rig`` that of the
+    rig and ``camera`` its name there; those that are no cameras are the first camera's. ``measurement``: "range" along
+    the ray or "depth" along z. ``frames``: the static transforms between its frames.
     """
 
     agent: str
@@ -196,6 +198,8 @@ class AgentSensors:
     base_frame: str = "base_link"
     topics: dict[str, str] = field(default_factory=dict)
     """Role ("left", "depth", "tof_info", "imu", ...) to the bag's topic; "depth" holds what ``measurement`` says."""
+    rig: str = ""
+    camera: str = ""
 
     def transform(self, target: str, source: str) -> FloatArray:
         """T_target_source between "base", "left" and "tof"; ValueError if the bag does not know it."""

@@ -15,8 +15,10 @@ Topics are those of the nodes, or given by role, see :mod:`slam_bags.reading.sen
 - ``scan`` of a laser scanner, ``imu``, ``odometry``, ``position``, ``pressure`` and ``ground_truth/pose``;
 - ``mask`` of the rectified left image and ``tof/mask`` of the depth image: pixels that are not zero are not used.
 
-Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera counts, and
-images under another one are left out. So is a message that is broken, has no partner or an odd stamp; all are counted.
+Several cameras of one rig (:mod:`slam_bags.reading.rig_cameras`) are read as an agent each, ``rigs`` says which belong
+together. Extrinsics come from ``tf_static``. The calibration of a bag is constant: the first info of each camera
+counts, and images under another one are left out. So is a message that is broken, has no partner or an odd stamp; all
+are counted.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Self, TypeVar
@@ -54,6 +57,7 @@ from slam_bags.reading.readings import (
     StereoReading,
 )
 from slam_bags.reading.rig_calibration import RigCalibration
+from slam_bags.reading.rig_cameras import RIG_ROLES, rigs_of
 from slam_bags.reading.sensor_topics import BagNames, find_agents, is_rectified, join, other_cameras, topics_of
 from slam_bags.storage.bag import BagReader
 from slam_core.camera import CameraInfo
@@ -109,6 +113,7 @@ class SensorBag:
 
     def __enter__(self) -> Self:
         self.reader.__enter__()
+        self.rigs: dict[str, tuple[str, ...]] = {}
         try:
             self.agents = self._find_agents()
             self.sensors = self._find_sensors()
@@ -244,14 +249,18 @@ class SensorBag:
         """Warnings about this bag, as far as it has been read."""
         return [*self._warnings, *self._left_out.warnings, *[self.reader.warning] * bool(self.reader.warning)]
 
+    def first_of(self, agent: str) -> AgentSensors:
+        """The sensors of an agent, or of the first camera of a rig."""
+        return self.sensors[agent if agent in self.sensors else self.rigs[agent][0]]
+
     def count(self, agent: str, role: str) -> int:
-        """Messages of a role ("left", "depth", "imu", ...) of an agent; 0 if there is no such topic."""
-        topic = self.sensors[agent].topics.get(role)
+        """Messages of a role ("left", "depth", "imu", ...) of an agent or a rig; 0 if there is no such topic."""
+        topic = self.first_of(agent).topics.get(role)
         return self.reader.topics[topic].count if topic else 0
 
     def ground_truth(self, agent: str) -> Trajectory | None:
-        """Poses T_world_base of the agent, without covariance; None if the bag has none."""
-        topic = self.sensors[agent].topics.get("ground_truth")
+        """Poses T_world_base of the agent or rig, without covariance; None if the bag has none."""
+        topic = self.first_of(agent).topics.get("ground_truth")
         if topic is None:
             return None
         if topic not in self._true_poses:  # the bag has not been read to its end
@@ -263,6 +272,8 @@ class SensorBag:
         return Trajectory(np.array(stamps, dtype=np.int64), np.stack([poses[s] for s in stamps])) if stamps else None
 
     def _find_agents(self) -> tuple[str, ...]:
+        if cameras := tuple(self._names.rig.topics):
+            return cameras
         found = find_agents(self.reader.topics, self._names.topics)
         if not found:
             topics = ", ".join(f"{name} ({info.type_name})" for name, info in self.reader.topics.items()) or "none"
@@ -276,10 +287,16 @@ class SensorBag:
         tree = self._read_frames()
         if self._names.calibration.is_given and len(self.agents) > 1:
             raise ValueError(f"a calibration is that of one rig, and {self.reader.path} has {len(self.agents)}")
-        return {agent: self._sensors_of(agent, tree) for agent in self.agents}
+        found = {agent: self._cameras_of(agent, tree) for agent in self.agents}
+        frames = {agent: [f for f in (s.left_frame, s.tof_frame) if f] for agent, s in found.items()}
+        self.rigs = {"": self.agents} if self._names.rig.topics else rigs_of(frames, tree)
+        rig_of = {agent: rig for rig, agents in self.rigs.items() for agent in agents}
+        return {agent: self._on_rig(sensors, rig_of[agent]) for agent, sensors in found.items()}
 
-    def _sensors_of(self, agent: str, tree: FrameTree) -> AgentSensors:
-        topics = topics_of(agent, self.reader.topics, self._names.topics)
+    def _cameras_of(self, agent: str, tree: FrameTree) -> AgentSensors:
+        """The sensors in a namespace; which frame is that of their rig is not known yet."""
+        given = self._names.rig.topics.get(agent, self._names.topics)
+        topics = topics_of(agent, self.reader.topics, given)
         measurement = "range" if "range" in topics else "depth"
         if "range" in topics:
             topics["depth"] = topics.pop("range")
@@ -290,8 +307,22 @@ class SensorBag:
         tof, tof_frame = self._camera_info(topics, "depth", "tof_info")
         for transform in self._names.calibration.transforms(left_frame, tof_frame):
             tree.add(transform.parent, transform.child, transform.T)
-        base = self._base_frame(agent, tree, left_frame or tof_frame)
-        return AgentSensors(agent, left, right, tof, measurement, tree, left_frame, tof_frame, base, topics)
+        return AgentSensors(agent, left, right, tof, measurement, tree, left_frame, tof_frame, topics=topics)
+
+    def _on_rig(self, sensors: AgentSensors, rig: str) -> AgentSensors:
+        """The sensors of a namespace as those of a rig; what is no camera is its first camera's."""
+        agent, cameras, topics = sensors.agent, self.rigs[rig], dict(sensors.topics)
+        camera = agent.rpartition("/")[2] if len(cameras) > 1 else ""
+        if camera:
+            topics = {role: topic for role, topic in topics.items() if role not in RIG_ROLES}
+            if agent == cameras[0]:
+                given = {r: t for r, t in self._names.topics.items() if r in RIG_ROLES}
+                own = topics_of(rig, self.reader.topics, given)
+                topics |= {role: topic for role, topic in own.items() if role in RIG_ROLES}
+                if "depth" in topics:
+                    topics.pop("scan", None)
+        base = self._base_frame(rig, sensors.frames, sensors.left_frame or sensors.tof_frame)
+        return replace(sensors, topics=topics, base_frame=base, rig=rig, camera=camera)
 
     def _base_frame(self, agent: str, tree: FrameTree, camera_frame: str) -> str:
         """Frame of the rig: base_link, or the root above the camera in a bag that has none."""
@@ -342,6 +373,8 @@ class SensorBag:
         for _, _, message in self.reader.messages(topics):
             for transform in message.transforms:
                 tree.add(*transform_from_message(transform))
+        for given in self._names.rig.transforms:
+            tree.add(given.parent, given.child, given.T)
         return tree
 
 

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from slam_bags.reading.rig_calibration import RigCalibration
+from slam_bags.reading.rig_cameras import RigCameras
 
 _LEFT = ("stereo/left/image_raw", "stereo/left/image_rect", "stereo/left/image_raw/compressed")
 _CANDIDATES = {
@@ -40,13 +41,14 @@ ROLES = (*_CANDIDATES, *_INFO_OF)
 class BagNames:
     """Names of a bag that differ from those of the nodes, and a calibration instead of its own.
 
-    topics: by role. base_frame: the frame whose poses are wanted; "": ``base_link``, or where there is none the root
-    above the camera in the tree of frames.
+    topics: by role. rig: those of several cameras of one rig. base_frame: the frame whose poses are wanted; "":
+    ``base_link``, or where there is none the root above the camera in the tree of frames.
     """
 
     topics: Mapping[str, str] = field(default_factory=dict)
     base_frame: str = ""
     calibration: RigCalibration = field(default_factory=RigCalibration)
+    rig: RigCameras = field(default_factory=RigCameras)
 
 
 def parse_topics(assignments: Iterable[str]) -> dict[str, str]:

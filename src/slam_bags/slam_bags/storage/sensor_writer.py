@@ -52,13 +52,17 @@ class SensorWriter:
         An open bag.
     agent
         Namespace of the agent, also the prefix of its frames; "" for a single rig.
+    camera
+        Namespace, below the agent's, of the images and their frames of one of several cameras; "" of one alone.
     """
 
-    def __init__(self, bag: BagWriter, agent: str = "") -> None:
+    def __init__(self, bag: BagWriter, agent: str = "", camera: str = "") -> None:
         self._bag = bag
         self._types = BagTypes()
         self._prefix = f"/{agent}" if agent else ""
+        self._camera_prefix = f"{self._prefix}/{camera}" if camera else self._prefix
         self._frame_prefix = f"{agent}/" if agent else ""
+        self._camera_frame_prefix = f"{self._frame_prefix}{camera}/" if camera else self._frame_prefix
 
     def extrinsics(self, stamp_ns: int, T_base_frame: Mapping[str, FloatArray]) -> None:
         """Static transforms (4, 4) from base_link to frames by name, to be written before the first reading."""
@@ -117,15 +121,16 @@ class SensorWriter:
         self._bag.write(f"{self._prefix}/ground_truth/pose", message, stamp_ns)
 
     def picture(self, topic: str, stamp_ns: int, frame: str, image: AnyArray) -> None:
-        """One image on a topic below the agent's namespace."""
+        """One image on a topic below the camera's namespace."""
         header = header_message(self._types, stamp_ns, self._frame(frame))
         message = image_message(self._types, header, image, "rgb8" if image.ndim == 3 else "")
-        self._bag.write(f"{self._prefix}/{topic}", message, stamp_ns)
+        self._bag.write(f"{self._camera_prefix}/{topic}", message, stamp_ns)
 
     def info(self, topic: str, stamp_ns: int, frame: str, info: CameraInfo) -> None:
-        """One camera info on a topic below the agent's namespace."""
+        """One camera info on a topic below the camera's namespace."""
         header = header_message(self._types, stamp_ns, self._frame(frame))
-        self._bag.write(f"{self._prefix}/{topic}", camera_info_message(self._types, header, info), stamp_ns)
+        self._bag.write(f"{self._camera_prefix}/{topic}", camera_info_message(self._types, header, info), stamp_ns)
 
     def _frame(self, name: str) -> str:
-        return f"{self._frame_prefix}{name}"
+        of_camera = name in (LEFT_FRAME, RIGHT_FRAME, TOF_FRAME)
+        return f"{self._camera_frame_prefix if of_camera else self._frame_prefix}{name}"

@@ -127,8 +127,10 @@ def choose(config: SystemConfig, mode: str, mapper: str, odometry: str, imu: str
     )
 
 
-def filter_config(config: FilterConfig, sensors: AgentSensors) -> FilterConfig:
+def filter_config(config: FilterConfig, sensors: AgentSensors, *others: AgentSensors) -> FilterConfig:
     """The filter of an agent, whose frames wait for its IMU and odometry as well where it has some that are used.
+
+    ``others``: the cameras of its rig beside the first.
 
     Raises
     ------
@@ -137,7 +139,9 @@ def filter_config(config: FilterConfig, sensors: AgentSensors) -> FilterConfig:
     """
     if config.imu.use == "on" and "imu" not in sensors.topics:
         raise ValueError("an IMU is asked for (--imu on) and there is no topic imu: name it by --topic imu=/...")
-    return replace(config, agent=sensors.agent, wait_for=awaited_streams(config, sensors.topics))
+    cameras = tuple(own.camera for own in (sensors, *others)) if others else ()
+    agent = sensors.rig if others else sensors.agent
+    return replace(config, agent=agent, cameras=cameras, wait_for=awaited_streams(config, sensors.topics))
 
 
 def awaited_streams(config: FilterConfig, roles: Collection[str]) -> tuple[str, ...]:

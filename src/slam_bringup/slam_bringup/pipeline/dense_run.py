@@ -44,9 +44,15 @@ def dense_model(
 ) -> DenseStage:
     """The model of all agents in the map frame, of what was read until ``stopped``; its surface is not made yet.
 
-    ``corrections``: by agent, what the rectification of its right images is wrong by, where that is sure.
+    Every camera of a rig takes part on the rig's trajectory. ``corrections``: by agent or camera, what the
+    rectification of its right images is wrong by, where that is sure.
     """
-    paths = {agent: trajectory for agent, trajectory in trajectories.items() if len(trajectory)}
+    paths = {
+        camera: trajectory
+        for agent, trajectory in trajectories.items()
+        if len(trajectory)
+        for camera in bag.rigs.get(agent, (agent,))
+    }
     coloured = frozenset(a for a in paths if config.dense_mapper.use_tof and "color" in bag.sensors[a].topics)
     masked = frozenset(f"{a}/{c}" for a in paths for c, role in MASK_ROLES.items() if role in bag.sensors[a].topics)
     stage = DenseStage(config.dense_mapper, paths, coloured, masked)

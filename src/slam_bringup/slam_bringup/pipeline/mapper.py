@@ -45,7 +45,7 @@ class Mapper:
     Parameters
     ----------
     sensors
-        What each agent carries, by name.
+        What each agent carries, by name; those of the cameras of one rig feed one filter.
     """
 
     def __init__(
@@ -54,11 +54,14 @@ class Mapper:
         self._times = times
         self.session = session
         self._compact = config.ekf_slam.submap.compact
+        rigs = _rigs(sensors)
         self._filters = {
-            agent: FilterStage(filter_config(config.ekf_slam, s), s.frames, s.base_frame, session.next_session)
-            for agent, s in sensors.items()
+            rig: FilterStage(filter_config(config.ekf_slam, *s), s[0].frames, s[0].base_frame, session.next_session)
+            for rig, s in rigs.items()
         }
-        self._diaries = {agent: _Diary() for agent in sensors}
+        self._cameras = {own.agent: (rig, own.camera) for rig, s in rigs.items() for own in s}
+        self._first_cameras = {s[0].agent for s in rigs.values()}
+        self._diaries = {rig: _Diary() for rig in rigs}
         self._futures: list[Future[Outcome | None]] = []
         self._outcomes: list[Outcome] = []
         self._events: list[str] = []
@@ -66,17 +69,20 @@ class Mapper:
 
     def process(self, item: AgentItem) -> None:
         """One step of one agent's filter, and of the map where that finished a submap."""
-        stage, value = self._filters[item.agent], item.value
+        agent, camera = self._cameras[item.agent]
+        stage, value = self._filters[agent], item.value
         if isinstance(value, SessionStart):
-            self._process_waiting(item.agent)
+            if item.agent not in self._first_cameras:
+                return  # the other cameras of a rig share its clock
+            self._process_waiting(agent)
             self._hand_over(stage.start_session())
         elif isinstance(value, PositionReading):
             self._has_positions = self._uses_positions
-            self.session.add_position(item.agent, value)
+            self.session.add_position(agent, value)
         elif isinstance(value, ScanEstimate):
-            self._diaries[item.agent].scans.append(value.pose)
-        add_to_filter(stage, value)
-        self._take_results(item.agent)
+            self._diaries[agent].scans.append(value.pose)
+        add_to_filter(stage, value, camera)
+        self._take_results(agent)
 
     def finish(self) -> None:
         """Close the open submaps and wait until all are joined; the map ends up the same whoever came first.
@@ -179,8 +185,16 @@ class Mapper:
         self._futures += [self.session.add(rounded(submap) if self._compact else submap) for submap in submaps]
 
 
-def add_to_filter(stage: FilterStage, value: Value) -> None:
-    """Hand a filter what its sensors have led to, as its node receives it."""
+def _rigs(sensors: Mapping[str, AgentSensors]) -> dict[str, list[AgentSensors]]:
+    """The sensors of each rig, first camera first, by the rig's namespace."""
+    rigs: dict[str, list[AgentSensors]] = {}
+    for own in sensors.values():
+        rigs.setdefault(own.rig if own.camera else own.agent, []).append(own)
+    return rigs
+
+
+def add_to_filter(stage: FilterStage, value: Value, camera: str = "") -> None:
+    """Hand a filter what its sensors, or one of several cameras, have led to, as its node receives it."""
     if isinstance(value, ImuSample):
         stage.add_imu(value)
     elif isinstance(value, OdometryReading):
@@ -190,7 +204,7 @@ def add_to_filter(stage: FilterStage, value: Value) -> None:
     elif isinstance(value, ScanEstimate):
         stage.add_motion(value.pose.stamp_ns, motion_as_received(value.motion))
     elif isinstance(value, Features):
-        stage.add_features(value)
+        stage.add_features(value, camera)
 
 
 def _loose(shown: MapSnapshot, known: int) -> list[str]:

@@ -26,7 +26,7 @@ from slam_bringup.pipeline.configuration import SystemConfig
 from slam_bringup.pipeline.mapper import Mapper
 from slam_bringup.pipeline.prefetch import prefetch
 from slam_bringup.pipeline.run_record import describe_error, run_result
-from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline
+from slam_bringup.pipeline.sensor_pipeline import AgentItem, SensorPipeline, rig_pipelines
 from slam_bringup.pipeline.stage_times import StageTimes
 from slam_core.types import ImuSample, OdometryReading, PositionReading, PressureReading
 from slam_viewer.results import RunResult
@@ -82,13 +82,14 @@ def run_bag(
     times = StageTimes()
     start = time.perf_counter()
     with SensorBag(path, names) as bag:
-        pipelines = {a: SensorPipeline(config, bag.sensors[a], odometry != "none", times) for a in bag.agents}
+        pipelines = _pipelines(bag, config, odometry != "none", times)
         mapping = Mapper(config, bag.sensors, times, session or MapSession(config.sjsam))
         failure = _map(mapping, _measured(bag, pipelines, on_reading, stopped))
         record = mapping.record(time.perf_counter() - start, dict(bag.left_out), failure)
         record = record.with_front_ends(
             {agent: pipeline.front_end() for agent, pipeline in pipelines.items()},
             {agent: pipeline.log.frames for agent, pipeline in pipelines.items()},
+            bag.rigs,
         )
         _LOG.info("mapped %d submaps in %.1f s; the dense model is next", record.submaps, record.wall_s)
         session = mapping.session
@@ -105,6 +106,14 @@ def run_bag(
                 on_mapped=on_mapped,
             )
     return result, session
+
+
+def _pipelines(bag: SensorBag, config: SystemConfig, odometry: bool, times: StageTimes) -> dict[str, SensorPipeline]:
+    """The pipelines of all cameras of all rigs."""
+    pipelines: dict[str, SensorPipeline] = {}
+    for agents in bag.rigs.values():
+        pipelines |= rig_pipelines(config, [bag.sensors[agent] for agent in agents], odometry, times)
+    return pipelines
 
 
 def _map(mapping: Mapper, items: Generator[AgentItem, None, None]) -> str:

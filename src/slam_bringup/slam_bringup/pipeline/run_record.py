@@ -71,8 +71,8 @@ class AgentRecord:
     """Estimates of one agent, frame by frame.
 
     ``events`` are changes of its filter's state, ``lost_share`` how much of the time it was lost, ``readout_seen_s``
-    the time in which its pictures are read out and its standard error, ``front_end`` what its images told, ``frames``
-    some of its pictures.
+    the time in which its pictures are read out and its standard error, ``front_end`` what its images told,
+    ``other_front_ends`` those of the other cameras of its rig by their namespaces, ``frames`` some of its pictures.
     """
 
     filtered: Sequence[PoseEstimate] = field(default_factory=list)
@@ -82,6 +82,7 @@ class AgentRecord:
     lost_share: float = 0.0
     readout_seen_s: tuple[float, float] = (0.0, 0.0)
     front_end: FrontendReport = field(default_factory=FrontendReport)
+    other_front_ends: Mapping[str, FrontendReport] = field(default_factory=dict)
     frames: Sequence[LoggedFrame] = ()
 
 
@@ -107,17 +108,25 @@ class RunRecord:
     fixed_frame: PoseEstimate | None = None
 
     def with_front_ends(
-        self, reports: Mapping[str, FrontendReport], frames: Mapping[str, Sequence[LoggedFrame]] | None = None
+        self,
+        reports: Mapping[str, FrontendReport],
+        frames: Mapping[str, Sequence[LoggedFrame]] | None = None,
+        rigs: Mapping[str, Sequence[str]] | None = None,
     ) -> RunRecord:
-        """The record with what the agents' front ends report, and some of their pictures, by agent."""
-        pictures = frames or {}
-        return replace(
-            self,
-            agents={
-                agent: replace(record, front_end=reports[agent], frames=pictures.get(agent, ()))
-                for agent, record in self.agents.items()
-            },
-        )
+        """The record with what the agents' front ends report, and some of their pictures, by agent.
+
+        ``rigs``: namespaces of the cameras of each agent, by default its own alone.
+        """
+        pictures, told = frames or {}, {}
+        for agent, record in self.agents.items():
+            first, *others = (rigs or {}).get(agent, (agent,))
+            told[agent] = replace(
+                record,
+                front_end=reports[first],
+                other_front_ends={camera: reports[camera] for camera in others},
+                frames=pictures.get(first, ()),
+            )
+        return replace(self, agents=told)
 
 
 _ONE_FILTER = (
@@ -206,7 +215,10 @@ def _dense(
     """The dense model's surface and floor plans, and why the run or the model failed, if so."""
     surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
     try:
-        corrections = {agent: known.front_end.correction for agent, known in record.agents.items()}
+        corrections = {}
+        for agent, known in record.agents.items():
+            corrections[bag.first_of(agent).agent] = known.front_end.correction
+            corrections |= {camera: own.correction for camera, own in known.other_front_ends.items()}
         model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading, stopped, corrections)
         if not stopped():
             surface = model.surface()
@@ -231,15 +243,15 @@ def _agent_result(
         readout_seen_s=record.readout_seen_s,
         sensors=_sensors(bag, config, agent, odometry),
         frames=tuple(record.frames),
-        base_frame=bag.sensors[agent].base_frame,
+        base_frame=bag.first_of(agent).base_frame,
         mounts=_mounts(bag, agent),
     )
 
 
 def _sensors(bag: SensorBag, config: SystemConfig, agent: str, odometry: str) -> tuple[str, ...]:
     """The sensors that the agent's map is made of, in words."""
-    mode, dense, topics = config.feature_extractor.mode, config.dense_mapper, bag.sensors[agent].topics
-    depth = "ToF camera" if bag.sensors[agent].measurement == "range" else "depth camera"
+    mode, dense, topics = config.feature_extractor.mode, config.dense_mapper, bag.first_of(agent).topics
+    depth = "ToF camera" if bag.first_of(agent).measurement == "range" else "depth camera"
     used = ["stereo camera"] * (mode != "tof") + [depth] * (mode != "stereo" or odometry != "none")
     used += ["IMU"] * (config.ekf_slam.imu.use != "off" and bag.count(agent, "imu") > 0)
     used += ["odometry"] * (config.ekf_slam.odometry.use != "off" and bag.count(agent, "odometry") > 0)
@@ -248,6 +260,10 @@ def _sensors(bag: SensorBag, config: SystemConfig, agent: str, odometry: str) ->
     for name, wanted, role in (("stereo camera", dense.use_stereo, "right"), (depth, dense.use_tof, "depth")):
         if wanted and role in topics and name not in used:
             used.append(f"{name} for the dense model alone")
+    cameras = bag.rigs.get(agent, ())
+    if len(cameras) > 1:
+        names = [bag.sensors[camera].camera for camera in cameras]
+        used[0] = f"{len(cameras)} cameras ({', '.join(names)})"
     return tuple(used)
 
 
@@ -259,10 +275,12 @@ def _changed(config: SystemConfig) -> dict[str, Any]:
 
 def _mounts(bag: SensorBag, agent: str) -> dict[str, FloatArray]:
     """T_base_frame of the agent's own frames; those of others hang together with it only through the map."""
-    sensors = bag.sensors[agent]
+    sensors = bag.first_of(agent)
     return sensors.frames.below(sensors.base_frame)
 
 
 def _events(agents: Mapping[str, AgentRecord]) -> list[str]:
     said = [(name, (*record.front_end.advice, *record.events)) for name, record in agents.items()]
+    others = [own for record in agents.values() for own in record.other_front_ends.items()]
+    said += [(camera, report.advice) for camera, report in others]
     return [f"{name}: {event}" if name else event for name, events in said for event in events]

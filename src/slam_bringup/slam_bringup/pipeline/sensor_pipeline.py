@@ -11,7 +11,7 @@ masks  ------> FeatureStage
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -59,7 +59,14 @@ class AgentItem:
 
 
 class SensorPipeline:
-    """The stages that a mode needs, from :meth:`add` to :meth:`measure`.
+    """The stages that a mode needs, from :meth:`add` to :meth:`measure`, for one agent or one camera of a rig.
+
+    Parameters
+    ----------
+    odometry
+        Whether scans are registered.
+    scans
+        What registers them where the cameras of a rig share it; None: one of its own.
 
     Raises
     ------
@@ -67,9 +74,16 @@ class SensorPipeline:
         If the agent lacks a sensor that the mode needs; the message says which mode would do.
     """
 
-    def __init__(self, config: SystemConfig, sensors: AgentSensors, odometry: bool, times: StageTimes) -> None:
+    def __init__(
+        self,
+        config: SystemConfig,
+        sensors: AgentSensors,
+        odometry: bool,
+        times: StageTimes,
+        scans: ScanOdometryStage | None = None,
+    ) -> None:
         mode = config.feature_extractor.mode
-        self._agent = sensors.agent
+        self._agent, self._camera = sensors.agent, sensors.camera
         self._times = times
         self._uses_stereo = mode != "tof"
         self._uses_depth = mode != "stereo" or (odometry and sensors.scanner == "depth")
@@ -80,9 +94,7 @@ class SensorPipeline:
         self._depth = depth_stage(config, sensors)
         self._mask_role = MASK_ROLES["stereo" if self._uses_stereo else "tof"]
         self._features = FeatureStage(with_masks(config.feature_extractor, sensors), sensors.frames)
-        self._odometry = (
-            ScanOdometryStage(config.ndt_odometry, sensors.frames, sensors.base_frame) if odometry else None
-        )
+        self._odometry = scans or rig_scans(config, [sensors]) if odometry else None
 
     def add(self, reading: Reading) -> Iterator[AgentItem]:
         """Take a reading; yields what it leads to. A stereo pair that waits for its ToF image comes out later."""
@@ -102,7 +114,7 @@ class SensorPipeline:
             self._features.add_mask(reading.mask)
             yield from self._frames()
         elif isinstance(reading, LaserReading) and self._odometry is not None:
-            self._odometry.add_scan(reading.scan)
+            self._odometry.add_scan(reading.scan, self._camera)
             yield from self._scans()
         elif isinstance(reading, SessionStart):
             yield from self._on_session(reading)
@@ -154,7 +166,7 @@ class SensorPipeline:
         self._depth.add(reading.raw)
         for depth in self._times.each("depth", self._depth.ready()):
             if self._odometry is not None:
-                self._odometry.add_scan(Scan(depth.stamp_ns, depth.points(), depth.frame_id))
+                self._odometry.add_scan(Scan(depth.stamp_ns, depth.points(), depth.frame_id), self._camera)
             self._features.add_depth(depth)
         yield from self._scans()
         yield from self._frames()
@@ -179,6 +191,53 @@ class SensorPipeline:
             raise ValueError(f"mode '{mode}' needs ToF images, and {who} has none: try {hint}")
         if no_scans:
             raise ValueError(f"scan odometry needs ToF images or laser scans, and {who} has none: leave --odometry out")
+
+
+def rig_pipelines(
+    config: SystemConfig, cameras: Sequence[AgentSensors], odometry: bool, times: StageTimes
+) -> dict[str, SensorPipeline]:
+    """The pipelines of the cameras of one rig by their namespaces; a rig with one camera has one.
+
+    A camera of several that lacks what the mode needs is used as what it is, and scans come from those with depth.
+
+    Raises
+    ------
+    ValueError
+        If a rig with one camera lacks a sensor that the mode needs, or none of several has depth for scan odometry.
+    """
+    if len(cameras) == 1:
+        return {cameras[0].agent: SensorPipeline(config, cameras[0], odometry, times)}
+    if odometry and not any(camera.scanner for camera in cameras):
+        raise ValueError("scan odometry needs ToF images, and no camera of the rig has any: leave --odometry out")
+    scans = rig_scans(config, cameras) if odometry else None
+    return {
+        camera.agent: SensorPipeline(
+            for_camera(config, camera), camera, odometry and bool(camera.scanner), times, scans
+        )
+        for camera in cameras
+    }
+
+
+def for_camera(config: SystemConfig, camera: AgentSensors) -> SystemConfig:
+    """The configuration for one of several cameras: the mode that its images are enough for."""
+    mode = mode_of_camera(config.feature_extractor.mode, camera.topics)
+    return replace(config, feature_extractor=replace(config.feature_extractor, mode=mode))
+
+
+def mode_of_camera(mode: str, roles: Collection[str]) -> str:
+    """Mode of one of several cameras with images of some ``roles``, for a rig that is run in ``mode``."""
+    has_pair = {"left", "right"} <= set(roles)
+    has_depth = bool({"depth", "range"} & set(roles))
+    if mode != "tof" and not has_pair:
+        return "tof"
+    return "stereo" if mode != "stereo" and not has_depth else mode
+
+
+def rig_scans(config: SystemConfig, cameras: Sequence[AgentSensors]) -> ScanOdometryStage:
+    """Scan odometry of a rig with these cameras: what all that have depth measure at one moment is one scan."""
+    first = cameras[0]
+    names = [camera.camera for camera in cameras if camera.scanner] if len(cameras) > 1 else []
+    return ScanOdometryStage(config.ndt_odometry, first.frames, first.base_frame, names)
 
 
 def with_masks(config: FrontendConfig, sensors: AgentSensors) -> FrontendConfig:

@@ -58,5 +58,6 @@ def command(
         plan = replace(plan, sensors=(*plan.sensors, *{name}.difference(plan.sensors)))
     options = BagOptions(images, compact, truth, rectified, storage, every, overwrite)
     with progress_bar() as progress:
-        task = progress.add_task(f"rendering {plan.name}", total=-(-plan.frames // every) * len(plan.agents))
+        frames = -(-plan.frames // every) * len(plan.agents) * max(1, len(plan.cameras))
+        task = progress.add_task(f"rendering {plan.name}", total=frames)
         write_bag(plan, output, options, threads, lambda: progress.advance(task))

@@ -70,25 +70,26 @@ def write_bag(
     options = options or BagOptions()
     world = compile_world(scenario.world())
     agents = [
-        Simulator(scenario, k, world, threads, truth=options.truth, rectified=options.rectified)
+        Simulator(scenario, k, world, threads, camera=camera, truth=options.truth, rectified=options.rectified)
         for k in range(len(scenario.agents))
+        for camera in range(max(1, len(scenario.cameras)))
     ]
     error = agents[0].stereo.calibration_error
     calibration = "" if error.is_exact else parameter_file(error)
     with BagWriter(output, options.storage, overwrite=options.overwrite, calibration=calibration) as bag:
-        writers = {s.scenario.agents[s.agent].name: SimulationWriter(bag, s, options) for s in agents}
+        writers = {(s.agent_name, s.camera_name): SimulationWriter(bag, s, options) for s in agents}
         for writer in writers.values():
             writer.mountings(min(s.stamp_ns(0) for s in agents))
         for frame in merge(*(s.run(every=options.every) for s in agents), key=lambda f: f.stamp_ns):
-            writers[frame.agent].frame(frame)
+            writers[frame.agent, frame.camera].frame(frame)
             advance()
 
 
 class SimulationWriter(SensorWriter):
-    """Writes the frames of one agent: the sensors' topics, and what only a simulation knows."""
+    """Writes the frames of one agent or camera: the sensors' topics, and what only a simulation knows."""
 
     def __init__(self, bag: BagWriter, simulator: Simulator, options: BagOptions) -> None:
-        super().__init__(bag, simulator.scenario.agents[simulator.agent].name)
+        super().__init__(bag, simulator.agent_name, simulator.camera_name)
         self._simulator, self._options = simulator, options
 
     def mountings(self, stamp: int) -> None:
@@ -100,8 +101,8 @@ class SimulationWriter(SensorWriter):
         if "stereo" in sensors:
             frames |= {LEFT_FRAME: s.T_rig_left, RIGHT_FRAME: T_rig_right}
         if "tof" in sensors:
-            frames[TOF_FRAME] = s.tof.T_rig_tof
-        if "imu" in sensors:
+            frames[TOF_FRAME] = s.T_rig_tof
+        if "imu" in sensors and s.camera == 0:
             frames[IMU_FRAME] = np.eye(4)
         if s.wheels is not None:
             frames[FRAME] = s.wheels.T_rig_frame
@@ -117,8 +118,9 @@ class SimulationWriter(SensorWriter):
             self.position(position, BUILDING_FRAME)
         for pressure in frame.pressures:
             self.pressure(pressure)
-        self.ground_truth(frame.stamp_ns, frame.T_world_rig)
-        self._moving_truth(frame.stamp_ns, frame.T_world_rig)
+        if self._simulator.camera == 0:
+            self.ground_truth(frame.stamp_ns, frame.T_world_rig)
+            self._moving_truth(frame.stamp_ns, frame.T_world_rig)
         if frame.left is not None and frame.right is not None:
             stamps = (frame.stamp_ns, frame.right_stamp_ns)
             for k, (stamp, image) in enumerate(zip(stamps, (frame.left, frame.right), strict=True)):
@@ -145,7 +147,7 @@ class SimulationWriter(SensorWriter):
         message = compressed_image_message(
             self._types, header, encode(image, self._options.images), self._options.images
         )
-        self._bag.write(f"{self._prefix}/{topic}/compressed", message, stamp)
+        self._bag.write(f"{self._camera_prefix}/{topic}/compressed", message, stamp)
 
     def _tof(self, stamp: int, images: TofImages) -> None:
         info = CameraInfo(self._simulator.tof.camera)
