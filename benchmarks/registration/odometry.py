@@ -25,6 +25,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ndt_registration.clouds.cloud import finite_points
 from ndt_registration.odometry import OdometryConfig, OdometryStatus, ScanOdometry
 from ndt_registration.registration import RegistrationConfig, register
 from slam_bags.reading.readings import DepthReading
@@ -34,6 +35,7 @@ from slam_bringup.pipeline.sensor_pipeline import depth_stage
 from slam_core.config import from_mapping
 from slam_core.estimation.rigid_alignment import umeyama
 from slam_core.geometry import FloatArray, boxminus, invert_transform
+from slam_core.types import AnyArray
 
 FOCAL_PX, CENTRE_PX = 585.0, (320.0, 240.0)
 PERIOD_NS = 33_333_333
@@ -49,11 +51,15 @@ HEADINGS = (
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Stamp, points (n, 3) m in the sensor's frame, true pose T_world_sensor."""
+    """Stamp, points (..., 3) m in the sensor's frame, true pose T_world_sensor."""
 
     stamp_ns: int
-    points: FloatArray
+    points: AnyArray
     truth: FloatArray
+
+    def cloud(self) -> FloatArray:
+        """Finite points (n, 3)."""
+        return finite_points(self.points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +85,7 @@ def scans_of_bag(path: Path) -> list[Scan]:
             if isinstance(reading, DepthReading):
                 stage.add(reading.raw)
                 for depth in stage.ready():
-                    points = depth.points().reshape(-1, 3).astype(np.float64)
-                    scans.append(Scan(reading.stamp_ns, points, poses[reading.stamp_ns] @ T_base_tof))
+                    scans.append(Scan(reading.stamp_ns, depth.points(), poses[reading.stamp_ns] @ T_base_tof))
     return scans
 
 
@@ -121,7 +126,7 @@ def gicp(scans: list[Scan]) -> Run:
     import small_gicp as library
 
     poses, motion, milliseconds = [np.eye(4)], np.eye(4), []
-    clouds = [scan.points[np.isfinite(scan.points).all(axis=1)] for scan in scans]
+    clouds = [scan.cloud() for scan in scans]
     for target, source in pairwise(clouds):
         began = time.thread_time()
         result = library.align(
@@ -146,7 +151,7 @@ def kiss_icp(scans: list[Scan], min_motion: float = 0.1) -> Run:
     config.registration.max_num_threads = 1
     odometry, run = KissICP(config), Run([], [], [], 0)
     for scan in scans:
-        cloud = scan.points[np.isfinite(scan.points).all(axis=1)]
+        cloud = scan.cloud()
         began = time.thread_time()
         odometry.register_frame(cloud, np.empty(0))
         run.milliseconds.append(1e3 * (time.thread_time() - began))

@@ -18,6 +18,16 @@ from ndt_registration.clouds.visibility import range_image
 from ndt_registration.methods.pyramid import Pyramid
 from ndt_registration.registration import IMAGE_SIZE, RegistrationConfig, Target, check_cloud
 from slam_core.geometry import FloatArray, invert_transform, transform_points
+from slam_core.types import AnyArray
+
+_MANY_POINTS = 160_000
+"""Points of a scan beyond which some are left out at once: a few thousand are drawn of them anyway."""
+
+
+def _fewer(points: AnyArray) -> AnyArray:
+    """Every second, third, ... of many points (..., d), as (n, d); of a depth image these are columns."""
+    stride = 1 + points.size // points.shape[-1] // _MANY_POINTS if points.ndim > 1 and points.size else 1
+    return points.reshape(-1, points.shape[-1])[::stride] if stride > 1 else points
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +39,8 @@ class ScanPoints:
 
     @staticmethod
     def of(points: npt.ArrayLike) -> ScanPoints:
-        """The scan of an array (..., 3) or (..., 2), NaN where invalid."""
-        return ScanPoints(finite_points(points), is_planar(points))
+        """The scan of an array (..., 3) or (..., 2), NaN where invalid; of many points only some are taken."""
+        return ScanPoints(finite_points(_fewer(np.asarray(points))), is_planar(points))
 
     @cached_property
     def _evened(self) -> FloatArray:
