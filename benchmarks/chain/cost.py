@@ -3,8 +3,8 @@
 
     python benchmarks/chain/cost.py [CASE ...] [--against CHECKOUT] [--runs N] [--frames N] [--keep FOLDER]
 
-CASE: rig (stereo), rig_full (fuse + scan odometry + IMU), mh01, redkitchen, hololens, redkitchen_800 (800 frames,
-forwards and backwards; for the memory). Runs of this checkout and of another one take turns; the table has medians and
+CASE: rig (stereo), rig_full (fuse + scan odometry + IMU), mh01, redkitchen, hololens, redkitchen_ndt and hololens_ndt
+(with scan odometry), redkitchen_800 (800 frames, forwards and backwards; for the memory). Runs of this checkout and of another one take turns; the table has medians and
 their ratio. CPU time is user and system time of the process: it hardly changes where others use the machine, while
 wall times and factors do. ``mapping`` is without start, dense model and output; ``dense model and report`` is the share
 of all that comes after it. Factors are sensor time over wall time.
@@ -41,6 +41,8 @@ OPTIONS = {
     "mh01": ["--mode", "stereo"],
     "redkitchen": ["--mode", "tof"],
     "hololens": ["--mode", "tof"],
+    "redkitchen_ndt": ["--mode", "tof", "--odometry", "ndt"],
+    "hololens_ndt": ["--mode", "tof", "--odometry", "ndt"],
     "redkitchen_800": ["--mode", "tof"],
 }
 Row = dict[str, float]
@@ -111,7 +113,7 @@ def show(title: str, rows: dict[str, list[Row]]) -> None:
 
 def bag_of(case: str, folder: Path, frames: int | None) -> Path:
     """The recording of a case, made where it is not there yet, with its first ``frames`` only."""
-    name = "workshop_rig" if case.startswith("rig") else case
+    name = "workshop_rig" if case.startswith("rig") else case.removesuffix("_ndt")
     whole = next((p for p in (folder / name, folder / f"{name}.mcap") if p.exists()), folder / f"{name}.mcap")
     if not whole.exists():
         MAKERS[name](whole)
