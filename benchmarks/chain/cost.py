@@ -4,10 +4,10 @@
     python benchmarks/chain/cost.py [CASE ...] [--against CHECKOUT] [--runs N] [--frames N] [--keep FOLDER]
 
 CASE: rig (stereo), rig_full (fuse + scan odometry + IMU), mh01, redkitchen, hololens, redkitchen_ndt and hololens_ndt
-(with scan odometry), redkitchen_800 (800 frames, forwards and backwards; for the memory). Runs of this checkout and of another one take turns; the table has medians and
-their ratio. CPU time is user and system time of the process: it hardly changes where others use the machine, while
-wall times and factors do. ``mapping`` is without start, dense model and output; ``dense model and report`` is the share
-of all that comes after it. Factors are sensor time over wall time.
+(with scan odometry), redkitchen_800 (800 frames, forwards and backwards; for the memory). Runs of this checkout and of
+another one take turns; the table has medians and their ratio. CPU time is user and system time of the process: it
+hardly changes where others use the machine, while wall times and factors do. ``mapping`` is without start, dense model
+and output; ``dense model and report`` is the share of all that comes after it. Factors are sensor time over wall time.
 """
 
 from __future__ import annotations
