@@ -21,6 +21,7 @@ setup(
         "eclipse-zenoh",
         "numba",
         "numpy",
+        "opencv-python-headless",
         "scipy",
     ],
     zip_safe=False,

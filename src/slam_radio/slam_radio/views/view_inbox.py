@@ -64,7 +64,7 @@ class ViewInbox:
         return None
 
     def lacks(self) -> list[Lack]:
-        """What is wanted, oldest request first, as many as a message names; an image that two requests show once."""
+        """Wanted views, oldest request first, as many as a message names; an image that answers two is listed once."""
         first: dict[ViewKey, ViewKey] = {}
         for key in self.wanted:
             first.setdefault(self._shown(key) or key, key)

@@ -28,7 +28,7 @@ NEAR_NS = 2_000_000_000
 
 
 class ViewSender:
-    """What the post lacks of an agent's views. Times are those of any steady clock, s."""
+    """Views of an agent, and pieces of them that the post lacks. Times are those of any steady clock, s."""
 
     def __init__(self, files: ViewFiles, bytes_per_second: float, resend_after_s: float = 5.0) -> None:
         self.files = files

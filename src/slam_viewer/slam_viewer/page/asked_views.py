@@ -16,7 +16,6 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.nodes.stamp_guard import StampPolicy
-from slam_core.ros import below
 from slam_viewer.page.page import ViewerPage
 
 _PICTURE, _KEY_FRAME = "wanted_picture", "wanted_key_frame"
@@ -26,7 +25,7 @@ _ANY: dict[str, Any] = {"required": False, "latched": True, "stamps": StampPolic
 
 
 class AskedViews:
-    """What the leader asks the agents for, by the ``radio_link`` of the post.
+    """Requests of the leader to the agents, by the ``radio_link`` of the post.
 
     Parameters
     ----------
@@ -48,8 +47,8 @@ class AskedViews:
             node.advertise(topic, "PointStamped")
         agents: Sequence[str] = node.config.agents
         for agent in agents:
-            node.listen(below(agent, "view/pose"), "PoseStamped", partial(self._on_pose, agent), **_ANY)
-            picture = below(agent, "view/picture/compressed")
+            node.listen(_topic(agent, "view/pose"), "PoseStamped", partial(self._on_pose, agent), **_ANY)
+            picture = _topic(agent, "view/picture/compressed")
             node.listen(picture, "CompressedImage", partial(self._on_picture, agent), **_ANY)
         with page.camera:
             self._buttons = [
@@ -94,3 +93,8 @@ class AskedViews:
             T_map_rig = make_transform(T[:3, :3] @ OPTICAL_FROM_RIG, T[:3, 3])
             self._shown = self._shown % _MOST_SHOWN + 1
             self._page.show_camera(T_map_rig, picture, number=self._shown)
+
+
+def _topic(agent: str, name: str) -> str:
+    """A topic below an agent's namespace."""
+    return f"{agent}/{name}" if agent else name
