@@ -66,7 +66,7 @@ def test_what_the_post_asks_for_comes(make_submap: Callable[..., Any], tmp_path:
         with (
             node(environment, "slam_radio", "radio_link", log, **post),
             node(environment, "slam_radio", "radio_link", log, "helmet", **agent),
-            node(environment, "dense_mapping", "dense_mapper", log, agents=("anna",)),
+            node(environment, "dense_mapping", "dense_mapper", log, agents=("anna",), **{"tsdf.min_images": 1}),
         ):
             start = submap.start_stamp_ns
             odometry = odometry_message(types, "odom", "base_link", PoseEstimate(start, np.eye(4), np.eye(6)))

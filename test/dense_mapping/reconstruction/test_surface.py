@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from dense_mapping.reconstruction import surface_kernels as kernels
 from dense_mapping.reconstruction.cube_triangles import triangle_table
 from dense_mapping.reconstruction.row_keys import row_keys
-from dense_mapping.reconstruction.surface import _MAX_SIGMA, _MIN_IMAGES, voxel_statistics
+from dense_mapping.reconstruction.surface import _MAX_SIGMA, voxel_statistics
 
 
 @pytest.mark.parametrize("unknown", [0.0, 0.4])
@@ -34,9 +34,9 @@ def test_means_are_those_of_the_statistics(rng):
     voxels[..., 3] = np.rint(voxels[..., 3])
     cube = np.full((16, 8, 8), np.nan, dtype=np.float32)
     corners = np.array([[8, 0, 0], [0, 0, 0]])
-    limits, noise = (_MIN_IMAGES, _MAX_SIGMA), (0.15, 0.002)
+    limits, noise = (2, _MAX_SIGMA), (0.15, 0.002)
     kernels.fill_means(voxels, np.array([2, 0]), corners, limits, noise, cube)
-    mean, _ = voxel_statistics(voxels[[0, 2]])
+    mean, _ = voxel_statistics(voxels[[0, 2]], 2)
     np.testing.assert_array_equal(cube, mean.reshape(16, 8, 8))
     assert 0.1 < np.isnan(cube).mean() < 0.9
 

@@ -101,6 +101,7 @@ def test_a_command_post_has_link_map_and_page(started: dict[str, Any]) -> None:
     nodes = ("radio_link", "sjsam", "dense_mapper", "viewer")
     assert all('agents:=["anna", "bert"]' in started[name] for name in nodes)
     assert 'role:="post"' in started["radio_link"]
+    assert "tsdf.min_images:=1" in started["dense_mapper"]
     assert 'listen:=["tcp/0.0.0.0:7447"]' in started["radio_link"]
     assert "port:=0" in started["viewer"]
 

@@ -34,8 +34,6 @@ _THREADS = 2
 """Cubes at once; more threads would only wait for the interpreter between their kernels."""
 _UNSEEN = 150
 """Grey of a surface that no picture shows."""
-_MIN_IMAGES = 2
-"""Key frames that must have seen a voxel for it to count."""
 _MAX_SIGMA = 0.06
 """Voxels whose distance is less certain are left out, m."""
 
@@ -85,14 +83,14 @@ def extract_surface(volume: TsdfVolume, *, release: bool = False) -> Surface:
     return Surface(points, _normals(points, faces), colours[kept][used], sigma[kept][used], faces)
 
 
-def voxel_statistics(voxels: Float32Array) -> tuple[Float32Array, Float32Array]:
+def voxel_statistics(voxels: Float32Array, min_images: int) -> tuple[Float32Array, Float32Array]:
     """Mean distance (..., ) m of each voxel and its standard deviation, NaN where it was not seen well enough.
 
     The spread of the images about their mean widens what their sigmas claim, and never narrows it; a share of the
     variance, ``correlation``, stays however many images there are, because neighbours see a place with equal errors.
     """
     weighted, weight, squared, number = np.moveaxis(voxels, -1, 0)
-    seen = (number >= _MIN_IMAGES - 0.5) & (weight > 0.0)
+    seen = (number >= min_images - 0.5) & (weight > 0.0)
     w, count = weight[seen].astype(np.float64), number[seen].astype(np.float64)
     seen_mean = weighted[seen] / w
     spread = np.maximum(squared[seen] - weighted[seen] * seen_mean, 0.0) / np.maximum(count - 1.0, 1.0)
@@ -119,7 +117,8 @@ def _chunk_surface(
     rows[tuple((volume.coordinates[inside] - corner).T)] = inside
     edge = _CHUNK * BLOCK + 1
     distance = np.full(((_CHUNK + 1) * BLOCK,) * 3, np.nan, dtype=np.float32)
-    limits, noise = (_MIN_IMAGES, _MAX_SIGMA), (_CORRELATION, _SIGMA_FLOOR)
+    min_images = volume.config.min_images
+    limits, noise = (min_images, _MAX_SIGMA), (_CORRELATION, _SIGMA_FLOOR)
     fill_means(volume.voxels, inside, (volume.coordinates[inside] - corner) * BLOCK, limits, noise, distance)
     vertices, voxels, faces = march(distance[:edge, :edge, :edge], triangle_table())
     if not len(faces):
@@ -130,7 +129,7 @@ def _chunk_surface(
     voxel = (x * BLOCK + y) * BLOCK + z
     shown = volume.colours[block, voxel]
     colours = np.where(shown[:, 3:] > 0, shown[:, :3], np.uint8(_UNSEEN))
-    return points, faces, colours, voxel_statistics(volume.voxels[block, voxel])[1]
+    return points, faces, colours, voxel_statistics(volume.voxels[block, voxel], min_images)[1]
 
 
 def _nothing() -> tuple[Float32Array, npt.NDArray[np.int32], ByteArray, Float32Array]:

@@ -33,6 +33,10 @@ class TsdfConfig(Config):
 
     voxel_size: float = parameter(0.03, "edge of a voxel", unit="m", minimum=0.005, maximum=0.5)
     max_blocks: int = parameter(60000, "blocks of 8 x 8 x 8 voxels (10 kB each) beyond which none is added", minimum=1)
+    min_images: int = parameter(
+        2, "key frames that must have seen a voxel for it to count; slam post has 1, since it asks for single ones",
+        minimum=1, maximum=100,
+    )  # fmt: skip
 
 
 class TsdfVolume:

@@ -192,10 +192,11 @@ def peer_nodes(agent: str, peers: Mapping[str, str], listen: Sequence[str], conf
 def post_nodes(agents: Sequence[str], addresses: Sequence[str], port: int, config: SystemConfig) -> list[NodeSpec]:
     """The nodes of a command post that listens at ``addresses``, with a page at ``port``."""
     link = {"role": "post", "agents": tuple(agents), "listen": tuple(addresses)}
+    single = {"tsdf.min_images": 1}  # key frames that are asked for seldom overlap
     return [
         NodeSpec("slam_radio", "radio_link", "", link),
         _spec("sjsam", config.sjsam, "", {}, agents=tuple(agents)),
-        _spec("dense_mapper", config.dense_mapper, "", {}, agents=tuple(agents)),
+        _spec("dense_mapper", config.dense_mapper, "", {"dense_mapper": single}, agents=tuple(agents)),
         _spec("viewer", None, "", {}, agents=tuple(agents), port=port),
     ]
 
