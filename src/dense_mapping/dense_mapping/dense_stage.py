@@ -17,7 +17,7 @@ its time can have come. What accelerometers read turns with the path too: it lev
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Self
@@ -63,6 +63,8 @@ class DenseStage:
         Agents whose depth images have colour pictures; of others it is known when one comes.
     with_masks
         Cameras, ``AGENT/stereo`` or ``AGENT/tof``, that have masks; of others it is known when one comes.
+    rides
+        First and last stamp (ns) of lift rides by agent: a cabin on its way is no part of the building.
 
     Attributes
     ----------
@@ -80,9 +82,11 @@ class DenseStage:
         final: Mapping[str, Trajectory] | None = None,
         coloured: frozenset[str] = frozenset(),
         with_masks: frozenset[str] = frozenset(),
+        rides: Mapping[str, Sequence[tuple[int, int]]] | None = None,
     ) -> None:
         self.config = config
         self._final, self._first_coloured, self._first_masked = final, coloured, with_masks
+        self._rides = rides or {}
         self._pool = None if final is None else ThreadPoolExecutor(1, "field")
         self._last: Future[None] | None = None
         self.reset()
@@ -129,6 +133,8 @@ class DenseStage:
 
     def wants(self, agent: str, sensor: str, stamp_ns: int, T_base_camera: FloatArray) -> bool:
         """True if an image is a key frame; the caller then adds it."""
+        if self._is_riding(agent, np.array([stamp_ns]))[0]:
+            return False
         T = self._odometry.get(agent) if self._final is None else self._T_map_base(agent, stamp_ns)
         selector = self._selectors.setdefault(f"{agent}/{sensor}", KeyframeSelector(self.config.keyframe))
         return T is not None and selector.wants(T @ T_base_camera)
@@ -139,10 +145,17 @@ class DenseStage:
         """The stamps of a camera's images that make key frames on a final trajectory."""
         path = self._paths[agent]
         inside = (stamps_ns >= path.stamps_ns[0]) & (stamps_ns <= path.stamps_ns[-1])
-        stamps: npt.NDArray[np.int64] = stamps_ns[inside]
+        stamps: npt.NDArray[np.int64] = stamps_ns[inside & ~self._is_riding(agent, stamps_ns)]
         selector = KeyframeSelector(self.config.keyframe)
         poses = path.interpolate(stamps) @ T_base_camera if len(stamps) else ()
         return np.array([t for t, T in zip(stamps, poses, strict=True) if selector.wants(T)], dtype=np.int64)
+
+    def _is_riding(self, agent: str, stamps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """True (n,) for stamps (n,) within a lift ride."""
+        riding = np.zeros(len(stamps_ns), dtype=bool)
+        for first, last in self._rides.get(agent, ()):
+            riding |= (stamps_ns > first) & (stamps_ns < last)
+        return riding
 
     def add(
         self, agent: str, sensor: str, T_base_camera: FloatArray, image: DepthImage, picture: ByteArray | None = None

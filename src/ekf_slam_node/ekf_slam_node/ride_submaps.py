@@ -20,12 +20,16 @@ from slam_core.types import Counters, PoseEstimate, Submap
 
 @dataclass
 class RideSubmaps:
-    """Ends and begins submaps as a lift takes the rig along; ``texts``: the rides so far in words."""
+    """Ends and begins submaps as a lift takes the rig along.
+
+    ``texts``: the rides so far in words. ``spans``: first and last stamp of each, ns.
+    """
 
     chain: SubmapChain
     aids: RelativePoseBuffer
     counters: Counters
     texts: list[str] = field(default_factory=list)
+    spans: list[tuple[int, int]] = field(default_factory=list)
 
     @property
     def finding(self) -> str:
@@ -63,6 +67,7 @@ class RideSubmaps:
         ride = self.aids.rides.ended
         assert ride is not None
         self.chain.is_held_open = False
+        self.spans.append((ride.start_ns, ride.end_ns))
         self.texts.append(f"{ride.text} in {1e-9 * (ride.end_ns - ride.start_ns):.1f} s")
         if refused := self.aids.rides.pressure_refused:
             self.counters.add("pressure_contradicted", refused)

@@ -183,6 +183,11 @@ class EkfSlam:
         return self._rides.finding
 
     @property
+    def ride_spans(self) -> list[tuple[int, int]]:
+        """First and last stamp (ns) of each lift ride so far."""
+        return self._rides.spans
+
+    @property
     def diagnostic(self) -> str:
         """Complaint about the IMU, the odometry or the association, or ""."""
         return self._aids.inertial.diagnostic or self._aids.external.diagnostic or self._innovations.diagnostic

@@ -223,6 +223,11 @@ class FilterStage:
         return "" if self._slam is None else self._slam.rides_finding
 
     @property
+    def ride_spans(self) -> tuple[tuple[int, int], ...]:
+        """First and last stamp (ns) of each lift ride of this session."""
+        return () if self._slam is None else tuple(self._slam.ride_spans)
+
+    @property
     def moving_objects(self) -> str:
         """In how many frames objects moved, whose features were left out, or ""."""
         counts = self.counters.counts

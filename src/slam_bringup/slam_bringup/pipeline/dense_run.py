@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 
 import numpy as np
@@ -41,11 +41,13 @@ def dense_model(
     on_reading: Callable[[], None] = lambda: None,
     stopped: Callable[[], bool] = lambda: False,
     corrections: Mapping[str, RectificationError | None] | None = None,
+    rides: Mapping[str, Sequence[tuple[int, int]]] | None = None,
 ) -> DenseStage:
     """The model of all agents in the map frame, of what was read until ``stopped``; its surface is not made yet.
 
     Every camera of a rig takes part on the rig's trajectory. ``corrections``: by agent or camera, what the
-    rectification of its right images is wrong by, where that is sure.
+    rectification of its right images is wrong by, where that is sure. ``rides``: by agent or camera, first and last
+    stamp (ns) of the lift rides.
     """
     paths = {
         camera: trajectory
@@ -55,7 +57,7 @@ def dense_model(
     }
     coloured = frozenset(a for a in paths if config.dense_mapper.use_tof and "color" in bag.sensors[a].topics)
     masked = frozenset(f"{a}/{c}" for a in paths for c, role in MASK_ROLES.items() if role in bag.sensors[a].topics)
-    stage = DenseStage(config.dense_mapper, paths, coloured, masked)
+    stage = DenseStage(config.dense_mapper, paths, coloured, masked, rides)
     cameras = {
         a: _Images(bag.sensors[a], config, stage, (path.stamps_ns[0], path.stamps_ns[-1]), (corrections or {}).get(a))
         for a, path in paths.items()

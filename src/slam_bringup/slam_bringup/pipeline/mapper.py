@@ -75,6 +75,7 @@ class Mapper:
             if item.agent not in self._first_cameras:
                 return  # the other cameras of a rig share its clock
             self._process_waiting(agent)
+            self._diaries[agent].rides += stage.ride_spans
             self._hand_over(stage.start_session())
         elif isinstance(value, PositionReading):
             self._has_positions = self._uses_positions
@@ -95,6 +96,7 @@ class Mapper:
             for text in filter(None, (stage.diagnostic, stage.moving_objects)):
                 self._events.append(f"{agent}: {text}" if agent else text)
             self._diaries[agent].readout_seen_s = stage.readout_seen_s
+            self._diaries[agent].rides += stage.ride_spans
             last += stage.start_session()  # which no frame begins: the filter forgets its state
         self._hand_over(in_order(last))
         self.session.finish().result()
@@ -228,6 +230,7 @@ class _Diary:
         self.poses: list[PoseEstimate] = []
         self.scans: list[PoseEstimate] = []
         self.readout_seen_s = 0.0, 0.0
+        self.rides: list[tuple[int, int]] = []
         self._features: list[int] = []
         self._changes = StateChanges()
 
@@ -240,5 +243,11 @@ class _Diary:
     def record(self) -> AgentRecord:
         changes = self._changes
         return AgentRecord(
-            self.poses, self.scans, self._features, changes.events, changes.lost_share, self.readout_seen_s
+            self.poses,
+            self.scans,
+            self._features,
+            changes.events,
+            changes.lost_share,
+            self.readout_seen_s,
+            rides=self.rides,
         )

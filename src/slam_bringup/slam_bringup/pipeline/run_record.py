@@ -72,7 +72,8 @@ class AgentRecord:
 
     ``events`` are changes of its filter's state, ``lost_share`` how much of the time it was lost, ``readout_seen_s``
     the time in which its pictures are read out and its standard error, ``front_end`` what its images told,
-    ``other_front_ends`` those of the other cameras of its rig by their namespaces, ``frames`` some of its pictures.
+    ``other_front_ends`` those of the other cameras of its rig by their namespaces, ``frames`` some of its pictures,
+    ``rides`` the first and last stamp (ns) of its lift rides.
     """
 
     filtered: Sequence[PoseEstimate] = field(default_factory=list)
@@ -84,6 +85,7 @@ class AgentRecord:
     front_end: FrontendReport = field(default_factory=FrontendReport)
     other_front_ends: Mapping[str, FrontendReport] = field(default_factory=dict)
     frames: Sequence[LoggedFrame] = ()
+    rides: Sequence[tuple[int, int]] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,11 +217,13 @@ def _dense(
     """The dense model's surface and floor plans, and why the run or the model failed, if so."""
     surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
     try:
-        corrections = {}
+        corrections, rides = {}, {}
         for agent, known in record.agents.items():
             corrections[bag.first_of(agent).agent] = known.front_end.correction
             corrections |= {camera: own.correction for camera, own in known.other_front_ends.items()}
-        model = dense_model(bag, config, {a.name: a.trajectory for a in agents}, on_reading, stopped, corrections)
+            rides |= {camera: known.rides for camera in bag.rigs.get(agent, (agent,))}
+        paths = {a.name: a.trajectory for a in agents}
+        model = dense_model(bag, config, paths, on_reading, stopped, corrections, rides)
         if not stopped():
             surface = model.surface()
             plans = model.floor_plans(surface)
