@@ -13,7 +13,7 @@ from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.pipeline.configuration import SystemConfig, choose, load_system_config
 from slam_bringup.pipeline.offline import run_bag
 from slam_bringup.processes.online_run import run_nodes
-from slam_bringup.processes.recorded_run import collect
+from slam_bringup.processes.recorded_run import Recording, collect
 from slam_experiments.simulated.simulated_bag import BagOptions, write_bag
 from slam_simulation import Scenario
 from slam_viewer.results import RunResult, summarise
@@ -61,6 +61,8 @@ def test_the_new_storey_is_at_its_height_and_not_the_old_one(lift: Path, tmp_pat
 def test_the_nodes_ride_as_well(domain_environment: dict[str, str], lift: Path, tmp_path: Path) -> None:
     own = config(tmp_path)
     run = run_nodes(lift, own, tmp_path / "nodes", odometry=False, composed=True, names=BagNames())
+    ((first_ns, last_ns),) = Recording(run.recording).of_agent("").rides
+    assert 8.0 < 1e-9 * (last_ns - first_ns) < 12.0
     online, _ = collect(lift, own, run, mapper="sjsam", odometry="none", names=BagNames())
     height, sigma = risen(online)
     assert abs(height - HEIGHT) < 3.0 * sigma < 1.0

@@ -144,6 +144,7 @@ class EkfNode(StageNode[EkfNodeConfig]):
             self.health.show("imu_clock", self.stage.clock_finding or "as the images'")
             self.health.show("odometry", self.stage.odometry_finding or "none heard")
             self.health.show("lift_rides", self.stage.rides_finding or "none")
+            self.health.show("lift_rides_ns", " ".join(f"{a}-{b}" for a, b in self.stage.ride_spans))
             self.health.show("moving_objects", self.stage.moving_objects or "none seen")
 
     def _publish_result(self, result: EkfResult) -> None:

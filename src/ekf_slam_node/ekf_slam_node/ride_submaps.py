@@ -72,7 +72,7 @@ class RideSubmaps:
         if refused := self.aids.rides.pressure_refused:
             self.counters.add("pressure_contradicted", refused)
             self.aids.rides.pressure_refused = 0
-        self.chain.raise_path(ride.way, self._up)
+        self.chain.raise_path(ride.heights, self._up)
         self.chain.displace(ride.height, ride.variance, self._up)
         return self._renew(frame)
 

@@ -90,7 +90,7 @@ class LiftPath:
 
     @property
     def within_storey(self) -> Path:
-        """The same motion without the rides."""
+        """Motion without the rides, as pictures show it."""
         return _WithinStorey(self)
 
     def risen(self, t: float) -> float:

@@ -122,7 +122,7 @@ class RunResult:
 
 
 def storeys(result: RunResult) -> list[dict[str, Any]]:
-    """Of each storey, from the lowest: height (m) of its floor above the lowest one, and its submaps by agent."""
+    """Floors from the lowest: height (m) above that one, and the submaps on each by agent."""
     plans = result.floor_plans
     if not plans:
         return []

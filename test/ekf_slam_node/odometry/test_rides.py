@@ -109,7 +109,7 @@ def test_heights_of_rides_are_honest() -> None:
         (ride,) = ridden(by_lift, seed)
         assert abs(ride.height - 9.0) < 0.6
         errors.append((ride.height - 9.0) ** 2 / ride.variance)
-        middle = ride.way[len(ride.way) // 2]
+        middle = ride.heights[len(ride.heights) // 2]
         true = by_lift(1e-9 * middle.stamp_ns) - by_lift(1e-9 * ride.start_ns)
         on_the_way.append((middle.height - true) ** 2 / middle.variance)
         assert ride.variance < 0.35**2

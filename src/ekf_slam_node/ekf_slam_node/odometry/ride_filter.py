@@ -31,12 +31,12 @@ _SIGMA_REST = 0.03
 class VerticalMotion:
     """Motion over dt (s) along the vertical.
 
-    speed, way: gained beyond free fall by the accelerometer, m/s and m, with covariance (2, 2) of (way, speed). seen:
-    way (m) within the cabin, as the images show it, with its variance.
+    speed, distance: gained beyond free fall by the accelerometer, m/s and m, with covariance (2, 2) of (distance, speed). seen:
+    distance (m) within the cabin, as the images show it, with its variance.
     """
 
     dt: float
-    way: float
+    distance: float
     speed: float
     covariance: FloatArray
     seen: float
@@ -116,7 +116,7 @@ class RideFilter:
         F = np.eye(5)
         F[H, V], F[H, B], F[V, B] = dt, 0.5 * dt**2, dt
         x = F @ self._x
-        x[H] += motion.way - motion.seen
+        x[H] += motion.distance - motion.seen
         x[V] += motion.speed
         P = F @ self._P @ F.T
         P[:2, :2] += motion.covariance

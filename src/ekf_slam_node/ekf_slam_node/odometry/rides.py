@@ -57,7 +57,7 @@ class Ride:
     end_ns: int
     height: float
     variance: float
-    way: tuple[HeightAt, ...]
+    heights: tuple[HeightAt, ...]
 
     @property
     def text(self) -> str:

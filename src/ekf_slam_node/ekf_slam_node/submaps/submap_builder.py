@@ -60,11 +60,11 @@ class SubmapBuilder:
         """
         self._bridged.append(pose)
 
-    def raise_path(self, way: tuple[HeightAt, ...], up: UpDirection) -> None:
+    def raise_path(self, heights: tuple[HeightAt, ...], up: UpDirection) -> None:
         """Raise the poses at the stamps of a lift's way by its heights; ``up`` along the submap's axes."""
-        heights = {at.stamp_ns: at for at in way}
+        by_stamp = {at.stamp_ns: at for at in heights}
         for number, pose in enumerate(self._path):
-            if (at := heights.get(pose.stamp_ns)) is not None and number > 0:
+            if (at := by_stamp.get(pose.stamp_ns)) is not None and number > 0:
                 self._path[number] = up.raised(pose, at.height, at.variance)
 
     def replace_end(self, pose: PoseEstimate) -> None:

@@ -136,9 +136,9 @@ class SubmapChain:
         """True if the open submap has no pose beside its first."""
         return self._builder.is_empty
 
-    def raise_path(self, way: tuple[HeightAt, ...], up: UpDirection) -> None:
+    def raise_path(self, heights: tuple[HeightAt, ...], up: UpDirection) -> None:
         """Raise the poses of the path, which a lift has carried to these heights; ``up`` along the rig's axes."""
-        self._builder.raise_path(way, up.seen_from(self.local.T))
+        self._builder.raise_path(heights, up.seen_from(self.local.T))
 
     def displace(self, height: float, variance: float, up: UpDirection) -> None:
         """Move the rig upwards by a height (m) with its variance: the submap ends there, its landmarks stay."""

@@ -38,6 +38,7 @@ class Recording:
         self.stage_ms: dict[str, list[float]] = defaultdict(list)
         self.submaps = 0
         self._states: dict[str, StateChanges] = defaultdict(StateChanges)
+        self._rides: dict[str, dict[str, None]] = defaultdict(dict)
         with BagReader(path) as bag:
             for topic, _, message in bag.messages():
                 if topic.endswith("/odom") or topic.endswith("/ndt/odometry"):
@@ -55,6 +56,7 @@ class Recording:
                         self._add_latency(status.name, values)
                         stamp = int(values["input_stamp_ns"])
                         self._states[status.name].add(stamp, values["state"], values["reason"])
+                        self._rides[status.name] |= dict.fromkeys(values.get("lift_rides_ns", "").split())
 
     def of_agent(self, agent: str) -> AgentRecord:
         """Record of one agent, as it was heard."""
@@ -64,6 +66,7 @@ class Recording:
             feature_counts=self._feature_counts[_topic(agent, "features")],
             events=self._states[_topic(agent, "ekf_slam")].events,
             lost_share=self._states[_topic(agent, "ekf_slam")].lost_share,
+            rides=[_span(text) for text in self._rides[_topic(agent, "ekf_slam")]],
         )
 
     def located(self, agent: str) -> list[PoseEstimate]:
@@ -153,6 +156,12 @@ def _losses(diagnostics: dict[str, dict[str, str]]) -> dict[str, int]:
         if key in values
     }
     return {what: number for what, number in counted.items() if number}
+
+
+def _span(text: str) -> tuple[int, int]:
+    """First and last stamp (ns) of a lift ride, as the filter's node tells it."""
+    first, _, last = text.partition("-")
+    return int(first), int(last)
 
 
 def _topic(agent: str, name: str) -> str:
