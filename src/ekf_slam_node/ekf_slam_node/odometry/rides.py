@@ -138,9 +138,9 @@ class RideWatch:
         if self._seen and self._seen[-1].end_ns != stamps[0]:
             self._seen.clear()
         self._seen.append(_Seen(*stamps, step.pre, T, covariance, copy.copy(inertial)))
-        while self._seen[0].start_ns < stamps[1] - _WINDOW_NS:
+        while self._seen and self._seen[0].start_ns < stamps[1] - _WINDOW_NS:
             self._seen.popleft()
-        return self._begin() if self._is_carried() else inertial
+        return self._begin() if self._seen and self._is_carried() else inertial
 
     def within_cabin(
         self, inertial: InertialFilter, step: Prediction, stamp_ns: int, T: FloatArray, covariance: FloatArray
