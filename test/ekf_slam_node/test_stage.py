@@ -104,7 +104,7 @@ def test_a_source_of_motions_that_never_lived_delays_only_the_first_frames(frame
 
 
 def test_an_unknown_stream_is_refused() -> None:
-    with pytest.raises(ValueError, match="may hold motion, imu, odometry, got wheels"):
+    with pytest.raises(ValueError, match="may hold motion, imu, odometry, pressure, got wheels"):
         FilterConfig(wait_for=("wheels",))
 
 
