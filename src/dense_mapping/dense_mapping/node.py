@@ -60,6 +60,9 @@ class DenseNodeConfig(DenseConfig):
     """The dense model's parameters and the node's own."""
 
     agents: tuple[str, ...] = parameter(("",), "namespaces of the agents whose cameras make the model")
+    cameras: tuple[str, ...] = parameter(
+        (), "names of the cameras of each agent's rig that has several, each with its own topics; empty: one camera"
+    )
     map_frame: str = parameter("map", "frame of the map")
     base_frame: str = parameter("base_link", "frame of each agent's rig, below its namespace")
     output_path: str = parameter("dense", "folder that ~/save writes: mesh.ply, floor_plan*.yaml and .pgm")
@@ -74,7 +77,9 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
     def __init__(self) -> None:
         super().__init__("dense_mapper", DenseNodeConfig)
         self.mapper = DenseStage(self.config)
-        self._pairs = {agent: StereoStage(rectified=True) for agent in self.config.agents}
+        # Each camera is to the model what an agent with one camera is, on the path of its rig.
+        self._cameras = {a: [below(a, c) for c in self.config.cameras] or [a] for a in self.config.agents}
+        self._pairs = {camera: StereoStage(rectified=True) for own in self._cameras.values() for camera in own}
         self._corrections: dict[str, str] = {}
         self._stamp_ns = 0
         self._is_news = False
@@ -86,8 +91,13 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
         for agent in self.config.agents:
             self.advertise(below(agent, "storey"), "Int32", latched=True, depth=1)
             self.advertise(below(agent, "storey/occupancy"), "OccupancyGrid", latched=True, depth=1)
+        if self.config.use_stereo:
+            # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
+            self.create_subscription(self.types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
         for agent in self.config.agents:
             self._listen_to(agent)
+            for camera in self._cameras[agent]:
+                self._listen_to_camera(agent, camera)
         self.create_service(Trigger, "~/save", self._on_save)
         self.create_timer(_PUBLISH_PERIOD_S, self._publish_news, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -110,86 +120,90 @@ class DenseMapperNode(SlamNode[DenseNodeConfig]):
     # -- inputs --------------------------------------------------------------------------------------------------------
 
     def _listen_to(self, agent: str) -> None:
-        own = partial(below, agent)
-        listen, listen_together = partial(self.listen, clock=agent), partial(self.listen_together, clock=agent)
+        own, listen = partial(below, agent), partial(self.listen, clock=agent)
         listen(own("odom"), "Odometry", partial(self._on_odometry, agent))
         listen(own("map/path"), "Path", partial(self._on_path, agent), latched=True, stamps=StampPolicy.ANY)
         listen(own("pose"), "PoseWithCovarianceStamped", partial(self._on_pose, agent), required=False)
         listen(own("imu"), "Imu", partial(self._on_imu, agent), required=False)
         radio = {own(topic): kind for topic, kind in KEY_FRAME_TOPICS.items()}
-        listen_together(radio, partial(self._on_key_frame, agent), latched=True, required=False, stamps=StampPolicy.ANY)
+        on_radio = partial(self._on_key_frame, agent)
+        self.listen_together(radio, on_radio, clock=agent, latched=True, required=False, stamps=StampPolicy.ANY)
+
+    def _listen_to_camera(self, agent: str, camera: str) -> None:
+        own = partial(below, camera)
+        listen, listen_together = partial(self.listen, clock=agent), partial(self.listen_together, clock=agent)
         if self.config.use_tof:
             topics = {"tof/depth/image": "Image", "tof/noise/image": "Image", "tof/camera_info": "CameraInfo"}
             topics = {own(topic): kind for topic, kind in topics.items()}
-            listen_together(topics, partial(self._on_depth, agent), required=False)
-            listen(own("tof/color/image"), "Image", partial(self._on_colour, agent, "tof"), required=False)
-            masks = partial(self._on_mask, agent, "tof")
+            listen_together(topics, partial(self._on_depth, agent, camera), required=False)
+            listen(own("tof/color/image"), "Image", partial(self._on_colour, camera, "tof"), required=False)
+            masks = partial(self._on_mask, camera, "tof")
             listen(own("tof/mask"), "Image", masks, required=False, stamps=StampPolicy.FOLLOWS)
         if self.config.use_stereo:
             for side in SIDES:
                 topic = own(f"stereo/{side}/camera_info")
-                listen(topic, "CameraInfo", partial(self._on_info, agent, side), required=False)
+                listen(topic, "CameraInfo", partial(self._on_info, camera, side), required=False)
             pairs = {own(f"stereo/{side}/image_rect"): "Image" for side in SIDES}
-            listen_together(pairs, partial(self._on_pair, agent), required=False)
-            # Diagnostics are stamped by the clock on the wall, a replay's messages by that of the recording.
-            self.create_subscription(self.types.DiagnosticArray, "/diagnostics", self._on_diagnostics, sensor_qos(100))
-            masks = partial(self._on_mask, agent, "stereo")
+            listen_together(pairs, partial(self._on_pair, agent, camera), required=False)
+            masks = partial(self._on_mask, camera, "stereo")
             listen(own("mask"), "Image", masks, required=False, stamps=StampPolicy.FOLLOWS)
             colours = own("stereo/left/image_rect_color")
-            listen(colours, "Image", partial(self._on_colour, agent, "stereo"), required=False)
+            listen(colours, "Image", partial(self._on_colour, camera, "stereo"), required=False)
 
     def _on_odometry(self, agent: str, message: Message) -> None:
-        self.mapper.add_odometry(agent, pose_from_message(message.pose.pose))
+        for camera in self._cameras[agent]:
+            self.mapper.add_odometry(camera, pose_from_message(message.pose.pose))
 
     def _on_pose(self, agent: str, message: Message) -> None:
         if self._current[agent].update(self._plans, pose_from_message(message.pose.pose)[:3, 3]):
             self._publish_storey(agent)
 
-    def _on_depth(self, agent: str, depth: Message, noise: Message, info: Message) -> None:
+    def _on_depth(self, agent: str, camera: str, depth: Message, noise: Message, info: Message) -> None:
         T_base_camera = self.lookup(below(agent, self.config.base_frame), depth.header.frame_id)
-        if self.mapper.wants(agent, "tof", stamp_ns(depth), T_base_camera):
-            self.mapper.add(agent, "tof", T_base_camera, depth_from_messages(depth, noise, info), NO_PICTURE)
+        if self.mapper.wants(camera, "tof", stamp_ns(depth), T_base_camera):
+            self.mapper.add(camera, "tof", T_base_camera, depth_from_messages(depth, noise, info), NO_PICTURE)
 
     def _on_key_frame(self, agent: str, *messages: Message) -> None:
         """Take a key frame that a post has asked for over the radio."""
-        if self.mapper.add_anchored(agent, key_frame_from_messages(*messages)):
+        if self.mapper.add_anchored(self._cameras[agent][0], key_frame_from_messages(*messages)):
             self._is_news = True
 
-    def _on_colour(self, agent: str, sensor: str, message: Message) -> None:
-        self.mapper.add_colour(agent, sensor, stamp_ns(message), colour_from_message(message))
+    def _on_colour(self, camera: str, sensor: str, message: Message) -> None:
+        self.mapper.add_colour(camera, sensor, stamp_ns(message), colour_from_message(message))
 
-    def _on_mask(self, agent: str, sensor: str, message: Message) -> None:
-        self.mapper.add_mask(agent, sensor, mask_from_message(message))
+    def _on_mask(self, camera: str, sensor: str, message: Message) -> None:
+        self.mapper.add_mask(camera, sensor, mask_from_message(message))
 
-    def _on_info(self, agent: str, side: str, message: Message) -> None:
-        self._pairs[agent].set_info(side, camera_info_from_message(message))
+    def _on_info(self, camera: str, side: str, message: Message) -> None:
+        self._pairs[camera].set_info(side, camera_info_from_message(message))
 
-    def _on_pair(self, agent: str, left: Message, right: Message) -> None:
+    def _on_pair(self, agent: str, camera: str, left: Message, right: Message) -> None:
         T_base_camera = self.lookup(below(agent, self.config.base_frame), left.header.frame_id)
         grey, colour = grey_and_colour_from_message(left)
         pair = RawPair(stamp_ns(left), grey, grey_from_message(right), left.header.frame_id, colour)
-        self.mapper.add_pair(agent, T_base_camera, pair, self._pairs[agent])
+        self.mapper.add_pair(camera, T_base_camera, pair, self._pairs[camera])
 
     def _on_imu(self, agent: str, message: Message) -> None:
         sample = imu_from_message(message)
         R_base_imu = self.lookup(below(agent, self.config.base_frame), sample.frame_id)[:3, :3]
-        self.mapper.add_force(agent, sample.stamp_ns, R_base_imu @ sample.linear_acceleration)
+        self.mapper.add_force(self._cameras[agent][0], sample.stamp_ns, R_base_imu @ sample.linear_acceleration)
 
     def _on_diagnostics(self, message: Message) -> None:
         """Rectify as the front end has found out that one should."""
         for status in message.status:
-            for agent, stage in self._pairs.items():
-                if status.name != f"/{below(agent, 'feature_extractor')}" or stage.infos is None:
+            for camera, stage in self._pairs.items():
+                if status.name != f"/{below(camera, 'feature_extractor')}" or stage.infos is None:
                     continue
                 text = next((entry.value for entry in status.values if entry.key == "correction"), "")
-                if text != self._corrections.get(agent, ""):
-                    self._corrections[agent] = text
+                if text != self._corrections.get(camera, ""):
+                    self._corrections[camera] = text
                     stage.correct(RectificationError.from_text(stage.infos[0].rectified, text))
 
     def _on_path(self, agent: str, message: Message) -> None:
         self._stamp_ns = max(self._stamp_ns, stamp_ns(message))
         poses = [PoseEstimate(stamp, T, np.zeros((6, 6))) for stamp, T in path_from_message(message)]
-        if self.mapper.set_path(agent, Trajectory.from_estimates(poses)):
+        path = Trajectory.from_estimates(poses)
+        if any([self.mapper.set_path(camera, path) for camera in self._cameras[agent]]):
             self._is_news = True
         self.health.take(
             {

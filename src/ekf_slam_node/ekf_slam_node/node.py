@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.stage import FilterConfig, FilterStage
@@ -32,7 +33,7 @@ from slam_core.messages import (
 )
 from slam_core.messages.base import Message
 from slam_core.nodes.stage_node import StageNode
-from slam_core.ros import run_node
+from slam_core.ros import below, run_node
 from slam_core.types import PoseEstimate, Submap
 
 _SUBMAPS_KEPT = 200
@@ -67,7 +68,9 @@ class EkfNode(StageNode[EkfNodeConfig]):
         prefix = f"{self.config.agent}/" if self.config.agent else ""
         self.odom_frame = prefix + self.config.odom_frame
         self._advertise_outputs()
-        self.listen_together(FEATURE_TOPICS, self.on_features)
+        for camera in self.config.cameras or ("",):
+            topics = {below(camera, topic): kind for topic, kind in FEATURE_TOPICS.items()}
+            self.listen_together(topics, partial(self.on_features, camera))
         self.listen("ndt/motion", "PoseWithCovarianceStamped", self.on_motion, required=False)
         self.listen("imu", "Imu", self.on_imu, required=False)
         self.listen("odometry", "Odometry", self.on_odometry, required=False)
@@ -81,9 +84,9 @@ class EkfNode(StageNode[EkfNodeConfig]):
         for topic, kind in SUBMAP_TOPICS.items():
             self.advertise(topic, kind, latched=True, depth=_SUBMAPS_KEPT)
 
-    def on_features(self, cloud: Message, descriptors: Message, camera_info: Message) -> None:
-        """One frame; it may have to wait for the motion that leads to it."""
-        self.stage.add_features(features_from_messages(cloud, descriptors, camera_info))
+    def on_features(self, camera: str, cloud: Message, descriptors: Message, camera_info: Message) -> None:
+        """One frame, of one camera; it may have to wait for the motion that leads to it, and for other cameras."""
+        self.stage.add_features(features_from_messages(cloud, descriptors, camera_info), camera)
         self.publish_ready()
 
     def on_motion(self, message: Message) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from ndt_registration.clouds.cloud import finite_points
 from ndt_registration.odometry import OdometryConfig, OdometryResult, OdometryStatus
@@ -33,7 +34,7 @@ from slam_core.messages import (
 from slam_core.messages.base import Message
 from slam_core.motion import mean_twist
 from slam_core.nodes.stage_node import StageNode
-from slam_core.ros import run_node
+from slam_core.ros import below, run_node
 from slam_core.types import AnyArray, PoseEstimate, RelativeMotion
 
 
@@ -43,6 +44,11 @@ class NdtNodeConfig(OdometryConfig):
 
     odom_frame: str = parameter("odom", "frame of the odometry")
     base_frame: str = parameter("base_link", "frame of the rig; the cloud's frame is looked up in it")
+    cameras: tuple[str, ...] = parameter(
+        (),
+        "names of the depth cameras of a rig that has several, each with its own topics below its name "
+        "(``front/tof/points``); empty: one camera or laser",
+    )
     path_length: int = parameter(2000, "newest poses shown in ``ndt/path``", minimum=1)
 
 
@@ -51,20 +57,30 @@ class NdtNode(StageNode[NdtNodeConfig]):
 
     def __init__(self) -> None:
         super().__init__("ndt_odometry", NdtNodeConfig)
-        self.stage: ScanOdometryStage = ScanOdometryStage(self.config, self.frames, self.config.base_frame)
+        self.stage: ScanOdometryStage = ScanOdometryStage(
+            self.config, self.frames, self.config.base_frame, self.config.cameras
+        )
         self.source = ""
         self.path = deque[PoseEstimate](maxlen=self.config.path_length)
         self.advertise("ndt/odometry", "Odometry")
         self.advertise("ndt/motion", "PoseWithCovarianceStamped")
         self.advertise("ndt/path", "Path")
         self.advertise("ndt/points_aligned", "PointCloud2")
-        self.listen("tof/points", "PointCloud2", self.on_points)
-        self.listen("scan", "LaserScan", self.on_laser_scan, required=False)
+        for camera in self.config.cameras:
+            self.listen(below(camera, "tof/points"), "PointCloud2", partial(self.on_points_of, camera))
+        if not self.config.cameras:
+            self.listen("tof/points", "PointCloud2", self.on_points)
+            self.listen("scan", "LaserScan", self.on_laser_scan, required=False)
         self.listen("imu", "Imu", self.on_imu, required=False)
 
     def on_points(self, cloud: Message) -> None:
         """A scan in space."""
         self._add("tof/points", cloud, points_from_message)
+
+    def on_points_of(self, camera: str, cloud: Message) -> None:
+        """A scan of one of several cameras."""
+        self.stage.add_scan(Scan(stamp_ns(cloud), points_from_message(cloud), cloud.header.frame_id), camera)
+        self.publish_ready()
 
     def on_laser_scan(self, message: Message) -> None:
         """A scan in the plane of a laser scanner, on a rig that stays level."""

@@ -61,12 +61,12 @@ class CandidateLandmarks:
         )  # fmt: skip
 
     def of_others(self, cameras: Collection[int], stamp_ns: int) -> CandidateLandmarks:
-        """Those that other cameras than ``cameras`` saw, not long before a stamp."""
+        """Features that other cameras than ``cameras`` saw, not long before a stamp."""
         is_recent = stamp_ns - self.stamps < KEPT_FOR_NS
         return self.select(np.flatnonzero(is_recent & ~np.isin(self.cameras, list(cameras))))
 
     def moved(self, T: FloatArray, covariance: FloatArray) -> CandidateLandmarks:
-        """Those whose points are seen from another rig frame: by T_other_own (4, 4) of covariance (6, 6).
+        """Features whose points are seen from another rig frame: by T_other_own (4, 4) of covariance (6, 6).
 
         The error of the motion, which they share, is part of each one's own from then on.
         """

@@ -81,9 +81,9 @@ class FrameCamera:
 
 
 class CameraPart(NamedTuple):
-    """What one camera has of a frame: the measurements ``index``, their camera and its mounting (4, 4) on the rig."""
+    """One camera's part of a frame: the measurements ``rows``, their camera and its mounting (4, 4) on the rig."""
 
-    index: slice | np.ndarray
+    rows: slice | np.ndarray
     camera: Camera
     T_rig_optical: FloatArray
 

@@ -34,6 +34,7 @@ from typing import Self, TypeVar
 import numpy as np
 
 from slam_bags.reading.agent_stream import AgentStream
+from slam_bags.reading.extrinsics import StaticTransform
 from slam_bags.reading.left_out import LeftOut
 from slam_bags.reading.reading_times import ReadingTimes, Stamps
 from slam_bags.reading.readings import (
@@ -240,6 +241,11 @@ class SensorBag:
         return self._names.calibration
 
     @property
+    def mountings(self) -> tuple[StaticTransform, ...]:
+        """Static transforms of a rig that a user gives beside the bag's."""
+        return self._names.rig.transforms
+
+    @property
     def left_out(self) -> Counter[str]:
         """Messages that the last :meth:`readings` left out, by reason."""
         return self._left_out.counts
@@ -312,7 +318,7 @@ class SensorBag:
     def _on_rig(self, sensors: AgentSensors, rig: str) -> AgentSensors:
         """The sensors of a namespace as those of a rig; what is no camera is its first camera's."""
         agent, cameras, topics = sensors.agent, self.rigs[rig], dict(sensors.topics)
-        camera = agent.rpartition("/")[2] if len(cameras) > 1 else ""
+        camera = agent.rpartition("/")[2] if len(cameras) > 1 or self._names.rig.topics else ""
         if camera:
             topics = {role: topic for role, topic in topics.items() if role not in RIG_ROLES}
             if agent == cameras[0]:

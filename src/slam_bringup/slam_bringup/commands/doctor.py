@@ -15,11 +15,11 @@ import click
 
 from slam_bags.reading.rig_calibration import read_rig_calibration
 from slam_bags.reading.sensor_topics import ROLES, BagNames, parse_topics
-from slam_bringup.doctor.examination import GROUPS, examine
+from slam_bringup.doctor.examination import GROUPS, examined
 from slam_bringup.doctor.finding import Finding
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand, NodeProcess
-from slam_bringup.terminal.paths import UserPath, calibration_option
+from slam_bringup.terminal.paths import UserPath, calibration_option, rig_cameras, rig_option
 
 FAULTS = 1
 """Exit code where something is wrong."""
@@ -42,6 +42,7 @@ _START_S = 60.0
     help=f"a topic that is not named like the nodes' (may be repeated); roles: {', '.join(ROLES)}",
 )
 @calibration_option()
+@rig_option()
 @click.option("--base-frame", default="", metavar="FRAME", help="the rig's frame [base_link]")
 @click.option("--json", "as_json", is_flag=True, help="print the findings as JSON")
 def command(
@@ -59,13 +60,14 @@ def command(
     """
     if (bag is None) != live:
         raise ValueError("name a bag, or say --live")
-    names = BagNames(parse_topics(topics), base_frame, read_rig_calibration(calibrations))
-    findings = examine(bag, names) if bag is not None else examine_live(seconds, names)
-    click.echo(json.dumps([asdict(f) for f in findings], indent=2) if as_json else _text(findings))
+    names = BagNames(parse_topics(topics), base_frame, read_rig_calibration(calibrations), rig_cameras())
+    findings, cameras = examined(bag, names) if bag is not None else examine_live(seconds, names)
+    text = "\n".join(filter(None, [cameras, _text(findings)]))
+    click.echo(json.dumps([asdict(f) for f in findings], indent=2) if as_json else text)
     sys.exit(FAULTS if findings else 0)
 
 
-def examine_live(seconds: float, names: BagNames) -> list[Finding]:
+def examine_live(seconds: float, names: BagNames) -> tuple[list[Finding], str]:
     """Record what is published for some seconds, then examine it as a bag.
 
     Raises
@@ -85,7 +87,7 @@ def examine_live(seconds: float, names: BagNames) -> list[Finding]:
         if code != 0 or not bag.exists():
             raise ValueError(f"the recorder ended with code {code}:\n{process.diagnostic()}")
         try:
-            return examine(bag, names)
+            return examined(bag, names)
         except ValueError as error:
             raise ValueError(str(error).replace(str(bag), "the running graph")) from None
 

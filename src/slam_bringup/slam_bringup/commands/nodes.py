@@ -25,6 +25,7 @@ from slam_bringup.terminal.mapping_options import (
     own_overrides,
     require_map,
 )
+from slam_bringup.terminal.paths import rig_cameras
 from slam_bringup.terminal.run_end import end_run
 from slam_core.storage.output_folder import LOGS, OutputFolder
 from slam_core.version import VERSION
@@ -45,7 +46,7 @@ def command(
     old_map: Path | None, localize_only: bool, composed: bool, view: bool,
 ) -> None:  # fmt: skip
     """Map BAG with the nodes of the workspace: starts them, plays the bag, and writes what ``slam run`` does."""
-    names = BagNames(parse_topics(topics), base_frame, read_rig_calibration(calibrations))
+    names = BagNames(parse_topics(topics), base_frame, read_rig_calibration(calibrations), rig_cameras())
     with SensorBag(bag, names) as opened:
         mode = mode_for(opened, mode)
         frames = sum(opened.count(agent, "depth" if mode == "tof" else "left") for agent in opened.agents)

@@ -21,6 +21,7 @@ from slam_bringup.processes.interrupt import INTERRUPTED, Interrupt
 from slam_bringup.processes.kernels import compile_kernels_once
 from slam_bringup.terminal.console import is_quiet, progress_bar, show
 from slam_bringup.terminal.mapping_options import mapping_options, own_overrides, worker_options
+from slam_bringup.terminal.paths import rig_cameras
 from slam_bringup.terminal.run_end import DEGRADED, FAILED, end_run
 from slam_viewer.report.summary_table import summary_table
 
@@ -43,7 +44,7 @@ def command(
 
     With --map all results are in the frame of that map; OUT gets a map of its own, the old one is only read.
     """
-    names = BagNames(parse_topics(topics), base_frame, read_rig_calibration(calibrations))
+    names = BagNames(parse_topics(topics), base_frame, read_rig_calibration(calibrations), rig_cameras())
     options = RunOptions(
         mode, mapper, odometry, imu, own_overrides(config), names, overwrite, old_map, localize_only
     )  # fmt: skip

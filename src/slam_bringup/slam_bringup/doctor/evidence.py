@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from slam_bags.nodes.pacing import header_stamp_ns
+from slam_bags.reading.rig_cameras import rigs_of
 from slam_bags.reading.sensor_topics import BagNames, find_agents, is_rectified, topics_of
 from slam_bags.storage.bag import BagReader, TopicInfo
 from slam_core.camera import CameraInfo
@@ -74,6 +75,7 @@ class Evidence:
     images: decoded sample by role and stamp; depth and range in m. faults: messages that could not be decoded, by topic
     with the first reason. imu: rows of stamp s, angular velocity rad/s, specific force m/s2, in the IMU's axes.
     odometry, positions, pressures: every pose, position in a fixed frame, and pressure that could be read.
+    rig, camera: namespace of the rig, and name there, of one of several cameras; "" otherwise.
     """
 
     agent: str
@@ -89,6 +91,13 @@ class Evidence:
     odometry: list[OdometryReading] = field(default_factory=list)
     positions: list[PositionReading] = field(default_factory=list)
     pressures: list[PressureReading] = field(default_factory=list)
+    rig: str = ""
+    camera: str = ""
+
+    @property
+    def leader(self) -> Stream:
+        """The stream of the left images, or of the depth images without a left camera."""
+        return self.streams["left" if "left" in self.streams else self.depth_role]
 
     @property
     def depth_role(self) -> str:
@@ -136,7 +145,7 @@ def gather(path: Path, names: BagNames | None = None, *, messages: int | None = 
     """
     names = names or BagNames()
     with BagReader(path) as bag:
-        agents = find_agents(bag.topics, names.topics)
+        agents = tuple(names.rig.topics) or find_agents(bag.topics, names.topics)
         if not agents:
             topics = ", ".join(f"{n} ({i.type_name})" for n, i in bag.topics.items()) or "none"
             raise ValueError(
@@ -144,12 +153,23 @@ def gather(path: Path, names: BagNames | None = None, *, messages: int | None = 
                 f"--topic right=/... or --topic depth=/...). Its topics: {topics}"
             )
         frames = _read_frames(bag)
-        return [_gather_agent(bag, agent, frames, names, messages) for agent in agents]
+        for given in names.rig.transforms:
+            frames.add(given.parent, given.child, given.T)
+        found = {agent: _gather_agent(bag, agent, frames, names, messages) for agent in agents}
+        image_frames = {
+            agent: [own.calibrations[role].frame for role in own.calibrations if role != "right"]
+            for agent, own in found.items()
+        }
+        rigs = {"": agents} if names.rig.topics else rigs_of(image_frames, frames)
+        for rig, cameras in rigs.items():
+            for agent in cameras if len(cameras) > 1 else ():
+                found[agent].rig, found[agent].camera = rig, agent.rpartition("/")[2]
+        return list(found.values())
 
 
 def _gather_agent(bag: BagReader, agent: str, frames: FrameTree, names: BagNames, messages: int | None) -> Evidence:
     known = bag.topics
-    topics = topics_of(agent, known, names.topics)
+    topics = topics_of(agent, known, names.rig.topics.get(agent, names.topics))
     streams = _streams(bag, {role: topics[role] for role in _STREAMED if role in topics}, messages)
     calibrations = {role: _calibration(bag, topics[info]) for role, info in _INFOS.items() if role in topics}
     usual = [f for f in (f"{agent}/base_link", "base_link") if f in frames]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from slam_bags.reading.sensor_topics import BagNames
 from slam_bringup.doctor.calibration import check_calibration
+from slam_bringup.doctor.cameras import cameras_text, check_rig, rigs_in
 from slam_bringup.doctor.depth_images import check_depth_images
 from slam_bringup.doctor.evidence import Evidence, gather
 from slam_bringup.doctor.finding import Finding
@@ -38,7 +39,21 @@ def examine(path: Path, names: BagNames | None = None) -> list[Finding]:
     ValueError
         If there is no bag with images to look at.
     """
-    return [finding for evidence in gather(path, names) for check in CHECKS for finding in _named(evidence, check)]
+    return examined(path, names)[0]
+
+
+def examined(path: Path, names: BagNames | None = None) -> tuple[list[Finding], str]:
+    """Everything that is wrong with a bag, and the names of the cameras of a rig that has several, or "".
+
+    Raises
+    ------
+    ValueError
+        If there is no bag with images to look at.
+    """
+    evidences = gather(path, names)
+    rigs = rigs_in(evidences)
+    found = [finding for evidence in evidences for check in CHECKS for finding in _named(evidence, check)]
+    return [*found, *(finding for cameras in rigs.values() for finding in check_rig(cameras))], cameras_text(rigs)
 
 
 def require_stereo(path: Path, names: BagNames | None = None) -> None:
@@ -58,4 +73,5 @@ def require_stereo(path: Path, names: BagNames | None = None) -> None:
 
 def _named(evidence: Evidence, check: Callable[[Evidence], Iterator[Finding]]) -> Iterator[Finding]:
     for finding in check(evidence):
-        yield replace(finding, what=f"agent {evidence.agent}: {finding.what}") if evidence.agent else finding
+        who = f"camera {evidence.camera}" if evidence.camera else f"agent {evidence.agent}"
+        yield replace(finding, what=f"{who}: {finding.what}") if evidence.agent else finding

@@ -139,8 +139,8 @@ def filter_config(config: FilterConfig, sensors: AgentSensors, *others: AgentSen
     """
     if config.imu.use == "on" and "imu" not in sensors.topics:
         raise ValueError("an IMU is asked for (--imu on) and there is no topic imu: name it by --topic imu=/...")
-    cameras = tuple(own.camera for own in (sensors, *others)) if others else ()
-    agent = sensors.rig if others else sensors.agent
+    cameras = tuple(own.camera for own in (sensors, *others)) if sensors.camera else ()
+    agent = sensors.rig if sensors.camera else sensors.agent
     return replace(config, agent=agent, cameras=cameras, wait_for=awaited_streams(config, sensors.topics))
 
 

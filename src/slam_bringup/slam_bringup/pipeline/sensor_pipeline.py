@@ -236,7 +236,7 @@ def mode_of_camera(mode: str, roles: Collection[str]) -> str:
 def rig_scans(config: SystemConfig, cameras: Sequence[AgentSensors]) -> ScanOdometryStage:
     """Scan odometry of a rig with these cameras: what all that have depth measure at one moment is one scan."""
     first = cameras[0]
-    names = [camera.camera for camera in cameras if camera.scanner] if len(cameras) > 1 else []
+    names = [camera.camera for camera in cameras if camera.scanner] if first.camera else []
     return ScanOdometryStage(config.ndt_odometry, first.frames, first.base_frame, names)
 
 

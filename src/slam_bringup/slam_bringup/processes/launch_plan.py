@@ -16,6 +16,8 @@ from typing import Any
 import yaml
 
 from slam_bags.reading.rig_calibration import read_rig_calibration
+from slam_bags.reading.rig_cameras import RigCameras
+from slam_bags.reading.rig_file import read_rig_cameras
 from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import BagNames, nodes_name, parse_topics
 from slam_bringup.pipeline.configuration import ODOMETRIES, choose, overrides_for, system_config, with_files
@@ -50,6 +52,7 @@ ARGUMENTS = (
     LaunchArgument("pressure_topic", "", "air pressure of a barometer [pressure]"),
     LaunchArgument("base_frame", "", "frame of the rig [base_link, below the agent's name]"),
     LaunchArgument("calibration", "", "folders of slam calibrate, comma-separated, instead of the drivers' infos"),
+    LaunchArgument("rig", "", "rig.yaml: several cameras of one rig, by the topics of each"),
     LaunchArgument("rectified", "false", "the stereo images are rectified: image_rect", _BOOLEANS),
     LaunchArgument("compressed", "false", "the stereo images are compressed: image_raw/compressed", _BOOLEANS),
     LaunchArgument("pictures", AUTO, "ToF pictures beside depth: auto, none, amplitude, both"),
@@ -86,7 +89,8 @@ def plan_launch(values: Mapping[str, str]) -> LaunchPlan:
         given += [f"{role}={values[f'{role}_topic']}"] if values[f"{role}_topic"] else []
     topics = parse_topics(given)
     folders = [Path(part.strip()).expanduser() for part in values["calibration"].split(",") if part.strip()]
-    names = BagNames(topics, values["base_frame"], read_rig_calibration(folders))
+    rig = read_rig_cameras(Path(values["rig"]).expanduser()) if values["rig"] else RigCameras()
+    names = BagNames(topics, values["base_frame"], read_rig_calibration(folders), rig)
     overrides = with_files(overrides, names.calibration.parameters)
     plan = _for_bag(values, overrides, names) if values["bag"] else _for_rig(values, overrides, names)
     if values["use_sim_time"] != "true":
@@ -118,6 +122,10 @@ def _for_rig(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
     config = choose(system_config(overrides), mode, "sjsam", values["odometry"])
     if names.calibration.is_given and (len(agents) > 1 or values["rectified"] == "true"):
         raise ValueError("a calibration is that of one rig, and of its raw images")
+    if names.rig.topics and (len(agents) > 1 or names.calibration.is_given):
+        raise ValueError("a rig.yaml is that of one rig, whose cameras publish their own calibration")
+    if names.rig.transforms:
+        raise ValueError("transforms of a rig.yaml are for bags: have them published (static_transform_publisher)")
     drivers = names.calibration.driver_parameters()
     compressed = {"compressed": True} if values["compressed"] == "true" else {}
     chosen = {k: values[k] for k in ("pictures", "measurement") if values[k] != AUTO}
@@ -133,19 +141,31 @@ def _for_rig(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
             "tof_driver": drivers["tof_driver"] | chosen,
             "feature_extractor": {"tof.images": images} if chooses else {},
             "stereo_driver": drivers["stereo_driver"] | compressed,
-        },
+        }
+        | {f"{name}/tof_driver": chosen | _measurement(roles) for name, roles in names.rig.topics.items()},
         base_frames=dict.fromkeys(agents, names.base_frame) if names.base_frame else None,
+        cameras={"": {name: {_role(r) for r in own} for name, own in names.rig.topics.items()}},
         overrides=overrides,
     )
-    return LaunchPlan(tuple(specs), tuple(_remapped(names.topics)))
+    remapped = [pair for name, own in names.rig.topics.items() for pair in _remapped(own, name)]
+    return LaunchPlan(tuple(specs), (*_remapped(names.topics), *remapped))
 
 
-def _remapped(topics: Mapping[str, str]) -> list[tuple[str, str]]:
-    """Pairs of the nodes' names and the rig's names of its topics."""
+def _role(role: str) -> str:
+    return "depth" if role == "range" else role
+
+
+def _measurement(roles: Mapping[str, str]) -> dict[str, str]:
+    """Parameter of the driver of a depth camera among several cameras."""
+    return {"measurement": "range" if "range" in roles else "depth"} if {"range", "depth"} & roles.keys() else {}
+
+
+def _remapped(topics: Mapping[str, str], place: str = "") -> list[tuple[str, str]]:
+    """Pairs of the nodes' names, in the namespace ``place``, and the rig's names of its topics."""
     found = []
     for role, topic in topics.items():
         measurement = role if role in ("range", "depth") else "range"
-        own = nodes_name("", "depth" if role == "range" else role, topic, measurement)
+        own = nodes_name(place, _role(role), topic, measurement)
         found.append((own, topic))
     return found
 
@@ -166,6 +186,7 @@ def _for_bag(values: Mapping[str, str], overrides: Overrides, names: BagNames) -
             overrides,
             autosave=True,
             calibration=names.calibration,
+            mountings=names.rig.transforms,
         )
     return LaunchPlan((*graph.specs, _player(path, graph, values)))
 

@@ -7,13 +7,15 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from slam_bags.reading.extrinsics import StaticTransform
 from slam_bags.reading.readings import AgentSensors
 from slam_bags.reading.rig_calibration import RigCalibration
+from slam_bags.reading.rig_cameras import RIG_ROLES
 from slam_bags.reading.sensor_topics import is_rectified, join, nodes_name
 from slam_bringup.pipeline.configuration import SystemConfig, awaited_streams
 from slam_bringup.pipeline.node_table import NODES, RESULT_TOPICS, node_named
 from slam_bringup.pipeline.overrides import Overrides, is_parameter_of
-from slam_bringup.pipeline.sensor_pipeline import with_masks
+from slam_bringup.pipeline.sensor_pipeline import for_camera, mode_of_camera, with_masks
 from slam_bringup.processes.node_arguments import ros_arguments
 from slam_bringup.processes.processes import NodeCommand
 from slam_bringup.processes.start_map import StartMap
@@ -25,6 +27,8 @@ _REPLAY = {"input.policy": "all"}
 
 
 _MISSING = object()
+_OF_A_CAMERA = ("stereo_driver", "tof_driver", "feature_extractor")
+"""Nodes that a rig with several cameras has once for each."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +76,13 @@ def live_nodes(
     base_frames: Mapping[str, str] | None = None,
     known_roles: Mapping[str, Collection[str]] | None = None,
     with_laser: Iterable[str] = (),
+    cameras: Mapping[str, Mapping[str, Collection[str]]] | None = None,
     overrides: Overrides | None = None,
 ) -> list[NodeSpec]:
     """Nodes for rigs with the sensors that the mode of ``config`` needs.
+
+    ``cameras``: of agents whose rigs have several, the roles of each by its name; drivers and front end run once for
+    each, in its namespace below the agent's, and ``extra`` is theirs by ``<agent>/<camera>/<executable>``.
 
     ``rectified``: their stereo images are. ``extra``: parameters by executable. ``base_frames``: frame of each agent's
     rig, by default ``base_link`` below the agent's name. ``known_roles``: sensors of each agent that are known to
@@ -86,16 +94,23 @@ def live_nodes(
     specs = []
     for agent in agents:
         base = {"base_frame": base_frames[agent]} if agent in base_frames else _below(agent, base_frame="base_link")
-        if mode != "tof" and not rectified:
-            specs.append(_spec("stereo_driver", None, agent, extra))
-        if mode != "stereo" or (odometry and agent not in with_laser):
-            specs.append(_spec("tof_driver", config.tof_driver, agent, extra))
+        several = (cameras or {}).get(agent, {})
+        modes = {join(agent, name)[1:]: mode_of_camera(mode, roles) for name, roles in several.items()} or {agent: mode}
+        with_depth = tuple(name for name, roles in several.items() if "depth" in roles)
+        for place, own_mode in modes.items():
+            has_scans = agent not in with_laser if not several else place.rpartition("/")[2] in with_depth
+            if own_mode != "tof" and not rectified:
+                specs.append(_spec("stereo_driver", None, place, extra))
+            if own_mode != "stereo" or (odometry and has_scans):
+                specs.append(_spec("tof_driver", config.tof_driver, place, extra))
         if odometry:
-            frames = base | _below(agent, odom_frame="odom")
+            frames = base | _below(agent, odom_frame="odom") | {"cameras": with_depth}
             specs.append(_spec("ndt_odometry", config.ndt_odometry, agent, extra, **frames))
-        specs.append(_spec("feature_extractor", config.feature_extractor, agent, extra))
+        for place, own_mode in modes.items():
+            front_end = replace(config.feature_extractor, mode=own_mode)
+            specs.append(_spec("feature_extractor", front_end, place, extra))
         wait_for = awaited_streams(config.ekf_slam, (known_roles or {}).get(agent, ()))
-        own = base | {"agent": agent, "wait_for": wait_for}
+        own = base | {"agent": agent, "wait_for": wait_for, "cameras": tuple(several)}
         specs.append(_spec("ekf_slam", config.ekf_slam, agent, extra, **own))
     specs.append(_spec("sjsam", config.sjsam, "", extra, agents=agents if any(agents) else ()))
     return [_overridden(spec, config, overrides) for spec in specs] if overrides else specs
@@ -111,45 +126,59 @@ def plan_nodes(
     autosave: bool = False,
     calibration: RigCalibration | None = None,
     start_map: StartMap | None = None,
+    mountings: Sequence[StaticTransform] = (),
 ) -> NodeGraph:
     """The nodes of a run over the agents of a bag; ``autosave`` where nobody has the map saved at the end.
 
     ``calibration``: instead of the bag's. ``start_map``: what ``sjsam`` begins with instead of an empty map.
+    ``mountings``: static transforms that the bag lacks.
     """
     calibration = calibration or RigCalibration()
     mode = config.feature_extractor.mode
     first = next(iter(sensors.values()))
-    base_frames = {agent: sensor.base_frame for agent, sensor in sensors.items()}
+    rigs = _rigs(sensors)
+    firsts = {rig: own[0] for rig, own in rigs.items()}
+    base_frames = {rig: sensor.base_frame for rig, sensor in firsts.items()}
     extra = _bag_parameters(config, first, map_path, autosave, calibration)
     for executable, parameters in (start_map.parameters if start_map else {}).items():
         extra[executable] = extra.get(executable, {}) | parameters
+    for camera in (own for several in rigs.values() for own in several if own.camera):
+        of_camera = _bag_parameters(for_camera(config, camera), camera, map_path, autosave, calibration)
+        extra |= {f"{camera.agent}/{name}": of_camera[name] for name in _OF_A_CAMERA}
     specs = live_nodes(
-        config, sensors, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
+        config, rigs, odometry=odometry, rectified=is_rectified(first.topics.get("left", "")),
         extra=extra, base_frames=base_frames,
         overrides=overrides,
-        known_roles={agent: own.topics for agent, own in sensors.items()},
-        with_laser=[a for a, s in sensors.items() if s.scanner == "scan"],
+        known_roles={rig: own.topics for rig, own in firsts.items()},
+        with_laser=[rig for rig, own in firsts.items() if own.scanner == "scan"],
+        cameras={rig: {s.camera: s.topics for s in several} for rig, several in rigs.items() if several[0].camera},
     )  # fmt: skip
     specs = [replace(spec, parameters=spec.parameters | _REPLAY) for spec in specs]
     finishers = [declared.executable for declared in NODES if declared.holds_frames]
     names = {e: tuple(s.command.full_name for s in specs if s.executable == e) for e in finishers}
-    recorded = {join(agent, topic) for agent in ("", *sensors) for topic in RESULT_TOPICS}
+    recorded = {join(agent, topic) for agent in ("", *rigs, *sensors) for topic in RESULT_TOPICS}
     return NodeGraph(
         specs=tuple(specs),
         commands=tuple(spec.command for spec in specs),
-        played={t: name for s in sensors.values() for t, name in _topics(s, mode, odometry, calibration.files).items()},
-        pace=tuple(p for s in sensors.values() for p in _pace(s, mode, odometry)),
+        played={
+            topic: name
+            for own in sensors.values()
+            for topic, name in _topics(own, _mode_of(own, mode), odometry, calibration.files).items()
+        },
+        pace=tuple(p for own in rigs.values() for p in _paces(own, mode, odometry)),
         recorded_topics=(*sorted(recorded), "/diagnostics", STATIC_TRANSFORMS_TOPIC),
         filters=names["ekf_slam"],
         finishers=tuple(name for executable in finishers for name in names[executable]),
-        transforms=tuple(t.text for t in calibration.transforms(first.left_frame, first.tof_frame)),
+        transforms=tuple(t.text for t in (*calibration.transforms(first.left_frame, first.tof_frame), *mountings)),
     )
 
 
 def viewer_nodes(config: SystemConfig, sensors: Mapping[str, AgentSensors], port: int) -> list[NodeSpec]:
     """The dense model and the page that shows it, beside the nodes of :func:`plan_nodes`."""
-    agents = tuple(sensors) if any(sensors) else ()
-    model = _spec("dense_mapper", config.dense_mapper, "", {}, agents=agents)
+    rigs = _rigs(sensors)
+    agents = tuple(rigs) if any(rigs) else ()
+    names = tuple(dict.fromkeys(own.camera for several in rigs.values() for own in several if own.camera))
+    model = _spec("dense_mapper", config.dense_mapper, "", {}, agents=agents, cameras=names)
     page = _spec("viewer", None, "", {}, agents=agents, port=port)
     return [model, page]
 
@@ -236,7 +265,33 @@ def _topics(sensor: AgentSensors, mode: str, odometry: bool, calibrated: Collect
 
 
 def _heard(sensor: AgentSensors, role: str) -> str:
-    return nodes_name(sensor.agent, role, sensor.topics[role], sensor.measurement)
+    place = sensor.rig if sensor.camera and role in RIG_ROLES else sensor.agent
+    return nodes_name(place, role, sensor.topics[role], sensor.measurement)
+
+
+def _rigs(sensors: Mapping[str, AgentSensors]) -> dict[str, list[AgentSensors]]:
+    """Cameras of each rig, first one first, by the rig's namespace."""
+    rigs: dict[str, list[AgentSensors]] = {}
+    for own in sensors.values():
+        rigs.setdefault(own.rig if own.camera else own.agent, []).append(own)
+    return rigs
+
+
+def _mode_of(sensor: AgentSensors, mode: str) -> str:
+    return mode_of_camera(mode, sensor.topics) if sensor.camera else mode
+
+
+def _paces(cameras: Sequence[AgentSensors], mode: str, odometry: bool) -> Iterable[str]:
+    """Paces of one camera, or of the first of several, for which filter and scan odometry wait for the others."""
+    first = cameras[0]
+    if not first.camera:
+        yield from _pace(first, mode, odometry)
+        return
+    image = "depth" if _mode_of(first, mode) == "tof" else "left"
+    yield f"{join(first.rig, 'ekf_slam')}={_heard(first, image)}"
+    with_depth = [camera for camera in cameras if camera.scanner]
+    if odometry and with_depth:
+        yield f"{join(first.rig, 'ndt_odometry')}={_heard(with_depth[0], with_depth[0].scanner)}"
 
 
 def _pace(sensor: AgentSensors, mode: str, odometry: bool) -> Iterable[str]:
@@ -257,10 +312,9 @@ def _spec(
     **own: Any,
 ) -> NodeSpec:
     changed = dict(_changed(config)) if config is not None else {}
+    of_place = extra.get(f"{namespace}/{executable}", extra.get(executable, {}))
     given = {name: value for name, value in own.items() if value is not False and value not in ("", ())}
-    return NodeSpec(
-        node_named(executable).package, executable, namespace, changed | given | dict(extra.get(executable, {}))
-    )
+    return NodeSpec(node_named(executable).package, executable, namespace, changed | given | dict(of_place))
 
 
 def _below(agent: str, **frames: str) -> dict[str, str]:

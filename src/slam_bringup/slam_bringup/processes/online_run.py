@@ -119,7 +119,7 @@ def run_nodes(
     with SensorBag(bag, names) as opened:
         graph = plan_nodes(
             config, opened.sensors, odometry, str(out / "map"), overrides, calibration=opened.calibration,
-            start_map=start_map,
+            start_map=start_map, mountings=opened.mountings,
         )  # fmt: skip
         viewers = viewer_nodes(config, opened.sensors, view_port) if view_port else []
     with PrivateDomain() as domain:

@@ -58,12 +58,12 @@ class Recording:
                         self._states[status.name].add(stamp, values["state"], values["reason"])
                         self._rides[status.name] |= dict.fromkeys(values.get("lift_rides_ns", "").split())
 
-    def of_agent(self, agent: str) -> AgentRecord:
-        """Record of one agent, as it was heard."""
+    def of_agent(self, agent: str, camera: str) -> AgentRecord:
+        """Record of one agent, as it was heard; its features are those in the namespace of its first ``camera``."""
         return AgentRecord(
             filtered=self._odometry[_topic(agent, "odom")],
             scans=self._odometry[_topic(agent, "ndt/odometry")],
-            feature_counts=self._feature_counts[_topic(agent, "features")],
+            feature_counts=self._feature_counts[_topic(camera, "features")],
             events=self._states[_topic(agent, "ekf_slam")].events,
             lost_share=self._states[_topic(agent, "ekf_slam")].lost_share,
             rides=[_span(text) for text in self._rides[_topic(agent, "ekf_slam")]],
@@ -97,12 +97,12 @@ def collect(
     joiner = run.diagnostics.get("/sjsam", {})
     with SensorBag(bag, names) as opened:
         record = RunRecord(
-            agents={agent: recording.of_agent(agent) for agent in opened.agents},
+            agents={rig: recording.of_agent(rig, cameras[0]) for rig, cameras in opened.rigs.items()},
             map=snapshot,
             landmarks=landmarks,
             tags=map_tags(snapshot, landmarks),
             fixed_frame=snapshot.fixed_frame(),
-            trajectories={agent: recording.located(agent) for agent in opened.agents}
+            trajectories={agent: recording.located(agent) for agent in opened.rigs}
             if is_localized
             else snapshot.trajectory(start_map.submaps if start_map else 0),
             submaps=recording.submaps,
@@ -114,7 +114,7 @@ def collect(
             events=tuple([STOPPED] * run.stopped + unclean_ends(run)),
         )
         record = record.with_front_ends(
-            {agent: _front_end(opened.sensors[agent], run.diagnostics) for agent in opened.agents}
+            {agent: _front_end(opened.sensors[agent], run.diagnostics) for agent in opened.agents}, rigs=opened.rigs
         )
         result = run_result(opened, config, record, mapper=mapper, odometry=odometry, stopped=lambda: run.stopped)
     return replace(result, is_localized=is_localized), global_map

@@ -14,7 +14,7 @@ from slam_bags.reading.sensor_bag import SensorBag
 from slam_bags.reading.sensor_topics import ROLES
 from slam_bringup.pipeline.configuration import MAPPERS, ODOMETRIES
 from slam_bringup.pipeline.overrides import Overrides, read_overrides
-from slam_bringup.terminal.paths import UserPath, calibration_option, overwrite_option
+from slam_bringup.terminal.paths import UserPath, calibration_option, overwrite_option, rig_option
 from slam_viewer.results import RunResult
 from stereo_frontend.fiducials.detector import DICTIONARIES
 from stereo_frontend.frontend_config import MODES
@@ -98,6 +98,7 @@ _RIG_OPTIONS = (
         help=f"a topic that is not named like the nodes' (may be repeated); roles: {', '.join(ROLES)}",
     ),
     calibration_option(),
+    rig_option(),
     click.option(
         "--base-frame", default="", metavar="FRAME",
         help="the frame whose poses are wanted [base_link; else the root above the camera]",

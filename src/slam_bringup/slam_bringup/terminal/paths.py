@@ -9,6 +9,11 @@ from typing import Any
 
 import click
 
+from slam_bags.reading.rig_cameras import RigCameras
+from slam_bags.reading.rig_file import read_rig_cameras
+
+_RIG = "slam_bringup.rig"
+
 
 class UserPath(click.Path):
     """A path with ``~`` for the home folder, also where the shell does not replace it (``--output=~/x``)."""
@@ -32,3 +37,22 @@ def calibration_option() -> Any:
         "--calibration", "calibrations", multiple=True, metavar="FOLDER", type=UserPath(exists=True, file_okay=False),
         help="cameras as slam calibrate wrote them into FOLDER, instead of their camera infos (may be repeated)",
     )  # fmt: skip
+
+
+def _keep_rig(context: click.Context, _: click.Parameter, path: Path | None) -> None:
+    if path is not None:
+        context.meta[_RIG] = read_rig_cameras(path)
+
+
+def rig_option() -> Any:
+    """The option ``--rig``, which :func:`rig_cameras` gives."""
+    return click.option(
+        "--rig", type=UserPath(exists=True, dir_okay=False), expose_value=False, callback=_keep_rig, metavar="FILE",
+        help="rig.yaml: cameras of one rig, by the topics of each (docs/several_cameras.md) [by the tree of frames]",
+    )  # fmt: skip
+
+
+def rig_cameras() -> RigCameras:
+    """The cameras of the command line's ``--rig``; empty without."""
+    given: RigCameras = click.get_current_context().meta.get(_RIG, RigCameras())
+    return given

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the cameras of one rig give, in any order, as groups of one moment in the order of their stamps.
+"""Features or scans of the cameras of one rig, in any order, as groups of one moment in the order of their stamps.
 
     front -> features or scans --> those whose stamps belong together -> one group
     back --> features or scans --^
@@ -106,7 +106,7 @@ class RigGroups(Generic[T]):
                 yield used
 
     def _in_step_with_first(self, parts: list[tuple[int, T]]) -> list[tuple[int, T]]:
-        """Those of a group whose cameras have shared a stamp with the first camera that is heard."""
+        """Parts of a group whose cameras have shared a stamp with the first camera that is heard."""
         numbers = {number for number, _ in parts}
         if not self._in_step or numbers & self._in_step:
             self._in_step |= numbers
@@ -119,7 +119,7 @@ class RigGroups(Generic[T]):
 
     @property
     def left_out(self) -> int:
-        """How much was left out of cameras without a common trigger."""
+        """Number of frames left out of cameras without a common trigger."""
         return sum(self._out_of_step.values())
 
     def give_up(self) -> None:
