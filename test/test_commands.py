@@ -51,6 +51,7 @@ NOT_RUN = {
     r"\./slam run monday.bag ": "test_run_many.py maps several bags on as many workers as there are processors",
     r"\./slam (simulate tagged_corridor|run out/corridor) ": "test/integration/test_fiducials.py runs both as typed",
     r"slam (simulate|run|calibrate refine) untriggered": "test_untriggered_pair.py runs each, with smaller pictures",
+    r"\./slam (simulate back_to_back|run out/turn|doctor out/turn)": "test_several_cameras.py does, with less pixels",
     r"\./slam merge ": "takes finished maps; test/slam_bringup/commands/test_merge.py makes some and merges them",
     r"(\S*/)?dask ": "serves a cluster until Ctrl-C; test/sjsam_node/regions/test_tasks.py starts one",
     r"\./slam post ": "runs until Ctrl-C; test/slam_bringup/commands/test_live.py looks at what it starts",
