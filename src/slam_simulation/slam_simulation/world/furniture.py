@@ -20,8 +20,6 @@ Generator = np.random.Generator
 _RISE, _SLAB = 0.18, 0.2
 """Height of a step of stairs, and thickness of a gallery's floor, m."""
 SIDE = "side"
-_BLANK = 1e-3
-"""Reflectance of a blank wall, which shines by itself: nothing of its pattern is seen."""
 
 
 @dataclass(frozen=True)
@@ -221,14 +219,10 @@ CONTENTS: dict[str, tuple[str, ...]] = {
 
 
 def blank(world: World, spot: Spot, size: tuple[float, float]) -> None:
-    """A wall of ``size`` (width, height) m that shines white and shows nothing, seen from the spot's front.
-
-    A depth camera sees it as any other wall.
-    """
+    """A white wall of ``size`` (width, height) m without any texture, seen from the spot's front."""
     width, height = size
-    white = Material("label", brightness=_BLANK, infrared=0.6 / _BLANK, emission=0.5)
     edge_u, edge_v = spot.at(0.0, width) - spot.at(), np.array([0.0, 0.0, height])
-    world.add(Rectangle(spot.at(0.0, -0.5 * width), edge_u, edge_v, white, spot.room))
+    world.add(Rectangle(spot.at(0.0, -0.5 * width), edge_u, edge_v, Material("white"), spot.room))
 
 
 def furnish_wall(world: World, wall: Wall, room: Room, rng: Generator) -> None:

@@ -154,6 +154,10 @@ def _fabric(rng: np.random.Generator) -> FloatArray:
     return np.asarray(0.22 + 0.02 * weave[None, :] * weave[:, None] + 0.03 * noise(rng, (16, 16), 5, 0.7))
 
 
+def _white(rng: np.random.Generator) -> FloatArray:
+    return np.full((SIZE, SIZE), 0.8)
+
+
 PATTERNS: dict[str, Pattern] = {
     "plaster": Pattern(_plaster, 1.7),
     "blotches": Pattern(_blotches, 4.3),
@@ -168,4 +172,5 @@ PATTERNS: dict[str, Pattern] = {
     "metal": Pattern(_metal, 0.9),
     "cardboard": Pattern(_cardboard, 0.8),
     "fabric": Pattern(_fabric, 0.6),
+    "white": Pattern(_white, 1.0),
 }
