@@ -217,7 +217,8 @@ def _dense(
     """The dense model's surface and floor plans, and why the run or the model failed, if so."""
     surface, plans, failure = Surface.empty(), tuple[FloorPlan, ...](), record.failure
     try:
-        corrections, rides = {}, {}
+        corrections = {}
+        rides: dict[str, Sequence[tuple[int, int]]] = {}
         for agent, known in record.agents.items():
             corrections[bag.first_of(agent).agent] = known.front_end.correction
             corrections |= {camera: own.correction for camera, own in known.other_front_ends.items()}
