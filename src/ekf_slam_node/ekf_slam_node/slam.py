@@ -15,7 +15,6 @@ from ekf_slam_node.association.linking import CONVINCING, FrameLink, Linker
 from ekf_slam_node.config import MAX_FRAME_FEATURES, MAX_UPDATE_LANDMARKS, STANDING_FRAMES, EkfSlamConfig
 from ekf_slam_node.filtering.candidates import Candidates, MotionPrior, motion_prior
 from ekf_slam_node.filtering.correlated_noise import CORRELATED_NOISE_FACTOR, CorrelatedNoise
-from ekf_slam_node.filtering.landmarks import KEPT_FOR_NS
 from ekf_slam_node.filtering.models import Frame, seconds_between
 from ekf_slam_node.filtering.noise_monitor import InnovationWatch, NoiseMonitor
 from ekf_slam_node.loss_recovery import LossRecovery
@@ -28,7 +27,7 @@ from ekf_slam_node.odometry.relative_poses import (
 )
 from ekf_slam_node.results import EkfResult, LandmarkView, TrackingState
 from ekf_slam_node.ride_submaps import RideSubmaps
-from ekf_slam_node.submaps.frame_input import frame_of_strongest, mounted, usable_features, without_tags
+from ekf_slam_node.submaps.frame_input import LinkedCameras, frame_of_strongest, mounted, usable_features, without_tags
 from ekf_slam_node.submaps.missed_frames import MissedFrames
 from ekf_slam_node.submaps.motion_checks import (
     StandingDetector,
@@ -102,7 +101,7 @@ class EkfSlam:
         self._next_id = 0
         self._newest_stamp_ns = 0
         self._tags: Frame | None = None
-        self._linked_cameras: set[int] = set()
+        self._linked_cameras = LinkedCameras()
         self._standing = StandingDetector(STANDING_FRAMES, self.config.association.gate)
         missed = MissedFrames(self._linker, self._T_rig_optical, self.config.motion)
         self._rides = RideSubmaps(self._chain, self._aids, self.counters)
@@ -125,10 +124,9 @@ class EkfSlam:
         self._tags = None if tags is None else mounted(tags, *place)
         usable = usable_features(features)
         self.counters.add("features_unusable", int(len(features) - usable.sum()))
-        strongest = frame_of_strongest(features, usable, MAX_FRAME_FEATURES)
-        frame = self._noise.corrected(mounted(strongest, *place))
+        frame = self._noise.corrected(mounted(frame_of_strongest(features, usable, MAX_FRAME_FEATURES), *place))
         if not self._chain.is_open:
-            self._linked_cameras = set(frame.camera_numbers)
+            self._linked_cameras.take(frame)
             return self._recovery.begin(frame)
         slips = self._aids.external.slips
         self._aids.rides.forget_events()
@@ -242,12 +240,12 @@ class EkfSlam:
             bridge = self._aids.bridge(self._chain.stamp_ns, frame.stamp_ns)
         if linked is None and bridge is not None:
             linked = self._link(frame, dt, bridge)
-        if linked is None and self._others_see(frame):
+        if linked is None and self._linked_cameras.go_on_without(frame):
             self.counters.add("frames_of_one_camera_unlinked")
             return self._chain.result(frame.stamp_ns, TrackingState.OK, "")
         if linked is None:
             return self._recovery.track_lost(frame, bridge)
-        self._linked_cameras = set(frame.camera_numbers)
+        self._linked_cameras.take(frame)
         if bridge is not None:
             self._chain.add_bridged_pose(frame.stamp_ns, bridge)
         if self._standing.add(linked):
@@ -259,20 +257,10 @@ class EkfSlam:
         submaps = self._close(linked, seen, updated) if updated.closes else self._maintain(linked, updated)
         return self._chain.result(frame.stamp_ns, *updated.state(linked.link), submaps, updated)
 
-    def _others_see(self, frame: Frame) -> bool:
-        """True if a camera that is not among the frame's own has been linked just now: its next frame will be, too."""
-        recent = frame.stamp_ns - self._chain.stamp_ns < KEPT_FOR_NS
-        return recent and bool(frame.cameras) and bool(self._linked_cameras - set(frame.camera_numbers))
-
-    def _expected(self, dt: float) -> MotionPrior:
-        """The motion over dt (s) at the velocity that is known."""
-        local = self._chain.local
-        return motion_prior(local.velocity, local.velocity_covariance(), self.config.motion.sigma, dt)
-
     def _link(self, frame: Frame, dt: float, aid: RelativePoseMeasurement | None) -> LinkedFrame | None:
         """Associate a frame with what is known, and learn its noise from the pairs; None if nothing fits."""
         local = self._chain.local
-        expected = self._expected(dt)
+        expected = motion_prior(local.velocity, local.velocity_covariance(), self.config.motion.sigma, dt)
         prior = fused_prior(expected, aid)
         known = None if aid is None else prior.T
         predicted = self._shutter.corrected(frame, dt, known)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ekf_slam_node.filtering.landmarks import KEPT_FOR_NS
 from ekf_slam_node.filtering.models import Frame, FrameCamera, frame_from_features
 from slam_core.camera import MIN_DEPTH
 from slam_core.geometry import FloatArray, invert_transform
@@ -61,6 +62,23 @@ def mounted(
     T_first_rig = invert_transform(T_rig_optical)
     seen = tuple(FrameCamera(c.camera, T_first_rig @ mountings[c.frame_id], c.number) for c in cameras)
     return replace(frame, cameras=seen) if seen else frame
+
+
+class LinkedCameras:
+    """The cameras of a rig's newest frame that was linked."""
+
+    def __init__(self) -> None:
+        self._numbers: frozenset[int] = frozenset()
+        self._stamp_ns = 0
+
+    def take(self, frame: Frame) -> None:
+        """A frame was linked, or begins the map."""
+        self._numbers, self._stamp_ns = frozenset(frame.camera_numbers), frame.stamp_ns
+
+    def go_on_without(self, frame: Frame) -> bool:
+        """True if a camera that is not among an unlinked frame's own was linked just now: its next one will be, too."""
+        is_recent = frame.stamp_ns - self._stamp_ns < KEPT_FOR_NS
+        return is_recent and bool(frame.cameras) and bool(self._numbers - set(frame.camera_numbers))
 
 
 def without_tags(features: Features) -> tuple[Features, Frame | None]:
