@@ -8,6 +8,7 @@ import itertools
 import numpy as np
 
 from dense_mapping.plans.floor_plan import FloorPlan
+from dense_mapping.plans.levelling import floor_heights
 from dense_mapping.plans.storeys import CurrentStorey, storey_number
 from slam_core.geometry import make_transform
 
@@ -45,3 +46,16 @@ def test_a_plan_that_vanished_is_left() -> None:
     assert current.number == 2
     assert current.update(PLANS[:2], at(7.0))
     assert current.number == 1
+
+
+def test_treads_of_stairs_are_no_floor() -> None:
+    """Floors at 0 and 3 m, of which the upper one is seen less than the treads between them."""
+    rng = np.random.default_rng(1)
+    levels = np.concatenate([np.full(900, 0.0), *(np.full(300, 0.18 * k) for k in range(1, 16)), np.full(500, 3.0)])
+    points = np.column_stack(
+        [rng.uniform(0.0, 5.0, (len(levels), 2)), levels + 0.01 * rng.standard_normal(len(levels))]
+    )
+    heights = np.concatenate([np.full(60, 1.3), np.linspace(1.3, 4.3, 20), np.full(60, 4.3)])
+    cameras = np.column_stack([np.zeros((len(heights), 2)), heights])
+    floors = floor_heights(points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), cameras, 2.0, 1.3)
+    np.testing.assert_allclose(floors, [0.0, 3.0], atol=0.05)

@@ -15,10 +15,10 @@ STEP_NS = 100_000_000
 
 
 def filled(sigma_pa: float = 0.0) -> PressureHeights:
-    """Two seconds on a floor at 0.9 bar, then 6 m above it."""
+    """At 0.9 bar, after half a second 2 m higher, after two seconds 6 m above that."""
     heights = PressureHeights(RideConfig())
     for k in range(40):
-        pascal = 9e4 * np.exp(-(6.0 if k >= 20 else 0.0) / 8434.0)
+        pascal = 9e4 * np.exp(-(2.0 * (k >= 5) + 6.0 * (k >= 20)) / 8434.0)
         assert heights.add(PressureReading(k * STEP_NS, pascal, sigma_pa**2)) == ""
     return heights
 
