@@ -51,7 +51,7 @@ def test_a_plan_that_vanished_is_left() -> None:
 def test_treads_of_stairs_are_no_floor() -> None:
     """Floors at 0 and 3 m, of which the upper one is seen less than the treads between them."""
     rng = np.random.default_rng(1)
-    levels = np.concatenate([np.full(900, 0.0), *(np.full(600, 0.18 * k) for k in range(1, 16)), np.full(500, 3.0)])
+    levels = np.concatenate([np.full(900, 0.0), *(np.full(600, 0.18 * k) for k in range(1, 13)), np.full(500, 3.0)])
     points = np.column_stack(
         [rng.uniform(0.0, 5.0, (len(levels), 2)), levels + 0.01 * rng.standard_normal(len(levels))]
     )

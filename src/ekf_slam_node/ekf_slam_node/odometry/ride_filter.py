@@ -31,8 +31,8 @@ _SIGMA_REST = 0.03
 class VerticalMotion:
     """Motion over dt (s) along the vertical.
 
-    speed, distance: gained beyond free fall by the accelerometer, m/s and m, with covariance (2, 2) of distance, speed.
-    seen: distance (m) within the cabin, as the images show it, with its variance.
+    speed, distance: gained beyond free fall by the accelerometer, m/s and m, with covariance (2, 2) of (distance,
+    speed). seen: distance (m) within the cabin, as the images show it, with its variance.
     """
 
     dt: float
