@@ -6,7 +6,7 @@ import pytest
 
 from ndt_registration.clouds.quantiles import quantiles, root_quantiles
 
-SHARES = (0.0, 0.25, 0.5, 0.9, 1.0)
+SHARES = (0.0, 0.13, 0.25, 0.37, 0.5, 0.63, 0.77, 0.9, 0.99, 1.0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 1000, 4097])
