@@ -228,3 +228,33 @@ def test_pieces_of_before_that_are_damaged_or_not_wanted_are_dropped_at_the_star
     assert world.views.lacks() == [Lack(key, 1, 0b10)]
     assert len(list(files[0].parent.iterdir())) == 2
     assert unpack_piece(files[0].read_bytes()).number == 0
+
+
+def test_a_submap_that_is_not_acknowledged_yet_holds_views_back(world):
+    keep(world, 10**9)
+    world.run(5.0)
+    world.uplink.views.lack([Lack(ViewKey(PICTURE, SESSION, 10**9))], world.now_s)
+    world.submap(1)
+    kinds = [[m.kind for m in world.uplink.due(world.now_s + k)] for k in (0.1, 0.2)]
+    assert "submap" in kinds[0]
+    assert not any("piece" in sent for sent in kinds)
+    world.uplink.on_acknowledgement([(2, 0, 2)], world.now_s + 0.3)
+    assert "piece" in [m.kind for m in world.uplink.due(world.now_s + 0.3)]
+
+
+def test_details_that_the_budget_does_not_allow_yet_hold_views_back(tmp_path, make_submap):
+    world = World(tmp_path, make_submap, landmarks=80)
+    keep(world, 10**9)
+    world.run(5.0)
+    world.submap(0)
+    world.run(10.0)
+    uplink, now = world.uplink, world.now_s
+    uplink.details.want([(2, 0, 1)])
+    uplink.views.lack([Lack(ViewKey(PICTURE, SESSION, 10**9))], now)
+    assert uplink.details.ready(now) == (2, 0)
+    room = uplink.details.size((2, 0)) - 100
+    assert room > uplink.views.size(uplink.views.ready(now))
+    uplink._budget.allows(0, now)
+    uplink._budget.spend(round(uplink._budget._level) - room)
+    assert not {"details", "piece"} & {m.kind for m in uplink.due(now)}
+    assert [m.kind for m in uplink.due(now + 5.0) if m.kind in ("details", "piece")] == ["details", "piece"]
