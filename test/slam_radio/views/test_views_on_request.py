@@ -252,9 +252,10 @@ def test_details_that_the_budget_does_not_allow_yet_hold_views_back(tmp_path, ma
     uplink.details.want([(2, 0, 1)])
     uplink.views.lack([Lack(ViewKey(PICTURE, SESSION, 10**9))], now)
     assert uplink.details.ready(now) == (2, 0)
-    room = uplink.details.size((2, 0)) - 100
+    room = min(uplink.details.size((2, 0)), 4000) - 100  # 4000: two seconds of the budget
     assert room > uplink.views.size(uplink.views.ready(now))
     uplink._budget.allows(0, now)
     uplink._budget.spend(round(uplink._budget._level) - room)
     assert not {"details", "piece"} & {m.kind for m in uplink.due(now)}
-    assert [m.kind for m in uplink.due(now + 5.0) if m.kind in ("details", "piece")] == ["details", "piece"]
+    sent = [m.kind for k in range(1, 10) for m in uplink.due(now + k)]
+    assert [kind for kind in sent if kind in ("details", "piece")][:2] == ["details", "piece"]
